@@ -1,0 +1,186 @@
+"""The box of nodes on which a value function lives.
+
+Node-centred: both ends of an ordinary axis are nodes; a periodic axis omits its upper end. Coordinates are
+computed where they are used, as x_i = (lo·(M − i) + hi·i)/M with M = N − 1 (M = N on a periodic axis), so
+that a node at zero is exactly zero, and are never stored as a table of all nodes.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.pytree import node
+
+
+@node(static=("shape", "periodic", "names"))
+class Grid:
+    """A uniform grid of nodes on a box in R^n.
+
+    Args:
+      lo: lower corner, shape (n,), in the units of each state.
+      hi: upper corner, shape (n,); on a periodic axis the point that is the same as ``lo``.
+      shape: number of nodes an axis, n integers of at least 2.
+      periodic: one bool an axis; ``None`` means none.
+      names: one name an axis, used by pictures and printed tables.
+
+    Raises:
+      ValueError: bounds that are not finite or not increasing, or lengths that differ.
+      TypeError: sizes that are not integers, periodicities that are not booleans.
+
+    Example:
+      >>> grid = Grid(lo=[-1.0, 0.0], hi=[1.0, 1.0], shape=(5, 4), periodic=(False, True))
+      >>> grid.axis(0).tolist(), grid.axis(1).tolist()
+      ([-1.0, -0.5, 0.0, 0.5, 1.0], [0.0, 0.25, 0.5, 0.75])
+    """
+
+    lo: Any
+    hi: Any
+    shape: tuple[int, ...]
+    periodic: tuple[bool, ...] | None = None
+    names: tuple[str, ...] = ()
+
+    def __post_init__(self):
+        lo, hi = _corner(self.lo, "lo"), _corner(self.hi, "hi")
+        shape = _sizes(self.shape)
+        periodic = _flags(self.periodic, len(shape))
+        names = tuple(str(name) for name in self.names) or tuple(f"x{axis + 1}" for axis in range(len(shape)))
+        lengths = (len(lo), len(hi), len(shape), len(periodic), len(names))
+        if len(set(lengths)) != 1:
+            raise ValueError(
+                "Grid: got lo, hi, shape, periodic and names of lengths {}, {}, {}, {} and {}; "
+                "wanted one entry an axis in each".format(*lengths)
+            )
+        if isinstance(lo, np.ndarray) and isinstance(hi, np.ndarray):
+            for axis, (low, high) in enumerate(zip(lo, hi, strict=True)):
+                if not (math.isfinite(low) and math.isfinite(high) and low < high):
+                    raise ValueError(f"Grid: axis {axis} runs from lo = {low:g} to hi = {high:g}; wanted finite lo < hi")
+        for name, value in zip(("lo", "hi", "shape", "periodic", "names"), (lo, hi, shape, periodic, names), strict=True):
+            object.__setattr__(self, name, value)
+
+    @property
+    def ndim(self) -> int:
+        """The number of states n."""
+        return len(self.shape)
+
+    @property
+    def size(self) -> int:
+        """The number of nodes, a Python integer of any size."""
+        return math.prod(self.shape)
+
+    def intervals(self, axis: int) -> int:
+        """The number M of intervals between ``lo`` and ``hi``."""
+        return self.shape[axis] if self.periodic[axis] else self.shape[axis] - 1  # type: ignore[index]
+
+    def spacing(self, axis: int) -> Any:
+        """The distance h between neighbours along ``axis``."""
+        return (self.hi[axis] - self.lo[axis]) / self.intervals(axis)
+
+    def axis(self, axis: int, dtype: Any = None) -> Any:
+        """The coordinates of the nodes along one axis, shape (N,)."""
+        index, last = np.arange(self.shape[axis], dtype=dtype or np.float64), self.intervals(axis)
+        return (self.lo[axis] * (last - index) + self.hi[axis] * index) / last
+
+    def components(self, dtype: Any) -> list[jax.Array]:
+        """The coordinates as n arrays, the i-th of which varies along axis i alone and broadcasts."""
+        columns = []
+        for axis, count in enumerate(self.shape):
+            along = [1] * self.ndim
+            along[axis] = count
+            columns.append(jnp.asarray(self.axis(axis, np.dtype(dtype)), dtype).reshape(along))
+        return columns
+
+    def state(self, index: Sequence[int]) -> np.ndarray:
+        """The state at a node, shape (n,); host level."""
+        return np.array([np.asarray(self.axis(axis))[i] for axis, i in enumerate(index)])
+
+    def nodes(self) -> np.ndarray:
+        """All states, shape (*grid, n), at host level: a table for tests and pictures, not for solvers."""
+        return np.stack(np.meshgrid(*(np.asarray(self.axis(i)) for i in range(self.ndim)), indexing="ij"), axis=-1)
+
+    def wrap(self, x: Any) -> Any:
+        """States with their periodic entries brought into [lo, hi); the others as they are."""
+        x = jnp.asarray(x)
+        lo, hi = jnp.asarray(self.lo, x.dtype), jnp.asarray(self.hi, x.dtype)
+        return jnp.where(np.array(self.periodic), lo + jnp.mod(x - lo, hi - lo), x)
+
+    def interpolate(self, values: Any, x: Any, *, clamp: bool = False) -> jax.Array:
+        """Multilinear interpolation of node values, second order; jit- and vmap-able.
+
+        Args:
+          values: shape (*grid, ...).
+          x: states, shape (..., n).
+          clamp: outside the box take the nearest point of the box; otherwise the answer there is NaN.
+
+        Returns:
+          Shape ``x.shape[:-1] + values.shape[n:]``.
+        """
+        values, x = jnp.asarray(values), jnp.asarray(x)
+        if x.ndim == 0 or x.shape[-1] != self.ndim:
+            raise ValueError(f"got states of shape {x.shape}, wanted (..., {self.ndim}): one entry an axis")
+        weighted, outside = jnp.zeros((), x.dtype), jnp.zeros(x.shape[:-1], bool)
+        cells, fractions = [], []
+        wrapped = self.wrap(x)
+        for axis in range(self.ndim):
+            lo, hi, last = self.lo[axis], self.hi[axis], self.intervals(axis)
+            place = (wrapped[..., axis] - lo) / (hi - lo) * last
+            slack = 8 * last * jnp.finfo(x.dtype).eps
+            outside |= ~((place >= -slack) & (place <= last + slack))  # NaN counts as outside
+            place = jnp.clip(jnp.nan_to_num(place), 0, last)
+            cell = jnp.minimum(jnp.floor(place), last - 1).astype(int)
+            cells.append(cell)
+            fractions.append(place - cell)
+        trailing = (1,) * (values.ndim - self.ndim)
+        for corner in np.ndindex(*(2,) * self.ndim):
+            weight = jnp.ones((), x.dtype)
+            for fraction, bit in zip(fractions, corner, strict=True):
+                weight = weight * (fraction if bit else 1 - fraction)
+            index = tuple(
+                (cell + bit) % count for cell, bit, count in zip(cells, corner, self.shape, strict=True)
+            )
+            weight = weight.reshape(weight.shape + trailing)
+            weighted = weighted + jnp.where(weight == 0, 0, weight * values[index])  # 0 · inf counts nothing
+        hidden = (outside & (not clamp)) | jnp.any(jnp.isnan(x), axis=-1)
+        return jnp.where(hidden.reshape(hidden.shape + trailing), jnp.nan, weighted)
+
+
+def _corner(value: Any, name: str) -> Any:
+    if isinstance(value, jax.core.Tracer):
+        return value
+    try:
+        corner = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        if isinstance(value, Sequence) and any(isinstance(entry, jax.core.Tracer) for entry in value):
+            return jnp.stack([jnp.asarray(entry) for entry in value])
+        raise TypeError(f"Grid.{name}: got {value!r}, wanted a list of numbers, one an axis") from None
+    if corner.ndim != 1 or corner.size == 0:
+        raise ValueError(f"Grid.{name}: got {value!r}, wanted a list of numbers, one an axis")
+    return corner
+
+
+def _sizes(shape: Any) -> tuple[int, ...]:
+    if isinstance(shape, str) or not isinstance(shape, (Sequence, np.ndarray)):
+        raise TypeError(f"Grid.shape: got {shape!r}, wanted a tuple of integers, one an axis")
+    for axis, count in enumerate(shape):
+        if isinstance(count, (bool, np.bool_)) or not isinstance(count, (int, np.integer)):
+            raise TypeError(f"Grid.shape: axis {axis} has {count!r} points; wanted an integer")
+        if count < 2:
+            raise ValueError(f"Grid.shape: axis {axis} has {count} points; wanted at least 2")
+    return tuple(int(count) for count in shape)
+
+
+def _flags(periodic: Any, n: int) -> tuple[bool, ...]:
+    if periodic is None:
+        return (False,) * n
+    if isinstance(periodic, (str, bool)) or not isinstance(periodic, (Sequence, np.ndarray)):
+        raise TypeError(f"Grid.periodic: got {periodic!r}, wanted one bool an axis, as in {(True,) + (False,) * (n - 1)}")
+    for axis, flag in enumerate(periodic):
+        if not isinstance(flag, (bool, np.bool_)):
+            raise ValueError(
+                f"Grid.periodic: entry {axis} is {flag!r}; wanted one bool an axis "
+                f"(not axis numbers), as in {(True,) + (False,) * (n - 1)}"
+            )
+    return tuple(bool(flag) for flag in periodic)

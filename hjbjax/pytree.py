@@ -1,0 +1,94 @@
+"""Frozen dataclasses that JAX can look through.
+
+Fields are of three kinds: leaves (numbers and arrays: what one may sweep, batch or differentiate), static
+fields (part of the structure: what may cost a recompile) and host fields (timings, histories: dropped when
+the object is flattened, default when it is rebuilt). Rebuilding never runs ``__post_init__``: it meets
+tracers and stacked arrays, which no check of values could pass.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterable
+from typing import Any, TypeVar, dataclass_transform
+
+import jax
+import numpy as np
+
+T = TypeVar("T")
+
+
+@dataclass_transform(frozen_default=True, eq_default=False)
+def node(*, static: Iterable[str] = (), host: Iterable[str] = ()) -> Callable[[type[T]], type[T]]:
+    """Class decorator: a frozen dataclass, registered as a pytree node.
+
+    Args:
+      static: names of the fields that belong to the tree's structure; they must be hashable.
+      host: names of the fields that do not survive flattening; they need defaults.
+
+    Example:
+      >>> @node(static=("shape",))
+      ... class Block:
+      ...     scale: float
+      ...     shape: tuple
+      >>> jax.tree.map(lambda leaf: 2 * leaf, Block(3.0, (4,)))
+      Block(scale=6.0, shape=(4,))
+    """
+    static, host = tuple(static), tuple(host)
+
+    def register(cls: type[T]) -> type[T]:
+        cls = dataclasses.dataclass(frozen=True, eq=False, init="__init__" not in vars(cls))(cls)
+        fields = dataclasses.fields(cls)  # type: ignore[arg-type]
+        defaults = {field.name: _default(field) for field in fields if field.name in host}
+        leaves = tuple(field.name for field in fields if field.name not in static + host)
+
+        def flatten_with_keys(self):
+            children = [(jax.tree_util.GetAttrKey(name), getattr(self, name)) for name in leaves]
+            return children, tuple(getattr(self, name) for name in static)
+
+        def unflatten(aux, children):
+            self = object.__new__(cls)
+            for name, value in (*zip(leaves, children, strict=True), *zip(static, aux, strict=True)):
+                object.__setattr__(self, name, value)
+            for name, make in defaults.items():
+                object.__setattr__(self, name, make())
+            return self
+
+        jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten)
+        return cls
+
+    return register
+
+
+def _default(field: dataclasses.Field) -> Callable[[], Any]:
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory
+    return lambda: field.default
+
+
+def is_traced(*trees: Any) -> bool:
+    """Whether any leaf of the trees is a tracer, that is, whether we run inside a JAX transformation."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
+
+
+def as_partial(function: Callable | None) -> jax.tree_util.Partial | None:
+    """A callable as a pytree: a bound method of a registered dataclass brings the fields along as leaves."""
+    if function is None or isinstance(function, jax.tree_util.Partial):
+        return function
+    if not callable(function):
+        raise TypeError(f"got {function!r}, wanted a function of one state")
+    owner = getattr(function, "__self__", None)
+    if owner is not None and hasattr(function, "__func__") and not jax.tree_util.all_leaves([owner]):
+        return jax.tree_util.Partial(function.__func__, owner)
+    return jax.tree_util.Partial(function)
+
+
+def cast(tree: T, dtype: Any) -> T:
+    """Every floating-point or Python-number leaf of ``tree`` in ``dtype``; integers and booleans as they are."""
+
+    def convert(leaf):
+        if isinstance(leaf, (bool, int)) or not np.issubdtype(jax.numpy.result_type(leaf), np.floating):
+            return leaf
+        return jax.numpy.asarray(leaf, dtype)
+
+    return jax.tree.map(convert, tree)
+
+

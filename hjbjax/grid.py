@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.pytree import node
+from hjbjax.pytree import node, numbers
 
 
 @node(static=("shape", "periodic", "names"))
@@ -57,8 +57,9 @@ class Grid:
         if isinstance(lo, np.ndarray) and isinstance(hi, np.ndarray):
             for axis, (low, high) in enumerate(zip(lo, hi, strict=True)):
                 if not (math.isfinite(low) and math.isfinite(high) and low < high):
-                    raise ValueError(f"Grid: axis {axis} runs from lo = {low:g} to hi = {high:g}; wanted finite lo < hi")
-        for name, value in zip(("lo", "hi", "shape", "periodic", "names"), (lo, hi, shape, periodic, names), strict=True):
+                    raise ValueError(f"Grid: axis {axis} runs from {low:g} to {high:g}; wanted finite lo < hi")
+        checked = {"lo": lo, "hi": hi, "shape": shape, "periodic": periodic, "names": names}
+        for name, value in checked.items():
             object.__setattr__(self, name, value)
 
     @property
@@ -103,9 +104,11 @@ class Grid:
 
     def wrap(self, x: Any) -> Any:
         """States with their periodic entries brought into [lo, hi); the others as they are."""
-        x = jnp.asarray(x)
+        x = _states(x)
         lo, hi = jnp.asarray(self.lo, x.dtype), jnp.asarray(self.hi, x.dtype)
-        return jnp.where(np.array(self.periodic), lo + jnp.mod(x - lo, hi - lo), x)
+        moved = lo + jnp.mod(x - lo, hi - lo)
+        moved = jnp.where(moved >= hi, lo, moved)  # just below lo, the remainder rounds up to a whole period
+        return jnp.where(np.array(self.periodic) & ~((x >= lo) & (x < hi)), moved, x)
 
     def interpolate(self, values: Any, x: Any, *, clamp: bool = False) -> jax.Array:
         """Multilinear interpolation of node values, second order; jit- and vmap-able.
@@ -118,45 +121,49 @@ class Grid:
         Returns:
           Shape ``x.shape[:-1] + values.shape[n:]``.
         """
-        values, x = jnp.asarray(values), jnp.asarray(x)
+        values, x = jnp.asarray(values), _states(x)
         if x.ndim == 0 or x.shape[-1] != self.ndim:
-            raise ValueError(f"got states of shape {x.shape}, wanted (..., {self.ndim}): one entry an axis")
-        weighted, outside = jnp.zeros((), x.dtype), jnp.zeros(x.shape[:-1], bool)
-        cells, fractions = [], []
-        wrapped = self.wrap(x)
-        for axis in range(self.ndim):
-            lo, hi, last = self.lo[axis], self.hi[axis], self.intervals(axis)
-            place = (wrapped[..., axis] - lo) / (hi - lo) * last
-            slack = 8 * last * jnp.finfo(x.dtype).eps
-            outside |= ~((place >= -slack) & (place <= last + slack))  # NaN counts as outside
-            place = jnp.clip(jnp.nan_to_num(place), 0, last)
-            cell = jnp.minimum(jnp.floor(place), last - 1).astype(int)
-            cells.append(cell)
-            fractions.append(place - cell)
+            raise ValueError(f"Grid: got states of shape {x.shape}, wanted (..., {self.ndim}): one entry an axis")
+        if values.shape[: self.ndim] != self.shape:
+            raise ValueError(f"Grid: got values of shape {values.shape}, wanted {self.shape} first: one a node")
+        x = self.wrap(x)
+        cells, fractions, inside = zip(*(self._locate(axis, x[..., axis]) for axis in range(self.ndim)), strict=True)
         trailing = (1,) * (values.ndim - self.ndim)
+        total = jnp.zeros((), x.dtype)
         for corner in np.ndindex(*(2,) * self.ndim):
             weight = jnp.ones((), x.dtype)
             for fraction, bit in zip(fractions, corner, strict=True):
                 weight = weight * (fraction if bit else 1 - fraction)
-            index = tuple(
-                (cell + bit) % count for cell, bit, count in zip(cells, corner, self.shape, strict=True)
-            )
-            weight = weight.reshape(weight.shape + trailing)
-            weighted = weighted + jnp.where(weight == 0, 0, weight * values[index])  # 0 · inf counts nothing
-        hidden = (outside & (not clamp)) | jnp.any(jnp.isnan(x), axis=-1)
-        return jnp.where(hidden.reshape(hidden.shape + trailing), jnp.nan, weighted)
+            index = tuple((cell + bit) % count for cell, bit, count in zip(cells, corner, self.shape, strict=True))
+            weight, at_corner = weight.reshape(weight.shape + trailing), values[index]
+            # A corner of no weight may be infinite (0 · inf); where it is finite it still carries the derivative.
+            total = total + weight * jnp.where((weight == 0) & ~jnp.isfinite(at_corner), 0, at_corner)
+        hidden = jnp.any(jnp.isnan(x), axis=-1) | ((not clamp) & ~jnp.all(jnp.stack(inside), axis=0))
+        return jnp.where(hidden.reshape(hidden.shape + trailing), jnp.nan, total)
+
+    def _locate(self, axis: int, x: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """The node below ``x``, the fraction of the way to the next, and whether ``x`` lies in the box."""
+        lo, hi, last = jnp.asarray(self.lo[axis], x.dtype), jnp.asarray(self.hi[axis], x.dtype), self.intervals(axis)
+        place = (x - lo) / (hi - lo) * last
+        # What rounding of coordinates of the size of the ends can do to a place, in cells, with room to spare.
+        slack = 8 * last * jnp.finfo(x.dtype).eps * jnp.maximum(1, jnp.maximum(abs(lo), abs(hi)) / (hi - lo))
+        inside = (place >= -slack) & (place <= last + slack)  # NaN counts as outside
+        place = jnp.clip(jnp.nan_to_num(place), 0, last)
+        # A node is met exactly, so that an infinite neighbour stays out of it; the derivative is untouched.
+        to_node = jax.lax.stop_gradient(jnp.round(place) - place)
+        place = place + jnp.where(abs(to_node) <= slack, to_node, 0)
+        cell = jnp.minimum(jnp.floor(jax.lax.stop_gradient(place)), last - 1).astype(int)
+        return cell, place - cell, inside
+
+
+def _states(x: Any) -> jax.Array:
+    x = jnp.asarray(x)
+    return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(float)
 
 
 def _corner(value: Any, name: str) -> Any:
-    if isinstance(value, jax.core.Tracer):
-        return value
-    try:
-        corner = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        if isinstance(value, Sequence) and any(isinstance(entry, jax.core.Tracer) for entry in value):
-            return jnp.stack([jnp.asarray(entry) for entry in value])
-        raise TypeError(f"Grid.{name}: got {value!r}, wanted a list of numbers, one an axis") from None
-    if corner.ndim != 1 or corner.size == 0:
+    corner = numbers(value, f"Grid.{name}")
+    if np.ndim(corner) != 1 or np.size(corner) == 0:
         raise ValueError(f"Grid.{name}: got {value!r}, wanted a list of numbers, one an axis")
     return corner
 
@@ -175,12 +182,10 @@ def _sizes(shape: Any) -> tuple[int, ...]:
 def _flags(periodic: Any, n: int) -> tuple[bool, ...]:
     if periodic is None:
         return (False,) * n
+    wanted = f"wanted one bool an axis (not axis numbers), as in {(True,) + (False,) * (n - 1)}"
     if isinstance(periodic, (str, bool)) or not isinstance(periodic, (Sequence, np.ndarray)):
-        raise TypeError(f"Grid.periodic: got {periodic!r}, wanted one bool an axis, as in {(True,) + (False,) * (n - 1)}")
+        raise TypeError(f"Grid.periodic: got {periodic!r}, {wanted}")
     for axis, flag in enumerate(periodic):
         if not isinstance(flag, (bool, np.bool_)):
-            raise ValueError(
-                f"Grid.periodic: entry {axis} is {flag!r}; wanted one bool an axis "
-                f"(not axis numbers), as in {(True,) + (False,) * (n - 1)}"
-            )
+            raise ValueError(f"Grid.periodic: entry {axis} is {flag!r}; {wanted}")
     return tuple(bool(flag) for flag in periodic)

@@ -1,0 +1,168 @@
+"""The Kushner–Dupuis Markov chain of a controlled diffusion.
+
+On axis i with spacing h (h⁺ up, h⁻ down), drift f_i and diffusion a = σσᵀ the chain leaves a node at the rates
+
+    c_i^+ = (e_i + h⁻ f_i) / (h⁺ (h⁺ + h⁻)),     c_i^- = (e_i − h⁺ f_i) / (h⁻ (h⁺ + h⁻))
+
+with e_i = a_ii + h⁺ f_i⁺ + h⁻ f_i⁻ for the plain upwind chain, so that on a uniform grid
+c_i^± = f_i^±/h + a_ii/(2h²), and with e_i = max(a_ii, h⁺ f_i, −h⁻ f_i) where central differences are allowed as
+far as they stay monotone. Correlated noise moves along diagonals: a pair i, j gives
+c^{±(e_i + e_j)} = a_ij⁺/(2 h_i h_j), c^{±(e_i − e_j)} = a_ij⁻/(2 h_i h_j), and takes |a_ij| h_i/h_j from a_ii.
+
+Q = Σ c, Δt = 1/max_u Q, the transition probabilities are c Δt, and the self-transition is 1 − Q Δt (the chapter
+prints (13.3) without the "1 −"). Drift that points out of the box is zeroed, noise reflects. Source: H. J. Kushner
+and P. Dupuis, Numerical Methods for Stochastic Control Problems in Continuous Time.
+"""
+
+import itertools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax import fields, stencil
+from hjbjax.grid import Grid
+from hjbjax.problem import Problem
+from hjbjax.pytree import node
+from hjbjax.schemes import Upwind
+
+Offset = tuple[int, ...]
+
+
+@node(static=("offsets",))
+class Rates:
+    """The generator of the chain under one policy, matrix-free: (𝓛V)(x) = Σ_o c_o(x) (V(x + o) − V(x)).
+
+    Args:
+      offsets: the jumps o, each a tuple of −1, 0, 1, one entry an axis.
+      values: for each offset the rates c_o ≥ 0 per unit time, shape (*grid); none leads out of the box.
+    """
+
+    offsets: tuple[Offset, ...]
+    values: tuple[jax.Array, ...]
+
+    def total(self) -> jax.Array:
+        """Q = Σ_o c_o, the rate at which the chain leaves each node, shape (*grid)."""
+        return sum(self.values[1:], start=self.values[0])
+
+    def apply(self, grid: Grid, values: jax.Array) -> jax.Array:
+        """𝓛V for node values V, shape (*grid); cost per unit time."""
+        jumps = zip(self.offsets, self.values, strict=True)
+        terms = [c * (stencil.neighbour(values, grid, offset) - values) for offset, c in jumps]
+        return sum(terms[1:], start=terms[0])
+
+    def scaled(self, factor: jax.Array) -> "Rates":
+        """Every rate times ``factor``, shape (*grid)."""
+        return Rates(self.offsets, tuple(factor * c for c in self.values))
+
+    def inflow(self, grid: Grid) -> "Rates":
+        """The off-diagonal part of the transposed generator: what flows into x from x + o, as rates."""
+        opposite = [tuple(-step for step in offset) for offset in self.offsets]
+        arriving = [
+            stencil.neighbour(c, grid, offset, ghost=False) for offset, c in zip(opposite, self.values, strict=True)
+        ]
+        return Rates(tuple(opposite), tuple(arriving))
+
+
+def drift(problem: Problem, x: list, u: list, d: list | None, t: Any, dtype: Any) -> list:
+    """The n components of f on per-node scalars."""
+    return list(fields.components(problem.drift, *problem.arguments(x, u, d, t), dtype=dtype))
+
+
+def running_cost(problem: Problem, x: list, u: list, d: list | None, t: Any, dtype: Any) -> Any:
+    """L on per-node scalars; zero where the problem has none."""
+    if problem.cost is None:
+        return jnp.zeros((), dtype)
+    return fields.scalar(problem.cost, *problem.arguments(x, u, d, t), dtype=dtype)
+
+
+def diffusion(problem: Problem, x: list, u: list, d: list | None, t: Any, dtype: Any) -> dict[tuple[int, int], Any]:
+    """The entries a_ij, i ≤ j, of a = σσᵀ on per-node scalars; those that are zero by construction are left out."""
+    n = len(x)
+    if problem.noise is None:
+        return {}
+    if callable(problem.noise):
+        sigma = fields.components(problem.noise, *problem.arguments(x, u, d, t), dtype=dtype)
+    else:
+        sigma = fields.components(lambda x: jnp.asarray(problem.noise, dtype), x, dtype=dtype)
+    if sigma.ndim < 2:
+        return {(i, i): s * s for i, s in enumerate(np.broadcast_to(sigma, (n,)))}
+    pairs = itertools.combinations_with_replacement(range(n), 2)
+    return {(i, j): sum(p * q for p, q in zip(sigma[i], sigma[j], strict=True)) for i, j in pairs}
+
+
+def along_axis(a: dict[tuple[int, int], Any], grid: Grid, axis: int) -> Any:
+    """What is left of a_ii for jumps along axis i once the diagonal jumps have taken Σ_j |a_ij| h_i/h_j."""
+    left = a.get((axis, axis))
+    if left is None:
+        return None
+    for (i, j), entry in a.items():
+        if i != j and axis in (i, j):
+            other = j if axis == i else i
+            left = left - jnp.abs(entry) * (grid.spacing(axis) / grid.spacing(other))
+    return left
+
+
+def excess(f: Any, a: Any, grid: Grid, axis: int, scheme: Upwind) -> Any:
+    """e_i, the diffusion that the chain has along an axis: a_ii and what keeps its rates non-negative."""
+    h_up, h_down = stencil.steps(grid, axis)
+    least = jnp.maximum(h_up * f, -h_down * f)
+    if a is None:
+        return least
+    a = jnp.maximum(a, 0)  # along_axis may leave a rounding error below zero
+    if not scheme.central:
+        return a + least
+    edge = stencil.on_edge(grid, axis, 1) | stencil.on_edge(grid, axis, -1)
+    return jnp.where(edge, a + least, jnp.maximum(a, least))  # projection wants drift and noise apart
+
+
+def axis_rates(f: Any, a: Any, grid: Grid, axis: int, scheme: Upwind) -> tuple[Any, Any]:
+    """c_i^+ and c_i^- before the projection at the edges."""
+    h_up, h_down = stencil.steps(grid, axis)
+    e = excess(f, a, grid, axis, scheme)
+    return (e + h_down * f) / (h_up * (h_up + h_down)), (e - h_up * f) / (h_down * (h_up + h_down))
+
+
+def rates(
+    problem: Problem, grid: Grid, u: list, d: list | None = None, *, scheme: Upwind, dtype: Any, t: Any = 0.0
+) -> Rates:
+    """The jump rates of the chain under a policy.
+
+    Args:
+      problem: the problem; only its drift and noise matter.
+      grid: the grid.
+      u: the m components of the control on per-node scalars.
+      d: likewise of the disturbance, in a game.
+      scheme: how the rates are made.
+      dtype: the floating-point type of the rates.
+      t: the time, if the problem depends on it.
+    """
+    x = grid.components(dtype)
+    f, a = drift(problem, x, u, d, t, dtype), diffusion(problem, x, u, d, t, dtype)
+    table: dict[Offset, Any] = {}
+    for axis in range(grid.ndim):
+        pair = axis_rates(f[axis], along_axis(a, grid, axis), grid, axis, scheme)
+        for step, rate in zip((1, -1), pair, strict=True):
+            table[stencil.unit(grid, axis, step)] = _inside(rate, grid, axis, step)
+    for (i, j), entry in a.items():
+        if i != j:
+            _add_diagonal_jumps(table, entry, grid, i, j)
+    values = tuple(jnp.broadcast_to(jnp.asarray(rate, dtype), grid.shape) for rate in table.values())
+    return Rates(tuple(table), values)
+
+
+def _inside(rate: Any, grid: Grid, axis: int, step: int) -> Any:
+    return jnp.where(stencil.on_edge(grid, axis, step), 0, rate)
+
+
+def _add_diagonal_jumps(table: dict[Offset, Any], entry: Any, grid: Grid, i: int, j: int) -> None:
+    """A diagonal jump that would leave the box across one axis slides along the other: noise reflects."""
+    scale = 2 * grid.spacing(i) * grid.spacing(j)
+    for step_i, step_j in itertools.product((1, -1), repeat=2):
+        rate = jnp.maximum(entry * (step_i * step_j), 0) / scale
+        along_i, along_j = stencil.unit(grid, i, step_i), stencil.unit(grid, j, step_j)
+        off_i, off_j = stencil.on_edge(grid, i, step_i), stencil.on_edge(grid, j, step_j)
+        table[tuple(p + q for p, q in zip(along_i, along_j, strict=True))] = jnp.where(off_i | off_j, 0, rate)
+        table[along_j] = table[along_j] + jnp.where(off_i & ~off_j, rate, 0)
+        table[along_i] = table[along_i] + jnp.where(off_j & ~off_i, rate, 0)

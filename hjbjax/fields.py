@@ -1,0 +1,295 @@
+"""A function of one state, evaluated on a whole grid, component by component.
+
+``vmap`` of a drift that ends in ``jnp.stack`` writes one array of all nodes per entry to memory. Here the
+function is traced once on a single state, and its jaxpr is evaluated with every vector held as a NumPy object
+array of scalars-per-node: entry i of the state is an array that varies along axis i alone, so that sin θ is
+computed N times and not N^n times, stacking and slicing cost nothing, and XLA fuses what is left.
+
+Three kinds of primitives have a rule: those that move entries about (one rule: move labels instead), those
+that act entry by entry, and sums and products. Anything else falls back to ``vmap``, with one warning.
+"""
+
+import functools
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend import core as jex
+
+# Which operands of a data-moving primitive are data; the others are indices and must be known.
+_MOVES: dict[str, Callable[[int], Sequence[int]]] = {
+    "broadcast_in_dim": lambda n: (0,),
+    "reshape": lambda n: (0,),
+    "squeeze": lambda n: (0,),
+    "expand_dims": lambda n: (0,),
+    "transpose": lambda n: (0,),
+    "rev": lambda n: (0,),
+    "slice": lambda n: (0,),
+    "split": lambda n: (0,),
+    "dynamic_slice": lambda n: (0,),
+    "gather": lambda n: (0,),
+    "concatenate": range,
+    "stack": range,
+    "unstack": lambda n: (0,),
+    "tile": lambda n: (0,),
+    "pad": range,
+    "dynamic_update_slice": lambda n: (0, 1),
+    "scatter": lambda n: (0, 2),
+}
+
+_ENTRYWISE = frozenset(
+    """abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type copy copy_p
+    cos cosh digamma div eq erf erf_inv erfc exp exp2 expm1 floor ge gt imag integer_pow is_finite le lgamma log
+    log1p logistic lt max min mul ne neg nextafter not or pow real reduce_precision rem round rsqrt select_n sign
+    sin sinh sqrt square stop_gradient sub tan tanh xor""".split()
+)
+
+_REDUCTIONS: dict[str, Callable] = {
+    "reduce_sum": jax.lax.add,
+    "reduce_prod": jax.lax.mul,
+    "reduce_max": jax.lax.max,
+    "reduce_min": jax.lax.min,
+    "reduce_and": jax.lax.bitwise_and,
+    "reduce_or": jax.lax.bitwise_or,
+}
+
+_CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr"}
+_CALLS |= {"checkpoint": "jaxpr", "remat": "jaxpr", "custom_vjp_call": "call_jaxpr", "custom_jvp_call": "call_jaxpr"}
+
+
+class FallbackWarning(UserWarning):
+    """A primitive has no component rule and is evaluated node by node with ``vmap``: correct, slower."""
+
+
+def components(function: Callable, *arguments: Any, dtype: Any) -> np.ndarray:
+    """``function`` of one state, evaluated at every node.
+
+    Args:
+      function: a JAX-traceable function; its vector arguments have shape (n,), (m,), ...
+      *arguments: each a list of per-node scalars for a vector argument, or one per-node scalar for a scalar
+        argument. A per-node scalar is an array that broadcasts against the node axes, or a number.
+      dtype: floating-point type in which the function is traced.
+
+    Returns:
+      An object array of the shape of the function's result; every entry is a per-node scalar.
+    """
+    closed, packed = trace(function, *arguments, dtype=dtype)
+    (result,) = evaluate(closed, packed, ARRAYS)
+    return _lift(result, ARRAYS)
+
+
+def scalar(function: Callable, *arguments: Any, dtype: Any) -> Any:
+    """Like ``components`` for a function that returns a scalar: one per-node scalar."""
+    entries = components(function, *arguments, dtype=dtype)
+    if entries.shape != ():
+        raise ValueError(f"a function returned shape {entries.shape}, expected a scalar ()")
+    return entries.item()
+
+
+def trace(function: Callable, *arguments: Any, dtype: Any) -> tuple[jex.ClosedJaxpr, list[np.ndarray]]:
+    """The jaxpr of ``function`` on one state, and the arguments as object arrays."""
+    packed = [pack(argument) for argument in arguments]
+    shapes = [jax.ShapeDtypeStruct(entries.shape, dtype) for entries in packed]
+    return jax.make_jaxpr(function)(*shapes), packed
+
+
+def pack(argument: Any) -> np.ndarray:
+    """A list of per-node scalars, or one of them, as an object array."""
+    if isinstance(argument, (list, tuple)):
+        return _object_array(argument, (len(argument),))
+    return _object_array([argument], ())
+
+
+def _object_array(entries: Sequence[Any], shape: tuple[int, ...]) -> np.ndarray:
+    array = np.empty(len(entries), dtype=object)
+    for index, entry in enumerate(entries):
+        array[index] = entry
+    return array.reshape(shape)
+
+
+def _is_components(value: Any) -> bool:
+    return isinstance(value, np.ndarray) and value.dtype == object
+
+
+def _lift(value: Any, algebra: Any) -> np.ndarray:
+    """A value that is the same at all nodes, as an object array of the algebra's scalars."""
+    if _is_components(value):
+        return value
+    shape = np.shape(value)
+    return _object_array([algebra.constant(value, index) for index in np.ndindex(*shape)], shape)
+
+
+def evaluate(closed: jex.ClosedJaxpr, arguments: Sequence[Any], algebra: Any) -> list[Any]:
+    """Evaluate a jaxpr on object arrays.
+
+    Args:
+      closed: the jaxpr of a function of one state.
+      arguments: one value an input; an object array, or an array that is the same at all nodes.
+      algebra: what the scalars are; ``ARRAYS``, or an abstract one that records how results depend on inputs.
+
+    Returns:
+      One value an output, likewise.
+    """
+    env = dict(zip(closed.jaxpr.constvars, closed.consts, strict=True))
+    env |= dict(zip(closed.jaxpr.invars, arguments, strict=True))
+    for eqn in closed.jaxpr.eqns:
+        operands = [var.val if isinstance(var, jex.Literal) else env[var] for var in eqn.invars]
+        results = _apply(eqn, operands, algebra)
+        env.update(zip(eqn.outvars, results, strict=True))
+    return [var.val if isinstance(var, jex.Literal) else env[var] for var in closed.jaxpr.outvars]
+
+
+def _apply(eqn: Any, operands: list[Any], algebra: Any) -> list[Any]:
+    name = eqn.primitive.name
+    if not any(map(_is_components, operands)):
+        return _uniform(eqn, operands)
+    if name in _CALLS and _CALLS[name] in eqn.params:
+        if name == "custom_jvp_call" and all(np.shape(value) == () for value in operands):
+            return algebra.nodewise(eqn, operands)  # keeps the function's own derivative; still one fused kernel
+        inner = eqn.params[_CALLS[name]]
+        inner = inner if isinstance(inner, jex.ClosedJaxpr) else jex.ClosedJaxpr(inner, ())
+        return evaluate(inner, operands, algebra)
+    if name in _MOVES:
+        moved = _move(eqn, operands, algebra)
+        if moved is not None:
+            return moved
+    elif name in _ENTRYWISE:
+        return [_entrywise(eqn, operands, algebra)]
+    elif name in _REDUCTIONS:
+        return [_reduce(eqn, _lift(operands[0], algebra), algebra)]
+    elif name == "dot_general":
+        return [_contract(eqn, *(_lift(value, algebra) for value in operands), algebra)]
+    if any(np.shape(value) != () for value in operands) or any(var.aval.shape != () for var in eqn.outvars):
+        _warn_once(name)
+    return algebra.nodewise(eqn, operands)
+
+
+def _uniform(eqn: Any, operands: list[Any]) -> list[Any]:
+    """An equation none of whose operands varies over the nodes; kept concrete while its operands are."""
+    if any(isinstance(value, jax.core.Tracer) for value in operands):
+        return _bind(eqn, operands)
+    with jax.ensure_compile_time_eval():
+        return _bind(eqn, operands)
+
+
+def _bind(eqn: Any, operands: list[Any]) -> list[Any]:
+    results = eqn.primitive.bind(*operands, **eqn.primitive.get_bind_params(eqn.params))
+    return list(results) if eqn.primitive.multiple_results else [results]
+
+
+def _move(eqn: Any, operands: list[Any], algebra: Any) -> list[Any] | None:
+    """Where every entry of a data-moving primitive goes, found by moving integer labels."""
+    data = set(_MOVES[eqn.primitive.name](len(operands)))
+    known = [value for position, value in enumerate(operands) if position not in data]
+    if any(_is_components(value) or isinstance(value, jax.core.Tracer) for value in known):
+        return None
+    if eqn.params.get("fill_value") is not None:
+        return None
+    pool: list[Any] = []
+    labelled = list(operands)
+    for position in sorted(data):
+        entries = _lift(operands[position], algebra)
+        labelled[position] = np.arange(len(pool), len(pool) + entries.size, dtype=np.int32).reshape(entries.shape)
+        pool.extend(entries.reshape(-1))
+    with jax.ensure_compile_time_eval():
+        moved = _bind(eqn, labelled)
+    pool.append(algebra.constant(np.asarray(np.nan), ()))
+    return [  # a gather out of range has a negative label: it takes the NaN at the end
+        _object_array([pool[max(label, -1)] for label in np.ravel(labels)], np.shape(labels)) for labels in moved
+    ]
+
+
+def _entrywise(eqn: Any, operands: list[Any], algebra: Any) -> np.ndarray:
+    lifted = np.broadcast_arrays(*(_lift(value, algebra) for value in operands))
+    dtypes = [var.aval.dtype for var in eqn.invars]
+    rows = zip(*(value.reshape(-1) for value in lifted), strict=True)
+    results = [algebra.entrywise(eqn.primitive, eqn.params, list(row), dtypes) for row in rows]
+    return _object_array(results, lifted[0].shape)
+
+
+def _reduce(eqn: Any, entries: np.ndarray, algebra: Any) -> np.ndarray:
+    axes = tuple(eqn.params["axes"])
+    kept = [axis for axis in range(entries.ndim) if axis not in axes]
+    shape = tuple(entries.shape[axis] for axis in kept)
+    if entries.size == 0 and eqn.primitive.name == "reduce_sum":
+        return _object_array([algebra.constant(np.zeros(()), ())] * math.prod(shape), shape)
+    rows = entries.transpose(*kept, *axes).reshape(math.prod(shape), -1)
+    combine = functools.partial(algebra.combine, _REDUCTIONS[eqn.primitive.name], eqn.invars[0].aval.dtype)
+    return _object_array([functools.reduce(combine, row) for row in rows], shape)
+
+
+def _contract(eqn: Any, left: np.ndarray, right: np.ndarray, algebra: Any) -> np.ndarray:
+    """dot_general: batch axes first, then the free axes of the left and of the right operand."""
+    (contract_l, contract_r), (batch_l, batch_r) = eqn.params["dimension_numbers"]
+    free_l = [axis for axis in range(left.ndim) if axis not in (*contract_l, *batch_l)]
+    free_r = [axis for axis in range(right.ndim) if axis not in (*contract_r, *batch_r)]
+    batch = tuple(left.shape[axis] for axis in batch_l)
+    rows = tuple(left.shape[axis] for axis in free_l)
+    columns = tuple(right.shape[axis] for axis in free_r)
+    length = math.prod(left.shape[axis] for axis in contract_l)
+    left = left.transpose(*batch_l, *free_l, *contract_l).reshape(math.prod(batch), math.prod(rows), length)
+    right = right.transpose(*batch_r, *free_r, *contract_r).reshape(math.prod(batch), math.prod(columns), length)
+    dtype = eqn.outvars[0].aval.dtype
+    if length == 0:
+        return _lift(np.zeros(batch + rows + columns), algebra)
+    add, multiply = (functools.partial(algebra.combine, op, dtype) for op in (jax.lax.add, jax.lax.mul))
+    inner = [
+        functools.reduce(add, map(multiply, left[b, i], right[b, j]))
+        for b, i, j in np.ndindex(math.prod(batch), math.prod(rows), math.prod(columns))
+    ]
+    return _object_array(inner, batch + rows + columns)
+
+
+class _Arrays:
+    """Scalars that are arrays over the nodes; ranks are those of the grid, or zero."""
+
+    def constant(self, value: Any, index: tuple[int, ...]) -> Any:
+        return value[index] if np.ndim(value) else value
+
+    def entrywise(self, primitive: Any, params: dict, operands: list[Any], dtypes: list[Any]) -> Any:
+        arrays = [jnp.asarray(value, dtype) for value, dtype in zip(operands, dtypes, strict=True)]
+        return primitive.bind(*jnp.broadcast_arrays(*arrays), **params)
+
+    def combine(self, operation: Callable, dtype: Any, left: Any, right: Any) -> Any:
+        return operation(*jnp.broadcast_arrays(jnp.asarray(left, dtype), jnp.asarray(right, dtype)))
+
+    def nodewise(self, eqn: Any, operands: list[Any]) -> list[Any]:
+        """One equation at every node by ``vmap`` over the flattened nodes."""
+        varying = [_is_components(value) for value in operands]
+        shapes = [np.shape(entry) for value, v in zip(operands, varying, strict=True) if v for entry in value.flat]
+        nodes = np.broadcast_shapes(*shapes)
+
+        def gathered(value, aval):
+            entries = [jnp.broadcast_to(jnp.asarray(entry, aval.dtype), nodes).reshape(-1) for entry in value.flat]
+            return jnp.stack(entries, axis=-1).reshape(math.prod(nodes), *value.shape)
+
+        arguments = [
+            gathered(value, var.aval) if v else value
+            for value, v, var in zip(operands, varying, eqn.invars, strict=True)
+        ]
+        axes = [0 if v else None for v in varying]
+        results = jax.vmap(lambda *one: _bind(eqn, list(one)), in_axes=axes)(*arguments)
+        return [
+            _object_array(
+                [result[(slice(None), *index)].reshape(nodes) for index in np.ndindex(*result.shape[1:])],
+                result.shape[1:],
+            )
+            for result in results
+        ]
+
+
+ARRAYS = _Arrays()
+
+
+@functools.cache
+def _warn_once(name: str) -> None:
+    warnings.warn(
+        f"the primitive {name!r} has no component rule: the function that uses it is evaluated node by node, "
+        "which is correct and slower; entry-by-entry arithmetic on x[0], x[1], ... avoids it",
+        FallbackWarning,
+        stacklevel=2,
+    )

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.pytree import as_partial, is_traced, node
+from hjbjax.pytree import as_partial, is_traced, node, numbers
 from hjbjax.sets import AdmissibleSet, Ball, Box, Finite
 
 
@@ -89,8 +89,9 @@ class Problem:
         _check_sets(controls, disturbances)
         if isaacs not in ("upper", "lower"):
             raise ValueError(f"Problem.isaacs: got {isaacs!r}, wanted 'upper' (min max) or 'lower' (max min)")
-        if not is_traced(discount) and not (np.ndim(discount) == 0 and np.isfinite(discount) and discount >= 0):
-            raise ValueError(f"Problem.discount: got {discount!r}, wanted a finite number ≥ 0")
+        discount = _rate(discount)
+        if not isinstance(time_dependent, (bool, np.bool_)):
+            raise TypeError(f"Problem.time_dependent: got {time_dependent!r}, wanted True or False")
         if running_max is not None and (cost is not None or _is_nonzero(discount)):
             raise ValueError(
                 "Problem.running_max: the cost is the running maximum alone; "
@@ -98,19 +99,18 @@ class Problem:
             )
         if exit_cost is not None and target is None:
             raise ValueError("Problem.exit_cost: there is no target to pay it on; give target as well")
-        _check_noise(noise)
         fields = {
-            "drift": as_partial(drift),
-            "cost": as_partial(cost),
+            "drift": as_partial(drift, "Problem.drift"),
+            "cost": as_partial(cost, "Problem.cost"),
             "controls": controls,
             "disturbances": disturbances,
-            "noise": _function_or_numbers(noise, "noise"),
+            "noise": _noise(noise),
             "discount": discount,
-            "target": as_partial(target),
-            "exit_cost": _function_or_numbers(exit_cost, "exit_cost"),
-            "terminal_cost": _function_or_numbers(terminal_cost, "terminal_cost"),
-            "stopping_cost": _function_or_numbers(stopping_cost, "stopping_cost"),
-            "running_max": as_partial(running_max),
+            "target": as_partial(target, "Problem.target"),
+            "exit_cost": _function_or_number(exit_cost, "Problem.exit_cost"),
+            "terminal_cost": _function_or_number(terminal_cost, "Problem.terminal_cost"),
+            "stopping_cost": _function_or_number(stopping_cost, "Problem.stopping_cost"),
+            "running_max": as_partial(running_max, "Problem.running_max"),
             "isaacs": isaacs,
             "time_dependent": bool(time_dependent),
         }
@@ -148,27 +148,39 @@ def _is_nonzero(discount: Any) -> bool:
 def _check_sets(controls: Any, disturbances: Any) -> None:
     for name, choices in (("controls", controls), ("disturbances", disturbances)):
         if choices is not None and not isinstance(choices, (Box, Ball, Finite)):
-            raise TypeError(f"Problem.{name}: got {choices!r}, wanted Box(lo, hi), Ball(radius, dim), Finite(points) or None")
+            raise TypeError(f"Problem.{name}: got {choices!r}, wanted a Box, a Ball, a Finite or None")
 
 
-def _check_noise(noise: Any) -> None:
-    if noise is None or callable(noise) or is_traced(noise):
-        return
-    sigma = np.asarray(noise, dtype=np.float64)
-    if sigma.ndim > 2:
-        raise ValueError(f"Problem.noise: got shape {sigma.shape}, wanted a number, (n,) or (n, k)")
+def _rate(discount: Any) -> Any:
+    """The discount as a float, or the tracer that stands for it."""
+    rate = numbers(discount, "Problem.discount")
+    if np.ndim(rate) != 0 or (isinstance(rate, np.ndarray) and not 0 <= rate < np.inf):
+        raise ValueError(f"Problem.discount: got {discount!r}, wanted a finite number ≥ 0")
+    return float(rate) if isinstance(rate, np.ndarray) else rate
+
+
+def _noise(noise: Any) -> Any:
+    """σ as a function, a number or an array; with its shape and its numbers checked where they are known."""
+    sigma = _function_or_number(noise, "Problem.noise", largest=2)
+    if sigma is None or callable(sigma) or is_traced(sigma):
+        return sigma
     if not np.all(np.isfinite(sigma)):
         raise ValueError(f"Problem.noise: got {noise!r}, wanted finite numbers")
-    if sigma.ndim < 2 and np.any(sigma < 0):
+    if np.ndim(sigma) < 2 and np.any(np.asarray(sigma) < 0):
         raise ValueError(f"Problem.noise: got {noise!r}, wanted numbers ≥ 0: it is σ in dx = f dt + σ dw")
+    return sigma
 
 
-def _function_or_numbers(value: Any, name: str) -> Any:
-    if value is None or is_traced(value):
-        return value
-    if callable(value):
-        return as_partial(value)
-    try:
-        return np.asarray(value, dtype=np.float64) if np.ndim(value) else float(value)
-    except (TypeError, ValueError):
-        raise TypeError(f"Problem.{name}: got {value!r}, wanted a number or a function") from None
+def _function_or_number(value: Any, name: str, largest: int = 0) -> Any:
+    """A function as a pytree, or numbers in an array of at most ``largest`` dimensions."""
+    if value is None or callable(value):
+        return as_partial(value, name)
+    array = numbers(value, name)
+    if np.ndim(array) > largest:
+        wanted = "a number, (n,) or (n, k)" if largest else "one number"
+        raise ValueError(f"{name}: got shape {np.shape(array)}, wanted {wanted}")
+    if not isinstance(array, np.ndarray):
+        return array
+    if np.any(np.isnan(array)):
+        raise ValueError(f"{name}: got {value!r}, which is not a number")
+    return array if array.ndim else float(array)

@@ -7,7 +7,7 @@ tracers and stacked arrays, which no check of values could pass.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
@@ -37,6 +37,9 @@ def node(*, static: Iterable[str] = (), host: Iterable[str] = ()) -> Callable[[t
     def register(cls: type[T]) -> type[T]:
         cls = dataclasses.dataclass(frozen=True, eq=False, init="__init__" not in vars(cls))(cls)
         fields = dataclasses.fields(cls)  # type: ignore[arg-type]
+        unknown = {*static, *host} - {field.name for field in fields}
+        if unknown:
+            raise TypeError(f"{cls.__name__} has no field {', '.join(sorted(unknown))}")
         defaults = {field.name: _default(field) for field in fields if field.name in host}
         leaves = tuple(field.name for field in fields if field.name not in static + host)
 
@@ -61,6 +64,8 @@ def node(*, static: Iterable[str] = (), host: Iterable[str] = ()) -> Callable[[t
 def _default(field: dataclasses.Field) -> Callable[[], Any]:
     if field.default_factory is not dataclasses.MISSING:
         return field.default_factory
+    if field.default is dataclasses.MISSING:
+        raise TypeError(f"{field.name}: a host field does not survive flattening and needs a default")
     return lambda: field.default
 
 
@@ -69,12 +74,29 @@ def is_traced(*trees: Any) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
 
 
-def as_partial(function: Callable | None) -> jax.tree_util.Partial | None:
-    """A callable as a pytree: a bound method of a registered dataclass brings the fields along as leaves."""
+def numbers(value: Any, name: str) -> Any:
+    """``value`` as its own float64 array while it is concrete; a tracer, or a list that holds one, as a tracer."""
+    if is_traced(value) and isinstance(value, (jax.core.Tracer, Sequence)):
+        return jax.numpy.asarray(value)
+    try:
+        if np.asarray(value).dtype.kind in "USc":  # NumPy would parse "1.0" and drop imaginary parts
+            raise TypeError
+        return np.array(value, dtype=np.float64)  # a copy: what the caller does to the original later is no concern
+    except (TypeError, ValueError):
+        raise TypeError(f"{name}: got {value!r}, wanted numbers") from None
+
+
+def as_partial(function: Callable | None, name: str = "function") -> jax.tree_util.Partial | None:
+    """A callable as a pytree: a bound method of a registered dataclass brings the fields along as leaves.
+
+    So does a callable that is itself a pytree, such as a registered dataclass with a ``__call__``.
+    """
     if function is None or isinstance(function, jax.tree_util.Partial):
         return function
     if not callable(function):
-        raise TypeError(f"got {function!r}, wanted a function of one state")
+        raise TypeError(f"{name}: got {function!r}, wanted a function of one state")
+    if not jax.tree_util.all_leaves([function]):
+        return jax.tree_util.Partial(type(function).__call__, function)
     owner = getattr(function, "__self__", None)
     if owner is not None and hasattr(function, "__func__") and not jax.tree_util.all_leaves([owner]):
         return jax.tree_util.Partial(function.__func__, owner)
@@ -82,13 +104,11 @@ def as_partial(function: Callable | None) -> jax.tree_util.Partial | None:
 
 
 def cast(tree: T, dtype: Any) -> T:
-    """Every floating-point or Python-number leaf of ``tree`` in ``dtype``; integers and booleans as they are."""
+    """Every floating-point leaf of ``tree`` in ``dtype``; integers and booleans as they are."""
 
     def convert(leaf):
-        if isinstance(leaf, (bool, int)) or not np.issubdtype(jax.numpy.result_type(leaf), np.floating):
+        if not jax.numpy.issubdtype(jax.numpy.result_type(leaf), jax.numpy.floating):
             return leaf
         return jax.numpy.asarray(leaf, dtype)
 
     return jax.tree.map(convert, tree)
-
-

@@ -1,0 +1,187 @@
+"""Dataclasses that JAX looks through: round trips, host fields, no validation on the way back."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hjbjax import Ball, Box, Finite, Grid, Problem
+from hjbjax.pytree import as_partial, cast, is_traced, node, numbers
+
+
+@node(static=("kind",), host=("history", "note"))
+class Record:
+    """Leaves, a static field and two host fields."""
+
+    value: object
+    scale: object = 1.0
+    kind: str = "plain"
+    history: list = dataclasses.field(default_factory=list)
+    note: str = "none"
+
+    def __post_init__(self):
+        if not np.isfinite(self.scale):
+            raise ValueError("scale")
+
+
+@node()
+class Spring:
+    """A system whose parameters are leaves."""
+
+    stiffness: object
+    mass: object = 1.0
+
+    def drift(self, x, u):
+        return jnp.stack([x[1], (u[0] - self.stiffness * x[0]) / self.mass])
+
+    def __call__(self, x):
+        return self.stiffness * x
+
+
+def drift(x, u):
+    return jnp.stack([x[1], u[0]])
+
+
+NODES = [
+    Record(np.ones(2), 3.0, "other"),
+    Box([-1.0], [1.0]),
+    Ball(2.0, 3),
+    Finite([[1.0], [2.0]]),
+    Grid([0.0], [1.0], (3,), periodic=(True,), names=("angle",)),
+    Problem(drift, lambda x, u: x @ x, Box([-1.0], [1.0]), discount=0.5, noise=[0.1, 0.2], isaacs="lower"),
+]
+
+
+@pytest.mark.parametrize("thing", NODES, ids=lambda thing: type(thing).__name__)
+def test_round_trip(thing):
+    leaves, tree = jax.tree.flatten(thing)
+    back = jax.tree.unflatten(tree, leaves)
+    assert type(back) is type(thing)
+    assert jax.tree.structure(back) == tree == jax.tree.structure(jax.tree.map(lambda leaf: 2 * leaf, thing))
+    assert all(new is old for new, old in zip(jax.tree.leaves(back), leaves, strict=True))
+    assert [path[0].name for path, _ in jax.tree_util.tree_leaves_with_path(thing)]  # every leaf has a name
+
+
+@pytest.mark.parametrize("leaf", [None, object(), "text", float("nan"), -1])
+@pytest.mark.parametrize("thing", NODES, ids=lambda thing: type(thing).__name__)
+def test_rebuilding_validates_nothing(thing, leaf):
+    leaves, tree = jax.tree.flatten(thing)
+    back = jax.tree.unflatten(tree, [leaf] * len(leaves))
+    rest = jax.tree.leaves(back, is_leaf=lambda each: each is None)
+    assert type(back) is type(thing)
+    assert sum(each is leaf for each in rest) >= len(leaves)
+
+
+def test_a_constructor_validates():
+    with pytest.raises(ValueError, match="scale"):
+        Record(0.0, float("nan"))
+
+
+def test_host_fields_are_dropped_and_come_back_as_their_defaults():
+    record = Record(1.0, history=[1, 2], note="mine")
+    back, again = (jax.tree.map(lambda leaf: leaf, record) for _ in range(2))
+    assert (back.history, back.note) == ([], "none")
+    assert back.history is not again.history
+    assert (record.history, record.note) == ([1, 2], "mine")
+
+
+def test_nodes_are_frozen_and_compared_by_identity():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        NODES[1].lo = 0.0
+    assert Box([0.0], [1.0]) != Box([0.0], [1.0])  # arrays have no single truth value
+    assert dataclasses.replace(NODES[1], hi=[5.0]).hi.tolist() == [5.0]
+
+
+def test_static_fields_recompile_and_leaves_do_not():
+    traces = []
+
+    @jax.jit
+    def double(record):
+        traces.append(record.kind)
+        return jax.tree.map(lambda leaf: 2 * leaf, record)
+
+    assert double(Record(1.0)).value == 2.0
+    assert double(Record(5.0, scale=4.0)).scale == 8.0
+    assert double(Record(5.0, kind="other")).kind == "other"
+    assert traces == ["plain", "other"]
+
+
+def test_a_decorator_refuses_fields_that_are_not_there_and_host_fields_without_default():
+    with pytest.raises(TypeError, match="has no field shap"):
+
+        @node(static=("shap",))
+        class Typo:
+            shape: tuple
+
+    with pytest.raises(TypeError, match="note: a host field .* needs a default"):
+
+        @node(host=("note",))
+        class NoDefault:
+            note: str
+
+
+def test_a_bound_method_brings_the_fields_along_as_leaves():
+    held = as_partial(Spring(3.0, 2.0).drift)
+    assert jax.tree.leaves(held) == [3.0, 2.0]
+    assert held(jnp.ones(2), jnp.ones(1)).tolist() == [1.0, -1.0]
+    traces = []
+
+    @jax.jit
+    def rate(function):
+        traces.append(function)
+        return function(jnp.ones(2), jnp.zeros(1))[1]
+
+    assert [float(rate(as_partial(Spring(k).drift))) for k in (1.0, 2.0, 3.0)] == [-1.0, -2.0, -3.0]
+    assert len(traces) == 1
+    assert jax.grad(lambda k: as_partial(Spring(k).drift)(jnp.ones(2), jnp.zeros(1))[1])(3.0) == -1.0
+
+
+def test_a_callable_node_brings_its_fields_along_too():
+    held = as_partial(Spring(3.0, 2.0))
+    assert jax.tree.leaves(held) == [3.0, 2.0]
+    assert held(4.0) == 12.0
+
+
+def test_other_callables_are_held_as_they_are():
+    assert as_partial(None) is None
+    assert jax.tree.leaves(as_partial(drift)) == []
+    held = as_partial(drift)
+    assert as_partial(held) is held
+    assert as_partial("x".join)(["a", "b"]) == "axb"  # a bound method of something that is no pytree
+
+
+def test_what_is_no_function_is_named():
+    with pytest.raises(TypeError, match=r"Problem\.cost: got 3\.0, wanted a function"):
+        as_partial(3.0, "Problem.cost")
+
+
+def test_is_traced():
+    seen = []
+    jax.jit(lambda x: seen.append((is_traced(x), is_traced({"a": [x, 1.0]}), is_traced(1.0, None, drift))))(1.0)
+    assert seen == [(True, True, False)]
+    assert not is_traced(np.ones(2), jnp.ones(2))
+
+
+def test_cast_changes_floating_leaves_alone():
+    with jax.enable_x64(True):
+        tree = cast(
+            {"f": 1.0, "a": np.ones(2), "i": 3, "b": True, "n": np.arange(2), "h": jnp.ones(1, "bfloat16")}, "float32"
+        )
+    assert tree["f"].dtype == tree["a"].dtype == tree["h"].dtype == np.float32
+    assert type(tree["i"]) is int
+    assert type(tree["b"]) is bool
+    assert tree["n"].dtype == np.arange(2).dtype
+
+
+@pytest.mark.parametrize("value", ["1", "a", ["1.0"], 1j, [1j], [[1.0], [1.0, 2.0]], {}, object(), drift])
+def test_numbers_refuses_what_is_none(value):
+    with pytest.raises(TypeError, match="mass: got .* wanted numbers"):
+        numbers(value, "mass")
+
+
+def test_numbers_takes_any_nesting_of_numbers_and_tracers():
+    assert numbers([True, 2, np.float32(0.5)], "mass").tolist() == [1.0, 2.0, 0.5]
+    nested = jax.jit(lambda x: numbers([[x, 0.0], [0.0, 1.0]], "mass"))
+    assert nested(3.0).tolist() == [[3.0, 0.0], [0.0, 1.0]]

@@ -12,28 +12,24 @@ import pytest
 
 import hjbjax as hjb
 
-ROOT = Path(hjb.__file__).parents[1]
+ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "hjbjax"
 
-# The stages of the pipeline; a file imports only from files to its left and above.
-STAGES = """
-    _version pytree sets grid
-    problem fields structure
-    stencil schemes chain
-    minimisers hamiltonian bellman certificates
-    relaxation transfer iteration nested marching
-    interpolation files solution solver
-    reachability robust simulation extremals filtering calibration neural
-    geometry stability sharding
-    convergence sections plotting zoo __init__ cli __main__
-"""
-ORDER = STAGES.split()
+# The README's architecture table, top to bottom and left to right: a file imports only from files before it.
+TABLE = (ROOT / "README.md").read_text(encoding="utf-8").split("## Architecture")[1].split("\n## ")[0]
+FILES = re.findall(r"`(\w+)`", "".join(row.split("|")[2] for row in TABLE.splitlines() if row.startswith("| ")))
+ORDER = ["_version", *FILES[:-1], "__init__", FILES[-1], "__main__"]  # the command alone may see the whole package
 SOURCES = sorted(PACKAGE.rglob("*.py"))
 
 
 def module_of(path):
     """The name in ORDER: a package such as zoo counts as one file."""
     return path.relative_to(PACKAGE).with_suffix("").parts[0]
+
+
+def test_the_table_names_each_file_once():
+    assert len(set(FILES)) == len(FILES)
+    assert FILES[-1] == "cli"
 
 
 def imports_of(path):
@@ -54,7 +50,7 @@ def imports_of(path):
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_a_file_imports_only_from_above(path):
     name = module_of(path)
-    assert name in ORDER, f"{path.name} has no place in STAGES above and in the README's architecture section"
+    assert name in ORDER, f"{path.name} has no place in the README's architecture table"
     above = set(ORDER[: ORDER.index(name)])
     if name == "solver":
         above -= {"files"}  # a Solution reads and writes itself; solving touches no file

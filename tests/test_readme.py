@@ -1,0 +1,47 @@
+"""The README tells the truth: its commands, its examples with their output, its files."""
+
+import contextlib
+import doctest
+import io
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
+COMMANDS = ["pip install . && hjbjax solve pendulum", "pip install '.[test]' && pytest"]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_commands_stand_in_the_first_screen(command):
+    assert command in README.splitlines()[:30]
+
+
+def test_ci_runs_the_test_command_as_it_stands_here():
+    script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+    assert f'tests="{COMMANDS[1]}"' in script.splitlines()
+
+
+def test_every_python_block_runs_and_prints_what_the_text_block_after_it_says(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names, checker, flags = {}, doctest.OutputChecker(), doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+    ran = 0
+    for (kind, code), (after, wanted) in zip(BLOCKS, [*BLOCKS[1:], ("", "")], strict=True):
+        if kind != "python":
+            continue
+        with contextlib.redirect_stdout(io.StringIO()) as printed:
+            exec(compile(code, "README.md", "exec"), names)
+        ran += 1
+        if after == "text":
+            assert checker.check_output(wanted, printed.getvalue(), flags), f"printed\n{printed.getvalue()}"
+    assert ran, "the README has no example"
+
+
+def test_the_files_it_names_exist():
+    linked = re.findall(r"\]\((?!https?:)([^)#]+)", README)
+    named = re.findall(r"`((?:tests|notebooks|benchmarks)/[\w/.]+)`", README)
+    assert named
+    for path in linked + named:
+        assert (ROOT / path).exists(), path

@@ -1,0 +1,323 @@
+"""The answer: value, policy, how it ended, and how far it can be off.
+
+A ``Solution`` is a pytree, so it may leave ``jit`` and ``vmap`` and be differentiated; timings and residuals
+are host matter and do not survive such a passage. With certified bounds lower ≤ V_h ≤ upper on the exact
+discrete solution V_h, the error of the value V is at most max(upper − V, V − lower).
+"""
+
+import dataclasses
+import math
+import textwrap
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax import files
+from hjbjax.files import Expected, FileError
+from hjbjax.grid import Grid
+from hjbjax.interpolation import between, between_defined, nearest, query
+from hjbjax.pytree import is_traced, node
+from hjbjax.status import Status
+
+__all__ = ["FileError", "Solution", "SolveError", "Status", "load"]
+
+FORMAT, VERSION = "hjbjax.Solution", 1
+WIDTH = 100  # columns of the printed screen
+KINDS: dict[str, tuple[type, ...]] = {  # what a file's header holds, as JSON has it
+    "code": (int,),
+    "steps": (int,),
+    "isaacs_gap": (float, type(None)),
+    "discrete": (bool,),
+    "discrete_disturbance": (bool,),
+    "message": (str,),
+    "stats": (dict,),
+}
+
+
+class SolveError(RuntimeError):
+    """A solve that did not converge: the ``message`` says how it ended, ``.solution`` is what there is."""
+
+    def __init__(self, message: str, solution: "Solution | None" = None):
+        super().__init__(message)
+        self.solution = solution
+
+
+@node(static=("discrete", "discrete_disturbance"), host=("residuals", "stats", "message"))
+class Solution:
+    """A value function on a grid with its policy.
+
+    Args:
+      grid: the nodes.
+      value: V, shape (*grid), in cost units; infinite where the target is out of reach.
+      policy: u, shape (*grid, m); NaN at nodes where no control is defined.
+      disturbance: d, shape (*grid, l), in a game.
+      code: a ``Status`` number.
+      steps: how many steps were taken.
+      lower: certified lower bound on the exact discrete solution, shape (*grid), or ``None``.
+      upper: certified upper bound, likewise.
+      isaacs_gap: the largest min-max minus max-min over the nodes, in cost units per unit time, in a game.
+      reached: the nodes from which the target can be reached, bool (*grid); ``None`` means all.
+      times: shape (k,) when marched; value and policy then have a leading axis.
+      discrete: whether the controls are enumerated, so that a mean of two need not be admissible.
+      discrete_disturbance: the same of the disturbances.
+      residuals: one number a step; host level.
+      stats: "method", "scheme", "device", "dtype", "seconds", "compile_seconds", "bytes", "tol",
+        "certificate" (a sentence) and "versions" (a dict), each where known; host level.
+      message: what happened in this very solve; empty after a passage through ``jit``; host level.
+
+    Example:
+      >>> grid = Grid([0.0], [1.0], (3,))
+      >>> solution = Solution(grid, np.array([0.0, 1.0, 4.0]), np.zeros((3, 1)), code=Status.CONVERGED, steps=2)
+      >>> solution, float(solution.value_at([0.75]))
+      (Solution(CONVERGED after 2 steps on 3 nodes), 2.5)
+    """
+
+    grid: Grid
+    value: Any
+    policy: Any
+    disturbance: Any = None
+    code: Any = 0
+    steps: Any = 0
+    lower: Any = None
+    upper: Any = None
+    isaacs_gap: Any = None
+    reached: Any = None
+    times: Any = None
+    discrete: bool = False
+    discrete_disturbance: bool = False
+    residuals: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
+    stats: dict = dataclasses.field(default_factory=dict)
+    message: str = ""
+
+    def __post_init__(self):
+        if isinstance(self.code, Status):
+            object.__setattr__(self, "code", int(self.code))
+
+    @property
+    def status(self) -> Any:
+        """The ``Status``; the bare numbers while traced, or of a batch."""
+        if is_traced(self.code) or np.ndim(self.code):
+            return self.code
+        return Status(int(self.code))
+
+    @property
+    def bounds(self) -> tuple[Any, Any] | None:
+        """The certified ``(lower, upper)``, each of shape (*grid), or ``None`` without a certificate."""
+        return None if self.lower is None or self.upper is None else (self.lower, self.upper)
+
+    @property
+    def error(self) -> Any:
+        """The certified bound on |V − V_h|, the largest over the nodes where V is finite; ``None`` without one.
+
+        A NaN among the values or the bounds, or no finite node at all, makes it infinite: nothing is certified.
+        """
+        if self.bounds is None:
+            return None
+        xp: Any = jnp if is_traced(self.value, self.bounds) else np
+        value, (lower, upper) = xp.asarray(self.value), self.bounds
+        finite = xp.isfinite(value)
+        center = xp.where(finite, value, 0)
+        off = xp.where(finite, xp.maximum(upper - center, center - lower), -xp.inf)
+        broken = xp.any(xp.isnan(value)) | xp.any(xp.isnan(off)) | ~xp.any(finite)
+        worst = xp.where(broken, xp.inf, xp.max(off))
+        return worst if xp is jnp else float(worst)
+
+    @property
+    def residual(self) -> float | None:
+        """The last residual; ``None`` where none was kept."""
+        return float(self.residuals[-1]) if len(self.residuals) else None
+
+    def value_at(self, x: Any, *, clamp: bool = False) -> Any:
+        """V between the nodes: multilinear interpolation, second order; jit- and vmap-able.
+
+        Concrete states and data give float64 NumPy; under a tracer the answer has the tracer's dtype.
+
+        Args:
+          x: states, shape (n,) or (..., n).
+          clamp: outside the grid take the nearest point of its box; otherwise the answer there is NaN.
+
+        Returns:
+          Shape ``x.shape[:-1]``, in cost units.
+
+        Raises:
+          ValueError: a state of another length; a marched solution; a batch of solutions.
+          TypeError: states that are not numbers.
+        """
+        return self._query("value_at", between, self.value, 0, x, clamp)
+
+    def control_at(self, x: Any, *, clamp: bool = False) -> Any:
+        """u between the nodes, shape ``x.shape[:-1] + (m,)``; arguments and refusals as for ``value_at``.
+
+        Only nodes of the cell where a control is defined count, with their weights scaled to sum to one, so
+        that the feedback reaches up to a target or to the edge of the reachable states; where no node of the
+        cell has one, the answer is NaN. Enumerated controls are not averaged: the nearest such node's is taken.
+        """
+        look = nearest if self.discrete else between_defined
+        return self._query("control_at", look, self.policy, 1, x, clamp)
+
+    def disturbance_at(self, x: Any, *, clamp: bool = False) -> Any:
+        """The opponent's d between the nodes, shape ``x.shape[:-1] + (l,)``; as ``control_at``."""
+        look = nearest if self.discrete_disturbance else between_defined
+        return self._query("disturbance_at", look, self.disturbance, 1, x, clamp)
+
+    def _query(self, name: str, look: Any, values: Any, trailing: int, x: Any, clamp: bool) -> Any:
+        _check_query(self, name, values, trailing)
+        return query(look, self.grid, values, x, clamp=clamp, name=f"Solution.{name}")
+
+    def save(self, path: Any, *, force: bool = False) -> None:
+        """Write the solution to ``path``, whole or not at all; ``load`` gives back the same bits.
+
+        Statistics come back as JSON has them: tuples as lists, objects as their text.
+
+        Raises:
+          FileExistsError: the file exists; another name or ``force=True`` helps.
+          FileError: it cannot be written; nothing is left behind.
+          ValueError: traced, or a batch: arrays that do not fit the grid.
+        """
+        if is_traced(self):
+            raise ValueError("Solution.save: got a traced solution; save it outside of jit, vmap and grad")
+        grid = self.grid
+        header = {
+            "format": FORMAT,
+            "version": VERSION,
+            "grid": {"shape": grid.shape, "periodic": grid.periodic, "names": grid.names},
+            "marched": None if self.times is None else int(np.shape(self.times)[0]),
+            "isaacs_gap": np.asarray(self.isaacs_gap).tolist(),
+            "code": np.asarray(self.code).tolist(),
+            "steps": np.asarray(self.steps).tolist(),
+            **{name: getattr(self, name) for name in ("discrete", "discrete_disturbance", "message", "stats")},
+        }
+        arrays = {}
+        for name, wanted in _plan(header).items():
+            array = getattr(grid if name in ("lo", "hi") else self, name)
+            if array is None:
+                continue
+            arrays[name] = array = np.asarray(array)
+            if complaint := wanted.complaint(array.shape, array.dtype.str):
+                raise ValueError(f"Solution.save: {name} {complaint}; of a batch, save one solution at a time")
+        files.write(path, header, arrays, force=force)
+
+    def __repr__(self) -> str:
+        status = self.status
+        if not isinstance(status, Status):
+            return f"Solution({'traced' if is_traced(status) else 'a batch'}, grid of shape {self.grid.shape})"
+        return f"Solution({status.name} after {self.steps} steps on {self.grid.size:,} nodes)"
+
+    def __str__(self) -> str:
+        if is_traced(self) or np.ndim(self.code):
+            return repr(self)
+        return _screen(self)
+
+
+def load(path: Any) -> Solution:
+    """The solution in the file ``path`` that ``Solution.save`` wrote; code in a file is never run.
+
+    Raises:
+      FileError: the file is missing, truncated, damaged, foreign, of a newer format, or contradicts itself.
+    """
+    return files.read(path, FORMAT, VERSION, _plan, _rebuild)
+
+
+def _plan(header: dict) -> dict[str, Expected]:
+    """What each array must look like, from the grid in the header alone."""
+    shape, marched = tuple(header["grid"]["shape"]), header["marched"]
+    if not all(type(count) is int and count >= 2 for count in shape):
+        raise FileError(f"its grid has shape {shape}")
+    many, lead = (None,), () if marched is None else (marched,)
+    values, controls = Expected((lead + shape,)), Expected((lead + shape + many, many * len(lead) + shape + many))
+    return {
+        "lo": Expected(((len(shape),),), optional=False),
+        "hi": Expected(((len(shape),),), optional=False),
+        "value": Expected((lead + shape,), optional=False),
+        "policy": controls,
+        "disturbance": controls,
+        "lower": values,
+        "upper": values,
+        "reached": Expected((shape, lead + shape), (np.bool_,)),
+        "residuals": Expected((many,)),
+        **({} if marched is None else {"times": Expected((lead,), optional=False)}),
+    }
+
+
+def _rebuild(header: dict, arrays: dict[str, np.ndarray]) -> Solution:
+    about = header["grid"]
+    grid = Grid(arrays.pop("lo"), arrays.pop("hi"), tuple(about["shape"]), about["periodic"], tuple(about["names"]))
+    for name, kinds in KINDS.items():
+        if type(header[name]) not in kinds:
+            raise FileError(f"its header has {name} = {header[name]!r:.60}, wanted {kinds[0].__name__}")
+    Status(header["code"])
+    return Solution(**{"policy": None, **arrays, "grid": grid, **{name: header[name] for name in KINDS}})
+
+
+def _check_query(solution: Solution, name: str, values: Any, trailing: int) -> None:
+    """Refuse what has no answer at a state."""
+    if values is None:
+        what = "policy" if name == "control_at" else "disturbance: the problem is not a game"
+        raise ValueError(f"Solution.{name}: this solution has no {what}")
+    if solution.times is not None:
+        raise ValueError(
+            f"Solution.{name}: got a solution marched over {np.shape(solution.times)[-1]} times, wanted a stationary "
+            "one; choose a time k: solution.grid.interpolate(solution.value[k], x)"
+        )
+    shape, wanted = np.shape(values), solution.grid.shape
+    if shape[: len(wanted)] != wanted or len(shape) != len(wanted) + trailing:
+        raise ValueError(
+            f"Solution.{name}: got node values of shape {shape} on a grid of shape {wanted}; of a batch of solutions "
+            f"ask one at a time, as in jax.vmap(lambda solution, x: solution.{name}(x))"
+        )
+
+
+def _screen(solution: Solution) -> str:
+    """The printed screen: at most 14 lines; what is not known is left out."""
+    stats, grid = solution.stats, solution.grid
+    axes = " x ".join(name + " (periodic)" * flag for name, flag in zip(grid.names, grid.periodic or (), strict=True))
+    last = "" if solution.residual is None else f", last residual {solution.residual:.3g}"
+    reached = 1.0 if solution.reached is None else float(np.mean(np.asarray(solution.reached)))
+    compiling = f", and {_number(stats['compile_seconds'])} to compile" if "compile_seconds" in stats else ""
+    dtype = stats.get("dtype") or np.asarray(solution.value).dtype
+    rows = {
+        "grid": f"{axes}: {' x '.join(map(str, grid.shape))} = {grid.size:,} nodes",
+        "times": "" if solution.times is None else str(np.size(solution.times)),
+        "method": ", ".join(str(stats[name]) for name in ("method", "scheme") if name in stats),
+        "steps": f"{int(solution.steps)}{last}",
+        "error": _certified(solution),
+        "reached": f"{_percent(reached)} of the nodes" if reached < 1 else "",
+        "isaacs gap": "" if solution.isaacs_gap is None else _number(solution.isaacs_gap),
+        "seconds": f"{_number(stats['seconds'])}{compiling}" if "seconds" in stats else "",
+        "memory": _bytes(stats["bytes"]) if "bytes" in stats else "",
+        "device": f"{stats['device']}, {dtype}" if "device" in stats else str(dtype),
+    }
+    head = textwrap.wrap(f"{solution.status.name}: {solution.message or solution.status.message}", WIDTH)
+    lines = head if len(head) < 4 else [*head[:2], _one_line(" ".join(head[2:]))]
+    return "\n".join(lines + [f"  {name:10}  {_one_line(text)}" for name, text in rows.items() if text])
+
+
+def _certified(solution: Solution) -> str:
+    """The certified error and what certifies it, or why nothing does."""
+    error, tol = solution.error, solution.stats.get("tol")
+    what = "no certificate" if error is None else f"at most {error:.3g}"
+    asked = "" if error is None or tol is None else f" (tol {_number(tol)})"
+    why = solution.stats.get("certificate")
+    return what + asked + (f": {why}" if why else "")
+
+
+def _one_line(text: str) -> str:
+    text = " ".join(text.split())
+    return text if len(text) <= WIDTH else text[: WIDTH - 4] + " ..."
+
+
+def _number(value: Any) -> str:
+    return f"{float(value):.3g}" if np.isreal(value) and np.ndim(value) == 0 else str(value)
+
+
+def _percent(share: float) -> str:
+    """Rounded down to a tenth, so that 100 % is all and nothing else."""
+    return f"{math.floor(1000 * share) / 10:.1f} %"
+
+
+def _bytes(count: Any) -> str:
+    count, unit = float(count), 0
+    while count >= 1000 and unit < 4:
+        count, unit = count / 1000, unit + 1
+    return f"{count:.3g} {('bytes', 'kB', 'MB', 'GB', 'TB')[unit]}"

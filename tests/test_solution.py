@@ -1,0 +1,243 @@
+"""The answer: between the nodes, through transformations, and on the screen."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hjbjax.grid import Grid
+from hjbjax.solution import Solution, SolveError, Status
+
+GRID = Grid([-1.0, 0.0], [1.0, 3.0], (5, 4))
+RING = Grid([0.0, -1.0], [2 * np.pi, 1.0], (8, 3), (True, False), ("angle", "speed"))
+
+
+def solution_of(function, grid=GRID, **fields):
+    """A solution whose value is ``function`` of the coordinates at the nodes, and whose policy is twice that."""
+    value = function(*np.moveaxis(grid.nodes(), -1, 0))
+    return Solution(**{"grid": grid, "value": value, "policy": 2 * value[..., None], "code": 1, "steps": 3, **fields})
+
+
+LINEAR = solution_of(lambda a, b: 1 + 2 * a - b)
+
+# Status and errors
+
+
+def test_status_says_what_happened_and_what_to_do():
+    names = ["RUNNING", "CONVERGED", "MAX_STEPS", "STALLED", "DIVERGED", "NONFINITE", "INTERRUPTED", "TIME_LIMIT"]
+    assert [status.name for status in Status] == names
+    assert [int(status) for status in Status] == list(range(8))
+    messages = {status.message for status in Status}
+    assert len(messages) == 8
+    assert all(message.endswith(".") and ";" in message for message in messages)
+    assert f"{Status.STALLED}" == str(Status.STALLED) == "STALLED"
+
+
+def test_solve_error_carries_the_solution():
+    error = SolveError("no luck", LINEAR)
+    assert isinstance(error, RuntimeError)
+    assert error.solution is LINEAR
+    assert str(error) == "no luck"
+    assert SolveError("nothing yet").solution is None
+
+
+# Transformations
+
+
+def test_a_solution_leaves_jit_vmap_and_grad():
+    def solve(scale):
+        value = scale * jnp.asarray(LINEAR.value)
+        code = jnp.where(scale > 1, int(Status.CONVERGED), int(Status.MAX_STEPS))
+        solution = Solution(
+            GRID,
+            value,
+            value[..., None],
+            code=code,
+            steps=jnp.asarray(4),
+            lower=value - 1,
+            upper=value + 2,
+            message="m",
+        )
+        if isinstance(code, jax.core.Tracer):  # in jit and vmap, and not in grad
+            assert isinstance(solution.status, jax.core.Tracer)
+            assert repr(solution) == str(solution) == "Solution(traced, grid of shape (5, 4))"
+        return solution
+
+    single = jax.jit(solve)(2.0)
+    assert single.status is Status.CONVERGED
+    assert single.message == ""
+    assert single.stats == {}
+    assert single.residual is None
+    assert single.error == pytest.approx(2, abs=1e-5)
+    assert single.grid.shape == (5, 4)
+    assert single.value_at([0.1, 1.0]) == pytest.approx(0.4, abs=1e-6)
+    assert str(single).startswith("CONVERGED: ")
+    batch = jax.vmap(solve)(jnp.array([0.5, 2.0, 3.0]))
+    assert batch.status.tolist() == [2, 1, 1]
+    assert str(batch) == repr(batch) == "Solution(a batch, grid of shape (5, 4))"
+    with pytest.raises(ValueError, match=r"shape \(3, 5, 4\) on a grid of shape \(5, 4\); of a batch.*vmap"):
+        batch.value_at([0.1, 1.0])
+    np.testing.assert_allclose(
+        jax.vmap(lambda solution, x: solution.value_at(x), (0, None))(batch, jnp.array([0.1, 1.0])),
+        [0.1, 0.4, 0.6],
+        rtol=1e-5,
+    )
+    assert jax.tree.map(lambda leaf: leaf[0], batch).status is Status.MAX_STEPS
+    assert jax.grad(lambda scale: solve(scale).value_at([0.5, 1.0]))(2.0) == pytest.approx(1.0)
+    assert jax.jit(lambda scale: solve(scale).error)(2.0) == pytest.approx(2, abs=1e-5)
+
+
+def test_a_traced_solution_cannot_be_saved(tmp_path):
+    def save(value):
+        Solution(GRID, value, None).save(tmp_path / "run.npz")
+
+    with pytest.raises(ValueError, match="outside of jit"):
+        jax.jit(save)(LINEAR.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_moving_the_grid_does_not_recompile():
+    traces = []
+
+    @jax.jit
+    def value_there(solution, x):
+        traces.append(1)
+        return solution.value_at(x)
+
+    for end in (3.0, 4.0, 5.0):
+        value_there(Solution(Grid([-1.0, 0.0], [1.0, end], (5, 4)), LINEAR.value, LINEAR.policy), jnp.zeros(2))
+    assert len(traces) == 1
+
+
+def test_rebuilding_does_not_validate():
+    structure = jax.tree.structure(LINEAR)
+    rebuilt = jax.tree.unflatten(structure, [object()] * structure.num_leaves)
+    assert rebuilt.discrete is False
+    assert jax.tree.structure(rebuilt) == structure
+
+
+# Certificates
+
+
+def test_error_and_bounds():
+    value = np.array([0.0, 1.0, np.inf, 2.0])
+    grid = Grid([0.0], [3.0], (4,))
+
+    def certified(lower, upper, value=value):
+        return Solution(grid, value, None, lower=lower, upper=upper)
+
+    solution = certified(value - [0.1, 0, 0, 0.3], value + np.array([0.2, 0.1, 0, 0.1]))
+    assert solution.error == pytest.approx(0.3)
+    assert isinstance(solution.error, float)
+    assert solution.bounds[0] is solution.lower
+    assert solution.bounds[1] is solution.upper
+    assert certified(value, value + np.array([0.5, 0, 0, 0])).error == 0.5
+    assert certified(value, value).error == 0
+    assert certified(None, None).error is None
+    assert certified(value, None).bounds is None
+    assert certified(value, np.full(4, np.inf)).error == np.inf
+
+
+@pytest.mark.parametrize("where", ["value", "lower", "upper", "all"])
+def test_nan_certifies_nothing(where):
+    fields = {name: np.zeros(4) for name in ("value", "lower", "upper")}
+    fields.get(where, np.zeros(4))[1] = np.nan
+    if where == "all":
+        fields["value"][:] = np.inf
+    solution = Solution(Grid([0.0], [3.0], (4,)), policy=None, **fields)
+    assert solution.error == np.inf
+    assert jax.jit(lambda solution: solution.error)(solution) == np.inf
+
+
+# The screen
+
+FULL = {
+    "method": "PolicyIteration(evaluation=Sweeps(3))",
+    "scheme": "Upwind()",
+    "device": "cpu",
+    "dtype": "float64",
+    "seconds": 1.2345,
+    "compile_seconds": 0.5,
+    "bytes": 12_345_678,
+    "tol": 1e-6,
+    "certificate": "residual over the discount rate",
+    "versions": {"jax": "1"},
+}
+
+
+def test_the_whole_screen():
+    value = np.zeros(RING.shape)
+    reached = np.ones(RING.shape, bool)
+    reached[0, 0] = False
+    solution = Solution(
+        RING,
+        value,
+        value[..., None],
+        code=Status.CONVERGED,
+        steps=7,
+        lower=value - 1e-7,
+        upper=value + 2e-7,
+        isaacs_gap=0.125,
+        reached=reached,
+        residuals=np.array([1.0, 3e-8]),
+        stats=FULL,
+    )
+    assert str(solution).splitlines() == [
+        "CONVERGED: The residual meets the tolerance; nothing is left to do.",
+        "  grid        angle (periodic) x speed: 8 x 3 = 24 nodes",
+        "  method      PolicyIteration(evaluation=Sweeps(3)), Upwind()",
+        "  steps       7, last residual 3e-08",
+        "  error       at most 2e-07 (tol 1e-06): residual over the discount rate",
+        "  reached     95.8 % of the nodes",
+        "  isaacs gap  0.125",
+        "  seconds     1.23, and 0.5 to compile",
+        "  memory      12.3 MB",
+        "  device      cpu, float64",
+    ]
+    assert repr(solution) == "Solution(CONVERGED after 7 steps on 24 nodes)"
+
+
+@pytest.mark.parametrize("missing", [*FULL, "all"])
+def test_the_screen_copes_with_what_is_missing(missing):
+    stats = {} if missing == "all" else {name: value for name, value in FULL.items() if name != missing}
+    text = str(solution_of(lambda a, b: a, stats=stats))
+    assert text.startswith("CONVERGED: ")
+    assert "no certificate" in text
+    assert all(len(line.split()) > 1 for line in text.splitlines())  # no row without a text
+    assert "reached" not in text
+    assert "isaacs" not in text
+    assert len(text.splitlines()) >= 4
+
+
+def test_the_screen_says_why_there_is_no_certificate():
+    text = str(solution_of(lambda a, b: a, stats={"certificate": "no discount and\nno running cost"}))
+    assert "  error       no certificate: no discount and no running cost" in text.splitlines()
+
+
+def test_the_screen_stays_one_screen():
+    stats = FULL | {"method": "Method\n" * 100, "scheme": "x" * 1000, "certificate": "because " * 200}
+    fields = {"stats": stats, "message": "a long story\n" * 100, "isaacs_gap": 1.0, "residuals": np.ones(3)}
+    grid = Grid([0.0, 0.0], [1.0, 1.0], (3, 2), names=["a\nrather long name" * 9] * 2)
+    solution = solution_of(lambda a, b: a, grid, reached=np.zeros((3, 2), bool), **fields)
+    lines = str(solution).splitlines()
+    assert len(lines) <= 14
+    assert max(map(len, lines)) <= 120
+    assert len(repr(solution).splitlines()) == 1
+
+
+def test_nearly_all_is_not_printed_as_all():
+    reached = np.ones((50, 40), bool)
+    reached[0, 0] = False
+    solution = solution_of(lambda a, b: a, Grid([0.0, 0.0], [1.0, 1.0], (50, 40)), reached=reached)
+    assert "99.9 % of the nodes" in str(solution)
+
+
+def test_the_message_of_the_solve_comes_first():
+    assert str(solution_of(lambda a, b: a, message="step 3 is NaN")).startswith("CONVERGED: step 3 is NaN\n")
+
+
+def test_status_from_every_kind_of_number():
+    for code in (3, np.int64(3), np.array(3), jnp.asarray(3), Status.STALLED):
+        solution = Solution(GRID, LINEAR.value, None, code=code)
+        assert solution.status is Status.STALLED
+        assert type(solution.code) is not Status

@@ -17,8 +17,9 @@ PACKAGE = ROOT / "hjbjax"
 
 # The README's architecture table, top to bottom and left to right: a file imports only from files before it.
 TABLE = (ROOT / "README.md").read_text(encoding="utf-8").split("## Architecture")[1].split("\n## ")[0]
-FILES = re.findall(r"`(\w+)`", "".join(row.split("|")[2] for row in TABLE.splitlines() if row.startswith("| ")))
-ORDER = ["_version", *FILES[:-1], "__init__", FILES[-1], "__main__"]  # the command alone may see the whole package
+ROWS = [re.findall(r"`(\w+)`", row.split("|")[2]) for row in TABLE.splitlines() if row.startswith("| ")]
+*PIPELINE, COMMAND = ROWS  # the command alone may see the package as its users do
+ORDER = ["_version", *sum(PIPELINE, []), "__init__", *COMMAND, "__main__"]
 SOURCES = sorted(PACKAGE.rglob("*.py"))
 
 
@@ -28,8 +29,8 @@ def module_of(path):
 
 
 def test_the_table_names_each_file_once():
-    assert len(set(FILES)) == len(FILES)
-    assert FILES[-1] == "cli"
+    assert len(set(ORDER)) == len(ORDER)
+    assert COMMAND[-1] == "cli"
 
 
 def imports_of(path):

@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+import itertools
 import re
 import subprocess
 import sys
@@ -19,7 +20,7 @@ PACKAGE = ROOT / "hjbjax"
 TABLE = (ROOT / "README.md").read_text(encoding="utf-8").split("## Architecture")[1].split("\n## ")[0]
 ROWS = [re.findall(r"`(\w+)`", row.split("|")[2]) for row in TABLE.splitlines() if row.startswith("| ")]
 *PIPELINE, COMMAND = ROWS  # the command alone may see the package as its users do
-ORDER = ["_version", *sum(PIPELINE, []), "__init__", *COMMAND, "__main__"]
+ORDER = ["_version", *itertools.chain.from_iterable(PIPELINE), "__init__", *COMMAND, "__main__"]
 SOURCES = sorted(PACKAGE.rglob("*.py"))
 
 

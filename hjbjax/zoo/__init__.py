@@ -1,0 +1,156 @@
+"""Ready problems, with the exact or an independent answer beside each where one exists.
+
+A ready problem is a function of its parameters that returns ``(problem, grid)``; the function of the same name
+with ``_exact`` takes the same keywords and returns the value as a function of one state. ``catalogue`` has them
+all under the names of the command line.
+
+    >>> from hjbjax import zoo
+    >>> problem, grid = zoo.bang_bang(noise=0.5)
+    >>> value = zoo.bang_bang_exact(noise=0.5)
+    >>> problem.controls.dim, grid.shape, value([0.0]).shape
+    (1, (81,), ())
+"""
+
+from hjbjax.zoo.entry import Entry
+from hjbjax.zoo.finance import Merton, merton, merton_exact
+from hjbjax.zoo.linear_quadratic import (
+    LinearScalar,
+    double_integrator_lq,
+    double_integrator_lq_exact,
+    lq_game,
+    lq_game_exact,
+    stochastic_lq,
+    stochastic_lq_exact,
+)
+from hjbjax.zoo.manipulator import Manipulator, manipulator
+from hjbjax.zoo.mechanical import Pendulum, VanDerPol, pendulum, pendulum_near_upright, van_der_pol
+from hjbjax.zoo.minimum_time import (
+    Boat,
+    DoubleIntegrator,
+    Dubins,
+    SingleIntegrator,
+    double_integrator,
+    double_integrator_exact,
+    dubins,
+    eikonal,
+    eikonal_exact,
+    zermelo,
+    zermelo_exact,
+)
+from hjbjax.zoo.stochastic import (
+    BangBang,
+    bang_bang,
+    bang_bang_exact,
+    brownian_ball,
+    brownian_ball_exact,
+    brownian_exit,
+    brownian_exit_exact,
+)
+
+_ENTRIES = (
+    Entry("pendulum", "swing a pendulum up and hold it upright", pendulum, start=(2.8, 0.0), duration=6.0),
+    Entry(
+        "double-integrator",
+        "bring a mass to rest at the origin in the least time",
+        double_integrator,
+        double_integrator_exact,
+        start=(1.0, 0.0),
+        duration=4.0,
+    ),
+    Entry(
+        "double-integrator-lq",
+        "bring a mass to rest at a quadratic cost",
+        double_integrator_lq,
+        double_integrator_lq_exact,
+        start=(1.0, 0.0),
+        duration=8.0,
+    ),
+    Entry("manipulator", "raise a planar arm of n links and hold it upright", manipulator, start=(2.0, 0.0)),
+    Entry(
+        "stochastic-lq",
+        "hold a linear system near zero against noise",
+        stochastic_lq,
+        stochastic_lq_exact,
+        start=(1.0,),
+        duration=5.0,
+    ),
+    Entry("lq-game", "attenuate a disturbance to the level gamma", lq_game, lq_game_exact, start=(1.0,), duration=5.0),
+    Entry(
+        "brownian-exit",
+        "how long a Brownian motion stays in a cube",
+        brownian_exit,
+        brownian_exit_exact,
+        start=(0.0,),
+        duration=2.0,
+    ),
+    Entry(
+        "brownian-ball",
+        "how long a Brownian motion stays in a ball",
+        brownian_ball,
+        brownian_ball_exact,
+        start=(0.0, 0.0),
+        duration=2.0,
+    ),
+    Entry(
+        "zermelo",
+        "steer a boat through a current in the least time",
+        zermelo,
+        zermelo_exact,
+        start=(1.0, -1.0),
+        duration=5.0,
+    ),
+    Entry("eikonal", "the shortest way to the origin", eikonal, eikonal_exact, start=(0.8, 0.5), duration=2.0),
+    Entry("dubins", "drive a car that cannot turn on the spot to a disc", dubins, start=(1.5, 0.5, 0.0), duration=8.0),
+    Entry("van-der-pol", "quieten a Van der Pol oscillator", van_der_pol, start=(2.0, 0.0), duration=10.0),
+    Entry("bang-bang", "hold a point near zero with a bounded speed", bang_bang, bang_bang_exact, start=(1.5,)),
+    Entry(
+        "merton",
+        "consume and invest under constant relative risk aversion",
+        merton,
+        merton_exact,
+        start=(0.0,),
+        duration=10.0,
+    ),
+)
+
+catalogue: dict[str, Entry] = {entry.name: entry for entry in _ENTRIES}
+
+__all__ = [
+    "BangBang",
+    "Boat",
+    "DoubleIntegrator",
+    "Dubins",
+    "Entry",
+    "LinearScalar",
+    "Manipulator",
+    "Merton",
+    "Pendulum",
+    "SingleIntegrator",
+    "VanDerPol",
+    "bang_bang",
+    "bang_bang_exact",
+    "brownian_ball",
+    "brownian_ball_exact",
+    "brownian_exit",
+    "brownian_exit_exact",
+    "catalogue",
+    "double_integrator",
+    "double_integrator_exact",
+    "double_integrator_lq",
+    "double_integrator_lq_exact",
+    "dubins",
+    "eikonal",
+    "eikonal_exact",
+    "lq_game",
+    "lq_game_exact",
+    "manipulator",
+    "merton",
+    "merton_exact",
+    "pendulum",
+    "pendulum_near_upright",
+    "stochastic_lq",
+    "stochastic_lq_exact",
+    "van_der_pol",
+    "zermelo",
+    "zermelo_exact",
+]

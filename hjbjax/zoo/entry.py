@@ -1,0 +1,44 @@
+"""One line of the catalogue: a ready problem, its answer where one is known, and a path worth drawing."""
+
+import dataclasses
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+
+@dataclasses.dataclass(frozen=True)
+class Entry:
+    """A ready problem under its name.
+
+    Args:
+      name: the name on the command line, with hyphens.
+      summary: one line.
+      build: ``build(**parameters) -> (problem, grid)``.
+      exact: ``exact(**parameters) -> value``, a function of one state that ``jit`` and ``vmap`` accept; it takes
+        the keywords of ``build`` except ``shape``. ``None`` where no answer is known.
+      start: the initial state of the picture of a trajectory.
+      duration: its length, in units of time.
+
+    Example:
+      >>> from hjbjax import zoo
+      >>> entry = zoo.catalogue["bang-bang"]
+      >>> problem, grid = entry.build(discount=2.0)
+      >>> float(entry.exact(discount=2.0)([0.0]))
+      0.0
+    """
+
+    name: str
+    summary: str
+    build: Callable[..., tuple[Any, Any]]
+    exact: Callable[..., Callable] | None = None
+    start: tuple[float, ...] = ()
+    duration: float = 5.0
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """The keywords of ``build`` with their defaults."""
+        return {name: argument.default for name, argument in inspect.signature(self.build).parameters.items()}
+
+    def initial_state(self, ndim: int) -> tuple[float, ...]:
+        """``start`` in ``ndim`` dimensions: cut, or filled up with zeros, where a parameter chose another number."""
+        return (self.start + (0.0,) * ndim)[:ndim]

@@ -1,0 +1,127 @@
+"""Problems of finance whose value is known.
+
+    Merton          consumption and investment with constant relative risk aversion
+
+A utility to be maximised is minus a cost.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+
+from hjbjax.grid import Grid
+from hjbjax.problem import Problem
+from hjbjax.pytree import is_traced, node
+from hjbjax.sets import Box
+from hjbjax.zoo.ingredients import OutsideCube, answer
+
+
+@node()
+class Merton:
+    """Consume and invest for ever with the utility C^{1−γ}/(1−γ); the cost is minus the utility.
+
+    The state is the logarithm z of wealth, the controls are the share π in the risky asset and the rate of
+    consumption k = C/W:
+
+        dz = (r + π(μ − r) − k − ½π²σ²) dt + πσ dw,     V = −k*^{−γ} e^{(1−γ)z}/(1−γ)
+        π* = (μ − r)/(γσ²),  k* = (ρ − (1−γ)(r + (μ−r)²/(2γσ²)))/γ
+
+    so that the noise is controlled, and noise and value are scale-free where wealth itself would span decades.
+
+    Args:
+      interest: r.
+      growth: μ, of the risky asset.
+      volatility: σ.
+      aversion: γ > 0, not 1.
+      discount: ρ.
+    """
+
+    interest: Any = 0.03
+    growth: Any = 0.07
+    volatility: Any = 0.2
+    aversion: Any = 2.0
+    discount: Any = 0.05
+
+    def drift(self, x: Any, u: Any) -> Any:
+        """The mean growth of the logarithm of wealth."""
+        spread = u[0] * self.volatility
+        growth = self.interest + u[0] * (self.growth - self.interest) - u[1] - 0.5 * spread * spread
+        return jnp.stack([growth])
+
+    def noise(self, x: Any, u: Any) -> Any:
+        """πσ."""
+        return jnp.stack([u[0] * self.volatility])
+
+    def cost(self, x: Any, u: Any) -> Any:
+        """Minus the utility of the consumption k·e^z."""
+        power = 1 - self.aversion
+        return -jnp.exp(power * (x[0] + jnp.log(u[1]))) / power
+
+    @property
+    def share(self) -> Any:
+        """π*, the best share in the risky asset."""
+        return (self.growth - self.interest) / (self.aversion * self.volatility * self.volatility)
+
+    @property
+    def consumption(self) -> Any:
+        """k*, the best consumption per unit of wealth and time."""
+        premium = self.growth - self.interest
+        certain = self.interest + premium * premium / (2 * self.aversion * self.volatility * self.volatility)
+        return (self.discount - (1 - self.aversion) * certain) / self.aversion
+
+    def value(self, x: Any) -> Any:
+        """The value at one state, while the best controls are admissible and k* > 0."""
+        power = 1 - self.aversion
+        return -(self.consumption**-self.aversion) * jnp.exp(power * jnp.asarray(x)[0]) / power
+
+
+def merton(
+    *,
+    interest: Any = 0.03,
+    growth: Any = 0.07,
+    volatility: Any = 0.2,
+    aversion: Any = 2.0,
+    discount: Any = 0.05,
+    shape: tuple[int, ...] = (101,),
+) -> tuple[Problem, Grid]:
+    """Consume and invest: log-wealth on [−1, 1], share in [0, 1], consumption rate in [.01, .1].
+
+    The ends are held at the exact value: the noise would carry the effect of a wall into the whole box.
+
+    Args:
+      interest: r.
+      growth: μ.
+      volatility: σ.
+      aversion: γ, not 1.
+      discount: ρ.
+      shape: nodes.
+    """
+    system = _merton(interest, growth, volatility, aversion, discount)
+    problem = Problem(
+        system.drift,
+        system.cost,
+        Box([0.0, 0.01], [1.0, 0.1]),
+        noise=system.noise,
+        discount=discount,
+        target=OutsideCube(1.0).level,
+        exit_cost=system.value,
+    )
+    return problem, Grid([-1.0], [1.0], shape, names=("log wealth",))
+
+
+def merton_exact(
+    *,
+    interest: Any = 0.03,
+    growth: Any = 0.07,
+    volatility: Any = 0.2,
+    aversion: Any = 2.0,
+    discount: Any = 0.05,
+) -> Any:
+    """The value as a function of log-wealth; 493.8271605 at wealth 1 with the defaults."""
+    return answer(_merton(interest, growth, volatility, aversion, discount).value)
+
+
+def _merton(interest: Any, growth: Any, volatility: Any, aversion: Any, discount: Any) -> Merton:
+    if not is_traced(aversion) and aversion == 1:
+        raise ValueError("merton: got aversion = 1 (logarithmic utility), wanted another number > 0")
+    return Merton(interest, growth, volatility, aversion, discount)

@@ -1,0 +1,203 @@
+"""Linear systems with quadratic costs: the Riccati equation knows the answer.
+
+    double integrator   ẍ = u/m,              cost |x|² + u²,           V = x'Px + tr(σσ'P)/β
+    stochastic          dx = (ax + u)dt + σ dw, cost qx² + ru², β > 0,  V = px² + σ²p/β
+    game                ẋ = ax + u + d,       cost x² + u² − γ²d²,      V = px²
+
+A discount β acts on the quadratic part like the drift A − ½βI. The answers hold on the whole space: where the box
+is left, compare on its inner half, unless the problem holds its ends at the exact value.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.grid import Grid
+from hjbjax.problem import Problem
+from hjbjax.pytree import is_traced, node
+from hjbjax.sets import Box
+from hjbjax.zoo.ingredients import Disc, OutsideCube, QuadraticCost, QuadraticValue, answer, noise_or_none
+from hjbjax.zoo.minimum_time import DoubleIntegrator
+
+
+@node()
+class LinearScalar:
+    """The scalar system ẋ = ax + u, or ẋ = ax + u + d with an opponent.
+
+    Args:
+      rate: a, per unit time.
+    """
+
+    rate: Any = 0.0
+
+    def drift(self, x: Any, u: Any) -> Any:
+        """ax + u."""
+        return self.rate * x + u
+
+    def contested_drift(self, x: Any, u: Any, d: Any) -> Any:
+        """ax + u + d."""
+        return self.rate * x + u + d
+
+
+@node()
+class GameCost:
+    """The cost x² + u² − γ²d² of the attenuation level γ."""
+
+    gamma: Any
+
+    def rate(self, x: Any, u: Any, d: Any) -> Any:
+        """Cost per unit time."""
+        return jnp.sum(x * x) + jnp.sum(u * u) - self.gamma * self.gamma * jnp.sum(d * d)
+
+
+@node()
+class ScalarQuadratic:
+    """The value p|x|² + c, with p the stabilising root of state + (2a − β)p − (weight)p² = 0 and c = σ²p/β.
+
+    Args:
+      state: the weight q of x².
+      weight: 1/r for one player with the control weight r, 1 − γ⁻² for the game.
+      rate: a.
+      discount: β.
+      noise: σ.
+    """
+
+    state: Any
+    weight: Any
+    rate: Any
+    discount: Any
+    noise: Any = 0.0
+
+    @property
+    def curvature(self) -> Any:
+        """The root p, written so that it stays finite where the weight vanishes."""
+        shifted = self.rate - 0.5 * self.discount
+        return self.state / (jnp.sqrt(shifted * shifted + self.weight * self.state) - shifted)
+
+    def value(self, x: Any) -> Any:
+        """The value at one state."""
+        x, p = jnp.asarray(x), self.curvature
+        beta = jnp.where(self.discount == 0, 1.0, self.discount)
+        constant = jnp.where(jnp.asarray(self.noise) == 0, 0.0, self.noise * self.noise * p / beta)
+        return p * jnp.sum(x * x) + constant
+
+
+def double_integrator_lq(
+    *,
+    mass: Any = 1.0,
+    control_weight: Any = 1.0,
+    noise: Any = 0.0,
+    discount: Any = 0.0,
+    bound: Any = 8.0,
+    shape: tuple[int, ...] = (101, 101),
+) -> tuple[Problem, Grid]:
+    """Bring a mass to rest at the cost |x|² + r u², on [−2, 2]²; the bound on u is there to be slack.
+
+    Undiscounted by default: rest at the origin costs nothing. With noise it needs a discount.
+    """
+    problem = Problem(
+        DoubleIntegrator(mass).drift,
+        QuadraticCost(1.0, control_weight).rate,
+        Box([-bound], [bound]),
+        noise=noise_or_none(noise),
+        discount=discount,
+    )
+    return problem, Grid([-2.0, -2.0], [2.0, 2.0], shape, names=("position", "velocity"))
+
+
+def double_integrator_lq_exact(
+    *, mass: float = 1.0, control_weight: float = 1.0, noise: float = 0.0, discount: float = 0.0, bound: float = 8.0
+) -> Any:
+    """x'Px + σ² tr(P)/β on the whole plane while the bound is slack, by SciPy's Riccati solver; host level.
+
+    With the defaults P = [[√3, 1], [1, √3]].
+    """
+    from scipy.linalg import solve_continuous_are
+
+    a = np.array([[0.0, 1.0], [0.0, 0.0]]) - 0.5 * discount * np.eye(2)
+    b = np.array([[0.0], [1.0 / mass]])
+    matrix = solve_continuous_are(a, b, np.eye(2), control_weight * np.eye(1))
+    constant = noise**2 * np.trace(matrix) / discount if noise else 0.0
+    return answer(QuadraticValue(matrix, constant).value)
+
+
+def stochastic_lq(
+    *,
+    rate: Any = 0.0,
+    state_weight: Any = 1.0,
+    control_weight: Any = 1.0,
+    noise: Any = 1.0,
+    discount: Any = 1.0,
+    bound: Any = 8.0,
+    shape: tuple[int, ...] = (201,),
+) -> tuple[Problem, Grid]:
+    """Hold dx = (ax + u)dt + σ dw near zero at the cost qx² + ru², on [−2, 2].
+
+    The ends are held at the exact value: noise would otherwise carry the effect of a wall into the box.
+    """
+    exact = stochastic_lq_exact(
+        rate=rate, state_weight=state_weight, control_weight=control_weight, noise=noise, discount=discount, bound=bound
+    )
+    problem = Problem(
+        LinearScalar(rate).drift,
+        QuadraticCost(state_weight, control_weight).rate,
+        Box([-bound], [bound]),
+        noise=noise_or_none(noise),
+        discount=discount,
+        target=OutsideCube(2.0).level,
+        exit_cost=exact,
+    )
+    return problem, Grid([-2.0], [2.0], shape, names=("x",))
+
+
+def stochastic_lq_exact(
+    *,
+    rate: Any = 0.0,
+    state_weight: Any = 1.0,
+    control_weight: Any = 1.0,
+    noise: Any = 1.0,
+    discount: Any = 1.0,
+    bound: Any = 8.0,
+) -> Any:
+    """px² + σ²p/β while the bound is slack; with the defaults p = (√5 − 1)/2."""
+    return answer(ScalarQuadratic(state_weight, 1.0 / control_weight, rate, discount, noise).value)
+
+
+def lq_game(
+    *,
+    gamma: Any = 2.0,
+    rate: Any = 0.0,
+    discount: Any = 0.0,
+    bound: Any = 4.0,
+    shape: tuple[int, ...] = (201,),
+) -> tuple[Problem, Grid]:
+    """Attenuate a disturbance to the level γ: ẋ = ax + u + d, cost x² + u² − γ²d², on [−1, 1].
+
+    The run ends at the origin, where both players rest; undiscounted, that is what makes the answer unique.
+    """
+    problem = Problem(
+        LinearScalar(rate).contested_drift,
+        GameCost(gamma).rate,
+        Box([-bound], [bound]),
+        disturbances=Box([-bound], [bound]),
+        discount=discount,
+        target=Disc(0.0, 1).level,
+    )
+    return problem, Grid([-1.0], [1.0], shape, names=("x",))
+
+
+def lq_game_exact(*, gamma: Any = 2.0, rate: Any = 0.0, discount: Any = 0.0, bound: Any = 4.0) -> Any:
+    """px² with p = 1/(√(α² + 1 − γ⁻²) − α), α = a − β/2; with the defaults p = 2/√3.
+
+    Raises:
+      ValueError: the level is at or below the least one that can be attained, so there is no finite value.
+    """
+    if not is_traced(gamma, rate, discount):
+        shifted, weight = rate - 0.5 * discount, 1 - gamma**-2
+        if shifted**2 + weight < 0 or (weight <= 0 and shifted >= 0):
+            raise ValueError(
+                f"lq_game_exact: got gamma = {gamma:g}, wanted a level above the least attainable one "
+                f"(1 where rate ≥ discount/2): below it the disturbance makes the cost infinite"
+            )
+    return answer(ScalarQuadratic(1.0, 1 - gamma**-2, rate, discount).value)

@@ -1,0 +1,184 @@
+"""A planar arm of n links by differentiating its Lagrangian.
+
+    M(q) q̈ + V(q, w) + G(q) = τ                                             (5.5)
+
+q₁ is the angle of the first link from upright, q_i that of link i from the one before; each link is massless with
+a point mass at its far end, so that one link is the pendulum. With the kinetic energy T = ½ w'M(q)w and the
+potential energy U,
+
+    M e_j = ∂T/∂w at w = e_j,    V = (∂/∂q ∂T/∂w) w − ∂T/∂q,    G = ∂U/∂q.
+
+Everything is done on lists of scalars: n is static, the loops unroll, and only elementwise operations are left,
+which a solver can evaluate on a whole grid without forming a matrix a node.
+"""
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from hjbjax.grid import Grid
+from hjbjax.problem import Problem
+from hjbjax.pytree import node
+from hjbjax.sets import Box
+from hjbjax.zoo.ingredients import QuadraticCost
+
+
+@node(static=("links",))
+class Manipulator:
+    """A planar arm, state (q, w) in R^2n, one torque a joint.
+
+    Args:
+      links: n.
+      lengths: n lengths; ``None`` is 1 each.
+      masses: n point masses at the far ends of the links; ``None`` is 1 each.
+      g: gravity.
+
+    Example:
+      >>> arm = Manipulator(links=2)
+      >>> arm.mass_matrix(jnp.zeros(2)).tolist()
+      [[5.0, 2.0], [2.0, 1.0]]
+      >>> arm.gravity(jnp.array([jnp.pi / 2, 0.0])).astype(int).tolist()
+      [-29, -9]
+    """
+
+    links: int = 1
+    lengths: Any = None
+    masses: Any = None
+    g: Any = 9.81
+
+    def __post_init__(self):
+        if isinstance(self.links, bool) or not isinstance(self.links, int) or self.links < 1:
+            raise ValueError(f"Manipulator: got links = {self.links!r}, wanted a positive integer")
+        for name in ("lengths", "masses"):
+            numbers = getattr(self, name)
+            if numbers is None:
+                object.__setattr__(self, name, (1.0,) * self.links)
+            elif len(numbers) != self.links:
+                raise ValueError(f"Manipulator.{name}: got {len(numbers)} numbers, wanted {self.links}: one a link")
+
+    def kinetic_energy(self, q: Any, w: Any) -> Any:
+        """T(q, w), of vectors or lists of n scalars."""
+        total: Any = 0.0
+        angle: Any = 0.0
+        rate: Any = 0.0
+        across: Any = 0.0
+        up: Any = 0.0
+        for i in range(self.links):
+            angle, rate = angle + q[i], rate + w[i]
+            across = across + self.lengths[i] * jnp.cos(angle) * rate
+            up = up - self.lengths[i] * jnp.sin(angle) * rate
+            total = total + 0.5 * self.masses[i] * (across * across + up * up)
+        return total
+
+    def potential_energy(self, q: Any) -> Any:
+        """U(q), zero at the height of the first joint."""
+        total: Any = 0.0
+        angle: Any = 0.0
+        height: Any = 0.0
+        for i in range(self.links):
+            angle = angle + q[i]
+            height = height + self.lengths[i] * jnp.cos(angle)
+            total = total + self.masses[i] * self.g * height
+        return total
+
+    def energy(self, x: Any) -> Any:
+        """T + U at the state x = (q, w): constant without torque, and dE/dt = w·τ with it."""
+        return self.kinetic_energy(x[: self.links], x[self.links :]) + self.potential_energy(x)
+
+    def mass_matrix(self, q: Any) -> Any:
+        """M(q), shape (n, n), symmetric and positive definite."""
+        columns = self._mass(_scalars(q, self.links))
+        return jnp.stack([jnp.stack(column) for column in columns])
+
+    def coriolis(self, q: Any, w: Any) -> Any:
+        """V(q, w), shape (n,): the centrifugal and Coriolis torques."""
+        return jnp.stack(self._coriolis(_scalars(q, self.links), _scalars(w, self.links)))
+
+    def gravity(self, q: Any) -> Any:
+        """G(q), shape (n,)."""
+        return jnp.stack(jax.grad(self.potential_energy)(_scalars(q, self.links)))
+
+    def drift(self, x: Any, u: Any) -> Any:
+        """(w, M⁻¹(τ − V − G))."""
+        n = self.links
+        numbers = _scalars(x, 2 * n)
+        q, w = numbers[:n], numbers[n:]
+        bias, weight = self._coriolis(q, w), jax.grad(self.potential_energy)(q)
+        rest = [u[i] - bias[i] - weight[i] for i in range(n)]
+        return jnp.stack([*w, *_solve_positive(self._mass(q), rest)])
+
+    def _mass(self, q: list) -> list[list]:
+        # T is quadratic in w, so its gradient at the unit vector e_j is the column j of M.
+        zero, one = jnp.zeros((), q[0].dtype), jnp.ones((), q[0].dtype)
+        units = ([one if i == j else zero for i in range(self.links)] for j in range(self.links))
+        return [jax.grad(self.kinetic_energy, argnums=1)(q, unit) for unit in units]
+
+    def _coriolis(self, q: list, w: list) -> list:
+        def momentum(angles):
+            return jax.grad(self.kinetic_energy, argnums=1)(angles, w)
+
+        _, change = jax.jvp(momentum, (q,), (w,))
+        pull = jax.grad(self.kinetic_energy, argnums=0)(q, w)
+        return [change[i] - pull[i] for i in range(self.links)]
+
+
+def _scalars(vector: Any, count: int) -> list:
+    vector = jnp.asarray(vector)
+    vector = vector if jnp.issubdtype(vector.dtype, jnp.inexact) else vector.astype(float)
+    return [vector[i] for i in range(count)]
+
+
+def _solve_positive(matrix: list[list], rest: list) -> list:
+    """The solution of a symmetric positive definite system by elimination without pivoting, on scalars."""
+    n, matrix, rest = len(rest), [list(row) for row in matrix], list(rest)
+    for k in range(n):
+        for i in range(k + 1, n):
+            factor = matrix[i][k] / matrix[k][k]
+            rest[i] = rest[i] - factor * rest[k]
+            for j in range(k + 1, n):
+                matrix[i][j] = matrix[i][j] - factor * matrix[k][j]
+    for k in reversed(range(n)):
+        for j in range(k + 1, n):
+            rest[k] = rest[k] - matrix[k][j] * rest[j]
+        rest[k] = rest[k] / matrix[k][k]
+    return rest
+
+
+def manipulator(
+    *,
+    links: int = 1,
+    lengths: Any = None,
+    masses: Any = None,
+    g: Any = 9.81,
+    torque: Any = 30.0,
+    discount: Any = 0.5,
+    shape: tuple[int, ...] | None = None,
+) -> tuple[Problem, Grid]:
+    """Raise an arm and hold it upright, at the cost ½(|x|² + |τ|²).
+
+    Args:
+      links: n; the state has 2n dimensions.
+      lengths: n lengths; ``None`` is 1 each.
+      masses: n masses; ``None`` is 1 each.
+      g: gravity.
+      torque: the bound on each |τ_i|.
+      discount: β.
+      shape: nodes in the n angles (even) and the n velocities (odd), on [−π, π)ⁿ × [−8, 8]ⁿ; ``None`` is
+        60 and 61 with one link, 20 and 21 with more.
+    """
+    system = Manipulator(links=links, lengths=lengths, masses=masses, g=g)
+    if shape is None:
+        shape = (60, 61) if links == 1 else (20,) * links + (21,) * links
+    controls = Box([-torque] * links, [torque] * links)
+    problem = Problem(system.drift, QuadraticCost(0.5, 0.5).rate, controls, discount=discount)
+    names = ("angle", "velocity")
+    grid = Grid(
+        [-math.pi] * links + [-8.0] * links,
+        [math.pi] * links + [8.0] * links,
+        shape,
+        periodic=(True,) * links + (False,) * links,
+        names=names if links == 1 else tuple(f"{name} {i + 1}" for name in names for i in range(links)),
+    )
+    return problem, grid

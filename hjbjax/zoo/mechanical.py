@@ -1,0 +1,119 @@
+"""Mechanical systems with one degree of freedom or two, and the problems of bringing them to rest.
+
+    pendulum         θ̈ = g sin θ + τ/m           θ from upright, on S¹ × R
+    Van der Pol      ẍ = μ(1 − x²)ẋ − x + u
+
+The pendulum follows from mθ̈ − mg sin θ = τ; (9.4) of the chapter prints the input gain g/m, kept as
+``as_printed=True`` since figures 10 to 12 may come from it.
+"""
+
+import math
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.grid import Grid
+from hjbjax.problem import Problem
+from hjbjax.pytree import node
+from hjbjax.sets import Box
+from hjbjax.zoo.ingredients import QuadraticCost, QuadraticValue
+
+
+@node(static=("as_printed",))
+class Pendulum:
+    """A pendulum with a torque at its pivot, state (θ, θ̇), θ = 0 upright.
+
+    Args:
+      mass: m, at unit length.
+      g: gravity; 9.81 m/s².
+      as_printed: input gain g/m as (9.4) prints it, instead of 1/m.
+
+    Example:
+      >>> Pendulum(mass=2.0).drift(jnp.zeros(2), jnp.ones(1)).tolist()
+      [0.0, 0.5]
+    """
+
+    mass: Any = 1.0
+    g: Any = 9.81
+    as_printed: bool = False
+
+    @property
+    def gain(self) -> Any:
+        """θ̈ per unit of torque."""
+        return (self.g if self.as_printed else 1.0) / self.mass
+
+    def drift(self, x: Any, u: Any) -> Any:
+        """(θ̇, g sin θ + gain·τ)."""
+        return jnp.stack([x[1], self.g * jnp.sin(x[0]) + self.gain * u[0]])
+
+
+@node()
+class VanDerPol:
+    """The Van der Pol oscillator, state (x, ẋ): a limit cycle that the control has to leave.
+
+    Args:
+      stiffness: μ ≥ 0; at zero the oscillator is harmonic.
+    """
+
+    stiffness: Any = 1.0
+
+    def drift(self, x: Any, u: Any) -> Any:
+        """(ẋ, μ(1 − x²)ẋ − x + u)."""
+        return jnp.stack([x[1], self.stiffness * (1 - x[0] * x[0]) * x[1] - x[0] + u[0]])
+
+
+def pendulum(
+    *,
+    mass: Any = 1.0,
+    as_printed: bool = False,
+    g: Any = 9.81,
+    torque: Any = None,
+    discount: Any = 0.0,
+    shape: tuple[int, ...] = (200, 201),
+) -> tuple[Problem, Grid]:
+    """Swing a pendulum up and hold it there, at the cost ½(|x|² + τ²).
+
+    Undiscounted by default: upright at rest costs nothing, and an even number of angles with an odd number of
+    velocities puts a node exactly there.
+
+    Args:
+      mass: m.
+      as_printed: input gain g/m as (9.4) prints it, instead of 1/m.
+      g: gravity.
+      torque: the bound on |τ|; ``None`` is 30, or 6 as printed.
+      discount: β.
+      shape: nodes in angle (even) and velocity (odd), on [−π, π) × [−8, 8].
+    """
+    bound = (6.0 if as_printed else 30.0) if torque is None else torque
+    system = Pendulum(mass=mass, g=g, as_printed=as_printed)
+    problem = Problem(system.drift, QuadraticCost(0.5, 0.5).rate, Box([-bound], [bound]), discount=discount)
+    return problem, Grid([-math.pi, -8.0], [math.pi, 8.0], shape, periodic=(True, False), names=("angle", "velocity"))
+
+
+def pendulum_near_upright(
+    *, mass: float = 1.0, as_printed: bool = False, g: float = 9.81, discount: float = 0.0
+) -> QuadraticValue:
+    """The leading term ½x'Px of the pendulum's value at the upright rest, by the Riccati equation; host level.
+
+    sin θ is odd, so what it leaves out is of fourth order in the state.
+    """
+    from scipy.linalg import solve_continuous_are
+
+    gain = Pendulum(mass, g, as_printed).gain
+    a = np.array([[0.0, 1.0], [g, 0.0]]) - 0.5 * discount * np.eye(2)
+    matrix = solve_continuous_are(a, np.array([[0.0], [gain]]), np.eye(2), np.eye(1))
+    return QuadraticValue(0.5 * matrix)
+
+
+def van_der_pol(
+    *, stiffness: Any = 1.0, bound: Any = 1.0, discount: Any = 0.5, shape: tuple[int, ...] = (121, 121)
+) -> tuple[Problem, Grid]:
+    """Quieten a Van der Pol oscillator at the cost ½(|x|² + u²), |u| ≤ bound, on [−3, 3]².
+
+    Where the bound is too weak to leave the limit cycle, the discount keeps the value finite.
+    """
+    problem = Problem(
+        VanDerPol(stiffness).drift, QuadraticCost(0.5, 0.5).rate, Box([-bound], [bound]), discount=discount
+    )
+    return problem, Grid([-3.0, -3.0], [3.0, 3.0], shape, names=("position", "velocity"))

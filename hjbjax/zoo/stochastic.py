@@ -1,0 +1,189 @@
+"""Problems with noise whose value is known.
+
+    Brownian exit   dx = σ dw until it leaves a cube or a ball, cost 1
+    bang-bang       dx = u dt + ε dw, |u| ≤ 1, cost x²
+
+Both are held at the exact value where the box ends, so that the answer is exact at every node.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.grid import Grid
+from hjbjax.problem import Problem
+from hjbjax.pytree import node
+from hjbjax.sets import Box
+from hjbjax.zoo.ingredients import OutsideBall, OutsideCube, answer, noise_or_none, unit_cost
+
+TERMS = 200  # of the series for the square, whose tail falls like k⁻³ at the worst place: 1e-6 there, 1e-15 inside
+
+
+def no_drift(x: Any, u: Any) -> Any:
+    """Zero: only the noise moves the state."""
+    return jnp.zeros_like(x)
+
+
+@node(static=("dim",))
+class CubeExit:
+    """The discounted time for which σ dw stays in the cube |x_i| < R; one and two dimensions.
+
+    On the interval V = (1 − cosh κx/cosh κR)/β with κ = √(2β)/σ, and (R² − x²)/σ² for β = 0. On the square the
+    difference from the interval's value is expanded in cosines along the longer coordinate.
+    """
+
+    noise: Any
+    discount: Any
+    half_width: Any
+    dim: int
+
+    def value(self, x: Any) -> Any:
+        """The value at one state."""
+        scaled = jnp.abs(jnp.asarray(x)) / self.half_width
+        time = (self.half_width / self.noise) ** 2
+        kappa = jnp.sqrt(2 * self.discount * time)
+        if self.dim == 1:
+            return time * _interval(scaled[0], kappa)
+        # Along y = max the factor cosh μy/cosh μ would not decay; along the smaller coordinate it does.
+        across, along = jnp.max(scaled), jnp.min(scaled)
+        odd = np.arange(1, 2 * TERMS, 2)
+        wave = 0.5 * np.pi * odd
+        sign = np.where(odd % 4 == 1, 1.0, -1.0)
+        rate = jnp.sqrt(wave**2 + kappa**2)
+        amplitude = 4 * sign / (wave * (wave**2 + kappa**2))
+        decay = jnp.exp(rate * (along - 1)) * (1 + jnp.exp(-2 * rate * along)) / (1 + jnp.exp(-2 * rate))
+        return time * (_interval(across, kappa) - jnp.sum(amplitude * jnp.cos(wave * across) * decay))
+
+
+def _interval(x: Any, kappa: Any) -> Any:
+    """2(1 − cosh κx/cosh κ)/κ², as (1 − x²) times factors that are 1 at κ = 0 and never cancel or overflow."""
+    near, far = 0.5 * kappa * (1 - x), 0.5 * kappa * (1 + x)  # their sum is κ
+    return (1 - x * x) * _sinhc(near) * _sinhc(far) * 2 / (1 + jnp.exp(-2 * kappa))
+
+
+def _sinhc(z: Any) -> Any:
+    """e^{−z} sinh(z)/z."""
+    small = jnp.where(z == 0, 1.0, z)
+    return jnp.where(z == 0, 1.0, -jnp.expm1(-2 * small) / (2 * small))
+
+
+@node(static=("dim",))
+class BallExit:
+    """The mean time for which σ dw stays in the ball |x| < R: (R² − |x|²)/(nσ²)."""
+
+    noise: Any
+    radius: Any
+    dim: int
+
+    def value(self, x: Any) -> Any:
+        """The value at one state; outside the ball the same formula, which is negative there."""
+        x = jnp.asarray(x)
+        return (self.radius * self.radius - jnp.sum(x * x)) / (self.dim * self.noise * self.noise)
+
+
+def brownian_exit(
+    *, dim: int = 1, noise: Any = 1.0, discount: Any = 0.0, half_width: Any = 1.0, shape: tuple[int, ...] | None = None
+) -> tuple[Problem, Grid]:
+    """How long a Brownian motion stays in the cube |x_i| < half_width: no control, cost 1.
+
+    Args:
+      dim: the number of states.
+      noise: σ.
+      discount: β; 0 is the mean exit time.
+      half_width: R.
+      shape: nodes; ``None`` is 101 in one dimension, 41 an axis in more.
+    """
+    problem = Problem(no_drift, unit_cost, noise=noise, discount=discount, target=OutsideCube(half_width).level)
+    shape = ((101,) if dim == 1 else (41,) * dim) if shape is None else shape
+    return problem, Grid([-half_width] * dim, [half_width] * dim, shape)
+
+
+def brownian_exit_exact(*, dim: int = 1, noise: Any = 1.0, discount: Any = 0.0, half_width: Any = 1.0) -> Any:
+    """(1 − x²)/σ² on the interval (−1, 1), .58937083 at the centre of the square for σ = 1.
+
+    Raises:
+      ValueError: more than two dimensions.
+    """
+    if dim not in (1, 2):
+        raise ValueError(f"brownian_exit_exact: got dim = {dim}, wanted 1 or 2; brownian_ball is known in any")
+    return answer(CubeExit(noise, discount, half_width, dim).value)
+
+
+def brownian_ball(
+    *, dim: int = 2, noise: Any = 1.0, radius: Any = 1.0, shape: tuple[int, ...] | None = None
+) -> tuple[Problem, Grid]:
+    """How long on average a Brownian motion stays in the ball |x| < radius: no control, cost 1.
+
+    Nodes outside the ball are held at the answer's continuation, so that the sphere needs not pass through nodes.
+    """
+    problem = Problem(
+        no_drift,
+        unit_cost,
+        noise=noise,
+        target=OutsideBall(radius).level,
+        exit_cost=brownian_ball_exact(dim=dim, noise=noise, radius=radius),
+    )
+    return problem, Grid([-radius] * dim, [radius] * dim, (41,) * dim if shape is None else shape)
+
+
+def brownian_ball_exact(*, dim: int = 2, noise: Any = 1.0, radius: Any = 1.0) -> Any:
+    """(R² − |x|²)/(nσ²)."""
+    return answer(BallExit(noise, radius, dim).value)
+
+
+@node()
+class BangBang:
+    """Hold dx = u dt + ε dw, |u| ≤ 1, near zero at the cost x² discounted at the rate λ: u = −sgn x.
+
+        V = x²/λ − 2|x|/λ² + 2/λ³ + ε²/λ² − (2/(λ²μ)) e^{−μ|x|},   μ = 2λ/(1 + √(1 + 2ε²λ))
+
+    Args:
+      discount: λ.
+      noise: ε.
+    """
+
+    discount: Any = 1.0
+    noise: Any = 0.0
+
+    def drift(self, x: Any, u: Any) -> Any:
+        """The control itself."""
+        return u
+
+    def cost(self, x: Any, u: Any) -> Any:
+        """x²."""
+        return jnp.sum(x * x)
+
+    def value(self, x: Any) -> Any:
+        """The value at one state of the whole line."""
+        rate, variance = self.discount, self.noise * self.noise
+        mu = 2 * rate / (1 + jnp.sqrt(1 + 2 * variance * rate))
+        distance = jnp.abs(jnp.asarray(x)[0])
+        parabola = distance * distance / rate - 2 * distance / rate**2 + 2 / rate**3 + variance / rate**2
+        return parabola - 2 / (rate**2 * mu) * jnp.exp(-mu * distance)
+
+
+def bang_bang(*, discount: Any = 1.0, noise: Any = 0.0, shape: tuple[int, ...] = (81,)) -> tuple[Problem, Grid]:
+    """Hold a point near zero with |u| ≤ 1 at the cost x², on [−2, 2] with the ends held at the exact value.
+
+    Args:
+      discount: λ > 0.
+      noise: ε.
+      shape: nodes.
+    """
+    system = BangBang(discount, noise)
+    problem = Problem(
+        system.drift,
+        system.cost,
+        Box([-1.0], [1.0]),
+        noise=noise_or_none(noise),
+        discount=discount,
+        target=OutsideCube(2.0).level,
+        exit_cost=system.value,
+    )
+    return problem, Grid([-2.0], [2.0], shape, names=("x",))
+
+
+def bang_bang_exact(*, discount: Any = 1.0, noise: Any = 0.0) -> Any:
+    """The value on the whole line, with noise or without; see ``BangBang``."""
+    return answer(BangBang(discount, noise).value)

@@ -223,6 +223,8 @@ ANSWERS = [
     ("eikonal", {}, 1e-5),
     ("eikonal", {"norm": 1, "dim": 3, "discount": 0.5}, 1e-12),
     ("eikonal", {"norm": np.inf, "speed": 2.0}, 1e-12),
+    ("smooth", {}, 1e-5),
+    ("smooth", {"discount": 1.5}, 1e-5),
     ("merton", {}, 1e-10),
     ("merton", {"growth": 0.06, "aversion": 3.0, "interest": 0.02}, 1e-10),
 ]

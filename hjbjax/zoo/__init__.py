@@ -23,6 +23,7 @@ from hjbjax.zoo.linear_quadratic import (
     stochastic_lq_exact,
 )
 from hjbjax.zoo.manipulator import Manipulator, manipulator
+from hjbjax.zoo.manufactured import Smooth, smooth, smooth_exact
 from hjbjax.zoo.mechanical import Pendulum, VanDerPol, pendulum, pendulum_near_upright, van_der_pol
 from hjbjax.zoo.minimum_time import (
     Boat,
@@ -111,6 +112,7 @@ _ENTRIES = (
         start=(0.0,),
         duration=10.0,
     ),
+    Entry("smooth", "a smooth nonlinear problem made for a known value", smooth, smooth_exact, start=(0.8, 0.5)),
 )
 
 catalogue: dict[str, Entry] = {entry.name: entry for entry in _ENTRIES}
@@ -126,6 +128,7 @@ __all__ = [
     "Merton",
     "Pendulum",
     "SingleIntegrator",
+    "Smooth",
     "VanDerPol",
     "bang_bang",
     "bang_bang_exact",
@@ -148,6 +151,8 @@ __all__ = [
     "merton_exact",
     "pendulum",
     "pendulum_near_upright",
+    "smooth",
+    "smooth_exact",
     "stochastic_lq",
     "stochastic_lq_exact",
     "van_der_pol",

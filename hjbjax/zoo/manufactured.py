@@ -1,0 +1,72 @@
+"""Problems made for a value chosen beforehand, to measure orders of convergence.
+
+    smooth   ẋ₁ = −x₁ + x₂,  ẋ₂ = −½x₁ − ½x₂(1 − c²) + c·u,  c = 2 + cos 2x₁,  |u| ≤ 6,  cost q(x) + u²
+
+With f₀ the drift at u = 0, the choice q = βV − f₀·DV + ¼c²V₂² makes V the value, and u = −½cV₂ the control. A
+linear-quadratic problem is no such test: schemes that limit slopes are exact on a quadratic.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+
+from hjbjax.grid import Grid
+from hjbjax.problem import Problem
+from hjbjax.pytree import node
+from hjbjax.sets import Box
+from hjbjax.zoo.ingredients import answer
+
+
+@node()
+class Smooth:
+    """A nonlinear problem with the value V = cosh x₁ − 1 + x₂² + ¼x₁²x₂².
+
+    Args:
+      discount: β.
+    """
+
+    discount: Any = 0.5
+
+    def drift(self, x: Any, u: Any) -> Any:
+        """The drift above."""
+        gain = self.gain(x)
+        return jnp.stack([x[1] - x[0], -0.5 * x[0] - 0.5 * x[1] * (1 - gain * gain) + gain * u[0]])
+
+    def gain(self, x: Any) -> Any:
+        """The input gain c = 2 + cos 2x₁."""
+        return 2 + jnp.cos(2 * x[0])
+
+    def cost(self, x: Any, u: Any) -> Any:
+        """The cost q(x) + u² that makes V the value."""
+        free, slope = self.drift(x, jnp.zeros_like(u)), self.slope(x)
+        best = self.gain(x) * slope[1]
+        return (
+            self.discount * self.value(x) - (free[0] * slope[0] + free[1] * slope[1]) + 0.25 * best * best + u[0] * u[0]
+        )
+
+    def value(self, x: Any) -> Any:
+        """The chosen value."""
+        x = jnp.asarray(x)
+        product = x[0] * x[1]
+        return jnp.cosh(x[0]) - 1 + x[1] * x[1] + 0.25 * product * product
+
+    def slope(self, x: Any) -> Any:
+        """DV, the two derivatives of the value."""
+        return jnp.sinh(x[0]) + 0.5 * x[0] * x[1] * x[1], 2 * x[1] + 0.5 * x[0] * x[0] * x[1]
+
+
+def smooth(*, discount: Any = 0.5, shape: tuple[int, ...] = (81, 81)) -> tuple[Problem, Grid]:
+    """A smooth nonlinear problem on [−1, 1]² whose value is known; compare on |x₁| ≤ .5, |x₂| ≤ .45.
+
+    Args:
+      discount: β.
+      shape: nodes.
+    """
+    system = Smooth(discount)
+    problem = Problem(system.drift, system.cost, Box([-6.0], [6.0]), discount=discount)
+    return problem, Grid([-1.0, -1.0], [1.0, 1.0], shape)
+
+
+def smooth_exact(*, discount: Any = 0.5) -> Any:
+    """The value cosh x₁ − 1 + x₂² + ¼x₁²x₂², whatever the discount."""
+    return answer(Smooth(discount).value)

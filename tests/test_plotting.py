@@ -1,0 +1,459 @@
+"""The pictures: what is drawn is compared with the solution's numbers, never with pixels."""
+
+import io
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from hjbjax import plotting
+from hjbjax.grid import Grid
+from hjbjax.solution import Solution
+
+
+def made(grid, value, policy=None, **more):
+    """A Solution with the given functions of the table of nodes."""
+    x = grid.nodes()
+    policy = np.zeros((*grid.shape, 1)) if policy is None else policy(x)
+    return Solution(grid, value(x), policy, **more)
+
+
+def plane(shape=(5, 7), **more):
+    grid = Grid([-1.0, -2.0], [1.0, 2.0], shape, names=("position", "velocity"), **more)
+    return made(grid, lambda x: x[..., 0] ** 2 + 3 * x[..., 1], lambda x: -x[..., 1:])
+
+
+def line(count=9):
+    return made(Grid([-2.0], [2.0], (count,)), lambda x: x[..., 0] ** 2, lambda x: -x)
+
+
+def volume(shape=(5, 4, 6), periodic=None):
+    grid = Grid([0.0, 0.0, 0.0], [1.0, 2.0, 3.0], shape, periodic, names=("a", "b", "c"))
+    return made(grid, lambda x: x[..., 0] + 10 * x[..., 1] + 100 * x[..., 2], lambda x: x - 1.0)
+
+
+def path_of(states, controls=None, times=None):
+    states = np.asarray(states, float)
+    k = len(states) - 1
+    controls = np.zeros((k, 1)) if controls is None else np.asarray(controls, float)
+    times = np.linspace(0.0, 1.0, k + 1) if times is None else times
+    return SimpleNamespace(times=times, states=states, controls=controls, cost=0.0)
+
+
+def drawn(mesh):
+    """The array of a mesh as (first axis, second axis)."""
+    return np.ma.asarray(mesh.get_array()).T
+
+
+def saved(artists):
+    """Draws everything for real: the errors of a picture come late."""
+    buffer = io.BytesIO()
+    artists[0].get_figure().savefig(buffer, format="png", dpi=40)
+    return buffer.getvalue()
+
+
+def labels(ax):
+    return [text.get_text() for text in ax.get_legend().get_texts()] if ax.get_legend() else []
+
+
+def test_a_value_over_one_axis_is_a_line_through_the_nodes():
+    solution = line()
+    artists = plotting.value(solution)
+    np.testing.assert_array_equal(artists[0].get_xdata(), solution.grid.axis(0))
+    np.testing.assert_array_equal(artists[0].get_ydata(), solution.value)
+    ax = artists[0].axes
+    assert (ax.get_xlabel(), ax.get_ylabel(), ax.get_xlim(), labels(ax)) == ("x1", "V", (-2.0, 2.0), [])
+
+
+def test_a_value_over_two_axes_is_a_mesh_of_the_nodes_with_contours():
+    solution = plane()
+    mesh, contours = plotting.value(solution)
+    np.testing.assert_array_equal(drawn(mesh), solution.value)
+    ax = mesh.axes
+    assert (ax.get_xlabel(), ax.get_ylabel(), mesh.colorbar.ax.get_ylabel()) == ("position", "velocity", "V")
+    assert ax.get_xlim() == (-1.0, 1.0)
+    assert ax.get_ylim() == (-2.0, 2.0)
+    assert mesh.get_clim() == (solution.value.min(), solution.value.max())
+    assert mesh.get_cmap().name == "viridis"
+    assert len(contours.levels) > 3
+    assert all(solution.value.min() < level < solution.value.max() for level in contours.levels)
+    assert saved([mesh]).startswith(b"\x89PNG")
+
+
+def test_levels_are_a_count_or_values_and_a_constant_has_none():
+    contours = plotting.value(plane(), levels=[9.0, 0.5, -99.0])[1]
+    assert contours.levels.tolist() == [0.5]
+    contours = plotting.value(plane(), levels=[1.5, 0.5])[1]
+    assert contours.levels.tolist() == [0.5, 1.5]
+    assert len(plotting.value(plane(), levels=0)) == 1
+    flat = made(plane().grid, lambda x: np.full(x.shape[:-1], 4.0))
+    assert len(plotting.value(flat)) == 1
+    assert saved(plotting.policy(flat))
+
+
+def test_the_axes_given_are_drawn_on_and_keep_their_figure():
+    figure = Figure()
+    ax = figure.add_subplot()
+    artists = plotting.value(plane(), ax=ax, colorbar=False)
+    artists += plotting.switching_curve(plane(), ax=ax)
+    artists += plotting.trajectory(path_of([[0.5, 1.0], [0.0, 0.0]]), ax=ax, label="path")
+    assert {artist.axes for artist in artists} == {ax}
+    assert figure.axes == [ax]
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("position", "velocity")
+    assert labels(ax) == ["switching curve", "path"]
+
+
+def test_nothing_is_shown_and_no_global_state_changes():
+    """In an interpreter of its own: pyplot is not even imported, and rcParams stay as they are."""
+    code = """
+import sys, numpy as np, matplotlib
+before = dict(matplotlib.rcParams.copy())  # looking at rcParams['backend'] itself would choose one
+from hjbjax import plotting
+from hjbjax.grid import Grid
+from hjbjax.solution import Solution
+grid = Grid([-1.0, -1.0], [1.0, 1.0], (5, 5))
+solution = Solution(grid, grid.nodes()[..., 0], grid.nodes()[..., :1], residuals=np.array([1.0, 0.1]))
+for draw in (plotting.value, plotting.policy, plotting.switching_curve, plotting.residuals):
+    draw(solution)[0].get_figure().savefig("/dev/null", format="png")
+assert dict(matplotlib.rcParams.copy()) == before
+assert "matplotlib.pyplot" not in sys.modules
+"""
+    subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], check=True, timeout=60, env={"PATH": "/usr/bin", "HOME": "/tmp"}
+    )
+
+
+def test_importing_plotting_does_not_import_matplotlib():
+    code = "import sys, hjbjax.plotting; sys.exit('matplotlib' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
+
+
+def test_policy_colours_are_centred_at_zero():
+    solution = made(plane().grid, lambda x: x[..., 0], lambda x: x[..., 1:] + 1.0)
+    mesh = plotting.policy(solution)[0]
+    np.testing.assert_array_equal(drawn(mesh), solution.policy[..., 0])
+    assert mesh.get_clim() == (-3.0, 3.0)
+    assert np.ptp(mesh.get_cmap()(0.5)[:3]) < 0.02  # the middle is grey
+    assert mesh.colorbar.ax.get_ylabel() == "u"
+
+
+@pytest.mark.parametrize("name", ["viridis", "coolwarm"])
+def test_the_colour_maps_are_even_in_lightness(name):
+    """viridis rises, coolwarm rises and falls, in CIE lightness; jet would do neither."""
+    rgb = matplotlib.colormaps[name](np.linspace(0, 1, 33))[:, :3]
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    luminance = linear @ [0.2126, 0.7152, 0.0722]
+    steps = np.diff(116 * np.cbrt(luminance) - 16)
+    assert np.all(steps[:15] > 0)
+    assert np.all(steps[17:] * (1 if name == "viridis" else -1) > 0)
+
+
+def test_each_input_has_its_picture():
+    solution = volume()
+    for input in range(3):
+        mesh = plotting.policy(solution, input=input, fixed={"c": 0.6})[0]
+        np.testing.assert_allclose(drawn(mesh), solution.policy[:, :, 1, input])
+        assert mesh.colorbar.ax.get_ylabel() == f"u{input + 1}"
+
+
+@pytest.mark.parametrize("input", [3, -1, True, 1.0, "u1"])
+def test_an_input_that_does_not_exist_is_refused(input):
+    with pytest.raises(ValueError, match=r"got input=.*, wanted one of 0 to 2"):
+        plotting.policy(volume(), input=input, fixed={"c": 0.6})
+
+
+def test_without_a_control_there_is_no_policy_to_draw():
+    with pytest.raises(ValueError, match="the problem has no control"):
+        plotting.policy(made(line().grid, lambda x: x[..., 0], lambda x: np.zeros((*x.shape[:-1], 0))))
+    with pytest.raises(ValueError, match="has no policy"):
+        plotting.policy(Solution(line().grid, line().value, None))
+
+
+def test_infinite_values_are_masked_and_named():
+    solution = plane()
+    solution.value[0, :] = np.inf
+    mesh = plotting.value(solution)[0]
+    np.testing.assert_array_equal(np.ma.getmaskarray(drawn(mesh)), np.isinf(solution.value))
+    assert labels(mesh.axes) == ["V = ∞"]
+    assert mesh.get_clim() == (solution.value[1:].min(), solution.value[1:].max())
+    assert matplotlib.colors.to_hex(mesh.get_cmap().get_bad()) == plotting.GREY
+    policy = plotting.policy(solution)[0]
+    np.testing.assert_array_equal(np.ma.getmaskarray(drawn(policy)), np.isinf(solution.value))
+    assert labels(policy.axes) == ["no control defined"]
+    solution.value[3, 3] = np.nan
+    mesh = plotting.value(solution)[0]
+    assert labels(mesh.axes) == ["V not finite"]
+    assert np.ma.getmaskarray(drawn(mesh))[3, 3]
+    assert saved([mesh])
+
+
+def test_masked_nodes_of_a_line_are_bands_half_a_cell_wide():
+    solution = line()  # spacing 1/2
+    solution.value[[0, 1, 5]] = np.inf
+    curve, *bands = plotting.value(solution)
+    np.testing.assert_array_equal(np.ma.getmaskarray(curve.get_ydata()), np.isinf(solution.value))
+    extents = [(band.get_x(), band.get_x() + band.get_width()) for band in bands]
+    assert extents == [(-2.25, -1.25), (0.25, 0.75)]
+    assert labels(curve.axes) == ["V = ∞"]
+
+
+def test_a_value_without_one_finite_node_is_all_grey():
+    grid = plane().grid
+    for entry in (np.inf, np.nan):
+        artists = plotting.value(made(grid, lambda x, entry=entry: np.full(x.shape[:-1], entry)))
+        assert drawn(artists[0]).mask.all()
+        assert saved(artists)
+
+
+def test_a_slice_on_a_node_is_that_node_and_between_nodes_the_mean():
+    solution = volume()
+    np.testing.assert_array_equal(drawn(plotting.value(solution, fixed={"c": 1.2})[0]), solution.value[:, :, 2])
+    np.testing.assert_array_equal(drawn(plotting.value(solution, fixed={2: 1.2})[0]), solution.value[:, :, 2])
+    between = drawn(plotting.value(solution, fixed={"b": 1.0})[0])
+    np.testing.assert_allclose(between, (solution.value[:, 1] + solution.value[:, 2]) / 2, rtol=1e-14)
+    artists = plotting.value(solution, fixed={"a": 0.1, "c": 0.6})
+    expected = [float(solution.value_at([0.1, b, 0.6])) for b in solution.grid.axis(1)]
+    np.testing.assert_allclose(artists[0].get_ydata(), expected, rtol=1e-12)
+    assert (artists[0].axes.get_xlabel(), artists[0].axes.get_title(loc="right")) == ("b", "a = 0.1, c = 0.6")
+
+
+def test_enumerated_controls_are_cut_at_the_nearest_node():
+    grid = volume().grid
+    solution = made(grid, lambda x: x[..., 0], lambda x: np.sign(x[..., 2:] - 1.5), discrete=True)
+    mesh = plotting.policy(solution, fixed={"c": 1.6})[0]  # nodes at 1.2 and 1.8
+    assert set(np.unique(drawn(mesh))) == {1.0}
+
+
+def test_a_slice_next_to_infinity():
+    """On a node its infinite neighbours have no weight; between nodes an infinite one makes the mean infinite."""
+    solution = volume()
+    solution.value[:, :, 3] = np.inf
+    assert not np.ma.getmaskarray(drawn(plotting.value(solution, fixed={"c": 1.2})[0])).any()
+    assert np.ma.getmaskarray(drawn(plotting.value(solution, fixed={"c": 1.3})[0])).all()
+
+
+def test_a_slice_across_the_seam_uses_both_its_sides():
+    solution = volume(periodic=(False, False, True))  # nodes at 0, .5, ..., 2.5 of the period 3
+    seam = drawn(plotting.value(solution, fixed={"c": 2.75})[0])
+    np.testing.assert_allclose(seam, (solution.value[:, :, 5] + solution.value[:, :, 0]) / 2)
+    again = drawn(plotting.value(solution, fixed={"c": -0.25})[0])
+    np.testing.assert_allclose(again, seam)
+
+
+def test_a_picture_of_more_than_two_axes_is_refused():
+    grid = Grid([0.0] * 5, [1.0] * 5, (2,) * 5)
+    solution = made(grid, lambda x: x.sum(-1))
+    for draw in (plotting.value, plotting.policy, plotting.switching_curve):
+        with pytest.raises(ValueError, match="choose two axes and fix the other three"):
+            draw(solution)
+        with pytest.raises(ValueError, match="3 are free"):
+            draw(solution, fixed={"x1": 0.0, "x2": 0.0})
+    assert drawn(plotting.value(solution, fixed={"x1": 0.0, "x3": 1.0, 4: 0.0})[0]).shape == (2, 2)
+    with pytest.raises(ValueError, match="choose two axes and fix the other one"):
+        plotting.value(volume())
+
+
+@pytest.mark.parametrize(
+    ("fixed", "message"),
+    [
+        ({"velocty": 0.0}, r"axis 'velocty', wanted one of position, velocity or 0 to 1; did you mean 'velocity'"),
+        ({2: 0.0}, "wanted one of position"),
+        ({True: 0.0}, "wanted one of position"),
+        ({"velocity": 2.5}, r"velocity = 2.5, which is outside the grid, \[-2, 2\]"),
+        ({"velocity": np.nan}, "outside the grid"),
+        ({"velocity": [0.0, 1.0]}, "wanted one coordinate"),
+        ({"velocity": "0"}, "wanted one coordinate"),
+        ({"velocity": 0.0, 1: 0.0}, "twice"),
+        ({0: 0.0, 1: 0.0}, "every axis is fixed"),
+    ],
+)
+def test_slices_that_make_no_sense_are_refused(fixed, message):
+    with pytest.raises(ValueError, match=message):
+        plotting.value(plane(), fixed=fixed)
+
+
+def test_a_periodic_axis_is_closed_at_its_seam():
+    solution = plane(shape=(8, 5), periodic=(True, False))
+    for mesh, field in (
+        (plotting.value(solution)[0], solution.value),
+        (plotting.policy(solution)[0], solution.policy[..., 0]),
+    ):
+        array = drawn(mesh)
+        assert array.shape == (9, 5)
+        np.testing.assert_array_equal(array[:-1], field)
+        np.testing.assert_array_equal(array[-1], field[0])
+        assert mesh.axes.get_xlim() == (-1.0, 1.0)
+    circle = made(Grid([0.0], [2.0], (4,), periodic=(True,)), lambda x: np.cos(np.pi * x[..., 0]))
+    curve = plotting.value(circle)[0]
+    assert curve.get_xdata()[-1] == 2.0
+    assert curve.get_ydata()[-1] == circle.value[0]
+
+
+def test_the_switching_curve_lies_where_the_control_changes_sign():
+    grid = Grid([-1.0, -1.0], [1.0, 1.0], (41, 41))
+    smooth = made(grid, lambda x: x[..., 0], lambda x: x[..., :1] + 2 * x[..., 1:])
+    vertices = plotting.switching_curve(smooth)[0].get_paths()[0].vertices
+    assert np.ptp(vertices[:, 1]) > 0.9
+    np.testing.assert_allclose(vertices[:, 0], -2 * vertices[:, 1], atol=1e-12)
+    jump = made(grid, lambda x: x[..., 0], lambda x: np.where(x[..., :1] + x[..., 1:] ** 3 > 0.01, 1.0, -1.0))
+    vertices = plotting.switching_curve(jump)[0].get_paths()[0].vertices
+    distance = np.abs(vertices[:, 0] + vertices[:, 1] ** 3 - 0.01)
+    assert len(vertices) > 40
+    assert distance.max() < 2 * 0.05  # in x1 the curve moves at most 3 per unit of x2; cells are .05 wide
+
+
+def test_switching_points_over_one_axis():
+    assert [line.get_xdata()[0] for line in plotting.switching_curve(line(), label=None)] == [0.0]  # a node
+    shifted = made(line().grid, lambda x: x[..., 0], lambda x: 0.2 - x)
+    found = plotting.switching_curve(shifted, label=None)
+    assert [line.get_xdata()[0] for line in found] == pytest.approx([0.2])
+    rest = made(line().grid, lambda x: x[..., 0], lambda x: np.where(abs(x) < 0.6, 0.0, 5 * x - abs(x)))
+    assert [line.get_xdata()[0] for line in plotting.switching_curve(rest, label=None)] == [0.0]  # zero at three nodes
+    touching = made(line().grid, lambda x: x[..., 0], lambda x: (x - 1.0) ** 2 * (x + 1.0))
+    found = plotting.switching_curve(touching, label=None)
+    assert [line.get_xdata()[0] for line in found] == [-1.0]  # zero at +1 without a change of sign
+
+
+def test_no_switching_curve_across_masked_nodes():
+    solution = line()
+    solution.value[4] = np.inf  # the node at 0, where the sign changes
+    assert plotting.switching_curve(solution, label=None) == []
+
+
+def test_a_control_that_keeps_its_sign_has_no_switching_curve():
+    solution = made(plane().grid, lambda x: x[..., 0], lambda x: 2.0 + x[..., :1])
+    with pytest.raises(ValueError, match="u stays between 1 and 3"):
+        plotting.switching_curve(solution)
+
+
+def test_a_path_in_the_plane():
+    path = path_of(np.cumsum(np.ones((6, 3)), 0) * [1, 2, 3])
+    curve, start, end = plotting.trajectory(path, axes=(2, 0))
+    np.testing.assert_array_equal(curve.get_xydata(), path.states[:, [2, 0]])
+    np.testing.assert_array_equal(start.get_xydata()[0], path.states[0, [2, 0]])
+    np.testing.assert_array_equal(end.get_xydata()[0], path.states[-1, [2, 0]])
+    assert (curve.axes.get_xlabel(), curve.axes.get_ylabel()) == ("x3", "x1")
+    curve = plotting.trajectory(path, names=("a", "b", "c"), label="run")[0]
+    assert (curve.axes.get_xlabel(), curve.axes.get_ylabel(), labels(curve.axes)) == ("a", "b", ["run"])
+    with pytest.raises(ValueError, match="the path has 3 states, wanted two of 0 to 2"):
+        plotting.trajectory(path, axes=(0, 3))
+
+
+def test_a_path_over_time():
+    path = path_of(np.arange(8.0).reshape(4, 2))
+    *curves, legend = plotting.trajectory(path, axes=None, grid=plane().grid)
+    for i, curve in enumerate(curves):
+        np.testing.assert_array_equal(curve.get_xdata(), path.times)
+        np.testing.assert_array_equal(curve.get_ydata(), path.states[:, i])
+    assert [text.get_text() for text in legend.get_texts()] == ["position", "velocity"]
+    single = plotting.trajectory(path_of([[1.0], [0.5]]))
+    assert (len(single), single[0].axes.get_xlabel(), single[0].axes.get_ylabel()) == (1, "t", "x1")
+
+
+@pytest.mark.parametrize("unwound", [True, False])
+def test_a_path_is_cut_at_the_seam(unwound):
+    """Over the top and round again: the line reaches both edges, and no stroke crosses the picture."""
+    grid = Grid([-np.pi, -8.0], [np.pi, 8.0], (8, 8), periodic=(True, False))
+    angle = np.linspace(2.0, 2.0 + 3 * np.pi, 38)
+    rate = np.linspace(5.0, 1.0, 38)
+    shown = angle if unwound else (angle + np.pi) % (2 * np.pi) - np.pi
+    curve, _, end = plotting.trajectory(path_of(np.stack([shown, rate], 1)), grid=grid)
+    x, y = curve.get_xydata().T
+    gaps = np.flatnonzero(np.isnan(x))
+    assert len(gaps) == 2
+    np.testing.assert_allclose(x[gaps - 1], np.pi)
+    np.testing.assert_allclose(x[gaps + 1], -np.pi)
+    np.testing.assert_allclose(y[gaps - 1], y[gaps + 1])
+    np.testing.assert_allclose(y[gaps[0] - 1], np.interp(np.pi, angle, rate))
+    pieces = np.split(x, gaps)
+    assert max(np.abs(np.diff(piece[np.isfinite(piece)])).max() for piece in pieces) < 0.3
+    assert np.nanmax(np.abs(x)) <= np.pi + 1e-12
+    np.testing.assert_allclose(end.get_xdata(), [(angle[-1] + np.pi) % (2 * np.pi) - np.pi])
+    over_time = plotting.trajectory(path_of(np.stack([shown, rate], 1)), axes=None, grid=grid)[0]
+    np.testing.assert_allclose(over_time.get_ydata(), angle)
+
+
+def test_a_path_on_a_torus_and_one_along_the_seam():
+    grid = Grid([0.0, 0.0], [1.0, 1.0], (4, 4), periodic=(True, True))
+    curve = plotting.trajectory(path_of([[0.8, 0.9], [1.2, 1.1]]), grid=grid)[0]
+    nan = np.nan
+    wanted = [[0.8, 0.9], [1, 1], [nan, nan], [0, 0], [0.2, 0.1]]
+    np.testing.assert_allclose(curve.get_xydata(), wanted, atol=1e-12)
+    curve = plotting.trajectory(path_of([[0.75, 0.5], [1.0, 0.5], [1.25, 0.5]]), grid=grid)[0]
+    wanted = [[0.75, 0.5], [1, 0.5], [nan, nan], [0, 0.5], [0.25, 0.5]]
+    np.testing.assert_allclose(curve.get_xydata(), wanted, atol=1e-12)
+
+
+def test_controls_are_steps():
+    path = path_of(np.zeros((4, 1)), [[1.0], [-1.0], [0.5]], np.array([0.0, 1.0, 3.0, 4.0]))
+    steps = plotting.controls(path)[0]
+    np.testing.assert_array_equal(steps.get_data().values, [1.0, -1.0, 0.5])
+    np.testing.assert_array_equal(steps.get_data().edges, path.times)
+    assert steps.axes.get_ylabel() == "u"
+    *steps, legend = plotting.controls(path_of(np.zeros((2, 1)), [[1.0, 2.0]]))
+    assert [text.get_text() for text in legend.get_texts()] == ["u1", "u2"]
+
+
+@pytest.mark.parametrize("solution", [line(), plane(), volume()], ids=["1-D", "2-D", "3-D"])
+def test_the_closed_loop_in_one_figure(solution):
+    n = solution.grid.ndim
+    states = np.linspace(np.full(n, 0.6), np.full(n, 0.1), 7)
+    artists = plotting.closed_loop(solution, path_of(states))
+    figure = artists[0].get_figure()
+    assert saved(artists)
+    titles = [ax.get_title(loc="right") for ax in figure.axes]
+    assert ("c = 0.6" in titles) == (n == 3)
+    assert len([ax for ax in figure.axes if ax.get_xlabel() == "t"]) == 1
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_the_closed_loop_of_a_path_that_ends_at_once_or_has_no_control(count):
+    states = np.full((1 + count, 2), 0.5)
+    assert saved(plotting.closed_loop(plane(), path_of(states, np.zeros((count, 1 - count)))))
+
+
+def test_residuals_on_a_logarithmic_scale():
+    history = np.array([1.0, 0.1, 0.0, np.nan, np.inf, 1e-3])
+    curve, band = plotting.residuals(SimpleNamespace(residuals=history))
+    np.testing.assert_array_equal(curve.get_xdata(), np.arange(1, 7))
+    np.testing.assert_array_equal(np.ma.getmaskarray(curve.get_ydata()), [False, False, True, True, True, False])
+    np.testing.assert_array_equal(curve.get_ydata().compressed(), [1.0, 0.1, 1e-3])
+    assert (band.get_x(), band.get_width()) == (3.5, 2.0)
+    ax = curve.axes
+    assert (ax.get_yscale(), ax.get_xlabel(), ax.get_ylabel(), labels(ax)) == (
+        "log",
+        "step",
+        "residual",
+        ["not finite"],
+    )
+    assert saved([curve])
+    plotting.residuals(SimpleNamespace(residuals=np.array([1.0, 0.5])), ax=ax, label="other")
+    assert labels(ax) == ["not finite", "other"]
+
+
+def test_without_a_history_there_are_no_residuals():
+    with pytest.raises(ValueError, match="carries no history"):
+        plotting.residuals(line())
+
+
+def test_a_marched_solution_is_drawn_at_one_of_its_times():
+    grid = line().grid
+    value = np.arange(3.0)[:, None] * grid.axis(0)
+    solution = Solution(grid, value, value[..., None], times=np.array([0.5, 0.25, 0.0]))
+    np.testing.assert_array_equal(plotting.value(solution)[0].get_ydata(), value[2])
+    artists = plotting.value(solution, time=0.3)
+    np.testing.assert_array_equal(artists[0].get_ydata(), value[1])
+    assert artists[0].axes.get_title(loc="right") == "t = 0.25"
+    np.testing.assert_array_equal(plotting.policy(solution, time=0.5)[0].get_ydata(), value[0])
+    with pytest.raises(ValueError, match="stationary"):
+        plotting.value(line(), time=0.0)
+
+
+def test_a_batch_is_refused():
+    solution = line()
+    with pytest.raises(ValueError, match="draw one lane at a time"):
+        plotting.value(Solution(solution.grid, np.stack([solution.value] * 2), solution.policy))

@@ -4,6 +4,7 @@ Beyond an edge that is not periodic stands a copy of the edge node: a one-sided 
 zero, which projects outward drift back onto the box and reflects noise.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -65,3 +66,25 @@ def one_sided(values: jax.Array, grid: Grid, axis: int) -> tuple[jax.Array, jax.
     up = neighbour(values, grid, unit(grid, axis, 1))
     down = neighbour(values, grid, unit(grid, axis, -1))
     return (up - values) / h_up, (values - down) / h_down
+
+
+def sparse(offsets: Sequence[tuple[int, ...]], values: Sequence[np.ndarray], diagonal: np.ndarray, grid: Grid) -> Any:
+    """The matrix with ``diagonal`` and, for every offset o, entry values_o(x) in row x and column x + o.
+
+    Host level. Nodes are numbered in C order. Entries whose column lies outside the box must be zero.
+
+    Returns:
+      A SciPy CSR array of shape (nodes, nodes) without explicit zeros off the diagonal.
+    """
+    from scipy.sparse import coo_array
+
+    number = np.arange(grid.size).reshape(grid.shape)
+    rows, columns, entries = [number.ravel()], [number.ravel()], [np.asarray(diagonal, np.float64).ravel()]
+    for offset, value in zip(offsets, values, strict=True):
+        nonzero = np.asarray(value).ravel() != 0
+        target = np.roll(number, [-step for step in offset], axis=range(grid.ndim)).ravel()
+        rows.append(number.ravel()[nonzero])
+        columns.append(target[nonzero])
+        entries.append(np.asarray(value, np.float64).ravel()[nonzero])
+    index = (np.concatenate(rows), np.concatenate(columns))
+    return coo_array((np.concatenate(entries), index), shape=(grid.size, grid.size)).tocsr()

@@ -1,0 +1,170 @@
+"""One step: the residual of the variational inequality, the greedy policy, and the linear equation it leaves.
+
+At a node that is not held, with r = min_u max_d H(u, d) − β V in cost per unit time and s = r/(Q + β) its
+size in cost units (the Bellman operator of the chain is T V = V + s at the greedy action),
+
+    residual = max(min(s, ψ − V), g − V),      V ← V + residual  is  V ← max(g, min(ψ, T V)).
+
+Nodes on the target, and rest points of an undiscounted problem, are held at given values. For one policy the
+equation is linear: δ = s + Σ_o w_o δ(x + o) with weights w_o = c_o/(Q + β), and s, w = ψ − V, 0 (or g − V, 0)
+where the constraint is the active branch. That correction is what every method solves, exactly or roughly.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from hjbjax import chain, fields, hamiltonian, sets
+from hjbjax.chain import Rates
+from hjbjax.grid import Grid
+from hjbjax.problem import Problem
+from hjbjax.pytree import node
+from hjbjax.schemes import Upwind
+
+
+@node()
+class Conditions:
+    """What the value obeys beside the equation itself, at every node.
+
+    Args:
+      held: bool (*grid), where the value is given.
+      given: (*grid), the value there.
+      stop: ψ at the nodes, or None.
+      floor: g at the nodes, or None.
+    """
+
+    held: Any
+    given: Any
+    stop: Any = None
+    floor: Any = None
+
+    def impose(self, value: jax.Array) -> jax.Array:
+        """``value`` with the given values put in and the constraints respected: max(g, min(ψ, V))."""
+        if self.stop is not None:
+            value = jnp.minimum(value, self.stop)
+        if self.floor is not None:
+            value = jnp.maximum(value, self.floor)
+        return jnp.where(self.held, self.given, value)
+
+
+@node()
+class Greedy:
+    """The greedy policy of a value function and what it leaves unsolved.
+
+    Args:
+      rate: r = min max H − β V, (*grid), cost per unit time; zero where held.
+      controls: the m components of u, each (*grid).
+      disturbances: the components of d, each (*grid).
+    """
+
+    rate: jax.Array
+    controls: tuple[jax.Array, ...]
+    disturbances: tuple[jax.Array, ...]
+
+
+@node()
+class Correction:
+    """The linear equation δ = source + Σ_o weights_o δ(x + o) for a correction δ of the value, in cost units."""
+
+    source: jax.Array
+    weights: Rates
+
+
+def conditions(problem: Problem, grid: Grid, dtype: Any, t: Any = 0.0) -> Conditions:
+    """Target, stopping cost and running maximum at the nodes."""
+    x = grid.components(dtype)
+
+    def at_nodes(ingredient):
+        if not callable(ingredient):
+            return jnp.full(grid.shape, ingredient, dtype)
+        return jnp.broadcast_to(fields.scalar(ingredient, *problem.state_arguments(x, t), dtype=dtype), grid.shape)
+
+    held = jnp.zeros(grid.shape, bool) if problem.target is None else at_nodes(problem.target) <= 0
+    given = jnp.zeros(grid.shape, dtype) if problem.exit_cost is None else at_nodes(problem.exit_cost)
+    stop = None if problem.stopping_cost is None else at_nodes(problem.stopping_cost)
+    floor = None if problem.running_max is None else at_nodes(problem.running_max)
+    return Conditions(held, jnp.where(held, given, 0), stop, floor)
+
+
+def greedy(problem: Problem, grid: Grid, value: jax.Array, held: jax.Array, *, scheme: Upwind, t: Any = 0.0) -> Greedy:
+    """The optimal actions at ``value`` and the rate r that is left."""
+    how = hamiltonian.setting(problem, grid.ndim, value.dtype)
+    best, u, d = hamiltonian.optimise(hamiltonian.local(problem, grid, value, scheme=scheme, t=t), how)
+    return _left_over(problem, grid, value, held, best, u, d)
+
+
+def respond(
+    problem: Problem, grid: Grid, value: jax.Array, held: jax.Array, current: Greedy, *, scheme: Upwind, t: Any = 0.0
+) -> Greedy:
+    """The inner player's best answer to the outer player's current policy, in a game."""
+    how = hamiltonian.setting(problem, grid.ndim, value.dtype)
+    here = hamiltonian.local(problem, grid, value, scheme=scheme, t=t)
+    u, d = list(current.controls), list(current.disturbances)
+    if problem.isaacs == "upper":
+        best, d = hamiltonian.best_response(here, how.disturbance, lambda d: (u, d))
+    else:
+        best, u = hamiltonian.best_response(here, how.control, lambda u: (u, d))
+    return _left_over(problem, grid, value, held, best, u, d)
+
+
+def _left_over(problem: Problem, grid: Grid, value: Any, held: Any, best: Any, u: list, d: list) -> Greedy:
+    rate = jnp.where(held, 0, best - problem.discount * value)
+    full = [tuple(jnp.broadcast_to(jnp.asarray(c, value.dtype), grid.shape) for c in action) for action in (u, d)]
+    return Greedy(rate, *full)
+
+
+def frozen_rate(
+    problem: Problem, grid: Grid, value: jax.Array, policy: Greedy, *, scheme: Upwind, t: Any = 0.0
+) -> jax.Array:
+    """H(u, d) − β V at given actions: what a change of the problem's numbers does to the residual."""
+    here = hamiltonian.local(problem, grid, value, scheme=scheme, t=t)
+    return here.at(list(policy.controls), list(policy.disturbances)) - problem.discount * value
+
+
+def correction(
+    problem: Problem,
+    grid: Grid,
+    value: jax.Array,
+    policy: Greedy,
+    rules: Conditions,
+    *,
+    scheme: Upwind,
+    t: Any = 0.0,
+) -> Correction:
+    """The linear equation for δ under one policy; the active branch of the constraints is chosen node by node."""
+    u, d = list(policy.controls), list(policy.disturbances) if problem.is_game else None
+    rates = chain.rates(problem, grid, u, d, scheme=scheme, dtype=value.dtype, t=t)
+    leaving = rates.total() + problem.discount
+    fastest = jnp.max(leaving)
+    pace = jnp.where(leaving > 0, leaving, jnp.where(fastest > 0, fastest, 1))  # nothing moves: the cost piles up
+    source, free = policy.rate / pace, ~rules.held
+    if rules.stop is not None:
+        stops = free & (rules.stop - value < source)
+        source, free = jnp.where(stops, rules.stop - value, source), free & ~stops
+    if rules.floor is not None:
+        floored = ~rules.held & (rules.floor - value > source)
+        source, free = jnp.where(floored, rules.floor - value, source), free & ~floored
+    return Correction(source, rates.scaled(jnp.where(free, 1 / pace, 0)))
+
+
+def fastest_rate(problem: Problem, grid: Grid, *, scheme: Upwind, dtype: Any, t: Any = 0.0) -> jax.Array:
+    """max over the actions of Q at every node, (*grid): with Δt = 1/(Q + β) value iteration is monotone.
+
+    Q is convex in u for a drift affine in u, so that corners of the sets suffice; samples are added for others.
+    """
+    result = jnp.zeros(grid.shape, dtype)
+    for u in _probes(problem.controls, dtype):
+        for d in _probes(problem.disturbances, dtype):
+            rates = chain.rates(problem, grid, u, d if problem.is_game else None, scheme=scheme, dtype=dtype, t=t)
+            result = jnp.maximum(result, rates.total())
+    return result
+
+
+def _probes(choices: Any, dtype: Any) -> list[list]:
+    if choices is None:
+        return [[]]
+    points = jnp.asarray(sets.extremes(choices), dtype)
+    if not isinstance(choices, sets.Finite):
+        points = jnp.concatenate([points, jnp.asarray(sets.samples(choices, 9), dtype)])
+    return [[points[k, j] for j in range(points.shape[1])] for k in range(points.shape[0])]

@@ -1,0 +1,106 @@
+"""Bounds on the distance from a value function to the exact solution of the discrete equation.
+
+Discounted: with ρ = max(min(r/β, ψ − V), g − V) at every node (zero where held)
+
+    V + min ρ ≤ V_h ≤ V + max ρ.
+
+Undiscounted with running cost L ≥ 0, exit cost ≥ 0 and V ≥ 0: with L the least running cost at a node,
+
+    V/(1 + η) ≤ V_h ≤ V/(1 − ρ),    ρ = max(r/L)⁺ < 1,   η = max((−r)⁺/L),
+
+because scaling a super- or subsolution scales its generator part and not its cost. Minimum time is L = 1.
+Both follow from the comparison principle of a monotone scheme; they bound the algebraic error and not the
+error of the grid, hold where the minimum over the actions is exact, and want float64.
+"""
+
+import enum
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from hjbjax.bellman import Conditions, Correction, Greedy
+from hjbjax.pytree import node
+
+
+class Certificate(enum.Enum):
+    """Which bound a problem admits; the value says so in words."""
+
+    ADDITIVE = "bound from the discount: V + min r/β ≤ V_h ≤ V + max r/β"
+    MULTIPLICATIVE = "bound from the running cost: V/(1 + max(−r/L)) ≤ V_h ≤ V/(1 − max(r/L))"
+    NONE = "no certificate: without discount and positive running cost the residual bounds nothing"
+
+
+@node()
+class Gap:
+    """How far the bounds are from the value.
+
+    Args:
+      below, above: what bounds V_h: V + shift where additive, V · factor where multiplicative.
+      error: the largest |bound − V| over the nodes that count, cost units; without a certificate the size of the
+        last correction or of the residual.
+      residual: the largest |residual| in cost units.
+    """
+
+    below: jax.Array
+    above: jax.Array
+    error: jax.Array
+    residual: jax.Array
+
+
+def gap(
+    kind: Certificate,
+    value: jax.Array,
+    policy: Greedy,
+    equation: Correction,
+    rules: Conditions,
+    *,
+    discount: Any,
+    least_cost: Any,
+    counted: Any,
+    moved: Any,
+) -> Gap:
+    """The certificate of ``value``.
+
+    Args:
+      kind: which bound applies.
+      value: V.
+      policy: the greedy policy at V with its rate r.
+      equation: the correction equation there, whose source is the residual.
+      rules: held nodes and constraints.
+      discount: β.
+      least_cost: L at every node, for the multiplicative bound.
+      counted: bool (*grid), the nodes whose error counts (those that reach the target).
+      moved: the size of the last correction, the fallback measure.
+    """
+    residual = jnp.max(jnp.where(counted, jnp.abs(equation.source), 0))
+    free = counted & ~rules.held
+    zero, one = jnp.zeros_like(residual), jnp.ones_like(residual)
+    if kind is Certificate.ADDITIVE:
+        shift = policy.rate / discount
+        if rules.stop is not None:
+            shift = jnp.minimum(shift, rules.stop - value)
+        if rules.floor is not None:
+            shift = jnp.maximum(shift, rules.floor - value)
+        shift = jnp.where(rules.held, 0, shift)
+        below, above = jnp.min(shift), jnp.max(shift)
+        return Gap(below, above, jnp.maximum(jnp.abs(below), jnp.abs(above)), residual)
+    if kind is Certificate.MULTIPLICATIVE:
+        safe = jnp.where(free & (least_cost > 0), least_cost, 1)
+        relative = jnp.where(free, jnp.where(least_cost > 0, policy.rate / safe, jnp.sign(policy.rate) * jnp.inf), 0)
+        rho, eta = jnp.maximum(jnp.max(relative), 0), jnp.maximum(jnp.max(-relative), 0)
+        below, above = 1 / (1 + eta), jnp.where(rho < 1, 1 / jnp.where(rho < 1, 1 - rho, 1), jnp.inf)
+        largest = jnp.max(jnp.where(counted, value, 0))
+        valid = jnp.all(jnp.where(counted, value, 0) >= 0)
+        error = jnp.where(valid, largest * jnp.maximum(above - 1, 1 - below), jnp.inf)
+        return Gap(jnp.where(jnp.isnan(residual), residual, below), above, error + 0 * residual, residual)
+    return Gap(zero, one, jnp.maximum(residual, moved), residual)
+
+
+def bounds(kind: Certificate, value: Any, below: Any, above: Any) -> tuple[Any, Any] | None:
+    """The lower and upper bound arrays, or None without a certificate."""
+    if kind is Certificate.ADDITIVE:
+        return value + below, value + above
+    if kind is Certificate.MULTIPLICATIVE:
+        return value * below, value * above
+    return None

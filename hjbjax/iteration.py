@@ -1,0 +1,212 @@
+"""Many steps: value iteration and policy iteration as one loop.
+
+Every method repeats the same step. At V the greedy policy leaves a residual; the linear equation of that
+policy gives a correction δ; V + δ is the next value. What differs is how well the equation is solved: value
+iteration takes its diagonal with the largest rate (monotone, a contraction), modified policy iteration a few
+Gauss–Seidel sweeps, policy iteration (Howard; semismooth Newton) solves it. In a game the outer player's policy
+is kept while the inner player's problem is improved (Hoffman–Karp); improving both at once may cycle.
+
+The loop stops by the certificate of the value it returns, not by the size of a step, and tests finiteness: a
+NaN residual is never taken for convergence.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from hjbjax import bellman, certificates, chain, hamiltonian, relaxation
+from hjbjax.bellman import Conditions, Correction, Greedy
+from hjbjax.certificates import Certificate, Gap
+from hjbjax.grid import Grid
+from hjbjax.problem import Problem
+from hjbjax.pytree import node
+from hjbjax.relaxation import Evaluation, Sweeps
+from hjbjax.schemes import Upwind
+from hjbjax.status import Status
+
+HISTORY = 256  # steps whose residuals one chunk can record
+GROWTH = 1e6  # a residual that has grown by this factor over its smallest has diverged
+ROUNDING = 64  # residuals below this many units in the last place of max|V| are rounding
+
+
+@node()
+class ValueIteration:
+    """V ← max(g, min(ψ, V + (min max H − β V)/(max_u Q + β))): monotone, converges from every guess.
+
+    The error falls by 1/(1 + βΔt) a step: many cheap steps. For reference, for games, and where memory rules.
+    """
+
+
+@node(static=("replies",))
+class PolicyIteration:
+    """Improve the policy, evaluate it, repeat; the evaluation is what distinguishes the methods of this family.
+
+    Args:
+      evaluation: ``Sweeps(count)`` is modified policy iteration; ``Krylov()`` and ``Direct()`` are Howard's.
+      replies: in a game, the inner player's improvements for each of the outer player's, at most.
+    """
+
+    evaluation: Evaluation = Sweeps()
+    replies: int = 20
+
+
+Method = ValueIteration | PolicyIteration
+
+
+@node(static=("scheme", "certificate"))
+class Task:
+    """All that stays the same during a solve.
+
+    Args:
+      problem, grid: the question.
+      method: how the correction is made.
+      rules: held nodes and constraints.
+      counted: bool (*grid), nodes that have a finite value.
+      least_cost: the least running cost at each node, for the multiplicative certificate; else None.
+      pace: max Q + β at each node for value iteration; else None.
+      tol: certified error to reach, cost units.
+      scheme, certificate: static choices.
+    """
+
+    problem: Problem
+    grid: Grid
+    method: Method
+    rules: Conditions
+    counted: jax.Array
+    least_cost: jax.Array | None
+    pace: jax.Array | None
+    tol: Any
+    scheme: Upwind
+    certificate: Certificate
+
+
+@node()
+class State:
+    """Where the iteration stands: a value, its greedy policy, its certificate, and the loop's book-keeping."""
+
+    value: jax.Array
+    policy: Greedy
+    gap: Gap
+    step: jax.Array
+    best: jax.Array
+    since_best: jax.Array
+    code: jax.Array
+    history: jax.Array
+
+
+def begin(task: Task, guess: jax.Array) -> State:
+    """The state at a guess, already certified."""
+    value = task.rules.impose(guess)
+    policy, measured = _look(task, value, moved=jnp.asarray(jnp.inf, value.dtype))
+    zero = jnp.zeros((), jnp.int32)
+    history = jnp.full(HISTORY, jnp.nan, value.dtype).at[0].set(measured.residual)
+    best = jnp.stack([measured.error, measured.residual])
+    return State(value, policy, measured, zero, best, zero, _judge(task, value, measured, best, zero), history)
+
+
+def run(task: Task, state: State, until: Any) -> State:
+    """Steps until the state is no longer running or ``until`` steps are done; at most ``HISTORY`` at a time."""
+    start = state.step
+
+    def goes_on(state):
+        return (state.code == Status.RUNNING) & (state.step < until)
+
+    return jax.lax.while_loop(goes_on, lambda state: advance(task, state, start), state)
+
+
+def advance(task: Task, state: State, start: Any = 0) -> State:
+    """One step; a step that ends in numbers that are not finite is taken back."""
+    value = task.rules.impose(state.value + _correct(task, state))
+    policy, measured = _look(task, value, moved=jnp.max(jnp.abs(jnp.where(task.counted, value - state.value, 0))))
+    measures = jnp.stack([measured.error, measured.residual])
+    since = jnp.where(jnp.any(measures < state.best), 0, state.since_best + 1)
+    code = _judge(task, value, measured, state.best, since)
+    history = state.history.at[state.step - start].set(measured.residual)
+    best = jnp.minimum(state.best, measures)
+    new = State(value, policy, measured, state.step + 1, best, since, code, history)
+    old = State(state.value, state.policy, state.gap, state.step + 1, state.best, since, code, history)
+    failed = code == Status.NONFINITE
+    return jax.tree.map(lambda after, before: jnp.where(failed, before, after), new, old)
+
+
+def _look(task: Task, value: jax.Array, moved: jax.Array) -> tuple[Greedy, Gap]:
+    problem, grid, scheme = task.problem, task.grid, task.scheme
+    policy = bellman.greedy(problem, grid, value, task.rules.held, scheme=scheme)
+    equation = bellman.correction(problem, grid, value, policy, task.rules, scheme=scheme)
+    measured = certificates.gap(
+        task.certificate,
+        value,
+        policy,
+        equation,
+        task.rules,
+        discount=problem.discount,
+        least_cost=task.least_cost,
+        counted=task.counted,
+        moved=moved,
+    )
+    return policy, measured
+
+
+def _judge(task: Task, value: jax.Array, measured: Gap, best: jax.Array, since: jax.Array) -> jax.Array:
+    finite = jnp.isfinite(measured.residual)
+    rounding = ROUNDING * jnp.finfo(value.dtype).eps * jnp.max(jnp.where(task.counted, jnp.abs(value), 0))
+    patience = jnp.where(measured.residual <= rounding, 10, 100 + 4 * sum(task.grid.shape))
+    code = jnp.where(since >= patience, Status.STALLED, Status.RUNNING)
+    code = jnp.where(measured.residual > GROWTH * jnp.maximum(best[1], rounding), Status.DIVERGED, code)
+    code = jnp.where(measured.error <= task.tol, Status.CONVERGED, code)
+    return jnp.where(finite, code, Status.NONFINITE).astype(jnp.int32)
+
+
+def _correct(task: Task, state: State) -> jax.Array:
+    if isinstance(task.method, ValueIteration):
+        assert task.pace is not None
+        return state.policy.rate / task.pace
+    if task.problem.is_game:
+        return _hoffman_karp(task, state)
+    return relaxation.solve(task.method.evaluation, _equation(task, state.value, state.policy), task.grid)
+
+
+def _equation(task: Task, value: jax.Array, policy: Greedy) -> Correction:
+    return bellman.correction(task.problem, task.grid, value, policy, task.rules, scheme=task.scheme)
+
+
+def _hoffman_karp(task: Task, state: State) -> jax.Array:
+    """The inner player's problem against the outer player's frozen policy, to a tenth of the outer residual."""
+    assert isinstance(task.method, PolicyIteration)
+    evaluation, held = task.method.evaluation, task.rules.held
+    target = 0.1 * state.gap.residual
+
+    def reply(carry):
+        value, policy, _, count = carry
+        value = task.rules.impose(value + relaxation.solve(evaluation, _equation(task, value, policy), task.grid))
+        policy = bellman.respond(task.problem, task.grid, value, held, policy, scheme=task.scheme)
+        left = jnp.max(jnp.where(task.counted, jnp.abs(_equation(task, value, policy).source), 0))
+        return value, policy, left, count + 1
+
+    def unfinished(carry):
+        return (carry[2] > target) & (carry[3] < task.method.replies)
+
+    start = (state.value, state.policy, jnp.asarray(jnp.inf, state.value.dtype), jnp.zeros((), jnp.int32))
+    return jax.lax.while_loop(unfinished, reply, start)[0] - state.value
+
+
+def rest_nodes(problem: Problem, grid: Grid, *, scheme: Upwind, dtype: Any) -> tuple[jax.Array, jax.Array]:
+    """Where the system can rest at no cost, bool (*grid), and the least running cost at every node.
+
+    At V = 0 the Hamiltonian is the running cost. Rest means that the action that is cheapest there leaves the
+    state where it is; up to rounding, since sin π is not zero in floating point.
+    """
+    how = hamiltonian.setting(problem, grid.ndim, dtype)
+    here = hamiltonian.local(problem, grid, jnp.zeros(grid.shape, dtype), scheme=scheme)
+    least, u, d = hamiltonian.optimise(here, how)
+    other = d if problem.is_game else None
+    f = chain.drift(problem, here.x, u, other, 0.0, dtype)
+    a = chain.diffusion(problem, here.x, u, other, 0.0, dtype)
+    small = 1e3 * jnp.finfo(dtype).eps
+    rests = jnp.abs(least) <= small
+    for axis, component in enumerate(f):
+        rests &= jnp.abs(component) <= small * (1 + grid.hi[axis] - grid.lo[axis])
+    for entry in a.values():
+        rests &= entry == 0
+    return rests, least

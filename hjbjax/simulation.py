@@ -157,6 +157,10 @@ def simulate(
     if isinstance(key, (int, np.integer)) and not isinstance(key, bool):
         key = jax.random.key(key)
     _check_key(problem, key)
+    # Its import adds to JAX's configuration, which is part of the key of every compiled function: once before, or
+    # the second call compiles again.
+    import diffrax  # noqa: F401
+
     with jax.enable_x64(True):
         problem, grid = cast((problem, grid), np.float64)
         control, opponent = cast(_players(problem, feedback, disturbance), np.float64)

@@ -1,8 +1,43 @@
 """hjbjax: Hamilton–Jacobi–Bellman and Isaacs equations on grids, with JAX."""
 
+from hjbjax import chain, zoo
 from hjbjax._version import __version__
+from hjbjax.fields import FallbackWarning
+from hjbjax.files import FileError
 from hjbjax.grid import Grid
+from hjbjax.iteration import PolicyIteration, ValueIteration
+from hjbjax.preparation import SolveWarning
 from hjbjax.problem import Problem
+from hjbjax.relaxation import Direct, Krylov, Sweeps
+from hjbjax.schemes import Upwind
 from hjbjax.sets import Ball, Box, Finite
+from hjbjax.simulation import simulate
+from hjbjax.solution import Solution, SolveError, load
+from hjbjax.solver import solve
+from hjbjax.status import Status
 
-__all__ = ["Ball", "Box", "Finite", "Grid", "Problem", "__version__"]
+__all__ = [
+    "Ball",
+    "Box",
+    "Direct",
+    "FallbackWarning",
+    "FileError",
+    "Finite",
+    "Grid",
+    "Krylov",
+    "PolicyIteration",
+    "Problem",
+    "Solution",
+    "SolveError",
+    "SolveWarning",
+    "Status",
+    "Sweeps",
+    "Upwind",
+    "ValueIteration",
+    "__version__",
+    "chain",
+    "load",
+    "simulate",
+    "solve",
+    "zoo",
+]

@@ -61,11 +61,18 @@ class Player:
 
 @dataclass(frozen=True)
 class Setting:
-    """Both players, and whether their choices do not touch each other (then the Isaacs condition holds)."""
+    """Both players and how they meet.
+
+    Attributes:
+      control, disturbance: the players.
+      decoupled: whether their choices do not touch each other; then the Isaacs condition holds.
+      disturbance_costs: whether the running cost depends on the disturbance.
+    """
 
     control: Player
     disturbance: Player
     decoupled: bool
+    disturbance_costs: bool
 
     @property
     def exact(self) -> bool:
@@ -93,7 +100,7 @@ def setting(problem: Problem, n: int, dtype: Any) -> Setting:
         entry is None or any(set(term) & set(inputs_u) and set(term) & set(inputs_d) for term in entry)
         for entry in (*drift.entries, *cost.entries)
     )
-    return Setting(mine, theirs, decoupled=separate and not crossed and noise.is_constant)
+    return Setting(mine, theirs, separate and not crossed and noise.is_constant, not cost.free_of(inputs_d))
 
 
 def _player(
@@ -169,8 +176,8 @@ def local(problem: Problem, grid: Grid, value: jax.Array, *, scheme: Upwind, t: 
     return Local(problem, grid, scheme, value.dtype, t, x, value, up, down)
 
 
-def optimise(here: Local, how: Setting) -> tuple[jax.Array, Action, Action]:
-    """min max (or max min, as the problem says) of H: the value, the control and the disturbance at every node."""
+def optimise(here: Local, how: Setting, isaacs: str | None = None) -> tuple[jax.Array, Action, Action]:
+    """min max of H, or max min, as the problem or ``isaacs`` says: the value, the control and the disturbance."""
     no_control, no_disturbance = how.control.choices is None, how.disturbance.choices is None
     if no_disturbance:
         u = _best_action(here, how.control, lambda u: (u, []))
@@ -180,7 +187,7 @@ def optimise(here: Local, how: Setting) -> tuple[jax.Array, Action, Action]:
         u = [] if no_control else _best_action(here, how.control, lambda u: (u, start))
         d = _best_action(here, how.disturbance, lambda d: (u, d))
         return here.at(u, d), u, d
-    if here.problem.isaacs == "upper":
+    if (isaacs or here.problem.isaacs) == "upper":
         u, d = _nested(here, how.control, how.disturbance, lambda u, d: (u, d))
     else:
         d, u = _nested(here, how.disturbance, how.control, lambda d, u: (u, d))

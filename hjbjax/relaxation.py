@@ -54,10 +54,11 @@ Evaluation = Sweeps | Krylov | Direct
 
 def solve(method: Evaluation, equation: Correction, grid: Grid) -> jax.Array:
     """An approximate solution δ, shape (*grid), in the dtype of the equation."""
-    if isinstance(method, Direct):
-        return direct(equation, grid)
-    if isinstance(method, Krylov):
-        return krylov(method, equation, grid)
+    if not isinstance(method, Sweeps):
+        delta = direct(equation, grid) if isinstance(method, Direct) else krylov(method, equation, grid)
+        size, left = jnp.max(jnp.abs(equation.source)), jnp.max(jnp.abs(left_over(equation, grid, delta)))
+        # an improper policy has no value, and BiCGStab may break down: then relax, which always makes sense
+        return jax.lax.cond(left <= size, lambda: delta, lambda: gauss_seidel(equation, grid, 2))
     single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), equation)
     return gauss_seidel(single, grid, method.count).astype(equation.source.dtype)
 
@@ -167,6 +168,10 @@ def direct(equation: Correction, grid: Grid) -> jax.Array:
         from scipy.sparse.linalg import splu
 
         matrix = stencil.sparse(offsets, [-np.asarray(w) for w in weights], np.ones(grid.shape), grid)
-        return splu(matrix.tocsc()).solve(np.asarray(source, np.float64).ravel()).reshape(grid.shape).astype(result.dtype)
+        try:
+            delta = splu(matrix.tocsc()).solve(np.asarray(source, np.float64).ravel())
+        except RuntimeError:  # exactly singular
+            delta = np.full(grid.size, np.nan)
+        return delta.reshape(grid.shape).astype(result.dtype)
 
     return jax.pure_callback(on_host, result, equation.source, *equation.weights.values, vmap_method="sequential")

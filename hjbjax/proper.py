@@ -1,0 +1,78 @@
+"""Which nodes can be brought to the target for certain, read off the graph of the chain.
+
+Without discount the value is finite exactly where some policy reaches the held nodes with probability one (a
+proper policy). The largest such set R is a fixed point: take away the nodes from which no path of jumps leads
+to the target by actions that keep every jump inside R, until nothing changes. Jumps under sampled actions are
+found on the device, paths by a breadth-first search on the host.
+"""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax import chain, sets, stencil
+from hjbjax.chain import Rates
+from hjbjax.grid import Grid
+from hjbjax.problem import Problem
+from hjbjax.schemes import Upwind
+
+SAMPLES = 33  # actions of a continuum that are tried
+
+
+@functools.partial(jax.jit, static_argnames=("scheme", "dtype"))
+def _open_jumps(problem: Problem, grid: Grid, inside: jax.Array, scheme: Upwind, dtype: Any) -> Rates:
+    """For every jump whether some action makes it while all jumps of that action stay ``inside``."""
+    points = sets.samples(problem.controls, SAMPLES) if problem.controls is not None else np.zeros((1, 0))
+    known = None
+    for k in range(np.shape(points)[0]):
+        u = [jnp.asarray(points[k, j], dtype) for j in range(np.shape(points)[1])]
+        rates = chain.rates(problem, grid, u, None, scheme=scheme, dtype=dtype)
+        jumps = [c > 0 for c in rates.values]
+        stays = jnp.ones(grid.shape, bool)
+        for offset, jump in zip(rates.offsets, jumps, strict=True):
+            stays &= ~jump | stencil.neighbour(inside, grid, offset)
+        usable = [jump & stays for jump in jumps]
+        known = usable if known is None else [p | q for p, q in zip(known, usable, strict=True)]
+    assert known is not None
+    return Rates(rates.offsets, tuple(known))
+
+
+def reached(problem: Problem, grid: Grid, held: np.ndarray, *, scheme: Upwind, dtype: Any, surely: bool) -> np.ndarray:
+    """The nodes from which the held nodes can be reached; host level, for problems with one player.
+
+    Args:
+      problem, grid, scheme, dtype: the chain.
+      held: bool (*grid), the nodes to reach.
+      surely: with probability one rather than with some probability.
+
+    Returns:
+      bool (*grid).
+    """
+    inside = np.ones(grid.shape, bool)
+    while True:
+        jumps = _open_jumps(problem, grid, jnp.asarray(inside), scheme, dtype)
+        found = _leads_to(held, jumps, grid) & inside
+        if not surely or np.array_equal(found, inside):
+            return found
+        inside = found
+
+
+def _leads_to(held: np.ndarray, jumps: Rates, grid: Grid) -> np.ndarray:
+    """Nodes with a path of jumps to a held node."""
+    from scipy.sparse import bmat, csr_array
+    from scipy.sparse.csgraph import breadth_first_order
+
+    free = ~held
+    values = [(free & np.asarray(jump)).astype(np.float64) for jump in jumps.values]
+    graph = stencil.sparse(jumps.offsets, values, np.zeros(grid.shape), grid)
+    graph.eliminate_zeros()
+    backward = graph.T.tocsr()
+    source = csr_array(held.reshape(1, -1).astype(np.float64))  # one extra node that leads to every held one
+    whole = bmat([[backward, None], [source, csr_array((1, 1))]], format="csr")
+    order = breadth_first_order(whole, grid.size, directed=True, return_predecessors=False)
+    found = np.zeros(grid.size + 1, bool)
+    found[order] = True
+    return found[:-1].reshape(grid.shape)

@@ -8,12 +8,13 @@ A utility to be maximised is minus a cost.
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 
 from hjbjax.grid import Grid
 from hjbjax.problem import Problem
 from hjbjax.pytree import is_traced, node
 from hjbjax.sets import Box
-from hjbjax.zoo.ingredients import OutsideCube, answer
+from hjbjax.zoo.ingredients import OutsideCube, answer, positive
 
 
 @node()
@@ -41,6 +42,11 @@ class Merton:
     volatility: Any = 0.2
     aversion: Any = 2.0
     discount: Any = 0.05
+
+    def __post_init__(self):
+        positive("merton", volatility=self.volatility, aversion=self.aversion, discount=self.discount)
+        if not is_traced(self.aversion) and np.any(np.asarray(self.aversion) == 1):
+            raise ValueError("merton: got aversion = 1 (logarithmic utility), wanted another number > 0")
 
     def drift(self, x: Any, u: Any) -> Any:
         """The mean growth of the logarithm of wealth."""
@@ -96,7 +102,7 @@ def merton(
       discount: ρ.
       shape: nodes.
     """
-    system = _merton(interest, growth, volatility, aversion, discount)
+    system = Merton(interest, growth, volatility, aversion, discount)
     problem = Problem(
         system.drift,
         system.cost,
@@ -118,10 +124,4 @@ def merton_exact(
     discount: Any = 0.05,
 ) -> Any:
     """The value as a function of log-wealth; 493.8271605 at wealth 1 with the defaults."""
-    return answer(_merton(interest, growth, volatility, aversion, discount).value)
-
-
-def _merton(interest: Any, growth: Any, volatility: Any, aversion: Any, discount: Any) -> Merton:
-    if not is_traced(aversion) and aversion == 1:
-        raise ValueError("merton: got aversion = 1 (logarithmic utility), wanted another number > 0")
-    return Merton(interest, growth, volatility, aversion, discount)
+    return answer(Merton(interest, growth, volatility, aversion, discount).value)

@@ -115,3 +115,20 @@ def answer(method: Callable) -> Callable:
 def noise_or_none(noise: Any) -> Any:
     """``None`` for a plain zero, so that the problem counts as deterministic."""
     return noise if is_traced(noise) or np.any(np.asarray(noise) != 0) else None
+
+
+def positive(owner: str, **numbers: Any) -> None:
+    """Refuse parameters that are not positive, while they are known.
+
+    Raises:
+      ValueError: a number that is zero, negative or not finite.
+    """
+    for name, value in numbers.items():
+        if is_traced(value):
+            continue
+        try:
+            array = np.asarray(value, np.float64)
+        except (TypeError, ValueError):
+            raise TypeError(f"{owner}: got {name} = {value!r}, wanted a number") from None
+        if not np.all(np.isfinite(array) & (array > 0)):
+            raise ValueError(f"{owner}: got {name} = {value!r}, wanted a finite number > 0")

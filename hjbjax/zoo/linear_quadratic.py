@@ -17,7 +17,7 @@ from hjbjax.grid import Grid
 from hjbjax.problem import Problem
 from hjbjax.pytree import is_traced, node
 from hjbjax.sets import Box
-from hjbjax.zoo.ingredients import Disc, OutsideCube, QuadraticCost, QuadraticValue, answer, noise_or_none
+from hjbjax.zoo.ingredients import Disc, OutsideCube, QuadraticCost, QuadraticValue, answer, noise_or_none, positive
 from hjbjax.zoo.minimum_time import DoubleIntegrator
 
 
@@ -118,7 +118,10 @@ def double_integrator_lq_exact(
     a = np.array([[0.0, 1.0], [0.0, 0.0]]) - 0.5 * discount * np.eye(2)
     b = np.array([[0.0], [1.0 / mass]])
     matrix = solve_continuous_are(a, b, np.eye(2), control_weight * np.eye(1))
-    constant = noise**2 * np.trace(matrix) / discount if noise else 0.0
+    constant = 0.0
+    if noise:
+        positive("double_integrator_lq with noise", discount=discount)
+        constant = noise**2 * np.trace(matrix) / discount
     return answer(QuadraticValue(matrix, constant).value)
 
 
@@ -161,6 +164,7 @@ def stochastic_lq_exact(
     bound: Any = 8.0,
 ) -> Any:
     """px² + σ²p/β while the bound is slack; with the defaults p = (√5 − 1)/2."""
+    positive("stochastic_lq", control_weight=control_weight, discount=discount)
     return answer(ScalarQuadratic(state_weight, 1.0 / control_weight, rate, discount, noise).value)
 
 
@@ -193,6 +197,7 @@ def lq_game_exact(*, gamma: Any = 2.0, rate: Any = 0.0, discount: Any = 0.0, bou
     Raises:
       ValueError: the level is at or below the least one that can be attained, so there is no finite value.
     """
+    positive("lq_game", gamma=gamma)
     if not is_traced(gamma, rate, discount):
         shifted, weight = rate - 0.5 * discount, 1 - gamma**-2
         if shifted**2 + weight < 0 or (weight <= 0 and shifted >= 0):

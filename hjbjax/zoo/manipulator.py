@@ -17,12 +17,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from hjbjax.grid import Grid
 from hjbjax.problem import Problem
 from hjbjax.pytree import node
 from hjbjax.sets import Box
-from hjbjax.zoo.ingredients import QuadraticCost
+from hjbjax.zoo.ingredients import QuadraticCost, positive
 
 
 @node(static=("links",))
@@ -31,8 +32,8 @@ class Manipulator:
 
     Args:
       links: n.
-      lengths: n lengths; ``None`` is 1 each.
-      masses: n point masses at the far ends of the links; ``None`` is 1 each.
+      lengths: n lengths, or one for all; ``None`` is 1.
+      masses: n point masses at the far ends of the links, or one for all; ``None`` is 1.
       g: gravity.
 
     Example:
@@ -55,8 +56,11 @@ class Manipulator:
             numbers = getattr(self, name)
             if numbers is None:
                 object.__setattr__(self, name, (1.0,) * self.links)
+            elif not isinstance(numbers, (list, tuple)) and np.ndim(numbers) == 0:
+                object.__setattr__(self, name, (numbers,) * self.links)
             elif len(numbers) != self.links:
                 raise ValueError(f"Manipulator.{name}: got {len(numbers)} numbers, wanted {self.links}: one a link")
+            positive("Manipulator", **{name: getattr(self, name)})
 
     def kinetic_energy(self, q: Any, w: Any) -> Any:
         """T(q, w), of vectors or lists of n scalars."""
@@ -160,8 +164,8 @@ def manipulator(
 
     Args:
       links: n; the state has 2n dimensions.
-      lengths: n lengths; ``None`` is 1 each.
-      masses: n masses; ``None`` is 1 each.
+      lengths: n lengths, or one for all; ``None`` is 1.
+      masses: n masses, or one for all; ``None`` is 1.
       g: gravity.
       torque: the bound on each |τ_i|.
       discount: β.

@@ -17,7 +17,7 @@ from hjbjax.grid import Grid
 from hjbjax.problem import Problem
 from hjbjax.pytree import node
 from hjbjax.sets import Box
-from hjbjax.zoo.ingredients import QuadraticCost, QuadraticValue
+from hjbjax.zoo.ingredients import QuadraticCost, QuadraticValue, positive
 
 
 @node(static=("as_printed",))
@@ -37,6 +37,9 @@ class Pendulum:
     mass: Any = 1.0
     g: Any = 9.81
     as_printed: bool = False
+
+    def __post_init__(self):
+        positive("Pendulum", mass=self.mass)
 
     @property
     def gain(self) -> Any:

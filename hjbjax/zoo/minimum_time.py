@@ -22,7 +22,7 @@ from hjbjax.grid import Grid
 from hjbjax.problem import Problem
 from hjbjax.pytree import node
 from hjbjax.sets import Ball, Box, Finite
-from hjbjax.zoo.ingredients import Arrival, Disc, answer, unit_cost
+from hjbjax.zoo.ingredients import Arrival, Disc, answer, positive, unit_cost
 
 
 @node()
@@ -34,6 +34,9 @@ class DoubleIntegrator:
     """
 
     mass: Any = 1.0
+
+    def __post_init__(self):
+        positive("DoubleIntegrator", mass=self.mass)
 
     def drift(self, x: Any, u: Any) -> Any:
         """(x₂, u/m)."""
@@ -64,6 +67,9 @@ class Boat:
     speed: Any = 1.0
     current: Any = (0.5, 0.0)
 
+    def __post_init__(self):
+        positive("Boat", speed=self.speed)
+
     def drift(self, x: Any, u: Any) -> Any:
         """c + s·u."""
         return jnp.stack([self.current[0] + self.speed * u[0], self.current[1] + self.speed * u[1]])
@@ -92,6 +98,9 @@ class SingleIntegrator:
     speed: Any = 1.0
     norm: float = 2
 
+    def __post_init__(self):
+        positive("SingleIntegrator", speed=self.speed)
+
     def drift(self, x: Any, u: Any) -> Any:
         """s·u."""
         return self.speed * u
@@ -112,6 +121,9 @@ class Dubins:
     """
 
     speed: Any = 1.0
+
+    def __post_init__(self):
+        positive("Dubins", speed=self.speed)
 
     def drift(self, x: Any, u: Any) -> Any:
         """(s cos θ, s sin θ, u)."""

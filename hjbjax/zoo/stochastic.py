@@ -15,7 +15,7 @@ from hjbjax.grid import Grid
 from hjbjax.problem import Problem
 from hjbjax.pytree import node
 from hjbjax.sets import Box
-from hjbjax.zoo.ingredients import OutsideBall, OutsideCube, answer, noise_or_none, unit_cost
+from hjbjax.zoo.ingredients import OutsideBall, OutsideCube, answer, noise_or_none, positive, unit_cost
 
 TERMS = 200  # of the series for the square, whose tail falls like k⁻³ at the worst place: 1e-6 there, 1e-15 inside
 
@@ -37,6 +37,9 @@ class CubeExit:
     discount: Any
     half_width: Any
     dim: int
+
+    def __post_init__(self):
+        positive("brownian_exit", noise=self.noise, half_width=self.half_width)
 
     def value(self, x: Any) -> Any:
         """The value at one state."""
@@ -76,6 +79,9 @@ class BallExit:
     radius: Any
     dim: int
 
+    def __post_init__(self):
+        positive("brownian_ball", noise=self.noise, radius=self.radius)
+
     def value(self, x: Any) -> Any:
         """The value at one state; outside the ball the same formula, which is negative there."""
         x = jnp.asarray(x)
@@ -94,6 +100,7 @@ def brownian_exit(
       half_width: R.
       shape: nodes; ``None`` is 101 in one dimension, 41 an axis in more.
     """
+    positive("brownian_exit", noise=noise, half_width=half_width)
     problem = Problem(no_drift, unit_cost, noise=noise, discount=discount, target=OutsideCube(half_width).level)
     shape = ((101,) if dim == 1 else (41,) * dim) if shape is None else shape
     return problem, Grid([-half_width] * dim, [half_width] * dim, shape)
@@ -145,6 +152,9 @@ class BangBang:
 
     discount: Any = 1.0
     noise: Any = 0.0
+
+    def __post_init__(self):
+        positive("bang_bang", discount=self.discount)
 
     def drift(self, x: Any, u: Any) -> Any:
         """The control itself."""

@@ -1,0 +1,135 @@
+"""The mechanical systems against textbook formulas, energy and the linear theory."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+from hjbjax import zoo
+
+
+def test_the_pendulum_rests_upright_on_a_node():
+    problem, grid = zoo.pendulum()
+    upright = grid.state((grid.shape[0] // 2, grid.shape[1] // 2))
+    assert upright.tolist() == [0.0, 0.0]
+    assert problem.drift(upright, np.zeros(1)).tolist() == [0.0, 0.0]
+    assert float(problem.cost(upright, np.zeros(1))) == 0.0
+    assert grid.periodic == (True, False)
+    assert problem.discount == 0.0
+
+
+def test_the_two_readings_of_the_pendulum():
+    x, u = jnp.zeros(2), jnp.ones(1)
+    corrected, printed = zoo.pendulum(mass=2.0)[0], zoo.pendulum(mass=2.0, as_printed=True)[0]
+    assert float(corrected.drift(x, u)[1]) == pytest.approx(1 / 2)
+    assert float(printed.drift(x, u)[1]) == pytest.approx(9.81 / 2)
+    assert corrected.controls.hi.tolist() == [30.0]
+    assert printed.controls.hi.tolist() == [6.0]
+
+
+@pytest.mark.parametrize("parameters", [{}, {"mass": 2.0, "discount": 0.1}, {"as_printed": True}])
+def test_the_pendulum_is_quadratic_near_upright(parameters):
+    problem, _ = zoo.pendulum(**parameters)
+    value = zoo.pendulum_near_upright(**parameters).value
+    gain = problem.drift.args[0].gain
+
+    def residual(x):
+        u = -gain * jax.grad(value)(x)[1:]
+        return float(problem.discount * value(x) - problem.cost(x, u) - problem.drift(x, u) @ jax.grad(value)(x))
+
+    near, far = residual(jnp.array([0.05, -0.1])), residual(jnp.array([0.1, -0.2]))
+    assert abs(far) > 1e-7
+    assert far / near == pytest.approx(16, rel=0.02)
+
+
+@pytest.mark.parametrize("links", [1, 2, 3, 4])
+def test_the_mass_matrix_is_symmetric_and_positive(links):
+    rng = np.random.default_rng(links)
+    arm = zoo.Manipulator(links=links, lengths=rng.uniform(0.5, 2, links), masses=rng.uniform(0.5, 2, links))
+    q, w, tau = (jnp.asarray(rng.uniform(-3, 3, links)) for _ in range(3))
+    matrix = np.asarray(arm.mass_matrix(q))
+    np.testing.assert_allclose(matrix, matrix.T, atol=1e-12)
+    assert np.min(np.linalg.eigvalsh(matrix)) > 0
+    assert float(arm.kinetic_energy(q, w)) == pytest.approx(0.5 * w @ matrix @ w)
+    # The drift solves (5.5).
+    rates = arm.drift(jnp.concatenate([q, w]), tau)
+    np.testing.assert_allclose(matrix @ rates[links:] + arm.coriolis(q, w) + arm.gravity(q), tau, atol=1e-9)
+    np.testing.assert_array_equal(rates[:links], w)
+
+
+@pytest.mark.parametrize("links", [1, 2, 3, 4])
+def test_power_is_torque_times_velocity(links):
+    rng = np.random.default_rng(10 + links)
+    arm = zoo.Manipulator(links=links, masses=rng.uniform(0.5, 2, links))
+    x, tau = jnp.asarray(rng.uniform(-3, 3, 2 * links)), jnp.asarray(rng.uniform(-9, 9, links))
+    power = jax.grad(arm.energy)(x) @ arm.drift(x, tau)
+    assert float(power) == pytest.approx(float(x[links:] @ tau), rel=1e-9, abs=1e-9)
+    # V − ½ Ṁ w does no work: Ṁ − 2C is skew for any C with C w = V.
+    q, w = x[:links], x[links:]
+    _, change = jax.jvp(arm.mass_matrix, (q,), (w,))
+    assert float(w @ (arm.coriolis(q, w) - 0.5 * change @ w)) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_one_link_is_the_pendulum():
+    arm, pendulum = zoo.Manipulator(masses=[2.0]), zoo.Pendulum(mass=2.0)
+    x, u = jnp.array([0.7, -1.2]), jnp.array([3.0])
+    np.testing.assert_allclose(arm.drift(x, u), pendulum.drift(x, u), rtol=1e-12)
+
+
+@given(*[st.floats(-3, 3) for _ in range(4)])
+def test_two_links_are_the_textbook_arm(q1, q2, w1, w2):
+    """Craig's two-link arm with point masses at the ends; his first angle is from the horizontal, ours from upright."""
+    m1, m2, l1, l2, g = 1.3, 0.7, 0.9, 1.4, 9.81
+    arm = zoo.Manipulator(links=2, lengths=(l1, l2), masses=(m1, m2), g=g)
+    q, w = jnp.array([q1, q2]), jnp.array([w1, w2])
+    c2, s2 = np.cos(q2), np.sin(q2)
+    off = m2 * l2**2 + m2 * l1 * l2 * c2
+    matrix = [[m2 * l2**2 + 2 * m2 * l1 * l2 * c2 + (m1 + m2) * l1**2, off], [off, m2 * l2**2]]
+    bias = [-m2 * l1 * l2 * s2 * (w2**2 + 2 * w1 * w2), m2 * l1 * l2 * s2 * w1**2]
+    fold = -m2 * l2 * g * np.sin(q1 + q2)
+    np.testing.assert_allclose(arm.mass_matrix(q), matrix, atol=1e-10)
+    np.testing.assert_allclose(arm.coriolis(q, w), bias, atol=1e-10)
+    np.testing.assert_allclose(arm.gravity(q), [fold - (m1 + m2) * l1 * g * np.sin(q1), fold], atol=1e-10)
+
+
+@pytest.mark.parametrize("links", [1, 2, 3])
+def test_energy_is_conserved_without_torque(links):
+    arm = zoo.Manipulator(links=links)
+    drift = jax.jit(arm.drift)
+    start = np.concatenate([np.linspace(1.0, 0.4, links), np.zeros(links)])
+    flow = solve_ivp(lambda t, x: np.asarray(drift(x, np.zeros(links))), (0, 3), start, rtol=1e-10, atol=1e-10)
+    energies = [float(arm.energy(jnp.asarray(x))) for x in flow.y.T[:: max(1, flow.y.shape[1] // 10)]]
+    assert flow.success
+    assert np.ptp(energies) < 1e-6
+    assert np.ptp(flow.y[0]) > 1
+
+
+def test_the_manipulator_problem_grows_with_its_links():
+    problem, grid = zoo.manipulator(links=2)
+    assert grid.ndim == 4
+    assert grid.periodic == (True, True, False, False)
+    assert problem.controls.dim == 2
+    upright = grid.state([count // 2 for count in grid.shape])
+    np.testing.assert_array_equal(upright, 0)
+    np.testing.assert_allclose(problem.drift(upright, np.zeros(2)), 0, atol=1e-12)
+    assert zoo.catalogue["manipulator"].initial_state(4) == (2.0, 0.0, 0.0, 0.0)
+
+
+def test_one_length_is_for_all_links():
+    x, u = jnp.linspace(0.1, 0.6, 4), jnp.ones(2)
+    np.testing.assert_array_equal(
+        zoo.Manipulator(links=2, lengths=0.7).drift(x, u), zoo.Manipulator(links=2, lengths=(0.7, 0.7)).drift(x, u)
+    )
+
+
+def test_van_der_pol_is_van_der_pol():
+    rates = zoo.VanDerPol(1.5).drift(jnp.array([0.5, 2.0]), jnp.array([0.25]))
+    np.testing.assert_allclose(rates, [2.0, 1.5 * 0.75 * 2.0 - 0.5 + 0.25])
+
+
+def test_dubins_drives_ahead():
+    rates = zoo.Dubins(2.0).drift(jnp.array([0.0, 0.0, np.pi / 6]), jnp.array([0.3]))
+    np.testing.assert_allclose(rates, [3**0.5, 1.0, 0.3])

@@ -28,16 +28,12 @@ from hjbjax.zoo.mechanical import Pendulum, VanDerPol, pendulum, pendulum_near_u
 from hjbjax.zoo.minimum_time import (
     Boat,
     DoubleIntegrator,
-    Dubins,
-    SingleIntegrator,
     double_integrator,
     double_integrator_exact,
-    dubins,
-    eikonal,
-    eikonal_exact,
     zermelo,
     zermelo_exact,
 )
+from hjbjax.zoo.shortest_paths import Dubins, SingleIntegrator, dubins, eikonal, eikonal_exact
 from hjbjax.zoo.stochastic import (
     BangBang,
     bang_bang,

@@ -123,5 +123,13 @@ def merton_exact(
     aversion: Any = 2.0,
     discount: Any = 0.05,
 ) -> Any:
-    """The value as a function of log-wealth; 493.8271605 at wealth 1 with the defaults."""
+    """The value as a function of log-wealth; 493.8271605 at wealth 1 with the defaults.
+
+    Args:
+      interest: r.
+      growth: μ.
+      volatility: σ.
+      aversion: γ, not 1.
+      discount: ρ.
+    """
     return answer(Merton(interest, growth, volatility, aversion, discount).value)

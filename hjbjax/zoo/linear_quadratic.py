@@ -95,6 +95,14 @@ def double_integrator_lq(
     """Bring a mass to rest at the cost |x|² + r u², on [−2, 2]²; the bound on u is there to be slack.
 
     Undiscounted by default: rest at the origin costs nothing. With noise it needs a discount.
+
+    Args:
+      mass: m.
+      control_weight: r.
+      noise: σ, on position and velocity alike.
+      discount: β.
+      bound: on |u|.
+      shape: nodes; odd numbers put one at the origin.
     """
     problem = Problem(
         DoubleIntegrator(mass).drift,
@@ -112,6 +120,13 @@ def double_integrator_lq_exact(
     """x'Px + σ² tr(P)/β on the whole plane while the bound is slack, by SciPy's Riccati solver; host level.
 
     With the defaults P = [[√3, 1], [1, √3]].
+
+    Args:
+      mass: m.
+      control_weight: r.
+      noise: σ.
+      discount: β, positive where there is noise.
+      bound: taken to be slack.
     """
     from scipy.linalg import solve_continuous_are
 
@@ -138,6 +153,15 @@ def stochastic_lq(
     """Hold dx = (ax + u)dt + σ dw near zero at the cost qx² + ru², on [−2, 2].
 
     The ends are held at the exact value: noise would otherwise carry the effect of a wall into the box.
+
+    Args:
+      rate: a.
+      state_weight: q.
+      control_weight: r.
+      noise: σ.
+      discount: β > 0.
+      bound: on |u|, to be slack.
+      shape: nodes.
     """
     exact = stochastic_lq_exact(
         rate=rate, state_weight=state_weight, control_weight=control_weight, noise=noise, discount=discount, bound=bound
@@ -163,7 +187,16 @@ def stochastic_lq_exact(
     discount: Any = 1.0,
     bound: Any = 8.0,
 ) -> Any:
-    """px² + σ²p/β while the bound is slack; with the defaults p = (√5 − 1)/2."""
+    """px² + σ²p/β while the bound is slack; with the defaults p = (√5 − 1)/2.
+
+    Args:
+      rate: a.
+      state_weight: q.
+      control_weight: r.
+      noise: σ.
+      discount: β > 0.
+      bound: taken to be slack.
+    """
     positive("stochastic_lq", control_weight=control_weight, discount=discount)
     return answer(ScalarQuadratic(state_weight, 1.0 / control_weight, rate, discount, noise).value)
 
@@ -179,6 +212,13 @@ def lq_game(
     """Attenuate a disturbance to the level γ: ẋ = ax + u + d, cost x² + u² − γ²d², on [−1, 1].
 
     The run ends at the origin, where both players rest; undiscounted, that is what makes the answer unique.
+
+    Args:
+      gamma: the level γ; at or below the least attainable one (1 for a ≥ 0) the value is infinite.
+      rate: a.
+      discount: β.
+      bound: on |u| and |d|, to be slack.
+      shape: nodes; an odd number puts one at the origin.
     """
     problem = Problem(
         LinearScalar(rate).contested_drift,
@@ -193,6 +233,12 @@ def lq_game(
 
 def lq_game_exact(*, gamma: Any = 2.0, rate: Any = 0.0, discount: Any = 0.0, bound: Any = 4.0) -> Any:
     """px² with p = 1/(√(α² + 1 − γ⁻²) − α), α = a − β/2; with the defaults p = 2/√3.
+
+    Args:
+      gamma: the level γ.
+      rate: a.
+      discount: β.
+      bound: taken to be slack.
 
     Raises:
       ValueError: the level is at or below the least one that can be attained, so there is no finite value.

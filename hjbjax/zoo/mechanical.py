@@ -100,6 +100,12 @@ def pendulum_near_upright(
     """The leading term ½x'Px of the pendulum's value at the upright rest, by the Riccati equation; host level.
 
     sin θ is odd, so what it leaves out is of fourth order in the state.
+
+    Args:
+      mass: m.
+      as_printed: input gain g/m instead of 1/m.
+      g: gravity.
+      discount: β.
     """
     from scipy.linalg import solve_continuous_are
 
@@ -115,6 +121,12 @@ def van_der_pol(
     """Quieten a Van der Pol oscillator at the cost ½(|x|² + u²), |u| ≤ bound, on [−3, 3]².
 
     Where the bound is too weak to leave the limit cycle, the discount keeps the value finite.
+
+    Args:
+      stiffness: μ ≥ 0.
+      bound: on |u|.
+      discount: β.
+      shape: nodes in position and velocity; odd numbers put one at rest.
     """
     problem = Problem(
         VanDerPol(stiffness).drift, QuadraticCost(0.5, 0.5).rate, Box([-bound], [bound]), discount=discount

@@ -109,6 +109,12 @@ def brownian_exit(
 def brownian_exit_exact(*, dim: int = 1, noise: Any = 1.0, discount: Any = 0.0, half_width: Any = 1.0) -> Any:
     """(1 − x²)/σ² on the interval (−1, 1), .58937083 at the centre of the square for σ = 1.
 
+    Args:
+      dim: the number of states, 1 or 2.
+      noise: σ.
+      discount: β.
+      half_width: R.
+
     Raises:
       ValueError: more than two dimensions.
     """
@@ -123,6 +129,12 @@ def brownian_ball(
     """How long on average a Brownian motion stays in the ball |x| < radius: no control, cost 1.
 
     Nodes outside the ball are held at the answer's continuation, so that the sphere needs not pass through nodes.
+
+    Args:
+      dim: the number n of states.
+      noise: σ.
+      radius: R.
+      shape: nodes; ``None`` is 41 an axis.
     """
     problem = Problem(
         no_drift,
@@ -135,7 +147,13 @@ def brownian_ball(
 
 
 def brownian_ball_exact(*, dim: int = 2, noise: Any = 1.0, radius: Any = 1.0) -> Any:
-    """(R² − |x|²)/(nσ²)."""
+    """(R² − |x|²)/(nσ²).
+
+    Args:
+      dim: the number n of states.
+      noise: σ.
+      radius: R.
+    """
     return answer(BallExit(noise, radius, dim).value)
 
 
@@ -195,5 +213,10 @@ def bang_bang(*, discount: Any = 1.0, noise: Any = 0.0, shape: tuple[int, ...] =
 
 
 def bang_bang_exact(*, discount: Any = 1.0, noise: Any = 0.0) -> Any:
-    """The value on the whole line, with noise or without; see ``BangBang``."""
+    """The value on the whole line, with noise or without; see ``BangBang``.
+
+    Args:
+      discount: λ > 0.
+      noise: ε.
+    """
     return answer(BangBang(discount, noise).value)

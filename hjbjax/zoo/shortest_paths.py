@@ -1,0 +1,165 @@
+"""Shortest paths: the eikonal equation, and a car that cannot turn on the spot.
+
+    eikonal   ẋ = s·u, u in a ball, a box or ±e_i   the least time to the origin is a norm
+    Dubins    ẋ = s(cos θ, sin θ), θ̇ = u
+
+Minimum time in the discounted form V = (1 − e^{−βT})/β.
+"""
+
+import math
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.grid import Grid
+from hjbjax.problem import Problem
+from hjbjax.pytree import node
+from hjbjax.sets import Ball, Box, Finite
+from hjbjax.zoo.ingredients import Arrival, Disc, answer, positive, unit_cost
+
+
+@node(static=("norm",))
+class SingleIntegrator:
+    """A point that moves at will, ẋ = s·u, with u in the unit ball of the norm dual to ``norm``.
+
+    Args:
+      speed: s.
+      norm: the norm in which the distance to the origin is the time: 1, 2 or infinity.
+    """
+
+    speed: Any = 1.0
+    norm: float = 2
+
+    def __post_init__(self):
+        positive("SingleIntegrator", speed=self.speed)
+
+    def drift(self, x: Any, u: Any) -> Any:
+        """s·u."""
+        return self.speed * u
+
+    def arrival_time(self, x: Any) -> Any:
+        """‖x‖/s."""
+        if self.norm == 1:
+            return jnp.sum(jnp.abs(x)) / self.speed
+        return (jnp.sqrt(jnp.sum(x * x)) if self.norm == 2 else jnp.max(jnp.abs(x))) / self.speed
+
+
+@node()
+class Dubins:
+    """A car at constant speed, state (x, y, heading), control the rate of turn.
+
+    Args:
+      speed: s.
+    """
+
+    speed: Any = 1.0
+
+    def __post_init__(self):
+        positive("Dubins", speed=self.speed)
+
+    def drift(self, x: Any, u: Any) -> Any:
+        """(s cos θ, s sin θ, u)."""
+        return jnp.stack([self.speed * jnp.cos(x[2]), self.speed * jnp.sin(x[2]), u[0]])
+
+
+def eikonal(
+    *,
+    norm: float = 2,
+    dim: int = 2,
+    speed: Any = 1.0,
+    discount: Any = 1.0,
+    radius: Any = 0.2,
+    directions: int | None = None,
+    shape: tuple[int, ...] | None = None,
+) -> tuple[Problem, Grid]:
+    """The shortest way to the origin, on [−1, 1]^dim.
+
+    Args:
+      norm: 2 for u in the unit ball, infinity for the box |u_i| ≤ 1, 1 for u = ±e_i.
+      dim: the number of states.
+      speed: s.
+      discount: β.
+      radius: the exact value is held within it; 0 leaves the node at the origin alone.
+      directions: in the plane with norm 2, as many directions around the circle instead of the ball.
+      shape: nodes; ``None`` is 81 an axis.
+
+    Raises:
+      ValueError: a norm other than 1, 2 and infinity, or directions outside the plane.
+    """
+    exact = eikonal_exact(norm=norm, dim=dim, speed=speed, discount=discount, radius=radius, directions=directions)
+    problem = Problem(
+        SingleIntegrator(speed, norm).drift,
+        unit_cost,
+        _unit_ball(norm, dim, directions),
+        discount=discount,
+        target=Disc(radius, dim).level,
+        exit_cost=exact,
+    )
+    return problem, Grid([-1.0] * dim, [1.0] * dim, (81,) * dim if shape is None else shape)
+
+
+def eikonal_exact(
+    *,
+    norm: float = 2,
+    dim: int = 2,
+    speed: Any = 1.0,
+    discount: Any = 1.0,
+    radius: Any = 0.2,
+    directions: int | None = None,
+) -> Any:
+    """(1 − e^{−βT})/β with T = ‖x‖/s.
+
+    Args:
+      norm: of ‖x‖: 1, 2 or infinity.
+      dim: the number of states.
+      speed: s.
+      discount: β.
+      radius: where the problem holds the value; the answer does not depend on it.
+      directions: of the problem in the plane; the answer is that of the ball.
+    """
+    _unit_ball(norm, dim, directions)
+    return answer(Arrival(SingleIntegrator(speed, norm), discount).value)
+
+
+def _unit_ball(norm: float, dim: int, directions: int | None) -> Ball | Box | Finite:
+    if norm not in (1, 2, math.inf):
+        raise ValueError(f"eikonal: got norm = {norm!r}, wanted 1, 2 or infinity")
+    if directions is not None:
+        if (dim, norm) != (2, 2):
+            raise ValueError(f"eikonal: got directions with dim = {dim} and norm = {norm:g}, wanted 2 and 2")
+        angles = 2 * np.pi * np.arange(directions) / directions
+        return Finite(np.stack([np.cos(angles), np.sin(angles)], axis=-1))
+    if norm == 1:
+        return Finite(np.concatenate([np.eye(dim), -np.eye(dim)]))
+    return Ball(1.0, dim) if norm == 2 else Box([-1.0] * dim, [1.0] * dim)
+
+
+def dubins(
+    *,
+    speed: Any = 1.0,
+    turn: Any = 1.0,
+    radius: Any = 0.3,
+    discount: Any = 1.0,
+    shape: tuple[int, ...] = (41, 41, 40),
+) -> tuple[Problem, Grid]:
+    """Drive a Dubins car to a disc around the origin in the least time, in any heading, on [−2, 2]² × [−π, π).
+
+    The value jumps where the car just fails to turn in; no answer is kept beside it.
+
+    Args:
+      speed: s.
+      turn: the bound on |θ̇|; the car turns on circles of radius s/turn.
+      radius: of the disc.
+      discount: β.
+      shape: nodes.
+    """
+    problem = Problem(
+        Dubins(speed).drift,
+        unit_cost,
+        Box([-turn], [turn]),
+        discount=discount,
+        target=Disc(radius, 2).level,
+    )
+    lo, hi = [-2.0, -2.0, -math.pi], [2.0, 2.0, math.pi]
+    return problem, Grid(lo, hi, shape, periodic=(False, False, True), names=("x", "y", "heading"))

@@ -104,6 +104,8 @@ def test_the_front_door_documents_every_parameter(name):
 
 
 @pytest.mark.parametrize("name", INNER)
-def test_a_list_of_arguments_is_complete(name):
-    assert INNER[name].__doc__, f"{name} has no docstring"
-    assert "Args:" not in INNER[name].__doc__ or not unmentioned(INNER[name])
+def test_the_rooms_behind_it_have_no_incomplete_list_of_arguments(name):
+    documentation = INNER[name].__doc__
+    assert documentation, f"{name} has no docstring"
+    if "Args:" in documentation or name.startswith("hjbjax.zoo."):
+        assert not unmentioned(INNER[name])

@@ -1,7 +1,6 @@
 """The README tells the truth: its commands, its examples with their output, its files."""
 
 import contextlib
-import doctest
 import io
 import re
 from pathlib import Path
@@ -24,10 +23,15 @@ def test_ci_runs_the_test_command_as_it_stands_here():
     assert f'tests="{COMMANDS[1]}"' in script.splitlines()
 
 
+def settled(text):
+    """A printed screen without what differs between machines: clocks, memory, and numbers made of rounding."""
+    text = re.sub(r"^( *(?:seconds|memory|device) ).*$", r"\1", text, flags=re.MULTILINE)
+    return re.sub(r"\d(\.\d+)?e-(0[7-9]|[1-9]\d)", "tiny", text)
+
+
 def test_every_python_block_runs_and_prints_what_the_text_block_after_it_says(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    names, checker, flags = {}, doctest.OutputChecker(), doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
-    ran = 0
+    names, ran = {}, 0
     for (kind, code), (after, wanted) in zip(BLOCKS, [*BLOCKS[1:], ("", "")], strict=True):
         if kind != "python":
             continue
@@ -35,7 +39,7 @@ def test_every_python_block_runs_and_prints_what_the_text_block_after_it_says(tm
             exec(compile(code, "README.md", "exec"), names)
         ran += 1
         if after == "text":
-            assert checker.check_output(wanted, printed.getvalue(), flags), f"printed\n{printed.getvalue()}"
+            assert settled(printed.getvalue()) == settled(wanted)
     assert ran, "the README has no example"
 
 

@@ -5,7 +5,7 @@ from hjbjax._version import __version__
 from hjbjax.fields import FallbackWarning
 from hjbjax.files import FileError
 from hjbjax.grid import Grid
-from hjbjax.iteration import PolicyIteration, ValueIteration
+from hjbjax.iteration import Nested, PolicyIteration, ValueIteration
 from hjbjax.preparation import SolveWarning
 from hjbjax.problem import Problem
 from hjbjax.relaxation import Direct, Krylov, Sweeps
@@ -25,6 +25,7 @@ __all__ = [
     "Finite",
     "Grid",
     "Krylov",
+    "Nested",
     "PolicyIteration",
     "Problem",
     "Solution",

@@ -4,11 +4,12 @@ Discounted: with ρ = max(min(r/β, ψ − V), g − V) at every node (zero wher
 
     V + min ρ ≤ V_h ≤ V + max ρ.
 
-Undiscounted with running cost L ≥ 0, exit cost ≥ 0 and V ≥ 0: with L the least running cost at a node,
+Undiscounted with running cost L > 0, exit cost ≥ 0 and V ≥ 0: with L the least running cost at a node,
 
     V/(1 + η) ≤ V_h ≤ V/(1 − ρ),    ρ = max(r/L)⁺ < 1,   η = max((−r)⁺/L),
 
-because scaling a super- or subsolution scales its generator part and not its cost. Minimum time is L = 1.
+because scaling a super- or subsolution scales its generator part and not its cost. Minimum time is L = 1. A
+constant may be added to an undiscounted V: where an exit cost is negative all of it is lifted to zero first.
 Both follow from the comparison principle of a monotone scheme; they bound the algebraic error and not the
 error of the grid, hold where the minimum over the actions is exact, and want float64.
 """
@@ -36,7 +37,8 @@ class Gap:
     """How far the bounds are from the value.
 
     Args:
-      below, above: what bounds V_h: V + shift where additive, V · factor where multiplicative.
+      below, above: what bounds V_h: V + shift where additive, (V + lift) · factor − lift where multiplicative.
+      lift: what makes every exit cost non-negative.
       error: the largest |bound − V| over the nodes that count, cost units; without a certificate the size of the
         last correction or of the residual.
       residual: the largest |residual| in cost units.
@@ -44,6 +46,7 @@ class Gap:
 
     below: jax.Array
     above: jax.Array
+    lift: jax.Array
     error: jax.Array
     residual: jax.Array
 
@@ -75,7 +78,7 @@ def gap(
     """
     residual = jnp.max(jnp.where(counted, jnp.abs(equation.source), 0))
     free = counted & ~rules.held
-    zero, one = jnp.zeros_like(residual), jnp.ones_like(residual)
+    zero = jnp.zeros_like(residual)
     if kind is Certificate.ADDITIVE:
         shift = policy.rate / discount
         if rules.stop is not None:
@@ -84,23 +87,25 @@ def gap(
             shift = jnp.maximum(shift, rules.floor - value)
         shift = jnp.where(rules.held, 0, shift)
         below, above = jnp.min(shift), jnp.max(shift)
-        return Gap(below, above, jnp.maximum(jnp.abs(below), jnp.abs(above)), residual)
+        return Gap(below, above, zero, jnp.maximum(jnp.abs(below), jnp.abs(above)), residual)
     if kind is Certificate.MULTIPLICATIVE:
         safe = jnp.where(free & (least_cost > 0), least_cost, 1)
         relative = jnp.where(free, jnp.where(least_cost > 0, policy.rate / safe, jnp.sign(policy.rate) * jnp.inf), 0)
         rho, eta = jnp.maximum(jnp.max(relative), 0), jnp.maximum(jnp.max(-relative), 0)
         below, above = 1 / (1 + eta), jnp.where(rho < 1, 1 / jnp.where(rho < 1, 1 - rho, 1), jnp.inf)
-        largest = jnp.max(jnp.where(counted, value, 0))
-        valid = jnp.all(jnp.where(counted, value, 0) >= 0)
-        error = jnp.where(valid, largest * jnp.maximum(above - 1, 1 - below), jnp.inf)
-        return Gap(jnp.where(jnp.isnan(residual), residual, below), above, error + 0 * residual, residual)
-    return Gap(zero, one, jnp.maximum(residual, moved), residual)
+        lift = jnp.maximum(-jnp.min(jnp.where(counted & rules.held, rules.given, 0)), 0)
+        lifted = jnp.where(counted, value + lift, 0)
+        error = jnp.max(lifted) * jnp.maximum(above - 1, 1 - below)
+        error = jnp.where(jnp.all(lifted >= 0), error, jnp.inf) + 0 * residual  # a NaN stays one
+        return Gap(below, above, lift, error, residual)
+    return Gap(zero, zero, zero, jnp.maximum(residual, moved), residual)
 
 
-def bounds(kind: Certificate, value: Any, below: Any, above: Any) -> tuple[Any, Any] | None:
+def bounds(kind: Certificate, value: Any, measured: Gap) -> tuple[Any, Any] | None:
     """The lower and upper bound arrays, or None without a certificate."""
     if kind is Certificate.ADDITIVE:
-        return value + below, value + above
+        return value + measured.below, value + measured.above
     if kind is Certificate.MULTIPLICATIVE:
-        return value * below, value * above
+        lifted = value + measured.lift
+        return lifted * measured.below - measured.lift, lifted * measured.above - measured.lift
     return None

@@ -51,7 +51,23 @@ class PolicyIteration:
     replies: int = 20
 
 
-Method = ValueIteration | PolicyIteration
+@node(static=("coarsest",))
+class Nested:
+    """Solve on coarser grids first, and start each finer one from the interpolated answer.
+
+    From a cold start the count of policy improvements grows with N, one cell of good policy an improvement; from
+    the coarser grid's answer it stays at a few. Host level only: every level is compiled on its own.
+
+    Args:
+      inner: what runs on each level.
+      coarsest: do not go on to grids with fewer nodes than this.
+    """
+
+    inner: PolicyIteration = PolicyIteration()
+    coarsest: int = 2000
+
+
+Method = ValueIteration | PolicyIteration | Nested
 
 
 @node(static=("scheme", "certificate"))

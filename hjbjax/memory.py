@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from hjbjax.grid import Grid
-from hjbjax.iteration import Method, PolicyIteration
+from hjbjax.iteration import Method, Nested, PolicyIteration
 from hjbjax.problem import Problem
 from hjbjax.relaxation import Krylov, Sweeps
 
@@ -21,6 +21,8 @@ def estimate(problem: Problem, grid: Grid, method: Method, dtype: Any) -> int:
     Value, residual, policy and what the certificate needs; for policy iteration the 2n weights and the source in
     double and, sheared, in single precision; eight vectors for a Krylov method.
     """
+    if isinstance(method, Nested):
+        return estimate(problem, grid, method.inner, dtype)
     word, n = np.dtype(dtype).itemsize, grid.ndim
     actions = sum(choices.dim for choices in (problem.controls, problem.disturbances) if choices is not None)
     per_node = word * (6 + 2 * actions) + 2

@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax import bellman, certificates, checks, hamiltonian, iteration, proper
+from hjbjax import bellman, checks, hamiltonian, iteration, proper, transfer
 from hjbjax.certificates import Certificate
 from hjbjax.grid import Grid
-from hjbjax.iteration import Method, PolicyIteration, Task, ValueIteration
+from hjbjax.iteration import Method, Nested, PolicyIteration, Task, ValueIteration
 from hjbjax.problem import Problem
 from hjbjax.pytree import cast, is_traced
 from hjbjax.relaxation import Direct, Krylov, Sweeps
@@ -25,15 +25,34 @@ class SolveWarning(UserWarning):
     """The solve went through, and something about its answer deserves attention."""
 
 
+NEST = 100_000  # nodes beyond which compiling coarser grids pays
+
+
 def choose(problem: Problem, grid: Grid, *, traced: bool) -> Method:
     """The method that suits a problem.
 
     Where transport rules, a few wavefront sweeps evaluate a policy well enough. Where there is noise they are
-    too slow and precondition a Krylov method; on a line a direct solve costs nothing.
+    too slow and precondition a Krylov method; on a line a direct solve costs nothing. Large grids are nested.
     """
     if problem.noise is None:
-        return PolicyIteration(Sweeps())
-    return PolicyIteration(Direct() if grid.ndim == 1 and not traced else Krylov())
+        method = PolicyIteration(Sweeps())
+    else:
+        method = PolicyIteration(Direct() if grid.ndim == 1 and not traced else Krylov())
+    return Nested(method) if grid.size > NEST and not traced else method
+
+
+def levels(problem: Problem, grid: Grid, method: Method, scheme: Upwind, dtype: Any) -> list[Grid]:
+    """The grids of a nested solve, coarsest first; a coarser grid that loses the target or rest point is left out."""
+    chain = [grid]
+    if not isinstance(method, Nested):
+        return chain
+    verdict = judge(problem, grid, dtype)
+    needs_held = problem.target is not None or verdict.may_rest
+    while (smaller := transfer.coarser(chain[0])) is not None and smaller.size >= method.coarsest:
+        if needs_held and not held_jit(problem, smaller, scheme=scheme, dtype=dtype, verdict=verdict).any():
+            break
+        chain.insert(0, smaller)
+    return chain
 
 
 def prepare(
@@ -41,11 +60,7 @@ def prepare(
 ) -> Task:
     """The task of a solve, all arrays in ``dtype``; pure, so that it may be traced, batched and differentiated."""
     problem, grid = cast(problem, dtype), cast(grid, dtype)
-    rules = bellman.conditions(problem, grid, dtype)
-    least = None
-    if verdict.may_rest:
-        rests, least = iteration.rest_nodes(problem, grid, scheme=scheme, dtype=dtype)
-        rules = dataclasses.replace(rules, held=rules.held | rests)
+    rules, least = _rules(problem, grid, scheme=scheme, dtype=dtype, verdict=verdict)
     pace = None
     if isinstance(method, ValueIteration):
         rate = bellman.fastest_rate(problem, grid, scheme=scheme, dtype=dtype) + problem.discount
@@ -54,6 +69,17 @@ def prepare(
     if verdict.certificate is not Certificate.MULTIPLICATIVE:
         least = None
     return Task(problem, grid, method, rules, counted, least, pace, jnp.asarray(tol, dtype), scheme, verdict.certificate)
+
+
+def _rules(
+    problem: Problem, grid: Grid, *, scheme: Upwind, dtype: Any, verdict: "Verdict"
+) -> tuple[bellman.Conditions, Any]:
+    """The conditions, rest points among them, and the least running cost where it was needed."""
+    rules = bellman.conditions(problem, grid, dtype)
+    if not verdict.may_rest:
+        return rules, None
+    rests, least = iteration.rest_nodes(problem, grid, scheme=scheme, dtype=dtype)
+    return dataclasses.replace(rules, held=rules.held | rests), least
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,7 +115,13 @@ def judge(problem: Problem, grid: Grid, dtype: Any) -> Verdict:
     return Verdict(kind, how.exact, may_rest=not constrained and problem.cost is not None)
 
 
-prepare_jit = functools.partial(jax.jit, static_argnames=("scheme", "dtype", "verdict"))(prepare)
+prepare_jit = jax.jit(prepare, static_argnames=("scheme", "dtype", "verdict"))
+
+
+@functools.partial(jax.jit, static_argnames=("scheme", "dtype", "verdict"))
+def held_jit(problem: Problem, grid: Grid, *, scheme: Upwind, dtype: Any, verdict: Verdict) -> jax.Array:
+    """The nodes at which the value is given, bool (*grid)."""
+    return _rules(cast(problem, dtype), cast(grid, dtype), scheme=scheme, dtype=dtype, verdict=verdict)[0].held
 
 
 def prepare_on_host(
@@ -123,9 +155,8 @@ def prepare_on_host(
 
 
 def _costs_suit(task: Task) -> bool:
-    """Whether running and exit costs are non-negative, and positive where the value is not given."""
-    held, least = np.asarray(task.rules.held), np.asarray(task.least_cost)
-    return bool(np.all(np.asarray(task.rules.given)[held] >= 0) and np.all(least[~held] > 0))
+    """Whether the running cost is positive wherever the value is not given."""
+    return bool(np.all(np.asarray(task.least_cost)[~np.asarray(task.rules.held)] > 0))
 
 
 def _without(task: Task, reached: np.ndarray) -> Task:

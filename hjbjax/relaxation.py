@@ -160,18 +160,32 @@ def krylov(method: Krylov, equation: Correction, grid: Grid) -> jax.Array:
 
 
 def direct(equation: Correction, grid: Grid) -> jax.Array:
-    """(I − W)⁻¹ s by SuperLU through a host callback; lanes of a batch are solved one after another."""
-    result = jax.ShapeDtypeStruct(equation.source.shape, equation.source.dtype)
-    offsets = equation.weights.offsets
+    """(I − W)⁻¹ s by SuperLU through a host callback; lanes of a batch are solved one after another.
+
+    Numbers travel as 32-bit words: the callback's thread does not know of ``jax.enable_x64``.
+    """
+    offsets, dtype = equation.weights.offsets, equation.source.dtype
+    word = np.uint32
+
+    def numbers(words):
+        return np.ascontiguousarray(words).view(dtype).reshape(grid.shape).astype(np.float64)
 
     def on_host(source, *weights):
-        from scipy.sparse.linalg import splu
+        delta = _factor_and_solve(offsets, [numbers(w) for w in weights], numbers(source), grid)
+        return np.ascontiguousarray(delta.astype(dtype)).view(word).reshape(source.shape)
 
-        matrix = stencil.sparse(offsets, [-np.asarray(w) for w in weights], np.ones(grid.shape), grid)
-        try:
-            delta = splu(matrix.tocsc()).solve(np.asarray(source, np.float64).ravel())
-        except RuntimeError:  # exactly singular
-            delta = np.full(grid.size, np.nan)
-        return delta.reshape(grid.shape).astype(result.dtype)
+    words = [jax.lax.bitcast_convert_type(array, word) for array in (equation.source, *equation.weights.values)]
+    result = jax.ShapeDtypeStruct(words[0].shape, word)
+    delta = jax.pure_callback(on_host, result, *words, vmap_method="sequential")
+    return jax.lax.bitcast_convert_type(delta, dtype)
 
-    return jax.pure_callback(on_host, result, equation.source, *equation.weights.values, vmap_method="sequential")
+
+def _factor_and_solve(offsets: Any, weights: list[np.ndarray], source: np.ndarray, grid: Grid) -> np.ndarray:
+    from scipy.sparse.linalg import splu
+
+    matrix = stencil.sparse(offsets, [-w for w in weights], np.ones(grid.shape), grid)
+    try:
+        delta = splu(matrix.tocsc()).solve(source.ravel())
+    except RuntimeError:  # exactly singular
+        delta = np.full(grid.size, np.nan)
+    return delta.reshape(grid.shape)

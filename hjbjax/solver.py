@@ -6,6 +6,8 @@ runs with a fixed method and none of that, and its value is differentiable.
 """
 
 import contextlib
+import dataclasses
+import itertools
 import math
 import sys
 import time
@@ -16,11 +18,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax import certificates, checks, hamiltonian, iteration, memory, sensitivity
+from hjbjax import certificates, checks, hamiltonian, iteration, memory, sensitivity, transfer
 from hjbjax.certificates import Certificate
 from hjbjax.grid import Grid
-from hjbjax.iteration import HISTORY, Method, PolicyIteration, State, Task, ValueIteration
-from hjbjax.preparation import SolveWarning, Verdict, choose, judge, prepare, prepare_on_host
+from hjbjax.iteration import HISTORY, Method, Nested, PolicyIteration, State, Task, ValueIteration
+from hjbjax.preparation import SolveWarning, Verdict, choose, judge, levels, prepare, prepare_jit, prepare_on_host
 from hjbjax.problem import Problem
 from hjbjax.pytree import is_traced
 from hjbjax.schemes import Upwind
@@ -30,6 +32,8 @@ from hjbjax.status import Status
 
 CHUNK_SECONDS = 0.2
 TRACED_STEPS = 10_000
+VANISHING = (1.0, 0.1, 0.01)  # discounts on the way to none, per unit time
+WARM_STEPS = 60  # improvements for each of them
 
 _begin = jax.jit(iteration.begin)
 _run = jax.jit(iteration.run)
@@ -91,49 +95,91 @@ def solve(
     kind = _dtype(dtype)
     _check_guess(guess, grid)
     method = method or choose(problem, grid, traced=False)
-    clock = time.perf_counter()
+    clock = _Clock(max_steps or 10**9, math.inf if time_limit is None else time_limit, progress)
     with jax.enable_x64(kind == np.float64):
         needed = memory.require(problem, grid, method, kind, max_memory)
         checks.shapes(problem, grid, scheme)
         checks.values(problem, grid, scheme, kind)
-        task, verdict, reached = prepare_on_host(problem, grid, method=method, scheme=scheme, tol=tol, dtype=kind)
-        start = jnp.zeros(grid.shape, kind) if guess is None else jnp.asarray(guess, kind)
-        limits = (max_steps or 10**9, math.inf if time_limit is None else time_limit)
-        state, code, residuals, compiling = _drive(task, start, limits, clock, progress)
+        guess, coarse = _coarse_answer(problem, grid, method, scheme, tol, guess, kind, clock)
+        inner = method.inner if isinstance(method, Nested) else method
+        task, verdict, reached = prepare_on_host(problem, grid, method=inner, scheme=scheme, tol=tol, dtype=kind)
+        state, code, residuals = _drive(task, guess if coarse else _warm(task, guess, clock), clock)
         solution = _finish(task, state, code, reached, residuals, verdict, grid)
-    stats = solution.stats
-    stats.update(seconds=time.perf_counter() - clock - compiling, compile_seconds=compiling, bytes=needed, tol=tol)
+    solution.stats.update(
+        method=repr(method), levels=[*coarse, grid.shape], seconds=clock.elapsed() - clock.compiling,
+        compile_seconds=clock.compiling, bytes=needed, tol=tol,
+    )  # fmt: skip
     if throw and code is not Status.CONVERGED:
         raise SolveError(f"{code.name}: {solution.message}", solution)
     return solution
 
 
-def _drive(
-    task: Task, guess: jax.Array, limits: tuple[float, float], clock: float, progress: bool | None
-) -> tuple[State, Status, np.ndarray, float]:
+class _Clock:
+    """The limits of a solve and the time it has taken, compiling apart."""
+
+    def __init__(self, max_steps: int, seconds: float, progress: bool | None):
+        self.max_steps, self.seconds, self.progress = max_steps, seconds, progress
+        self.began, self.compiling = time.perf_counter(), 0.0
+
+    def elapsed(self) -> float:
+        return time.perf_counter() - self.began
+
+
+def _coarse_answer(
+    problem: Problem, grid: Grid, method: Method, scheme: Upwind, tol: float, guess: Any, kind: Any, clock: _Clock
+) -> tuple[Any, list]:
+    """The guess for the finest grid: the user's, or the answer of the coarser grids, and the shapes of those."""
+    if guess is not None or not isinstance(method, Nested):
+        return None if guess is None else jnp.asarray(guess, kind), []
+    grids = levels(problem, grid, method, scheme, kind)
+    value = None
+    for coarse, fine in itertools.pairwise(grids):
+        verdict = judge(problem, coarse, kind)
+        task = prepare_jit(problem, coarse, method=method.inner, scheme=scheme, tol=tol, dtype=kind, verdict=verdict)
+        state, _, _ = _drive(task, _warm(task, None, clock) if value is None else value, clock)
+        value = transfer.prolong(state.value, coarse, fine)
+    return value, [coarse.shape for coarse in grids[:-1]]
+
+
+def _warm(task: Task, guess: Any, clock: _Clock) -> jax.Array:
+    """The guess; without one zero, or without discount the answers for a discount that vanishes.
+
+    From below an undiscounted problem is full of policies that stay where they are at a cost; those of a small
+    discount move to the target.
+    """
+    zero = jnp.zeros(task.grid.shape, task.tol.dtype) if guess is None else guess
+    if guess is not None or task.certificate is not Certificate.MULTIPLICATIVE:
+        return zero
+    for discount in VANISHING:
+        problem = dataclasses.replace(task.problem, discount=jnp.asarray(discount, task.tol.dtype))
+        softened = dataclasses.replace(task, problem=problem)
+        zero = _run(softened, _begin(softened, zero), WARM_STEPS).value
+    return zero
+
+
+def _drive(task: Task, guess: jax.Array, clock: _Clock) -> tuple[State, Status, np.ndarray]:
     """The host's loop: chunks of steps until the state stops running, the steps or the time run out, or Ctrl-C."""
-    max_steps, seconds = limits
     compiling = time.perf_counter()
     state = _begin(task, guess)
     state = jax.block_until_ready(_run(task, state, 0))  # compiles; takes no step
-    compiling = time.perf_counter() - compiling
+    clock.compiling += time.perf_counter() - compiling
     residuals, chunk, code = [np.asarray(state.history[:1])], 1, Status(int(state.code))
-    with _bar(progress, float(task.tol)) as show:
+    with _bar(clock.progress, float(task.tol)) as show:
         try:
             while code is Status.RUNNING:
                 done, began = int(state.step), time.perf_counter()
-                if done >= max_steps or time.perf_counter() - clock >= seconds:
-                    code = Status.MAX_STEPS if done >= max_steps else Status.TIME_LIMIT
+                if done >= clock.max_steps or clock.elapsed() >= clock.seconds:
+                    code = Status.MAX_STEPS if done >= clock.max_steps else Status.TIME_LIMIT
                     break
-                new = jax.block_until_ready(_run(task, state, int(min(done + chunk, max_steps))))
-                state, took = new, time.perf_counter() - began
+                state = jax.block_until_ready(_run(task, state, int(min(done + chunk, clock.max_steps))))
+                took = time.perf_counter() - began
                 code, steps = Status(int(state.code)), int(state.step) - done
                 residuals.append(np.asarray(state.history[:steps]))
                 chunk = int(np.clip(chunk * CHUNK_SECONDS / max(took, 1e-4), 1, min(HISTORY, 8 * chunk)))
                 show(steps, float(state.gap.error))
         except KeyboardInterrupt:
             code = Status.INTERRUPTED
-    return state, code, np.concatenate(residuals), compiling
+    return state, code, np.concatenate(residuals)
 
 
 @contextlib.contextmanager
@@ -187,7 +233,6 @@ def _finish(
         residuals=residuals,
         message=_message(code, task, state, residuals),
         stats={
-            "method": repr(task.method),
             "scheme": repr(task.scheme),
             "device": str(jax.devices()[0].device_kind),
             "dtype": str(state.value.dtype),
@@ -208,7 +253,7 @@ def _rests(task: Task) -> np.ndarray:
 def assemble(task: Task, state: State, verdict: Verdict) -> Solution:
     """The solution as it stands in the state; pure."""
     problem = task.problem
-    bounds = certificates.bounds(verdict.certificate, state.value, state.gap.below, state.gap.above)
+    bounds = certificates.bounds(verdict.certificate, state.value, state.gap)
     lower, upper = bounds if bounds is not None else (None, None)
     controls, disturbances = state.policy.controls, state.policy.disturbances
     return Solution(
@@ -288,7 +333,7 @@ def _check_arguments(
 ) -> None:
     if not isinstance(problem, Problem) or not isinstance(grid, Grid):
         raise TypeError(f"solve: got {type(problem).__name__}, {type(grid).__name__}; wanted a Problem and a Grid")
-    if method is not None and not isinstance(method, (ValueIteration, PolicyIteration)):
+    if method is not None and not isinstance(method, (ValueIteration, PolicyIteration, Nested)):
         raise TypeError(f"solve: method is {method!r}; wanted hjb.PolicyIteration(...) or hjb.ValueIteration()")
     if not isinstance(scheme, Upwind):
         raise TypeError(f"solve: scheme is {scheme!r}; wanted hjb.Upwind(...)")

@@ -1,0 +1,130 @@
+"""A chain in the forms that other people's solvers read: SciPy's sparse matrices, QuantEcon's pairs.
+
+Host level, float64, nodes in C order. What depends on how rates are made is ``chain``'s; here is what the exports
+ask of a problem and a policy, and how their arrays are laid out.
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from hjbjax import fields
+from hjbjax.grid import Grid
+from hjbjax.problem import Problem
+from hjbjax.sets import AdmissibleSet, Finite
+
+Offsets = tuple[tuple[int, ...], ...]
+Table = tuple[Offsets, Sequence[Any], Any]
+
+
+def time_step(leaving: np.ndarray) -> float:
+    """Δt = 1/max Q; 1 where nothing moves."""
+    fastest = float(np.max(leaving))
+    return 1 / fastest if fastest > 0 else 1.0
+
+
+def refuse(what: str, where: np.ndarray, grid: Grid) -> None:
+    """Raise a ValueError that says ``what``, at how many nodes and at which first, if it is true of any."""
+    if np.any(where):
+        first = tuple(int(i) for i in np.argwhere(where)[0])
+        state = np.array2string(grid.state(first), separator=", ")
+        raise ValueError(f"chain: {what} at {int(np.sum(where))} nodes, the first {first} with state {state}")
+
+
+def target(problem: Problem, grid: Grid, t: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Which nodes lie on the target, and the exit cost; both (*grid)."""
+    arrays = []
+    with jax.enable_x64(True):
+        x = grid.components(np.float64)
+        for ingredient, default in ((problem.target, 1.0), (problem.exit_cost, 0.0)):
+            entry = default if ingredient is None else ingredient
+            if callable(entry):
+                entry = fields.scalar(entry, *problem.state_arguments(x, t), dtype=np.float64)
+            arrays.append(np.broadcast_to(np.asarray(entry, np.float64), grid.shape))
+    return arrays[0] <= 0, arrays[1]
+
+
+def policies(problem: Problem, grid: Grid, policy: Any, disturbance: Any) -> tuple[list, list, np.ndarray]:
+    """The components of both players' policies, each (*grid), and the nodes where no entry is NaN."""
+    u = _entries(policy, problem.controls, grid, "policy")
+    d = _entries(disturbance, problem.disturbances, grid, "disturbance")
+    active = ~np.any(np.isnan(np.concatenate([u, d], axis=-1)), axis=-1)
+    return *(list(np.moveaxis(np.where(active[..., None], action, 0), -1, 0)) for action in (u, d)), active
+
+
+def _entries(action: Any, choices: AdmissibleSet | None, grid: Grid, name: str) -> np.ndarray:
+    wanted = (*grid.shape, 0 if choices is None else choices.dim)
+    entries = np.zeros(wanted) if action is None and choices is None else np.asarray(action, np.float64)
+    if entries.shape != wanted:
+        raise ValueError(f"chain: got a {name} of shape {entries.shape}, wanted {wanted}: one action a node")
+    if np.any(np.isinf(entries)):
+        raise ValueError(f"chain: the {name} is infinite at some node; wanted numbers, or NaN where there is no action")
+    return entries
+
+
+def actions(problem: Problem) -> np.ndarray:
+    """The K actions of a discounted decision problem, shape (K, m); refuses what is none.
+
+    Raises:
+      ValueError: a game, no discount, constraints, time, or controls that are not finitely many.
+    """
+    if problem.is_game:
+        raise ValueError("transition_arrays: got a game; a decision problem has one player. Leave out disturbances")
+    if not problem.discount > 0:
+        raise ValueError(
+            "transition_arrays: got discount = 0, wanted > 0: the factor would be 1, and stationary decision problems "
+            "need one below (QuantEcon's methods refuse 1)"
+        )
+    if problem.stopping_cost is not None or problem.running_max is not None:
+        raise ValueError("transition_arrays: got a stopping_cost or running_max, which a decision problem cannot hold")
+    if problem.time_dependent:
+        raise ValueError("transition_arrays: got time_dependent=True, wanted a stationary problem")
+    if problem.controls is None:
+        return np.zeros((1, 0))
+    if not isinstance(problem.controls, Finite):
+        kind = type(problem.controls).__name__
+        raise ValueError(f"transition_arrays: got controls in a {kind}, wanted Finite: sample it, as by Box.grid(num)")
+    return np.asarray(problem.controls.points, np.float64)
+
+
+def decision_problem(
+    tables: Iterable[Table], grid: Grid, count: int, held: np.ndarray, given: np.ndarray, discount: float
+) -> tuple[np.ndarray, Any, np.ndarray, np.ndarray, float]:
+    """Costs, probabilities, indices and factor over pairs of state and action; see ``chain.transition_arrays``.
+
+    Args:
+      tables: for each action the offsets, the rates and the running cost; one action in memory at a time.
+      grid: the grid.
+      count: the number K of actions.
+      held: the nodes of the target, where the tables are zero.
+      given: the exit cost there.
+      discount: β.
+    """
+    from scipy.sparse import csr_array
+
+    costs, entries = np.empty((grid.size, count)), np.empty((grid.size, count, 0))
+    offsets: Offsets = ()
+    for k, (offsets, values, cost) in enumerate(tables):
+        if k == 0:  # the last entry of a row is its diagonal
+            entries = np.empty((grid.size, count, len(offsets) + 1))
+        costs[:, k] = cost.ravel()
+        for column, c in enumerate(values):
+            entries[:, k, column] = c.ravel()
+    leaving = entries[..., :-1].sum(axis=-1)
+    dt = time_step(leaving)
+    entries[..., :-1] *= dt
+    entries[..., -1] = np.maximum(1 - leaving * dt, 0)
+    factor = 1 / (1 + discount * dt)
+    paid = np.where(held.reshape(-1, 1), (1 - factor) * given.reshape(-1, 1), factor * dt * costs)
+    number = np.arange(grid.size, dtype=np.int32 if entries.size < 2**31 else np.int64).reshape(grid.shape)
+    ends = [np.roll(number, [-step for step in offset], axis=range(grid.ndim)) for offset in offsets]
+    columns = np.stack([end.ravel() for end in (*ends, number)], axis=-1)[:, None, :]
+    starts = np.arange(0, entries.size + 1, entries.shape[-1], dtype=number.dtype)
+    layout = (entries.ravel(), np.broadcast_to(columns, entries.shape).ravel(), starts)
+    probabilities = csr_array(layout, shape=(costs.size, grid.size))
+    probabilities.sum_duplicates()  # a jump over the seam of an axis with two nodes; sorts the columns as well
+    probabilities.eliminate_zeros()
+    state, action = np.divmod(np.arange(costs.size), count)
+    return paid.ravel(), probabilities, state, action, factor

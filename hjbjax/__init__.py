@@ -2,6 +2,7 @@
 
 from hjbjax import chain, zoo
 from hjbjax._version import __version__
+from hjbjax.batch import solve_batch
 from hjbjax.fields import FallbackWarning
 from hjbjax.files import FileError
 from hjbjax.grid import Grid
@@ -40,5 +41,6 @@ __all__ = [
     "load",
     "simulate",
     "solve",
+    "solve_batch",
     "zoo",
 ]

@@ -114,14 +114,6 @@ def _left_over(problem: Problem, grid: Grid, value: Any, held: Any, best: Any, u
     return Greedy(rate, *full)
 
 
-def frozen_rate(
-    problem: Problem, grid: Grid, value: jax.Array, policy: Greedy, *, scheme: Upwind, t: Any = 0.0
-) -> jax.Array:
-    """H(u, d) − β V at given actions: what a change of the problem's numbers does to the residual."""
-    here = hamiltonian.local(problem, grid, value, scheme=scheme, t=t)
-    return here.at(list(policy.controls), list(policy.disturbances)) - problem.discount * value
-
-
 def correction(
     problem: Problem,
     grid: Grid,

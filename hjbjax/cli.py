@@ -12,6 +12,7 @@ import contextlib
 import difflib
 import json
 import math
+import os
 import signal
 import sys
 import warnings
@@ -60,6 +61,9 @@ class OneLineGroup(click.Group):
         except (click.Abort, KeyboardInterrupt):
             click.echo("hjbjax: interrupted", err=True)
             code = 130
+            if sys.stdout is sys.__stdout__:  # a process of our own: leaving JAX at work to the usual exit crashes it
+                sys.stdout.flush()
+                os._exit(code)
         sys.exit(code if isinstance(code, int) else 0)
 
 
@@ -209,11 +213,19 @@ def solve(
             finally:  # what is whole is kept
                 results.publish(staging, out, made, force)
     files = [out / file for file in made]
+    off = None
+    with contextlib.suppress(ValueError):  # no answer is known for these parameters
+        off = None if entry.exact is None else results.difference(entry.exact(**parameters), solution)
     if as_json:
-        click.echo(json.dumps(results.report(solution, path, files, problem=name, parameters=parameters)))
+        about = {"problem": name, "parameters": parameters, "exact_difference": off}
+        click.echo(json.dumps(results.report(solution, path, files, **about)))
     else:
-        lines = [str(solution), *([f"path: {path}"] if path else []), f"wrote {', '.join(map(str, files))}"]
-        click.echo("\n".join(lines))
+        click.echo(str(solution))
+        if off is not None:
+            click.echo(f"off the exact answer by at most {off:.3g} on the inner half of the box")
+        if path is not None:
+            click.echo(f"path: {path}")
+        click.echo(f"wrote {', '.join(map(str, files))}")
     if code := CODES.get(solution.status.name, 3):
         raise Failure(f"{solution.status.name}: {solution.message or solution.status.message}", code)
 
@@ -295,9 +307,16 @@ def _build(entry: Any, parameters: dict[str, Any], shape: tuple[int, ...] | None
 
 @contextlib.contextmanager
 def _interruptible() -> Iterator[None]:
-    """SIGTERM as Ctrl-C: the solver keeps what it has for either."""
+    """Ctrl-C and SIGTERM alike: the solver keeps what it has for either.
+
+    A shell starts background jobs with SIGINT ignored, so SIGTERM must not go by way of SIGINT.
+    """
+
+    def stop(*_: Any) -> None:
+        raise KeyboardInterrupt
+
     try:
-        old = signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+        old = signal.signal(signal.SIGTERM, stop)
     except ValueError:  # not the main thread: signals are another's business
         yield
         return

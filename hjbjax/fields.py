@@ -10,6 +10,7 @@ that act entry by entry, and sums and products. Anything else falls back to ``vm
 """
 
 import functools
+import itertools
 import math
 import warnings
 from collections.abc import Callable, Sequence
@@ -40,12 +41,14 @@ _MOVES: dict[str, Callable[[int], Sequence[int]]] = {
     "dynamic_update_slice": lambda n: (0, 1),
     "scatter": lambda n: (0, 2),
 }
+_SCATTERS = {"scatter-add": jax.lax.add, "scatter-sub": jax.lax.sub, "scatter-mul": jax.lax.mul}
+_SCATTERS |= {"scatter-min": jax.lax.min, "scatter-max": jax.lax.max}
 
 _ENTRYWISE = frozenset(
-    """abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type copy copy_p
-    cos cosh digamma div eq erf erf_inv erfc exp exp2 expm1 floor ge gt imag integer_pow is_finite le lgamma log
-    log1p logistic lt max min mul ne neg nextafter not or pow real reduce_precision rem round rsqrt select_n sign
-    sin sinh sqrt square stop_gradient sub tan tanh xor""".split()
+    """abs acos acosh add add_any and asin asinh atan atan2 atanh bessel_i0e bessel_i1e cbrt ceil clamp
+    convert_element_type copy copy_p cos cosh digamma div eq erf erf_inv erfc exp exp2 expm1 floor ge gt imag
+    integer_pow is_finite le lgamma log log1p log2 logistic lt max min mul ne neg nextafter not or pow real
+    reduce_precision rem round rsqrt select_n sign sin sinh sqrt square stop_gradient sub tan tanh xor""".split()  # noqa: SIM905
 )
 
 _REDUCTIONS: dict[str, Callable] = {
@@ -57,8 +60,10 @@ _REDUCTIONS: dict[str, Callable] = {
     "reduce_or": jax.lax.bitwise_or,
 }
 
+_CUMULATIVE = {"cumsum": jax.lax.add, "cumprod": jax.lax.mul, "cummax": jax.lax.max, "cummin": jax.lax.min}
+
 _CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr"}
-_CALLS |= {"checkpoint": "jaxpr", "remat": "jaxpr", "custom_vjp_call": "call_jaxpr", "custom_jvp_call": "call_jaxpr"}
+_CALLS |= {"checkpoint": "jaxpr", "remat": "jaxpr", "remat2": "jaxpr", "custom_jvp_call": "call_jaxpr"}
 
 
 class FallbackWarning(UserWarning):
@@ -148,21 +153,31 @@ def _apply(eqn: Any, operands: list[Any], algebra: Any) -> list[Any]:
     if not any(map(_is_components, operands)):
         return _uniform(eqn, operands)
     if name in _CALLS and _CALLS[name] in eqn.params:
-        if name == "custom_jvp_call" and all(np.shape(value) == () for value in operands):
-            return algebra.nodewise(eqn, operands)  # keeps the function's own derivative; still one fused kernel
         inner = eqn.params[_CALLS[name]]
         inner = inner if isinstance(inner, jex.ClosedJaxpr) else jex.ClosedJaxpr(inner, ())
-        return evaluate(inner, operands, algebra)
+        return (
+            algebra.custom_jvp(eqn, inner, operands)
+            if name == "custom_jvp_call"
+            else evaluate(inner, operands, algebra)
+        )
+    if name == "cond":
+        return _branch(eqn, operands, algebra)
     if name in _MOVES:
         moved = _move(eqn, operands, algebra)
         if moved is not None:
             return moved
     elif name in _ENTRYWISE:
         return [_entrywise(eqn, operands, algebra)]
+    elif name in _SCATTERS:
+        scattered = _scatter(eqn, operands, algebra)
+        if scattered is not None:
+            return [scattered]
+    elif name in _CUMULATIVE:
+        return [_accumulate(eqn, _lift(operands[0], algebra), algebra)]
     elif name in _REDUCTIONS:
         return [_reduce(eqn, _lift(operands[0], algebra), algebra)]
     elif name == "dot_general":
-        return [_contract(eqn, *(_lift(value, algebra) for value in operands), algebra)]
+        return [_contract(eqn, _lift(operands[0], algebra), _lift(operands[1], algebra), algebra)]
     if any(np.shape(value) != () for value in operands) or any(var.aval.shape != () for var in eqn.outvars):
         _warn_once(name)
     return algebra.nodewise(eqn, operands)
@@ -181,13 +196,14 @@ def _bind(eqn: Any, operands: list[Any]) -> list[Any]:
     return list(results) if eqn.primitive.multiple_results else [results]
 
 
+def _known(values: Sequence[Any]) -> bool:
+    return not any(_is_components(value) or isinstance(value, jax.core.Tracer) for value in values)
+
+
 def _move(eqn: Any, operands: list[Any], algebra: Any) -> list[Any] | None:
     """Where every entry of a data-moving primitive goes, found by moving integer labels."""
     data = set(_MOVES[eqn.primitive.name](len(operands)))
-    known = [value for position, value in enumerate(operands) if position not in data]
-    if any(_is_components(value) or isinstance(value, jax.core.Tracer) for value in known):
-        return None
-    if eqn.params.get("fill_value") is not None:
+    if not _known([value for position, value in enumerate(operands) if position not in data]):
         return None
     pool: list[Any] = []
     labelled = list(operands)
@@ -195,12 +211,50 @@ def _move(eqn: Any, operands: list[Any], algebra: Any) -> list[Any] | None:
         entries = _lift(operands[position], algebra)
         labelled[position] = np.arange(len(pool), len(pool) + entries.size, dtype=np.int32).reshape(entries.shape)
         pool.extend(entries.reshape(-1))
+    fill = eqn.params.get("fill_value")
+    pool.append(algebra.constant(np.asarray(np.nan if fill is None else fill), ()))
+    if fill is not None:
+        eqn = eqn.replace(params=eqn.params | {"fill_value": -1})
     with jax.ensure_compile_time_eval():
         moved = _bind(eqn, labelled)
-    pool.append(algebra.constant(np.asarray(np.nan), ()))
-    return [  # a gather out of range has a negative label: it takes the NaN at the end
+    return [  # a gather out of range has a negative label: it takes the fill value at the end
         _object_array([pool[max(label, -1)] for label in np.ravel(labels)], np.shape(labels)) for labels in moved
     ]
+
+
+def _scatter(eqn: Any, operands: list[Any], algebra: Any) -> np.ndarray | None:
+    """``x.at[known].add(...)`` and its like: each update goes where a one in its place would go."""
+    target, indices, updates = operands
+    if not _known([indices]):
+        return None
+    entries, updates = _lift(target, algebra).copy(), _lift(updates, algebra)
+    numbers, mode = eqn.params["dimension_numbers"], eqn.params["mode"]
+    combine = functools.partial(algebra.combine, _SCATTERS[eqn.primitive.name], eqn.invars[0].aval.dtype)
+    for position in np.ndindex(*updates.shape):
+        one = np.zeros(updates.shape, np.int32)
+        one[position] = 1
+        with jax.ensure_compile_time_eval():
+            hit = jax.lax.scatter_add(jnp.zeros(entries.shape, np.int32), indices, one, numbers, mode=mode)
+        for place in zip(*np.nonzero(hit), strict=True):
+            entries[place] = combine(entries[place], updates[position])
+    return entries
+
+
+def _branch(eqn: Any, operands: list[Any], algebra: Any) -> list[Any]:
+    """``cond`` and ``switch``: the branch that is known to be taken, or a choice node by node, as under ``vmap``."""
+    index, *rest = operands
+    branches = eqn.params["branches"]
+    if _known([index]):
+        return evaluate(branches[int(np.clip(index, 0, len(branches) - 1))], rest, algebra)
+    index = _lift(index, algebra).item()
+    outputs = [[_lift(value, algebra) for value in evaluate(branch, rest, algebra)] for branch in branches]
+    results = []
+    for var, cases in zip(eqn.outvars, zip(*outputs, strict=True), strict=True):
+        dtypes = [eqn.invars[0].aval.dtype] + [var.aval.dtype] * len(cases)
+        rows = zip(*(case.reshape(-1) for case in cases), strict=True)
+        chosen = [algebra.entrywise(jax.lax.select_n_p, {}, [index, *row], dtypes) for row in rows]
+        results.append(_object_array(chosen, cases[0].shape))
+    return results
 
 
 def _entrywise(eqn: Any, operands: list[Any], algebra: Any) -> np.ndarray:
@@ -215,11 +269,21 @@ def _reduce(eqn: Any, entries: np.ndarray, algebra: Any) -> np.ndarray:
     axes = tuple(eqn.params["axes"])
     kept = [axis for axis in range(entries.ndim) if axis not in axes]
     shape = tuple(entries.shape[axis] for axis in kept)
-    if entries.size == 0 and eqn.primitive.name == "reduce_sum":
-        return _object_array([algebra.constant(np.zeros(()), ())] * math.prod(shape), shape)
+    if entries.size == 0:  # the neutral element
+        return _lift(_uniform(eqn, [np.zeros(entries.shape, eqn.invars[0].aval.dtype)])[0], algebra)
     rows = entries.transpose(*kept, *axes).reshape(math.prod(shape), -1)
     combine = functools.partial(algebra.combine, _REDUCTIONS[eqn.primitive.name], eqn.invars[0].aval.dtype)
     return _object_array([functools.reduce(combine, row) for row in rows], shape)
+
+
+def _accumulate(eqn: Any, entries: np.ndarray, algebra: Any) -> np.ndarray:
+    axis, step = eqn.params["axis"], -1 if eqn.params["reverse"] else 1
+    combine = functools.partial(algebra.combine, _CUMULATIVE[eqn.primitive.name], eqn.invars[0].aval.dtype)
+    rows = np.moveaxis(entries, axis, -1)[..., ::step]
+    result = np.empty(rows.shape, dtype=object)
+    for index in np.ndindex(*rows.shape[:-1]):
+        result[index] = _object_array(list(itertools.accumulate(rows[index], combine)), rows.shape[-1:])
+    return np.moveaxis(result[..., ::step], -1, axis)
 
 
 def _contract(eqn: Any, left: np.ndarray, right: np.ndarray, algebra: Any) -> np.ndarray:
@@ -256,6 +320,42 @@ class _Arrays:
 
     def combine(self, operation: Callable, dtype: Any, left: Any, right: Any) -> Any:
         return operation(*jnp.broadcast_arrays(jnp.asarray(left, dtype), jnp.asarray(right, dtype)))
+
+    def custom_jvp(self, eqn: Any, inner: jex.ClosedJaxpr, operands: list[Any]) -> list[Any]:
+        """The function by components, with its own derivative, which is a function of one state as well."""
+        avals = [var.aval for var in eqn.invars]
+        if not all(jnp.issubdtype(aval.dtype, jnp.floating) for aval in avals):
+            return self.nodewise(eqn, operands)
+        packed = [_lift(value, self) for value in operands]
+        shapes = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in avals]
+
+        def flat(closed, rows):
+            arguments = [_object_array(row, shape.shape) for row, shape in zip(rows, shapes * 2, strict=False)]
+            return [
+                [jnp.asarray(entry, var.aval.dtype) for entry in _lift(value, self).flat]
+                for var, value in zip(closed.jaxpr.outvars, evaluate(closed, arguments, self), strict=True)
+            ]
+
+        @jax.custom_jvp
+        def function(*rows):
+            return flat(inner, rows)
+
+        @function.defjvp
+        def derivative(primals, tangents):
+            def one(*args):
+                half = len(args) // 2
+                return jax.jvp(lambda *state: _bind(eqn, list(state)), args[:half], args[half:])
+
+            both = flat(jax.make_jaxpr(one)(*shapes, *shapes), (*primals, *tangents))
+            # a tangent has the shape of its primal, which may vary along more axes than the tangents it came from
+            values, slopes = both[: len(both) // 2], both[len(both) // 2 :]
+            return values, jax.tree.map(lambda value, slope: jnp.broadcast_to(slope, value.shape), values, slopes)
+
+        rows = [
+            [jnp.asarray(entry, aval.dtype) for entry in value.flat] for value, aval in zip(packed, avals, strict=True)
+        ]
+        outputs = function(*rows)
+        return [_object_array(entries, var.aval.shape) for entries, var in zip(outputs, eqn.outvars, strict=True)]
 
     def nodewise(self, eqn: Any, operands: list[Any]) -> list[Any]:
         """One equation at every node by ``vmap`` over the flattened nodes."""

@@ -15,10 +15,11 @@ import os
 import shutil
 import tempfile
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from hjbjax import plotting
@@ -163,6 +164,31 @@ def _with_curve(
         with contextlib.suppress(ValueError):  # the control keeps its sign
             artists += plotting.switching_curve(solution, input=input, fixed=fixed, ax=artists[0].axes)
     return artists
+
+
+def difference(exact: Callable, solution: Solution) -> float | None:
+    """The largest |V − exact| on the inner half of the box, where its edge is not felt.
+
+    Args:
+      exact: the value as a function of one state.
+      solution: what ``solve`` returned.
+
+    Returns:
+      The difference in cost units; ``None`` if nothing there is finite.
+    """
+    grid = solution.grid
+    index = []
+    for axis in range(grid.ndim):
+        lo, hi, nodes = grid.lo[axis], grid.hi[axis], np.asarray(grid.axis(axis))
+        inner = np.abs(nodes - (lo + hi) / 2) <= (hi - lo) / 4
+        index.append(np.arange(len(nodes)) if grid.periodic[axis] else np.flatnonzero(inner))  # type: ignore[index]
+    corner = np.ix_(*index)
+    states = grid.nodes()[corner]
+    with jax.enable_x64(True):
+        wanted = np.asarray(jax.lax.map(exact, states.reshape(-1, grid.ndim), batch_size=1 << 16))
+    off = np.abs(np.asarray(solution.value)[corner] - wanted.reshape(states.shape[:-1]))
+    off = off[np.isfinite(off)]
+    return float(off.max()) if off.size else None
 
 
 def report(solution: Solution, path: Trajectory | None, files: Sequence[Path], **about: Any) -> dict[str, Any]:

@@ -5,7 +5,8 @@ The value V of a converged solve satisfies Φ(V, θ) = 0, node by node the activ
 
     dV = (I − W)⁻¹ ∂Φ/∂θ dθ.
 
-The policy need not be differentiated: it is optimal. Forward mode takes one linear solve and reverse mode one
+∂Φ/∂θ is taken through the formulas that give the optimal action: where that is stationary they contribute nothing,
+and where it sits at a bound or at a kink of the upwinding, both of which may move with θ, they do. Forward mode takes one linear solve and reverse mode one
 transposed solve, whatever the number of steps that led to V.
 """
 
@@ -50,11 +51,11 @@ def attach(task: Task, state: State) -> jax.Array:
 
 
 def _residual(task: Task, state: State, equation: Correction) -> jax.Array:
-    """Φ at the frozen value, policy and branches, as a function of the problem and of the grid."""
+    """Φ at the frozen value and branches, as a function of the problem and of the grid."""
     problem, grid, value, policy = task.problem, task.grid, state.value, state.policy
     rules = bellman.conditions(problem, grid, value.dtype)
     u, d = list(policy.controls), list(policy.disturbances)
-    rate = bellman.frozen_rate(problem, grid, value, policy, scheme=task.scheme)
+    rate = bellman.greedy(problem, grid, value, jax.lax.stop_gradient(task.rules.held), scheme=task.scheme).rate
     total = chain.rates(problem, grid, u, d if problem.is_game else None, scheme=task.scheme, dtype=value.dtype).total()
     pace = jax.lax.stop_gradient(total + problem.discount)
     phi = rate / jnp.where(pace > 0, pace, 1)

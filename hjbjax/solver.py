@@ -89,10 +89,10 @@ def solve(
       >>> solution.status.name, solution.error <= 1e-3
       ('CONVERGED', True)
     """
-    _check_arguments(problem, grid, method, scheme, tol, max_steps, time_limit)
+    check_arguments(problem, grid, method, scheme, tol, max_steps, time_limit)
     if is_traced(problem, grid, guess, tol):
         return _solve_traced(problem, grid, method, scheme, tol, guess, dtype, max_steps)
-    kind = _dtype(dtype)
+    kind = as_dtype(dtype)
     _check_guess(guess, grid)
     method = method or choose(problem, grid, traced=False)
     clock = _Clock(max_steps or 10**9, math.inf if time_limit is None else time_limit, progress)
@@ -104,7 +104,7 @@ def solve(
         inner = method.inner if isinstance(method, Nested) else method
         task, verdict, reached = prepare_on_host(problem, grid, method=inner, scheme=scheme, tol=tol, dtype=kind)
         state, code, residuals = _drive(task, guess if coarse else _warm(task, guess, clock), clock)
-        solution = _finish(task, state, code, reached, residuals, verdict, grid)
+        solution = finish(task, state, code, reached, residuals, verdict, grid)
     solution.stats.update(
         method=repr(method), levels=[*coarse, grid.shape], seconds=clock.elapsed() - clock.compiling,
         compile_seconds=clock.compiling, bytes=needed, tol=tol,
@@ -199,7 +199,7 @@ def _bar(progress: bool | None, tol: float) -> Any:
         yield show
 
 
-def _finish(
+def finish(
     task: Task,
     state: State,
     code: Status,
@@ -321,16 +321,18 @@ def _solve_traced(
     return solution
 
 
-def _dtype(dtype: Any) -> np.dtype:
+def as_dtype(dtype: Any) -> np.dtype:
+    """The floating-point type that a user asked for; None is float64."""
     kind = np.dtype(np.float64 if dtype is None else dtype)
     if kind not in (np.dtype(np.float32), np.dtype(np.float64)):
         raise ValueError(f"dtype: got {dtype!r}, wanted 'float64' or 'float32'")
     return kind
 
 
-def _check_arguments(
+def check_arguments(
     problem: Any, grid: Any, method: Any, scheme: Any, tol: Any, max_steps: Any, time_limit: Any
 ) -> None:
+    """Refuse what no solve can start with; needs no values of the problem's functions."""
     if not isinstance(problem, Problem) or not isinstance(grid, Grid):
         raise TypeError(f"solve: got {type(problem).__name__}, {type(grid).__name__}; wanted a Problem and a Grid")
     if method is not None and not isinstance(method, (ValueIteration, PolicyIteration, Nested)):

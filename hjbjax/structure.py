@@ -35,7 +35,7 @@ class Dependence:
     @property
     def is_constant(self) -> bool:
         """Whether no entry depends on the control."""
-        return all(entry is not None and entry <= CONSTANT for entry in self.entries)
+        return all(entry is not None and not any(entry) for entry in self.entries)
 
     def affine_in(self, inputs: Sequence[int]) -> bool:
         """Whether every entry is affine in these inputs together, whatever the others are."""
@@ -73,7 +73,7 @@ def dependence(function: Callable, *arguments: tuple[int | None, bool], dtype: A
     shapes = [jax.ShapeDtypeStruct(() if length is None else (length,), dtype) for length, _ in arguments]
     closed = jax.make_jaxpr(function)(*shapes)
     packed, number = [], 0
-    for (length, counts), shape in zip(arguments, shapes, strict=True):
+    for (_, counts), shape in zip(arguments, shapes, strict=True):
         entries = np.empty(shape.shape, dtype=object)
         for index in np.ndindex(*shape.shape):
             entries[index] = frozenset({(number,)}) if counts else CONSTANT
@@ -106,6 +106,8 @@ class _Polynomials:
         name = primitive.name
         if all(value == CONSTANT for value in operands):
             return CONSTANT
+        if name == "convert_element_type" and not np.issubdtype(params["new_dtype"], np.inexact):
+            return NONLINEAR  # rounds
         if name in _LINEAR:
             return operands[0]
         if name in ("add", "add_any", "sub"):
@@ -129,6 +131,9 @@ class _Polynomials:
         if operation is jax.lax.mul:
             return _product(left, right)
         return CONSTANT if left == right == CONSTANT else NONLINEAR
+
+    def custom_jvp(self, eqn: Any, inner: Any, operands: list[Any]) -> list[Any]:
+        return fields.evaluate(inner, operands, self)
 
     def nodewise(self, eqn: Any, operands: list[Any]) -> list[Any]:
         varying = [v for v in operands if isinstance(v, np.ndarray) and v.dtype == object]

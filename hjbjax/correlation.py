@@ -5,8 +5,8 @@ The diagonal jumps of the chain take Σ_j |a_ij| h_i/h_j from a_ii, and what is 
     a_ii/h_i ≥ Σ_{j≠i} |a_ij|/h_j        (a = σσᵀ, scaled diagonal dominance)
 
 With D = diag a there are such spacings exactly where the spectral radius of B = D^(−1/2) |a − D| D^(−1/2) is at
-most one; then 1/h = D^(−1/2) v with (I − B) v = 1, or at one with the Perron vector v of B, block by block. In 2-D there always are:
-h₁/h₂ = √(a₁₁/a₂₂).
+most one; then 1/h = D^(−1/2) v with (I − B) v = 1, or at one with the Perron vector v of B, block by block. In 2-D
+there always are: h₁/h₂ = √(a₁₁/a₂₂).
 """
 
 from typing import Any

@@ -1,0 +1,46 @@
+"""The notebooks run from top to bottom, without a warning, and draw their pictures."""
+
+from pathlib import Path
+
+import jupytext
+import pytest
+from nbclient import NotebookClient
+
+ROOT = Path(__file__).parents[1]
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.py"))
+
+
+def run(path, folder, monkeypatch, nodes=None):
+    """Execute a notebook in ``folder`` against this checkout; its cells with their outputs."""
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    monkeypatch.delenv("MPLBACKEND", raising=False)  # the kernel brings its own, which keeps the pictures
+    if nodes:
+        monkeypatch.setenv("HJBJAX_NOTEBOOK_NODES", str(nodes))
+    notebook = jupytext.read(path)
+    NotebookClient(
+        notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(folder)}}
+    ).execute()
+    return [cell for cell in notebook.cells if cell.cell_type == "code"]
+
+
+def check(cells):
+    outputs = [output for cell in cells for output in cell.outputs]
+    complaints = [output.text for output in outputs if output.get("name") == "stderr"]
+    pictures = [output for output in outputs if "image/png" in output.get("data", {})]
+    assert not complaints
+    assert len(pictures) >= sum("plt.show()" in cell.source for cell in cells) > 0
+
+
+def test_both_are_there():
+    assert {path.stem for path in NOTEBOOKS} >= {"minimum_time", "pendulum"}
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_runs_on_a_coarse_grid(path, tmp_path, monkeypatch):
+    check(run(path, tmp_path, monkeypatch, nodes=41))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_runs_as_it_stands(path, tmp_path, monkeypatch):
+    check(run(path, tmp_path, monkeypatch))

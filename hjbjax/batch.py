@@ -25,7 +25,7 @@ from hjbjax.status import Status
 
 CHUNK = 8  # steps between two looks at which lanes are done
 
-_begin = jax.jit(jax.vmap(iteration.begin))
+_begin = jax.vmap(iteration.begin)
 _run = jax.jit(jax.vmap(iteration.run, in_axes=(0, 0, 0)))
 
 
@@ -131,8 +131,8 @@ def _solve_together(
 def _finish_lanes(tasks: Task, states: State, count: int, max_steps: int) -> tuple[list[State], list[list]]:
     """Chunks of steps for the lanes that still run; the number of lanes in a chunk is a power of two."""
     final = [_lane(states, i) for i in range(count)]
-    histories: list[list] = [[np.asarray(state.history[:1])] for state in final]
-    active = [i for i in range(count) if final[i].code == Status.RUNNING]
+    histories: list[list] = [[] for _ in range(count)]
+    active = list(range(count))
     while active:
         width = min(count, 1 << (len(active) - 1).bit_length())
         rows = np.array((active + active[-1:] * width)[:width])

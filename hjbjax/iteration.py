@@ -10,6 +10,7 @@ The loop stops by the certificate of the value it returns, not by the size of a 
 NaN residual is never taken for convergence.
 """
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -112,13 +113,16 @@ class State:
 
 
 def begin(task: Task, guess: jax.Array) -> State:
-    """The state at a guess, already certified."""
-    value = task.rules.impose(guess)
-    policy, measured = _look(task, value, moved=jnp.asarray(jnp.inf, value.dtype))
-    zero = jnp.zeros((), jnp.int32)
-    history = jnp.full(HISTORY, jnp.nan, value.dtype).at[0].set(measured.residual)
-    best = jnp.stack([measured.error, measured.residual])
-    return State(value, policy, measured, zero, best, zero, _judge(task, value, measured, best, zero), history)
+    """The state before the first look at a guess; step −1 of ``run`` is that look, so that all is one program."""
+    dtype, shape = guess.dtype, task.grid.shape
+    inputs = [0 if choices is None else choices.dim for choices in (task.problem.controls, task.problem.disturbances)]
+    policy = Greedy(jnp.zeros(shape, dtype), *(tuple(jnp.zeros(shape, dtype) for _ in range(m)) for m in inputs))
+    infinite = jnp.asarray(jnp.inf, dtype)
+    gap = Gap(-infinite, infinite, jnp.zeros((), dtype), infinite, infinite)
+    counter = jnp.zeros((), jnp.int32)
+    code = jnp.asarray(int(Status.RUNNING), jnp.int32)
+    history = jnp.full(HISTORY, jnp.nan, dtype)
+    return State(task.rules.impose(guess), policy, gap, counter - 1, jnp.stack([infinite] * 2), counter, code, history)
 
 
 def run(task: Task, state: State, until: Any) -> State:
@@ -131,19 +135,25 @@ def run(task: Task, state: State, until: Any) -> State:
     return jax.lax.while_loop(goes_on, lambda state: advance(task, state, start), state)
 
 
-def advance(task: Task, state: State, start: Any = 0) -> State:
+def advance(task: Task, state: State, start: Any) -> State:
     """One step; a step that ends in numbers that are not finite is taken back."""
-    value = task.rules.impose(state.value + _correct(task, state))
+    stay = jnp.zeros_like(state.value)
+    value = task.rules.impose(state.value + jax.lax.cond(state.step < 0, lambda: stay, lambda: _correct(task, state)))
     policy, measured = _look(task, value, moved=jnp.max(jnp.abs(jnp.where(task.counted, value - state.value, 0))))
+    measured = dataclasses.replace(measured, error=jnp.where(_unmeasured(task, state), jnp.inf, measured.error))
     measures = jnp.stack([measured.error, measured.residual])
     since = jnp.where(jnp.any(measures < state.best), 0, state.since_best + 1)
     code = _judge(task, value, measured, state.best, since)
     history = state.history.at[state.step - start].set(measured.residual)
-    best = jnp.minimum(state.best, measures)
+    best = jnp.fmin(state.best, measures)
     new = State(value, policy, measured, state.step + 1, best, since, code, history)
-    old = State(state.value, state.policy, state.gap, state.step + 1, state.best, since, code, history)
-    failed = code == Status.NONFINITE
-    return jax.tree.map(lambda after, before: jnp.where(failed, before, after), new, old)
+    old = dataclasses.replace(state, step=new.step, since_best=since, code=code, history=history)
+    return jax.tree.map(lambda after, before: jnp.where(code == Status.NONFINITE, before, after), new, old)
+
+
+def _unmeasured(task: Task, state: State) -> Any:
+    """Without a certificate a step must have been taken before its size says anything."""
+    return (state.step < 0) & (task.certificate is Certificate.NONE)
 
 
 def _look(task: Task, value: jax.Array, moved: jax.Array) -> tuple[Greedy, Gap]:

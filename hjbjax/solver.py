@@ -35,7 +35,6 @@ TRACED_STEPS = 10_000
 VANISHING = (1.0, 0.1, 0.01)  # discounts on the way to none, per unit time
 WARM_STEPS = 60  # improvements for each of them
 
-_begin = jax.jit(iteration.begin)
 _run = jax.jit(iteration.run)
 
 
@@ -153,15 +152,14 @@ def _warm(task: Task, guess: Any, clock: _Clock) -> jax.Array:
     for discount in VANISHING:
         problem = dataclasses.replace(task.problem, discount=jnp.asarray(discount, task.tol.dtype))
         softened = dataclasses.replace(task, problem=problem)
-        zero = _run(softened, _begin(softened, zero), WARM_STEPS).value
+        zero = _run(softened, iteration.begin(softened, zero), WARM_STEPS).value
     return zero
 
 
 def _drive(task: Task, guess: jax.Array, clock: _Clock) -> tuple[State, Status, np.ndarray]:
     """The host's loop: chunks of steps until the state stops running, the steps or the time run out, or Ctrl-C."""
     compiling = time.perf_counter()
-    state = _begin(task, guess)
-    state = jax.block_until_ready(_run(task, state, 0))  # compiles; takes no step
+    state = jax.block_until_ready(_run(task, iteration.begin(task, guess), 0))  # compiles, and looks at the guess
     clock.compiling += time.perf_counter() - compiling
     residuals, chunk, code = [np.asarray(state.history[:1])], 1, Status(int(state.code))
     with _bar(clock.progress, float(task.tol)) as show:

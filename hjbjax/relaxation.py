@@ -83,14 +83,12 @@ def gauss_seidel(equation: Correction, grid: Grid, rounds: int) -> jax.Array:
     """Rounds of wavefront Gauss–Seidel from zero; damped Jacobi where diagonal jumps break the wavefront."""
     if any(sum(map(abs, offset)) > 1 for offset in equation.weights.offsets):
         return jacobi(equation, grid, 4 * rounds * 2**grid.ndim)
-    orders = list(itertools.product((1, -1), repeat=grid.ndim - 1))
-    delta = None
-    for _ in range(rounds):
-        for signs in orders:
-            left = equation.source if delta is None else left_over(equation, grid, delta)
-            step = _wavefront(left, equation.weights, grid, signs)
-            delta = step if delta is None else delta + step
-    return delta
+    def one_round(_, delta):
+        for signs in itertools.product((1, -1), repeat=grid.ndim - 1):
+            delta = delta + _wavefront(left_over(equation, grid, delta), equation.weights, grid, signs)
+        return delta
+
+    return jax.lax.fori_loop(0, rounds, one_round, jnp.zeros_like(equation.source))
 
 
 def _wavefront(source: jax.Array, weights: Rates, grid: Grid, signs: tuple[int, ...]) -> jax.Array:

@@ -10,7 +10,7 @@ from hjbjax.iteration import Nested, PolicyIteration, ValueIteration
 from hjbjax.preparation import SolveWarning
 from hjbjax.problem import Problem
 from hjbjax.relaxation import Direct, Krylov, Sweeps
-from hjbjax.schemes import Upwind
+from hjbjax.schemes import Limited, Upwind
 from hjbjax.sets import Ball, Box, Finite
 from hjbjax.simulation import simulate
 from hjbjax.solution import Solution, SolveError, load
@@ -26,6 +26,7 @@ __all__ = [
     "Finite",
     "Grid",
     "Krylov",
+    "Limited",
     "Nested",
     "PolicyIteration",
     "Problem",

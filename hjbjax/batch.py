@@ -18,9 +18,10 @@ from hjbjax.grid import Grid
 from hjbjax.iteration import Method, Nested, State, Task
 from hjbjax.preparation import choose, prepare_on_host
 from hjbjax.problem import Problem
+from hjbjax.report import describe, finish
 from hjbjax.schemes import Upwind
 from hjbjax.solution import Solution, SolveError
-from hjbjax.solver import as_dtype, check_arguments, finish
+from hjbjax.solver import as_dtype, check_arguments
 from hjbjax.status import Status
 
 CHUNK = 8  # steps between two looks at which lanes are done
@@ -120,10 +121,10 @@ def _solve_together(
     final, histories = _finish_lanes(tasks, states, len(problems), max_steps or 10**9)
     seconds = time.perf_counter() - clock
     solutions = []
-    for (task, verdict, reached), state, residuals in zip(prepared, final, histories, strict=True):
+    for problem, (task, verdict, reached), state, residuals in zip(problems, prepared, final, histories, strict=True):
         code = Status(int(state.code)) or Status.MAX_STEPS
         solution = finish(task, state, code, reached, np.concatenate(residuals), verdict, grid)
-        solution.stats.update(method=repr(method), seconds=seconds, lanes=len(problems), tol=tol)
+        solution.stats.update(method=describe(method, problem), seconds=seconds, lanes=len(problems), tol=tol)
         solutions.append(solution)
     return solutions
 

@@ -20,7 +20,7 @@ from hjbjax.chain import Rates
 from hjbjax.grid import Grid
 from hjbjax.problem import Problem
 from hjbjax.pytree import node
-from hjbjax.schemes import Upwind
+from hjbjax.schemes import Scheme
 
 
 @node()
@@ -87,7 +87,7 @@ def conditions(problem: Problem, grid: Grid, dtype: Any, t: Any = 0.0) -> Condit
     return Conditions(held, jnp.where(held, given, 0), stop, floor)
 
 
-def greedy(problem: Problem, grid: Grid, value: jax.Array, held: jax.Array, *, scheme: Upwind, t: Any = 0.0) -> Greedy:
+def greedy(problem: Problem, grid: Grid, value: jax.Array, held: jax.Array, *, scheme: Scheme, t: Any = 0.0) -> Greedy:
     """The optimal actions at ``value`` and the rate r that is left."""
     how = hamiltonian.setting(problem, grid.ndim, value.dtype)
     best, u, d = hamiltonian.optimise(hamiltonian.local(problem, grid, value, scheme=scheme, t=t), how)
@@ -95,7 +95,7 @@ def greedy(problem: Problem, grid: Grid, value: jax.Array, held: jax.Array, *, s
 
 
 def respond(
-    problem: Problem, grid: Grid, value: jax.Array, held: jax.Array, current: Greedy, *, scheme: Upwind, t: Any = 0.0
+    problem: Problem, grid: Grid, value: jax.Array, held: jax.Array, current: Greedy, *, scheme: Scheme, t: Any = 0.0
 ) -> Greedy:
     """The inner player's best answer to the outer player's current policy, in a game."""
     how = hamiltonian.setting(problem, grid.ndim, value.dtype)
@@ -121,12 +121,12 @@ def correction(
     policy: Greedy,
     rules: Conditions,
     *,
-    scheme: Upwind,
+    scheme: Scheme,
     t: Any = 0.0,
 ) -> Correction:
     """The linear equation for δ under one policy; the active branch of the constraints is chosen node by node."""
     u, d = list(policy.controls), list(policy.disturbances) if problem.is_game else None
-    rates = chain.rates(problem, grid, u, d, scheme=scheme, dtype=value.dtype, t=t)
+    rates = chain.rates(problem, grid, u, d, scheme=scheme.chain, dtype=value.dtype, t=t)
     leaving = rates.total() + problem.discount
     fastest = jnp.max(leaving)
     pace = jnp.where(leaving > 0, leaving, jnp.where(fastest > 0, fastest, 1))  # nothing moves: the cost piles up
@@ -140,7 +140,7 @@ def correction(
     return Correction(source, rates.scaled(jnp.where(free, 1 / pace, 0)))
 
 
-def fastest_rate(problem: Problem, grid: Grid, *, scheme: Upwind, dtype: Any, t: Any = 0.0) -> jax.Array:
+def fastest_rate(problem: Problem, grid: Grid, *, scheme: Scheme, dtype: Any, t: Any = 0.0) -> jax.Array:
     """max over the actions of Q at every node, (*grid): with Δt = 1/(Q + β) value iteration is monotone.
 
     Q is convex in u for a drift affine in u, so that corners of the sets suffice; samples are added for others.
@@ -148,7 +148,7 @@ def fastest_rate(problem: Problem, grid: Grid, *, scheme: Upwind, dtype: Any, t:
     result = jnp.zeros(grid.shape, dtype)
     for u in _probes(problem.controls, dtype):
         for d in _probes(problem.disturbances, dtype):
-            rates = chain.rates(problem, grid, u, d if problem.is_game else None, scheme=scheme, dtype=dtype, t=t)
+            rates = chain.rates(problem, grid, u, d if problem.is_game else None, scheme=scheme.chain, dtype=dtype, t=t)
             result = jnp.maximum(result, rates.total())
     return result
 

@@ -27,9 +27,10 @@ from hjbjax.pytree import node
 class Certificate(enum.Enum):
     """Which bound a problem admits; the value says so in words."""
 
-    ADDITIVE = "bound from the discount: V + min r/β ≤ V_h ≤ V + max r/β"
-    MULTIPLICATIVE = "bound from the running cost: V/(1 + max(−r/L)) ≤ V_h ≤ V/(1 − max(r/L))"
-    NONE = "no certificate: without discount and positive running cost the residual bounds nothing"
+    ADDITIVE = "from the discount, V + min r/β ≤ V_h ≤ V + max r/β"
+    MULTIPLICATIVE = "from the running cost, V/(1 + η) ≤ V_h ≤ V/(1 − ρ)"
+    RESIDUAL = "the second-order equation, whose residual this is, has no comparison principle"
+    NONE = "without discount and positive running cost the residual bounds nothing"
 
 
 @node()

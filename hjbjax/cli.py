@@ -61,9 +61,10 @@ class OneLineGroup(click.Group):
         except (click.Abort, KeyboardInterrupt):
             click.echo("hjbjax: interrupted", err=True)
             code = 130
-            if sys.stdout is sys.__stdout__:  # a process of our own: leaving JAX at work to the usual exit crashes it
-                sys.stdout.flush()
-                os._exit(code)
+        if code == 130 and sys.stdout is sys.__stdout__:  # a process of our own
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(code)  # JAX may still be at work, which the usual exit waits for, or crashes on
         sys.exit(code if isinstance(code, int) else 0)
 
 

@@ -25,7 +25,7 @@ from hjbjax import chain, sets, stencil, structure
 from hjbjax.grid import Grid
 from hjbjax.minimisers import Action, Kinked, enumerate_actions, kinked_ball, piecewise_input, refine
 from hjbjax.problem import Problem
-from hjbjax.schemes import Upwind
+from hjbjax.schemes import Limited, Scheme
 from hjbjax.sets import AdmissibleSet, Ball, Box, Finite
 
 SAMPLES = 33  # points of a continuum before refinement
@@ -122,23 +122,32 @@ def _player(
 
 @dataclass(frozen=True)
 class Local:
-    """The Hamiltonian around one value function: coordinates, differences, and how to evaluate H(u, d)."""
+    """The Hamiltonian around one value function: coordinates, slopes, and how to evaluate H(u, d).
+
+    Attributes:
+      up, down: the slopes that drift sees; D⁺ and D⁻, or limited ones.
+      bends: D⁺ − D⁻ along every axis, which noise sees.
+    """
 
     problem: Problem
     grid: Grid
-    scheme: Upwind
+    scheme: Scheme
     dtype: Any
     t: Any
     x: list
     value: jax.Array
     up: tuple[jax.Array, ...]
     down: tuple[jax.Array, ...]
+    bends: tuple[jax.Array, ...]
 
     def gain(self, axis: int, f: Any, a: Any) -> Any:
-        """[(e + h⁻ f) D⁺ − (e − h⁺ f) D⁻]/(h⁺ + h⁻)."""
+        """[(e + h⁻ f) D⁺ − (e − h⁺ f) D⁻]/(h⁺ + h⁻); with other slopes f⁺ P⁺ + f⁻ P⁻ + a (D⁺ − D⁻)/(h⁺ + h⁻)."""
+        upwind = jnp.maximum(f, 0) * self.up[axis] + jnp.minimum(f, 0) * self.down[axis]
         if a is None:
-            return jnp.maximum(f, 0) * self.up[axis] + jnp.minimum(f, 0) * self.down[axis]
+            return upwind
         h_up, h_down = stencil.steps(self.grid, axis)
+        if isinstance(self.scheme, Limited):
+            return upwind + jnp.maximum(a, 0) * self.bends[axis] / (h_up + h_down)
         e = chain.excess(f, a, self.grid, axis, self.scheme)
         upward, downward = (e + h_down * f) / (h_up + h_down), (e - h_up * f) / (h_up + h_down)
         return upward * self.up[axis] - downward * self.down[axis]
@@ -165,15 +174,20 @@ class Local:
         }
         same, opposite = ends[1, 1] + ends[-1, -1], ends[1, -1] + ends[-1, 1]
         scale = 2 * self.grid.spacing(i) * self.grid.spacing(j)
-        return (jnp.maximum(entry, 0) * (same - 2 * self.value) + jnp.maximum(-entry, 0) * (opposite - 2 * self.value)) / scale
+        return (
+            jnp.maximum(entry, 0) * (same - 2 * self.value) + jnp.maximum(-entry, 0) * (opposite - 2 * self.value)
+        ) / scale
 
 
-def local(problem: Problem, grid: Grid, value: jax.Array, *, scheme: Upwind, t: Any = 0.0) -> Local:
+def local(problem: Problem, grid: Grid, value: jax.Array, *, scheme: Scheme, t: Any = 0.0) -> Local:
     """Coordinates and differences around ``value``, tied together so that no loop hoists tables out of itself."""
     x, value = jax.lax.optimization_barrier((grid.components(value.dtype), value))
     differences = [stencil.one_sided(value, grid, axis) for axis in range(grid.ndim)]
+    bends = tuple(up - down for up, down in differences)
+    if isinstance(scheme, Limited):
+        differences = [stencil.limited(*pair, grid, axis) for axis, pair in enumerate(differences)]
     up, down = zip(*differences, strict=True)
-    return Local(problem, grid, scheme, value.dtype, t, x, value, up, down)
+    return Local(problem, grid, scheme, value.dtype, t, x, value, up, down, bends)
 
 
 def optimise(here: Local, how: Setting, isaacs: str | None = None) -> tuple[jax.Array, Action, Action]:
@@ -183,6 +197,7 @@ def optimise(here: Local, how: Setting, isaacs: str | None = None) -> tuple[jax.
         u = _best_action(here, how.control, lambda u: (u, []))
         return here.at(u, []), u, []
     if how.decoupled:
+        assert how.disturbance.choices is not None
         start = _any_action(how.disturbance.choices)
         u = [] if no_control else _best_action(here, how.control, lambda u: (u, start))
         d = _best_action(here, how.disturbance, lambda d: (u, d))
@@ -250,13 +265,16 @@ def _any_action(choices: AdmissibleSet) -> Action:
 def _exact(here: Local, player: Player, join: Callable) -> Action:
     """The exact optimum over a box or a ball; see ``minimisers`` for why the candidates suffice."""
     choices = player.choices
+    assert isinstance(choices, (Box, Ball))
     zero = [jnp.zeros((), here.dtype)] * choices.dim
     linear, square, pieces = [], [], []
     for j in range(choices.dim):
-        b, slopes = jax.jvp(lambda s, j=j: _driven(here, player, join, zero, j, s), (zero[0],), (jnp.ones_like(zero[0]),))
-        l, q = _cost_coefficients(here, player, join, zero, j)
-        linear.append(l)
-        square.append(q)
+        b, slopes = jax.jvp(
+            lambda s, j=j: _driven(here, player, join, zero, j, s), (zero[0],), (jnp.ones_like(zero[0]),)
+        )
+        slope, bend = _cost_coefficients(here, player, join, zero, j)
+        linear.append(slope)
+        square.append(bend)
         pieces.append([_kinked(here, join(zero), i, b[i], slopes[i]) for i in player.driven[j]])
     if isinstance(choices, Ball):
         return kinked_ball(player.sign, choices.radius, linear, [p[0] if p else None for p in pieces])
@@ -300,7 +318,7 @@ def _kinked(here: Local, base: tuple[Action, Action], axis: int, offset: Any, sl
     def gain(f):
         return here.gain(axis, f, left)
 
-    if left is None or not here.scheme.central:
+    if left is None or isinstance(here.scheme, Limited) or not here.scheme.central:
         return Kinked(gain, offset, slope, (0.0,), (down, up))
     h_up, h_down = stencil.steps(here.grid, axis)
     edge = stencil.on_edge(here.grid, axis, 1) | stencil.on_edge(here.grid, axis, -1)

@@ -23,9 +23,10 @@ from hjbjax.grid import Grid
 from hjbjax.problem import Problem
 from hjbjax.pytree import node
 from hjbjax.relaxation import Evaluation, Sweeps
-from hjbjax.schemes import Upwind
+from hjbjax.schemes import Limited, Scheme
 from hjbjax.status import Status
 
+FULL_STEPS = 10  # corrections of a limited scheme before they are halved, which ends limit cycles of the limiter
 HISTORY = 256  # steps whose residuals one chunk can record
 GROWTH = 1e6  # a residual that has grown by this factor over its smallest has diverged
 ROUNDING = 64  # residuals below this many units in the last place of max|V| are rounding
@@ -94,7 +95,7 @@ class Task:
     least_cost: jax.Array | None
     pace: jax.Array | None
     tol: Any
-    scheme: Upwind
+    scheme: Scheme
     certificate: Certificate
 
 
@@ -138,7 +139,10 @@ def run(task: Task, state: State, until: Any) -> State:
 def advance(task: Task, state: State, start: Any) -> State:
     """One step; a step that ends in numbers that are not finite is taken back."""
     stay = jnp.zeros_like(state.value)
-    value = task.rules.impose(state.value + jax.lax.cond(state.step < 0, lambda: stay, lambda: _correct(task, state)))
+    delta = jax.lax.cond(state.step < 0, lambda: stay, lambda: _correct(task, state))
+    if isinstance(task.scheme, Limited):
+        delta = jnp.where(state.step < FULL_STEPS, 1.0, 0.5).astype(delta.dtype) * delta
+    value = task.rules.impose(state.value + delta)
     policy, measured = _look(task, value, moved=jnp.max(jnp.abs(jnp.where(task.counted, value - state.value, 0))))
     measured = dataclasses.replace(measured, error=jnp.where(_unmeasured(task, state), jnp.inf, measured.error))
     measures = jnp.stack([measured.error, measured.residual])
@@ -153,7 +157,7 @@ def advance(task: Task, state: State, start: Any) -> State:
 
 def _unmeasured(task: Task, state: State) -> Any:
     """Without a certificate a step must have been taken before its size says anything."""
-    return (state.step < 0) & (task.certificate is Certificate.NONE)
+    return (state.step < 0) & (task.certificate in (Certificate.NONE, Certificate.RESIDUAL))
 
 
 def _look(task: Task, value: jax.Array, moved: jax.Array) -> tuple[Greedy, Gap]:
@@ -188,6 +192,7 @@ def _correct(task: Task, state: State) -> jax.Array:
     if isinstance(task.method, ValueIteration):
         assert task.pace is not None
         return state.policy.rate / task.pace
+    assert isinstance(task.method, PolicyIteration)
     if task.problem.is_game:
         return _hoffman_karp(task, state)
     return relaxation.solve(task.method.evaluation, _equation(task, state.value, state.policy), task.grid)
@@ -200,7 +205,7 @@ def _equation(task: Task, value: jax.Array, policy: Greedy) -> Correction:
 def _hoffman_karp(task: Task, state: State) -> jax.Array:
     """The inner player's problem against the outer player's frozen policy, to a tenth of the outer residual."""
     assert isinstance(task.method, PolicyIteration)
-    evaluation, held = task.method.evaluation, task.rules.held
+    evaluation, replies, held = task.method.evaluation, task.method.replies, task.rules.held
     target = 0.1 * state.gap.residual
 
     def reply(carry):
@@ -211,13 +216,13 @@ def _hoffman_karp(task: Task, state: State) -> jax.Array:
         return value, policy, left, count + 1
 
     def unfinished(carry):
-        return (carry[2] > target) & (carry[3] < task.method.replies)
+        return (carry[2] > target) & (carry[3] < replies)
 
     start = (state.value, state.policy, jnp.asarray(jnp.inf, state.value.dtype), jnp.zeros((), jnp.int32))
     return jax.lax.while_loop(unfinished, reply, start)[0] - state.value
 
 
-def rest_nodes(problem: Problem, grid: Grid, *, scheme: Upwind, dtype: Any) -> tuple[jax.Array, jax.Array]:
+def rest_nodes(problem: Problem, grid: Grid, *, scheme: Scheme, dtype: Any) -> tuple[jax.Array, jax.Array]:
     """Where the system can rest at no cost, bool (*grid), and the least running cost at every node.
 
     At V = 0 the Hamiltonian is the running cost. Rest means that the action that is cheapest there leaves the

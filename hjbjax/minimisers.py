@@ -125,8 +125,11 @@ def piecewise_input(
             at = jnp.where(moving, at, lo)
             candidates.append(at)
             others = sum(
-                (other.slope * other.derivative(other.offset + other.slope * at) for k, other in enumerate(pieces)
-                 if k != index),
+                (
+                    other.slope * other.derivative(other.offset + other.slope * at)
+                    for k, other in enumerate(pieces)
+                    if k != index
+                ),
                 start=linear,
             )
             slopes += [others + piece.slope * d for d in piece.derivatives[position : position + 2]]
@@ -134,14 +137,11 @@ def piecewise_input(
         for slope in slopes or [linear]:
             stationary = -slope / (2 * jnp.where(square == 0, 1, square))
             candidates.append(jnp.where(square == 0, lo, jnp.clip(stationary, lo, hi)))
-    best_u, best_value = None, None
-    for u in candidates:
+    best_u, best_value = jnp.asarray(candidates[0]), total(candidates[0])
+    for u in candidates[1:]:
         value = total(u)
-        if best_value is None:
-            best_u, best_value = jnp.asarray(u), value
-        else:
-            wins = better(sign, value, best_value)
-            best_u, best_value = jnp.where(wins, u, best_u), jnp.where(wins, value, best_value)
+        wins = better(sign, value, best_value)
+        best_u, best_value = jnp.where(wins, u, best_u), jnp.where(wins, value, best_value)
     return best_u
 
 
@@ -178,12 +178,12 @@ def kinked_ball(sign: int, radius: Any, linear: Sequence[Any], pieces: Sequence[
     """
 
     def total(action):
-        terms = [l * u for l, u in zip(linear, action, strict=True)]
+        terms = [g * u for g, u in zip(linear, action, strict=True)]
         terms += [p.gain(p.offset + p.slope * u) for p, u in zip(pieces, action, strict=True) if p is not None]
         return sum(terms[1:], start=terms[0])
 
     best = None
-    for choice in itertools.product(*(_branches(l, piece) for l, piece in zip(linear, pieces, strict=True))):
+    for choice in itertools.product(*(_branches(g, piece) for g, piece in zip(linear, pieces, strict=True))):
         fixed = {j: u for j, (kind, u) in enumerate(choice) if kind == "kink"}
         spent = sum((u * u for u in fixed.values()), start=jnp.zeros(()))
         shrink = jnp.minimum(1, radius / jnp.sqrt(jnp.where(spent == 0, 1, spent))) if fixed else 1

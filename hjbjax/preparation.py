@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax import bellman, checks, hamiltonian, iteration, proper, transfer
+from hjbjax import bellman, checks, hamiltonian, iteration, proper
 from hjbjax.certificates import Certificate
 from hjbjax.grid import Grid
 from hjbjax.iteration import Method, Nested, PolicyIteration, Task, ValueIteration
@@ -41,20 +41,6 @@ def choose(problem: Problem, grid: Grid, *, traced: bool) -> Method:
     return Nested(method) if grid.size > NEST and not traced else method
 
 
-def levels(problem: Problem, grid: Grid, method: Method, scheme: Upwind, dtype: Any) -> list[Grid]:
-    """The grids of a nested solve, coarsest first; a coarser grid that loses the target or rest point is left out."""
-    chain = [grid]
-    if not isinstance(method, Nested):
-        return chain
-    verdict = judge(problem, grid, dtype)
-    needs_held = problem.target is not None or verdict.may_rest
-    while (smaller := transfer.coarser(chain[0])) is not None and smaller.size >= method.coarsest:
-        if needs_held and not held_jit(problem, smaller, scheme=scheme, dtype=dtype, verdict=verdict).any():
-            break
-        chain.insert(0, smaller)
-    return chain
-
-
 def prepare(
     problem: Problem, grid: Grid, *, method: Method, scheme: Upwind, tol: Any, dtype: Any, verdict: "Verdict"
 ) -> Task:
@@ -68,7 +54,9 @@ def prepare(
     counted = jnp.ones(grid.shape, bool)
     if verdict.certificate is not Certificate.MULTIPLICATIVE:
         least = None
-    return Task(problem, grid, method, rules, counted, least, pace, jnp.asarray(tol, dtype), scheme, verdict.certificate)
+    return Task(
+        problem, grid, method, rules, counted, least, pace, jnp.asarray(tol, dtype), scheme, verdict.certificate
+    )
 
 
 def _rules(
@@ -101,7 +89,7 @@ class Verdict:
         """What certifies the error, or why nothing does."""
         if self.certificate is Certificate.NONE or self.exact:
             return self.certificate.value
-        return self.certificate.value + "; for the refined sample of the actions, not for the continuum"
+        return self.certificate.value + "; for the refined sample of actions"
 
 
 def judge(problem: Problem, grid: Grid, dtype: Any) -> Verdict:

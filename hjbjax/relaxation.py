@@ -83,6 +83,7 @@ def gauss_seidel(equation: Correction, grid: Grid, rounds: int) -> jax.Array:
     """Rounds of wavefront Gauss–Seidel from zero; damped Jacobi where diagonal jumps break the wavefront."""
     if any(sum(map(abs, offset)) > 1 for offset in equation.weights.offsets):
         return jacobi(equation, grid, 4 * rounds * 2**grid.ndim)
+
     def one_round(_, delta):
         for signs in itertools.product((1, -1), repeat=grid.ndim - 1):
             delta = delta + _wavefront(left_over(equation, grid, delta), equation.weights, grid, signs)
@@ -96,14 +97,19 @@ def _wavefront(source: jax.Array, weights: Rates, grid: Grid, signs: tuple[int, 
     table = dict(zip(weights.offsets, weights.values, strict=True))
     moves = {offset: _shear(_cut_seam(w, grid, offset), signs) for offset, w in table.items()}
     source = _shear(source, signs)
-    behind, ahead = [], []  # neighbours on the slice d − 1 and on the slice d + 1: (weights, roll within the slice)
+    behind: list[tuple] = []
+    ahead: list[tuple] = []
+    # neighbours on the slice d − 1 and on the slice d + 1: (weights, roll within the slice)
     for offset, w in moves.items():
         axis = next(i for i, step in enumerate(offset) if step)
         direction = offset[axis] * (1 if axis == 0 else signs[axis - 1])
         (ahead if direction > 0 else behind).append((w, axis - 1, -offset[axis]))
 
     def pull(group, rows, plane):
-        terms = [row * (plane if axis < 0 else jnp.roll(plane, step, axis)) for (_, axis, step), row in zip(group, rows, strict=True)]
+        terms = [
+            row * (plane if axis < 0 else jnp.roll(plane, step, axis))
+            for (_, axis, step), row in zip(group, rows, strict=True)
+        ]
         return sum(terms[1:], start=terms[0]) if terms else jnp.zeros_like(plane)
 
     def sweep(done, coming, old, reverse):

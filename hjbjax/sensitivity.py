@@ -6,8 +6,8 @@ The value V of a converged solve satisfies Φ(V, θ) = 0, node by node the activ
     dV = (I − W)⁻¹ ∂Φ/∂θ dθ.
 
 ∂Φ/∂θ is taken through the formulas that give the optimal action: where that is stationary they contribute nothing,
-and where it sits at a bound or at a kink of the upwinding, both of which may move with θ, they do. Forward mode takes one linear solve and reverse mode one
-transposed solve, whatever the number of steps that led to V.
+and where it sits at a bound or at a kink of the upwinding, both of which may move with θ, they do. Forward mode
+takes one linear solve and reverse mode one transposed solve, whatever the number of steps that led to V.
 """
 
 from typing import Any
@@ -56,7 +56,8 @@ def _residual(task: Task, state: State, equation: Correction) -> jax.Array:
     rules = bellman.conditions(problem, grid, value.dtype)
     u, d = list(policy.controls), list(policy.disturbances)
     rate = bellman.greedy(problem, grid, value, jax.lax.stop_gradient(task.rules.held), scheme=task.scheme).rate
-    total = chain.rates(problem, grid, u, d if problem.is_game else None, scheme=task.scheme, dtype=value.dtype).total()
+    scheme = task.scheme.chain
+    total = chain.rates(problem, grid, u, d if problem.is_game else None, scheme=scheme, dtype=value.dtype).total()
     pace = jax.lax.stop_gradient(total + problem.discount)
     phi = rate / jnp.where(pace > 0, pace, 1)
     bound = equation.weights.total() == 0  # rows of the constraints hold no weights

@@ -1,0 +1,87 @@
+"""The host's loop around the jitted iteration.
+
+``run`` is called in chunks of about a fifth of a second; progress, Ctrl-C, time limits and stops at NaN all live
+between two chunks.
+"""
+
+import contextlib
+import sys
+import time
+from typing import Any
+
+import jax
+import numpy as np
+
+from hjbjax import iteration
+from hjbjax.iteration import HISTORY, State, Task
+from hjbjax.status import Status
+
+CHUNK_SECONDS = 0.2
+
+run = jax.jit(iteration.run)
+
+
+class Clock:
+    """The limits of a solve, the time it has taken with compiling apart, and whether it was interrupted."""
+
+    def __init__(self, max_steps: int, seconds: float, progress: bool | None):
+        self.max_steps, self.seconds, self.progress = max_steps, seconds, progress
+        self.began, self.compiling, self.interrupted = time.perf_counter(), 0.0, False
+
+    def elapsed(self) -> float:
+        """Seconds since the solve began."""
+        return time.perf_counter() - self.began
+
+    def compile(self, task: Task, guess: jax.Array) -> State:
+        """The state after the first look at a guess; the time goes to compiling."""
+        began = time.perf_counter()
+        state = jax.block_until_ready(run(task, iteration.begin(task, guess), 0))
+        self.compiling += time.perf_counter() - began
+        return state
+
+
+def drive(task: Task, guess: jax.Array, clock: Clock) -> tuple[State, Status, np.ndarray]:
+    """Chunks of steps until the state stops running, the steps or the time run out, or Ctrl-C.
+
+    Returns:
+      The last state, how it ended, and the residuals of all steps, that of the guess first.
+    """
+    state, residuals, chunk = iteration.begin(task, guess), [np.zeros(0)], 1
+    if clock.interrupted:
+        return state, Status.INTERRUPTED, residuals[0]
+    code = Status.RUNNING
+    with _bar(clock.progress, float(task.tol)) as show:
+        try:
+            state = clock.compile(task, guess)
+            residuals, code = [np.asarray(state.history[:1])], Status(int(state.code))
+            while code is Status.RUNNING:
+                done, began = int(state.step), time.perf_counter()
+                if done >= clock.max_steps or clock.elapsed() >= clock.seconds:
+                    code = Status.MAX_STEPS if done >= clock.max_steps else Status.TIME_LIMIT
+                    break
+                state = jax.block_until_ready(run(task, state, int(min(done + chunk, clock.max_steps))))
+                took = time.perf_counter() - began
+                code, steps = Status(int(state.code)), int(state.step) - done
+                residuals.append(np.asarray(state.history[:steps]))
+                chunk = int(np.clip(chunk * CHUNK_SECONDS / max(took, 1e-4), 1, min(HISTORY, 8 * chunk)))
+                show(steps, float(state.gap.error))
+        except KeyboardInterrupt:
+            clock.interrupted, code = True, Status.INTERRUPTED
+    return state, code, np.concatenate(residuals)
+
+
+@contextlib.contextmanager
+def _bar(progress: bool | None, tol: float) -> Any:
+    """A progress bar on a terminal after one second; silent elsewhere."""
+    if progress is False or (progress is None and not sys.stderr.isatty()):
+        yield lambda steps, error: None
+        return
+    from tqdm import tqdm
+
+    with tqdm(desc="solve", unit=" steps", delay=1, leave=False) as bar:
+
+        def show(steps, error):
+            bar.update(steps)
+            bar.set_postfix_str(f"error {error:.2e}, tol {tol:.0e}", refresh=False)
+
+        yield show

@@ -1,0 +1,133 @@
+"""From a state of the iteration to a Solution: NumPy arrays, masks, bounds, the Isaacs gap, the message."""
+
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax import bellman, certificates, hamiltonian
+from hjbjax.certificates import Certificate
+from hjbjax.grid import Grid
+from hjbjax.iteration import Method, Nested, PolicyIteration, State, Task
+from hjbjax.preparation import SolveWarning, Verdict
+from hjbjax.problem import Problem
+from hjbjax.sets import Finite
+from hjbjax.solution import Solution
+from hjbjax.status import Status
+
+
+def finish(
+    task: Task,
+    state: State,
+    code: Status,
+    reached: np.ndarray | None,
+    residuals: np.ndarray,
+    verdict: Verdict,
+    grid: Grid,
+) -> Solution:
+    """The solution in NumPy, with infinite values where the target cannot be reached and no policy where none is."""
+    solution = assemble(task, state, verdict)
+    gap = _isaacs_gap(task, state)
+    lost = ~np.asarray(task.counted)
+    arrays = {name: getattr(solution, name) for name in ("value", "lower", "upper", "policy", "disturbance")}
+    arrays = {name: None if array is None else np.array(array) for name, array in arrays.items()}
+    for array in (arrays["value"], arrays["lower"], arrays["upper"]):
+        if array is not None:
+            array[lost] = np.inf
+    idle = lost if task.problem.target is None else lost | (np.asarray(task.rules.held) & ~_rests(task))
+    for array in (arrays["policy"], arrays["disturbance"]):
+        if array is not None:
+            array[idle] = np.nan
+    return Solution(
+        **arrays,
+        grid=grid,
+        code=int(code),
+        steps=int(state.step),
+        isaacs_gap=gap,
+        reached=reached,
+        discrete=solution.discrete,
+        discrete_disturbance=solution.discrete_disturbance,
+        residuals=residuals,
+        message=_message(code, task, state, residuals),
+        stats={
+            "scheme": repr(task.scheme),
+            "device": str(jax.devices()[0].device_kind),
+            "dtype": str(state.value.dtype),
+            "certificate": verdict.sentence,
+            "versions": {"jax": jax.__version__, "numpy": np.__version__},
+        },
+    )
+
+
+def _rests(task: Task) -> np.ndarray:
+    """Held nodes that are no target: rest points, where the policy keeps its meaning."""
+    if task.problem.target is None:
+        return np.asarray(task.rules.held)
+    rules = bellman.conditions(task.problem, task.grid, task.tol.dtype)
+    return np.asarray(task.rules.held & ~rules.held)
+
+
+def assemble(task: Task, state: State, verdict: Verdict) -> Solution:
+    """The solution as it stands in the state; pure."""
+    problem = task.problem
+    bounds = certificates.bounds(verdict.certificate, state.value, state.gap)
+    lower, upper = bounds if bounds is not None else (None, None)
+    controls, disturbances = state.policy.controls, state.policy.disturbances
+    return Solution(
+        value=state.value,
+        policy=jnp.stack(controls, axis=-1) if controls else jnp.zeros((*task.grid.shape, 0), state.value.dtype),
+        disturbance=jnp.stack(disturbances, axis=-1) if problem.is_game else None,
+        code=state.code,
+        steps=state.step,
+        lower=lower,
+        upper=upper,
+        grid=task.grid,
+        discrete=isinstance(problem.controls, Finite),
+        discrete_disturbance=isinstance(problem.disturbances, Finite),
+    )
+
+
+@jax.jit
+def _gap_at(task: Task, value: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """max over the nodes of min max − max min, and the size of H, at one value function."""
+    how = hamiltonian.setting(task.problem, task.grid.ndim, value.dtype)
+    here = hamiltonian.local(task.problem, task.grid, value, scheme=task.scheme)
+    upper = hamiltonian.optimise(here, how, isaacs="upper")[0]
+    lower = hamiltonian.optimise(here, how, isaacs="lower")[0]
+    free = task.counted & ~task.rules.held
+    size = jnp.maximum(jnp.abs(upper), jnp.abs(lower))
+    return jnp.max(jnp.where(free, upper - lower, 0)), jnp.max(jnp.where(free, size, 0))
+
+
+def _isaacs_gap(task: Task, state: State) -> float | None:
+    if not task.problem.is_game:
+        return None
+    gap, size = (float(number) for number in _gap_at(task, state.value))
+    if gap > 0.05 * size:
+        warnings.warn(
+            f"the Isaacs condition fails: min max and max min of the Hamiltonian differ by up to {gap:.3g} per unit "
+            f"time; the value is the {task.problem.isaacs} one, isaacs= gives the other",
+            SolveWarning,
+            stacklevel=4,
+        )
+    return gap
+
+
+def _message(code: Status, task: Task, state: State, residuals: np.ndarray) -> str:
+    best, tol = float(state.best[0]), float(task.tol)
+    if code is Status.STALLED:
+        return f"{code.message} The smallest error was {best:.2g}: a tolerance of {2 * best:.2g} is within reach."
+    if code is Status.CONVERGED and task.certificate is Certificate.NONE:
+        return f"Residual and last step are at most {tol:.2g}; no certificate bounds the error."
+    return code.message
+
+
+def describe(method: Method, problem: Problem) -> str:
+    """The method as one would write it, without what the problem does not use."""
+    if isinstance(method, Nested):
+        return f"Nested({describe(method.inner, problem)})"
+    if isinstance(method, PolicyIteration):
+        game = f", replies={method.replies}" if problem.is_game else ""
+        return f"PolicyIteration({method.evaluation!r}{game})"
+    return repr(method)

@@ -62,8 +62,8 @@ class OneLineGroup(click.Group):
             click.echo("hjbjax: interrupted", err=True)
             code = 130
         if code == 130 and sys.stdout is sys.__stdout__:  # a process of our own
-            sys.stdout.flush()
-            sys.stderr.flush()
+            for stream in filter(None, (sys.stdout, sys.stderr)):
+                stream.flush()
             os._exit(code)  # JAX may still be at work, which the usual exit waits for, or crashes on
         sys.exit(code if isinstance(code, int) else 0)
 

@@ -256,14 +256,14 @@ def closed_loop(
     if plane:
         start = np.asarray(path.states)[0]
         cut: Mapping[Any, float] = {axis: float(start[axis]) for axis in range(grid.ndim) if axis not in axes}
-        ax = _styled(figure.add_subplot(columns[:, 0]))
+        ax = styled(figure.add_subplot(columns[:, 0]))
         artists += value(solution, ax=ax, fixed=cut if fixed is None else fixed)
         artists += trajectory(path, ax=ax, axes=axes if axes[0] < axes[1] else axes[::-1], grid=grid)
-    upper = _styled(figure.add_subplot(columns[0, -1]))
+    upper = styled(figure.add_subplot(columns[0, -1]))
     artists += trajectory(path, ax=upper, axes=None, grid=grid)
     if driven:
         upper.set_xlabel("")
-        artists += controls(path, ax=_styled(figure.add_subplot(columns[1, -1], sharex=upper)))
+        artists += controls(path, ax=styled(figure.add_subplot(columns[1, -1], sharex=upper)))
         upper.tick_params(labelbottom=False)
     return artists
 
@@ -315,11 +315,11 @@ def _axes(ax: Any, *, wide: bool = False) -> Any:
         return ax
     from matplotlib.figure import Figure
 
-    return _styled(Figure(figsize=(5.4, 3.2) if wide else (5.4, 4.2), layout="constrained").add_subplot())
+    return styled(Figure(figsize=(5.4, 3.2) if wide else (5.4, 4.2), layout="constrained").add_subplot())
 
 
-def _styled(ax: Any) -> Any:
-    """Fewer lines: no upper and right frame, thin ticks, a paper's text sizes. For our own axes only."""
+def styled(ax: Any) -> Any:
+    """The theme of the figures made here, on ``ax``: no upper and right frame, thin ticks, a paper's text sizes."""
     ax.spines[["top", "right"]].set_visible(False)
     ax.spines[["left", "bottom"]].set_linewidth(0.8)
     ax.tick_params(width=0.8, length=3, labelsize=9)

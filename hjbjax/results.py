@@ -151,7 +151,7 @@ def _policies(solution: Solution, fixed: dict[int, float], jumps: bool) -> list[
         return [figure.text(0.5, 0.5, "this problem has no control", ha="center", va="center", color="0.4")]
     artists: list[Any] = []
     for input, ax in enumerate(figure.subplots(1, count, squeeze=False)[0]):
-        drawn = plotting.policy(solution, input=input, fixed=fixed, ax=ax)
+        drawn = plotting.policy(solution, input=input, fixed=fixed, ax=plotting.styled(ax))
         artists += _with_curve(drawn, solution, fixed, jumps, input)
     return artists
 

@@ -1,6 +1,6 @@
 """hjbjax: Hamilton–Jacobi–Bellman and Isaacs equations on grids, with JAX."""
 
-from hjbjax import chain, zoo
+from hjbjax import chain, plotting, zoo
 from hjbjax._version import __version__
 from hjbjax.batch import solve_batch
 from hjbjax.fields import FallbackWarning
@@ -40,6 +40,7 @@ __all__ = [
     "__version__",
     "chain",
     "load",
+    "plotting",
     "simulate",
     "solve",
     "solve_batch",

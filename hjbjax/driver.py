@@ -22,45 +22,46 @@ run = jax.jit(iteration.run)
 
 
 class Clock:
-    """The limits of a solve, the time it has taken with compiling apart, and whether it was interrupted."""
+    """The limits of a solve, the time it has taken, that of its steps apart, and whether it was interrupted."""
 
     def __init__(self, max_steps: int, seconds: float, progress: bool | None):
         self.max_steps, self.seconds, self.progress = max_steps, seconds, progress
-        self.began, self.compiling, self.interrupted = time.perf_counter(), 0.0, False
+        self.began, self.stepping, self.interrupted = time.perf_counter(), 0.0, False
 
     def elapsed(self) -> float:
         """Seconds since the solve began."""
         return time.perf_counter() - self.began
 
-    def compile(self, task: Task, guess: jax.Array) -> State:
-        """The state after the first look at a guess; the time goes to compiling."""
-        began = time.perf_counter()
-        state = jax.block_until_ready(run(task, iteration.begin(task, guess), 0))
-        self.compiling += time.perf_counter() - began
-        return state
 
-
-def drive(task: Task, guess: jax.Array, clock: Clock) -> tuple[State, Status, np.ndarray]:
+def drive(task: Task, guess: jax.Array, clock: Clock, most: int | None = None) -> tuple[State, Status, np.ndarray]:
     """Chunks of steps until the state stops running, the steps or the time run out, or Ctrl-C.
+
+    Args:
+      task: what to iterate.
+      guess: node values to start from.
+      clock: the limits, and where the time goes.
+      most: at most so many steps, if fewer than the clock allows.
 
     Returns:
       The last state, how it ended, and the residuals of all steps, that of the guess first.
     """
+    limit = clock.max_steps if most is None else min(most, clock.max_steps)
     state, residuals, chunk = iteration.begin(task, guess), [np.zeros(0)], 1
     if clock.interrupted:
         return state, Status.INTERRUPTED, residuals[0]
     code = Status.RUNNING
     with _bar(clock.progress, float(task.tol)) as show:
         try:
-            state = clock.compile(task, guess)
+            state = jax.block_until_ready(run(task, state, 0))  # compiles, and looks at the guess
             residuals, code = [np.asarray(state.history[:1])], Status(int(state.code))
             while code is Status.RUNNING:
                 done, began = int(state.step), time.perf_counter()
-                if done >= clock.max_steps or clock.elapsed() >= clock.seconds:
-                    code = Status.MAX_STEPS if done >= clock.max_steps else Status.TIME_LIMIT
+                if done >= limit or clock.elapsed() >= clock.seconds:
+                    code = Status.MAX_STEPS if done >= limit else Status.TIME_LIMIT
                     break
-                state = jax.block_until_ready(run(task, state, int(min(done + chunk, clock.max_steps))))
+                state = jax.block_until_ready(run(task, state, int(min(done + chunk, limit))))
                 took = time.perf_counter() - began
+                clock.stepping += took
                 code, steps = Status(int(state.code)), int(state.step) - done
                 residuals.append(np.asarray(state.history[:steps]))
                 chunk = int(np.clip(chunk * CHUNK_SECONDS / max(took, 1e-4), 1, min(HISTORY, 8 * chunk)))

@@ -122,7 +122,7 @@ def decision_problem(
     ends = [np.roll(number, [-step for step in offset], axis=range(grid.ndim)) for offset in offsets]
     columns = np.stack([end.ravel() for end in (*ends, number)], axis=-1)[:, None, :]
     starts = np.arange(0, entries.size + 1, entries.shape[-1], dtype=number.dtype)
-    layout = (entries.ravel(), np.broadcast_to(columns, entries.shape).ravel(), starts)
+    layout = (entries.ravel(), np.repeat(columns, count, axis=1).ravel(), starts)
     probabilities = csr_array(layout, shape=(costs.size, grid.size))
     probabilities.sum_duplicates()  # a jump over the seam of an axis with two nodes; sorts the columns as well
     probabilities.eliminate_zeros()

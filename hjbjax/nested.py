@@ -7,9 +7,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax import iteration, transfer
+from hjbjax import transfer
 from hjbjax.certificates import Certificate
-from hjbjax.driver import Clock, drive, run
+from hjbjax.driver import Clock, drive
 from hjbjax.grid import Grid
 from hjbjax.iteration import Method, Nested, Task
 from hjbjax.preparation import held_jit, judge, prepare_jit
@@ -58,9 +58,7 @@ def warm(task: Task, guess: Any, clock: Clock) -> jax.Array:
     value = jnp.zeros(task.grid.shape, task.tol.dtype)
     if task.certificate is not Certificate.MULTIPLICATIVE:
         return value
-    clock.compile(task, value)
     for discount in VANISHING:
         problem = dataclasses.replace(task.problem, discount=jnp.asarray(discount, task.tol.dtype))
-        softened = dataclasses.replace(task, problem=problem)
-        value = run(softened, iteration.begin(softened, value), WARM_STEPS).value
+        value = drive(dataclasses.replace(task, problem=problem), value, clock, most=WARM_STEPS)[0].value
     return value

@@ -116,7 +116,7 @@ def _isaacs_gap(task: Task, state: State) -> float | None:
 
 def _message(code: Status, task: Task, state: State, residuals: np.ndarray) -> str:
     best, tol = float(state.best[0]), float(task.tol)
-    if code is Status.STALLED:
+    if code is Status.STALLED and np.isfinite(best):
         return f"{code.message} The smallest error was {best:.2g}: a tolerance of {2 * best:.2g} is within reach."
     if code is Status.CONVERGED and task.certificate is Certificate.NONE:
         return f"Residual and last step are at most {tol:.2g}; no certificate bounds the error."

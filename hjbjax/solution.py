@@ -274,7 +274,7 @@ def _screen(solution: Solution) -> str:
     axes = " x ".join(name + " (periodic)" * flag for name, flag in zip(grid.names, grid.periodic or (), strict=True))
     last = "" if solution.residual is None else f", last residual {solution.residual:.3g}"
     reached = 1.0 if solution.reached is None else float(np.mean(np.asarray(solution.reached)))
-    compiling = f", and {_number(stats['compile_seconds'])} to compile" if "compile_seconds" in stats else ""
+    compiling = f", and {_number(stats['compile_seconds'])} to check and compile" if "compile_seconds" in stats else ""
     dtype = stats.get("dtype") or np.asarray(solution.value).dtype
     rows = {
         "grid": f"{axes}: {' x '.join(map(str, grid.shape))} = {grid.size:,} nodes",

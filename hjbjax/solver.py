@@ -105,8 +105,8 @@ def solve(
                 jnp.max(jnp.abs(jnp.where(task.counted, state.value - monotone, 0)))
             )
     solution.stats.update(
-        method=describe(method, problem), levels=[*shapes, grid.shape], seconds=clock.elapsed() - clock.compiling,
-        compile_seconds=clock.compiling, bytes=needed, tol=tol,
+        method=describe(method, problem), levels=[*shapes, grid.shape], seconds=clock.stepping,
+        compile_seconds=clock.elapsed() - clock.stepping, bytes=needed, tol=tol,
     )  # fmt: skip
     if throw and code is not Status.CONVERGED:
         raise SolveError(f"{code.name}: {solution.message}", solution)

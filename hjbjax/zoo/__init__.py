@@ -97,7 +97,7 @@ _ENTRIES = (
         duration=5.0,
     ),
     Entry("eikonal", "the shortest way to the origin", eikonal, eikonal_exact, start=(0.8, 0.5), duration=2.0),
-    Entry("dubins", "drive a car that cannot turn on the spot to a disc", dubins, start=(1.5, 0.5, 0.0), duration=8.0),
+    Entry("dubins", "drive a car that cannot turn on the spot to a disc", dubins, start=(-1.5, 0.5, 0.0), duration=8.0),
     Entry("van-der-pol", "quieten a Van der Pol oscillator", van_der_pol, start=(2.0, 0.0), duration=10.0),
     Entry("bang-bang", "hold a point near zero with a bounded speed", bang_bang, bang_bang_exact, start=(1.5,)),
     Entry(

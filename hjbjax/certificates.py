@@ -108,5 +108,6 @@ def bounds(kind: Certificate, value: Any, measured: Gap) -> tuple[Any, Any] | No
         return value + measured.below, value + measured.above
     if kind is Certificate.MULTIPLICATIVE:
         lifted = value + measured.lift
-        return lifted * measured.below - measured.lift, lifted * measured.above - measured.lift
+        upper = jnp.where(jnp.isinf(measured.above), jnp.inf, lifted * measured.above - measured.lift)  # no 0 · inf
+        return lifted * measured.below - measured.lift, upper
     return None

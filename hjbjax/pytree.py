@@ -42,6 +42,8 @@ def node(*, static: Iterable[str] = (), host: Iterable[str] = ()) -> Callable[[t
             raise TypeError(f"{cls.__name__} has no field {', '.join(sorted(unknown))}")
         defaults = {field.name: _default(field) for field in fields if field.name in host}
         leaves = tuple(field.name for field in fields if field.name not in static + host)
+        if not leaves and "__eq__" not in vars(cls):
+            _compare_by_value(cls, static)
 
         def flatten_with_keys(self):
             children = [(jax.tree_util.GetAttrKey(name), getattr(self, name)) for name in leaves]
@@ -59,6 +61,21 @@ def node(*, static: Iterable[str] = (), host: Iterable[str] = ()) -> Callable[[t
         return cls
 
     return register
+
+
+def _compare_by_value(cls: type, names: tuple[str, ...]) -> None:
+    """Choices without numbers are equal when their fields are: as static arguments they must not recompile."""
+
+    def key(self):
+        return tuple(getattr(self, name) for name in names)
+
+    def equal(self, other):
+        return key(self) == key(other) if type(other) is cls else NotImplemented
+
+    def number(self):
+        return hash((cls, key(self)))
+
+    cls.__eq__, cls.__hash__ = equal, number  # type: ignore[method-assign, assignment]
 
 
 def _default(field: dataclasses.Field) -> Callable[[], Any]:

@@ -1,0 +1,114 @@
+"""Which nodes reach the target, against a plain search over the chain's transition matrices."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import hjbjax as hjb
+from hjbjax import chain, proper
+
+MOVES = np.array([[-1.0], [0.0], [1.0]])
+GRID = hjb.Grid([0.0], [7.0], (8,))
+PLANE = hjb.Grid([0.0, 0.0], [3.0, 4.0], (4, 5))
+
+
+def looked_up(table, x, u):
+    """The entry of a table at node x ∈ {0, …, 7} under action u ∈ {−1, 0, 1}, without indexing by tracers."""
+    total = 0.0
+    for node in range(8):
+        for k in range(3):
+            total = total + jnp.where((jnp.abs(x[0] - node) < 0.5) & (jnp.abs(u[0] - k + 1) < 0.5), table[node, k], 0.0)
+    return total
+
+
+def table_drift(table, x, u):
+    return looked_up(table, x, u)[None]
+
+
+def on_line(drifts, noises):
+    return hjb.Problem(
+        jax.tree_util.Partial(table_drift, drifts),
+        None,
+        hjb.Finite(MOVES),
+        noise=jax.tree_util.Partial(looked_up, noises),
+        discount=1.0,
+    )
+
+
+def reached(problem, grid, held, surely):
+    with jax.enable_x64(True):
+        return proper.reached(problem, grid, held, scheme=hjb.Upwind(), dtype=np.dtype(np.float64), surely=surely)
+
+
+def brute(problem, grid, held, surely):
+    """The greatest set of nodes from which some policy arrives (with probability one), by definition."""
+    held = held.reshape(-1)
+    tables = [
+        chain.matrix(problem, grid, np.broadcast_to(u, (*grid.shape, len(u))), scheme=hjb.Upwind()).toarray()
+        for u in np.asarray(problem.controls.points)
+    ]
+    jumps = [(table > 0) & ~np.eye(grid.size, dtype=bool) for table in tables]
+    inside = np.ones(grid.size, bool)
+    while True:
+        found = held.copy()
+        for _ in range(grid.size):
+            for jump in jumps:
+                stays = ~np.any(jump & ~inside, axis=1)
+                found |= inside & stays & np.any(jump & found, axis=1)
+        if not surely or np.array_equal(found, inside):
+            return found.reshape(grid.shape)
+        inside = found
+
+
+@settings(max_examples=60)
+@given(
+    st.lists(st.lists(st.sampled_from([-1.0, 0.0, 1.0]), min_size=3, max_size=3), min_size=8, max_size=8),
+    st.lists(st.lists(st.sampled_from([0.0, 0.0, 0.5]), min_size=3, max_size=3), min_size=8, max_size=8),
+    st.lists(st.booleans(), min_size=8, max_size=8),
+    st.booleans(),
+)
+def test_reached_nodes_on_a_line(drifts, noises, held, surely):
+    problem, held = on_line(np.array(drifts), np.array(noises)), np.array(held)
+    expected = brute(problem, GRID, held, surely)
+    np.testing.assert_array_equal(reached(problem, GRID, held, surely), expected)
+    assert np.all(expected[held])
+
+
+def turning(x, u):
+    return jnp.stack([u[0] * (x[1] - 2.0), 1.0 + 0.0 * x[0]])
+
+
+@pytest.mark.parametrize("surely", [True, False])
+@pytest.mark.parametrize("noise", [None, [0.5, 0.0]])
+@pytest.mark.parametrize("corner", [(0, 4), (3, 4), (2, 3)])
+def test_reached_nodes_in_the_plane(corner, noise, surely):
+    problem = hjb.Problem(turning, None, hjb.Finite(MOVES), noise=noise, discount=1.0)
+    held = np.zeros(PLANE.shape, bool)
+    held[corner] = True
+    found = reached(problem, PLANE, held, surely)
+    np.testing.assert_array_equal(found, brute(problem, PLANE, held, surely))
+    assert not found[:, corner[1] + 1 :].any()  # everything moves upwards
+
+
+def test_certain_arrival_is_more_than_possible_arrival():
+    """Noise carries the state either way, and only one end is the target: an absorbing trap waits at the other."""
+    noises = np.full((8, 3), 0.5)
+    noises[0] = 0.0  # the trap
+    problem, held = on_line(np.zeros((8, 3)), noises), np.arange(8) == 7
+    np.testing.assert_array_equal(reached(problem, GRID, held, False), np.arange(8) > 0)
+    np.testing.assert_array_equal(reached(problem, GRID, held, True), held)
+
+
+def test_nothing_is_reached_but_the_held_nodes():
+    problem = on_line(np.zeros((8, 3)), np.zeros((8, 3)))
+    np.testing.assert_array_equal(reached(problem, GRID, np.arange(8) == 3, True), np.arange(8) == 3)
+
+
+def test_a_periodic_axis_leads_around():
+    ring = hjb.Grid([0.0], [8.0], (8,), periodic=[True])
+    problem, held = on_line(np.ones((8, 3)), np.zeros((8, 3))), np.arange(8) == 3
+    assert reached(problem, ring, held, True).all()
+    np.testing.assert_array_equal(reached(problem, GRID, held, True), np.arange(8) <= 3)

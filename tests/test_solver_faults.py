@@ -1,0 +1,217 @@
+"""How a solve ends when it does not converge, and what the host does around it."""
+
+import _thread
+import threading
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hjbjax as hjb
+from hjbjax.pytree import node
+
+GRID = hjb.Grid([-1.0, -2.0], [1.0, 2.0], (17, 18))
+SLOW = hjb.ValueIteration()
+
+
+def drift(x, u):
+    return jnp.stack([x[1], u[0]])
+
+
+def cost(x, u):
+    return x @ x + 0.1 * u @ u
+
+
+@node()
+class Level:
+    """A constant cost, large if wanted."""
+
+    height: float
+
+    def cost(self, x, u):
+        return self.height * (1 + x[0] ** 2)
+
+
+def question(discount=1.0, **changes):
+    return hjb.Problem(drift, **({"cost": cost, "controls": hjb.Box([-1.0], [1.0]), "discount": discount} | changes))
+
+
+def endless(tol=1e-13):
+    """A solve that would take minutes: value iteration at a discount of 1e-4 an hour."""
+    return {"problem": question(1e-5), "grid": GRID, "method": SLOW, "tol": tol}
+
+
+def test_converged_history_has_one_residual_a_step_and_one_for_the_guess():
+    solution = hjb.solve(question(0.1), GRID, method=SLOW, tol=1e-6)
+    assert solution.status is hjb.Status.CONVERGED
+    assert solution.residuals.shape == (solution.steps + 1,)
+    assert solution.steps > 300  # more than one chunk can hold
+    assert np.all(np.isfinite(solution.residuals))
+    assert solution.residuals[-1] < 1e-5 < solution.residuals[0]
+    assert np.all(np.diff(solution.residuals) <= 1e-12)  # value iteration is a contraction in the maximum norm
+    assert solution.residual == solution.residuals[-1]
+
+
+@pytest.mark.parametrize("steps", [1, 7])
+def test_max_steps(steps):
+    with pytest.raises(hjb.SolveError, match=r"MAX_STEPS.*max_steps.*guess=") as caught:
+        hjb.solve(**endless(), max_steps=steps)
+    solution = caught.value.solution
+    assert (solution.status, solution.steps) == (hjb.Status.MAX_STEPS, steps)
+    assert solution.residuals.shape == (steps + 1,)
+    assert np.all(np.isfinite(solution.value))
+    quiet = hjb.solve(**endless(), max_steps=steps, throw=False)
+    np.testing.assert_array_equal(quiet.value, solution.value)
+
+
+def test_bounds_hold_before_convergence():
+    truth = hjb.solve(question(), GRID, method=hjb.PolicyIteration(hjb.Direct()), tol=1e-10).value
+    solution = hjb.solve(question(), GRID, method=SLOW, max_steps=5, throw=False)
+    lower, upper = solution.bounds
+    assert np.all(lower <= truth)
+    assert np.all(truth <= upper)
+    assert solution.error > 1e-3
+
+
+def test_chunks_change_no_bit():
+    together = hjb.solve(question(), GRID, method=SLOW, tol=1e-4)
+    half = hjb.solve(question(), GRID, method=SLOW, tol=1e-4, max_steps=together.steps // 2, throw=False)
+    rest = hjb.solve(question(), GRID, method=SLOW, tol=1e-4, guess=half.value)
+    assert half.steps + rest.steps == together.steps
+    np.testing.assert_array_equal(rest.value, together.value)
+
+
+def test_a_solution_as_guess_takes_no_more_than_one_step():
+    solution = hjb.solve(question(), GRID, tol=1e-6)
+    again = hjb.solve(question(), GRID, tol=1e-6, guess=solution.value)
+    assert again.steps <= 1 < solution.steps
+    np.testing.assert_allclose(again.value, solution.value, rtol=0, atol=2e-6)
+
+
+def test_the_guess_is_left_alone():
+    guess = np.ones(GRID.shape)
+    hjb.solve(question(), GRID, guess=guess)
+    np.testing.assert_array_equal(guess, 1.0)
+
+
+def test_time_limit():
+    hjb.solve(**endless(), max_steps=1, throw=False)  # compiles
+    began = time.perf_counter()
+    with pytest.raises(hjb.SolveError, match=r"TIME_LIMIT.*time_limit") as caught:
+        hjb.solve(**endless(), time_limit=1.0)
+    solution = caught.value.solution
+    assert 0.9 <= time.perf_counter() - began <= 3
+    assert solution.status is hjb.Status.TIME_LIMIT
+    assert solution.steps > 1
+    assert solution.residuals.shape == (solution.steps + 1,)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_a_tolerance_below_rounding_stalls_and_says_what_is_attainable(dtype):
+    tol = 1e-10 if dtype == "float32" else 1e-17
+    with pytest.raises(hjb.SolveError, match=r"(?s)STALLED.*within reach") as caught:
+        hjb.solve(question(), GRID, tol=tol, dtype=dtype)
+    solution = caught.value.solution
+    assert solution.status is hjb.Status.STALLED
+    attainable = float(str(caught.value).split("a tolerance of ")[1].split()[0])
+    assert hjb.solve(question(), GRID, tol=attainable, dtype=dtype).status is hjb.Status.CONVERGED
+    assert attainable < (1e-3 if dtype == "float32" else 1e-10)
+
+
+def test_overflow_stops_with_the_last_finite_value():
+    overflowing = question(1e-4, cost=Level(1e307).cost)  # V = L/β = 1e311
+    with pytest.raises(hjb.SolveError, match=r"NONFINITE") as caught:
+        hjb.solve(overflowing, GRID, method=hjb.PolicyIteration(hjb.Sweeps()))
+    solution = caught.value.solution
+    assert solution.status is hjb.Status.NONFINITE
+    assert np.all(np.isfinite(solution.value))
+    assert solution.residuals.shape == (solution.steps + 1,)
+    assert not np.isfinite(solution.residuals[-1])
+
+
+def interrupted(seconds, **options):
+    """A solve, and the seconds from Ctrl-C to its end."""
+    pressed = []
+
+    def press():
+        pressed.append(time.perf_counter())
+        _thread.interrupt_main()
+
+    timer = threading.Timer(seconds, press)
+    timer.start()
+    try:
+        return hjb.solve(**options), pressed
+    finally:
+        pressed.append(time.perf_counter())
+        timer.cancel()
+
+
+def test_ctrl_c_keeps_the_partial_solution():
+    hjb.solve(**endless(), max_steps=300, throw=False)  # compiles
+    solution, (pressed, ended) = interrupted(0.7, **endless(), throw=False)
+    assert solution.status is hjb.Status.INTERRUPTED
+    assert ended - pressed < 0.5
+    assert solution.steps > 0
+    assert np.all(np.isfinite(solution.value))
+    assert solution.residuals.shape == (solution.steps + 1,)
+    with pytest.raises(hjb.SolveError, match=r"INTERRUPTED.*guess=") as caught:
+        interrupted(0.7, **endless())
+    assert np.all(np.isfinite(caught.value.solution.value))
+
+
+def test_silent_where_there_is_no_terminal(capfd):
+    hjb.solve(**endless(), time_limit=1.5, throw=False)
+    out, err = capfd.readouterr()
+    assert (out, err) == ("", "")
+
+
+def test_progress_when_asked_for_and_when_not(capfd):
+    hjb.solve(**endless(), time_limit=2.0, throw=False, progress=True)
+    assert "error" in capfd.readouterr().err
+    hjb.solve(**endless(), time_limit=1.5, throw=False, progress=False)
+    assert capfd.readouterr().err == ""
+
+
+def test_dtype_and_host_arrays():
+    for dtype, kind in [(None, np.float64), ("float64", np.float64), ("float32", np.float32), (np.float32, np.float32)]:
+        solution = hjb.solve(question(), GRID, tol=1e-2, dtype=dtype)
+        for array in (solution.value, solution.policy, *solution.bounds):
+            assert type(array) is np.ndarray
+            assert array.dtype == kind
+        assert solution.stats["dtype"] == np.dtype(kind).name
+    assert not jax.config.jax_enable_x64
+    assert jnp.ones(2).dtype == jnp.float32
+
+
+def test_statistics_of_a_solve():
+    stats = hjb.solve(question(), GRID, tol=1e-4).stats
+    assert stats["tol"] == 1e-4
+    assert stats["seconds"] >= 0
+    assert stats["compile_seconds"] >= 0
+    assert stats["bytes"] > 8 * GRID.size
+    assert "PolicyIteration" in stats["method"]
+    assert "Upwind" in stats["scheme"]
+    assert "discount" in stats["certificate"]
+    assert stats["versions"]["jax"] == jax.__version__
+
+
+def test_two_threads_in_different_dtypes_get_their_own():
+    found, gate = {}, threading.Barrier(2)
+
+    def work(dtype):
+        gate.wait()
+        for repeat in range(3):
+            found[dtype, repeat] = hjb.solve(question(), GRID, tol=1e-2, dtype=dtype, method=SLOW).value
+
+    threads = [threading.Thread(target=work, args=(dtype,)) for dtype in ("float32", "float64")]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for dtype in ("float32", "float64"):
+        alone = hjb.solve(question(), GRID, tol=1e-2, dtype=dtype, method=SLOW).value
+        for repeat in range(3):
+            assert found[dtype, repeat].dtype == dtype
+            np.testing.assert_array_equal(found[dtype, repeat], alone)

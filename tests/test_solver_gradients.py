@@ -1,0 +1,163 @@
+"""solve under jit, vmap and grad, and what recompiles."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hjbjax as hjb
+from hjbjax import zoo
+from hjbjax.pytree import node
+
+TRACES = []
+
+
+@node()
+class Cart:
+    """A damped mass whose every number is a leaf; counts how often it is traced."""
+
+    mass: float = 1.0
+    damping: float = 0.3
+
+    def drift(self, x, u):
+        TRACES.append("drift")
+        return jnp.stack([x[1], (u[0] - self.damping * x[1]) / self.mass])
+
+
+@node()
+class Weights:
+    scale: float = 1.0
+
+    def cost(self, x, u):
+        return self.scale * (x @ x) + 0.5 * u @ u
+
+    def level(self, x):
+        return jnp.max(jnp.abs(x)) - 0.3
+
+    def exit(self, x):
+        return self.scale * (0.2 + 0.1 * x[0])
+
+    def stop(self, x):
+        return self.scale * (0.6 + 0.2 * x[1])
+
+
+GRID = hjb.Grid([-1.0, -1.2], [1.1, 1.0], (9, 10))
+AT = (2, 7)
+
+
+def question(*, mass=1.2, discount=0.8, noise=None, bound=1.0, exit_cost=None, scale=1.0, stopping=False, target=False):
+    weights = Weights(scale)
+    return hjb.Problem(
+        Cart(mass).drift,
+        weights.cost,
+        hjb.Box([-bound], [bound]),
+        noise=noise,
+        discount=discount,
+        target=weights.level if target else None,
+        exit_cost=(weights.exit if exit_cost is None else exit_cost) if target else None,
+        stopping_cost=weights.stop if stopping else None,
+    )
+
+
+def central_difference(function, at):
+    step = 1e-4 * max(1.0, abs(at))
+    return (function(at + step) - function(at - step)) / (2 * step)
+
+
+def value_of(problem, grid=GRID):
+    return hjb.solve(problem, grid, tol=1e-11).value
+
+
+def test_changing_a_parameter_does_not_recompile():
+    hjb.solve(question(mass=1.0), GRID)
+    TRACES.clear()
+    values = [
+        hjb.solve(question(mass=mass, discount=discount), GRID).value for mass, discount in [(1.3, 0.8), (2.0, 1.0)]
+    ]
+    two = len(TRACES)
+    assert np.max(np.abs(values[0] - values[1])) > 0.01
+    # what is left are the probes of one state, which compile nothing: the same number for every solve
+    TRACES.clear()
+    hjb.solve(question(mass=3.0), GRID)
+    assert two == 2 * len(TRACES)
+    assert len(TRACES) <= 3
+
+
+PARAMETERS = {
+    "mass": (1.2, lambda p: (question(mass=p), GRID)),
+    "discount": (0.8, lambda p: (question(discount=p), GRID)),
+    "noise": (0.5, lambda p: (question(noise=p), GRID)),
+    "control bound": (0.6, lambda p: (question(bound=p), GRID)),
+    "cost": (1.0, lambda p: (question(scale=p), GRID)),
+    "lower end of the grid": (-1.2, lambda p: (question(), hjb.Grid(jnp.stack([-1.0, p]), [1.1, 1.0], GRID.shape))),
+    "exit cost as a number": (0.4, lambda p: (question(target=True, exit_cost=p), GRID)),
+    "mass, with a target": (1.2, lambda p: (question(target=True, mass=p), GRID)),
+    "exit cost as a function": (1.0, lambda p: (question(target=True, scale=p), GRID)),
+    "stopping cost": (1.0, lambda p: (question(stopping=True, scale=p), GRID)),
+}
+
+
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_gradients_match_central_differences(name):
+    at, build = PARAMETERS[name]
+
+    def host(parameter):
+        return float(value_of(*build(parameter))[AT])
+
+    def traced(parameter):
+        return hjb.solve(*build(parameter), tol=1e-11).value[AT]
+
+    with jax.enable_x64(True):
+        slope = float(jax.jit(jax.grad(traced))(jnp.asarray(at, jnp.float64)))
+        wanted = central_difference(host, at)
+    assert abs(wanted) > 1e-3
+    assert slope == pytest.approx(wanted, rel=1e-5)
+
+
+def test_forward_and_reverse_mode_agree_and_a_game_is_differentiable():
+    def traced(gamma):
+        problem, grid = zoo.lq_game(gamma=gamma, discount=0.3, shape=(21,))
+        return hjb.solve(problem, grid, tol=1e-11).value[4]
+
+    with jax.enable_x64(True):
+        gamma = jnp.asarray(2.0, jnp.float64)
+        forward, reverse = jax.jit(jax.jacfwd(traced))(gamma), jax.jit(jax.jacrev(traced))(gamma)
+
+        def host(gamma):
+            problem, grid = zoo.lq_game(gamma=gamma, discount=0.3, shape=(21,))
+            return float(hjb.solve(problem, grid, tol=1e-11).value[4])
+
+        wanted = central_difference(host, 2.0)
+    assert float(forward) == pytest.approx(float(reverse), rel=1e-9)
+    assert float(reverse) == pytest.approx(wanted, rel=1e-5)
+
+
+@pytest.mark.parametrize("method", [hjb.PolicyIteration(hjb.Sweeps()), hjb.ValueIteration()], ids=["policy", "value"])
+def test_jit_and_vmap_over_a_parameter_equal_single_solves(method):
+    masses = np.array([0.8, 1.0, 1.7])
+
+    def solved(mass):
+        return hjb.solve(question(mass=mass), GRID, method=method, tol=1e-8)
+
+    single = [solved(mass) for mass in masses]
+    with jax.enable_x64(True):
+        batch = jax.jit(jax.vmap(solved))(jnp.asarray(masses, jnp.float64))
+        alone = jax.jit(solved)(jnp.asarray(masses[0], jnp.float64))
+        assert alone.value.dtype == jnp.float64
+    for lane, solution in enumerate(single):
+        np.testing.assert_allclose(batch.value[lane], solution.value, rtol=0, atol=1e-12)
+        assert int(batch.steps[lane]) == solution.steps
+        assert hjb.Status(int(batch.code[lane])) is hjb.Status.CONVERGED
+    np.testing.assert_allclose(alone.value, single[0].value, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(batch.policy[1], single[1].policy, rtol=0, atol=1e-9)
+
+
+def test_traced_solves_take_the_dtype_of_their_inputs():
+    result = jax.jit(lambda mass: hjb.solve(question(mass=mass), GRID, tol=1e-2))(jnp.float32(1.2))
+    assert result.value.dtype == jnp.float32
+    assert np.max(np.abs(result.value - hjb.solve(question(), GRID, tol=1e-6).value)) <= 1e-2
+
+
+def test_fixed_steps_under_jit_report_that_they_ran_out():
+    result = jax.jit(lambda mass: hjb.solve(question(mass=mass), GRID, tol=1e-6, max_steps=1))(jnp.float32(1.2))
+    assert hjb.Status(int(result.code)) is not hjb.Status.CONVERGED

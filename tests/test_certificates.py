@@ -1,0 +1,247 @@
+"""Every certificate contains a direct solution: policy iteration with dense matrices, written here."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from systems import SEEDS, random_grid, random_problem
+
+from hjbjax import bellman, certificates, chain
+from hjbjax.bellman import Conditions
+from hjbjax.certificates import Certificate
+from hjbjax.grid import Grid
+from hjbjax.problem import Problem
+from hjbjax.schemes import Upwind
+from hjbjax.sets import Finite
+
+POINTS = np.array([[-1.0], [0.0], [0.4], [1.0]])
+laws = settings(max_examples=10)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _float64():
+    with jax.enable_x64(True):
+        yield
+
+
+@functools.partial(jax.jit, static_argnames="kind")
+def measured(kind, problem, grid, value, rules, least_cost, counted, moved):
+    policy = bellman.greedy(problem, grid, value, rules.held, scheme=Upwind())
+    equation = bellman.correction(problem, grid, value, policy, rules, scheme=Upwind())
+    settings_ = {"discount": problem.discount, "least_cost": least_cost, "counted": counted, "moved": moved}
+    return certificates.gap(kind, value, policy, equation, rules, **settings_), equation
+
+
+def bounds_of(kind, problem, grid, value, rules, least_cost=None, counted=None):
+    counted = np.ones(grid.shape, bool) if counted is None else counted
+    gap, _ = jax.device_get(measured(kind, problem, grid, value, rules, least_cost, counted, np.inf))
+    return gap, certificates.bounds(kind, jnp.asarray(value), gap)
+
+
+def exact_solution(problem, grid, rules, start=0.0):
+    """Howard's iteration over actions and over the branches stop, floor and hold, with dense solves."""
+    size = grid.size
+    x = grid.nodes().reshape(size, grid.ndim)
+    held, given = np.ravel(rules.held), np.ravel(rules.given)
+    generators = [chain.generator(problem, grid, np.broadcast_to(u, (*grid.shape, 1))).toarray() for u in POINTS]
+    costs = [
+        np.zeros(size) if problem.cost is None else np.asarray(jax.vmap(lambda x, u=u: problem.cost(x, u))(x))
+        for u in POINTS
+    ]
+    value = np.where(held, given, np.ravel(start) if rules.stop is None else np.ravel(rules.stop))
+    choice, branch = np.full(size, -1), np.full(size, -1)
+    for _ in range(200):
+        rates = np.array([c + g @ value - problem.discount * value for c, g in zip(costs, generators, strict=True)])
+        # keep the incumbent unless the gain is real, so that the iteration ends
+        new = np.argmin(rates, axis=0)
+        better = rates[new, np.arange(size)] < rates[choice, np.arange(size)] - 1e-11 * (1 + np.max(np.abs(value)))
+        new = np.where((choice < 0) | better, new, choice)
+        pace = np.array([problem.discount - g[np.arange(size), np.arange(size)] for g in generators])[
+            new, np.arange(size)
+        ]
+        step = rates[new, np.arange(size)] / np.where(pace > 0, pace, 1)
+        where = np.where(held, 3, 0)
+        if rules.stop is not None:
+            where = np.where((where == 0) & (np.ravel(rules.stop) - value < step - 1e-12), 1, where)
+        if rules.floor is not None:
+            ahead = np.where(where == 1, np.ravel(rules.stop) - value, step)
+            where = np.where((where != 3) & (np.ravel(rules.floor) - value > ahead + 1e-12), 2, where)
+        matrix, right = np.zeros((size, size)), np.zeros(size)
+        for i in range(size):
+            if where[i] == 0:
+                matrix[i] = -generators[new[i]][i]
+                matrix[i, i] += problem.discount
+                right[i] = costs[new[i]][i]
+            else:
+                matrix[i, i] = 1
+                right[i] = {1: rules.stop, 2: rules.floor, 3: rules.given}[where[i]].ravel()[i]
+        value_new = np.linalg.solve(matrix, right)
+        done = np.max(np.abs(value_new - value)) <= 1e-12 * (1 + np.max(np.abs(value)))
+        value, choice, branch = value_new, new, where
+        if done:
+            return value.reshape(grid.shape), branch.reshape(grid.shape)
+    raise AssertionError("the oracle does not converge")
+
+
+def discounted(rng, kind, n, with_rules):
+    grid = random_grid(rng, n)
+    problem = random_problem(rng, grid, kind, Finite(POINTS), discount=rng.uniform(0.2, 2))
+    rules = Conditions(np.zeros(grid.shape, bool), np.zeros(grid.shape))
+    if with_rules:
+        held = rng.random(grid.shape) < 0.15
+        stop, floor = rng.uniform(-0.5, 2, grid.shape), rng.uniform(-2, 0.5, grid.shape)
+        rules = Conditions(held, np.where(held, rng.normal(size=grid.shape), 0), stop, floor)
+    return problem, grid, rules
+
+
+@pytest.mark.parametrize("with_rules", [False, True])
+@pytest.mark.parametrize(("n", "kind"), [(1, "diagonal"), (2, "none"), (2, "matrix")])
+@given(seed=SEEDS)
+@laws
+def test_the_discounted_bound_contains_the_exact_solution(n, kind, with_rules, seed):
+    rng = np.random.default_rng(seed)
+    problem, grid, rules = discounted(rng, kind, n, with_rules)
+    exact, _ = exact_solution(problem, grid, rules)
+    noise = rng.choice([0.0, 1e-6, 1.0]) * rng.normal(size=grid.shape)
+    value = np.asarray(rules.impose(exact + noise))
+    gap, (lower, upper) = bounds_of(Certificate.ADDITIVE, problem, grid, value, rules)
+    slack = 1e-9 * (1 + np.max(np.abs(exact)))
+    assert np.all(lower <= exact + slack)
+    assert np.all(exact <= upper + slack)
+    assert np.max(np.abs(value - exact)) <= gap.error + slack
+    if not noise.any():
+        assert gap.error <= slack
+
+
+def test_the_discounted_bound_is_sharp():
+    """A constant off by δ leaves r = −βδ: the bound is δ and no more."""
+    problem = Problem(lambda x, u: u, lambda x, u: 1.0 + 0 * x[0], Finite(POINTS), discount=0.5)
+    grid = Grid([0.0], [1.0], (5,))
+    rules = Conditions(np.zeros(5, bool), np.zeros(5))
+    gap, (lower, upper) = bounds_of(Certificate.ADDITIVE, problem, grid, np.full(5, 2.25), rules)
+    assert np.allclose(lower, 2.0, rtol=1e-14)
+    assert np.allclose(upper, 2.0, rtol=1e-14)
+    assert np.isclose(gap.error, 0.25, rtol=1e-14)
+
+
+@pytest.mark.parametrize(("n", "kind"), [(1, "none"), (2, "diagonal")])
+@given(seed=SEEDS)
+@laws
+def test_the_undiscounted_bound_contains_the_exact_solution(n, kind, seed):
+    rng = np.random.default_rng(seed)
+    grid = random_grid(rng, n, periodic=False)
+    speed, slope = rng.uniform(0.5, 2), rng.uniform(0, 2, n)
+    problem = Problem(
+        jax.tree_util.Partial(_away, speed),
+        jax.tree_util.Partial(_toll, slope, grid.lo),
+        Finite(POINTS),
+        noise=None if kind == "none" else rng.uniform(0.1, 1, n),
+    )
+    held = np.zeros(grid.shape, bool)
+    held[0] = held[-1] = True
+    rules = Conditions(held, np.where(held, rng.uniform(0, 1, grid.shape), 0))
+    steps = np.minimum(np.arange(len(held)), np.arange(len(held))[::-1])  # steep: its greedy policy is proper
+    start = np.broadcast_to(1e3 * steps.reshape(-1, *[1] * (n - 1)), grid.shape)
+    exact, _ = exact_solution(problem, grid, rules, start)
+    assert np.all(exact >= 0)
+    least = 0.3 + (grid.nodes() - grid.lo) @ slope
+    for noise in (0.0, 1e-6, 0.2):
+        value = np.where(held, exact, exact * (1 + noise * rng.uniform(-1, 1, grid.shape)))
+        gap, (lower, upper) = bounds_of(Certificate.MULTIPLICATIVE, problem, grid, value, rules, least)
+        slack = 1e-8 * (1 + np.max(exact))
+        assert np.all(lower <= exact + slack)
+        assert np.all(exact <= upper + slack)
+        assert np.max(np.abs(value - exact)) <= gap.error + slack
+        assert noise > 0 or gap.error <= slack
+
+
+def _away(speed, x, u):
+    return speed * u[0] * jnp.ones_like(x).at[1:].set(0.5)
+
+
+def _toll(slope, lo, x, u):
+    return 0.3 + slope @ (x - lo) + 0.5 * u[0] ** 2
+
+
+def minimum_time():
+    """ẋ = u on five nodes with both ends held: the time to the nearer end, 0, ¼, ½, ¼, 0."""
+    problem = Problem(lambda x, u: u, lambda x, u: 1.0 + 0 * x[0], Finite(POINTS))
+    grid = Grid([0.0], [1.0], (5,))
+    held = np.array([True, False, False, False, True])
+    return problem, grid, Conditions(held, np.zeros(5)), np.array([0.0, 0.25, 0.5, 0.25, 0.0])
+
+
+def test_minimum_time_by_hand():
+    problem, grid, rules, exact = minimum_time()
+    for factor in (1.0, 1.1, 0.8):
+        gap, (lower, upper) = bounds_of(Certificate.MULTIPLICATIVE, problem, grid, factor * exact, rules, np.ones(5))
+        assert np.allclose(lower if factor > 1 else upper, exact, rtol=1e-12)  # sharp on a multiple of the answer
+        assert np.isclose(gap.error, 0.5 * max(factor - 1, 1 - factor), atol=1e-12)
+
+
+def test_no_bound_where_the_theorem_says_nothing():
+    problem, grid, rules, exact = minimum_time()
+    negative, _ = bounds_of(Certificate.MULTIPLICATIVE, problem, grid, exact - 0.3, rules, np.ones(5))
+    assert np.isinf(negative.error)
+    low = np.where(rules.held, 0, 1e-6)
+    steep, (_, upper) = bounds_of(Certificate.MULTIPLICATIVE, problem, grid, low, rules, np.ones(5))
+    assert np.all(upper >= exact)
+    flat, _ = bounds_of(Certificate.MULTIPLICATIVE, problem, grid, 0 * exact, rules, np.ones(5))
+    assert np.isinf(flat.above)  # r = L
+    assert np.all(np.isinf(certificates.bounds(Certificate.MULTIPLICATIVE, jnp.zeros(5), flat)[1]))  # not 0 · inf
+    assert np.isfinite(steep.below)
+    free, _ = bounds_of(Certificate.MULTIPLICATIVE, problem, grid, 0.9 * exact, rules, np.array([1.0, 1, 0, 1, 1]))
+    assert np.isinf(free.error)
+    assert certificates.bounds(Certificate.NONE, exact, free) is None
+
+
+@pytest.mark.parametrize("kind", list(Certificate))
+def test_a_nan_certifies_nothing(kind):
+    problem, grid, rules, exact = minimum_time()
+    gap, _ = bounds_of(kind, problem, grid, np.where(np.arange(5) == 2, np.nan, exact), rules, np.ones(5))
+    assert not gap.residual <= 1e300
+    assert not gap.error <= 1e300
+
+
+def test_without_a_certificate_the_last_step_counts_too():
+    problem, grid, rules, exact = minimum_time()
+    counted = np.ones(5, bool)
+    gap, equation = measured(Certificate.NONE, problem, grid, 1.5 * exact, rules, None, counted, 0.0)
+    assert np.isclose(gap.residual, np.max(np.abs(equation.source)), rtol=1e-14)
+    assert gap.error == gap.residual
+    later, _ = measured(Certificate.NONE, problem, grid, 1.5 * exact, rules, None, counted, 7.0)
+    assert later.error == 7.0
+
+
+def test_nodes_that_do_not_count_do_not_spoil_the_bound():
+    problem, grid, rules, exact = minimum_time()
+    value = np.where(np.arange(5) == 3, 1e6, exact)
+    counted = np.array([True, True, False, False, True])
+    gap, _ = bounds_of(Certificate.MULTIPLICATIVE, problem, grid, value, rules, np.ones(5), counted)
+    assert np.isclose(gap.error, 0, atol=1e-12)
+
+
+def test_every_certificate_says_itself_in_words():
+    assert all(len(kind.value.split()) > 4 for kind in Certificate)
+
+
+@given(seed=SEEDS)
+@laws
+def test_without_cost_and_discount_constraints_supply_the_value(seed):
+    """A reach-avoid tube: V = max(g, min(ψ, V at the best neighbour)); a fixed point of the step has no residual."""
+    rng = np.random.default_rng(seed)
+    grid = random_grid(rng, 1)
+    problem = Problem(lambda x, u: u, None, Finite(POINTS))
+    stop, floor = rng.uniform(0, 1, 7), rng.uniform(-1, 0.5, 7)
+    rules = Conditions(np.zeros(7, bool), np.zeros(7), stop, floor)
+    value = np.maximum(floor, stop)
+    for _ in range(20):  # ends after at most as many steps as there are nodes
+        best = np.minimum(value, np.minimum(np.r_[value[1:], value[-1]], np.r_[value[0], value[:-1]]))
+        value = np.maximum(floor, np.minimum(stop, best))
+    gap, _ = bounds_of(Certificate.NONE, problem, grid, value, rules)
+    assert gap.residual <= 1e-14
+    worse, _ = bounds_of(Certificate.NONE, problem, grid, value + np.where(np.arange(7) == 3, 0.5, 0), rules)
+    assert worse.residual >= 0.01

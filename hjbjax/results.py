@@ -24,8 +24,8 @@ import numpy as np
 
 from hjbjax import plotting
 from hjbjax._version import __version__
+from hjbjax.path import Path as Trajectory
 from hjbjax.problem import Problem
-from hjbjax.simulation import Path as Trajectory
 from hjbjax.simulation import simulate
 from hjbjax.solution import Solution, Status
 

@@ -14,7 +14,7 @@ from click.testing import CliRunner
 import hjbjax
 from hjbjax import results, zoo
 from hjbjax.cli import main
-from hjbjax.simulation import Path, PathStatus
+from hjbjax.path import Path, PathStatus
 from hjbjax.solution import Solution, Status, load
 
 PNG = b"\x89PNG\r\n\x1a\n"

@@ -9,10 +9,11 @@ import pytest
 from scipy.linalg import expm
 
 from hjbjax.grid import Grid
+from hjbjax.path import PathStatus
 from hjbjax.problem import Problem
 from hjbjax.pytree import node
 from hjbjax.sets import Box
-from hjbjax.simulation import PathStatus, rollout, simulate
+from hjbjax.simulation import rollout, simulate
 
 ROOT3 = math.sqrt(3.0)
 A, B = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])

@@ -1,0 +1,120 @@
+"""The answer of a simulation: a path, why it ends, and the line that says so."""
+
+import enum
+import warnings
+from typing import Any
+
+import numpy as np
+
+from hjbjax.grid import Grid
+from hjbjax.pytree import node
+from hjbjax.sets import AdmissibleSet, Ball, Box
+
+
+class PathStatus(enum.IntEnum):
+    """Why a path ends."""
+
+    DURATION = 0
+    TARGET = 1
+    LEFT_BOX = 2
+    MAX_STEPS = 3
+    NONFINITE = 4
+
+    @property
+    def message(self) -> str:
+        """What happened and what to do, as said of a path."""
+        return MESSAGES[self]
+
+
+MESSAGES = {
+    PathStatus.DURATION: "ran for the whole duration",
+    PathStatus.TARGET: "reached the target",
+    PathStatus.LEFT_BOX: "stopped where it left the box of the grid; enlarge the grid, or go on with clamp=True",
+    PathStatus.MAX_STEPS: "stopped after max_steps internal steps; give hold=dt, or more max_steps",
+    PathStatus.NONFINITE: "stopped because the state is no longer finite; look at drift and feedback there",
+}
+
+
+@node(host=("message",))
+class Path:
+    """A closed loop's history, truncated where it ends.
+
+    Args:
+      times: shape (k+1,), from 0; the last is where the path ends.
+      states: shape (k+1, n), periodic states unwound (``grid.wrap`` brings them into the grid).
+      controls: shape (k, m), the control at the start of each interval; under ``hold`` all through it.
+      disturbances: shape (k, l), likewise, or None where there is no opponent.
+      cost: discounted running cost, plus the discounted exit cost if the target was reached; with
+        ``running_max`` the maximum of that function over the output times instead.
+      reached: the time at which the target was reached, or None.
+      code: a PathStatus number.
+      steps: internal steps of the integrator, rejected ones included.
+      message: one line on how the path ended.
+    """
+
+    times: Any
+    states: Any
+    controls: Any
+    disturbances: Any
+    cost: Any
+    reached: Any
+    code: Any
+    steps: Any
+    message: str = ""
+
+    @property
+    def status(self) -> PathStatus:
+        """Why the path ends."""
+        return PathStatus(int(self.code))
+
+    def __str__(self) -> str:
+        return self.message
+
+
+def truncated(path: Path, count: int, max_steps: int, grid: Grid | None, controls: Any, noisy: bool) -> Path:
+    """A path of full length cut where it ends, with its line; one that ends early outside the target warns.
+
+    Args:
+      path: NumPy arrays over all output times.
+      count: the number k of intervals before the end.
+      max_steps: the most internal steps that it could make.
+      grid: the box that the feedback is known in, if there is one.
+      controls: the admissible set of the problem, or None.
+      noisy: whether the steps were fixed in advance, so that their number says nothing of the loop.
+    """
+    status, times, states = path.status, path.times[: count + 1], path.states[: count + 1]
+    applied = path.controls[:count]
+    said = [
+        f"{status.message} at t = {times[-1]:.6g}",
+        f"cost {float(path.cost):.6g}",
+        f"{int(path.steps)} internal steps",
+    ]
+    if grid is not None and status != PathStatus.LEFT_BOX:
+        outside = np.any(((states < grid.lo) | (states > grid.hi)) & ~np.array(grid.periodic), axis=-1)
+        if outside.any():
+            said.append(f"left the box at t = {times[np.argmax(outside)]:.6g}: controls there are the nearest point's")
+    if not noisy and path.steps > max(1000, max_steps / 8):
+        said.append("the feedback jumps or the loop is stiff: hold=dt is faster")
+    if _inadmissible(controls, applied):
+        said.append("controls outside the problem's admissible set were applied as they are")
+    if status not in (PathStatus.DURATION, PathStatus.TARGET):
+        warnings.warn(f"simulate: the path {said[0]}", UserWarning, stacklevel=3)
+    return Path(
+        times=times,
+        states=states,
+        controls=applied,
+        disturbances=None if path.disturbances is None else path.disturbances[:count],
+        cost=float(path.cost),
+        reached=float(path.reached) if status == PathStatus.TARGET else None,
+        code=int(path.code),
+        steps=int(path.steps),
+        message="; ".join(said),
+    )
+
+
+def _inadmissible(controls: AdmissibleSet | None, applied: np.ndarray) -> bool:
+    """Whether a control lies outside a box or a ball by more than rounding."""
+    if isinstance(controls, Box):
+        slack = 1e-9 * (1 + np.abs(controls.lo) + np.abs(controls.hi))
+        return bool(np.any((applied < controls.lo - slack) | (applied > controls.hi + slack)))
+    return isinstance(controls, Ball) and bool(np.any(np.linalg.norm(applied, axis=-1) > controls.radius * (1 + 1e-9)))

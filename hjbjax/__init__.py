@@ -3,6 +3,7 @@
 from hjbjax import chain, plotting, zoo
 from hjbjax._version import __version__
 from hjbjax.batch import solve_batch
+from hjbjax.convergence import convergence_study
 from hjbjax.fields import FallbackWarning
 from hjbjax.files import FileError
 from hjbjax.grid import Grid
@@ -16,6 +17,7 @@ from hjbjax.simulation import simulate
 from hjbjax.solution import Solution, SolveError, load
 from hjbjax.solver import solve
 from hjbjax.status import Status
+from hjbjax.stretching import Sinh
 
 __all__ = [
     "Ball",
@@ -30,6 +32,7 @@ __all__ = [
     "Nested",
     "PolicyIteration",
     "Problem",
+    "Sinh",
     "Solution",
     "SolveError",
     "SolveWarning",
@@ -39,6 +42,7 @@ __all__ = [
     "ValueIteration",
     "__version__",
     "chain",
+    "convergence_study",
     "load",
     "plotting",
     "simulate",

@@ -142,7 +142,7 @@ def _finish_lanes(tasks: Task, states: State, count: int, max_steps: int) -> tup
         part = _run(_take(tasks, rows), _stack([final[i] for i in rows]), until)
         for lane, (index, began) in enumerate(zip(rows[: len(active)], before, strict=False)):
             final[index] = _lane(part, lane)
-            histories[index].append(np.asarray(final[index].history[: int(final[index].step) - began]))
+            histories[index].append(np.asarray(final[index].history)[: int(final[index].step) - began])
         active = [i for i in active if final[i].code == Status.RUNNING and final[i].step < max_steps]
     return final, histories
 

@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax import chain, fields, hamiltonian, sets
+from hjbjax import chain, fields, hamiltonian, sets, stencil
 from hjbjax.chain import Rates
 from hjbjax.grid import Grid
 from hjbjax.problem import Problem
@@ -137,7 +137,14 @@ def correction(
     if rules.floor is not None:
         floored = ~rules.held & (rules.floor - value > source)
         source, free = jnp.where(floored, rules.floor - value, source), free & ~floored
-    return Correction(source, rates.scaled(jnp.where(free, 1 / pace, 0)))
+    weights = rates.scaled(jnp.where(free, 1 / pace, 0))
+    if scheme.subcell:  # what leads to a held node ends on the target's boundary, where nothing is to be corrected
+        loose = ~rules.held
+        jumps = zip(weights.offsets, weights.values, strict=True)
+        weights = Rates(
+            weights.offsets, tuple(jnp.where(stencil.neighbour(loose, grid, offset), w, 0) for offset, w in jumps)
+        )
+    return Correction(source, weights)
 
 
 def fastest_rate(problem: Problem, grid: Grid, *, scheme: Scheme, dtype: Any, t: Any = 0.0) -> jax.Array:

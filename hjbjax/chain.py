@@ -27,6 +27,8 @@ from hjbjax.grid import Grid
 from hjbjax.problem import Problem
 from hjbjax.pytree import cast, node
 from hjbjax.schemes import Upwind
+from hjbjax.stencil import Links
+from hjbjax.subcell import links
 
 Offset = tuple[int, ...]
 
@@ -105,10 +107,9 @@ def along_axis(a: dict[tuple[int, int], Any], grid: Grid, axis: int) -> Any:
     return left
 
 
-def excess(f: Any, a: Any, grid: Grid, axis: int, scheme: Upwind) -> Any:
+def excess(f: Any, a: Any, grid: Grid, axis: int, scheme: Upwind, link: Links) -> Any:
     """e_i, the diffusion that the chain has along an axis: a_ii and what keeps its rates non-negative."""
-    h_up, h_down = stencil.steps(grid, axis)
-    least = jnp.maximum(h_up * f, -h_down * f)
+    least = jnp.maximum(link.up * f, -link.down * f)
     if a is None:
         return least
     a = jnp.maximum(a, 0)  # along_axis may leave a rounding error below zero
@@ -118,10 +119,9 @@ def excess(f: Any, a: Any, grid: Grid, axis: int, scheme: Upwind) -> Any:
     return jnp.where(edge, a + least, jnp.maximum(a, least))  # projection wants drift and noise apart
 
 
-def axis_rates(f: Any, a: Any, grid: Grid, axis: int, scheme: Upwind) -> tuple[Any, Any]:
+def axis_rates(f: Any, a: Any, grid: Grid, axis: int, scheme: Upwind, link: Links) -> tuple[Any, Any]:
     """c_i^+ and c_i^- before the projection at the edges."""
-    h_up, h_down = stencil.steps(grid, axis)
-    e = excess(f, a, grid, axis, scheme)
+    h_up, h_down, e = link.up, link.down, excess(f, a, grid, axis, scheme, link)
     return (e + h_down * f) / (h_up * (h_up + h_down)), (e - h_up * f) / (h_down * (h_up + h_down))
 
 
@@ -142,8 +142,8 @@ def rates(
     x = grid.components(dtype)
     f, a = drift(problem, x, u, d, t, dtype), diffusion(problem, x, u, d, t, dtype)
     table: dict[Offset, Any] = {}
-    for axis in range(grid.ndim):
-        pair = axis_rates(f[axis], along_axis(a, grid, axis), grid, axis, scheme)
+    for axis, link in enumerate(links(problem, grid, subcell=scheme.subcell, dtype=dtype, t=t)):
+        pair = axis_rates(f[axis], along_axis(a, grid, axis), grid, axis, scheme, link)
         for step, rate in zip((1, -1), pair, strict=True):
             table[stencil.unit(grid, axis, step)] = _inside(rate, grid, axis, step)
     for (i, j), entry in a.items():

@@ -52,6 +52,8 @@ def shapes(problem: Problem, grid: Grid, scheme: Any) -> None:
         if count < needed:
             raise ValueError(f"axis {axis} has {count} points; {type(scheme).__name__} needs at least {needed}")
     n = grid.ndim
+    if any(grid.stretch or ()) and np.ndim(problem.noise) == 2:
+        raise ValueError("correlated noise wants equal spacings: leave out Grid.stretch, or give noise by axis, (n,)")
     with jax.enable_x64(True):
         _expect(problem, "drift", n, f"({n},)", lambda shape: shape == (n,))
         _expect(

@@ -53,7 +53,7 @@ def drive(task: Task, guess: jax.Array, clock: Clock, most: int | None = None) -
     with _bar(clock.progress, float(task.tol)) as show:
         try:
             state = jax.block_until_ready(run(task, state, 0))  # compiles, and looks at the guess
-            residuals, code = [np.asarray(state.history[:1])], Status(int(state.code))
+            residuals, code = [np.asarray(state.history)[:1]], Status(int(state.code))
             while code is Status.RUNNING:
                 done, began = int(state.step), time.perf_counter()
                 if done >= limit or clock.elapsed() >= clock.seconds:
@@ -63,7 +63,7 @@ def drive(task: Task, guess: jax.Array, clock: Clock, most: int | None = None) -
                 took = time.perf_counter() - began
                 clock.stepping += took
                 code, steps = Status(int(state.code)), int(state.step) - done
-                residuals.append(np.asarray(state.history[:steps]))
+                residuals.append(np.asarray(state.history)[:steps])
                 chunk = int(np.clip(chunk * CHUNK_SECONDS / max(took, 1e-4), 1, min(HISTORY, 8 * chunk)))
                 show(steps, float(state.gap.error))
         except KeyboardInterrupt:

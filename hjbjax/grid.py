@@ -14,11 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.pytree import node, numbers
+from hjbjax.stretching import Sinh, Stretching
 
 
 @node(static=("shape", "periodic", "names"))
 class Grid:
-    """A uniform grid of nodes on a box in R^n.
+    """A grid of nodes on a box in R^n, uniform along every axis that is not stretched.
 
     Args:
       lo: lower corner, shape (n,), in the units of each state.
@@ -26,6 +27,7 @@ class Grid:
       shape: number of nodes an axis, n integers of at least 2.
       periodic: one bool an axis; ``None`` means none.
       names: one name an axis, used by pictures and printed tables.
+      stretch: one ``Sinh(strength, center)`` or ``None`` an axis; ``None`` means uniform. Not on a periodic axis.
 
     Raises:
       ValueError: bounds that are not finite or not increasing, or lengths that differ.
@@ -42,23 +44,26 @@ class Grid:
     shape: tuple[int, ...]
     periodic: tuple[bool, ...] | None = None
     names: tuple[str, ...] = ()
+    stretch: tuple[Stretching | None, ...] | None = None
 
     def __post_init__(self):
         lo, hi = _corner(self.lo, "lo"), _corner(self.hi, "hi")
         shape = _sizes(self.shape)
         periodic = _flags(self.periodic, len(shape))
         names = tuple(str(name) for name in self.names) or tuple(f"x{axis + 1}" for axis in range(len(shape)))
-        lengths = (len(lo), len(hi), len(shape), len(periodic), len(names))
+        stretch = (None,) * len(shape) if self.stretch is None else tuple(self.stretch)
+        lengths = (len(lo), len(hi), len(shape), len(periodic), len(names), len(stretch))
         if len(set(lengths)) != 1:
             raise ValueError(
-                "Grid: got lo, hi, shape, periodic and names of lengths {}, {}, {}, {} and {}; "
+                "Grid: got lo, hi, shape, periodic, names and stretch of lengths {}, {}, {}, {}, {} and {}; "
                 "wanted one entry an axis in each".format(*lengths)
             )
+        _check_stretch(stretch, periodic)
         if isinstance(lo, np.ndarray) and isinstance(hi, np.ndarray):
             for axis, (low, high) in enumerate(zip(lo, hi, strict=True)):
                 if not (math.isfinite(low) and math.isfinite(high) and low < high):
                     raise ValueError(f"Grid: axis {axis} runs from {low:g} to {high:g}; wanted finite lo < hi")
-        checked = {"lo": lo, "hi": hi, "shape": shape, "periodic": periodic, "names": names}
+        checked = {"lo": lo, "hi": hi, "shape": shape, "periodic": periodic, "names": names, "stretch": stretch}
         for name, value in checked.items():
             object.__setattr__(self, name, value)
 
@@ -77,12 +82,15 @@ class Grid:
         return self.shape[axis] if self.periodic[axis] else self.shape[axis] - 1  # type: ignore[index]
 
     def spacing(self, axis: int) -> Any:
-        """The distance h between neighbours along ``axis``."""
+        """The distance h between neighbours along ``axis``; their mean on a stretched one."""
         return (self.hi[axis] - self.lo[axis]) / self.intervals(axis)
 
     def axis(self, axis: int, dtype: Any = None) -> Any:
         """The coordinates of the nodes along one axis, shape (N,)."""
         index, last = np.arange(self.shape[axis], dtype=dtype or np.float64), self.intervals(axis)
+        stretching = self.stretch[axis]  # type: ignore[index]
+        if stretching is not None:
+            index = last * stretching.place(index / last)
         return (self.lo[axis] * (last - index) + self.hi[axis] * index) / last
 
     def components(self, dtype: Any) -> list[jax.Array]:
@@ -144,7 +152,10 @@ class Grid:
     def _locate(self, axis: int, x: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """The node below ``x``, the fraction of the way to the next, and whether ``x`` lies in the box."""
         lo, hi, last = jnp.asarray(self.lo[axis], x.dtype), jnp.asarray(self.hi[axis], x.dtype), self.intervals(axis)
-        place = (x - lo) / (hi - lo) * last
+        place = (x - lo) / (hi - lo)
+        if self.stretch[axis] is not None:  # type: ignore[index]
+            return self._locate_stretched(axis, x, place)
+        place = place * last
         # What rounding of coordinates of the size of the ends can do to a place, in cells, with room to spare.
         slack = 8 * last * jnp.finfo(x.dtype).eps * jnp.maximum(1, jnp.maximum(abs(lo), abs(hi)) / (hi - lo))
         inside = (place >= -slack) & (place <= last + slack)  # NaN counts as outside
@@ -155,10 +166,29 @@ class Grid:
         cell = jnp.minimum(jnp.floor(jax.lax.stop_gradient(place)), last - 1).astype(int)
         return cell, place - cell, inside
 
+    def _locate_stretched(self, axis: int, x: jax.Array, place: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """The same on a stretched axis: the cell by the inverse map, the fraction by the coordinates of its ends."""
+        slack = 64 * jnp.finfo(x.dtype).eps
+        inside = (place >= -slack) & (place <= 1 + slack)
+        nodes, last = jnp.asarray(self.axis(axis), x.dtype), self.intervals(axis)
+        guess = last * self.stretch[axis].fraction(jnp.clip(jnp.nan_to_num(place), 0, 1))  # type: ignore[index, union-attr]
+        cell = jnp.clip(jnp.floor(jax.lax.stop_gradient(guess)).astype(int), 0, last - 1)
+        cell = jnp.clip(cell + (x >= nodes[cell + 1]) - (x < nodes[cell]), 0, last - 1)  # rounding of the inverse map
+        fraction = (x - nodes[cell]) / (nodes[cell + 1] - nodes[cell])
+        return cell, jnp.clip(jnp.nan_to_num(fraction), 0, 1), inside
+
 
 def _states(x: Any) -> jax.Array:
     x = jnp.asarray(x)
     return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(float)
+
+
+def _check_stretch(stretch: tuple, periodic: tuple[bool, ...]) -> None:
+    for axis, (stretching, cyclic) in enumerate(zip(stretch, periodic, strict=True)):
+        if stretching is not None and not isinstance(stretching, Sinh):
+            raise TypeError(f"Grid.stretch: entry {axis} is {stretching!r}; wanted Sinh(strength, center) or None")
+        if stretching is not None and cyclic:
+            raise ValueError(f"Grid.stretch: axis {axis} is periodic; only an axis with ends can be stretched")
 
 
 def _corner(value: Any, name: str) -> Any:

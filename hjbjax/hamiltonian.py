@@ -13,15 +13,15 @@ drive disjoint sets of components (read from the jaxpr, see ``structure``): all 
 points are tried. Otherwise samples and a pattern search, and certificates hold for the refined sample.
 """
 
+import dataclasses
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from hjbjax import chain, sets, stencil, structure
+from hjbjax import chain, sets, stencil, structure, subcell
 from hjbjax.grid import Grid
 from hjbjax.minimisers import Action, Kinked, enumerate_actions, kinked_ball, piecewise_input, refine
 from hjbjax.problem import Problem
@@ -31,7 +31,7 @@ from hjbjax.sets import AdmissibleSet, Ball, Box, Finite
 SAMPLES = 33  # points of a continuum before refinement
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Player:
     """What one player may do and how the Hamiltonian depends on it; static, known from the jaxpr.
 
@@ -59,7 +59,7 @@ class Player:
         return 3 if self.exact else SAMPLES
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Setting:
     """Both players and how they meet.
 
@@ -120,12 +120,13 @@ def _player(
     return Player(choices, sign, suits and isinstance(choices, (Box, Ball)), driven, curved)
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Local:
     """The Hamiltonian around one value function: coordinates, slopes, and how to evaluate H(u, d).
 
     Attributes:
       up, down: the slopes that drift sees; D⁺ and D⁻, or limited ones.
+      links: the distances to the neighbours along every axis.
       bends: D⁺ − D⁻ along every axis, which noise sees.
     """
 
@@ -139,16 +140,18 @@ class Local:
     up: tuple[jax.Array, ...]
     down: tuple[jax.Array, ...]
     bends: tuple[jax.Array, ...]
+    links: tuple[stencil.Links, ...]
 
     def gain(self, axis: int, f: Any, a: Any) -> Any:
         """[(e + h⁻ f) D⁺ − (e − h⁺ f) D⁻]/(h⁺ + h⁻); with other slopes f⁺ P⁺ + f⁻ P⁻ + a (D⁺ − D⁻)/(h⁺ + h⁻)."""
         upwind = jnp.maximum(f, 0) * self.up[axis] + jnp.minimum(f, 0) * self.down[axis]
         if a is None:
             return upwind
-        h_up, h_down = stencil.steps(self.grid, axis)
+        link = self.links[axis]
+        h_up, h_down = link.up, link.down
         if isinstance(self.scheme, Limited):
             return upwind + jnp.maximum(a, 0) * self.bends[axis] / (h_up + h_down)
-        e = chain.excess(f, a, self.grid, axis, self.scheme)
+        e = chain.excess(f, a, self.grid, axis, self.scheme, link)
         upward, downward = (e + h_down * f) / (h_up + h_down), (e - h_up * f) / (h_up + h_down)
         return upward * self.up[axis] - downward * self.down[axis]
 
@@ -179,59 +182,62 @@ class Local:
         ) / scale
 
 
+def at_rest(problem: Problem, grid: Grid, *, scheme: Scheme, dtype: Any) -> Local:
+    """A Hamiltonian with slopes D⁺ = 1 and D⁻ = −1 everywhere: H = L + Σ |f_i| and what noise adds.
+
+    Its minimum is zero exactly where an action rests at no cost, if the cost is not negative.
+    """
+    here = local(problem, grid, jnp.zeros(grid.shape, dtype), scheme=scheme)
+    one = jnp.ones(grid.shape, dtype)
+    ups, downs, bends = ((sign * one,) * grid.ndim for sign in (1, -1, 2))
+    return dataclasses.replace(here, up=ups, down=downs, bends=bends)
+
+
 def local(problem: Problem, grid: Grid, value: jax.Array, *, scheme: Scheme, t: Any = 0.0) -> Local:
     """Coordinates and differences around ``value``, tied together so that no loop hoists tables out of itself."""
     x, value = jax.lax.optimization_barrier((grid.components(value.dtype), value))
-    differences = [stencil.one_sided(value, grid, axis) for axis in range(grid.ndim)]
+    links = tuple(subcell.links(problem, grid, subcell=scheme.subcell, dtype=value.dtype, t=t))
+    differences = [stencil.one_sided(value, grid, axis, link) for axis, link in enumerate(links)]
     bends = tuple(up - down for up, down in differences)
     if isinstance(scheme, Limited):
-        differences = [stencil.limited(*pair, grid, axis) for axis, pair in enumerate(differences)]
+        differences = [stencil.limited(*pair, grid, axis, links[axis]) for axis, pair in enumerate(differences)]
     up, down = zip(*differences, strict=True)
-    return Local(problem, grid, scheme, value.dtype, t, x, value, up, down, bends)
+    return Local(problem, grid, scheme, value.dtype, t, x, value, up, down, bends, links)
 
 
 def optimise(here: Local, how: Setting, isaacs: str | None = None) -> tuple[jax.Array, Action, Action]:
     """min max of H, or max min, as the problem or ``isaacs`` says: the value, the control and the disturbance."""
-    no_control, no_disturbance = how.control.choices is None, how.disturbance.choices is None
-    if no_disturbance:
-        u = _best_action(here, how.control, lambda u: (u, []))
-        return here.at(u, []), u, []
+    if how.disturbance.choices is None:
+        value, u = best_response(here, how.control, lambda u: (u, []))
+        return value, u, []
     if how.decoupled:
-        assert how.disturbance.choices is not None
         start = _any_action(how.disturbance.choices)
-        u = [] if no_control else _best_action(here, how.control, lambda u: (u, start))
-        d = _best_action(here, how.disturbance, lambda d: (u, d))
-        return here.at(u, d), u, d
+        _, u = best_response(here, how.control, lambda u: (u, start))
+        value, d = best_response(here, how.disturbance, lambda d: (u, d))
+        return value, u, d
     if (isaacs or here.problem.isaacs) == "upper":
-        u, d = _nested(here, how.control, how.disturbance, lambda u, d: (u, d))
-    else:
-        d, u = _nested(here, how.disturbance, how.control, lambda d, u: (u, d))
-    return here.at(u, d), u, d
+        return _nested(here, how.control, how.disturbance, lambda u, d: (u, d))
+    value, d, u = _nested(here, how.disturbance, how.control, lambda d, u: (u, d))
+    return value, u, d
 
 
 def best_response(here: Local, player: Player, join: Callable) -> tuple[jax.Array, Action]:
     """One player's optimum against a given action of the other; ``join(mine)`` makes the pair (u, d)."""
-    action = _best_action(here, player, join)
-    return here.at(*join(action)), action
+    if player.choices is None or player.exact:
+        action = [] if player.choices is None else _exact(here, player, join)
+        return here.at(*join(action)), action
+    value, action, _ = _sampled(here, player, lambda action: (here.at(*join(action)), []), weight=1)
+    return value, action
 
 
-def _nested(here: Local, outer: Player, inner: Player, join: Callable) -> tuple[Action, Action]:
+def _nested(here: Local, outer: Player, inner: Player, join: Callable) -> tuple[jax.Array, Action, Action]:
     def objective(action):
-        value, answer = best_response(here, inner, lambda reply: join(action, reply))
-        return value, answer
+        return best_response(here, inner, lambda reply: join(action, reply))
 
     if outer.choices is None:
-        return [], objective([])[1]
-    _, action, answer = _sampled(here, outer, objective, weight=inner.weight)
-    return action, answer
-
-
-def _best_action(here: Local, player: Player, join: Callable) -> Action:
-    if player.choices is None:
-        return []
-    if player.exact:
-        return _exact(here, player, join)
-    return _sampled(here, player, lambda action: (here.at(*join(action)), []), weight=1)[1]
+        value, answer = objective([])
+        return value, [], answer
+    return _sampled(here, outer, objective, weight=inner.weight)
 
 
 def _sampled(here: Local, player: Player, objective: Callable, weight: int) -> Any:
@@ -320,7 +326,7 @@ def _kinked(here: Local, base: tuple[Action, Action], axis: int, offset: Any, sl
 
     if left is None or isinstance(here.scheme, Limited) or not here.scheme.central:
         return Kinked(gain, offset, slope, (0.0,), (down, up))
-    h_up, h_down = stencil.steps(here.grid, axis)
+    h_up, h_down = here.links[axis].up, here.links[axis].down
     edge = stencil.on_edge(here.grid, axis, 1) | stencil.on_edge(here.grid, axis, -1)
     width = jnp.maximum(left, 0)
     middle = (h_down * up + h_up * down) / (h_up + h_down)

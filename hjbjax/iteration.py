@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax import bellman, certificates, chain, hamiltonian, relaxation
+from hjbjax import bellman, certificates, hamiltonian, relaxation
 from hjbjax.bellman import Conditions, Correction, Greedy
 from hjbjax.certificates import Certificate, Gap
 from hjbjax.grid import Grid
@@ -225,19 +225,12 @@ def _hoffman_karp(task: Task, state: State) -> jax.Array:
 def rest_nodes(problem: Problem, grid: Grid, *, scheme: Scheme, dtype: Any) -> tuple[jax.Array, jax.Array]:
     """Where the system can rest at no cost, bool (*grid), and the least running cost at every node.
 
-    At V = 0 the Hamiltonian is the running cost. Rest means that the action that is cheapest there leaves the
-    state where it is; up to rounding, since sin π is not zero in floating point.
+    Rest is up to rounding, since sin π is not zero in floating point. At V = 0 the Hamiltonian is the cost.
     """
     how = hamiltonian.setting(problem, grid.ndim, dtype)
-    here = hamiltonian.local(problem, grid, jnp.zeros(grid.shape, dtype), scheme=scheme)
-    least, u, d = hamiltonian.optimise(here, how)
-    other = d if problem.is_game else None
-    f = chain.drift(problem, here.x, u, other, 0.0, dtype)
-    a = chain.diffusion(problem, here.x, u, other, 0.0, dtype)
-    small = 1e3 * jnp.finfo(dtype).eps
-    rests = jnp.abs(least) <= small
-    for axis, component in enumerate(f):
-        rests &= jnp.abs(component) <= small * (1 + grid.hi[axis] - grid.lo[axis])
-    for entry in a.values():
-        rests &= entry == 0
-    return rests, least
+    nowhere = hamiltonian.local(problem, grid, jnp.zeros(grid.shape, dtype), scheme=scheme)
+    least = hamiltonian.optimise(nowhere, how)[0]
+    effort = hamiltonian.optimise(hamiltonian.at_rest(problem, grid, scheme=scheme, dtype=dtype), how)[0]
+    size = 1 + sum(grid.hi[axis] - grid.lo[axis] for axis in range(grid.ndim))
+    small = 1e3 * jnp.finfo(dtype).eps * size
+    return (jnp.abs(effort) <= small) & (jnp.abs(least) <= small), least

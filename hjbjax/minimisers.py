@@ -22,7 +22,7 @@ REFINEMENTS = 24  # halvings of the sample spacing: 2⁻²⁴ of it is below the
 
 
 def better(sign: int, challenger: Any, incumbent: Any) -> Any:
-    """Whether ``challenger`` is strictly better; a NaN challenger never is, a NaN incumbent stays."""
+    """Whether ``challenger`` is strictly better; NaN never is."""
     return challenger < incumbent if sign > 0 else challenger > incumbent
 
 
@@ -62,8 +62,12 @@ def enumerate_actions(objective: Objective, points: Any, sign: int, *, weight: i
 def _best_of(objective: Objective, actions: Sequence[Action], sign: int, best: Any) -> Any:
     for action in actions:
         value, extra = objective(action)
-        challenger = (value, [jnp.asarray(entry, value.dtype) for entry in action], extra)
-        best = challenger if best is None else pick(better(sign, value, best[0]), challenger, best)
+        chosen = ([jnp.asarray(entry, value.dtype) for entry in action], extra)
+        if best is None:
+            best = (value, *chosen)
+            continue
+        optimum = jnp.minimum(best[0], value) if sign > 0 else jnp.maximum(best[0], value)  # a NaN stays one
+        best = (optimum, *pick(better(sign, value, best[0]), chosen, best[1:]))
     return best
 
 

@@ -48,14 +48,20 @@ def levels(problem: Problem, grid: Grid, method: Nested, scheme: Upwind, dtype: 
 
 
 def warm(task: Task, guess: Any, clock: Clock) -> jax.Array:
-    """The guess; without one zero, or without discount the answers for a discount that vanishes.
+    """The guess; without one zero, or without discount what leads to the right one of many fixed points.
 
-    From below an undiscounted problem is full of policies that stay where they are at a cost; those of a small
-    discount move to the target.
+    A stopping cost or a running maximum is itself the start: ψ lies above all fixed points and g below. Otherwise
+    the answers for a discount that vanishes lead the way: from below an undiscounted problem is full of policies
+    that stay where they are at a cost; those of a small discount move to the target.
     """
     if guess is not None:
         return guess
     value = jnp.zeros(task.grid.shape, task.tol.dtype)
+    if task.problem.discount == 0:  # a constraint alone has many fixed points: ψ is above, g is below all of them
+        value = value if task.rules.stop is None else task.rules.stop
+        floor = task.rules.floor
+        if floor is not None:
+            value = floor if task.rules.stop is None else jnp.maximum(floor, value)
     if task.certificate is not Certificate.MULTIPLICATIVE:
         return value
     for discount in VANISHING:

@@ -15,19 +15,23 @@ from typing import Any
 
 import numpy as np
 
+from hjbjax.canvas import COLOURS, GREY, axes_of, bands, draw, frame, label_axes, legend, pair_of_axes, styled
 from hjbjax.grid import Grid
-from hjbjax.sections import Section, at_time, feedback, folded, lifted, section_of, zeros
+from hjbjax.sections import at_time, feedback, folded, lifted, section_of, zeros
 
-GREY = "#c9c9c9"
-COLOURS = (
-    "#0072b2",
-    "#d55e00",
-    "#009e73",
-    "#cc79a7",
-    "#e69f00",
-    "#56b4e9",
-    "#000000",
-)  # Okabe and Ito: safe for all eyes
+__all__ = [
+    "COLOURS",
+    "GREY",
+    "closed_loop",
+    "controls",
+    "convergence",
+    "policy",
+    "residuals",
+    "styled",
+    "switching_curve",
+    "trajectory",
+    "value",
+]
 
 
 def value(
@@ -66,9 +70,9 @@ def value(
     """
     field, caption = at_time(solution, solution.value, time)
     section = section_of("value", field, solution.grid, fixed, caption)
-    ax = _axes(ax)
+    ax = axes_of(ax)
     hidden = "V = ∞" if np.all(np.isposinf(section.values.data[section.values.mask])) else "V not finite"
-    artists = _draw(ax, section, solution.grid, "V", hidden, colorbar=colorbar)
+    artists = draw(ax, section, solution.grid, "V", hidden, colorbar=colorbar)
     lines = _levels(section.values, levels) if len(section.axes) == 2 else ()
     if len(lines):
         x, y = section.coordinates
@@ -97,7 +101,7 @@ def policy(
       ax, fixed, time, colorbar: as for :func:`value`, with its result and its refusals.
     """
     section, label = feedback(solution, input, fixed, time)
-    return _draw(_axes(ax), section, solution.grid, label, "no control defined", colorbar=colorbar, diverging=True)
+    return draw(axes_of(ax), section, solution.grid, label, "no control defined", colorbar=colorbar, diverging=True)
 
 
 def switching_curve(
@@ -131,17 +135,17 @@ def switching_curve(
     if known.size == 0 or known.min() >= 0 or known.max() <= 0:
         between = f"{known.min():g} and {known.max():g}" if known.size else "no finite values"
         raise ValueError(f"switching_curve: {name} stays between {between}; there is no change of sign to draw")
-    ax = _axes(ax)
+    ax = axes_of(ax)
     style = {"color": color, "linewidth": 1.6}
     if len(section.axes) == 1:
         artists = [ax.axvline(x, **style) for x in zeros(section.coordinates[0], section.values)]
     else:
         x, y = section.coordinates
         artists = [ax.contour(x, y, section.values.T, levels=[0.0], colors=color, linewidths=1.6)]
-    _frame(ax, section, solution.grid)
+    frame(ax, section, solution.grid)
     if label:
         artists += ax.plot([], [], label=label, **style)
-        _legend(ax)
+        legend(ax)
     return artists
 
 
@@ -183,14 +187,14 @@ def trajectory(
     names = tuple(names or (grid.names if grid is not None else (f"x{i + 1}" for i in range(count))))
     states = lifted(states, grid)
     if axes is None or count == 1:
-        ax = _axes(ax, wide=True)
+        ax = axes_of(ax, wide=True)
         colours = itertools.cycle((color,) if color else COLOURS)
         artists = [ax.plot(times, states[:, i], color=next(colours), label=names[i])[0] for i in range(count)]
-        _label(ax, "t", names[0] if count == 1 else "state")
-        return artists if count == 1 else [*artists, _legend(ax)]
+        label_axes(ax, "t", names[0] if count == 1 else "state")
+        return artists if count == 1 else [*artists, legend(ax)]
     if len(axes) != 2 or not all(0 <= i < count for i in axes):
         raise ValueError(f"trajectory: got axes={axes!r}; the path has {count} states, wanted two of 0 to {count - 1}")
-    ax = _axes(ax)
+    ax = axes_of(ax)
     first, last = folded(states[:1], axes, grid)[0], folded(states[-1:], axes, grid)[0]
     plane = folded(states, axes, grid)
     color = color or COLOURS[1]
@@ -199,9 +203,9 @@ def trajectory(
     marks = {"linestyle": "none", "marker": "o", "markeredgecolor": color, "markersize": 6, "zorder": 5}
     artists += ax.plot(*first, markerfacecolor="white", markeredgewidth=1.6, **marks)
     artists += ax.plot(*last, markerfacecolor=color, path_effects=casing, **marks)
-    _label(ax, names[axes[0]], names[axes[1]])
+    label_axes(ax, names[axes[0]], names[axes[1]])
     if label:
-        _legend(ax)
+        legend(ax)
     return artists
 
 
@@ -221,14 +225,14 @@ def controls(path: Any, *, ax: Any = None, names: Sequence[str] | None = None) -
     times, inputs = np.asarray(path.times), np.asarray(path.controls)
     count = inputs.shape[1]
     names = tuple(names or (("u",) if count == 1 else (f"u{i + 1}" for i in range(count))))
-    ax = _axes(ax, wide=True)
+    ax = axes_of(ax, wide=True)
     colours = itertools.cycle(COLOURS)
     artists = [
         ax.stairs(inputs[:, i], times, baseline=None, color=next(colours), linewidth=1.4, label=names[i])
         for i in range(count)
     ]
-    _label(ax, "t", names[0] if count == 1 else "control")
-    return artists if count < 2 else [*artists, _legend(ax)]
+    label_axes(ax, "t", names[0] if count == 1 else "control")
+    return artists if count < 2 else [*artists, legend(ax)]
 
 
 def closed_loop(
@@ -286,17 +290,55 @@ def residuals(solution: Any, *, ax: Any = None, label: str | None = None) -> lis
         raise ValueError(
             "residuals: the solution carries no history; it stays behind under jit and vmap: use solve directly"
         )
-    ax = _axes(ax, wide=True)
+    ax = axes_of(ax, wide=True)
     steps = np.arange(1, history.size + 1)
     drawable = np.isfinite(history) & (history > 0)  # an exact zero has no logarithm
     artists = ax.plot(steps, np.ma.masked_where(~drawable, history), color=None if label else COLOURS[0], label=label)
     if history.size < 60:
         artists[0].set(marker="o", markersize=3)
     ax.set_yscale("log")
-    artists += _bands(ax, steps, ~np.isfinite(history), "not finite")
-    _label(ax, "step", "residual")
+    artists += bands(ax, steps, ~np.isfinite(history), "not finite")
+    label_axes(ax, "step", "residual")
     if label or len(artists) > 1:
-        _legend(ax)
+        legend(ax)
+    return artists
+
+
+def convergence(study: Any, *, ax: Any = None) -> list[Any]:
+    """The errors of a convergence study over the spacing and over the seconds, with the fitted orders.
+
+    Full marks are the largest errors, rings the mean ones; the thin line beside the full marks has the fitted
+    slope. Errors of zero have no logarithm and are left out; an estimate is called one in the label of the axis.
+
+    Args:
+      study: what ``convergence_study`` returned.
+
+    Keyword Args:
+      ax: matplotlib axes to draw on: one for the errors over the spacing, or two, the second for the seconds;
+        ``None`` makes a figure with both.
+
+    Returns:
+      The artists: the line of the largest errors over the spacing first.
+    """
+    axes = pair_of_axes() if ax is None else list(np.ravel(ax))
+    quality = "estimated error" if study.estimated else "error"
+    artists = []
+    for ax, x, name in zip(axes, (study.h, study.seconds), ("h", "seconds"), strict=False):
+        for y, order, kind, fill in (
+            (study.errors, study.order, "largest", COLOURS[0]),
+            (study.mean_errors, study.mean_order, "mean", "white"),
+        ):
+            label = f"{kind}, order {order:.2f}" if np.isfinite(order) and name == "h" else kind
+            shown = np.ma.masked_where(~(np.isfinite(y) & (y > 0)), y)
+            style = {"color": COLOURS[0], "markerfacecolor": fill, "linewidth": 1.2, "markersize": 5}
+            artists += ax.plot(x, shown, marker="o", label=label, **style)
+        fitted = study.fitted & np.isfinite(study.errors) & (study.errors > 0)
+        if name == "h" and np.isfinite(study.order) and fitted.any():
+            middle = np.exp(np.mean(np.log(study.errors[fitted])) - study.order * np.mean(np.log(x[fitted])))
+            artists += ax.plot(x[fitted], middle * x[fitted] ** study.order, color=GREY, linewidth=3, zorder=0)
+        ax.set(xscale="log", yscale="log")
+        label_axes(ax, name, quality)
+        legend(ax)
     return artists
 
 
@@ -307,92 +349,3 @@ def _levels(values: np.ma.MaskedArray, levels: int | Sequence[float]) -> np.ndar
         return known
     places = np.linspace(known.min(), known.max(), levels + 2) if isinstance(levels, int) else np.sort(levels)
     return places[(places > known.min()) & (places < known.max())]
-
-
-def _axes(ax: Any, *, wide: bool = False) -> Any:
-    """The axes given, or those of a new figure that no global registry knows."""
-    if ax is not None:
-        return ax
-    from matplotlib.figure import Figure
-
-    return styled(Figure(figsize=(5.4, 3.2) if wide else (5.4, 4.2), layout="constrained").add_subplot())
-
-
-def styled(ax: Any) -> Any:
-    """The theme of the figures made here, on ``ax``: no upper and right frame, thin ticks, a paper's text sizes."""
-    ax.spines[["top", "right"]].set_visible(False)
-    ax.spines[["left", "bottom"]].set_linewidth(0.8)
-    ax.tick_params(width=0.8, length=3, labelsize=9)
-    ax.xaxis.label.set_size(10)
-    ax.yaxis.label.set_size(10)
-    return ax
-
-
-def _draw(
-    ax: Any, section: Section, grid: Grid, label: str, hidden: str, *, colorbar: bool, diverging: bool = False
-) -> list[Any]:
-    """One section as a line or as a colour mesh, with what is hidden in grey."""
-    from matplotlib import colormaps
-
-    known, mask = section.values.compressed(), np.ma.getmaskarray(section.values)
-    if len(section.axes) == 1:
-        artists = ax.plot(section.coordinates[0], section.values, color=COLOURS[0], linewidth=1.6)
-        artists += _bands(ax, section.coordinates[0], mask, hidden)
-    else:
-        largest = np.abs(known).max() if known.any() else 1.0
-        limits = (-largest, largest) if diverging else (known.min(), known.max()) if known.size else (0.0, 1.0)
-        colours = colormaps["coolwarm" if diverging else "viridis"].with_extremes(bad=GREY)
-        style = {"cmap": colours, "vmin": limits[0], "vmax": limits[1], "rasterized": True}
-        artists = [ax.pcolormesh(*section.coordinates, section.values.T, shading="nearest", **style)]
-        if mask.any():
-            artists += ax.plot([], [], "s", color=GREY, markersize=8, label=hidden)
-        if colorbar:
-            bar = ax.figure.colorbar(artists[0], ax=ax, label=label, fraction=0.06, pad=0.03)
-            bar.outline.set_visible(False)
-            bar.ax.tick_params(width=0.8, length=3, labelsize=9)
-    _frame(ax, section, grid, label)
-    if mask.any():
-        _legend(ax)
-    return artists
-
-
-def _bands(ax: Any, x: np.ndarray, mask: np.ndarray, label: str) -> list[Any]:
-    """Grey bands over the runs of masked nodes, half a cell beyond each end; the first one is labelled."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
-    half = (x[1] - x[0]) / 2 if len(x) > 1 else 0.5
-    runs = zip(edges[::2], edges[1::2], strict=True)
-    return [
-        ax.axvspan(x[a] - half, x[b - 1] + half, color=GREY, linewidth=0, zorder=0, label=None if k else label)
-        for k, (a, b) in enumerate(runs)
-    ]
-
-
-def _frame(ax: Any, section: Section, grid: Grid, label: str = "") -> None:
-    """Limits of the box, names and the caption of the cut."""
-    ax.set_xlim(section.coordinates[0][[0, -1]])
-    if len(section.axes) == 2:
-        ax.set_ylim(section.coordinates[1][[0, -1]])
-    _label(ax, grid.names[section.axes[0]], grid.names[section.axes[1]] if len(section.axes) == 2 else label)
-    if section.caption:
-        ax.set_title(section.caption, loc="right", fontsize=9)
-
-
-def _label(ax: Any, x: str, y: str) -> None:
-    """Labels, where the axes have none yet: a path on top of a value keeps the value's."""
-    if not ax.get_xlabel():
-        ax.set_xlabel(x)
-    if not ax.get_ylabel():
-        ax.set_ylabel(y)
-
-
-def _legend(ax: Any) -> Any:
-    """The legend, with all that has a label so far: in a corner of a mesh, above lines, which it would hide.
-
-    The search for a free corner is left out: it is slow on large pictures.
-    """
-    from matplotlib.collections import QuadMesh
-
-    style: dict[str, Any] = {"fontsize": 8, "edgecolor": "none", "handlelength": 1.4}
-    if any(isinstance(artist, QuadMesh) for artist in ax.collections):
-        return ax.legend(loc="upper right", framealpha=0.85, **style)
-    return ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=6, frameon=False, borderaxespad=0.2, **style)

@@ -32,8 +32,12 @@ def choose(problem: Problem, grid: Grid, *, traced: bool) -> Method:
     """The method that suits a problem.
 
     Where transport rules, a few wavefront sweeps evaluate a policy well enough. Where there is noise they are
-    too slow and precondition a Krylov method; on a line a direct solve costs nothing. Large grids are nested.
+    too slow and precondition a Krylov method; on a line a direct solve costs nothing. Large grids are nested. Tubes
+    without discount have policies without a value of their own: there value iteration alone keeps to the extreme
+    one of many fixed points.
     """
+    if (problem.stopping_cost is not None or problem.running_max is not None) and not may_be_positive(problem.discount):
+        return ValueIteration()
     if problem.noise is None:
         method = PolicyIteration(Sweeps())
     else:
@@ -70,6 +74,11 @@ def _rules(
     return dataclasses.replace(rules, held=rules.held | rests), least
 
 
+def may_be_positive(discount: Any) -> bool:
+    """Whether the discount is positive; a traced one is taken for positive."""
+    return is_traced(discount) or bool(discount > 0)
+
+
 @dataclasses.dataclass(frozen=True)
 class Verdict:
     """What is known of a problem before its numbers are looked at.
@@ -96,7 +105,7 @@ def judge(problem: Problem, grid: Grid, dtype: Any) -> Verdict:
     """Read the verdict from the problem's structure; a traced discount is taken for positive."""
     how = hamiltonian.setting(problem, grid.ndim, dtype)
     constrained = problem.stopping_cost is not None or problem.running_max is not None
-    if is_traced(problem.discount) or problem.discount > 0:
+    if may_be_positive(problem.discount):
         return Verdict(Certificate.ADDITIVE, how.exact, may_rest=False)
     fits = not constrained and problem.cost is not None and not how.disturbance_costs
     kind = Certificate.MULTIPLICATIVE if fits else Certificate.NONE

@@ -90,13 +90,15 @@ def assemble(task: Task, state: State, verdict: Verdict) -> Solution:
 
 @jax.jit
 def _gap_at(task: Task, value: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """max over the nodes of min max − max min, and the size of H, at one value function."""
+    """max over the nodes of min max − max min, and the size of H and of the cost, at one value function."""
     how = hamiltonian.setting(task.problem, task.grid.ndim, value.dtype)
     here = hamiltonian.local(task.problem, task.grid, value, scheme=task.scheme)
     upper = hamiltonian.optimise(here, how, isaacs="upper")[0]
     lower = hamiltonian.optimise(here, how, isaacs="lower")[0]
+    nowhere = hamiltonian.local(task.problem, task.grid, jnp.zeros_like(value), scheme=task.scheme)
+    cost = hamiltonian.optimise(nowhere, how)[0]
     free = task.counted & ~task.rules.held
-    size = jnp.maximum(jnp.abs(upper), jnp.abs(lower))
+    size = jnp.abs(upper) + jnp.abs(cost) + jnp.finfo(value.dtype).eps
     return jnp.max(jnp.where(free, upper - lower, 0)), jnp.max(jnp.where(free, size, 0))
 
 

@@ -3,7 +3,7 @@
 from hjbjax.pytree import node
 
 
-@node(static=("central",))
+@node(static=("central", "subcell"))
 class Upwind:
     """First-order upwind differences: the Kushner–Dupuis chain, monotone on every grid.
 
@@ -14,9 +14,12 @@ class Upwind:
 
     Args:
       central: whether to use central differences where they stay monotone.
+      subcell: whether the boundary of a target {l ≤ 0} is met where l = 0 between two nodes, which wants l to be a
+        signed distance or like one; otherwise the target is the nodes with l ≤ 0.
     """
 
     central: bool = True
+    subcell: bool = False
 
     @property
     def chain(self) -> "Upwind":
@@ -24,7 +27,7 @@ class Upwind:
         return self
 
 
-@node()
+@node(static=("subcell",))
 class Limited:
     """Second order where the solution is smooth: one-sided differences with limited slopes.
 
@@ -35,12 +38,17 @@ class Limited:
     (van Albada), with quadratic ghost values at ends that are not periodic. The scheme is no chain: the residual
     of the equation with these slopes is driven to zero by corrections with the matrix of the monotone one, from
     its answer. There is no certificate; the tolerance bounds that residual and the last step, in cost units.
+
+    Args:
+      subcell: as for ``Upwind``; on by default, since a target snapped to nodes is of first order.
     """
+
+    subcell: bool = True
 
     @property
     def chain(self) -> Upwind:
         """The monotone chain whose matrix makes the corrections."""
-        return Upwind()
+        return Upwind(subcell=self.subcell)
 
 
 Scheme = Upwind | Limited

@@ -19,6 +19,7 @@ from hjbjax.grid import Grid
 from hjbjax.interpolation import between, between_defined, nearest, query
 from hjbjax.pytree import is_traced, node
 from hjbjax.status import Status
+from hjbjax.stretching import Sinh
 
 __all__ = ["FileError", "Solution", "SolveError", "Status", "load"]
 
@@ -181,7 +182,12 @@ class Solution:
         header = {
             "format": FORMAT,
             "version": VERSION,
-            "grid": {"shape": grid.shape, "periodic": grid.periodic, "names": grid.names},
+            "grid": {
+                "shape": grid.shape,
+                "periodic": grid.periodic,
+                "names": grid.names,
+                "stretch": [s and [float(s.strength), float(s.center)] for s in grid.stretch or ()],
+            },
             "marched": None if self.times is None else int(np.shape(self.times)[0]),
             "isaacs_gap": np.asarray(self.isaacs_gap).tolist(),
             "code": np.asarray(self.code).tolist(),
@@ -242,7 +248,10 @@ def _plan(header: dict) -> dict[str, Expected]:
 
 def _rebuild(header: dict, arrays: dict[str, np.ndarray]) -> Solution:
     about = header["grid"]
-    grid = Grid(arrays.pop("lo"), arrays.pop("hi"), tuple(about["shape"]), about["periodic"], tuple(about["names"]))
+    stretch = tuple(pair and Sinh(*pair) for pair in about["stretch"])
+    grid = Grid(
+        arrays.pop("lo"), arrays.pop("hi"), tuple(about["shape"]), about["periodic"], tuple(about["names"]), stretch
+    )
     for name, kinds in KINDS.items():
         if type(header[name]) not in kinds:
             raise FileError(f"its header has {name} = {header[name]!r:.60}, wanted {kinds[0].__name__}")

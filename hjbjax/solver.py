@@ -4,6 +4,7 @@ At host level it validates, picks a method, drives the iteration from grid to gr
 same iteration runs with a fixed method and none of that, and its value is differentiable.
 """
 
+import contextlib
 import dataclasses
 import math
 from typing import Any
@@ -135,10 +136,11 @@ def _solve_traced(
 
 def as_dtype(dtype: Any) -> np.dtype:
     """The floating-point type that a user asked for; None is float64."""
-    kind = np.dtype(np.float64 if dtype is None else dtype)
-    if kind not in (np.dtype(np.float32), np.dtype(np.float64)):
-        raise ValueError(f"dtype: got {dtype!r}, wanted 'float64' or 'float32'")
-    return kind
+    for kind in (np.dtype(np.float64), np.dtype(np.float32)):
+        with contextlib.suppress(TypeError):
+            if kind == (np.float64 if dtype is None else np.dtype(dtype)):
+                return kind
+    raise ValueError(f"dtype: got {dtype!r}, wanted 'float64' or 'float32'")
 
 
 def check_arguments(
@@ -151,11 +153,11 @@ def check_arguments(
         raise TypeError(f"solve: method is {method!r}; wanted hjb.PolicyIteration(...) or hjb.ValueIteration()")
     if not isinstance(scheme, (Upwind, Limited)):
         raise TypeError(f"solve: scheme is {scheme!r}; wanted hjb.Upwind(...) or hjb.Limited()")
-    if not is_traced(tol) and not (np.ndim(tol) == 0 and math.isfinite(tol) and tol > 0):
+    if not is_traced(tol) and not _is_positive(tol):
         raise ValueError(f"solve: tol = {tol!r}; wanted a finite number > 0, in the units of the cost")
     if max_steps is not None and (isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1):
         raise ValueError(f"solve: max_steps = {max_steps!r}; wanted a positive integer")
-    if time_limit is not None and not (time_limit > 0):
+    if time_limit is not None and not (_is_positive(time_limit) or time_limit == math.inf):
         raise ValueError(f"solve: time_limit = {time_limit!r}; wanted seconds > 0")
     if problem.terminal_cost is not None:
         raise ValueError("solve: a terminal_cost belongs to a finite horizon; a stationary problem has none")
@@ -163,10 +165,16 @@ def check_arguments(
         raise ValueError("solve: a time-dependent problem has no stationary value; it needs a finite horizon")
 
 
+def _is_positive(number: Any) -> bool:
+    return isinstance(number, (int, float, np.number)) and math.isfinite(number) and bool(number > 0)
+
+
 def _check_guess(guess: Any, grid: Grid) -> None:
     if guess is None:
         return
     values = np.asarray(guess)
+    if values.dtype.kind not in "fiu":
+        raise ValueError(f"solve: the guess holds {values.dtype}; wanted real node values of shape {grid.shape}")
     if values.shape != grid.shape:
         hint = "; it looks transposed" if values.shape == grid.shape[::-1] else ""
         raise ValueError(f"solve: the guess has shape {values.shape}, the grid {grid.shape}{hint}")

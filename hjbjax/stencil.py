@@ -4,6 +4,7 @@ Beyond an edge that is not periodic stands a copy of the edge node: a one-sided 
 zero, which projects outward drift back onto the box and reflects noise.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -56,33 +57,58 @@ def unit(grid: Grid, axis: int, step: int) -> tuple[int, ...]:
     return tuple(step if i == axis else 0 for i in range(grid.ndim))
 
 
-def steps(grid: Grid, axis: int) -> tuple[Any, Any]:
-    """The distances to the upper and to the lower neighbour along ``axis``; broadcast against the node axes."""
-    h = grid.spacing(axis)
-    return h, h
+@dataclasses.dataclass(frozen=True)
+class Links:
+    """How every node hangs together with its two neighbours along one axis; all entries broadcast.
+
+    Attributes:
+      up, down: the distances.
+      meets_up, meets_down: where the link ends on the boundary of a target before it comes to the next node, and
+        the value there; None where no link does.
+    """
+
+    up: Any
+    down: Any
+    meets_up: tuple[Any, Any] | None = None
+    meets_down: tuple[Any, Any] | None = None
 
 
-def one_sided(values: jax.Array, grid: Grid, axis: int) -> tuple[jax.Array, jax.Array]:
-    """The differences D⁺ = (V(x+h) − V(x))/h and D⁻ = (V(x) − V(x−h))/h along one axis; zero across an edge."""
-    h_up, h_down = steps(grid, axis)
-    up = neighbour(values, grid, unit(grid, axis, 1))
-    down = neighbour(values, grid, unit(grid, axis, -1))
-    return (up - values) / h_up, (values - down) / h_down
+def links(grid: Grid, axis: int) -> Links:
+    """The links of the grid itself along one axis; on a stretched one an end repeats its only distance."""
+    if grid.stretch[axis] is None:  # type: ignore[index]
+        return Links(grid.spacing(axis), grid.spacing(axis))
+    gaps = jnp.diff(jnp.asarray(grid.axis(axis)))
+    along = [-1 if i == axis else 1 for i in range(grid.ndim)]
+    return Links(jnp.append(gaps, gaps[-1:]).reshape(along), jnp.append(gaps[:1], gaps).reshape(along))
 
 
-def limited(up: jax.Array, down: jax.Array, grid: Grid, axis: int) -> tuple[jax.Array, jax.Array]:
+def one_sided(values: jax.Array, grid: Grid, axis: int, link: Links | None = None) -> tuple[jax.Array, jax.Array]:
+    """The differences D⁺ = (V(x+h⁺) − V(x))/h⁺ and D⁻ = (V(x) − V(x−h⁻))/h⁻ along one axis; zero across an edge."""
+    link = link or links(grid, axis)
+    up, down = (neighbour(values, grid, unit(grid, axis, step)) for step in (1, -1))
+    if link.meets_up is not None:
+        up = jnp.where(*link.meets_up, up)
+    if link.meets_down is not None:
+        down = jnp.where(*link.meets_down, down)
+    return (up - values) / link.up, (values - down) / link.down
+
+
+def limited(up: jax.Array, down: jax.Array, grid: Grid, axis: int, link: Links) -> tuple[jax.Array, jax.Array]:
     """Second-order one-sided slopes from the differences D⁺, D⁻ along one axis; zero across an edge as they are.
 
-    Next to an edge the second difference is continued as a constant: the ghost value is quadratic.
+    Next to an edge, and to the boundary of a target, the second difference is continued as a constant.
     """
-    h_up, h_down = steps(grid, axis)
     upper, lower = on_edge(grid, axis, 1), on_edge(grid, axis, -1)
-    bend = 2 * (up - down) / (h_up + h_down)
+    bend = 2 * (up - down) / (link.up + link.down)
     bend = jnp.where(upper, neighbour(bend, grid, unit(grid, axis, -1)), bend)
     bend = jnp.where(lower, neighbour(bend, grid, unit(grid, axis, 1)), bend)
-    above, below = neighbour(bend, grid, unit(grid, axis, 1)), neighbour(bend, grid, unit(grid, axis, -1))
-    up = jnp.where(upper, 0, up - h_up / 2 * _van_albada(bend, above))
-    return up, jnp.where(lower, 0, down + h_down / 2 * _van_albada(bend, below))
+    above, below = (neighbour(bend, grid, unit(grid, axis, step)) for step in (1, -1))
+    if link.meets_up is not None:
+        above = jnp.where(link.meets_up[0], bend, above)
+    if link.meets_down is not None:
+        below = jnp.where(link.meets_down[0], bend, below)
+    up = jnp.where(upper, 0, up - link.up / 2 * _van_albada(bend, above))
+    return up, jnp.where(lower, 0, down + link.down / 2 * _van_albada(bend, below))
 
 
 def _van_albada(a: jax.Array, b: jax.Array) -> jax.Array:

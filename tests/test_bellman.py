@@ -1,0 +1,296 @@
+"""Laws of the Bellman operator: order, contraction, shifts, symmetry; and the equation that one policy leaves."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from systems import SEEDS, random_game, random_grid, random_problem
+
+from hjbjax import bellman, chain, hamiltonian
+from hjbjax.bellman import Conditions
+from hjbjax.grid import Grid
+from hjbjax.problem import Problem
+from hjbjax.pytree import node
+from hjbjax.schemes import Upwind
+from hjbjax.sets import Ball, Box, Finite
+
+UNIT = Box([-1.0], [1.0])
+NOISES = ["none", "diagonal", "matrix"]
+laws = settings(max_examples=12)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _float64():
+    with jax.enable_x64(True):
+        yield
+
+
+@functools.partial(jax.jit, static_argnames="scheme")
+def operator(problem, grid, value, rules, scheme=Upwind()):
+    """One step of value iteration; and βΔt, by which it contracts."""
+    pace = bellman.fastest_rate(problem, grid, scheme=scheme, dtype=value.dtype) + problem.discount
+    greedy = bellman.greedy(problem, grid, value, rules.held, scheme=scheme)
+    return rules.impose(value + greedy.rate / pace), problem.discount / jnp.max(pace)
+
+
+def random_rules(rng, grid):
+    """A target, an obstacle above and one below, at times crossing."""
+    held = rng.random(grid.shape) < 0.1
+    stop, floor = rng.normal(1.0, 1.0, grid.shape), rng.normal(-1.5, 1.0, grid.shape)
+    return Conditions(held, np.where(held, rng.normal(size=grid.shape), 0), stop, floor)
+
+
+def free_rules(grid):
+    return Conditions(np.zeros(grid.shape, bool), np.zeros(grid.shape))
+
+
+def random_question(rng, kind, n=2):
+    grid = random_grid(rng, n)
+    if kind == "game":
+        return random_game(rng, grid, "diagonal", Finite([[-1.0], [0.3], [1.0]]), Finite([[-0.5], [1.0]])), grid
+    return random_problem(rng, grid, kind, UNIT), grid
+
+
+@pytest.mark.parametrize("kind", [*NOISES, "game"])
+@given(seed=SEEDS)
+@laws
+def test_order_is_kept(kind, seed):
+    rng = np.random.default_rng(seed)
+    problem, grid = random_question(rng, kind)
+    rules, value = random_rules(rng, grid), rng.normal(size=grid.shape)
+    more = value + rng.random(grid.shape) * rng.choice([0.0, 1.0], grid.shape)
+    for scheme in (Upwind(central=False), Upwind()):
+        below, above = operator(problem, grid, value, rules, scheme)[0], operator(problem, grid, more, rules, scheme)[0]
+        assert jnp.all(below <= above + 1e-12)
+
+
+@pytest.mark.parametrize("kind", [*NOISES, "game"])
+@given(seed=SEEDS)
+@laws
+def test_contraction(kind, seed):
+    rng = np.random.default_rng(seed)
+    problem, grid = random_question(rng, kind)
+    rules, value, other = random_rules(rng, grid), *rng.normal(size=(2, *grid.shape))
+    (first, shrink), (second, _) = operator(problem, grid, value, rules), operator(problem, grid, other, rules)
+    assert jnp.max(jnp.abs(first - second)) <= (1 - shrink) * np.max(np.abs(value - other)) + 1e-12
+
+
+@pytest.mark.parametrize("kind", [*NOISES, "game"])
+@given(seed=SEEDS)
+@laws
+def test_a_constant_shifts_the_rate_by_the_discount(kind, seed):
+    rng = np.random.default_rng(seed)
+    problem, grid = random_question(rng, kind)
+    rules, value, shift = free_rules(grid), rng.normal(size=grid.shape), rng.normal()
+    before, after = (_rate(problem, grid, v, rules.held) for v in (value, value + shift))
+    assert np.allclose(after, before - problem.discount * shift, rtol=0, atol=1e-10 * (1 + np.max(np.abs(before))))
+
+
+@jax.jit
+def _rate(problem, grid, value, held):
+    return bellman.greedy(problem, grid, value, held, scheme=Upwind()).rate
+
+
+@given(seed=SEEDS)
+@laws
+def test_a_larger_control_set_never_costs_more(seed):
+    rng = np.random.default_rng(seed)
+    grid, value = random_grid(rng, 2), rng.normal(size=(5, 4))
+    problem = random_problem(rng, grid, "diagonal")
+    wider = Problem(problem.drift, problem.cost, Box([-1.5], [1.2]), noise=problem.noise, discount=problem.discount)
+    held = np.zeros(grid.shape, bool)
+    assert np.all(np.asarray(_rate(wider, grid, value, held)) <= np.asarray(_rate(problem, grid, value, held)) + 1e-12)
+
+
+@node(static=("order",))
+class Turned:
+    """The same physics with the axes in another order, or mirrored."""
+
+    system: object
+    order: object
+    sign: object
+
+    def drift(self, x, u):
+        f = self.sign * self.system.drift(self._back(x), u)
+        return jnp.stack([f[i] for i in self.order])
+
+    def cost(self, x, u):
+        return self.system.cost(self._back(x), u)
+
+    def _back(self, x):
+        return self.sign * jnp.stack([x[self.order.index(i)] for i in range(len(self.order))])
+
+
+@pytest.mark.parametrize("n", [2, 3])
+@given(seed=SEEDS)
+@settings(max_examples=6)
+def test_axes_may_be_permuted(n, seed):
+    rng = np.random.default_rng(seed)
+    grid = random_grid(rng, n)
+    problem = random_problem(rng, grid, "matrix")
+    order = tuple((i - 1) % n for i in range(n))
+    turned = Turned(problem.drift.args[0], order, np.ones(n))
+    permuted = Grid(
+        grid.lo[list(order)],
+        grid.hi[list(order)],
+        tuple(grid.shape[i] for i in order),
+        tuple(grid.periodic[i] for i in order),
+    )
+    again = Problem(turned.drift, turned.cost, UNIT, noise=problem.noise[list(order)], discount=problem.discount)
+    value = rng.normal(size=grid.shape)
+    here = np.asarray(_rate(problem, grid, value, np.zeros(grid.shape, bool)))
+    there = np.asarray(_rate(again, permuted, value.transpose(order), np.zeros(permuted.shape, bool)))
+    assert np.allclose(there, here.transpose(order), rtol=0, atol=1e-11 * (1 + np.max(np.abs(here))))
+
+
+@given(seed=SEEDS)
+@laws
+def test_axes_may_be_mirrored(seed):
+    rng = np.random.default_rng(seed)
+    grid = random_grid(rng, 2, periodic=False)
+    problem, sign = random_problem(rng, grid, "matrix"), np.array([-1.0, 1.0])
+    mirrored = Turned(problem.drift.args[0], (0, 1), sign)
+    flipped = Grid([-grid.hi[0], grid.lo[1]], [-grid.lo[0], grid.hi[1]], grid.shape)
+    again = Problem(mirrored.drift, mirrored.cost, UNIT, noise=sign[:, None] * problem.noise, discount=problem.discount)
+    value = rng.normal(size=grid.shape)
+    here = np.asarray(_rate(problem, grid, value, np.zeros(grid.shape, bool)))
+    there = np.asarray(_rate(again, flipped, value[::-1], np.zeros(grid.shape, bool)))
+    assert np.allclose(there[::-1], here, rtol=0, atol=1e-10 * (1 + np.max(np.abs(here))))
+
+
+# --- what holds beside the equation ---
+
+
+def test_conditions_are_read_at_the_nodes():
+    problem = Problem(
+        lambda x, u: u,
+        None,
+        UNIT,
+        target=lambda x: abs(x[0]) - 0.5,
+        exit_cost=lambda x: 10 * x[0],
+        stopping_cost=3.0,
+        discount=1.0,
+    )
+    grid = Grid([-1.0], [1.0], (5,))
+    rules = bellman.conditions(problem, grid, np.float64)
+    assert rules.held.tolist() == [False, True, True, True, False]
+    assert rules.given.tolist() == [0.0, -5.0, 0.0, 5.0, 0.0]
+    assert rules.stop.tolist() == [3.0] * 5
+    assert rules.floor is None
+    assert rules.impose(jnp.array([4.0, 4.0, -9.0, 4.0, -9.0])).tolist() == [3.0, -5.0, 0.0, 5.0, -9.0]
+
+
+def test_the_floor_wins_over_stopping_and_the_target_over_both():
+    held = jnp.array([False, False, True])
+    rules = Conditions(
+        held, jnp.array([0.0, 0.0, 9.0]), stop=jnp.array([1.0, 1.0, 1.0]), floor=jnp.array([2.0, -1.0, 2.0])
+    )
+    assert rules.impose(jnp.array([5.0, 5.0, 5.0])).tolist() == [2.0, 1.0, 9.0]
+    assert rules.impose(jnp.array([-5.0, -5.0, -5.0])).tolist() == [2.0, -1.0, 9.0]
+
+
+@jax.jit
+def _equation(problem, grid, value, rules):
+    policy = bellman.greedy(problem, grid, value, rules.held, scheme=Upwind())
+    return policy, bellman.correction(problem, grid, value, policy, rules, scheme=Upwind())
+
+
+@pytest.mark.parametrize("kind", [*NOISES, "game"])
+@given(seed=SEEDS)
+@laws
+def test_the_source_is_the_residual_and_the_weights_are_the_chain(kind, seed):
+    rng = np.random.default_rng(seed)
+    problem, grid = random_question(rng, kind)
+    rules, value = random_rules(rng, grid), rng.normal(size=grid.shape)
+    policy, equation = jax.device_get(_equation(problem, grid, value, rules))
+    u, d = (np.stack(side, axis=-1) if side else None for side in (policy.controls, policy.disturbances))
+    generator = chain.generator(problem, grid, u, disturbance=d).toarray()
+    pace = -np.diag(generator).reshape(grid.shape) + problem.discount
+    step = policy.rate / pace
+    expected = np.maximum(np.minimum(step, rules.stop - value), rules.floor - value)
+    assert np.allclose(equation.source, np.where(rules.held, 0, expected), rtol=0, atol=1e-12)
+    assert np.all(policy.rate[rules.held] == 0)
+    active = ~rules.held & (step <= rules.stop - value) & (step >= rules.floor - value)
+    total = np.where(active, -np.diag(generator).reshape(grid.shape) / pace, 0)
+    assert np.allclose(equation.weights.total(), total, rtol=1e-12)
+    assert all(np.all(w >= 0) for w in equation.weights.values)
+
+
+@pytest.mark.parametrize("n", [1, 2])
+@given(seed=SEEDS)
+@settings(max_examples=6)
+def test_the_correction_of_a_policy_is_its_value(n, seed):
+    """V + δ with δ from the linear equation is the value under that policy: a dense solve of (β − 𝓛)V = L."""
+    rng = np.random.default_rng(seed)
+    grid = random_grid(rng, n)
+    problem = random_problem(rng, grid, "diagonal")
+    value, rules = rng.normal(size=grid.shape), free_rules(grid)
+    policy, equation = jax.device_get(_equation(problem, grid, value, rules))
+    u = np.stack(policy.controls, axis=-1)
+    generator = chain.generator(problem, grid, u).toarray()
+    running = jax.vmap(problem.cost)(grid.nodes().reshape(grid.size, n), u.reshape(grid.size, 1))
+    exact = np.linalg.solve(problem.discount * np.eye(grid.size) - generator, np.asarray(running))
+    pace = -np.diag(generator) + problem.discount
+    weights = np.eye(grid.size) - (problem.discount * np.eye(grid.size) - generator) / pace[:, None]
+    delta = np.linalg.solve(np.eye(grid.size) - weights, equation.source.ravel())
+    assert np.allclose(value.ravel() + delta, exact, rtol=0, atol=1e-9 * (1 + np.max(np.abs(exact))))
+
+
+@pytest.mark.parametrize("controls", [Box([-1.0, 0.0], [1.0, 2.0]), Ball(1.5, 2), Finite([[0.0, 1.0], [1.0, -1.0]])])
+@given(seed=SEEDS)
+@settings(max_examples=5)
+def test_no_action_is_faster_than_the_fastest_rate(controls, seed):
+    rng = np.random.default_rng(seed)
+    grid = random_grid(rng, 2)
+    problem = random_problem(rng, grid, "matrix", controls)
+    fastest = np.asarray(_fastest(problem, grid))
+    for _ in range(10):
+        if isinstance(controls, Finite):
+            u = controls.points[rng.integers(2)]
+        elif isinstance(controls, Box):
+            u = rng.uniform(controls.lo, controls.hi)
+        else:
+            u = 1.5 * (lambda v: v / np.linalg.norm(v))(rng.normal(size=2))
+        leaving = -chain.generator(problem, grid, np.broadcast_to(u, (*grid.shape, 2))).diagonal()
+        assert np.all(leaving.reshape(grid.shape) <= fastest * (1 + 1e-12))
+
+
+@jax.jit
+def _fastest(problem, grid):
+    return bellman.fastest_rate(problem, grid, scheme=Upwind(), dtype=np.float64)
+
+
+@pytest.mark.parametrize("isaacs", ["upper", "lower"])
+@given(seed=SEEDS)
+@settings(max_examples=5)
+def test_the_inner_player_replies_to_the_outer_one(isaacs, seed):
+    rng = np.random.default_rng(seed)
+    grid = random_grid(rng, 2)
+    mine, theirs = Finite([[-1.0], [0.3], [1.0]]), Finite([[-0.5], [0.1], [1.0]])
+    problem = random_game(rng, grid, "none", mine, theirs, isaacs=isaacs)
+    value, other = rng.normal(size=(2, *grid.shape))
+    first, reply, tried = jax.device_get(_replies(problem, grid, value, other))
+    kept, changed = ("controls", "disturbances") if isaacs == "upper" else ("disturbances", "controls")
+    assert np.array_equal(getattr(first, kept)[0], getattr(reply, kept)[0])
+    expected = np.max(tried, axis=0) if isaacs == "upper" else np.min(tried, axis=0)
+    assert np.allclose(reply.rate, expected, rtol=0, atol=1e-11 * (1 + np.max(np.abs(expected))))
+    assert set(np.unique(getattr(reply, changed)[0])) <= set((theirs if isaacs == "upper" else mine).points.ravel())
+
+
+@jax.jit
+def _replies(problem, grid, value, other):
+    held = jnp.zeros(grid.shape, bool)
+    first = bellman.greedy(problem, grid, other, held, scheme=Upwind())
+    reply = bellman.respond(problem, grid, value, held, first, scheme=Upwind())
+    tried = []
+    for k in range(3):
+        name = "disturbances" if problem.isaacs == "upper" else "controls"
+        point = (problem.disturbances if problem.isaacs == "upper" else problem.controls).points[k, 0]
+        sides = {"controls": first.controls, "disturbances": first.disturbances}
+        sides[name] = (jnp.broadcast_to(point, grid.shape),)
+        here = hamiltonian.local(problem, grid, value, scheme=Upwind())
+        tried.append(here.at(list(sides["controls"]), list(sides["disturbances"])) - problem.discount * value)
+    return first, reply, jnp.stack(tried)

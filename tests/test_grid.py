@@ -46,14 +46,16 @@ def test_bounds_are_refused(lo, hi, words):
         {"shape": (3, 3, 3)},
         {"periodic": (True,)},
         {"names": ("angle",)},
+        {"stretch": (None,)},
     ],
 )
 def test_lengths_that_differ_are_named(options):
-    lengths = {"lo": 2, "hi": 2, "shape": 2, "periodic": 2, "names": 2}
+    lengths = {"lo": 2, "hi": 2, "shape": 2, "periodic": 2, "names": 2, "stretch": 2}
     lengths.update({name: len(value) for name, value in options.items()})
     if "shape" in options:  # what is left out follows the shape
-        lengths.update(periodic=3, names=3)
-    refuses(ValueError, "of lengths {lo}, {hi}, {shape}, {periodic} and {names}".format(**lengths), **options)
+        lengths.update(periodic=3, names=3, stretch=3)
+    named = "of lengths {lo}, {hi}, {shape}, {periodic}, {names} and {stretch}".format(**lengths)
+    refuses(ValueError, named, **options)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,109 @@
+"""Stretched axes: the map, the nodes, interpolation, and the order that schemes keep on them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import hjbjax as hjb
+from hjbjax import zoo
+
+strengths = st.floats(0.1, 8.0)
+centers = st.floats(0.0, 1.0)
+
+
+@settings(deadline=None)
+@given(strengths, centers)
+def test_the_map_takes_the_interval_onto_itself_and_is_densest_at_its_centre(strength, center):
+    place = hjb.Sinh(strength, center).place(np.linspace(0.0, 1.0, 41))
+    assert place[0] == pytest.approx(0.0, abs=1e-12)
+    assert place[-1] == pytest.approx(1.0, abs=1e-12)
+    gaps = np.diff(place)
+    assert np.all(gaps > 0)
+    closest = int(np.argmin(np.abs((place[1:] + place[:-1]) / 2 - center)))
+    assert gaps[closest] <= np.min(gaps) * (1 + strength / 20)
+
+
+@settings(deadline=None)
+@given(strengths, centers, st.floats(0.0, 1.0))
+def test_the_inverse_map(strength, center, fraction):
+    stretching = hjb.Sinh(strength, center)
+    with jax.enable_x64(True):
+        assert float(stretching.fraction(stretching.place(fraction))) == pytest.approx(fraction, abs=1e-8)
+
+
+def test_a_node_in_the_middle_is_exactly_zero():
+    grid = hjb.Grid([-3.7], [3.7], (41,), stretch=(hjb.Sinh(5.0),))
+    assert grid.axis(0)[20] == 0.0
+    np.testing.assert_array_equal(grid.axis(0)[[0, -1]], [-3.7, 3.7])
+
+
+@settings(deadline=None)
+@given(st.floats(-2.0, 2.0), st.floats(-1.0, 3.0))
+def test_interpolation_is_exact_on_multilinear_functions_and_at_nodes(x, y):
+    grid = hjb.Grid([-2.0, -1.0], [2.0, 3.0], (9, 12), stretch=(hjb.Sinh(4.0), hjb.Sinh(2.0, 0.3)))
+    nodes = grid.nodes()
+    values = 1 + 2 * nodes[..., 0] - nodes[..., 1] + 0.5 * nodes[..., 0] * nodes[..., 1]
+    with jax.enable_x64(True):
+        found = float(grid.interpolate(values, np.array([x, y])))
+        at_nodes = grid.interpolate(values, nodes)
+    assert found == pytest.approx(1 + 2 * x - y + 0.5 * x * y, abs=1e-12)
+    np.testing.assert_allclose(at_nodes, values, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("stretch", "kind", "word"),
+    [((3.0, None), TypeError, "Sinh"), ((hjb.Sinh(1.0), None), ValueError, "periodic")],
+)
+def test_what_is_no_stretching_is_refused(stretch, kind, word):
+    with pytest.raises(kind, match=word):
+        hjb.Grid([0.0, 0.0], [1.0, 1.0], (5, 5), periodic=(True, False), stretch=stretch)
+
+
+@pytest.mark.parametrize("arguments", [(0.0,), (-1.0,), (np.nan,), (1.0, 2.0)])
+def test_maps_that_are_none_are_refused(arguments):
+    with pytest.raises(ValueError, match="Sinh: got"):
+        hjb.Sinh(*arguments)
+
+
+def test_correlated_noise_wants_equal_spacings():
+    problem = hjb.Problem(lambda x, u: -x, lambda x, u: x @ x, noise=np.array([[1.0, 0.2], [0.0, 1.0]]), discount=1.0)
+    grid = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (9, 9), stretch=(hjb.Sinh(2.0), None))
+    with pytest.raises(ValueError, match="equal spacings"):
+        hjb.solve(problem, grid)
+
+
+def bang_bang_errors(scheme, epsilon, stretch, counts):
+    exact, errors = zoo.bang_bang_exact(noise=epsilon), []
+    for count in counts:
+        problem, grid = zoo.bang_bang(noise=epsilon, shape=(count,))
+        grid = hjb.Grid(grid.lo, grid.hi, (count,), stretch=(stretch,))
+        solution = hjb.solve(problem, grid, scheme=scheme, tol=1e-7)
+        with jax.enable_x64(True):
+            errors.append(np.max(np.abs(solution.value - np.asarray(jax.vmap(exact)(jnp.asarray(grid.nodes()))))))
+    return errors
+
+
+@pytest.mark.parametrize(
+    ("scheme", "epsilon", "order"), [(hjb.Upwind(), 0.0, 1), (hjb.Limited(), 0.0, 2), (hjb.Upwind(), 0.5**0.5, 2)]
+)
+def test_schemes_keep_their_order(scheme, epsilon, order):
+    errors = bang_bang_errors(scheme, epsilon, hjb.Sinh(2.0), (41, 81))
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.2)
+
+
+def test_nodes_where_the_value_bends_buy_accuracy():
+    uniform, gathered = (bang_bang_errors(hjb.Limited(), 0.0, stretch, (81,))[0] for stretch in (None, hjb.Sinh(3.0)))
+    assert gathered < 0.75 * uniform
+
+
+def test_a_stretched_solution_comes_back_from_its_file(tmp_path):
+    problem, grid = zoo.bang_bang(shape=(21,))
+    grid = hjb.Grid(grid.lo, grid.hi, (21,), stretch=(hjb.Sinh(2.0, 0.4),))
+    solution = hjb.solve(problem, grid)
+    solution.save(tmp_path / "run.npz")
+    again = hjb.load(tmp_path / "run.npz")
+    np.testing.assert_array_equal(again.grid.axis(0), grid.axis(0))
+    assert again.value_at([0.3]) == solution.value_at([0.3])

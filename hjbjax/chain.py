@@ -245,7 +245,8 @@ def transition_arrays(
         V = min_u [ L^u Δt + P^u V ] / (1 + βΔt),
 
     so that with cost L Δt/(1 + βΔt) and factor 1/(1 + βΔt) the decision problem has our value V_h exactly. A
-    target keeps its state, at a cost of (1 − factor) times its exit cost. QuantEcon maximises: its
+    target keeps its state, at a cost of (1 − factor) times its exit cost; where ``scheme.subcell`` ends a jump on the
+    boundary, the difference of the exit costs there and at the node is part of L. QuantEcon maximises: its
     ``DiscreteDP(-costs, probabilities, factor, state_index, action_index)`` has the value −V_h. Works in about
     20 (2n + 2) bytes a pair.
 
@@ -265,7 +266,10 @@ def transition_arrays(
     actions = export.actions(problem)
     held, given = export.target(problem, grid)
     found = (_checked(problem, grid, list(action), None, scheme, 0.0, ~held) for action in actions)
-    tables = ((jumps.offsets, jumps.values, cost) for jumps, cost in found)
+    with jax.enable_x64(True):
+        cut = links(cast(problem, np.float64), cast(grid, np.float64), subcell=scheme.subcell, dtype=np.float64)
+        surcharge = export.surcharge(cut, given, grid)
+    tables = ((jumps.offsets, jumps.values, cost + export.paid(jumps, surcharge)) for jumps, cost in found)
     return export.decision_problem(tables, grid, len(actions), held, given, float(problem.discount))
 
 

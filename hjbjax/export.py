@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from hjbjax import fields
+from hjbjax import fields, stencil
 from hjbjax.grid import Grid
 from hjbjax.problem import Problem
 from hjbjax.sets import AdmissibleSet, Finite
@@ -87,6 +87,24 @@ def actions(problem: Problem) -> np.ndarray:
         kind = type(problem.controls).__name__
         raise ValueError(f"transition_arrays: got controls in a {kind}, wanted Finite: sample it, as by Box.grid(num)")
     return np.asarray(problem.controls.points, np.float64)
+
+
+def surcharge(links: Sequence[stencil.Links], given: np.ndarray, grid: Grid) -> dict[tuple[int, ...], np.ndarray]:
+    """For each jump what it costs more to end on the boundary of the target than on the node beyond it, (*grid)."""
+    extra = {}
+    for axis, link in enumerate(links):
+        for step, meets in ((1, link.meets_up), (-1, link.meets_down)):
+            if meets is not None:
+                offset = stencil.unit(grid, axis, step)
+                beyond = np.asarray(stencil.neighbour(jax.numpy.asarray(given), grid, offset))
+                crosses, there = (np.asarray(entry) for entry in meets)
+                extra[offset] = np.where(crosses, there - beyond, 0)
+    return extra
+
+
+def paid(jumps: Any, extra: dict[tuple[int, ...], np.ndarray]) -> Any:
+    """The surcharges per unit time: Σ_o c_o extra_o."""
+    return sum(c * extra.get(offset, 0.0) for offset, c in zip(jumps.offsets, jumps.values, strict=True))
 
 
 def decision_problem(

@@ -69,18 +69,18 @@ def random_sigma(rng, grid, kind):
     return np.linalg.cholesky(b * np.outer(h, h)) * rng.uniform(0.2, 5)
 
 
-def random_system(rng, n, m=1, l=0, sigma=None):
+def random_system(rng, n, m=1, opponents=0, sigma=None):
     return System(
         a=rng.normal(size=(n, n)),
         b=rng.normal(size=n),
         scale=rng.choice([0.0, 1.0, 3.0], n),
         gain=rng.normal(size=(n, m)) * rng.choice([0.0, 1.0], (n, m), p=[0.25, 0.75]),
-        push=rng.normal(size=(n, l)),
+        push=rng.normal(size=(n, opponents)),
         sigma=sigma if sigma is not None else 0.0,
         state_cost=rng.normal(size=n),
         linear=rng.normal(size=m),
         square=rng.uniform(-1, 1, m) * rng.choice([0.0, 1.0], m),
-        pull=rng.normal(size=l),
+        pull=rng.normal(size=opponents),
     )
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from hjbjax import stencil
 from hjbjax.grid import Grid
+from hjbjax.stretching import Sinh
 
 GRIDS = [
     Grid([0.0], [1.0], (5,)),
@@ -52,7 +53,8 @@ def test_edges_and_differences(grid):
     values = np.random.default_rng(1).normal(size=grid.shape)
     for axis in range(grid.ndim):
         h = grid.spacing(axis)
-        assert stencil.steps(grid, axis) == (h, h)
+        link = stencil.links(grid, axis)
+        assert (link.up, link.down, link.meets_up, link.meets_down) == (h, h, None, None)
         up, down = map(np.asarray, stencil.one_sided(jnp.asarray(values), grid, axis))
         for index in np.ndindex(*grid.shape):
             above, below = (reached(grid, index, stencil.unit(grid, axis, step))[1] for step in (1, -1))
@@ -94,3 +96,14 @@ def test_sparse_stores_what_is_not_zero():
     entries = np.array([1.0, 0.0, 2.0, 0.0])
     matrix = stencil.sparse([(1,)], [entries], np.ones(4), grid)
     assert matrix.nnz == 6
+
+
+def test_differences_on_a_stretched_axis_divide_by_their_own_distance():
+    grid = Grid([0.0, 0.0], [1.0, 2.0], (3, 6), stretch=(None, Sinh(2.0, 0.5)))
+    x = np.asarray(grid.axis(1))
+    values = np.random.default_rng(5).normal(size=grid.shape)
+    up, down = map(np.asarray, stencil.one_sided(jnp.asarray(values), grid, 1))
+    slopes = np.diff(values, axis=1) / np.diff(x)
+    assert np.ptp(np.diff(x)) > 0.01
+    assert np.allclose(up, np.pad(slopes, ((0, 0), (0, 1))), rtol=1e-13)
+    assert np.allclose(down, np.pad(slopes, ((0, 0), (1, 0))), rtol=1e-13)

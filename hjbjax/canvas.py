@@ -39,6 +39,27 @@ def pair_of_axes() -> list[Any]:
     return [styled(ax) for ax in figure.subplots(1, 2, sharey=True)]
 
 
+def logarithmic(ax: Any, places: Any = None) -> None:
+    """Two logarithmic scales around what is drawn, with few ticks so that none overlap; those of x at ``places``."""
+    from matplotlib.ticker import NullFormatter
+
+    ax.set(xscale="log", yscale="log")
+    for axis, ticks in ((ax.xaxis, places), (ax.yaxis, None)):
+        ticks = few(*axis.get_view_interval()) if ticks is None else ticks
+        axis.set_ticks(ticks, labels=[f"{tick:.3g}" for tick in ticks])
+        axis.set_minor_formatter(NullFormatter())
+
+
+def few(lo: float, hi: float) -> list[float]:
+    """Two to seven round numbers between the ends of a logarithmic scale; the ends where there are not two."""
+    powers = 10.0 ** np.arange(np.floor(np.log10(lo)), np.ceil(np.log10(hi)) + 1)
+    for digits in ((1.0,), (1.0, 3.0), (1.0, 2.0, 5.0), (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)):
+        found = [tick for tick in np.outer(powers, digits).ravel().tolist() if lo <= tick <= hi]
+        if len(found) >= 2:
+            return found[:: -(-len(found) // 7)]
+    return [lo, hi]
+
+
 def styled(ax: Any) -> Any:
     """The theme of the figures made here, on ``ax``: no upper and right frame, thin ticks, a paper's text sizes."""
     ax.spines[["top", "right"]].set_visible(False)

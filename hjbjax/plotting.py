@@ -15,7 +15,19 @@ from typing import Any
 
 import numpy as np
 
-from hjbjax.canvas import COLOURS, GREY, axes_of, bands, draw, frame, label_axes, legend, pair_of_axes, styled
+from hjbjax.canvas import (
+    COLOURS,
+    GREY,
+    axes_of,
+    bands,
+    draw,
+    frame,
+    label_axes,
+    legend,
+    logarithmic,
+    pair_of_axes,
+    styled,
+)
 from hjbjax.grid import Grid
 from hjbjax.sections import at_time, feedback, folded, lifted, section_of, zeros
 
@@ -319,9 +331,15 @@ def convergence(study: Any, *, ax: Any = None) -> list[Any]:
 
     Returns:
       The artists: the line of the largest errors over the spacing first.
+
+    Raises:
+      ValueError: no error is positive and finite.
     """
+    if not np.any((study.errors > 0) & np.isfinite(study.errors)):
+        raise ValueError(f"convergence: the errors are {study.errors}; there is none with a logarithm to draw")
     axes = pair_of_axes() if ax is None else list(np.ravel(ax))
     quality = "estimated error" if study.estimated else "error"
+    own = ax is None
     artists = []
     for ax, x, name in zip(axes, (study.h, study.seconds), ("h", "seconds"), strict=False):
         for y, order, kind, fill in (
@@ -336,8 +354,8 @@ def convergence(study: Any, *, ax: Any = None) -> list[Any]:
         if name == "h" and np.isfinite(study.order) and fitted.any():
             middle = np.exp(np.mean(np.log(study.errors[fitted])) - study.order * np.mean(np.log(x[fitted])))
             artists += ax.plot(x[fitted], middle * x[fitted] ** study.order, color=GREY, linewidth=3, zorder=0)
-        ax.set(xscale="log", yscale="log")
-        label_axes(ax, name, quality)
+        logarithmic(ax, study.h if name == "h" else None)
+        label_axes(ax, name, "" if own and name == "seconds" else quality)
         legend(ax)
     return artists
 

@@ -1,0 +1,1 @@
+"""Measurements, beside the package and not part of it: ``python -m benchmarks NAME --help``."""

@@ -1,0 +1,29 @@
+"""``python -m benchmarks NAME [options]`` runs one benchmark; without a name it lists them.
+
+A benchmark is a file here with a click command called ``command``, and its name in ``NAMES``.
+"""
+
+import difflib
+import importlib
+import sys
+from collections.abc import Sequence
+
+NAMES = {"accuracy": "errors, orders and seconds over the zoo's problems with known answers"}
+
+
+def main(arguments: Sequence[str]) -> None:
+    name, *rest = arguments or ("--help",)
+    if name in ("-h", "--help"):
+        print("usage: python -m benchmarks NAME [options]\n")
+        print("\n".join(f"  {each:12} {summary}" for each, summary in NAMES.items()))
+        return
+    if name not in NAMES:
+        near = difflib.get_close_matches(name, NAMES, 1)
+        hint = f"; did you mean {near[0]}?" if near else ""
+        print(f"benchmarks: got {name!r}, wanted one of {', '.join(NAMES)}{hint}", file=sys.stderr)
+        raise SystemExit(2)
+    importlib.import_module(f"benchmarks.{name}").command.main(rest, prog_name=f"python -m benchmarks {name}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,146 @@
+"""What the benchmarks share: where a number was measured, tables, JSON files and one kind of picture.
+
+A measurement is a flat dictionary; ``stamped`` adds the machine, the versions and the date to each.
+"""
+
+import datetime
+import importlib.metadata
+import json
+import math
+import os
+import platform
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+RESULTS = Path(__file__).parent / "results"
+PACKAGES = ("jax", "numpy", "scipy", "hj-reachability", "quantecon", "numba", "mdpsolver", "scikit-fmm")
+
+
+def environment() -> dict[str, Any]:
+    """The machine, the versions and the date, to stand in every row."""
+    import jax
+
+    import hjbjax
+
+    versions = {"python": platform.python_version(), "hjbjax": hjbjax.__version__}
+    for package in PACKAGES:
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:  # a peer that is not installed
+            continue
+    device = jax.devices()[0]
+    return {
+        "device": device.platform if device.platform == "cpu" else device.device_kind,
+        "cores": os.cpu_count(),
+        "versions": versions,
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    }
+
+
+def stamped(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The rows with the environment in each; what a row says itself has precedence."""
+    common = environment()
+    return [common | row for row in rows]
+
+
+def table(rows: Sequence[dict[str, Any]], columns: Sequence[str]) -> str:
+    """The columns of the rows as aligned text; numbers to the right, what is missing as a dash."""
+    cells = [list(columns), *([_cell(row.get(column)) for column in columns] for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    right = [any(_is_number(row.get(column)) for row in rows) for column in columns]
+    lines = [
+        "  ".join(
+            f"{cell:{'>' if to_right else '<'}{width}}"
+            for cell, width, to_right in zip(line, widths, right, strict=True)
+        )
+        for line in cells
+    ]
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def write_json(path: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """The rows as a JSON list, whole or not at all; numbers that are not finite become null, as JSON has none."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.part")
+    try:
+        temporary.write_text(json.dumps(_plain(list(rows)), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def picture(
+    path: Path, rows: Sequence[dict[str, Any]], *, panel: str, line: str, x: Sequence[str], y: str, across: int = 4
+) -> None:
+    """Small panels, logarithmic: one block for every value of ``panel``, in it ``y`` over every ``x``.
+
+    Args:
+      path: of the PNG.
+      rows: the measurements; those without finite positive numbers are left out.
+      panel: the column that says in which block a row is drawn.
+      line: the column that says on which line.
+      x: the columns of the horizontal axes, one panel each.
+      y: the column of the vertical axis.
+      across: blocks in a row.
+    """
+    from matplotlib.figure import Figure
+
+    from hjbjax.canvas import COLOURS, logarithmic, styled
+
+    rows = [row for row in rows if all(_is_number(row.get(key)) and 0 < row[key] < math.inf for key in (*x, y))]
+    if not rows:
+        return
+    panels, lines = (list(dict.fromkeys(row[key] for row in rows)) for key in (panel, line))
+    across = min(across, len(panels))
+    down = -(-len(panels) // across)
+    figure = Figure(figsize=(1.9 * across * len(x), 0.5 + 1.8 * down), layout="constrained")
+    grid = figure.subplots(down, across * len(x), squeeze=False)
+    for ax in grid.ravel()[len(panels) * len(x) :]:
+        ax.remove()
+    for place, name in enumerate(panels):
+        for side, key in enumerate(x):
+            ax = styled(grid[place // across, (place % across) * len(x) + side])
+            for colour, label in zip(COLOURS, lines, strict=False):
+                mine = [row for row in rows if (row[panel], row[line]) == (name, label)]
+                points = [[row[column] for row in mine] for column in (key, y)]
+                ax.plot(*points, marker="o", markersize=3, linewidth=1, color=colour, label=label)
+            logarithmic(ax)
+            ax.tick_params(labelsize=6, labelleft=side == 0)  # the panels of a block show the same numbers
+            ax.set_xlabel(key, fontsize=7)
+            if side == 0:
+                ax.set_title(name, fontsize=8, loc="left")
+                ax.set_ylabel(y, fontsize=7)
+    figure.legend(
+        *grid[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=6, fontsize=7, frameon=False
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=90)
+
+
+def attempt(measure: Callable[[], list[dict[str, Any]]], about: dict[str, Any]) -> list[dict[str, Any]]:
+    """The rows of a measurement, or one row that says how it failed: a benchmark records failures too."""
+    try:
+        return [about | row for row in measure()]
+    except Exception as error:  # whatever a peer or a solve raises is a result
+        return [about | {"status": "FAILED", "reason": f"{type(error).__name__}: {' '.join(str(error).split())}"[:300]}]
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _cell(value: Any) -> str:
+    if value is None or (_is_number(value) and math.isnan(value)):
+        return "-"
+    if isinstance(value, float):
+        return f"{value:.3g}"
+    return " x ".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _plain(each) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -32,12 +32,14 @@ class Conditions:
       given: (*grid), the value there.
       stop: ψ at the nodes, or None.
       floor: g at the nodes, or None.
+      ended: bool (*grid), the held nodes that are targets, where no action is taken any more.
     """
 
     held: Any
     given: Any
     stop: Any = None
     floor: Any = None
+    ended: Any = False
 
     def impose(self, value: jax.Array) -> jax.Array:
         """``value`` with the given values put in and the constraints respected: max(g, min(ψ, V))."""
@@ -84,7 +86,7 @@ def conditions(problem: Problem, grid: Grid, dtype: Any, t: Any = 0.0) -> Condit
     given = jnp.zeros(grid.shape, dtype) if problem.exit_cost is None else at_nodes(problem.exit_cost)
     stop = None if problem.stopping_cost is None else at_nodes(problem.stopping_cost)
     floor = None if problem.running_max is None else at_nodes(problem.running_max)
-    return Conditions(held, jnp.where(held, given, 0), stop, floor)
+    return Conditions(held, jnp.where(held, given, 0), stop, floor, ended=held)
 
 
 def greedy(problem: Problem, grid: Grid, value: jax.Array, held: jax.Array, *, scheme: Scheme, t: Any = 0.0) -> Greedy:

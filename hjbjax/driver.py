@@ -18,6 +18,7 @@ from hjbjax.status import Status
 
 CHUNK_SECONDS = 0.2
 
+begin = jax.jit(iteration.begin)
 run = jax.jit(iteration.run)
 
 
@@ -46,7 +47,7 @@ def drive(task: Task, guess: jax.Array, clock: Clock, most: int | None = None) -
       The last state, how it ended, and the residuals of all steps, that of the guess first.
     """
     limit = clock.max_steps if most is None else min(most, clock.max_steps)
-    state, residuals, chunk = iteration.begin(task, guess), [np.zeros(0)], 1
+    state, residuals, chunk = begin(task, guess), [np.zeros(0)], 1
     if clock.interrupted:
         return state, Status.INTERRUPTED, residuals[0]
     code = Status.RUNNING

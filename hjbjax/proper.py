@@ -26,18 +26,18 @@ SAMPLES = 33  # actions of a continuum that are tried
 def _open_jumps(problem: Problem, grid: Grid, inside: jax.Array, scheme: Upwind, dtype: Any) -> Rates:
     """For every jump whether some action makes it while all jumps of that action stay ``inside``."""
     points = sets.samples(problem.controls, SAMPLES) if problem.controls is not None else np.zeros((1, 0))
-    known = None
-    for k in range(np.shape(points)[0]):
-        u = [jnp.asarray(points[k, j], dtype) for j in range(np.shape(points)[1])]
-        rates = chain.rates(problem, grid, u, None, scheme=scheme, dtype=dtype)
+    start = chain.rates(problem, grid, list(jnp.asarray(points[0], dtype)), None, scheme=scheme, dtype=dtype)
+
+    def also(known, action):
+        rates = chain.rates(problem, grid, list(action), None, scheme=scheme, dtype=dtype)
         jumps = [c > 0 for c in rates.values]
         stays = jnp.ones(grid.shape, bool)
         for offset, jump in zip(rates.offsets, jumps, strict=True):
             stays &= ~jump | stencil.neighbour(inside, grid, offset)
-        usable = [jump & stays for jump in jumps]
-        known = usable if known is None else [p | q for p, q in zip(known, usable, strict=True)]
-    assert known is not None
-    return Rates(rates.offsets, tuple(known))
+        return tuple(p | (q & stays) for p, q in zip(known, jumps, strict=True)), None
+
+    none = tuple(jnp.zeros(grid.shape, bool) for _ in start.offsets)
+    return Rates(start.offsets, jax.lax.scan(also, none, jnp.asarray(points, dtype))[0])
 
 
 def reached(problem: Problem, grid: Grid, held: np.ndarray, *, scheme: Upwind, dtype: Any, surely: bool) -> np.ndarray:

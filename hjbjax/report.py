@@ -1,17 +1,19 @@
 """From a state of the iteration to a Solution: NumPy arrays, masks, bounds, the Isaacs gap, the message."""
 
 import warnings
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax import bellman, certificates, hamiltonian
+from hjbjax import certificates, hamiltonian
 from hjbjax.certificates import Certificate
 from hjbjax.grid import Grid
 from hjbjax.iteration import Method, Nested, PolicyIteration, State, Task
 from hjbjax.preparation import SolveWarning, Verdict
 from hjbjax.problem import Problem
+from hjbjax.pytree import is_traced
 from hjbjax.sets import Finite
 from hjbjax.solution import Solution
 from hjbjax.status import Status
@@ -27,15 +29,16 @@ def finish(
     grid: Grid,
 ) -> Solution:
     """The solution in NumPy, with infinite values where the target cannot be reached and no policy where none is."""
-    solution = assemble(task, state, verdict)
     gap = _isaacs_gap(task, state)
+    state = jax.device_get(state)
+    solution = assemble(task, state, verdict)
     lost = ~np.asarray(task.counted)
     arrays = {name: getattr(solution, name) for name in ("value", "lower", "upper", "policy", "disturbance")}
     arrays = {name: None if array is None else np.array(array) for name, array in arrays.items()}
     for array in (arrays["value"], arrays["lower"], arrays["upper"]):
         if array is not None:
             array[lost] = np.inf
-    idle = lost if task.problem.target is None else lost | (np.asarray(task.rules.held) & ~_rests(task))
+    idle = lost | np.asarray(task.rules.ended)
     for array in (arrays["policy"], arrays["disturbance"]):
         if array is not None:
             array[idle] = np.nan
@@ -60,24 +63,17 @@ def finish(
     )
 
 
-def _rests(task: Task) -> np.ndarray:
-    """Held nodes that are no target: rest points, where the policy keeps its meaning."""
-    if task.problem.target is None:
-        return np.asarray(task.rules.held)
-    rules = bellman.conditions(task.problem, task.grid, task.tol.dtype)
-    return np.asarray(task.rules.held & ~rules.held)
-
-
 def assemble(task: Task, state: State, verdict: Verdict) -> Solution:
     """The solution as it stands in the state; pure."""
     problem = task.problem
     bounds = certificates.bounds(verdict.certificate, state.value, state.gap)
     lower, upper = bounds if bounds is not None else (None, None)
     controls, disturbances = state.policy.controls, state.policy.disturbances
+    xp: Any = jnp if is_traced(state) else np
     return Solution(
         value=state.value,
-        policy=jnp.stack(controls, axis=-1) if controls else jnp.zeros((*task.grid.shape, 0), state.value.dtype),
-        disturbance=jnp.stack(disturbances, axis=-1) if problem.is_game else None,
+        policy=xp.stack(controls, axis=-1) if controls else xp.zeros((*task.grid.shape, 0), state.value.dtype),
+        disturbance=xp.stack(disturbances, axis=-1) if problem.is_game else None,
         code=state.code,
         steps=state.step,
         lower=lower,
@@ -122,6 +118,8 @@ def _message(code: Status, task: Task, state: State, residuals: np.ndarray) -> s
         return f"{code.message} The smallest error was {best:.2g}: a tolerance of {2 * best:.2g} is within reach."
     if code is Status.CONVERGED and task.certificate is Certificate.NONE:
         return f"Residual and last step are at most {tol:.2g}; no certificate bounds the error."
+    if code is Status.CONVERGED and task.certificate is Certificate.RESIDUAL:
+        return f"Residual of the second-order equation and last step are at most {tol:.2g} in cost units."
     return code.message
 
 

@@ -64,14 +64,18 @@ def test_the_first_of_equals_wins(count):
     assert enumerate_actions(objective, points, -1)[1][0].tolist() == [0.0 if count == 5 else count - 2.0] * 3
 
 
-def test_a_nan_never_wins():
-    points = jnp.array([[1.0], [0.0], [2.0]])
+@pytest.mark.parametrize("count", [3, UNROLL + 6])
+def test_a_nan_surfaces_where_it_is_and_nowhere_else(count):
+    points = jnp.arange(float(count))[:, None]
+    spoiled = jnp.array([False, True])
 
     def objective(action):
-        return jnp.where(action[0] == 0, jnp.nan, action[0]) * jnp.ones(2), []
+        return jnp.where(spoiled & (action[0] == 1), jnp.nan, action[0]), []
 
-    for sign, best in ((1, 1.0), (-1, 2.0)):
-        assert enumerate_actions(objective, points, sign)[1][0].tolist() == [best] * 2
+    for sign, best in ((1, 0.0), (-1, count - 1.0)):
+        value = enumerate_actions(objective, points, sign)[0]
+        assert value[0] == best
+        assert jnp.isnan(value[1])
 
 
 @given(seed=SEEDS)

@@ -17,7 +17,8 @@ from hjbjax.grid import Grid
 from hjbjax.relaxation import Direct, Krylov, Sweeps
 
 SHAPES = {1: (9,), 2: (6, 5), 3: (4, 3, 5), 4: (3, 4, 2, 3)}
-LAYOUTS = [(n, flags) for n in (1, 2, 3) for flags in itertools.product((False, True), repeat=n)]
+LAYOUTS = [(n, flags) for n in (1, 2) for flags in itertools.product((False, True), repeat=n)]
+LAYOUTS += [(3, (False,) * 3), (3, (False, True, False)), (3, (False, False, True)), (3, (True, True, False))]
 LAYOUTS += [(4, (False,) * 4), (4, (True, False, True, False)), (4, (False, True, True, True))]
 ids = ["".join("p" if flag else "-" for flag in flags) for _, flags in LAYOUTS]
 
@@ -120,9 +121,7 @@ def solved(equation, grid, method_type):
     return relaxation.solve(method, equation, grid)
 
 
-@pytest.mark.parametrize(
-    ("n", "flags"), [(1, (True,)), (2, (False, True)), (3, (True, False, True)), (4, (False, True, False, True))]
-)
+@pytest.mark.parametrize(("n", "flags"), [(1, (True,)), (2, (False, True)), (4, (False, True, False, True))])
 @given(seed=SEEDS)
 @settings(max_examples=4)
 def test_krylov_and_direct_equal_the_dense_solve(n, flags, seed):

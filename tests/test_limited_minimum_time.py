@@ -1,0 +1,140 @@
+"""The double integrator's minimum time by Limited(): half the error of the plain chain, and the switching curve."""
+
+import functools
+import warnings
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hjbjax as hjb
+from hjbjax import zoo
+from hjbjax.pytree import node
+from hjbjax.zoo.ingredients import unit_cost
+from hjbjax.zoo.minimum_time import DoubleIntegrator
+
+PLAIN = hjb.Upwind(central=False)
+MASS = DoubleIntegrator(1.0)
+
+
+@node()
+class Held:
+    """Where the exact value is given: arrival within ``time``, and the faces of the cube |x_i| ≤ 1."""
+
+    system: Any
+    time: Any
+
+    def level(self, x):
+        return jnp.minimum(self.system.arrival_time(x) - self.time, 1 - 1e-6 - jnp.max(jnp.abs(x)))
+
+
+@functools.cache
+def solved(n, scheme, discount=1.0):
+    exact = zoo.double_integrator_exact(discount=discount)
+    problem = hjb.Problem(
+        MASS.drift,
+        unit_cost,
+        hjb.Box([-1.0], [1.0]),
+        discount=discount,
+        target=Held(MASS, 0.5).level,
+        exit_cost=exact,
+    )
+    grid = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (n, n))
+    solution = hjb.solve(problem, grid, scheme=scheme, tol=1e-6)
+    with jax.enable_x64(True):
+        known = jax.jit(jax.vmap(exact))(grid.nodes().reshape(-1, 2))
+    return solution, np.abs(solution.value - np.asarray(known).reshape(n, n))
+
+
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize("n", [pytest.param(41, marks=SLOW), pytest.param(81, marks=SLOW), 161])
+def test_mean_error_against_the_plain_chain(n):
+    """The value has a square root at the switching curve, so that halving the error is what can be had."""
+    plain, limited = np.mean(solved(n, PLAIN)[1]), np.mean(solved(n, hjb.Limited())[1])
+    assert limited <= {41: 0.8, 81: 0.6, 161: 0.6}[n] * plain
+    if n == 161:
+        assert plain == pytest.approx(8.47e-3, rel=0.02)  # evaluated independently
+        assert limited == pytest.approx(4.15e-3, rel=0.02)
+
+
+def test_largest_error_is_smaller_too():
+    assert np.max(solved(161, hjb.Limited())[1]) <= 0.7 * np.max(solved(161, PLAIN)[1])
+
+
+def furthest_miss(n, scheme):
+    """The largest Euclidean distance, in cells, from the exact switching curve to a node with the wrong force."""
+    solution, _ = solved(n, scheme)
+    states, force = solution.grid.nodes().reshape(-1, 2), solution.policy.reshape(-1)
+    velocity = np.linspace(-1, 1, 20001)
+    curve = np.stack([-0.5 * velocity * np.abs(velocity), velocity], axis=-1)
+    side = np.sign(states[:, 0] + 0.5 * states[:, 1] * np.abs(states[:, 1]))
+    inside = np.isfinite(force) & (np.max(np.abs(states), axis=1) <= 0.9 + 1e-9) & (side != 0)
+    wrong = states[inside & (np.sign(force) != -side)]
+    away = [np.min(np.hypot(*(curve - state).T)) for state in wrong]
+    return max(away, default=0.0) * (n - 1) / 2
+
+
+def test_switching_curve():
+    limited, plain = furthest_miss(161, hjb.Limited()), furthest_miss(161, PLAIN)
+    assert limited <= 6
+    assert limited <= 0.6 * plain
+
+
+def test_status_and_words():
+    solution, _ = solved(161, hjb.Limited())
+    assert solution.status is hjb.Status.CONVERGED
+    assert solution.bounds is None
+    assert "second-order" in solution.stats["certificate"]
+    assert "Limited" in solution.stats["scheme"]
+    change = np.max(np.abs(solution.value - solved(161, hjb.Upwind())[0].value))
+    assert solution.stats["from_monotone"] == pytest.approx(change, abs=1e-5)
+    assert change > 0.01
+
+
+KINKED = {
+    "the ball": {"norm": 2},
+    "the box": {"norm": float("inf")},
+    "along the axes": {"norm": 1},
+    "to one node": {"norm": 2, "radius": 0.0},
+    "along the axes to one node": {"norm": 1, "radius": 0.0},
+    "without discount": {"norm": 2, "discount": 0.0},
+}
+
+
+def errors(question, exact, where=1.0):
+    """The largest error of the plain chain and of Limited() on |x_i| ≤ where."""
+    problem, grid = question
+    with jax.enable_x64(True):
+        known = np.asarray(jax.jit(jax.vmap(exact))(grid.nodes().reshape(-1, grid.ndim))).reshape(grid.shape)
+    inner = np.max(np.abs(grid.nodes()), axis=-1) <= where + 1e-9
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", hjb.SolveWarning)  # states that are carried away, in the current
+        values = [hjb.solve(problem, grid, scheme=scheme, tol=1e-8).value for scheme in (PLAIN, hjb.Limited())]
+    return [np.max(np.abs(value - known)[inner & np.isfinite(known)]) for value in values]
+
+
+@pytest.mark.parametrize("name", [name if "one" not in name else pytest.param(name, marks=SLOW) for name in KINKED])
+def test_shortest_paths_are_never_worse(name):
+    plain, limited = errors(zoo.eikonal(shape=(41, 41), **KINKED[name]), zoo.eikonal_exact(**KINKED[name]))
+    assert limited <= 1.05 * plain + 1e-8
+    assert limited <= 0.6 * plain  # and indeed better
+
+
+@SLOW
+@pytest.mark.parametrize("discount", [0.0, 1.0])
+@pytest.mark.parametrize("radius", [0.0, 0.2])
+def test_minimum_time_in_a_larger_box_is_never_worse(discount, radius):
+    options = {"discount": discount, "radius": radius}
+    plain, limited = errors(
+        zoo.double_integrator(shape=(41, 41), **options), zoo.double_integrator_exact(**options), where=1
+    )
+    assert limited <= 1.05 * plain + 1e-8
+
+
+def test_boat_in_a_current_is_never_worse():
+    plain, limited = errors(zoo.zermelo(shape=(41, 41)), zoo.zermelo_exact(), where=1)
+    assert limited <= 0.3 * plain

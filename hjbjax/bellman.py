@@ -131,7 +131,8 @@ def correction(
     rates = chain.rates(problem, grid, u, d, scheme=scheme.chain, dtype=value.dtype, t=t)
     leaving = rates.total() + problem.discount
     fastest = jnp.max(leaving)
-    pace = jnp.where(leaving > 0, leaving, jnp.where(fastest > 0, fastest, 1))  # nothing moves: the cost piles up
+    moves = leaving > 8 * jnp.finfo(value.dtype).eps * fastest  # a drift that cancels leaves rounding
+    pace = jnp.where(moves, leaving, jnp.where(fastest > 0, fastest, 1))  # where nothing moves the cost piles up
     source, free = policy.rate / pace, ~rules.held
     if rules.stop is not None:
         stops = free & (rules.stop - value < source)
@@ -155,17 +156,8 @@ def fastest_rate(problem: Problem, grid: Grid, *, scheme: Scheme, dtype: Any, t:
     Q is convex in u for a drift affine in u, so that corners of the sets suffice; samples are added for others.
     """
     result = jnp.zeros(grid.shape, dtype)
-    for u in _probes(problem.controls, dtype):
-        for d in _probes(problem.disturbances, dtype):
+    for u in sets.probes(problem.controls, dtype):
+        for d in sets.probes(problem.disturbances, dtype):
             rates = chain.rates(problem, grid, u, d if problem.is_game else None, scheme=scheme.chain, dtype=dtype, t=t)
             result = jnp.maximum(result, rates.total())
     return result
-
-
-def _probes(choices: Any, dtype: Any) -> list[list]:
-    if choices is None:
-        return [[]]
-    points = jnp.asarray(sets.extremes(choices), dtype)
-    if not isinstance(choices, sets.Finite):
-        points = jnp.concatenate([points, jnp.asarray(sets.samples(choices, 9), dtype)])
-    return [[points[k, j] for j in range(points.shape[1])] for k in range(points.shape[0])]

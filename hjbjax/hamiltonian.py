@@ -200,9 +200,30 @@ def local(problem: Problem, grid: Grid, value: jax.Array, *, scheme: Scheme, t: 
     differences = [stencil.one_sided(value, grid, axis, link) for axis, link in enumerate(links)]
     bends = tuple(up - down for up, down in differences)
     if isinstance(scheme, Limited):
-        differences = [stencil.limited(*pair, grid, axis, links[axis]) for axis, pair in enumerate(differences)]
+        differences = _limited(problem, grid, x, differences, links, t)
     up, down = zip(*differences, strict=True)
     return Local(problem, grid, scheme, value.dtype, t, x, value, up, down, bends, links)
+
+
+def _limited(problem: Problem, grid: Grid, x: list, differences: list, links: tuple, t: Any) -> list:
+    """Limited slopes; central ones where noise keeps those monotone, a_ii ≥ h |f_i| for all actions."""
+    slopes = [stencil.limited(up, down, grid, axis, links[axis]) for axis, (up, down) in enumerate(differences)]
+    if problem.noise is None:
+        return slopes
+    dtype = differences[0][0].dtype
+    calm: list = [True] * grid.ndim
+    for u, d in itertools.product(sets.probes(problem.controls, dtype), sets.probes(problem.disturbances, dtype)):
+        other = d if problem.is_game else None
+        f = chain.drift(problem, x, u, other, t, dtype)
+        a = chain.diffusion(problem, x, u, other, t, dtype)
+        for axis, link in enumerate(links):
+            left = chain.along_axis(a, grid, axis)
+            calm[axis] &= left >= jnp.maximum(link.up, link.down) * jnp.abs(f[axis])
+    for axis, ((up, down), link) in enumerate(zip(differences, links, strict=True)):
+        inner = calm[axis] & ~(stencil.on_edge(grid, axis, 1) | stencil.on_edge(grid, axis, -1))
+        middle = (link.down * up + link.up * down) / (link.up + link.down)
+        slopes[axis] = (jnp.where(inner, middle, slopes[axis][0]), jnp.where(inner, middle, slopes[axis][1]))
+    return slopes
 
 
 def optimise(here: Local, how: Setting, isaacs: str | None = None) -> tuple[jax.Array, Action, Action]:

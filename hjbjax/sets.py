@@ -8,6 +8,7 @@ import itertools
 from collections.abc import Sequence
 from typing import Any, TypeAlias
 
+import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.pytree import node, numbers
@@ -163,6 +164,16 @@ def extremes(choices: AdmissibleSet) -> Any:
     if isinstance(choices, Box):
         return choices.grid(2).points
     return choices.radius * np.array(list(itertools.product((-1.0, 1.0), repeat=choices.dim)))
+
+
+def probes(choices: AdmissibleSet | None, dtype: Any) -> list[list]:
+    """Actions among which a convex function of u takes its largest value, and a few more for others."""
+    if choices is None:
+        return [[]]
+    points = jnp.asarray(extremes(choices), dtype)
+    if not isinstance(choices, Finite):
+        points = jnp.concatenate([points, jnp.asarray(samples(choices, 9), dtype)])
+    return [[points[k, j] for j in range(points.shape[1])] for k in range(points.shape[0])]
 
 
 def spacing(choices: AdmissibleSet, budget: int) -> list[Any]:

@@ -2,8 +2,8 @@
 
 With a target {l ≤ 0} the boundary crosses the link from a free node x to a held node y at the fraction
 θ = l(x)/(l(x) − l(y)) of the way, exactly so for a signed distance that is linear there. The link is cut to θh and
-ends on the boundary, where the exit cost is the linear interpolation of those at x and y. The chain stays a chain:
-it jumps to the boundary at rates for the distance θh.
+ends on the boundary, where the exit cost is paid. The chain stays a chain: it jumps to the boundary at rates for the
+distance θh.
 """
 
 from typing import Any
@@ -24,25 +24,25 @@ def links(problem: Problem, grid: Grid, *, subcell: bool, dtype: Any, t: Any = 0
     if not subcell or problem.target is None:
         return plain
     x = grid.components(dtype)
-    arguments = problem.state_arguments(x, t)
-    level = jnp.broadcast_to(fields.scalar(problem.target, *arguments, dtype=dtype), grid.shape)
-    exit_cost: Any = 0.0 if problem.exit_cost is None else problem.exit_cost
-    if callable(exit_cost):
-        exit_cost = fields.scalar(exit_cost, *arguments, dtype=dtype)
-    exit_cost = jnp.broadcast_to(jnp.asarray(exit_cost, dtype), grid.shape)
-    return [_cut(link, level, exit_cost, grid, axis) for axis, link in enumerate(plain)]
 
+    def at(ingredient: Any, x: list) -> Any:
+        if not callable(ingredient):
+            return jnp.full(grid.shape, 0.0 if ingredient is None else ingredient, dtype)
+        values = fields.scalar(ingredient, *problem.state_arguments(x, t), dtype=dtype)
+        return jnp.broadcast_to(values, grid.shape)
 
-def _cut(link: Links, level: Any, exit_cost: Any, grid: Grid, axis: int) -> Links:
-    theta_up, meets_up = _crossing(level, exit_cost, grid, stencil.unit(grid, axis, 1))
-    theta_down, meets_down = _crossing(level, exit_cost, grid, stencil.unit(grid, axis, -1))
-    return Links(theta_up * link.up, theta_down * link.down, meets_up, meets_down)
+    level = at(problem.target, x)
 
+    def cut(axis: int, step: int, length: Any) -> tuple[Any, tuple[Any, Any]]:
+        """The length of every link in one direction, and where it meets the target with the exit cost there."""
+        beyond = stencil.neighbour(level, grid, stencil.unit(grid, axis, step))
+        meets = (level > 0) & (beyond <= 0)
+        theta = jnp.where(meets, jnp.maximum(level / jnp.where(meets, level - beyond, 1), SHORTEST), 1)
+        boundary = [entry + step * theta * length if i == axis else entry for i, entry in enumerate(x)]
+        return theta * length, (meets, at(problem.exit_cost, boundary))
 
-def _crossing(level: Any, exit_cost: Any, grid: Grid, offset: tuple[int, ...]) -> tuple[Any, tuple[Any, Any]]:
-    """θ on every link in one direction, 1 where it does not cross, and where it crosses with the value there."""
-    beyond, beyond_cost = (stencil.neighbour(values, grid, offset) for values in (level, exit_cost))
-    crosses = (level > 0) & (beyond <= 0)
-    theta = jnp.where(crosses, level / jnp.where(crosses, level - beyond, 1), 1)
-    here = jnp.where(jnp.isfinite(exit_cost), exit_cost, beyond_cost)  # an exit cost may exist on the target alone
-    return jnp.maximum(theta, SHORTEST), (crosses, here + theta * (beyond_cost - here))
+    result = []
+    for axis, link in enumerate(plain):
+        (up, meets_up), (down, meets_down) = cut(axis, 1, link.up), cut(axis, -1, link.down)
+        result.append(Links(up, down, meets_up, meets_down))
+    return result

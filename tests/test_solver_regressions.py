@@ -114,3 +114,18 @@ def test_avoid_tube_of_the_floating_boat():
     level = 1 - np.maximum(np.abs(x), np.abs(y))
     assert np.all(solution.value >= level - 1e-12)
     assert np.all(solution.value[(y > 1) | (np.abs(x) > 1.5)] < 0)  # past the square, or beside it
+
+
+def test_a_nested_solve_where_the_drift_cancels_at_a_node():
+    """A drift of rounding size is no motion: dividing by it sent the value to infinity."""
+    problem, grid = zoo.pendulum(as_printed=True, shape=(100, 101))
+    nested = hjb.solve(problem, grid, method=hjb.Nested())
+    plain = hjb.solve(problem, grid, method=hjb.PolicyIteration())
+    assert np.max(np.abs(nested.value - plain.value)) <= 2e-3
+
+
+def test_a_second_order_game_where_the_drift_cancels_at_a_node():
+    problem, grid = zoo.lq_game(shape=(81,))
+    solution = hjb.solve(problem, grid, scheme=hjb.Limited(), tol=1e-6)
+    exact = jax.vmap(zoo.lq_game_exact())(jnp.asarray(grid.nodes(), jnp.float32))
+    assert np.max(np.abs(solution.value - np.asarray(exact))) <= 1e-5

@@ -520,13 +520,13 @@ def test_problems_of_every_kind_give_four_files(words):
 
 def test_a_real_process(folder):
     command = [sys.executable, "-m", "hjbjax", "solve", "stochastic-lq", "--shape", "41", "--json"]
-    first = subprocess.run(command, capture_output=True, text=True, env=environment(), timeout=60)
+    first = subprocess.run(command, capture_output=True, text=True, env=environment(), timeout=300)
     assert (first.returncode, first.stderr) == (0, "")
     assert strict(first.stdout)["status"] == "CONVERGED"
     solution = load(folder / "stochastic-lq" / "solution.npz")
     exact = zoo.stochastic_lq_exact()
     assert abs(float(solution.value_at([0.5])) - float(exact([0.5]))) < 0.05
-    again = subprocess.run(command, capture_output=True, text=True, env=environment(), timeout=60)
+    again = subprocess.run(command, capture_output=True, text=True, env=environment(), timeout=300)
     assert (again.returncode, again.stdout, again.stderr.count("\n")) == (2, "", 1)
 
 

@@ -325,7 +325,7 @@ def test_other_versions(tmp_path):
 
 def test_contradictions(tmp_path):
     path = tmp_path / "run.npz"
-    about = {"shape": [4, 3], "periodic": [True, False], "names": ["a", "b"]}
+    about = {"shape": [4, 3], "periodic": [True, False], "names": ["a", "b"], "stretch": [None, None]}
     refused(rewritten(path, value=np.zeros((3, 4))), r"'value' has shape \(3, 4\), wanted \(4, 3\)")
     refused(rewritten(path, policy=np.zeros((4, 3))), r"'policy' has shape \(4, 3\), wanted \(4, 3, any\)")
     refused(rewritten(path, lo=np.zeros(3)), r"'lo' has shape \(3,\), wanted \(2,\)")
@@ -367,7 +367,7 @@ def test_code_in_a_file_never_runs(tmp_path):
 
 def test_a_claim_of_eight_terabytes(tmp_path, monkeypatch):
     path = tmp_path / "run.npz"
-    huge = {"shape": [10**6, 10**6], "periodic": [False, False], "names": ["a", "b"]}
+    huge = {"shape": [10**6, 10**6], "periodic": [False, False], "names": ["a", "b"], "stretch": [None, None]}
     claim = npy("{'descr': '<f8', 'fortran_order': False, 'shape': (1000000, 1000000), }", bytes(64))
     refused(rewritten(path, header={"grid": huge}, value=claim), r"'value' declares shape \(1000000, 1000000\)")
     refused(

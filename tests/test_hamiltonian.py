@@ -14,7 +14,7 @@ from hjbjax.grid import Grid
 from hjbjax.problem import Problem
 from hjbjax.pytree import node
 from hjbjax.schemes import Upwind
-from hjbjax.sets import Ball, Box, Finite
+from hjbjax.sets import Ball, Box, Finite, samples
 
 CASES = [(1, "diagonal"), (2, "none"), (2, "matrix"), (2, "function"), (3, "diagonal"), (3, "matrix"), (4, "matrix")]
 SCHEMES = [Upwind(central=False), Upwind(central=True)]
@@ -163,15 +163,14 @@ def test_noise_that_depends_on_the_control_is_not_exact():
 
 
 @pytest.mark.parametrize("scheme", SCHEMES, ids=["plain", "central"])
-@given(seed=SEEDS)
-@settings(max_examples=5)
+@pytest.mark.parametrize("seed", range(4))
 def test_samples_and_search_come_close_where_the_minimum_is_not_exact(scheme, seed):
     rng = np.random.default_rng(seed)
     grid = random_grid(rng, 2)
     problem = random_problem(rng, grid, "diagonal", Box([-1.0, -2.0], [1.0, 1.0]))  # both inputs drive both components
     value = rng.normal(size=grid.shape)
-    best, lowest, coarse = jax.device_get(sampled_and_scan(problem, grid, value, scheme))
-    assert np.all(best <= coarse + 1e-12)
+    best, lowest, sampled = jax.device_get(sampled_and_scan(problem, grid, value, scheme))
+    assert np.all(best <= sampled + 1e-12)  # the search starts from the best of these
     assert np.all(best - lowest <= 0.02 * (1 + np.max(np.abs(lowest))))
 
 
@@ -183,7 +182,7 @@ def sampled_and_scan(problem, grid, value, scheme):
     def lowest(points):
         return jnp.min(jax.lax.map(lambda point: here.at(list(point), []), points), axis=0)
 
-    return best, lowest(problem.controls.grid(81).points), lowest(problem.controls.grid(5).points)
+    return best, lowest(problem.controls.grid(81).points), lowest(samples(problem.controls, hamiltonian.SAMPLES))
 
 
 # --- finite sets and games ---

@@ -99,7 +99,7 @@ def test_the_oracle_agrees_with_riccati_near_upright(name):
 def test_value_of_the_best_extremal(name):
     as_printed, oracle = PENDULUMS[name]
     problem, grid = zoo.pendulum(as_printed=as_printed, shape=(400, 401))
-    solution = hjb.solve(problem, grid, method=hjb.PolicyIteration(), scheme=hjb.Limited(), tol=1e-5)
+    solution = hjb.solve(problem, grid, scheme=hjb.Limited(), tol=1e-5)
     assert solution.status is hjb.Status.CONVERGED
     for state in STATES:
         value, fastest = oracle.extremals(state)[0]

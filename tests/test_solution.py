@@ -190,7 +190,7 @@ def test_the_whole_screen():
         "  error       at most 2e-07 (tol 1e-06): residual over the discount rate",
         "  reached     95.8 % of the nodes",
         "  isaacs gap  0.125",
-        "  seconds     1.23, and 0.5 to compile",
+        "  seconds     1.23, and 0.5 to check and compile",
         "  memory      12.3 MB",
         "  device      cpu, float64",
     ]

@@ -1,5 +1,6 @@
 """Targets whose boundary runs between the nodes."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -79,7 +80,6 @@ def test_an_exit_cost_is_met_where_the_boundary_is():
 
 
 def test_certificates_and_derivatives_hold_with_cut_links():
-
 
     grid = hjb.Grid([-2.0], [2.0], (41,))
     scheme = hjb.Upwind(subcell=True)

@@ -503,12 +503,14 @@ def environment():
 @pytest.mark.parametrize(
     "words",
     [
-        ["brownian-exit", "--shape", "41"],
-        ["lq-game", "--shape", "41"],
-        ["double-integrator", "--shape", "21x21"],
-        ["dubins", "--shape", "13x13x12"],
+        pytest.param(words.split(), marks=[pytest.mark.slow] * (words[:6] != "double"), id=words)
+        for words in (
+            "brownian-exit --shape 41",
+            "lq-game --shape 41",
+            "double-integrator --shape 21x21",
+            "dubins --shape 13x13x12",
+        )
     ],
-    ids=" ".join,
 )
 def test_problems_of_every_kind_give_four_files(words):
     """With noise and without a control, a game, bang-bang in the plane, three states."""

@@ -75,6 +75,7 @@ def test_an_error_below_the_tolerance_is_not_fitted():
     assert "* not fitted" in str(study)
 
 
+@pytest.mark.slow
 def test_a_study_in_the_plane_over_a_region():
     def inner(x):
         return (jnp.abs(x[0]) <= 0.5) & (jnp.abs(x[1]) <= 0.45)
@@ -96,6 +97,7 @@ def test_a_solve_that_does_not_converge_keeps_its_row_and_leaves_the_fit():
 # --- references ---
 
 
+@pytest.mark.slow
 def test_a_finer_solution_as_the_reference(plain):
     (grid,) = line(161)
     fine = hjb.solve(PROBLEM, grid, scheme=hjb.Limited(), tol=1e-9)
@@ -317,6 +319,7 @@ def test_a_measurement_that_fails_is_a_row_and_json_has_no_nan(tmp_path):
     ]
 
 
+@pytest.mark.slow
 def test_the_control_that_the_peer_marches_with_is_the_best_one():
     from benchmarks import marching
 

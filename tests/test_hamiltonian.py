@@ -164,6 +164,7 @@ def test_noise_that_depends_on_the_control_is_not_exact():
 
 @pytest.mark.parametrize("scheme", SCHEMES, ids=["plain", "central"])
 @pytest.mark.parametrize("seed", range(4))
+@pytest.mark.slow
 def test_samples_and_search_come_close_where_the_minimum_is_not_exact(scheme, seed):
     rng = np.random.default_rng(seed)
     grid = random_grid(rng, 2)

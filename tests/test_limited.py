@@ -160,6 +160,7 @@ def test_lq_game():
     assert abs(hjb.solve(problem, grid, scheme=hjb.Limited(), tol=1e-8).isaacs_gap) <= 0.05
 
 
+@pytest.mark.slow
 def test_merton_and_brownian_motion_in_the_square_are_never_worse():
     questions = [
         (zoo.merton(), zoo.merton_exact()),
@@ -194,6 +195,7 @@ def minus_put(x):
     return -jnp.where(price <= best, STRIKE - price, (STRIKE - best) * (price / best) ** -power)
 
 
+@pytest.mark.slow
 def test_perpetual_put():
     exit_cost = float(minus_put(np.log([500.0])))
     options = {"noise": VOLATILITY, "discount": INTEREST, "stopping_cost": minus_exercise}
@@ -220,6 +222,7 @@ def effort(x, u):
 
 
 @pytest.mark.parametrize("scheme", [hjb.Upwind(), hjb.Limited()])
+@pytest.mark.slow
 def test_a_box_beats_its_samples(scheme):
     box, grid, tol = hjb.Box([-1.0], [1.0]), hjb.Grid([-1.0, -1.0], [1.0, 1.0], (31, 31)), 1e-8
     value = hjb.solve(hjb.Problem(oscillator, effort, box, discount=0.5), grid, scheme=scheme, tol=tol).value

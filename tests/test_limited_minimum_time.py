@@ -52,6 +52,7 @@ SLOW = pytest.mark.slow
 
 
 @pytest.mark.parametrize("n", [pytest.param(41, marks=SLOW), pytest.param(81, marks=SLOW), 161])
+@pytest.mark.slow
 def test_mean_error_against_the_plain_chain(n):
     """The value has a square root at the switching curve, so that halving the error is what can be had."""
     plain, limited = np.mean(solved(n, PLAIN)[1]), np.mean(solved(n, hjb.Limited())[1])
@@ -118,6 +119,7 @@ def errors(question, exact, where=1.0):
 
 
 @pytest.mark.parametrize("name", [name if "one" not in name else pytest.param(name, marks=SLOW) for name in KINKED])
+@pytest.mark.slow
 def test_shortest_paths_are_never_worse(name):
     plain, limited = errors(zoo.eikonal(shape=(41, 41), **KINKED[name]), zoo.eikonal_exact(**KINKED[name]))
     assert limited <= 1.05 * plain + 1e-8
@@ -127,6 +129,7 @@ def test_shortest_paths_are_never_worse(name):
 @SLOW
 @pytest.mark.parametrize("discount", [0.0, 1.0])
 @pytest.mark.parametrize("radius", [0.0, 0.2])
+@pytest.mark.slow
 def test_minimum_time_in_a_larger_box_is_never_worse(discount, radius):
     options = {"discount": discount, "radius": radius}
     plain, limited = errors(
@@ -135,6 +138,7 @@ def test_minimum_time_in_a_larger_box_is_never_worse(discount, radius):
     assert limited <= 1.05 * plain + 1e-8
 
 
+@pytest.mark.slow
 def test_boat_in_a_current_is_never_worse():
     plain, limited = errors(zoo.zermelo(shape=(41, 41)), zoo.zermelo_exact(), where=1)
     assert limited <= 0.3 * plain

@@ -87,6 +87,7 @@ STATES = ((0.5, 0.0), (np.pi / 4, 0.0), (1.5, -1.0), (2.8, 1.5), (-2.0, -2.0))
 
 
 @pytest.mark.parametrize("name", PENDULUMS)
+@pytest.mark.slow
 def test_the_oracle_agrees_with_riccati_near_upright(name):
     as_printed, oracle = PENDULUMS[name]
     near = zoo.pendulum_near_upright(as_printed=as_printed)

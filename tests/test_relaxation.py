@@ -121,7 +121,10 @@ def solved(equation, grid, method_type):
     return relaxation.solve(method, equation, grid)
 
 
-@pytest.mark.parametrize(("n", "flags"), [(1, (True,)), (2, (False, True)), (4, (False, True, False, True))])
+@pytest.mark.parametrize(
+    ("n", "flags"),
+    [(1, (True,)), (2, (False, True)), pytest.param(4, (False, True, False, True), marks=pytest.mark.slow)],
+)
 @given(seed=SEEDS)
 @settings(max_examples=4)
 def test_krylov_and_direct_equal_the_dense_solve(n, flags, seed):

@@ -243,6 +243,7 @@ def test_ornstein_uhlenbeck_has_its_mean_and_variance():
     assert abs(paths.cost.mean() - expected) < 4 * paths.cost.std() / math.sqrt(count)
 
 
+@pytest.mark.slow
 def test_state_dependent_noise_is_taken_in_the_sense_of_ito():
     count, sigma = 2000, 0.5  # geometric Brownian motion: Itô's mean stays 1, Stratonovich's would be e^{σ²/2}
     problem = Problem(lambda x, u: 0 * x, noise=lambda x, u: sigma * x)

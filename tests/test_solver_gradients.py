@@ -114,6 +114,7 @@ def test_gradients_match_central_differences(name):
     assert slope == pytest.approx(wanted, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_forward_and_reverse_mode_agree_and_a_game_is_differentiable():
     def traced(gamma):
         problem, grid = zoo.lq_game(gamma=gamma, discount=0.3, shape=(21,))

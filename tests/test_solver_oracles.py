@@ -84,7 +84,9 @@ QUESTIONS = {
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=pytest.mark.slow) if name in ("one player", "game in the plane") else name
+        pytest.param(name, marks=pytest.mark.slow)
+        if name in ("one player", "game in the plane", "pursuit", "game on a line", "with noise")
+        else name
         for name in QUESTIONS
     ],
 )
@@ -184,7 +186,9 @@ def position(x, u, d):
     return x[0]
 
 
-@pytest.mark.parametrize("method", [hjb.ValueIteration(), hjb.PolicyIteration(hjb.Direct())])
+@pytest.mark.parametrize(
+    "method", [hjb.ValueIteration(), pytest.param(hjb.PolicyIteration(hjb.Direct()), marks=pytest.mark.slow)]
+)
 def test_upper_and_lower_values_of_a_game_without_value(method):
     grid, solutions = hjb.Grid([-1.0], [1.0], (21,)), {}
     for isaacs in ("upper", "lower"):

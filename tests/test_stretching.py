@@ -89,6 +89,7 @@ def bang_bang_errors(scheme, epsilon, stretch, counts):
 @pytest.mark.parametrize(
     ("scheme", "epsilon", "order"), [(hjb.Upwind(), 0.0, 1), (hjb.Limited(), 0.0, 2), (hjb.Upwind(), 0.5**0.5, 2)]
 )
+@pytest.mark.slow
 def test_schemes_keep_their_order(scheme, epsilon, order):
     errors = bang_bang_errors(scheme, epsilon, hjb.Sinh(2.0), (41, 81))
     assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.2)

@@ -64,6 +64,7 @@ def test_the_plain_scheme_on_a_disc():
     assert cut <= 9.2e-3
 
 
+@pytest.mark.slow
 def test_second_order_up_to_the_target():
     coarse, fine = errors(hjb.Limited(), (41, 81))
     assert fine <= 3e-4

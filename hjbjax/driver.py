@@ -5,7 +5,9 @@ between two chunks.
 """
 
 import contextlib
+import signal
 import sys
+import threading
 import time
 from typing import Any
 
@@ -51,12 +53,15 @@ def drive(task: Task, guess: jax.Array, clock: Clock, most: int | None = None) -
     if clock.interrupted:
         return state, Status.INTERRUPTED, residuals[0]
     code = Status.RUNNING
-    with _bar(clock.progress, float(task.tol)) as show:
+    with _bar(clock.progress, float(task.tol)) as show, _noting_interrupts(clock):
         try:
             state = jax.block_until_ready(run(task, state, 0))  # compiles, and looks at the guess
             residuals, code = [np.asarray(state.history)[:1]], Status(int(state.code))
             while code is Status.RUNNING:
                 done, began = int(state.step), time.perf_counter()
+                if clock.interrupted:
+                    code = Status.INTERRUPTED
+                    break
                 if done >= limit or clock.elapsed() >= clock.seconds:
                     code = Status.MAX_STEPS if done >= limit else Status.TIME_LIMIT
                     break
@@ -70,6 +75,28 @@ def drive(task: Task, guess: jax.Array, clock: Clock, most: int | None = None) -
         except KeyboardInterrupt:
             clock.interrupted, code = True, Status.INTERRUPTED
     return state, code, np.concatenate(residuals)
+
+
+@contextlib.contextmanager
+def _noting_interrupts(clock: Clock) -> Any:
+    """Ctrl-C leaves a note on the clock instead of an exception, which a callback of the runtime might swallow.
+
+    A second Ctrl-C is the usual one. Only in the main thread, and not over a handler of the user's own.
+    """
+    usual = signal.default_int_handler
+    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) is not usual:
+        yield
+        return
+
+    def note(number: int, frame: Any) -> None:
+        clock.interrupted = True
+        signal.signal(signal.SIGINT, usual)
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, usual)
 
 
 @contextlib.contextmanager

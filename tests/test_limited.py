@@ -144,6 +144,7 @@ def test_value_with_a_kink_in_its_policy_is_second_order():
 # --- noise, games, stopping ---
 
 
+@pytest.mark.slow
 def test_bang_bang_with_noise():
     """By default central differences where they stay monotone; the limited slopes are of order 2 as well."""
     question, exact = zoo.bang_bang(noise=NOISE, shape=(41,)), zoo.bang_bang_exact(noise=NOISE)
@@ -153,6 +154,7 @@ def test_bang_bang_with_noise():
     assert errors[0] <= 0.1 * largest_error(question, exact, scheme=PLAIN)
 
 
+@pytest.mark.slow
 def test_lq_game():
     problem, grid = zoo.lq_game(shape=(101,))
     assert largest_error((problem, grid), zoo.lq_game_exact(), inside(0.5)) <= 1e-8

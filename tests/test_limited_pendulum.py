@@ -108,6 +108,7 @@ def test_value_of_the_best_extremal(name):
         assert float(solution.value_at(state)) == pytest.approx(value, rel=1e-3), state
 
 
+@pytest.mark.slow
 def test_going_round_is_cheaper():
     """From 45° at rest to let the pendulum fall costs less than to lift it: the value is not that of the direct way."""
     ways = PENDULUMS["gain 1/m"][1].extremals((np.pi / 4, 0.0))

@@ -85,7 +85,7 @@ QUESTIONS = {
     "name",
     [
         pytest.param(name, marks=pytest.mark.slow)
-        if name in ("one player", "game in the plane", "pursuit", "game on a line", "with noise")
+        if name in ("one player", "game in the plane", "pursuit", "game on a line", "with noise", "minimum time")
         else name
         for name in QUESTIONS
     ],

@@ -66,6 +66,7 @@ def test_changing_a_zoo_parameter_compiles_nothing(change, caplog):
     assert compiled == []
 
 
+@pytest.mark.slow
 def test_the_lq_game_has_its_known_value():
     exact, errors = zoo.lq_game_exact(), []
     for n in (51, 101, 201):

@@ -54,8 +54,11 @@ SLOW = pytest.mark.slow
 @pytest.mark.parametrize("n", [pytest.param(41, marks=SLOW), pytest.param(81, marks=SLOW), 161])
 @pytest.mark.slow
 def test_mean_error_against_the_plain_chain(n):
-    """The value has a square root at the switching curve, so that halving the error is what can be had."""
-    plain, limited = np.mean(solved(n, PLAIN)[1]), np.mean(solved(n, hjb.Limited())[1])
+    """The value has a square root at the switching curve, so that halving the error is what can be had.
+
+    Values are held at the nodes inside: the level set of the time is no distance to cut links by.
+    """
+    plain, limited = np.mean(solved(n, PLAIN)[1]), np.mean(solved(n, hjb.Limited(subcell=False))[1])
     assert limited <= {41: 0.8, 81: 0.6, 161: 0.6}[n] * plain
     if n == 161:
         assert plain == pytest.approx(8.47e-3, rel=0.02)  # evaluated independently

@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax import chain, fields, hamiltonian, sets, stencil
+from hjbjax import chain, fields, hamiltonian, players, sets, stencil
 from hjbjax.chain import Rates
 from hjbjax.grid import Grid
 from hjbjax.problem import Problem
@@ -88,25 +88,41 @@ def conditions(problem: Problem, grid: Grid, dtype: Any, t: Any = 0.0) -> Condit
     return Conditions(held, jnp.where(held, given, 0), stop, floor, ended=held)
 
 
-def greedy(problem: Problem, grid: Grid, value: jax.Array, held: jax.Array, *, scheme: Scheme, t: Any = 0.0) -> Greedy:
-    """The optimal actions at ``value`` and the rate r that is left."""
-    how = hamiltonian.setting(problem, grid.ndim, value.dtype)
-    best, u, d = hamiltonian.optimise(hamiltonian.local(problem, grid, value, scheme=scheme, t=t), how)
-    return _left_over(problem, grid, value, held, best, u, d)
+def greedy(
+    problem: Problem,
+    grid: Grid,
+    value: jax.Array,
+    held: jax.Array,
+    *,
+    scheme: Scheme,
+    t: Any = 0.0,
+    incumbent: Greedy | None = None,
+) -> Greedy:
+    """The optimal actions at ``value`` and the rate r that is left; an incumbent policy is among the candidates."""
+    how = players.setting(problem, grid.ndim, value.dtype)
+    here = _around(problem, grid, value, scheme, t, incumbent)
+    return _left_over(problem, grid, value, held, *hamiltonian.optimise(here, how))
 
 
 def respond(
     problem: Problem, grid: Grid, value: jax.Array, held: jax.Array, current: Greedy, *, scheme: Scheme, t: Any = 0.0
 ) -> Greedy:
     """The inner player's best answer to the outer player's current policy, in a game."""
-    how = hamiltonian.setting(problem, grid.ndim, value.dtype)
-    here = hamiltonian.local(problem, grid, value, scheme=scheme, t=t)
+    how = players.setting(problem, grid.ndim, value.dtype)
+    here = _around(problem, grid, value, scheme, t, current)
     u, d = list(current.controls), list(current.disturbances)
     if problem.isaacs == "upper":
         best, d = hamiltonian.best_response(here, how.disturbance, lambda d: (u, d))
     else:
         best, u = hamiltonian.best_response(here, how.control, lambda u: (u, d))
     return _left_over(problem, grid, value, held, best, u, d)
+
+
+def _around(problem: Problem, grid: Grid, value: Any, scheme: Scheme, t: Any, policy: Greedy | None) -> Any:
+    here = hamiltonian.local(problem, grid, value, scheme=scheme, t=t)
+    if policy is None:
+        return here
+    return dataclasses.replace(here, tried=(list(policy.controls), list(policy.disturbances)))
 
 
 def _left_over(problem: Problem, grid: Grid, value: Any, held: Any, best: Any, u: list, d: list) -> Greedy:

@@ -8,116 +8,27 @@ written with one-sided differences, so that nothing but the value is read from m
 axis the gain of a drift component f is [(e + h⁻ f) D⁺ − (e − h⁺ f) D⁻]/(h⁺ + h⁻). As a function of u it has
 kinks where f changes sign (and at |f| = a/h under central differences): minimising it is piecewise.
 
-Exact where the drift is affine in u, the cost separable and quadratic, the noise free of u, and the inputs
-drive disjoint sets of components (read from the jaxpr, see ``structure``): all ends, kinks and stationary
-points are tried. Otherwise samples and a pattern search, and certificates hold for the refined sample.
+Exact where the drift is affine in u, the cost separable and quadratic, the noise free of u, and no more than two
+inputs drive a component together (read from the jaxpr, see ``structure``): all ends, kinks and stationary points
+are tried. Otherwise samples and a pattern search, and certificates hold for the refined sample.
 """
 
 import dataclasses
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from hjbjax import chain, sets, stencil, structure, subcell
+from hjbjax import chain, sets, stencil, subcell
 from hjbjax.grid import Grid
-from hjbjax.minimisers import Action, Kinked, enumerate_actions, kinked_ball, piecewise_input, refine
+from hjbjax.minimisers import Action, best_of, enumerate_actions, refine
+from hjbjax.piecewise import Kinked, kinked_ball, piecewise_input, piecewise_pair
+from hjbjax.players import SAMPLES, Player, Setting, shared
 from hjbjax.problem import Problem
 from hjbjax.schemes import Limited, Scheme
 from hjbjax.sets import AdmissibleSet, Ball, Box, Finite
-
-SAMPLES = 33  # points of a continuum before refinement
-
-
-@dataclasses.dataclass(frozen=True)
-class Player:
-    """What one player may do and how the Hamiltonian depends on it; static, known from the jaxpr.
-
-    Attributes:
-      choices: the admissible set, or None.
-      sign: +1 minimises, −1 maximises.
-      exact: whether the optimum is found exactly rather than by samples.
-      driven: for every input the drift components that it drives.
-      curved: for every input whether the cost may hold its square.
-    """
-
-    choices: AdmissibleSet | None
-    sign: int
-    exact: bool
-    driven: tuple[tuple[int, ...], ...]
-    curved: tuple[bool, ...]
-
-    @property
-    def weight(self) -> int:
-        """About how many evaluations of H one optimisation takes."""
-        if self.choices is None:
-            return 1
-        if isinstance(self.choices, Finite):
-            return len(self.choices.points)
-        return 3 if self.exact else SAMPLES
-
-
-@dataclasses.dataclass(frozen=True)
-class Setting:
-    """Both players and how they meet.
-
-    Attributes:
-      control, disturbance: the players.
-      decoupled: whether their choices do not touch each other; then the Isaacs condition holds.
-      disturbance_costs: whether the running cost depends on the disturbance.
-    """
-
-    control: Player
-    disturbance: Player
-    decoupled: bool
-    disturbance_costs: bool
-
-    @property
-    def exact(self) -> bool:
-        """Whether min (max) over the sets is exact, which certificates need."""
-        players = (self.control, self.disturbance)
-        return all(player.exact or isinstance(player.choices, (Finite, type(None))) for player in players)
-
-
-def setting(problem: Problem, n: int, dtype: Any) -> Setting:
-    """Read from the problem's functions how the Hamiltonian depends on each player."""
-    m = 0 if problem.controls is None else problem.controls.dim
-    k = 0 if problem.disturbances is None else problem.disturbances.dim
-    time = ((None, False),) * problem.time_dependent
-    game = ((k, True),) * problem.is_game
-    arguments = (*time, (n, False), (m, True), *game)
-    drift = structure.dependence(problem.drift, *arguments, dtype=dtype)
-    constant = structure.Dependence((structure.CONSTANT,))
-    cost = constant if problem.cost is None else structure.dependence(problem.cost, *arguments, dtype=dtype)
-    noise = structure.dependence(problem.noise, *arguments, dtype=dtype) if callable(problem.noise) else constant
-    inputs_u, inputs_d = range(m), range(m, m + k)
-    mine = _player(problem.controls, 1, inputs_u, drift, cost, noise)
-    theirs = _player(problem.disturbances, -1, inputs_d, drift, cost, noise)
-    separate = not set(drift.driven_by(inputs_u)) & set(drift.driven_by(inputs_d))
-    crossed = any(
-        entry is None or any(set(term) & set(inputs_u) and set(term) & set(inputs_d) for term in entry)
-        for entry in (*drift.entries, *cost.entries)
-    )
-    return Setting(mine, theirs, separate and not crossed and noise.is_constant, not cost.free_of(inputs_d))
-
-
-def _player(
-    choices: AdmissibleSet | None,
-    sign: int,
-    inputs: range,
-    drift: structure.Dependence,
-    cost: structure.Dependence,
-    noise: structure.Dependence,
-) -> Player:
-    driven = tuple(drift.driven_by([j]) for j in inputs)
-    curved = tuple(cost.has_square([j]) for j in inputs)
-    disjoint = all(not set(p) & set(q) for p, q in itertools.combinations(driven, 2))
-    suits = drift.affine_in(inputs) and cost.separable_quadratic_in(inputs) and noise.free_of(inputs) and disjoint
-    if isinstance(choices, Ball):
-        suits = suits and choices.dim <= 3 and not any(curved) and all(len(components) <= 1 for components in driven)
-    return Player(choices, sign, suits and isinstance(choices, (Box, Ball)), driven, curved)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,6 +39,8 @@ class Local:
       up, down: the slopes that drift sees; D⁺ and D⁻, or limited ones.
       links: the distances to the neighbours along every axis.
       bends: D⁺ − D⁻ along every axis, which noise sees.
+      tried: an action of each player that is a candidate beside the samples; with the actions of the last step
+        among them a sampled policy never gets worse, and policy iteration cannot cycle.
     """
 
     problem: Problem
@@ -141,6 +54,7 @@ class Local:
     down: tuple[jax.Array, ...]
     bends: tuple[jax.Array, ...]
     links: tuple[stencil.Links, ...]
+    tried: tuple[Action, Action] | None = None
 
     def gain(self, axis: int, f: Any, a: Any) -> Any:
         """[(e + h⁻ f) D⁺ − (e − h⁺ f) D⁻]/(h⁺ + h⁻); with other slopes f⁺ P⁺ + f⁻ P⁻ + a (D⁺ − D⁻)/(h⁺ + h⁻)."""
@@ -265,7 +179,10 @@ def _sampled(here: Local, player: Player, objective: Callable, weight: int) -> A
     best = enumerate_actions(objective, points, player.sign, weight=weight)
     if isinstance(player.choices, Finite):
         return best
-    return refine(objective, best, sets.spacing(player.choices, SAMPLES), _projection(player.choices), player.sign)
+    project = _projection(player.choices)
+    if here.tried is not None:
+        best = best_of(objective, [project(here.tried[0 if player.sign > 0 else 1])], player.sign, best)
+    return refine(objective, best, sets.spacing(player.choices, SAMPLES), project, player.sign)
 
 
 def _projection(choices: Box | Ball) -> Callable[[Action], Action]:
@@ -288,27 +205,36 @@ def _any_action(choices: AdmissibleSet) -> Action:
 
 
 def _exact(here: Local, player: Player, join: Callable) -> Action:
-    """The exact optimum over a box or a ball; see ``minimisers`` for why the candidates suffice."""
+    """The exact optimum over a box or a ball; see ``piecewise`` for why the candidates suffice."""
     choices = player.choices
     assert isinstance(choices, (Box, Ball))
     zero = [jnp.zeros((), here.dtype)] * choices.dim
-    linear, square, pieces = [], [], []
-    for j in range(choices.dim):
-        b, slopes = jax.jvp(
-            lambda s, j=j: _driven(here, player, join, zero, j, s), (zero[0],), (jnp.ones_like(zero[0]),)
-        )
-        slope, bend = _cost_coefficients(here, player, join, zero, j)
-        linear.append(slope)
-        square.append(bend)
-        pieces.append([_kinked(here, join(zero), i, b[i], slopes[i]) for i in player.driven[j]])
-    if isinstance(choices, Ball):
-        return kinked_ball(player.sign, choices.radius, linear, [p[0] if p else None for p in pieces])
-    return [
-        piecewise_input(
-            player.sign, choices.lo[j], choices.hi[j], linear[j], square[j], pieces[j], curved=player.curved[j]
-        )
-        for j in range(choices.dim)
+    one = jnp.ones((), here.dtype)
+    linear, square = zip(*(_cost_coefficients(here, player, join, zero, j) for j in range(choices.dim)), strict=True)
+    moves = [
+        jax.jvp(lambda s, j=j: _driven(here, player, join, zero, j, s), (zero[0],), (one,)) for j in range(choices.dim)
     ]
+
+    def piece(i: int, group: Sequence[int]) -> Kinked:
+        offset = next(moves[j][0][i] for j in group if i in player.driven[j])
+        slopes = [moves[j][1].get(i, zero[0]) for j in group]
+        return _kinked(here, join(zero), i, offset, slopes[0] if len(group) == 1 else slopes)
+
+    if isinstance(choices, Ball):
+        single = [[piece(i, [j]) for i in player.driven[j]] for j in range(choices.dim)]
+        return kinked_ball(player.sign, choices.radius, linear, [p[0] if p else None for p in single])
+    action = list(zero)
+    for group in player.groups:
+        pieces = [piece(i, group) for i in shared(player.driven, group)]
+        lo, hi, slope, bend = ([each[j] for j in group] for each in (choices.lo, choices.hi, linear, square))
+        curved = any(player.curved[j] for j in group)
+        if len(group) == 1:
+            found = [piecewise_input(player.sign, lo[0], hi[0], slope[0], bend[0], pieces, curved=curved)]
+        else:
+            found = piecewise_pair(player.sign, lo, hi, slope, bend, pieces, curved=curved)
+        for j, u in zip(group, found, strict=True):
+            action[j] = u
+    return action
 
 
 def _driven(here: Local, player: Player, join: Callable, zero: Action, j: int, s: Any) -> dict[int, Any]:

@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax import bellman, certificates, hamiltonian, relaxation
+from hjbjax import bellman, certificates, hamiltonian, players, relaxation
 from hjbjax.bellman import Conditions, Correction, Greedy
 from hjbjax.certificates import Certificate, Gap
 from hjbjax.grid import Grid
@@ -143,7 +143,9 @@ def advance(task: Task, state: State, start: Any) -> State:
     if isinstance(task.scheme, Limited):
         delta = jnp.where(state.step < FULL_STEPS, 1.0, 0.5).astype(delta.dtype) * delta
     value = task.rules.impose(state.value + delta)
-    policy, measured = _look(task, value, moved=jnp.max(jnp.abs(jnp.where(task.counted, value - state.value, 0))))
+    policy, measured = _look(
+        task, value, state.policy, moved=jnp.max(jnp.abs(jnp.where(task.counted, value - state.value, 0)))
+    )
     measured = dataclasses.replace(measured, error=jnp.where(_unmeasured(task, state), jnp.inf, measured.error))
     measures = jnp.stack([measured.error, measured.residual])
     since = jnp.where(jnp.any(measures < state.best), 0, state.since_best + 1)
@@ -160,9 +162,9 @@ def _unmeasured(task: Task, state: State) -> Any:
     return (state.step < 0) & (task.certificate in (Certificate.NONE, Certificate.RESIDUAL))
 
 
-def _look(task: Task, value: jax.Array, moved: jax.Array) -> tuple[Greedy, Gap]:
+def _look(task: Task, value: jax.Array, incumbent: Greedy, moved: jax.Array) -> tuple[Greedy, Gap]:
     problem, grid, scheme = task.problem, task.grid, task.scheme
-    policy = bellman.greedy(problem, grid, value, task.rules.held, scheme=scheme)
+    policy = bellman.greedy(problem, grid, value, task.rules.held, scheme=scheme, incumbent=incumbent)
     equation = bellman.correction(problem, grid, value, policy, task.rules, scheme=scheme)
     measured = certificates.gap(
         task.certificate,
@@ -227,7 +229,7 @@ def rest_nodes(problem: Problem, grid: Grid, *, scheme: Scheme, dtype: Any) -> t
 
     Rest is up to rounding, since sin π is not zero in floating point. At V = 0 the Hamiltonian is the cost.
     """
-    how = hamiltonian.setting(problem, grid.ndim, dtype)
+    how = players.setting(problem, grid.ndim, dtype)
     nowhere = hamiltonian.local(problem, grid, jnp.zeros(grid.shape, dtype), scheme=scheme)
     least = hamiltonian.optimise(nowhere, how)[0]
     effort = hamiltonian.optimise(hamiltonian.at_rest(problem, grid, scheme=scheme, dtype=dtype), how)[0]

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax import bellman, checks, hamiltonian, iteration, proper
+from hjbjax import bellman, checks, iteration, players, proper
 from hjbjax.certificates import Certificate
 from hjbjax.grid import Grid
 from hjbjax.iteration import Method, Nested, PolicyIteration, Task, ValueIteration
@@ -103,7 +103,7 @@ class Verdict:
 
 def judge(problem: Problem, grid: Grid, dtype: Any) -> Verdict:
     """Read the verdict from the problem's structure; a traced discount is taken for positive."""
-    how = hamiltonian.setting(problem, grid.ndim, dtype)
+    how = players.setting(problem, grid.ndim, dtype)
     constrained = problem.stopping_cost is not None or problem.running_max is not None
     if may_be_positive(problem.discount):
         return Verdict(Certificate.ADDITIVE, how.exact, may_rest=False)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax import certificates, hamiltonian
+from hjbjax import certificates, hamiltonian, players
 from hjbjax.certificates import Certificate
 from hjbjax.grid import Grid
 from hjbjax.iteration import Method, Nested, PolicyIteration, State, Task
@@ -87,7 +87,7 @@ def assemble(task: Task, state: State, verdict: Verdict) -> Solution:
 @jax.jit
 def _gap_at(task: Task, value: jax.Array) -> tuple[jax.Array, jax.Array]:
     """max over the nodes of min max − max min, and the size of H and of the cost, at one value function."""
-    how = hamiltonian.setting(task.problem, task.grid.ndim, value.dtype)
+    how = players.setting(task.problem, task.grid.ndim, value.dtype)
     here = hamiltonian.local(task.problem, task.grid, value, scheme=task.scheme)
     upper = hamiltonian.optimise(here, how, isaacs="upper")[0]
     lower = hamiltonian.optimise(here, how, isaacs="lower")[0]

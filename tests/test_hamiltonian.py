@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from systems import SEEDS, random_game, random_grid, random_problem, random_sigma
 
-from hjbjax import chain, hamiltonian
+from hjbjax import chain, hamiltonian, players
 from hjbjax.grid import Grid
 from hjbjax.problem import Problem
 from hjbjax.pytree import node
@@ -82,7 +82,7 @@ class Coupled:
 
 @functools.partial(jax.jit, static_argnames="scheme")
 def best_and_scan(problem, grid, value, scan, scheme):
-    how = hamiltonian.setting(problem, grid.ndim, value.dtype)
+    how = players.setting(problem, grid.ndim, value.dtype)
     assert how.exact
     here = hamiltonian.local(problem, grid, value, scheme=scheme)
     best, u, _ = hamiltonian.optimise(here, how)
@@ -141,7 +141,9 @@ def test_a_ball_is_minimised_exactly(kind, scheme, seed):
         (lambda x, u: x + u, lambda x, u: u @ u, Box([-1.0] * 2, [1.0] * 2), True),
         (lambda x, u: x + u, None, Ball(1.0, 2), True),
         (lambda x, u: x + u, lambda x, u: u @ u, Ball(1.0, 2), False),
-        (lambda x, u: x * u[0] + u[1], None, Box([-1.0] * 2, [1.0] * 2), False),  # both inputs drive both components
+        (lambda x, u: x * u[0] + u[1], None, Box([-1.0] * 2, [1.0] * 2), True),  # both inputs drive both components
+        (lambda x, u: x * u[0] + u[1] - u[2], None, Box([-1.0] * 3, [1.0] * 3), False),  # three do
+        (lambda x, u: x * u[0] + u[1], None, Ball(1.0, 2), False),
         (lambda x, u: x + u[0] ** 2, None, UNIT, False),
         (lambda x, u: x + jnp.sin(u[0]), None, UNIT, False),
         (lambda x, u: x + u, lambda x, u: u[0] * u[1], Box([-1.0] * 2, [1.0] * 2), False),
@@ -151,15 +153,15 @@ def test_a_ball_is_minimised_exactly(kind, scheme, seed):
     ],
 )
 def test_what_is_exact_is_read_from_the_functions(drift, cost, controls, exact):
-    how = hamiltonian.setting(Problem(drift, cost, controls, discount=1.0), 2, np.float64)
+    how = players.setting(Problem(drift, cost, controls, discount=1.0), 2, np.float64)
     assert how.exact == exact
 
 
 def test_noise_that_depends_on_the_control_is_not_exact():
     steered = Problem(lambda x, u: u, None, UNIT, noise=lambda x, u: u, discount=1.0)
     given_by_state = Problem(lambda x, u: u, None, UNIT, noise=lambda x, u: x, discount=1.0)
-    assert not hamiltonian.setting(steered, 1, np.float64).exact
-    assert hamiltonian.setting(given_by_state, 1, np.float64).exact
+    assert not players.setting(steered, 1, np.float64).exact
+    assert players.setting(given_by_state, 1, np.float64).exact
 
 
 @pytest.mark.parametrize("scheme", SCHEMES, ids=["plain", "central"])
@@ -178,12 +180,12 @@ def test_samples_and_search_come_close_where_the_minimum_is_not_exact(scheme, se
 @functools.partial(jax.jit, static_argnames="scheme")
 def sampled_and_scan(problem, grid, value, scheme):
     here = hamiltonian.local(problem, grid, value, scheme=scheme)
-    best = hamiltonian.optimise(here, hamiltonian.setting(problem, grid.ndim, value.dtype))[0]
+    best = hamiltonian.optimise(here, players.setting(problem, grid.ndim, value.dtype))[0]
 
     def lowest(points):
         return jnp.min(jax.lax.map(lambda point: here.at(list(point), []), points), axis=0)
 
-    return best, lowest(problem.controls.grid(81).points), lowest(samples(problem.controls, hamiltonian.SAMPLES))
+    return best, lowest(problem.controls.grid(81).points), lowest(samples(problem.controls, players.SAMPLES))
 
 
 # --- finite sets and games ---
@@ -192,7 +194,7 @@ def sampled_and_scan(problem, grid, value, scheme):
 @functools.partial(jax.jit, static_argnames=("scheme", "isaacs"))
 def optimum(problem, grid, value, scheme, isaacs=None):
     here = hamiltonian.local(problem, grid, value, scheme=scheme)
-    return hamiltonian.optimise(here, hamiltonian.setting(problem, grid.ndim, value.dtype), isaacs=isaacs)
+    return hamiltonian.optimise(here, players.setting(problem, grid.ndim, value.dtype), isaacs=isaacs)
 
 
 @functools.partial(jax.jit, static_argnames="scheme")
@@ -297,7 +299,7 @@ def test_a_squared_difference_has_a_gap_everywhere(slope):
 )
 def test_players_that_do_not_touch_each_other_are_told(drift, cost, noise, decoupled):
     problem = Problem(drift, cost, UNIT, disturbances=UNIT, noise=noise, discount=1.0)
-    how = hamiltonian.setting(problem, 2, np.float64)
+    how = players.setting(problem, 2, np.float64)
     assert how.decoupled == decoupled
     assert how.disturbance_costs == (cost is not None)
 
@@ -333,7 +335,7 @@ def test_one_player_at_a_time():
 def test_a_reply_meets_the_others_action():
     problem = Problem(lambda x, u, d: 0 * x, lambda x, u, d: u[0] * d[0], UNIT, disturbances=UNIT, discount=1.0)
     grid = Grid([0.0], [1.0], (3,))
-    how = hamiltonian.setting(problem, 1, np.float64)
+    how = players.setting(problem, 1, np.float64)
     here = hamiltonian.local(problem, grid, jnp.zeros(3), scheme=Upwind())
     fixed = [jnp.array([-1.0, 0.5, 1.0])]
     value, action = hamiltonian.best_response(here, how.disturbance, lambda d: (fixed, d))

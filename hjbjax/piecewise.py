@@ -1,0 +1,221 @@
+"""Exact minima of a convex or concave cost plus piecewise linear gains, over one input, two, or a ball.
+
+Under upwinding the Hamiltonian is such a function of the control wherever the drift is affine in it and the cost
+separable and quadratic: each drift component contributes a gain with a kink where it changes sign. ``sign`` is +1 to
+minimise and −1 to maximise; all numbers are per-node scalars.
+"""
+
+import itertools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+
+from hjbjax.minimisers import Action, better, pick
+
+
+class Kinked:
+    """A piecewise linear function gain(f) of one drift component f = offset + slope·u, with its kinks in order.
+
+    ``derivatives`` holds the slope of the gain between consecutive kinks: one more than there are kinks. ``slope`` is
+    a number a node, or one for each of two inputs.
+    """
+
+    def __init__(self, gain: Callable, offset: Any, slope: Any, kinks: Sequence[Any], derivatives: Sequence[Any]):
+        self.gain, self.offset, self.slope = gain, offset, slope
+        self.kinks, self.derivatives = tuple(kinks), tuple(derivatives)
+
+    def derivative(self, f: Any) -> Any:
+        """The slope of the gain at f; at a kink the one above it."""
+        result = self.derivatives[0]
+        for kink, above in zip(self.kinks, self.derivatives[1:], strict=True):
+            result = jnp.where(f >= kink, above, result)
+        return result
+
+    def on_line(self, point: Sequence[Any], direction: Sequence[Any]) -> "Kinked":
+        """The same along point + t · direction, as a function of one input t."""
+        at, along = (sum(g * c for g, c in zip(self.slope, vector, strict=True)) for vector in (point, direction))
+        return Kinked(self.gain, self.offset + at, along, self.kinks, self.derivatives)
+
+
+def piecewise_input(
+    sign: int, lo: Any, hi: Any, linear: Any, square: Any, pieces: Sequence[Kinked], *, curved: bool
+) -> Any:
+    """The exact optimum over one input u ∈ [lo, hi] of  l u + q u² + Σ_i gain_i(b_i + G_i u).
+
+    Each gain is linear between its kinks, so the optimum is an end, a kink, or the stationary point of a piece
+    clipped to [lo, hi]; all are tried. Concave pieces and G_i = 0 need no special care: every candidate is
+    admissible and is judged by its own value.
+
+    Args:
+      sign: +1 to minimise, −1 to maximise.
+      lo, hi: the bounds of the input.
+      linear, square: l and q, per-node scalars.
+      pieces: the gains that this input drives.
+      curved: whether q may differ from zero.
+    """
+
+    def total(u):
+        value = linear * u + square * u * u if curved else linear * u
+        return sum((piece.gain(piece.offset + piece.slope * u) for piece in pieces), start=value)
+
+    candidates = [lo, hi]
+    slopes = []
+    for index, piece in enumerate(pieces):
+        for position, kink in enumerate(piece.kinks):
+            moving = piece.slope != 0
+            at = jnp.clip((kink - piece.offset) / jnp.where(moving, piece.slope, 1), lo, hi)
+            at = jnp.where(moving, at, lo)
+            candidates.append(at)
+            others = sum(
+                (
+                    other.slope * other.derivative(other.offset + other.slope * at)
+                    for k, other in enumerate(pieces)
+                    if k != index
+                ),
+                start=linear,
+            )
+            slopes += [others + piece.slope * d for d in piece.derivatives[position : position + 2]]
+    if curved:
+        for slope in slopes or [linear]:
+            stationary = -slope / (2 * jnp.where(square == 0, 1, square))
+            candidates.append(jnp.where(square == 0, lo, jnp.clip(stationary, lo, hi)))
+    best_u, best_value = jnp.asarray(candidates[0]), total(candidates[0])
+    for u in candidates[1:]:
+        value = total(u)
+        wins = better(sign, value, best_value)
+        best_u, best_value = jnp.where(wins, u, best_u), jnp.where(wins, value, best_value)
+    return best_u
+
+
+def piecewise_pair(
+    sign: int,
+    lo: Sequence[Any],
+    hi: Sequence[Any],
+    linear: Sequence[Any],
+    square: Sequence[Any],
+    pieces: Sequence[Kinked],
+    *,
+    curved: bool,
+) -> list[Any]:
+    """The exact optimum over two inputs of  l·u + q₁u₁² + q₂u₂² + Σ_i gain_i(b_i + G_i·u)  in a box.
+
+    The lines on which a gain has its kink cut the box into cells, in each of which the objective is one quadratic.
+    Its optimum in a cell is its stationary point, or lies on the boundary: on a side of the box or on a line, where
+    the problem is one of a single input. All are tried; every candidate is admissible and judged by its own value.
+
+    Args:
+      sign: +1 to minimise, −1 to maximise.
+      lo, hi: the bounds of the two inputs.
+      linear, square: l and q for both, per-node scalars.
+      pieces: the gains; their slopes are pairs.
+      curved: whether a q may differ from zero.
+    """
+
+    def clipped(u: Sequence[Any]) -> list[Any]:
+        return [jnp.clip(v, low, high) for v, low, high in zip(u, lo, hi, strict=True)]
+
+    def total(u: Sequence[Any]) -> Any:
+        terms = [b * v + c * v * v if curved else b * v for b, c, v in zip(linear, square, u, strict=True)]
+        return sum(
+            (p.gain(p.offset + p.slope[0] * u[0] + p.slope[1] * u[1]) for p in pieces), start=terms[0] + terms[1]
+        )
+
+    def best_on_line(point: Sequence[Any], direction: Sequence[Any], ends: tuple[Any, Any], others: Any) -> list[Any]:
+        slope = sum((b + 2 * c * x) * v for b, c, x, v in zip(linear, square, point, direction, strict=True))
+        bend = sum(c * v * v for c, v in zip(square, direction, strict=True))
+        restricted = [piece.on_line(point, direction) for piece in others]
+        t = piecewise_input(sign, *ends, slope, bend, restricted, curved=curved)
+        return clipped([x + t * v for x, v in zip(point, direction, strict=True)])
+
+    candidates = [best_on_line((0.0, bound), (1.0, 0.0), (lo[0], hi[0]), pieces) for bound in (lo[1], hi[1])] + [
+        best_on_line((bound, 0.0), (0.0, 1.0), (lo[1], hi[1]), pieces) for bound in (lo[0], hi[0])
+    ]
+    for index, piece in enumerate(pieces):
+        others = [other for k, other in enumerate(pieces) if k != index]
+        for kink in piece.kinks:
+            point, direction = _kink_line(piece, kink)
+            candidates.append(best_on_line(point, direction, _within(point, direction, lo, hi), others))
+    if curved:
+        for choice in itertools.product(*(piece.derivatives for piece in pieces)):
+            slopes = [
+                b + sum(piece.slope[j] * d for piece, d in zip(pieces, choice, strict=True))
+                for j, b in enumerate(linear)
+            ]
+            bent = [jnp.where(c == 0, 1, c) for c in square]
+            candidates.append(clipped([-s / (2 * c) for s, c in zip(slopes, bent, strict=True)]))
+    best_u, best_value = candidates[0], total(candidates[0])
+    for u in candidates[1:]:
+        value = total(u)
+        wins = better(sign, value, best_value)
+        best_u, best_value = (
+            [jnp.where(wins, new, old) for new, old in zip(u, best_u, strict=True)],
+            jnp.where(wins, value, best_value),
+        )
+    return best_u
+
+
+def _kink_line(piece: Kinked, kink: Any) -> tuple[list[Any], list[Any]]:
+    """A point and a unit direction of the line b + G·u = kink; the origin and no direction where G = 0."""
+    g1, g2 = piece.slope
+    length = jnp.sqrt(g1 * g1 + g2 * g2)
+    there, safe = length > 0, jnp.where(length > 0, length, 1)
+    g1, g2 = g1 / safe, g2 / safe
+    away = jnp.where(there, (kink - piece.offset) / safe, 0)
+    return [away * g1, away * g2], [-g2, g1]
+
+
+def _within(point: Sequence[Any], direction: Sequence[Any], lo: Sequence[Any], hi: Sequence[Any]) -> tuple[Any, Any]:
+    """The range of t in which point + t · direction lies in the box; a line that misses the box gives one t."""
+    first: Any = -jnp.inf
+    last: Any = jnp.inf
+    for x, v, low, high in zip(point, direction, lo, hi, strict=True):
+        moves = v != 0
+        ends = [(bound - x) / jnp.where(moves, v, 1) for bound in (low, high)]
+        first = jnp.maximum(first, jnp.where(moves, jnp.minimum(*ends), -jnp.inf))
+        last = jnp.minimum(last, jnp.where(moves, jnp.maximum(*ends), jnp.inf))
+    first = jnp.where(jnp.isfinite(first), first, 0)
+    return first, jnp.maximum(first, jnp.where(jnp.isfinite(last), last, 0))
+
+
+def ball_directions(gradients: Sequence[Any], radius: Any, sign: int) -> Action:
+    """The optimum of g·u over |u| ≤ radius: −sign · radius · g/|g|; the centre where g = 0."""
+    norm = jnp.sqrt(sum(g * g for g in gradients))
+    scale = -sign * radius / jnp.where(norm == 0, 1, norm)
+    return [scale * g for g in gradients]
+
+
+def kinked_ball(sign: int, radius: Any, linear: Sequence[Any], pieces: Sequence[Kinked | None]) -> Action:
+    """The exact optimum over |u| ≤ radius of Σ_j (l_j u_j + gain_j(b_j + G_j u_j)), one gain an input at most.
+
+    On each combination of pieces the objective is linear, so its optimum lies on the sphere, or where some
+    inputs sit at kinks and the others on the sphere that is left; all combinations are tried.
+    """
+
+    def total(action):
+        terms = [g * u for g, u in zip(linear, action, strict=True)]
+        terms += [p.gain(p.offset + p.slope * u) for p, u in zip(pieces, action, strict=True) if p is not None]
+        return sum(terms[1:], start=terms[0])
+
+    best = None
+    for choice in itertools.product(*(_branches(g, piece) for g, piece in zip(linear, pieces, strict=True))):
+        fixed = {j: u for j, (kind, u) in enumerate(choice) if kind == "kink"}
+        spent = sum((u * u for u in fixed.values()), start=jnp.zeros(()))
+        shrink = jnp.minimum(1, radius / jnp.sqrt(jnp.where(spent == 0, 1, spent))) if fixed else 1
+        left = jnp.sqrt(jnp.maximum(radius * radius - spent, 0))
+        free = ball_directions([g for kind, g in choice if kind == "slope"] or [jnp.zeros(())], left, sign)
+        moving = iter(free)
+        action = [shrink * fixed[j] if j in fixed else next(moving) for j in range(len(choice))]
+        challenger = (total(action), action)
+        best = challenger if best is None else pick(better(sign, challenger[0], best[0]), challenger, best)
+    assert best is not None
+    return best[1]
+
+
+def _branches(linear: Any, piece: Kinked | None) -> list[tuple[str, Any]]:
+    """What one input may do: follow the gradient of a piece, or sit at a kink."""
+    if piece is None:
+        return [("slope", linear)]
+    moving = piece.slope != 0
+    kinks = [jnp.where(moving, (k - piece.offset) / jnp.where(moving, piece.slope, 1), 0) for k in piece.kinks]
+    return [("slope", linear + piece.slope * d) for d in piece.derivatives] + [("kink", u) for u in kinks]

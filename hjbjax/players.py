@@ -1,0 +1,125 @@
+"""The two players: what each may do, and how the Hamiltonian depends on it, read from the problem's functions.
+
+The optimum over a player's actions is exact where the drift is affine in them, the cost separable and quadratic, the
+noise free of them, and no more than two inputs of a box drive a component together (none of a ball); see ``piecewise``.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+from hjbjax import structure
+from hjbjax.problem import Problem
+from hjbjax.sets import AdmissibleSet, Ball, Box, Finite
+
+SAMPLES = 33  # points of a continuum before refinement
+MOST_SHARED = 3  # components that two inputs may drive together: every combination of their pieces is tried
+
+
+@dataclasses.dataclass(frozen=True)
+class Player:
+    """What one player may do and how the Hamiltonian depends on it; static, known from the jaxpr.
+
+    Attributes:
+      choices: the admissible set, or None.
+      sign: +1 minimises, −1 maximises.
+      exact: whether the optimum is found exactly rather than by samples.
+      driven: for every input the drift components that it drives.
+      groups: the inputs by what they drive together; the groups drive disjoint sets of components.
+      curved: for every input whether the cost may hold its square.
+    """
+
+    choices: AdmissibleSet | None
+    sign: int
+    exact: bool
+    driven: tuple[tuple[int, ...], ...]
+    groups: tuple[tuple[int, ...], ...]
+    curved: tuple[bool, ...]
+
+    @property
+    def weight(self) -> int:
+        """About how many evaluations of H one optimisation takes."""
+        if self.choices is None:
+            return 1
+        if isinstance(self.choices, Finite):
+            return len(self.choices.points)
+        return 3 if self.exact else SAMPLES
+
+
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    """Both players and how they meet.
+
+    Attributes:
+      control, disturbance: the players.
+      decoupled: whether their choices do not touch each other; then the Isaacs condition holds.
+      disturbance_costs: whether the running cost depends on the disturbance.
+    """
+
+    control: Player
+    disturbance: Player
+    decoupled: bool
+    disturbance_costs: bool
+
+    @property
+    def exact(self) -> bool:
+        """Whether min (max) over the sets is exact, which certificates need."""
+        players = (self.control, self.disturbance)
+        return all(player.exact or isinstance(player.choices, (Finite, type(None))) for player in players)
+
+
+def setting(problem: Problem, n: int, dtype: Any) -> Setting:
+    """Read from the problem's functions how the Hamiltonian depends on each player."""
+    m = 0 if problem.controls is None else problem.controls.dim
+    k = 0 if problem.disturbances is None else problem.disturbances.dim
+    time = ((None, False),) * problem.time_dependent
+    game = ((k, True),) * problem.is_game
+    arguments = (*time, (n, False), (m, True), *game)
+    drift = structure.dependence(problem.drift, *arguments, dtype=dtype)
+    constant = structure.Dependence((structure.CONSTANT,))
+    cost = constant if problem.cost is None else structure.dependence(problem.cost, *arguments, dtype=dtype)
+    noise = structure.dependence(problem.noise, *arguments, dtype=dtype) if callable(problem.noise) else constant
+    inputs_u, inputs_d = range(m), range(m, m + k)
+    mine = _player(problem.controls, 1, inputs_u, drift, cost, noise)
+    theirs = _player(problem.disturbances, -1, inputs_d, drift, cost, noise)
+    separate = not set(drift.driven_by(inputs_u)) & set(drift.driven_by(inputs_d))
+    crossed = any(
+        entry is None or any(set(term) & set(inputs_u) and set(term) & set(inputs_d) for term in entry)
+        for entry in (*drift.entries, *cost.entries)
+    )
+    return Setting(mine, theirs, separate and not crossed and noise.is_constant, not cost.free_of(inputs_d))
+
+
+def _player(
+    choices: AdmissibleSet | None,
+    sign: int,
+    inputs: range,
+    drift: structure.Dependence,
+    cost: structure.Dependence,
+    noise: structure.Dependence,
+) -> Player:
+    driven = tuple(drift.driven_by([j]) for j in inputs)
+    curved = tuple(cost.has_square([j]) for j in inputs)
+    groups = _groups(driven)
+    suits = drift.affine_in(inputs) and cost.separable_quadratic_in(inputs) and noise.free_of(inputs)
+    if isinstance(choices, Box):
+        suits &= all(len(g) == 1 or (len(g) == 2 and len(shared(driven, g)) <= MOST_SHARED) for g in groups)
+    elif isinstance(choices, Ball):
+        apart = all(len(group) == 1 for group in groups) and all(len(components) <= 1 for components in driven)
+        suits &= choices.dim <= 3 and not any(curved) and apart
+    return Player(choices, sign, suits and isinstance(choices, (Box, Ball)), driven, groups, curved)
+
+
+def _groups(driven: tuple[tuple[int, ...], ...]) -> tuple[tuple[int, ...], ...]:
+    """The inputs in groups that drive no component together."""
+    groups: list[list[int]] = []
+    for j, components in enumerate(driven):
+        meets = [group for group in groups if set(shared(driven, group)) & set(components)]
+        joined = [*(k for group in meets for k in group), j]
+        groups = [group for group in groups if group not in meets] + [joined]
+    return tuple(tuple(sorted(group)) for group in sorted(groups))
+
+
+def shared(driven: tuple[tuple[int, ...], ...], group: Sequence[int]) -> tuple[int, ...]:
+    """The components that a group of inputs drives."""
+    return tuple(sorted({i for j in group for i in driven[j]}))

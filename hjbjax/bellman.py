@@ -30,7 +30,7 @@ class Conditions:
 
     Args:
       held: bool (*grid), where the value is given.
-      given: (*grid), the value there.
+      given: the value there, (*grid) or a number.
       stop: ψ at the nodes, or None.
       floor: g at the nodes, or None.
       ended: bool (*grid), the held nodes that are targets, where no action is taken any more.
@@ -82,10 +82,10 @@ def conditions(problem: Problem, grid: Grid, dtype: Any, t: Any = 0.0) -> Condit
         return jnp.broadcast_to(fields.scalar(ingredient, *problem.state_arguments(x, t), dtype=dtype), grid.shape)
 
     held = jnp.zeros(grid.shape, bool) if problem.target is None else at_nodes(problem.target) <= 0
-    given = jnp.zeros(grid.shape, dtype) if problem.exit_cost is None else at_nodes(problem.exit_cost)
+    given = jnp.zeros((), dtype) if problem.exit_cost is None else jnp.where(held, at_nodes(problem.exit_cost), 0)
     stop = None if problem.stopping_cost is None else at_nodes(problem.stopping_cost)
     floor = None if problem.running_max is None else at_nodes(problem.running_max)
-    return Conditions(held, jnp.where(held, given, 0), stop, floor, ended=held)
+    return Conditions(held, given, stop, floor, ended=held)
 
 
 def greedy(

@@ -142,7 +142,7 @@ def rates(
       dtype: the floating-point type of the rates.
       t: the time, if the problem depends on it.
     """
-    x = grid.components(dtype)
+    x, u, d = jax.lax.optimization_barrier((grid.components(dtype), u, d))  # or loops keep drift that u does not move
     f, a = drift(problem, x, u, d, t, dtype), diffusion(problem, x, u, d, t, dtype)
     table: dict[Offset, Any] = {}
     for axis, link in enumerate(links(problem, grid, subcell=scheme.subcell, dtype=dtype, t=t)):

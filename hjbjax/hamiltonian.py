@@ -21,7 +21,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax import chain, sets, stencil, subcell
+from hjbjax import chain, fields, sets, stencil, subcell
 from hjbjax.grid import Grid
 from hjbjax.minimisers import Action, best_of, enumerate_actions, refine
 from hjbjax.piecewise import Kinked, kinked_ball, piecewise_input, piecewise_pair
@@ -209,16 +209,18 @@ def _exact(here: Local, player: Player, join: Callable) -> Action:
     choices = player.choices
     assert isinstance(choices, (Box, Ball))
     zero = [jnp.zeros((), here.dtype)] * choices.dim
-    one = jnp.ones((), here.dtype)
-    linear, square = zip(*(_cost_coefficients(here, player, join, zero, j) for j in range(choices.dim)), strict=True)
-    moves = [
-        jax.jvp(lambda s, j=j: _driven(here, player, join, zero, j, s), (zero[0],), (one,)) for j in range(choices.dim)
+    u, d = join(zero)
+    arguments = here.problem.arguments(here.x, u, d, here.t)
+    offsets = chain.drift(here.problem, here.x, u, d, here.t, here.dtype)
+    slopes = [
+        fields.components(player.derivative(here.problem, here.problem.drift, j), *arguments, dtype=here.dtype)
+        for j in range(choices.dim)
     ]
+    linear, square = zip(*(_cost_coefficients(here, player, arguments, j) for j in range(choices.dim)), strict=True)
 
     def piece(i: int, group: Sequence[int]) -> Kinked:
-        offset = next(moves[j][0][i] for j in group if i in player.driven[j])
-        slopes = [moves[j][1].get(i, zero[0]) for j in group]
-        return _kinked(here, join(zero), i, offset, slopes[0] if len(group) == 1 else slopes)
+        slope = [slopes[j][i] for j in group]
+        return _kinked(here, (u, d), i, offsets[i], slope[0] if len(group) == 1 else slope)
 
     if isinstance(choices, Ball):
         single = [[piece(i, [j]) for i in player.driven[j]] for j in range(choices.dim)]
@@ -237,27 +239,16 @@ def _exact(here: Local, player: Player, join: Callable) -> Action:
     return action
 
 
-def _driven(here: Local, player: Player, join: Callable, zero: Action, j: int, s: Any) -> dict[int, Any]:
-    u, d = join([s if k == j else u for k, u in enumerate(zero)])
-    f = chain.drift(here.problem, here.x, u, d, here.t, here.dtype)
-    return {i: f[i] for i in player.driven[j]}
-
-
-def _cost_coefficients(here: Local, player: Player, join: Callable, zero: Action, j: int) -> tuple[Any, Any]:
+def _cost_coefficients(here: Local, player: Player, arguments: tuple, j: int) -> tuple[Any, Any]:
     """l_j and q_j of a cost l_j u + q_j u² + ... by differentiation at zero."""
-    one = jnp.ones_like(zero[0])
-
-    def cost(s):
-        u, d = join([s if k == j else u for k, u in enumerate(zero)])
-        return chain.running_cost(here.problem, here.x, u, d, here.t, here.dtype)
-
-    def slope(s):
-        return jax.jvp(cost, (s,), (one,))[1]
-
+    cost, none = here.problem.cost, jnp.zeros((), here.dtype)
+    if cost is None:
+        return none, none
+    slope = player.derivative(here.problem, cost, j)
+    linear = fields.scalar(slope, *arguments, dtype=here.dtype)
     if not player.curved[j]:
-        return slope(zero[0]), jnp.zeros_like(one)
-    linear, twice = jax.jvp(slope, (zero[0],), (one,))
-    return linear, twice / 2
+        return linear, none
+    return linear, fields.scalar(player.derivative(here.problem, slope, j), *arguments, dtype=here.dtype) / 2
 
 
 def _kinked(here: Local, base: tuple[Action, Action], axis: int, offset: Any, slope: Any) -> Kinked:

@@ -38,6 +38,12 @@ class Kinked:
         return Kinked(self.gain, self.offset + at, along, self.kinks, self.derivatives)
 
 
+def inverse(number: Any) -> Any:
+    """1/number, 0 for zero. Slopes vary along few axes, and a product is fused where a quotient fills an array."""
+    zero = number == 0
+    return jnp.where(zero, 0, 1 / jnp.where(zero, 1, number))
+
+
 def piecewise_input(
     sign: int, lo: Any, hi: Any, linear: Any, square: Any, pieces: Sequence[Kinked], *, curved: bool
 ) -> Any:
@@ -63,9 +69,7 @@ def piecewise_input(
     slopes = []
     for index, piece in enumerate(pieces):
         for position, kink in enumerate(piece.kinks):
-            moving = piece.slope != 0
-            at = jnp.clip((kink - piece.offset) / jnp.where(moving, piece.slope, 1), lo, hi)
-            at = jnp.where(moving, at, lo)
+            at = jnp.clip((kink - piece.offset) * inverse(piece.slope), lo, hi)
             candidates.append(at)
             others = sum(
                 (
@@ -78,8 +82,7 @@ def piecewise_input(
             slopes += [others + piece.slope * d for d in piece.derivatives[position : position + 2]]
     if curved:
         for slope in slopes or [linear]:
-            stationary = -slope / (2 * jnp.where(square == 0, 1, square))
-            candidates.append(jnp.where(square == 0, lo, jnp.clip(stationary, lo, hi)))
+            candidates.append(jnp.clip(-slope * inverse(2 * square), lo, hi))
     best_u, best_value = jnp.asarray(candidates[0]), total(candidates[0])
     for u in candidates[1:]:
         value = total(u)
@@ -142,8 +145,7 @@ def piecewise_pair(
                 b + sum(piece.slope[j] * d for piece, d in zip(pieces, choice, strict=True))
                 for j, b in enumerate(linear)
             ]
-            bent = [jnp.where(c == 0, 1, c) for c in square]
-            candidates.append(clipped([-s / (2 * c) for s, c in zip(slopes, bent, strict=True)]))
+            candidates.append(clipped([-s * inverse(2 * c) for s, c in zip(slopes, square, strict=True)]))
     best_u, best_value = candidates[0], total(candidates[0])
     for u in candidates[1:]:
         value = total(u)
@@ -158,10 +160,9 @@ def piecewise_pair(
 def _kink_line(piece: Kinked, kink: Any) -> tuple[list[Any], list[Any]]:
     """A point and a unit direction of the line b + G·u = kink; the origin and no direction where G = 0."""
     g1, g2 = piece.slope
-    length = jnp.sqrt(g1 * g1 + g2 * g2)
-    there, safe = length > 0, jnp.where(length > 0, length, 1)
-    g1, g2 = g1 / safe, g2 / safe
-    away = jnp.where(there, (kink - piece.offset) / safe, 0)
+    shrink = inverse(jnp.sqrt(g1 * g1 + g2 * g2))
+    g1, g2 = g1 * shrink, g2 * shrink
+    away = (kink - piece.offset) * shrink
     return [away * g1, away * g2], [-g2, g1]
 
 
@@ -171,7 +172,7 @@ def _within(point: Sequence[Any], direction: Sequence[Any], lo: Sequence[Any], h
     last: Any = jnp.inf
     for x, v, low, high in zip(point, direction, lo, hi, strict=True):
         moves = v != 0
-        ends = [(bound - x) / jnp.where(moves, v, 1) for bound in (low, high)]
+        ends = [(bound - x) * inverse(v) for bound in (low, high)]
         first = jnp.maximum(first, jnp.where(moves, jnp.minimum(*ends), -jnp.inf))
         last = jnp.minimum(last, jnp.where(moves, jnp.maximum(*ends), jnp.inf))
     first = jnp.where(jnp.isfinite(first), first, 0)

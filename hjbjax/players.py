@@ -5,8 +5,11 @@ noise free of them, and no more than two inputs of a box drive a component toget
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
+
+import jax
+import jax.numpy as jnp
 
 from hjbjax import structure
 from hjbjax.problem import Problem
@@ -35,6 +38,22 @@ class Player:
     driven: tuple[tuple[int, ...], ...]
     groups: tuple[tuple[int, ...], ...]
     curved: tuple[bool, ...]
+
+    def derivative(self, problem: Problem, function: Callable, j: int) -> Callable:
+        """∂/∂u_j of a function of the problem's arguments, itself one of one state: it varies only as it must."""
+        position = problem.time_dependent + (1 if self.sign > 0 else 2)
+
+        def along(*arguments: Any) -> Any:
+            action = jnp.asarray(arguments[position])
+            unit = jnp.zeros_like(action).at[j].set(1)
+
+            def moved(s: Any) -> Any:
+                result = function(*arguments[:position], action + s * unit, *arguments[position + 1 :])
+                return jnp.asarray(result, action.dtype)
+
+            return jax.jvp(moved, (jnp.zeros((), action.dtype),), (jnp.ones((), action.dtype),))[1]
+
+        return along
 
     @property
     def weight(self) -> int:

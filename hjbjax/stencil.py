@@ -39,15 +39,16 @@ def neighbour(values: jax.Array, grid: Grid, offset: tuple[int, ...], *, ghost: 
     for axis, step in enumerate(offset):
         if step == 0:
             continue
-        padding = [(0, 0, 0)] * grid.ndim
-        padding[axis] = (-step, step, 0)
-        moved = jax.lax.pad(values, jnp.zeros((), values.dtype), padding)
-        if grid.periodic[axis]:  # type: ignore[index]
-            other_end = 0 if step > 0 else grid.shape[axis] - 1
-            seam = jax.lax.slice_in_dim(values, other_end, other_end + 1, axis=axis)
-            values = jnp.where(outermost(grid, axis, step), seam, moved)
+        last = grid.shape[axis] - 1
+        end = last if (step > 0) != bool(grid.periodic[axis]) else 0  # type: ignore[index]
+        beyond = jax.lax.slice_in_dim(values, end, end + 1, axis=axis)
+        if not ghost and not grid.periodic[axis]:  # type: ignore[index]
+            beyond = jnp.zeros_like(beyond)
+        if step > 0:
+            parts = [jax.lax.slice_in_dim(values, 1, last + 1, axis=axis), beyond]
         else:
-            values = jnp.where(on_edge(grid, axis, step), values, moved) if ghost else moved
+            parts = [beyond, jax.lax.slice_in_dim(values, 0, last, axis=axis)]
+        values = jnp.concatenate(parts, axis=axis)  # fused, where a pad would fill an array
     return values
 
 

@@ -51,7 +51,7 @@ def _towards(equation: Correction, grid: Grid, axis: int, flips: list[jax.Array]
     up, down = (table[stencil.unit(grid, axis, step)] for step in (1, -1))
     flipped = flips[axis - 1] == 1 if axis else False
     if equation.weights.one_way:
-        return (_sheared(jnp.where(flipped, down - up, up - down), flips),)
+        return (_sheared((up - down) * jnp.where(flipped, -1, 1).astype(up.dtype), flips),)
     return _sheared(jnp.where(flipped, down, up), flips), _sheared(jnp.where(flipped, up, down), flips)
 
 

@@ -8,7 +8,10 @@ import importlib
 import sys
 from collections.abc import Sequence
 
-NAMES = {"accuracy": "errors, orders and seconds over the zoo's problems with known answers"}
+NAMES = {
+    "accuracy": "errors, orders and seconds over the zoo's problems with known answers",
+    "sweep": "node-controls per second of one sweep, against numba and the copy bandwidth",
+}
 
 
 def main(arguments: Sequence[str]) -> None:

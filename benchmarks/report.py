@@ -5,6 +5,7 @@ A measurement is a flat dictionary; ``stamped`` adds the machine, the versions a
 
 import datetime
 import importlib.metadata
+import importlib.util
 import json
 import math
 import os
@@ -116,6 +117,13 @@ def picture(
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=90)
+
+
+def without(module: str) -> str | None:
+    """Why a peer cannot be measured; ``None`` where it can."""
+    if importlib.util.find_spec(module) is not None:
+        return None
+    return f"{module} is not installed (pip install '.[bench]')"
 
 
 def attempt(measure: Callable[[], list[dict[str, Any]]], about: dict[str, Any]) -> list[dict[str, Any]]:

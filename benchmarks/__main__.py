@@ -11,6 +11,7 @@ from collections.abc import Sequence
 NAMES = {
     "accuracy": "errors, orders and seconds over the zoo's problems with known answers",
     "sweep": "node-controls per second of one sweep, against numba and the copy bandwidth",
+    "peers": "a certified solve beside QuantEcon, mdpsolver and a hand-written numba solver",
 }
 
 

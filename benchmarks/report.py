@@ -34,6 +34,7 @@ def environment() -> dict[str, Any]:
     return {
         "device": device.platform if device.platform == "cpu" else device.device_kind,
         "cores": os.cpu_count(),
+        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,  # processes that want a core, at the end
         "versions": versions,
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }

@@ -17,10 +17,11 @@ PAUSE = 0.02  # seconds between two candidates: the threads of some runtimes spi
 
 @dataclasses.dataclass(frozen=True)
 class Timing:
-    """Seconds of the first call, and of every later one."""
+    """Seconds of the first call and of every later one, and the processor's seconds of those on all cores."""
 
     first: float
     rounds: tuple[float, ...]
+    busy: tuple[float, ...]
 
     @property
     def seconds(self) -> float:
@@ -42,6 +43,7 @@ class Timing:
         return {
             "seconds": self.seconds,
             "fastest": min(self.rounds),
+            "cpu_seconds": median(self.busy),
             "compile_seconds": self.compile_seconds,
             "repeats": len(self.rounds),
         }
@@ -54,22 +56,35 @@ def timed(call: Callable[[], Any]) -> tuple[Any, float]:
     return result, time.perf_counter() - began
 
 
-def interleaved(candidates: Mapping[str, Callable[[], Any]], repeats: int) -> tuple[dict[str, Any], dict[str, Timing]]:
+def _nothing() -> None:
+    pass
+
+
+def interleaved(
+    candidates: Mapping[str, Callable[[], Any]], repeats: int, before: Mapping[str, Callable[[], Any]] | None = None
+) -> tuple[dict[str, Any], dict[str, Timing]]:
     """Calls every candidate once, then ``repeats`` rounds of all of them in turn.
 
     Args:
       candidates: by name, what to call.
       repeats: rounds after the first.
+      before: by name, what to call before a candidate, outside of its seconds.
 
     Returns:
       The last result and the timing of every candidate.
     """
     results: dict[str, Any] = {}
     seconds: dict[str, list[float]] = {name: [] for name in candidates}
+    busy: dict[str, list[float]] = {name: [] for name in candidates}
     for _ in range(1 + repeats):
         for name, call in candidates.items():
             results[name] = None  # before the next one is made: two of them may not fit
+            (before or {}).get(name, _nothing)()
+            began = time.process_time()
             results[name], took = timed(call)
+            busy[name].append(time.process_time() - began)
             seconds[name].append(took)
             time.sleep(PAUSE)
-    return results, {name: Timing(first, tuple(rest)) for name, (first, *rest) in seconds.items()}
+    return results, {
+        name: Timing(first, tuple(rest), tuple(busy[name][1:])) for name, (first, *rest) in seconds.items()
+    }

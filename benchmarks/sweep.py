@@ -21,6 +21,7 @@ import numpy as np
 
 import hjbjax as hjb
 from benchmarks import floors, questions
+from benchmarks.footprint import bytes_of
 from benchmarks.report import RESULTS, attempt, picture, stamped, table, without, write_json
 from benchmarks.timing import interleaved
 from hjbjax import bellman, driver, memory
@@ -223,9 +224,7 @@ def footprint(kernel: str, problem: Any, grid: hjb.Grid, dtype: Any = KIND) -> d
         lowered = improve.lower(*question, values)
     else:
         return {}
-    found = lowered.compile().memory_analysis()
-    total = found.argument_size_in_bytes + found.output_size_in_bytes + found.temp_size_in_bytes
-    per_node = (total - found.alias_size_in_bytes) / grid.size
+    per_node = bytes_of(lowered) / grid.size
     return {"bytes_per_node": per_node, "bytes_beyond": per_node - 2 * np.dtype(dtype).itemsize}
 
 

@@ -52,9 +52,9 @@ def by_number(nodes: int, counts: tuple[int, ...], repeats: int) -> list[dict[st
     for name, (solution, timing) in found.items():
         off = None if name == "exact" else float(np.max(np.abs(solution.value - limit)))
         count = None if name == "exact" else int(name)
-        rows.append(_row("number", solution, timing) | {"error": off, "controls": count})
-    sampled = rows[:-1]
-    return _with_exponent(sampled, "controls", 1.0) + rows[-1:]
+        minimum = "exact" if count is None else "sampled"
+        rows.append(_row("number", minimum, solution, timing) | {"error": off, "controls": count})
+    return _with_exponent(rows[:-1], "controls", 1.0) + rows[-1:]
 
 
 def by_error(sizes: tuple[int, ...], repeats: int) -> list[dict[str, Any]]:
@@ -69,14 +69,14 @@ def by_error(sizes: tuple[int, ...], repeats: int) -> list[dict[str, Any]]:
         for name, (solution, timing) in solved({"sampled": (sampled, grid), "exact": (problem, grid)}, repeats).items():
             error = float(np.max(np.abs(solution.value - exact)[mask]))
             count = nodes if name == "sampled" else None
-            rows.append(_row("error", solution, timing) | {"minimum": name, "error": error, "controls": count})
+            rows.append(_row("error", name, solution, timing) | {"error": error, "controls": count})
     states, inputs = grid.ndim, problem.controls.dim
     parts = [[row for row in rows if row["minimum"] == name] for name in ("sampled", "exact")]
     return [row for part in parts for row in _with_exponent(part, "error", -float(2 * states + inputs))]
 
 
-def _row(part: str, solution: hjb.Solution, timing: dict[str, Any]) -> dict[str, Any]:
-    about = {"part": part, "minimum": "sampled", "shape": list(solution.grid.shape), "nodes": solution.grid.size}
+def _row(part: str, minimum: str, solution: hjb.Solution, timing: dict[str, Any]) -> dict[str, Any]:
+    about = {"part": part, "minimum": minimum, "shape": list(solution.grid.shape), "nodes": solution.grid.size}
     return about | timing | {"steps": solution.steps, "status": solution.status.name, "tol": TOL}
 
 
@@ -103,5 +103,7 @@ def command(quick: bool, repeats: int | None, nodes: int | None, out: Path) -> N
     click.echo(table(rows, COLUMNS))
     rows = stamped(rows)
     write_json(out / "controls.json", rows)
-    picture(out / "controls.png", rows, panel="problem", line="minimum", x=("error", "controls"), y="seconds")
-    click.echo(f"{len(rows)} rows in {out / 'controls.json'}, the picture in {out / 'controls.png'}")
+    number, error = ([row for row in rows if row.get("part") == part] for part in ("number", "error"))
+    picture(out / "controls.png", number, panel="problem", line="minimum", x=("controls", "error"), y="seconds")
+    picture(out / "controls_error.png", error, panel="problem", line="minimum", x=("error",), y="seconds")
+    click.echo(f"{len(rows)} rows in {out / 'controls.json'}, pictures in {out}/controls*.png")

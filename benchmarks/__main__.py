@@ -17,6 +17,7 @@ NAMES = {
     "controls": "seconds against the number of controls and against the error: O(1/ε^{2n+m}) and less",
     "batch": "solve_batch of pendulums of different mass, against one after the other",
     "startup": "from process start to pictures, cold and with the compile cache",
+    "precision": "error against seconds: what second order is worth",
 }
 
 

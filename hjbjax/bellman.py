@@ -10,6 +10,7 @@ equation is linear: δ = s + Σ_o w_o δ(x + o) with weights w_o = c_o/(Q + β),
 where the constraint is the active branch. That correction is what every method solves, exactly or roughly.
 """
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -78,8 +79,6 @@ def conditions(problem: Problem, grid: Grid, dtype: Any, t: Any = 0.0) -> Condit
     x = grid.components(dtype)
 
     def at_nodes(ingredient):
-        if not callable(ingredient):
-            return jnp.full(grid.shape, ingredient, dtype)
         return jnp.broadcast_to(fields.scalar(ingredient, *problem.state_arguments(x, t), dtype=dtype), grid.shape)
 
     held = jnp.zeros(grid.shape, bool) if problem.target is None else at_nodes(problem.target) <= 0
@@ -127,7 +126,7 @@ def correction(
     t: Any = 0.0,
 ) -> Correction:
     """The linear equation for δ under one policy; the active branch of the constraints is chosen node by node."""
-    u, d = list(policy.controls), list(policy.disturbances) if problem.is_game else None
+    u, d = list(policy.controls), list(policy.disturbances)
     rates = chain.rates(problem, grid, u, d, scheme=scheme.chain, dtype=value.dtype, t=t)
     leaving = rates.total() + problem.discount
     fastest = jnp.max(leaving)
@@ -144,9 +143,8 @@ def correction(
     if scheme.subcell:  # what leads to a held node ends on the target's boundary, where nothing is to be corrected
         loose = ~rules.held
         jumps = zip(weights.offsets, weights.values, strict=True)
-        weights = Rates(
-            weights.offsets, tuple(jnp.where(stencil.neighbour(loose, grid, offset), w, 0) for offset, w in jumps)
-        )
+        cut = tuple(jnp.where(stencil.neighbour(loose, grid, offset), w, 0) for offset, w in jumps)
+        weights = dataclasses.replace(weights, values=cut)
     return Correction(source, weights)
 
 
@@ -158,6 +156,6 @@ def fastest_rate(problem: Problem, grid: Grid, *, scheme: Scheme, dtype: Any, t:
     result = jnp.zeros(grid.shape, dtype)
     for u in sets.probes(problem.controls, dtype):
         for d in sets.probes(problem.disturbances, dtype):
-            rates = chain.rates(problem, grid, u, d if problem.is_game else None, scheme=scheme.chain, dtype=dtype, t=t)
+            rates = chain.rates(problem, grid, u, d, scheme=scheme.chain, dtype=dtype, t=t)
             result = jnp.maximum(result, rates.total())
     return result

@@ -14,6 +14,7 @@ prints (13.3) without the "1 −"). Drift that points out of the box is zeroed, 
 and P. Dupuis, Numerical Methods for Stochastic Control Problems in Continuous Time.
 """
 
+import dataclasses
 import functools
 import itertools
 from typing import Any
@@ -33,17 +34,19 @@ from hjbjax.subcell import links
 Offset = tuple[int, ...]
 
 
-@node(static=("offsets",))
+@node(static=("offsets", "one_way"))
 class Rates:
     """The generator of the chain under one policy, matrix-free: (𝓛V)(x) = Σ_o c_o(x) (V(x + o) − V(x)).
 
     Args:
       offsets: the jumps o, each a tuple of −1, 0, 1, one entry an axis.
       values: for each offset the rates c_o ≥ 0 per unit time, shape (*grid); none leads out of the box.
+      one_way: whether of two opposite jumps at most one has a positive rate, as without noise.
     """
 
     offsets: tuple[Offset, ...]
     values: tuple[Any, ...]
+    one_way: bool = False
 
     def total(self) -> Any:
         """Q = Σ_o c_o, the rate at which the chain leaves each node, shape (*grid)."""
@@ -57,7 +60,7 @@ class Rates:
 
     def scaled(self, factor: Any) -> "Rates":
         """Every rate times ``factor``, shape (*grid) or a number."""
-        return Rates(self.offsets, tuple(factor * c for c in self.values))
+        return dataclasses.replace(self, values=tuple(factor * c for c in self.values))
 
     def inflow(self, grid: Grid) -> "Rates":
         """The off-diagonal part of the transposed generator: what flows into x from x + o, as rates."""
@@ -150,7 +153,7 @@ def rates(
         if i != j:
             _add_diagonal_jumps(table, entry, grid, i, j)
     values = tuple(jnp.broadcast_to(jnp.asarray(rate, dtype), grid.shape) for rate in table.values())
-    return Rates(tuple(table), values)
+    return Rates(tuple(table), values, one_way=problem.noise is None)
 
 
 def _inside(rate: Any, grid: Grid, axis: int, step: int) -> Any:
@@ -277,7 +280,7 @@ def _under_policy(problem: Problem, grid: Grid, policy: Any, disturbance: Any, s
     """The rates under a policy; zero on the target and where there is no action."""
     u, d, active = export.policies(problem, grid, policy, disturbance)
     active &= ~export.target(problem, grid, t)[0]
-    return _checked(problem, grid, u, d if problem.is_game else None, scheme, t, active)[0]
+    return _checked(problem, grid, u, d, scheme, t, active)[0]
 
 
 def _checked(

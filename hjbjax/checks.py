@@ -261,7 +261,7 @@ def _survey(problem: Problem, grid: Grid, actions: tuple[Any, Any], dtype: Any) 
     def body(carry, index_and_action):
         index, u, d = index_and_action
         here, u, d = jax.lax.optimization_barrier((x, u, d))  # or XLA keeps an array of all nodes per invariant
-        new = _of_action(problem, grid, here, list(u), list(d) if problem.is_game else None, dtype)
+        new = _of_action(problem, grid, here, list(u), list(d), dtype)
         new = {name: _count(bad, grid, index) for name, bad in new.items()}
         kept = {
             name: jax.tree.map(functools.partial(jnp.where, carry[name].count > 0), carry[name], new[name])
@@ -271,17 +271,13 @@ def _survey(problem: Problem, grid: Grid, actions: tuple[Any, Any], dtype: Any) 
 
     us, ds = (jnp.asarray(action, dtype) for action in actions)
     nothing = _Finding(*(jnp.zeros((), jnp.int64),) * 3)
-    names = jax.eval_shape(
-        lambda: _of_action(problem, grid, x, list(us[0]), list(ds[0]) if problem.is_game else None, dtype)
-    )
+    names = jax.eval_shape(lambda: _of_action(problem, grid, x, list(us[0]), list(ds[0]), dtype))
     carry, _ = jax.lax.scan(body, dict.fromkeys(names, nothing), (jnp.arange(len(us)), us, ds))
     return found | carry
 
 
 def _of_state(problem: Problem, ingredient: Any, x: list, dtype: Any) -> Any:
     """A function of the state alone, or a number, on per-node scalars."""
-    if not callable(ingredient):
-        return jnp.asarray(ingredient, dtype)
     return jnp.asarray(fields.scalar(ingredient, *problem.state_arguments(x, 0.0), dtype=dtype))
 
 

@@ -40,9 +40,8 @@ def target(problem: Problem, grid: Grid, t: float = 0.0) -> tuple[np.ndarray, np
         x = grid.components(np.float64)
         for ingredient, default in ((problem.target, 1.0), (problem.exit_cost, 0.0)):
             entry = default if ingredient is None else ingredient
-            if callable(entry):
-                entry = fields.scalar(entry, *problem.state_arguments(x, t), dtype=np.float64)
-            arrays.append(np.broadcast_to(np.asarray(entry, np.float64), grid.shape))
+            values = fields.scalar(entry, *problem.state_arguments(x, t), dtype=np.float64)
+            arrays.append(np.broadcast_to(values, grid.shape))
     return arrays[0] <= 0, arrays[1]
 
 

@@ -87,8 +87,10 @@ def components(function: Callable, *arguments: Any, dtype: Any) -> np.ndarray:
     return _lift(result, ARRAYS)
 
 
-def scalar(function: Callable, *arguments: Any, dtype: Any) -> Any:
-    """Like ``components`` for a function that returns a scalar: one per-node scalar."""
+def scalar(function: Any, *arguments: Any, dtype: Any) -> Any:
+    """Like ``components`` for a function that returns a scalar, or a number in its place: one per-node scalar."""
+    if not callable(function):
+        return jnp.asarray(function, dtype)
     entries = components(function, *arguments, dtype=dtype)
     if entries.shape != ():
         raise ValueError(f"a function returned shape {entries.shape}, expected a scalar ()")

@@ -157,10 +157,9 @@ class Local:
 
     def at(self, u: Action, d: Action) -> Any:
         """H(u, d) at every node, in cost per unit time."""
-        d_or_none = d if self.problem.is_game else None
-        f = chain.drift(self.problem, self.x, u, d_or_none, self.t, self.dtype)
-        a = chain.diffusion(self.problem, self.x, u, d_or_none, self.t, self.dtype)
-        total = chain.running_cost(self.problem, self.x, u, d_or_none, self.t, self.dtype)
+        f = chain.drift(self.problem, self.x, u, d, self.t, self.dtype)
+        a = chain.diffusion(self.problem, self.x, u, d, self.t, self.dtype)
+        total = chain.running_cost(self.problem, self.x, u, d, self.t, self.dtype)
         for axis in range(self.grid.ndim):
             total = total + self.gain(axis, f[axis], chain.along_axis(a, self.grid, axis))
         for (i, j), entry in a.items():
@@ -213,9 +212,8 @@ def _limited(problem: Problem, grid: Grid, x: list, differences: list, links: tu
     dtype = differences[0][0].dtype
     calm: list = [True] * grid.ndim
     for u, d in itertools.product(sets.probes(problem.controls, dtype), sets.probes(problem.disturbances, dtype)):
-        other = d if problem.is_game else None
-        f = chain.drift(problem, x, u, other, t, dtype)
-        a = chain.diffusion(problem, x, u, other, t, dtype)
+        f = chain.drift(problem, x, u, d, t, dtype)
+        a = chain.diffusion(problem, x, u, d, t, dtype)
         for axis, link in enumerate(links):
             left = chain.along_axis(a, grid, axis)
             calm[axis] &= left >= jnp.maximum(link.up, link.down) * jnp.abs(f[axis])
@@ -315,7 +313,7 @@ def _exact(here: Local, player: Player, join: Callable) -> Action:
 
 def _driven(here: Local, player: Player, join: Callable, zero: Action, j: int, s: Any) -> dict[int, Any]:
     u, d = join([s if k == j else u for k, u in enumerate(zero)])
-    f = chain.drift(here.problem, here.x, u, d if here.problem.is_game else None, here.t, here.dtype)
+    f = chain.drift(here.problem, here.x, u, d, here.t, here.dtype)
     return {i: f[i] for i in player.driven[j]}
 
 
@@ -325,7 +323,7 @@ def _cost_coefficients(here: Local, player: Player, join: Callable, zero: Action
 
     def cost(s):
         u, d = join([s if k == j else u for k, u in enumerate(zero)])
-        return chain.running_cost(here.problem, here.x, u, d if here.problem.is_game else None, here.t, here.dtype)
+        return chain.running_cost(here.problem, here.x, u, d, here.t, here.dtype)
 
     def slope(s):
         return jax.jvp(cost, (s,), (one,))[1]
@@ -338,7 +336,7 @@ def _cost_coefficients(here: Local, player: Player, join: Callable, zero: Action
 
 def _kinked(here: Local, base: tuple[Action, Action], axis: int, offset: Any, slope: Any) -> Kinked:
     u, d = base
-    a = chain.diffusion(here.problem, here.x, u, d if here.problem.is_game else None, here.t, here.dtype)
+    a = chain.diffusion(here.problem, here.x, u, d, here.t, here.dtype)
     left = chain.along_axis(a, here.grid, axis)
     up, down = here.up[axis], here.down[axis]
 

@@ -1,34 +1,25 @@
-"""Solving δ = s + Σ_o w_o δ(x + o): sweeps, Krylov, direct.
+"""Solving δ = s + Σ_o w_o δ(x + o): sweeps, Krylov, direct."""
 
-Gauss–Seidel runs as a wavefront. Under the star stencil the nodes on a hyperplane σ·i = const, σ ∈ {±1}^n, do
-not depend on each other. The arrays are sheared cyclically along the first axis, S[d, j] = X[(d − Σ_k σ_k j_k)
-mod n₀, j], so that such a hyperplane is one slice (several, folded), and a sweep is a ``scan`` over slices that
-carries the one just written. Reversing the scan reverses the order; 2^{n−1} shears give all 2^n orders. Jumps
-across the seam of a periodic axis other than the first lag by one order: they enter through the residual.
-"""
-
-import itertools
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax import stencil
+from hjbjax import stencil, wavefront
 from hjbjax.bellman import Correction
-from hjbjax.chain import Rates
 from hjbjax.grid import Grid
 from hjbjax.pytree import node
 
 
 @node(static=("count",))
 class Sweeps:
-    """Rough evaluation by ``count`` rounds of Gauss–Seidel, each a forward and a backward sweep in every order.
+    """Rough evaluation by Gauss–Seidel: in every order ``count`` times a forward and a backward sweep.
 
-    The work of a round is about that of 2^n relaxations of every node. Runs in float32 on the correction.
+    The work is about that of ``count`` 2^n relaxations of every node. Runs in float32 on the correction.
     """
 
-    count: int = 2
+    count: int = 3
 
 
 @node(static=("max_steps",))
@@ -83,69 +74,7 @@ def gauss_seidel(equation: Correction, grid: Grid, rounds: int) -> jax.Array:
     """Rounds of wavefront Gauss–Seidel from zero; damped Jacobi where diagonal jumps break the wavefront."""
     if any(sum(map(abs, offset)) > 1 for offset in equation.weights.offsets):
         return jacobi(equation, grid, 4 * rounds * 2**grid.ndim)
-
-    def one_round(_, delta):
-        for signs in itertools.product((1, -1), repeat=grid.ndim - 1):
-            delta = delta + _wavefront(left_over(equation, grid, delta), equation.weights, grid, signs)
-        return delta
-
-    return jax.lax.fori_loop(0, rounds, one_round, jnp.zeros_like(equation.source))
-
-
-def _wavefront(source: jax.Array, weights: Rates, grid: Grid, signs: tuple[int, ...]) -> jax.Array:
-    """One forward and one backward sweep from zero in one order; the seams of axes beyond the first are cut."""
-    table = dict(zip(weights.offsets, weights.values, strict=True))
-    moves = {offset: _shear(_cut_seam(w, grid, offset), signs) for offset, w in table.items()}
-    source = _shear(source, signs)
-    behind: list[tuple] = []
-    ahead: list[tuple] = []
-    # neighbours on the slice d − 1 and on the slice d + 1: (weights, roll within the slice)
-    for offset, w in moves.items():
-        axis = next(i for i, step in enumerate(offset) if step)
-        direction = offset[axis] * (1 if axis == 0 else signs[axis - 1])
-        (ahead if direction > 0 else behind).append((w, axis - 1, -offset[axis]))
-
-    def pull(group, rows, plane):
-        terms = [
-            row * (plane if axis < 0 else jnp.roll(plane, step, axis))
-            for (_, axis, step), row in zip(group, rows, strict=True)
-        ]
-        return sum(terms[1:], start=terms[0]) if terms else jnp.zeros_like(plane)
-
-    def sweep(done, coming, old, reverse):
-        following = jnp.roll(old, 1 if reverse else -1, axis=0)
-        rows = (source, tuple(w for w, *_ in done), tuple(w for w, *_ in coming), following)
-
-        def advance(previous, row):
-            s, done_row, coming_row, following = row
-            new = s + pull(done, done_row, previous) + pull(coming, coming_row, following)
-            return new, new
-
-        start = old[0] if reverse else old[-1]
-        return jax.lax.scan(advance, start, rows, reverse=reverse)[1]
-
-    first = sweep(behind, ahead, jnp.zeros_like(source), False)
-    return _shear(sweep(ahead, behind, first, True), tuple(-s for s in signs))
-
-
-def _cut_seam(w: jax.Array, grid: Grid, offset: tuple[int, ...]) -> jax.Array:
-    axis = next(i for i, step in enumerate(offset) if step)
-    if axis == 0 or not grid.periodic[axis]:  # type: ignore[index]
-        return w
-    edge = np.arange(grid.shape[axis]) == (grid.shape[axis] - 1 if offset[axis] > 0 else 0)
-    return jnp.where(edge.reshape([-1 if i == axis else 1 for i in range(grid.ndim)]), 0, w)
-
-
-def _shear(values: jax.Array, signs: tuple[int, ...]) -> jax.Array:
-    """S[d, j] = X[(d − Σ_k σ_k j_k) mod n₀, j]; undone by the opposite signs."""
-    if not signs:
-        return values
-    shift = sum(
-        sign * np.arange(count).reshape([-1 if i == k else 1 for i in range(len(signs))])
-        for k, (sign, count) in enumerate(zip(signs, values.shape[1:], strict=True))
-    )
-    rows = (np.arange(values.shape[0]).reshape((-1,) + (1,) * len(signs)) - shift) % values.shape[0]
-    return jnp.take_along_axis(values, jnp.asarray(rows), axis=0)
+    return wavefront.gauss_seidel(equation, grid, rounds)
 
 
 def krylov(method: Krylov, equation: Correction, grid: Grid) -> jax.Array:

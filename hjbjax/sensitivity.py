@@ -57,7 +57,7 @@ def _residual(task: Task, state: State, equation: Correction) -> jax.Array:
     u, d = list(policy.controls), list(policy.disturbances)
     rate = bellman.greedy(problem, grid, value, jax.lax.stop_gradient(task.rules.held), scheme=task.scheme).rate
     scheme = task.scheme.chain
-    total = chain.rates(problem, grid, u, d if problem.is_game else None, scheme=scheme, dtype=value.dtype).total()
+    total = chain.rates(problem, grid, u, d, scheme=scheme, dtype=value.dtype).total()
     pace = jax.lax.stop_gradient(total + problem.discount)
     phi = rate / jnp.where(pace > 0, pace, 1)
     bound = equation.weights.total() == 0  # rows of the constraints hold no weights

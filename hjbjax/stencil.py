@@ -15,12 +15,16 @@ import numpy as np
 from hjbjax.grid import Grid
 
 
+def outermost(grid: Grid, axis: int, step: int) -> np.ndarray:
+    """Which nodes are the last ones in direction ``step`` along ``axis``; broadcasts against the node axes."""
+    mask = np.zeros(grid.shape[axis], dtype=bool)
+    mask[-1 if step > 0 else 0] = True
+    return mask.reshape([-1 if i == axis else 1 for i in range(grid.ndim)])
+
+
 def on_edge(grid: Grid, axis: int, step: int) -> np.ndarray:
     """Which nodes have no neighbour in direction ``step`` along ``axis``; broadcasts against the node axes."""
-    mask = np.zeros(grid.shape[axis], dtype=bool)
-    if not grid.periodic[axis]:  # type: ignore[index]
-        mask[-1 if step > 0 else 0] = True
-    return mask.reshape([-1 if i == axis else 1 for i in range(grid.ndim)])
+    return outermost(grid, axis, step) & (not grid.periodic[axis])  # type: ignore[index]
 
 
 def neighbour(values: jax.Array, grid: Grid, offset: tuple[int, ...], *, ghost: bool = True) -> jax.Array:
@@ -39,14 +43,9 @@ def neighbour(values: jax.Array, grid: Grid, offset: tuple[int, ...], *, ghost: 
         padding[axis] = (-step, step, 0)
         moved = jax.lax.pad(values, jnp.zeros((), values.dtype), padding)
         if grid.periodic[axis]:  # type: ignore[index]
-            count = grid.shape[axis]
-            seam = (
-                jax.lax.slice_in_dim(values, 0, 1, axis=axis)
-                if step > 0
-                else (jax.lax.slice_in_dim(values, count - 1, count, axis=axis))
-            )
-            last = np.arange(count) == (count - 1 if step > 0 else 0)
-            values = jnp.where(last.reshape([-1 if i == axis else 1 for i in range(grid.ndim)]), seam, moved)
+            other_end = 0 if step > 0 else grid.shape[axis] - 1
+            seam = jax.lax.slice_in_dim(values, other_end, other_end + 1, axis=axis)
+            values = jnp.where(outermost(grid, axis, step), seam, moved)
         else:
             values = jnp.where(on_edge(grid, axis, step), values, moved) if ghost else moved
     return values

@@ -1,55 +1,25 @@
 """Sweeps, Krylov and direct solves of δ = s + Σ_o w_o δ(x + o) against dense linear algebra."""
 
 import functools
-import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from equations import LAYOUTS, ids, make_grid, random_equation
 from hypothesis import given, settings
 from systems import SEEDS
 
-from hjbjax import relaxation, stencil
+from hjbjax import relaxation
 from hjbjax.bellman import Correction
 from hjbjax.chain import Rates
-from hjbjax.grid import Grid
 from hjbjax.relaxation import Direct, Krylov, Sweeps
-
-SHAPES = {1: (9,), 2: (6, 5), 3: (4, 3, 5), 4: (3, 4, 2, 3)}
-LAYOUTS = [(n, flags) for n in (1, 2) for flags in itertools.product((False, True), repeat=n)]
-LAYOUTS += [(3, (False,) * 3), (3, (False, True, False)), (3, (False, False, True)), (3, (True, True, False))]
-LAYOUTS += [(4, (False,) * 4), (4, (True, False, True, False)), (4, (False, True, True, True))]
-ids = ["".join("p" if flag else "-" for flag in flags) for _, flags in LAYOUTS]
 
 
 @pytest.fixture(autouse=True, scope="module")
 def _float64():
     with jax.enable_x64(True):
         yield
-
-
-def make_grid(n, flags, shape=None):
-    return Grid([0.0] * n, [1.0] * n, shape or SHAPES[n], flags)
-
-
-def random_equation(rng, grid, leak=0.1, diagonal=False):
-    """Substochastic weights with a leak, some nodes held (no weights), and the dense matrix I − W."""
-    offsets = [stencil.unit(grid, axis, step) for axis in range(grid.ndim) for step in (1, -1)]
-    if diagonal:
-        offsets += [(1, 1), (-1, -1)]
-    weights = [rng.uniform(0, 1, grid.shape) * rng.choice([0.0, 1.0], grid.shape) for _ in offsets]
-    for offset, w in zip(offsets, weights, strict=True):
-        for axis, step in enumerate(offset):
-            if step:
-                w[np.broadcast_to(stencil.on_edge(grid, axis, step), grid.shape)] = 0
-    total = sum(weights)
-    scale = np.where(rng.random(grid.shape) < 0.1, 0, (1 - leak) / np.where(total > 0, total, 1))
-    weights = [w * scale for w in weights]
-    source = rng.normal(size=grid.shape)
-    dense = stencil.sparse(offsets, [-w for w in weights], np.ones(grid.shape), grid).toarray()
-    equation = Correction(jnp.asarray(source), Rates(tuple(offsets), tuple(map(jnp.asarray, weights))))
-    return equation, dense, np.linalg.solve(dense, source.ravel()).reshape(grid.shape)
 
 
 @functools.partial(jax.jit, static_argnames="rounds")
@@ -69,50 +39,6 @@ def test_rounds_of_sweeps_converge_to_the_dense_solve(n, flags, seed):
     left = (np.ravel(equation.source) - dense @ guess).reshape(grid.shape)
     found = relaxation.left_over(equation, grid, jnp.asarray(guess.reshape(grid.shape)))
     assert np.allclose(found, left, rtol=0, atol=1e-13 * np.max(np.abs(left)))
-
-
-def one_round(dense, source, grid, signs):
-    """Forward and backward through the folded hyperplanes by a loop: newest values, but old ones across the fold."""
-    number = np.arange(grid.size).reshape(grid.shape)
-    plane = sum(s * i for s, i in zip((1, *signs), np.indices(grid.shape), strict=True)) % grid.shape[0]
-    order, plane = np.argsort(plane.ravel(), kind="stable"), plane.ravel()
-    delta = np.zeros(number.size)
-    for pass_ in (order, order[::-1]):
-        old = delta.copy()
-        for here in pass_:
-            known = np.where(np.abs(plane - plane[here]) <= 1, delta, old)
-            delta[here] += source.ravel()[here] - dense[here] @ np.where(np.arange(delta.size) == here, delta, known)
-    return delta.reshape(grid.shape)
-
-
-@functools.partial(jax.jit, static_argnames="signs")
-def _wavefront(equation, grid, signs):
-    return relaxation._wavefront(equation.source, equation.weights, grid, signs)
-
-
-@pytest.mark.parametrize("shape", [(9,), (6, 5), (4, 7), (4, 3, 5), (3, 4, 2, 3)])
-@pytest.mark.parametrize("periodic", [False, True])
-@given(seed=SEEDS)
-@settings(max_examples=2)
-def test_the_wavefront_equals_a_loop_over_the_nodes(shape, periodic, seed):
-    """Every order of the sweep; only the first axis may be periodic, the seams of the others are cut."""
-    n = len(shape)
-    rng, grid = np.random.default_rng(seed), make_grid(n, (periodic,) + (False,) * (n - 1), shape)
-    equation, dense, _ = random_equation(rng, grid)
-    for signs in itertools.product((1, -1), repeat=n - 1):
-        expected = one_round(dense, np.asarray(equation.source), grid, signs)
-        assert np.allclose(_wavefront(equation, grid, signs), expected, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize(("n", "flags"), LAYOUTS, ids=ids)
-def test_shears_undo_each_other(n, flags):
-    values = jnp.asarray(np.random.default_rng(0).normal(size=SHAPES[n]))
-    for signs in itertools.product((1, -1), repeat=n - 1):
-        sheared = relaxation._shear(values, signs)
-        for index in np.ndindex(*values.shape):
-            plane = (index[0] + sum(s * i for s, i in zip(signs, index[1:], strict=True))) % values.shape[0]
-            assert sheared[(plane, *index[1:])] == values[index]
-        assert jnp.array_equal(relaxation._shear(sheared, tuple(-s for s in signs)), values)
 
 
 @functools.partial(jax.jit, static_argnames="method_type")

@@ -1,0 +1,130 @@
+"""Error against seconds: what a second-order scheme is worth, on the pendulum and on the double integrator.
+
+The pendulum (gain 1/m) has no exact value; errors are relative ones at the states of ``STATES``, against Limited() on
+a grid twice as fine as the finest measured. What the plain chain would need for an error that it does not reach is
+read off its fitted order and off the fitted growth of its seconds. On the double integrator (Kružkov) the exact value
+is known, hj_reachability's "very_high" marches beside us, and seconds are compared at equal mean error.
+
+Writes ``precision.json`` and ``precision.png``. Every number is from a second run; compiling stands apart.
+"""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+import hjbjax as hjb
+from benchmarks import accuracy
+from benchmarks.report import RESULTS, attempt, picture, stamped, table, write_json
+
+COLUMNS = ("problem", "scheme", "shape", "error", "seconds", "compile_seconds", "status")
+PLAIN, LIMITED = hjb.Upwind(central=False), hjb.Limited()
+STATES = ((0.5, 0.0), (np.pi / 4, 0.0), (1.5, -1.0), (2.8, 1.5), (-2.0, -2.0))
+PENDULUM, DOUBLE_INTEGRATOR = (50, 100, 200, 400), (21, 41, 81, 161, 321)
+LEVELS = 25  # errors at which seconds are compared
+TOL = 1e-4
+
+
+def pendulum(nodes: Sequence[int]) -> list[dict[str, Any]]:
+    """One row a scheme and grid; the error is the mean relative one at ``STATES``."""
+
+    def grid(count: int) -> Any:
+        return hjb.zoo.pendulum(shape=(count, count + 1))[1]
+
+    problem = hjb.zoo.pendulum()[0]
+    fine = hjb.solve(problem, grid(2 * max(nodes)), scheme=LIMITED, tol=TOL)
+    known = np.array([fine.value_at(state) for state in STATES])
+    rows = []
+    for scheme in (PLAIN, LIMITED):
+        study = hjb.convergence_study(problem, [grid(count) for count in nodes], fine, scheme=scheme, tol=TOL)
+        for row, solution in zip(study.rows, study.solutions, strict=True):
+            values = np.array([solution.value_at(state) for state in STATES])
+            relative = np.abs(values / known - 1)
+            label = {"problem": "pendulum", "code": "hjbjax", "scheme": _name(scheme), "tol": TOL}
+            rows.append(row | label | {"error": float(np.mean(relative)), "relative": relative.tolist()})
+    return rows
+
+
+def double_integrator(nodes: Sequence[int]) -> list[dict[str, Any]]:
+    """One row a code, scheme and grid; the error is the mean one on the inner half of the box."""
+    case = accuracy.Case("double-integrator", tuple(nodes), 0.5)
+    rows = []
+    for scheme in (PLAIN, LIMITED):
+        label = {"code": "hjbjax", "scheme": _name(scheme)}
+        rows += [label | row for row in accuracy.ours(case, nodes, scheme, TOL)]
+    theirs = accuracy.theirs(case, [count for count in nodes if count <= 161], TOL)
+    rows += [{"code": "hj_reachability", "scheme": "hj_reachability very_high"} | row for row in theirs]
+    return [row | {"problem": "double integrator", "error": row.get("mean_error")} for row in rows]
+
+
+def _name(scheme: Any) -> str:
+    return "Limited()" if isinstance(scheme, hjb.Limited) else "plain upwind"
+
+
+def would_need(rows: Sequence[dict[str, Any]], error: float) -> float:
+    """Seconds for an error that the rows do not reach, by their fitted order and growth of seconds."""
+    h, errors, seconds = (np.log([row[key] for row in rows]) for key in ("h", "error", "seconds"))
+    order, offset = np.polyfit(h, errors, 1)
+    growth, start = np.polyfit(h, seconds, 1)
+    return float(np.exp(start + growth * (math.log(error) - offset) / order))
+
+
+def advantage(rows: Sequence[dict[str, Any]], others: Sequence[dict[str, Any]]) -> tuple[float, float] | None:
+    """The smallest and largest ratio of the others' seconds to ours over the errors that both reach, log-linear."""
+
+    def curve(points: Sequence[dict[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
+        ordered = sorted((row["error"], row["seconds"]) for row in points)
+        return tuple(np.log(np.array(ordered)).T)  # type: ignore[return-value]
+
+    ours, theirs = curve(rows), curve(others)
+    low, high = max(ours[0][0], theirs[0][0]), min(ours[0][-1], theirs[0][-1])
+    if not low < high:
+        return None
+    at = np.linspace(low, high, LEVELS)
+    ratios = np.exp(np.interp(at, *theirs) - np.interp(at, *ours))
+    return float(ratios.min()), float(ratios.max())
+
+
+def verdicts(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """What the rows say, one sentence a figure."""
+
+    def of(problem: str, scheme: str) -> list[dict[str, Any]]:
+        return [
+            row for row in rows if (row.get("problem"), row.get("scheme")) == (problem, scheme) and row.get("error")
+        ]
+
+    said = []
+    plain, limited = of("pendulum", "plain upwind"), of("pendulum", "Limited()")
+    here = [row for row in limited if row["shape"][0] == 100]
+    if plain and here:
+        factor = would_need(plain, here[0]["error"]) / here[0]["seconds"]
+        said.append(
+            f"pendulum: Limited() on 100 x 101 is {here[0]['error']:.2%} off; by its fitted order and growth the plain "
+            f"scheme would need {factor:.3g} times its time (floor 50)"
+        )
+    ours = of("double integrator", "Limited()")
+    for scheme in ("plain upwind", "hj_reachability very_high"):
+        found = advantage(ours, others) if ours and (others := of("double integrator", scheme)) else None
+        if found:
+            said.append(f"double integrator: {scheme} takes {found[0]:.3g} to {found[1]:.3g} times our time (floor 1)")
+    return said
+
+
+@click.command()
+@click.option("--quick", is_flag=True, help="Coarse grids only.")
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Folder of the files.")
+def command(quick: bool, out: Path) -> None:
+    """Error against seconds, plain and second order, on the pendulum and the double integrator."""
+    about = {"benchmark": "precision", "dtype": "float64"}
+    rows = attempt(lambda: pendulum(PENDULUM[:2] if quick else PENDULUM), about)
+    rows += attempt(lambda: double_integrator(DOUBLE_INTEGRATOR[:2] if quick else DOUBLE_INTEGRATOR), about)
+    rows = stamped(rows)
+    click.echo(table(rows, COLUMNS))
+    for sentence in verdicts(rows):
+        click.echo(sentence)
+    write_json(out / "precision.json", rows)
+    picture(out / "precision.png", rows, panel="problem", line="scheme", x=("seconds",), y="error", across=2)
+    click.echo(f"{len(rows)} rows in {out / 'precision.json'}, the picture in {out / 'precision.png'}")

@@ -1,0 +1,104 @@
+"""Gauss–Seidel as a wavefront: δ(x) ← s(x) + Σ_o w_o(x) δ(x + o), node after node, a plane of nodes at a time.
+
+Under the star stencil the nodes on a hyperplane i₀ + i₁ + … = const do not depend on each other. The arrays are
+sheared cyclically along the first axis,
+
+    S[d, j] = X[(d − Σ_k j_k) mod n₀, j],
+
+so that such a hyperplane is one slice S[d] (several, folded); its neighbours stand in S[d − 1] and S[d + 1], one
+entry to the side for the axes beyond the first. A forward sweep goes through the slices upwards, a backward one
+downwards, and flipping axes beyond the first before shearing gives all 2ⁿ orders. What comes across the fold, or
+across the seam of a periodic axis, is as old as the last sweep.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from hjbjax import stencil
+from hjbjax.bellman import Correction
+from hjbjax.grid import Grid
+
+
+def gauss_seidel(equation: Correction, grid: Grid, rounds: int) -> jax.Array:
+    """Sweeps from zero, in every order ``rounds`` times forward and backward; for jumps along the axes alone.
+
+    The orders are one loop, so that one program serves them all and its operands are arrays in memory: a fused
+    gather would compute each of their entries on its own.
+    """
+
+    def order(index: jax.Array, delta: jax.Array) -> jax.Array:
+        flips = [(index >> axis) & 1 for axis in range(grid.ndim - 1)]
+        source = _sheared(equation.source, flips)
+        weights = [_towards(equation, grid, axis, flips) for axis in range(grid.ndim)]
+
+        def sweep(planes: jax.Array, up: bool) -> jax.Array:
+            return _sweep(source, weights, _wrapped(planes, grid), up)
+
+        def pair(_: Any, planes: jax.Array) -> jax.Array:
+            return sweep(sweep(planes, True), False)
+
+        planes = jax.lax.fori_loop(0, rounds, pair, jnp.pad(_sheared(delta, flips), 1))
+        return _sheared(planes[(slice(1, -1),) * grid.ndim], flips, back=True)
+
+    return jax.lax.fori_loop(0, 2 ** (grid.ndim - 1), order, jnp.zeros_like(equation.source))
+
+
+def _towards(equation: Correction, grid: Grid, axis: int, flips: list[jax.Array]) -> tuple[jax.Array, ...]:
+    """The sheared weights (up, down) along an axis, or (up − down,) where at most one of the two is positive."""
+    table = dict(zip(equation.weights.offsets, equation.weights.values, strict=True))
+    up, down = (table[stencil.unit(grid, axis, step)] for step in (1, -1))
+    flipped = flips[axis - 1] == 1 if axis else False
+    if equation.weights.one_way:
+        return (_sheared(jnp.where(flipped, down - up, up - down), flips),)
+    return _sheared(jnp.where(flipped, down, up), flips), _sheared(jnp.where(flipped, up, down), flips)
+
+
+def _wrapped(planes: jax.Array, grid: Grid) -> jax.Array:
+    """The margin filled with what lies across the fold of the shear and across the seams of periodic axes."""
+    core = (slice(1, -1),) * grid.ndim
+    for axis in range(1, grid.ndim):
+        if grid.periodic[axis]:  # type: ignore[index]
+            count = grid.shape[axis]
+            for margin, source, shift in ((count + 1, 1, count), (0, count, -count)):
+                inner = planes[(*core[:axis], source, *core[axis + 1 :])]
+                planes = planes.at[(*core[:axis], margin, *core[axis + 1 :])].set(jnp.roll(inner, shift, axis=0))
+    return planes.at[0].set(planes[-2]).at[-1].set(planes[1])
+
+
+def _sweep(source: jax.Array, weights: list[tuple[jax.Array, ...]], planes: jax.Array, up: bool) -> jax.Array:
+    """One pass over the slices; ``planes`` has a margin of one entry on every side."""
+    count = source.shape[0]
+
+    def row(values: jax.Array, d: Any) -> jax.Array:
+        return jax.lax.dynamic_slice_in_dim(values, d, 1, allow_negative_indices=False)
+
+    def core(slab: jax.Array, axis: int, step: int) -> jax.Array:
+        """A slice without its margin, moved by ``step`` along an axis of the grid beyond the first."""
+        starts = [1 + step * (k == axis) for k in range(1, source.ndim)]
+        cut = (slice(start, start + size) for start, size in zip(starts, source.shape[1:], strict=True))
+        return slab[(slice(None), *cut)]
+
+    def relax(k: jax.Array, planes: jax.Array) -> jax.Array:
+        d = k if up else count - 1 - k
+        below, above, new = row(planes, d), row(planes, d + 2), row(source, d)
+        for axis, pair in enumerate(weights):
+            rows = [row(w, d) for w in pair]
+            to_above, to_below = rows if len(rows) == 2 else (jnp.maximum(rows[0], 0), jnp.maximum(-rows[0], 0))
+            new = new + to_above * core(above, axis, 1) + to_below * core(below, axis, -1)
+        start = (d + 1, *(1 for _ in source.shape[1:]))
+        return jax.lax.dynamic_update_slice(planes, new, start, allow_negative_indices=False)
+
+    return jax.lax.fori_loop(0, count, relax, planes)
+
+
+def _sheared(values: jax.Array, flips: list[jax.Array], *, back: bool = False) -> jax.Array:
+    """S[d, j] = X[(d − Σ_k j_k) mod n₀, j] of the flipped array; or ``back`` from S to X."""
+    row, *columns = (jax.lax.broadcasted_iota(jnp.int32, values.shape, axis) for axis in range(values.ndim))
+    flipped = [
+        jnp.where(flip == 1, count - 1 - column, column)
+        for column, count, flip in zip(columns, values.shape[1:], flips, strict=True)
+    ]
+    row = row + sum(flipped) if back else row - sum(columns)
+    return values.at[(row % values.shape[0], *flipped)].get(mode="promise_in_bounds")

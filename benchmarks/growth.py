@@ -94,7 +94,9 @@ def judged(rows: list[dict[str, Any]]) -> dict[str, float]:
 @click.option("--problem", "names", multiple=True, type=click.Choice([case.name for case in CASES]))
 @click.option("--repeats", type=click.IntRange(1), default=None, help="Warm solves; 3 if not given, quick 1.")
 @click.option("--largest", type=click.IntRange(1), default=None, help="Leave out grids with more nodes.")
-@click.option("--time-limit", type=click.FloatRange(0, min_open=True), default=None, help="Seconds for each solve.")
+@click.option(
+    "--time-limit", type=click.FloatRange(0, min_open=True), default=600, show_default=True, help="Of a solve."
+)
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Folder of the files.")
 def command(
     quick: bool,

@@ -19,12 +19,12 @@ from benchmarks import floors
 from benchmarks.report import RESULTS, attempt, stamped, table, write_json
 
 ROOT = Path(__file__).parents[1]
-COLUMNS = ("start", "seconds", "fastest", "repeats", "pictures", "status")
+COLUMNS = ("start", "seconds", "fastest", "cpu_seconds", "repeats", "pictures", "status")
 CACHE = {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0", "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1"}
 
 
-def one(problem: str, shape: str | None, cache: str | None) -> tuple[float, int]:
-    """Seconds of the process, and the pictures it left."""
+def one(problem: str, shape: str | None, cache: str | None) -> tuple[float, float, int]:
+    """Seconds of the process, the processor's seconds on all cores, and the pictures it left."""
     kept = {key: value for key, value in os.environ.items() if not key.startswith("JAX_COMPILATION_CACHE")}
     environment = kept | {"MPLBACKEND": "Agg", "PYTHONPATH": str(ROOT)}
     if cache is not None:
@@ -33,23 +33,26 @@ def one(problem: str, shape: str | None, cache: str | None) -> tuple[float, int]
         out = Path(folder) / "run"
         command = [sys.executable, "-m", "hjbjax", "solve", problem, "--out", str(out)]
         command += [] if shape is None else ["--shape", shape]
-        began = time.perf_counter()
+        began, before = time.perf_counter(), os.times()
         subprocess.run(command, env=environment, check=True, capture_output=True)
-        return time.perf_counter() - began, len(list(out.glob("*.png")))
+        seconds, after = time.perf_counter() - began, os.times()
+        busy = after.children_user + after.children_system - before.children_user - before.children_system
+        return seconds, busy, len(list(out.glob("*.png")))
 
 
 def measure(problem: str, shape: str | None, repeats: int) -> list[dict[str, Any]]:
     """Two rows; cold and cached processes take turns, after one that fills the cache."""
     with tempfile.TemporaryDirectory() as cache:
-        filling, _ = one(problem, shape, cache)
-        found: dict[str, list[tuple[float, int]]] = {"cold": [], "cached": []}
+        filling, *_ = one(problem, shape, cache)
+        found: dict[str, list[tuple[float, float, int]]] = {"cold": [], "cached": []}
         for _ in range(repeats):
             found["cold"].append(one(problem, shape, None))
             found["cached"].append(one(problem, shape, cache))
     rows = []
     for start, runs in found.items():
-        seconds, pictures = zip(*runs, strict=True)
+        seconds, busy, pictures = zip(*runs, strict=True)
         row = {"start": start, "seconds": median(seconds), "fastest": min(seconds), "repeats": repeats}
+        row["cpu_seconds"] = median(busy)
         rows.append(row | {"pictures": min(pictures), "filling_seconds": filling, "status": "DONE"})
     return rows
 

@@ -41,6 +41,16 @@ _MOVES: dict[str, Callable[[int], Sequence[int]]] = {
     "dynamic_update_slice": lambda n: (0, 1),
     "scatter": lambda n: (0, 2),
 }
+# The commonest of them for labels in NumPy: JAX would compile each on its first use.
+_IN_NUMPY: dict[str, Callable[..., np.ndarray]] = {
+    "slice": lambda x, start_indices, limit_indices, strides: x[
+        tuple(map(slice, start_indices, limit_indices, strides or (None,) * x.ndim))
+    ],
+    "squeeze": lambda x, dimensions: np.squeeze(x, dimensions),
+    "stack": lambda *xs, axis: np.stack(xs, axis),
+    "concatenate": lambda *xs, dimension: np.concatenate(xs, dimension),
+}
+
 _SCATTERS = {"scatter-add": jax.lax.add, "scatter-sub": jax.lax.sub, "scatter-mul": jax.lax.mul}
 _SCATTERS |= {"scatter-min": jax.lax.min, "scatter-max": jax.lax.max}
 
@@ -217,8 +227,11 @@ def _move(eqn: Any, operands: list[Any], algebra: Any) -> list[Any] | None:
     pool.append(algebra.constant(np.asarray(np.nan if fill is None else fill), ()))
     if fill is not None:
         eqn = eqn.replace(params=eqn.params | {"fill_value": -1})
-    with jax.ensure_compile_time_eval():
-        moved = _bind(eqn, labelled)
+    if eqn.primitive.name in _IN_NUMPY:
+        moved = [_IN_NUMPY[eqn.primitive.name](*labelled, **eqn.params)]
+    else:
+        with jax.ensure_compile_time_eval():
+            moved = _bind(eqn, labelled)
     return [  # a gather out of range has a negative label: it takes the fill value at the end
         _object_array([pool[max(label, -1)] for label in np.ravel(labels)], np.shape(labels)) for labels in moved
     ]

@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from hjbjax import transfer
 from hjbjax.certificates import Certificate
@@ -56,8 +57,10 @@ def warm(task: Task, guess: Any, clock: Clock) -> jax.Array:
     """
     if guess is not None:
         return guess
-    value = jnp.zeros(task.grid.shape, task.tol.dtype)
-    if task.problem.discount == 0:  # a constraint alone has many fixed points: ψ is above, g is below all of them
+    value = jnp.asarray(np.zeros(task.grid.shape, task.tol.dtype))
+    if (
+        np.asarray(task.problem.discount) == 0
+    ):  # a constraint alone has many fixed points: ψ is above, g is below all of them
         value = value if task.rules.stop is None else task.rules.stop
         floor = task.rules.floor
         if floor is not None:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax import checks, iteration, memory, nested, sensitivity
+from hjbjax import checks, iteration, memory, nested, sensitivity, survey
 from hjbjax.certificates import Certificate
 from hjbjax.driver import Clock, drive
 from hjbjax.grid import Grid
@@ -89,7 +89,7 @@ def solve(
     with jax.enable_x64(kind == np.float64):
         needed = memory.require(problem, grid, method, kind, max_memory)
         checks.shapes(problem, grid, scheme)
-        checks.values(problem, grid, scheme, kind)
+        survey.values(problem, grid, kind)
         known = None if guess is None else jnp.asarray(guess, kind)
         start, shapes = nested.start(problem, grid, method, scheme.chain, tol, known, kind, clock)
         inner = method.inner if isinstance(method, Nested) else method

@@ -87,7 +87,7 @@ def _sweep(source: jax.Array, weights: list[tuple[jax.Array, ...]], planes: jax.
             rows = [row(w, d) for w in pair]
             to_above, to_below = rows if len(rows) == 2 else (jnp.maximum(rows[0], 0), jnp.maximum(-rows[0], 0))
             new = new + to_above * core(above, axis, 1) + to_below * core(below, axis, -1)
-        start = (d + 1, *(1 for _ in source.shape[1:]))
+        start: tuple[Any, ...] = (d + 1, *(1 for _ in source.shape[1:]))
         return jax.lax.dynamic_update_slice(planes, new, start, allow_negative_indices=False)
 
     return jax.lax.fori_loop(0, count, relax, planes)

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 import hjbjax as hjb
-from hjbjax import driver
+from hjbjax import driver, iteration
 from hjbjax.preparation import choose, judge, prepare
 from hjbjax.pytree import cast
 
@@ -18,8 +18,13 @@ def bytes_of(lowered: Any) -> int:
     return int(total - found.alias_size_in_bytes)
 
 
+def loop() -> Any:
+    """The compiled loop that ``solve`` calls again and again, as ``loop()(task, state, until)``."""
+    return driver.compiled(iteration.run)
+
+
 def of_solve(problem: Any, grid: Any, tol: float, *, method: Any = None, dtype: Any = np.float64) -> dict[str, Any]:
-    """Bytes a node of the program that ``solve`` calls again and again, at its finest level."""
+    """Bytes a node of that loop at the finest level of a solve."""
     method = method or choose(problem, grid, traced=False)
     inner = method.inner if isinstance(method, hjb.Nested) else method
     kind = np.dtype(dtype)
@@ -31,4 +36,4 @@ def of_solve(problem: Any, grid: Any, tol: float, *, method: Any = None, dtype: 
             return task, driver.begin(task, jax.numpy.zeros(grid.shape, kind))
 
         shapes = jax.eval_shape(begin, *cast((problem, grid), kind))
-        return {"bytes_per_node": bytes_of(driver.run.lower(*shapes, 1)) / grid.size}
+        return {"bytes_per_node": bytes_of(loop().lower(*shapes, 1)) / grid.size}

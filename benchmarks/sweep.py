@@ -21,7 +21,7 @@ import numpy as np
 
 import hjbjax as hjb
 from benchmarks import floors, questions
-from benchmarks.footprint import bytes_of
+from benchmarks.footprint import bytes_of, loop
 from benchmarks.report import RESULTS, attempt, picture, stamped, table, without, write_json
 from benchmarks.timing import interleaved
 from hjbjax import bellman, driver, memory
@@ -134,7 +134,7 @@ def candidates(problem: Any, grid: hjb.Grid, count: int) -> dict[str, Any]:
     pace, value = paces(*question), started(grid)
     again, looping = jnp.copy, [started(grid)]
 
-    def loop():
+    def looped():
         looping[0] = several(looping[0], *question, pace, count)
         return looping[0]
 
@@ -145,7 +145,7 @@ def candidates(problem: Any, grid: hjb.Grid, count: int) -> dict[str, Any]:
 
     return {
         "sweep": turning(lambda old, new: one(old, *question, new, pace), again(value), again(value), count=count),
-        "loop": loop,
+        "loop": looped,
         "improve": improvements,
         "copy": turning(copy, again(value), again(value), count=count),
     }
@@ -155,10 +155,10 @@ def whole_steps(problem: Any, grid: hjb.Grid, count: int) -> Any:
     """Steps of ``solve`` with value iteration, as its host loop runs them."""
     method = hjb.ValueIteration()
     task, _, _ = prepare_on_host(problem, grid, method=method, scheme=SCHEME, tol=1e-30, dtype=KIND)
-    states = [driver.run(task, driver.begin(task, started(grid)), 0)]
+    states = [loop()(task, driver.begin(task, started(grid)), 0)]
 
     def call():
-        states[0] = driver.run(task, states[0], int(states[0].step) + count)
+        states[0] = loop()(task, states[0], int(states[0].step) + count)
         return states[0].value
 
     return call
@@ -269,17 +269,20 @@ def judged(rows: list[dict[str, Any]]) -> dict[str, float]:
 def command(quick: bool, repeats: int | None, controls: int, few: int, out: Path) -> None:
     """Node-controls per second of one sweep, against numba and against the copy bandwidth."""
     repeats = repeats or (2 if quick else 9)
+    plane = (64, 96) if quick else (1024, 2048)
+    shapes = ((96, 96), (16,) * 3, (9,) * 4, (5,) * 6) if quick else tuple(map(fitted, LARGE))
+    parts = [
+        *(("pendulum", functools.partial(against_numba, nodes, controls, repeats)) for nodes in plane),
+        *(("integrators", functools.partial(by_dimension, shape, few, repeats)) for shape in shapes),
+        ("memory", in_six_dimensions),
+    ]
     rows: list[dict[str, Any]] = []
-    for nodes in (64, 96) if quick else (1024, 2048):
-        about = {"benchmark": "sweep", "problem": "pendulum", "dtype": KIND.name}
-        rows += attempt(lambda nodes=nodes: against_numba(nodes, controls, repeats), about)
-    for shape in ((96, 96), (16,) * 3, (9,) * 4, (5,) * 6) if quick else map(fitted, LARGE):
-        about = {"benchmark": "sweep", "problem": "integrators", "dtype": KIND.name}
-        rows += attempt(lambda shape=shape: by_dimension(shape, few, repeats), about)
-    rows += attempt(in_six_dimensions, {"benchmark": "sweep", "problem": "memory"})
-    click.echo(table(rows, COLUMNS))
+    for problem, measure in parts:
+        found = attempt(measure, {"benchmark": "sweep", "problem": problem, "dtype": KIND.name})
+        click.echo(table(found, COLUMNS) + "\n")
+        rows += found
     figures = judged(rows)
-    click.echo("\n".join(["", *floors.verdicts(figures)]))
+    click.echo("\n".join(floors.verdicts(figures)))
     rows = stamped([*rows, *floors.as_rows(figures, "sweep")])
     write_json(out / "sweep.json", rows)
     picture(out / "sweep.png", rows, panel="problem", line="kernel", x=("nodes",), y="node_controls_per_second")

@@ -3,7 +3,7 @@
 A grid of N nodes an axis has N^n of them, and no method on it does better than a constant amount of work and memory
 a node. What a method can do is keep that constant, and the steps, from growing with N: an exponent of seconds in
 nodes of one. The states of the problem do not touch each other, so that its value, also that of the chain, is the
-sum of n values of one state; every row is checked against it.
+sum of n values of one state; every row is checked against it. Exponents are fitted as in ``growth``.
 """
 
 from pathlib import Path
@@ -13,16 +13,18 @@ import click
 import numpy as np
 
 import hjbjax as hjb
-from benchmarks import footprint, questions
+from benchmarks import footprint, growth, questions
 from benchmarks.report import RESULTS, attempt, picture, stamped, table, write_json
 from benchmarks.timing import interleaved
-from hjbjax.convergence import fitted_order
 
 COLUMNS = (
     "dimension", "shape", "nodes", "steps", "seconds", "compile_seconds", "microseconds_per_node", "bytes_per_node",
     "difference", "exponent", "status",
 )  # fmt: skip
-SIZES = {1: (101, 1001, 10001), 2: (51, 101, 201, 401), 3: (21, 31, 41, 61), 4: (11, 15, 21), 5: (7, 9, 11), 6: (5, 7)}
+SIZES = {
+    1: (1001, 10_001, 100_001), 2: (51, 101, 201, 401, 801), 3: (21, 31, 41, 61, 101), 4: (11, 15, 21, 31),
+    5: (7, 9, 11, 15), 6: (5, 6, 7, 9),
+}  # fmt: skip
 QUICK = {1: (11, 21), 2: (7, 11), 3: (4, 5)}
 TOL = 1e-3
 
@@ -45,14 +47,6 @@ def measure(dimension: int, nodes: int, repeats: int) -> list[dict[str, Any]]:
     return [row | {"method": solution.stats["method"]} | footprint.of_solve(problem, grid, TOL)]
 
 
-def fit(rows: list[dict[str, Any]]) -> None:
-    """Writes the exponent of seconds in nodes into the rows of one dimension."""
-    done = [row for row in rows if row["status"] == "CONVERGED"]
-    exponent = fitted_order([row["nodes"] for row in done], [row["seconds"] for row in done])
-    for row in rows:
-        row["exponent"] = exponent
-
-
 @click.command()
 @click.option("--quick", is_flag=True, help="Small grids in up to three dimensions, one round.")
 @click.option("--dimension", "dimensions", multiple=True, type=click.IntRange(1, 6), help="Only this one; repeatable.")
@@ -70,7 +64,7 @@ def command(quick: bool, dimensions: tuple[int, ...], repeats: int | None, times
         for nodes in (round(size * times ** (1 / dimension)) for size in sizes):
             again = repeats or (1 if quick else 3)
             mine += attempt(lambda d=dimension, n=nodes, r=again: measure(d, n, r), about)
-        fit(mine)
+        growth.fit([row for row in mine if "nodes" in row])
         click.echo(table(mine, COLUMNS) + "\n")
         rows += mine
     rows = stamped(rows)

@@ -23,6 +23,7 @@ from benchmarks.peers import decision
 from benchmarks.report import RESULTS, attempt, picture, stamped, table, without, write_json
 from benchmarks.timing import interleaved, timed
 
+PAIRS = 2_000_000  # of state and action in a chain: beyond that it takes gigabytes
 OURS, NUMBA, MDP = "hjbjax", "numba", "mdpsolver"
 COLUMNS = (
     "code", "shape", "controls", "seconds", "fastest", "compile_seconds", "first_seconds", "first_cpu_seconds",
@@ -139,12 +140,13 @@ def command(quick: bool, nodes: tuple[int, ...], repeats: int | None, controls: 
     sizes = nodes or ((26, 52) if quick else (200, 400, 800, 1600))
     rows: list[dict[str, Any]] = []
     for place, count in enumerate(sizes):
+        chain = not place and count * (count + 1) * controls <= PAIRS
         rounds = repeats or (1 if quick else 5 if count < 800 else 3)
         first = 1 if quick or place else 3
         found = attempt(
-            lambda n=count, r=rounds, p=place, f=first: measure(n, controls, tol, r, chain=p == 0, first=f), ABOUT
+            lambda n=count, r=rounds, c=chain, f=first: measure(n, controls, tol, r, chain=c, first=f), ABOUT
         )
-        if not place:
+        if chain:
             found += attempt(lambda n=count: beside_mdpsolver(n // 4 * 2, controls, tol), ABOUT)
         rows += checked(found)
         click.echo(table(found, COLUMNS))

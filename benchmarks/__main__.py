@@ -10,6 +10,13 @@ from collections.abc import Sequence
 
 NAMES = {
     "accuracy": "errors, orders and seconds over the zoo's problems with known answers",
+    "sweep": "node-controls per second of one sweep, against numba and the copy bandwidth",
+    "peers": "a certified solve beside QuantEcon, mdpsolver and a hand-written numba solver",
+    "growth": "seconds, steps and bytes a node of certified solves on finer and finer grids",
+    "scaling": "the N^n law: seconds, steps and bytes a node in one to six dimensions",
+    "controls": "seconds against the number of controls and against the error: O(1/ε^{2n+m}) and less",
+    "batch": "solve_batch of pendulums of different mass, against one after the other",
+    "startup": "from process start to pictures, cold and with the compile cache",
     "precision": "error against seconds: what second order is worth",
 }
 

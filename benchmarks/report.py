@@ -5,6 +5,7 @@ A measurement is a flat dictionary; ``stamped`` adds the machine, the versions a
 
 import datetime
 import importlib.metadata
+import importlib.util
 import json
 import math
 import os
@@ -33,6 +34,7 @@ def environment() -> dict[str, Any]:
     return {
         "device": device.platform if device.platform == "cpu" else device.device_kind,
         "cores": os.cpu_count(),
+        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,  # processes that want a core, at the end
         "versions": versions,
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
@@ -116,6 +118,13 @@ def picture(
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=90)
+
+
+def without(module: str) -> str | None:
+    """Why a peer cannot be measured; ``None`` where it can."""
+    if importlib.util.find_spec(module) is not None:
+        return None
+    return f"{module} is not installed (pip install '.[bench]')"
 
 
 def attempt(measure: Callable[[], list[dict[str, Any]]], about: dict[str, Any]) -> list[dict[str, Any]]:

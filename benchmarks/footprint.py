@@ -1,0 +1,39 @@
+"""What compiled programs need, by their own account: nothing is allocated, arrays are shapes."""
+
+from typing import Any
+
+import jax
+import numpy as np
+
+import hjbjax as hjb
+from hjbjax import driver, iteration
+from hjbjax.preparation import choose, judge, prepare
+from hjbjax.pytree import cast
+
+
+def bytes_of(lowered: Any) -> int:
+    """Arguments, results and scratch of a lowered program together, once it is compiled."""
+    found = lowered.compile().memory_analysis()
+    total = found.argument_size_in_bytes + found.output_size_in_bytes + found.temp_size_in_bytes
+    return int(total - found.alias_size_in_bytes)
+
+
+def loop() -> Any:
+    """The compiled loop that ``solve`` calls again and again, as ``loop()(task, state, until)``."""
+    return driver.compiled(iteration.run)
+
+
+def of_solve(problem: Any, grid: Any, tol: float, *, method: Any = None, dtype: Any = np.float64) -> dict[str, Any]:
+    """Bytes a node of that loop at the finest level of a solve."""
+    method = method or choose(problem, grid, traced=False)
+    inner = method.inner if isinstance(method, hjb.Nested) else method
+    kind = np.dtype(dtype)
+    with jax.enable_x64(kind == np.float64):
+        verdict = judge(problem, grid, kind)
+
+        def begin(problem, grid):
+            task = prepare(problem, grid, method=inner, scheme=hjb.Upwind(), tol=tol, dtype=kind, verdict=verdict)
+            return task, driver.begin(task, jax.numpy.zeros(grid.shape, kind))
+
+        shapes = jax.eval_shape(begin, *cast((problem, grid), kind))
+        return {"bytes_per_node": bytes_of(loop().lower(*shapes, 1)) / grid.size}

@@ -1,0 +1,128 @@
+"""Seconds against nodes at a fixed tolerance: a certified solve on finer and finer grids.
+
+A method whose steps do not grow with the grid takes seconds in proportion to the nodes, an exponent of one; value
+iteration on one grid takes N times as many steps on N times as fine a one. Seconds are those of a whole ``solve`` once
+it is compiled, checks and coarser grids included; bytes a node are the peak of the program that ``solve`` runs on the
+finest grid, by that program's own account. Exponents are fitted over the grids with at least ``FITTED`` nodes: below
+that a solve is made of what it does once.
+"""
+
+import dataclasses
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+import hjbjax as hjb
+from benchmarks import floors, footprint, questions
+from benchmarks.report import RESULTS, attempt, picture, stamped, table, write_json
+from benchmarks.timing import interleaved
+from hjbjax.convergence import fitted_order
+
+COLUMNS = (
+    "problem", "shape", "nodes", "steps", "seconds", "compile_seconds", "microseconds_per_node", "exponent",
+    "bytes_per_node", "error", "status",
+)  # fmt: skip
+FITTED = 10_000
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """A family of questions by one number, the sizes at which it is asked, quick ones apart, and the tolerance."""
+
+    name: str
+    build: Callable[[int], tuple[hjb.Problem, hjb.Grid]]
+    sizes: tuple[int, ...]
+    quick: tuple[int, ...]
+    tol: float
+
+
+CASES = (
+    Case("pendulum", questions.pendulum, (100, 200, 400, 800, 1600), (16, 32), 1e-3),
+    Case("dubins", lambda n: questions.dubins(n, 1.0), (24, 50, 100), (10, 12), 1e-3),
+    Case("dubins undiscounted", lambda n: questions.dubins(n, 0.0), (24, 50, 100), (10, 12), 1e-3),
+    Case("manipulator", questions.manipulator, (14, 20, 28, 40), (4, 6), 1e-2),
+)
+
+
+def measure(case: Case, size: int, repeats: int, time_limit: float | None) -> list[dict[str, Any]]:
+    """One row: a solve that compiles, and ``repeats`` that do not."""
+    problem, grid = case.build(size)
+    about = {"shape": list(grid.shape), "nodes": grid.size, "tol": case.tol}
+    solutions: list[hjb.Solution] = []
+
+    def call():
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", hjb.SolveWarning)  # of nodes that cannot reach the target; see reached
+            solutions[:] = [hjb.solve(problem, grid, tol=case.tol, time_limit=time_limit, throw=False)]
+
+    _, timings = interleaved({case.name: call}, repeats)
+    (solution,), timing = solutions, timings[case.name]
+    row = about | timing.row | {"steps": solution.steps, "error": solution.error, "status": solution.status.name}
+    row |= {"method": solution.stats["method"], "levels": [list(shape) for shape in solution.stats["levels"]]}
+    row["reached"] = 1.0 if solution.reached is None else float(np.mean(solution.reached))
+    row["microseconds_per_node"] = 1e6 * timing.seconds / grid.size
+    return [row | footprint.of_solve(problem, grid, case.tol)]
+
+
+def fit(rows: list[dict[str, Any]]) -> None:
+    """Writes the exponent of seconds in nodes into the rows of one problem."""
+    counted = [row for row in rows if row["status"] == "CONVERGED" and row["nodes"] >= FITTED]
+    exponent = fitted_order([row["nodes"] for row in counted], [row["seconds"] for row in counted])
+    for row in rows:
+        row["exponent"] = exponent
+
+
+def judged(rows: list[dict[str, Any]]) -> dict[str, float]:
+    """The figures of the floors that these rows hold."""
+    found = {(row["problem"], row["shape"][0]): row for row in rows if row["status"] == "CONVERGED"}
+    figures = {}
+    if {("pendulum", 400), ("pendulum", 1600)} <= set(found):
+        figures["growth"] = found["pendulum", 1600]["seconds"] / found["pendulum", 400]["seconds"]
+    for key, name, size in (("dubins", "dubins", 101), ("manipulator", "manipulator", 40)):
+        if (name, size) in found:
+            row = found[name, size]
+            figures |= {f"{key} bytes": row["bytes_per_node"], f"{key} exponent": row["exponent"]}
+    return figures
+
+
+@click.command()
+@click.option("--quick", is_flag=True, help="Small grids, one round.")
+@click.option("--problem", "names", multiple=True, type=click.Choice([case.name for case in CASES]))
+@click.option("--repeats", type=click.IntRange(1), default=None, help="Warm solves; 3 if not given, quick 1.")
+@click.option("--largest", type=click.IntRange(1), default=None, help="Leave out grids with more nodes.")
+@click.option(
+    "--time-limit", type=click.FloatRange(0, min_open=True), default=600, show_default=True, help="Of a solve."
+)
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Folder of the files.")
+def command(
+    quick: bool,
+    names: tuple[str, ...],
+    repeats: int | None,
+    largest: int | None,
+    time_limit: float | None,
+    out: Path,
+) -> None:
+    """Seconds, steps and bytes a node of certified solves on finer and finer grids."""
+    rows: list[dict[str, Any]] = []
+    for case in CASES:
+        if names and case.name not in names:
+            continue
+        mine: list[dict[str, Any]] = []
+        for size in case.quick if quick else case.sizes:
+            if largest is None or case.build(size)[1].size <= largest:
+                about = {"benchmark": "growth", "problem": case.name, "dtype": "float64"}
+                again = repeats or (1 if quick else 3)
+                mine += attempt(lambda c=case, s=size, r=again: measure(c, s, r, time_limit), about)
+        fit([row for row in mine if "nodes" in row])
+        click.echo(table(mine, COLUMNS) + "\n")
+        rows += mine
+    figures = judged([row for row in rows if "nodes" in row])
+    click.echo("\n".join(floors.verdicts(figures)))
+    rows = stamped([*rows, *floors.as_rows(figures, "growth")])
+    write_json(out / "growth.json", rows)
+    picture(out / "growth.png", rows, panel="problem", line="benchmark", x=("nodes",), y="seconds")
+    click.echo(f"{len(rows)} rows in {out / 'growth.json'}, the picture in {out / 'growth.png'}")

@@ -1,0 +1,66 @@
+"""The problems that several benchmarks ask, at any size."""
+
+import dataclasses
+import math
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+import hjbjax as hjb
+
+
+def pendulum(nodes: int, actions: int | None = 21, mass: float = 1.0) -> tuple[hjb.Problem, hjb.Grid]:
+    """The zoo's pendulum on nodes x (nodes + 1), discount .1, torques sampled; ``None`` keeps them a continuum."""
+    problem, grid = hjb.zoo.pendulum(mass=mass, discount=0.1, shape=(nodes, nodes + 1))
+    if actions is not None:
+        problem = dataclasses.replace(problem, controls=problem.controls.grid(actions))
+    return problem, grid
+
+
+def dubins(nodes: int, discount: float) -> tuple[hjb.Problem, hjb.Grid]:
+    """The zoo's car to a disc of radius .5, on [−3, 3]² × [−π, π) with (nodes + 1)² · nodes nodes."""
+    problem, _ = hjb.zoo.dubins(radius=0.5, discount=discount)
+    lo, hi = [-3.0, -3.0, -math.pi], [3.0, 3.0, math.pi]
+    return problem, hjb.Grid(lo, hi, (nodes + 1, nodes + 1, nodes), periodic=(False, False, True))
+
+
+def manipulator(nodes: int) -> tuple[hjb.Problem, hjb.Grid]:
+    """The zoo's arm of two links, discount .5; nodes² angles and (nodes + 1)² velocities."""
+    return hjb.zoo.manipulator(links=2, discount=0.5, shape=(nodes, nodes, nodes + 1, nodes + 1))
+
+
+def integrators(shape: tuple[int, ...], actions: int = 3) -> tuple[hjb.Problem, hjb.Grid]:
+    """A chain of integrators in any dimension, pushed at its end: the plain case for a sweep with few controls."""
+    dim = len(shape)
+    problem = hjb.Problem(_push, _effort, hjb.Box([-1.0], [1.0]).grid(actions), discount=0.5)
+    return problem, hjb.Grid([-1.0] * dim, [1.0] * dim, shape)
+
+
+def apart(dim: int, nodes: int) -> tuple[hjb.Problem, hjb.Grid]:
+    """States that do not touch each other, each with its own input.
+
+    The value is the sum of ``dim`` values of one state, also that of the chain, which is what a benchmark checks.
+    """
+    problem = hjb.Problem(_decay, _effort, hjb.Box([-1.0] * dim, [1.0] * dim), discount=0.5)
+    return problem, hjb.Grid([-1.0] * dim, [1.0] * dim, (nodes,) * dim)
+
+
+def sum_over_axes(value: np.ndarray, dim: int) -> np.ndarray:
+    """Σ_i v(x_i) on the grid of ``dim`` axes, from v at the nodes of one."""
+    total = np.zeros((1,) * dim)
+    for axis in range(dim):
+        total = total + value.reshape([-1 if i == axis else 1 for i in range(dim)])
+    return total
+
+
+def _push(x: Any, u: Any) -> Any:
+    return jnp.concatenate([x[1:], u])
+
+
+def _decay(x: Any, u: Any) -> Any:
+    return u - 0.5 * x
+
+
+def _effort(x: Any, u: Any) -> Any:
+    return x @ x + 0.5 * (u @ u)

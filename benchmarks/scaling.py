@@ -1,0 +1,74 @@
+"""The N^n law: nodes, steps, seconds and bytes a node of a certified solve in one to six dimensions.
+
+A grid of N nodes an axis has N^n of them, and no method on it does better than a constant amount of work and memory
+a node. What a method can do is keep that constant, and the steps, from growing with N: an exponent of seconds in
+nodes of one. The states of the problem do not touch each other, so that its value, also that of the chain, is the
+sum of n values of one state; every row is checked against it. Exponents are fitted as in ``growth``.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+import hjbjax as hjb
+from benchmarks import footprint, growth, questions
+from benchmarks.report import RESULTS, attempt, picture, stamped, table, write_json
+from benchmarks.timing import interleaved
+
+COLUMNS = (
+    "dimension", "shape", "nodes", "steps", "seconds", "compile_seconds", "microseconds_per_node", "bytes_per_node",
+    "difference", "exponent", "status",
+)  # fmt: skip
+SIZES = {
+    1: (1001, 10_001, 100_001), 2: (51, 101, 201, 401, 801), 3: (21, 31, 41, 61, 101), 4: (11, 15, 21, 31),
+    5: (7, 9, 11, 15), 6: (5, 6, 7, 9),
+}  # fmt: skip
+QUICK = {1: (11, 21), 2: (7, 11), 3: (4, 5)}
+TOL = 1e-3
+
+
+def measure(dimension: int, nodes: int, repeats: int) -> list[dict[str, Any]]:
+    """One row: a solve that compiles, ``repeats`` that do not, and the check of their value."""
+    problem, grid = questions.apart(dimension, nodes)
+    line = hjb.solve(*questions.apart(1, nodes), tol=TOL / dimension).value
+    solutions: list[hjb.Solution] = []
+
+    def call():
+        solutions[:] = [hjb.solve(problem, grid, tol=TOL, throw=False)]
+
+    _, timings = interleaved({"hjbjax": call}, repeats)
+    (solution,), timing = solutions, timings["hjbjax"]
+    off = float(np.max(np.abs(solution.value - questions.sum_over_axes(line, dimension))))
+    status = solution.status.name if off <= 2 * TOL else "DISAGREES"
+    row = {"shape": list(grid.shape), "nodes": grid.size, "steps": solution.steps, "difference": off, "status": status}
+    row |= timing.row | {"microseconds_per_node": 1e6 * timing.seconds / grid.size, "error": solution.error}
+    return [row | {"method": solution.stats["method"]} | footprint.of_solve(problem, grid, TOL)]
+
+
+@click.command()
+@click.option("--quick", is_flag=True, help="Small grids in up to three dimensions, one round.")
+@click.option("--dimension", "dimensions", multiple=True, type=click.IntRange(1, 6), help="Only this one; repeatable.")
+@click.option("--repeats", type=click.IntRange(1), default=None, help="Warm solves; 3 if not given, quick 1.")
+@click.option("--times", type=click.IntRange(1), default=1, help="So many times the nodes in all, for a GPU.")
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Folder of the files.")
+def command(quick: bool, dimensions: tuple[int, ...], repeats: int | None, times: int, out: Path) -> None:
+    """The N^n law: seconds, steps and bytes a node in one to six dimensions."""
+    rows: list[dict[str, Any]] = []
+    for dimension, sizes in (QUICK if quick else SIZES).items():
+        if dimensions and dimension not in dimensions:
+            continue
+        mine: list[dict[str, Any]] = []
+        about = {"benchmark": "scaling", "problem": "apart", "dtype": "float64", "dimension": dimension, "tol": TOL}
+        for nodes in (round(size * times ** (1 / dimension)) for size in sizes):
+            again = repeats or (1 if quick else 3)
+            mine += attempt(lambda d=dimension, n=nodes, r=again: measure(d, n, r), about)
+        growth.fit([row for row in mine if "nodes" in row])
+        click.echo(table(mine, COLUMNS) + "\n")
+        rows += mine
+    rows = stamped(rows)
+    write_json(out / "scaling.json", rows)
+    lines = [row | {"dimensions": f"{row['dimension']}-D"} for row in rows]
+    picture(out / "scaling.png", lines, panel="problem", line="dimensions", x=("nodes",), y="seconds")
+    click.echo(f"{len(rows)} rows in {out / 'scaling.json'}, the picture in {out / 'scaling.png'}")

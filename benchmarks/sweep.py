@@ -1,0 +1,289 @@
+"""One Bellman sweep: node-controls per second, against a hand-written numba loop and against copying the value.
+
+    V ← V + (min_u H − β V)/(max_u Q + β)        what a step of value iteration does, once over all nodes
+
+Kernels: ``sweep`` is that line in a compiled call of its own; ``loop`` is several of them in one compiled loop;
+``improve`` also writes down the greedy controls, as policy iteration needs them; ``step`` is a whole step of
+``solve`` with ``ValueIteration``, certificate included; ``numba`` is the peer's ``jacobi_sweep``; ``copy`` reads a
+value and writes a multiple of it, which is what memory allows. The fraction of the copy bandwidth is the seconds of
+``copy`` over those of the kernel. Before anything is timed, both sweeps are compared number by number.
+"""
+
+import functools
+import math
+from pathlib import Path
+from typing import Any
+
+import click
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import hjbjax as hjb
+from benchmarks import floors, questions
+from benchmarks.footprint import bytes_of, loop
+from benchmarks.report import RESULTS, attempt, picture, stamped, table, without, write_json
+from benchmarks.timing import interleaved
+from hjbjax import bellman, driver, memory
+from hjbjax.preparation import prepare_on_host
+from hjbjax.pytree import cast
+
+COLUMNS = (
+    "problem", "kernel", "shape", "controls", "seconds", "compile_seconds", "node_controls_per_second",
+    "node_controls_per_cpu_second", "against_numba", "fraction_of_copy", "bytes_per_node", "bytes_beyond", "status",
+)  # fmt: skip
+SCHEME = hjb.Upwind()
+KIND = np.dtype(np.float32)
+AGREE = 1e-5  # of the largest |V|: float32, and two orders of summation
+LARGE = ((8192, 8192), (512,) * 3, (104,) * 4, (22,) * 6)  # what fills a GPU
+LIMIT_ON_CPU = 1 << 24  # nodes: beyond that a sweep on two cores tells nothing new
+SIX = (20,) * 6
+
+
+def sweep(problem: Any, grid: Any, value: jax.Array, pace: jax.Array) -> jax.Array:
+    """V + r/(max Q + β) with r = min H − β V."""
+    return value + bellman.greedy(problem, grid, value, jnp.zeros((), bool), scheme=SCHEME).rate / pace
+
+
+@functools.partial(jax.jit, donate_argnums=0, keep_unused=True)
+def one(old: jax.Array, problem: Any, grid: Any, value: jax.Array, pace: jax.Array) -> jax.Array:
+    """A sweep that writes over ``old``, as the peer's does."""
+    return sweep(problem, grid, value, pace)
+
+
+@functools.partial(jax.jit, donate_argnums=0, static_argnums=4)
+def several(value: jax.Array, problem: Any, grid: Any, pace: jax.Array, count: int) -> jax.Array:
+    """Sweeps in one compiled loop."""
+    return jax.lax.fori_loop(0, count, lambda _, value: sweep(problem, grid, value, pace), value)
+
+
+@jax.jit
+def improve(problem: Any, grid: Any, value: jax.Array) -> Any:
+    """The greedy controls and the rate they leave."""
+    return bellman.greedy(problem, grid, value, jnp.zeros((), bool), scheme=SCHEME)
+
+
+@functools.partial(jax.jit, donate_argnums=0, keep_unused=True)
+def copy(old: jax.Array, value: jax.Array) -> jax.Array:
+    """Reads one array, writes another."""
+    return value * jnp.asarray(0.999, value.dtype)
+
+
+@jax.jit
+def paces(problem: Any, grid: Any) -> jax.Array:
+    """max_u Q + β at the nodes."""
+    return bellman.fastest_rate(problem, grid, scheme=SCHEME, dtype=KIND) + problem.discount
+
+
+def started(grid: hjb.Grid) -> jax.Array:
+    """A smooth value to begin with."""
+    return jnp.asarray(sum(np.cos(each) for each in jax.device_get(grid.components(KIND))), KIND)
+
+
+def turning(function: Any, *arrays: jax.Array, count: int) -> Any:
+    """Calls ``function(old, new)`` ``count`` times, each result being the next ``new``; keeps both arrays between."""
+    pair = list(arrays)
+
+    def call():
+        for _ in range(count):
+            pair[:] = [pair[1], function(*pair)]
+        return pair[1]
+
+    return call
+
+
+def theirs(grid: hjb.Grid, points: np.ndarray, discount: float, count: int) -> Any:
+    """The peer's sweeps, in the same manner."""
+    from benchmarks.peers.numba_pendulum import jacobi_sweep
+
+    pair = [np.empty(grid.shape, KIND), np.array(started(grid))]
+
+    def call():
+        for _ in range(count):
+            jacobi_sweep(pair[1], pair[0], points, discount)
+            pair.reverse()
+        return pair[1]
+
+    return call
+
+
+def largest_difference(problem: Any, grid: hjb.Grid, points: np.ndarray) -> float:
+    """max |W − W'| / max |V| after one sweep of each code from one value, with the peer's pace in both.
+
+    At the edges the peer counts rates that lead out of the box in its pace, where ours does not; the rates r agree.
+    """
+    from benchmarks.peers.numba_pendulum import jacobi_sweep
+
+    value = started(grid)
+    wanted = np.empty(grid.shape, KIND)
+    jacobi_sweep(np.array(value), wanted, points, float(problem.discount))
+    angle, velocity = (np.asarray(axis) for axis in grid.components(KIND))
+    fastest = np.abs(9.81 * np.sin(angle)) + np.max(np.abs(points))
+    pace = np.abs(velocity) / grid.spacing(0) + fastest / grid.spacing(1) + problem.discount
+    found = sweep(*cast((problem, grid), KIND), value, jnp.asarray(pace, KIND))
+    moved = np.max(np.abs(wanted - value))
+    off = float(np.max(np.abs(np.asarray(found) - wanted)) / np.max(np.abs(value)))
+    if not off <= AGREE < moved:
+        raise ValueError(f"the sweeps differ by {off:.2g} of the value, and one moves it by {moved:.2g}")
+    return off
+
+
+def candidates(problem: Any, grid: hjb.Grid, count: int) -> dict[str, Any]:
+    """What is timed at one size, ``count`` sweeps a call."""
+    question = cast((problem, grid), KIND)
+    pace, value = paces(*question), started(grid)
+    again, looping = jnp.copy, [started(grid)]
+
+    def looped():
+        looping[0] = several(looping[0], *question, pace, count)
+        return looping[0]
+
+    def improvements():
+        for _ in range(count):
+            found = improve(*question, value)
+        return found
+
+    return {
+        "sweep": turning(lambda old, new: one(old, *question, new, pace), again(value), again(value), count=count),
+        "loop": looped,
+        "improve": improvements,
+        "copy": turning(copy, again(value), again(value), count=count),
+    }
+
+
+def whole_steps(problem: Any, grid: hjb.Grid, count: int) -> Any:
+    """Steps of ``solve`` with value iteration, as its host loop runs them."""
+    method = hjb.ValueIteration()
+    task, _, _ = prepare_on_host(problem, grid, method=method, scheme=SCHEME, tol=1e-30, dtype=KIND)
+    states = [loop()(task, driver.begin(task, started(grid)), 0)]
+
+    def call():
+        states[0] = loop()(task, states[0], int(states[0].step) + count)
+        return states[0].value
+
+    return call
+
+
+def sweeps_per_call(grid: hjb.Grid) -> int:
+    """So many that a call outlasts what starting it costs."""
+    return min(32, max(1, (1 << 23) // grid.size))
+
+
+def against_numba(nodes: int, actions: int, repeats: int) -> list[dict[str, Any]]:
+    """All kernels on nodes x nodes of the pendulum."""
+    problem, grid = questions.pendulum(nodes, actions)
+    grid = hjb.Grid(grid.lo, grid.hi, (nodes, nodes), periodic=grid.periodic)
+    points = np.ascontiguousarray(problem.controls.points[:, 0], KIND)
+    count = sweeps_per_call(grid)
+    calls = candidates(problem, grid, count) | {"step": whole_steps(problem, grid, count)}
+    about: dict[str, Any] = {}
+    if (reason := without("numba")) is None:
+        import numba
+
+        about = {"numba_threads": numba.get_num_threads(), "difference": largest_difference(problem, grid, points)}
+        calls = {"numba": theirs(grid, points, float(problem.discount), count)} | calls
+    _, timings = interleaved(calls, repeats)
+    rows = [_row(kernel, grid, actions, count, timings) | about for kernel in calls]
+    return rows if reason is None else [*rows, {"kernel": "numba", "status": "SKIPPED", "reason": reason}]
+
+
+def by_dimension(shape: tuple[int, ...], actions: int, repeats: int) -> list[dict[str, Any]]:
+    """The kernels in any dimension, on the chain of integrators, with what they take in memory."""
+    problem, grid = questions.integrators(shape, actions)
+    count = sweeps_per_call(grid)
+    calls = candidates(problem, grid, count)
+    _, timings = interleaved(calls, repeats)
+    return [_row(kernel, grid, actions, count, timings) | footprint(kernel, problem, grid) for kernel in calls]
+
+
+def _row(kernel: str, grid: hjb.Grid, actions: int, count: int, timings: dict[str, Any]) -> dict[str, Any]:
+    timing = timings[kernel]
+    row = {"kernel": kernel, "shape": list(grid.shape), "nodes": grid.size, "controls": actions} | timing.row
+    row |= {key: row[key] / count for key in ("seconds", "fastest", "cpu_seconds")} | {"sweeps_per_call": count}
+    row |= {"fraction_of_copy": timings["copy"].over(timing), "status": "DONE"}
+    row["copy_bytes_per_second"] = 2 * KIND.itemsize * grid.size * count / timings["copy"].seconds
+    if kernel != "copy":
+        row["node_controls_per_second"] = grid.size * actions / row["seconds"]
+        row["node_controls_per_cpu_second"] = grid.size * actions / row["cpu_seconds"]
+    if "numba" in timings and kernel != "copy":
+        row["against_numba"] = timings["numba"].over(timing)
+        row["fastest_against_numba"] = min(timings["numba"].rounds) / min(timing.rounds)
+    return row
+
+
+def footprint(kernel: str, problem: Any, grid: hjb.Grid, dtype: Any = KIND) -> dict[str, Any]:
+    """Bytes a node by the compiled program's own account: in all, and beyond the two values of a sweep.
+
+    Nothing is allocated: the arrays are shapes.
+    """
+    question = cast((problem, grid), dtype)
+    values = jax.ShapeDtypeStruct(grid.shape, dtype)
+    if kernel == "sweep":
+        lowered = jax.jit(sweep).lower(*question, values, values)
+    elif kernel == "improve":
+        lowered = improve.lower(*question, values)
+    else:
+        return {}
+    per_node = bytes_of(lowered) / grid.size
+    return {"bytes_per_node": per_node, "bytes_beyond": per_node - 2 * np.dtype(dtype).itemsize}
+
+
+def in_six_dimensions() -> list[dict[str, Any]]:
+    """What a sweep on 20^6 needs beside the value before and after, in both precisions."""
+    rows = []
+    for dtype in (np.float32, np.float64):
+        with jax.enable_x64(dtype is np.float64):
+            problem, grid = questions.integrators(SIX)
+            row = {"kernel": "sweep", "shape": list(SIX), "nodes": grid.size, "controls": 3, "status": "DONE"}
+            rows.append(row | {"dtype": np.dtype(dtype).name} | footprint("sweep", problem, grid, np.dtype(dtype)))
+    return rows
+
+
+def fitted(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """The shape, or the largest like it that this machine takes."""
+    free = memory.available()
+    most = math.inf if free is None else free / (8 * KIND.itemsize)  # values, pace, controls, and as much again
+    if jax.devices()[0].platform == "cpu":
+        most = min(most, LIMIT_ON_CPU)
+    scale = min(1.0, most / math.prod(shape)) ** (1 / len(shape))
+    return tuple(max(4, math.floor(count * scale)) for count in shape)
+
+
+def judged(rows: list[dict[str, Any]]) -> dict[str, float]:
+    """The figures of the floors that these rows hold."""
+    figures = {}
+    for row in rows:
+        if row.get("kernel") == "sweep" and row.get("controls") == 21 and "against_numba" in row:
+            figures[f"sweep {row['shape'][0]}"] = row["against_numba"]
+        if row.get("shape") == list(SIX) and row["problem"] == "memory":
+            figures["sweep 6-D"] = max(figures.get("sweep 6-D", 0.0), row["bytes_beyond"])
+    return {name: value for name, value in figures.items() if name in floors.FLOORS}
+
+
+@click.command()
+@click.option("--quick", is_flag=True, help="Small grids, two rounds.")
+@click.option("--repeats", type=click.IntRange(1), default=None, help="Rounds; 9 if not given, quick 2.")
+@click.option("--controls", type=click.IntRange(2), default=21, show_default=True, help="Of the pendulum.")
+@click.option("--few", type=click.IntRange(2), default=3, show_default=True, help="Controls in the other dimensions.")
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Folder of the files.")
+def command(quick: bool, repeats: int | None, controls: int, few: int, out: Path) -> None:
+    """Node-controls per second of one sweep, against numba and against the copy bandwidth."""
+    repeats = repeats or (2 if quick else 9)
+    plane = (64, 96) if quick else (1024, 2048)
+    shapes = ((96, 96), (16,) * 3, (9,) * 4, (5,) * 6) if quick else tuple(map(fitted, LARGE))
+    parts = [
+        *(("pendulum", functools.partial(against_numba, nodes, controls, repeats)) for nodes in plane),
+        *(("integrators", functools.partial(by_dimension, shape, few, repeats)) for shape in shapes),
+        ("memory", in_six_dimensions),
+    ]
+    rows: list[dict[str, Any]] = []
+    for problem, measure in parts:
+        found = attempt(measure, {"benchmark": "sweep", "problem": problem, "dtype": KIND.name})
+        click.echo(table(found, COLUMNS) + "\n")
+        rows += found
+    figures = judged(rows)
+    click.echo("\n".join(floors.verdicts(figures)))
+    rows = stamped([*rows, *floors.as_rows(figures, "sweep")])
+    write_json(out / "sweep.json", rows)
+    picture(out / "sweep.png", rows, panel="problem", line="kernel", x=("nodes",), y="node_controls_per_second")
+    click.echo(f"{len(rows)} rows in {out / 'sweep.json'}, the picture in {out / 'sweep.png'}")

@@ -1,0 +1,250 @@
+"""The benchmarks at small sizes: what they compare agrees, every row is complete, every floor has its line."""
+
+import json
+import math
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import hjbjax as hjb
+from benchmarks import batch, controls, floors, footprint, growth, peers, questions, scaling, startup, sweep, timing
+from benchmarks.__main__ import NAMES
+from hjbjax.pytree import cast
+
+COMPLETE = {"benchmark", "device", "dtype", "versions", "date", "cores", "status"}
+
+
+def rows_of(benchmark, folder, *options):
+    """The rows that a quick run of a benchmark leaves, each of them complete; the run failed nowhere."""
+    result = CliRunner().invoke(benchmark.command, ["--quick", *options, "--out", str(folder)])
+    assert result.exit_code == 0, result.output
+    (path,) = folder.glob("*.json")
+    rows = json.loads(path.read_text())
+    assert rows
+    assert all(set(row) >= COMPLETE for row in rows)
+    assert not [row for row in rows if row["status"] in ("FAILED", "DISAGREES", "MIXED")]
+    return rows
+
+
+def test_every_name_leads_to_a_command():
+    for module in (sweep, peers, growth, scaling, controls, batch, startup):
+        name = module.__name__.removeprefix("benchmarks.")
+        assert NAMES[name]
+        assert CliRunner().invoke(module.command, ["--help"]).exit_code == 0
+
+
+# --- timing and floors ---
+
+
+def test_candidates_take_turns_and_what_comes_before_is_not_timed():
+    order = []
+    clock = {"slow": 2.0, "fast": 1.0}
+
+    def candidate(name):
+        return lambda: order.append(name) or jnp.asarray(clock[name])
+
+    results, timings = timing.interleaved(
+        {name: candidate(name) for name in clock}, 2, {"fast": lambda: order.append("before")}
+    )
+    assert order == ["slow", "before", "fast"] * 3
+    assert {name: float(result) for name, result in results.items()} == clock
+    assert all(len(each.rounds) == len(each.busy) == 2 for each in timings.values())
+
+
+def test_ratios_are_taken_round_by_round():
+    mine, theirs = timing.Timing(9.0, (1.0, 2.0, 10.0), (1.0,) * 3), timing.Timing(3.0, (3.0, 4.0, 10.0), (1.0,) * 3)
+    assert theirs.over(mine) == 2.0  # the ratio of medians is 2 as well; that of means is not
+    assert (mine.seconds, mine.compile_seconds, theirs.compile_seconds) == (2.0, 7.0, 0.0)
+
+
+@pytest.mark.parametrize(("measured", "met"), [(1.5, True), (1.49, False), (math.nan, False)])
+def test_a_floor_is_met_or_missed(measured, met):
+    line = floors.verdicts({"sweep 1024": measured})[0]
+    assert line.endswith("met" if met else "MISSED")
+    (row,) = floors.as_rows({"sweep 1024": measured}, "sweep")
+    assert row["status"] == ("MET" if met else "MISSED")
+
+
+def test_a_floor_from_above():
+    assert floors.FLOORS["growth"].met(24.0)
+    assert not floors.FLOORS["growth"].met(24.1)
+
+
+# --- sweep ---
+
+
+@pytest.mark.parametrize("shape", [(6,), (5, 4), (4, 3, 4), (3, 3, 3, 4)])
+def test_the_timed_sweep_is_that_of_the_exported_chain(shape):
+    problem, grid = questions.integrators(shape)
+    value = np.random.default_rng(0).uniform(-1, 1, shape)
+    costs, probabilities, _, _, factor = hjb.chain.transition_arrays(problem, grid)
+    dt = (1 / factor - 1) / problem.discount
+    pairs = costs / (factor * dt) + (probabilities @ value.ravel() - np.repeat(value.ravel(), 3)) / dt
+    rate = pairs.reshape(*shape, 3).min(axis=-1) - problem.discount * value
+    with jax.enable_x64(True):
+        pace = np.asarray(
+            sweep.bellman.fastest_rate(*cast((problem, grid), np.float64), scheme=sweep.SCHEME, dtype=np.float64)
+        )
+        found = sweep.sweep(
+            *cast((problem, grid), np.float64), jnp.asarray(value), jnp.asarray(pace + problem.discount)
+        )
+    np.testing.assert_allclose(found, value + rate / (pace + problem.discount), rtol=0, atol=1e-12)
+
+
+def test_a_sweep_is_compared_with_the_peer_before_it_is_timed(monkeypatch):
+    pytest.importorskip("numba")
+    problem, grid = questions.pendulum(32, 21)
+    points = np.ascontiguousarray(problem.controls.points[:, 0], np.float32)
+    assert 0 < sweep.largest_difference(problem, grid, points) <= sweep.AGREE
+    ours = sweep.sweep
+    monkeypatch.setattr(sweep, "sweep", lambda *arguments: 1.001 * ours(*arguments))
+    with pytest.raises(ValueError, match="the sweeps differ"):
+        sweep.largest_difference(problem, grid, points)
+
+
+def test_sweep_kernels_compute_what_a_step_of_value_iteration_does():
+    problem, grid = questions.pendulum(16, 5)
+    calls = sweep.candidates(problem, grid, 3)
+    iterated = hjb.solve(
+        problem, grid, method=hjb.ValueIteration(), guess=np.asarray(sweep.started(grid)),
+        dtype="float32", max_steps=3, throw=False,
+    )  # fmt: skip
+    for kernel in ("sweep", "loop"):
+        np.testing.assert_allclose(calls[kernel](), iterated.value, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(sweep.whole_steps(problem, grid, 3)(), iterated.value, rtol=0, atol=1e-5)
+
+
+def test_six_dimensions_need_little_beside_the_values():
+    for row in sweep.in_six_dimensions():
+        word = np.dtype(row["dtype"]).itemsize
+        assert row["bytes_per_node"] == row["bytes_beyond"] + 2 * word
+        assert word <= row["bytes_beyond"] <= floors.FLOORS["sweep 6-D"].bound
+
+
+def test_sizes_are_fitted_to_the_machine(monkeypatch):
+    monkeypatch.setattr(sweep.memory, "available", lambda: 32 * 10**6)
+    for shape in sweep.LARGE:
+        found = sweep.fitted(shape)
+        assert len(found) == len(shape)
+        assert math.prod(found) <= 10**6
+    assert sweep.fitted((10, 10)) == (10, 10)
+
+
+# --- peers ---
+
+
+def test_the_peers_agree_on_the_pendulum(tmp_path):
+    for peer in ("numba", "quantecon", "mdpsolver"):
+        pytest.importorskip(peer)
+    rows = rows_of(peers, tmp_path)
+    codes = [row["code"] for row in rows]
+    assert len(codes) == 7
+    assert sum(code.startswith("QuantEcon") for code in codes) == 2
+    for row in rows:
+        if row["code"] == "hjbjax":
+            assert row["status"] == "CONVERGED"
+            assert row["error"] <= row["tol"]
+        else:
+            assert 0 < row["difference"] <= 2 * row["tol"]
+            assert row["ours_is_faster"] > 0
+
+
+def test_a_peer_that_disagrees_is_marked():
+    assert peers.checked([{"difference": 3e-3, "tol": 1e-3}])[0]["status"] == "DISAGREES"
+    assert peers.checked([{"difference": math.nan, "tol": 1e-3}])[0]["status"] == "DISAGREES"
+    assert "status" not in peers.checked([{"difference": 2e-3, "tol": 1e-3}])[0]
+
+
+def test_a_peer_that_is_not_there_is_skipped(tmp_path, monkeypatch):
+    monkeypatch.setattr(peers, "without", lambda module: f"{module} is not installed")
+    rows = rows_of(peers, tmp_path)
+    assert [row["status"] for row in rows if row["code"] == "hjbjax"] == ["CONVERGED", "CONVERGED"]
+    assert {row["code"] for row in rows if row["status"] == "SKIPPED"} == {"numba", "QuantEcon", "mdpsolver"}
+
+
+# --- growth, scaling, controls, batch, startup ---
+
+
+def test_bytes_of_a_solve_hold_at_least_what_it_keeps():
+    problem, grid = questions.pendulum(30, 5)
+    double, single = (footprint.of_solve(problem, grid, 1e-3, dtype=kind) for kind in (np.float64, np.float32))
+    assert double["bytes_per_node"] > single["bytes_per_node"] > 2 * (4 + 4 + 4)  # value, rate and control, twice
+
+
+@pytest.mark.parametrize("problem", ["pendulum", pytest.param("dubins", marks=pytest.mark.slow)])
+def test_growth_solves_what_it_times(tmp_path, problem):
+    rows = rows_of(growth, tmp_path, "--problem", problem)
+    assert {row["problem"] for row in rows} == {problem}
+    for row in rows:
+        assert row["status"] == "CONVERGED"
+        assert row["error"] <= row["tol"]
+        assert row["bytes_per_node"] > 0
+        assert row["nodes"] == math.prod(row["shape"])
+
+
+def test_exponents_are_those_of_the_large_grids_alone():
+    sizes = [100, *(growth.FITTED * 4**k for k in range(3))]
+    rows = [{"nodes": n, "seconds": 5.0 if n == 100 else 1e-6 * n**1.25, "status": "CONVERGED"} for n in sizes]
+    growth.fit(rows)
+    assert rows[0]["exponent"] == pytest.approx(1.25)
+
+
+def test_growth_reads_its_figures_from_the_rows():
+    rows = [
+        {"problem": "pendulum", "shape": [n, n + 1], "seconds": s, "status": "CONVERGED"}
+        for n, s in ((400, 0.5), (1600, 10.0))
+    ]
+    assert growth.judged(rows) == {"growth": 20.0}
+    assert growth.judged([rows[0], rows[1] | {"status": "STALLED"}]) == {}
+
+
+def test_the_value_of_states_apart_is_a_sum():
+    line = np.array([1.0, 2.0])
+    np.testing.assert_array_equal(questions.sum_over_axes(line, 2), [[2.0, 3.0], [3.0, 4.0]])
+
+
+def test_scaling_checks_its_value(tmp_path):
+    rows = rows_of(scaling, tmp_path, "--dimension", "1", "--dimension", "2")
+    assert [row["dimension"] for row in rows] == [1, 1, 2, 2]
+    assert all(row["status"] == "CONVERGED" and row["difference"] <= 2 * scaling.TOL for row in rows)
+
+
+@pytest.mark.slow
+def test_more_controls_never_cost_more_to_the_controlled(tmp_path):
+    rows = rows_of(controls, tmp_path)
+    number = [row["error"] for row in rows if row["part"] == "number"]
+    assert number[0] > number[1] > 0  # 9 controls hold the 5
+    assert number[2] is None
+    for minimum in ("sampled", "exact"):
+        coarse, fine = (row["error"] for row in rows if (row["part"], row["minimum"]) == ("error", minimum))
+        assert fine < 0.7 * coarse
+        assert {row["bound"] for row in rows if row["part"] == "error"} == {-5.0}
+
+
+def test_a_batch_gives_the_values_of_its_members(tmp_path):
+    together, apart = rows_of(batch, tmp_path)
+    assert (together["code"], apart["code"]) == ("solve_batch", "solve")
+    assert together["difference"] <= 2 * batch.TOL
+    assert apart["throughput"] == 1.0
+    assert together["throughput"] > 0
+
+
+@pytest.mark.slow
+def test_startup_leaves_pictures_and_fills_the_cache(tmp_path):
+    cold, cached = rows_of(startup, tmp_path)
+    assert (cold["start"], cached["start"]) == ("cold", "cached")
+    assert cold["pictures"] == cached["pictures"] == 3
+
+
+@pytest.mark.slow
+def test_sweep_and_the_dimensions(tmp_path):
+    rows = rows_of(sweep, tmp_path)
+    timed = [row for row in rows if row.get("seconds")]
+    assert {len(row["shape"]) for row in timed} == {2, 3, 4, 6}
+    assert {row["kernel"] for row in timed} >= {"sweep", "loop", "improve", "step", "copy"}
+    verdicts = [row for row in rows if "figure" in row]
+    assert [bool(re.search("20\\^6", row["figure"])) for row in verdicts] == [True]

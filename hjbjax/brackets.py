@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.pytree import as_partial, cast, is_traced
+from hjbjax.pytree import as_partial, cast, is_traced, node
 
 Field = Callable[[Any], Any]
 
@@ -83,7 +83,7 @@ def ad(f: Field, g: Field, k: int) -> Field:
     return g
 
 
-def affine_fields(drift: Callable, inputs: int) -> tuple[Field, list[Field]]:
+def affine_fields(drift: Callable, inputs: int) -> tuple[Field, Sequence[Field]]:
     """The fields f and g_1, …, g_m of a drift f(x) + Σ g_j(x) u_j, such as ``Problem.drift``.
 
     Args:
@@ -97,17 +97,23 @@ def affine_fields(drift: Callable, inputs: int) -> tuple[Field, list[Field]]:
     """
     check_count("affine_fields", "inputs", inputs)
     held = as_partial(drift, "affine_fields: drift")
-    free = jax.tree_util.Partial(_free_field, held, inputs=inputs)
-    return free, [jax.tree_util.Partial(_input_field, held, inputs=inputs, j=j) for j in range(inputs)]
+    return _Affine(held, inputs, None), [_Affine(held, inputs, j) for j in range(inputs)]
 
 
-def _free_field(drift, x, *, inputs):
-    return drift(x, jnp.zeros(inputs, x.dtype))
+@node(static=("inputs", "j"))
+class _Affine:
+    """x ↦ f(x, 0), or with j the rate of f(x, u) with u_j; the drift's numbers stay leaves."""
 
+    drift: Any
+    inputs: int
+    j: int | None
 
-def _input_field(drift, x, *, inputs, j):
-    zero = jnp.zeros(inputs, x.dtype)
-    return jax.jvp(lambda u: drift(x, u), (zero,), (zero.at[j].set(1),))[1]
+    def __call__(self, x):
+        x = as_state(x)
+        zero = jnp.zeros(self.inputs, x.dtype)
+        if self.j is None:
+            return self.drift(x, zero)
+        return jax.jvp(functools.partial(self.drift, x), (zero,), (zero.at[self.j].set(1),))[1]
 
 
 def along(function: Callable, x: Any, directions: Any) -> Any:

@@ -15,6 +15,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from hjbjax.brackets import (
     Field,
@@ -30,7 +31,7 @@ from hjbjax.brackets import (
 )  # fmt: skip
 from hjbjax.distributions import Distribution, observability_codistribution, reachability_distribution, span
 from hjbjax.linearisation import Linearisation, RelativeDegree, linearising_feedback, near, plain, relative_degree
-from hjbjax.pytree import as_partial, node
+from hjbjax.pytree import as_partial, is_traced, node
 
 __all__ = [
     "Distribution",
@@ -54,8 +55,8 @@ class Linearisability:
     """Whether a system can be linearised by feedback, with the conditions it follows from.
 
     Args:
-      ranks: the dimensions of G_0, …, G_{n−1} at the state, shape (n,).
-      independence: the n-th singular value of G_{n−1} over the first; above ``tolerance`` where it has rank n.
+      ranks: the dimensions of G_0, G_1, … at the state, up to the first that is n or to G_{n−1}.
+      independence: the n-th singular value of the last of them over the first; above ``tolerance`` where it has rank n.
       involutivity: the largest part of a bracket of two fields of a G_k that lies outside G_k, relative to the
         terms the bracket is made of; below ``tolerance`` where all are involutive.
       regular: whether every G_k has the same dimension at all points looked at.
@@ -114,56 +115,66 @@ def is_feedback_linearisable(
     """
     check_count("is_feedback_linearisable", "samples", samples)
     fields = tuple(as_partial(field) for field in (f, *as_fields(g)))
-    return decide(_linearisability, fields, x, tolerance, radius=float(radius), samples=int(samples))
+    settings = {"radius": float(radius), "samples": int(samples)}
+    states = np.shape(x)[0] if np.ndim(x) else 1
+    # Where G_k is everything the longer brackets add nothing, and with m inputs that can be from k = n/m − 1 on.
+    enough = states if is_traced(fields, x, tolerance) else -(-states // max(len(fields) - 1, 1))
+    for depth in range(enough, states):
+        answer = decide(_linearisability, fields, x, tolerance, **settings, depth=depth)
+        if answer.regular and answer.ranks[-1] == states:
+            return answer
+    return decide(_linearisability, fields, x, tolerance, **settings, depth=states)
 
 
-def _linearisability(fields, x, tolerance, *, radius, samples):
+def _linearisability(fields, x, tolerance, *, radius, samples, depth):
+    """Looks at G_0, …, G_{depth − 1}."""
     n = x.shape[0]
-    ladder = _ad_ladder(fields, n)
-    points = near(x, radius, samples)
+    members, slopes = jax.vmap(lambda y: _ad_ladder(fields, y, depth))(near(x, radius, samples))
     # In a unit of time in which no bracket is longer than the fields themselves: stiff systems look like others.
-    sizes = jnp.sqrt(jnp.sum(ladder(x) ** 2, axis=(1, 2)))
-    steps = jnp.arange(1, n)
-    grown = jnp.where(sizes[0] > 0, sizes[1:] / jnp.where(sizes[0] > 0, sizes[0], 1), 0) ** (1 / steps)
+    sizes = jnp.sqrt(jnp.sum(members[0] ** 2, axis=(1, 2)))
+    grown = jnp.where(sizes[0] > 0, sizes[1:] / jnp.where(sizes[0] > 0, sizes[0], 1), 0) ** (1 / jnp.arange(1, depth))
     rate = jnp.max(grown, initial=0)
-    powers = jnp.where(rate > 0, rate, 1) ** jnp.arange(n)
+    powers = jnp.where(rate > 0, rate, 1) ** jnp.arange(depth)
+    members = members / powers[:, None, None]
+    slopes = slopes / powers[:-1, None, None, None]
 
-    def scaled(y):
-        return ladder(y) / powers[:, None, None]
-
-    def at(y):
-        members, slopes = scaled(y), jax.jacfwd(scaled)(y)
-        spans = [span(members[: k + 1].reshape(-1, n), tolerance) for k in range(n)]
-        outside = [_outside(spans[k], members[: k + 1], slopes[: k + 1]) for k in range(n - 1)]
+    def at(members, slopes):
+        spans = [span(members[: k + 1].reshape(-1, n), tolerance) for k in range(depth)]
+        outside = [_outside(spans[k], members[: k + 1], slopes[: k + 1]) for k in range(depth - 1)]
         ranks = jnp.stack([one.counted.sum() for one in spans])
-        return ranks, jnp.max(jnp.stack(outside)) if outside else jnp.zeros((), y.dtype)
+        return ranks, jnp.max(jnp.stack(outside)) if outside else jnp.zeros((), x.dtype)
 
-    ranks, outside = jax.vmap(at)(points)
-    values = span(scaled(x).reshape(-1, n), tolerance).singular_values
+    ranks, outside = jax.vmap(at)(members, slopes)
+    values = span(members[0].reshape(-1, n), tolerance).singular_values
     full = values.shape[0] == n
     independence = jnp.where((values[0] > 0) & full, values[-1] / jnp.where(values[0] > 0, values[0], 1), 0)
     return Linearisability(ranks[0], independence, jnp.max(outside), jnp.all(ranks == ranks[0]), tolerance)
 
 
-def _ad_ladder(fields, count):
-    """x ↦ ad_f^k g_j(x), k < count, shape (count, m, n)."""
-    f, *gs = fields
+def _ad_ladder(fields, x, count):
+    """ad_f^k g_j(x) for k < count, shape (count, m, n), and their slopes for k < count − 1, with one more axis."""
+    f, gs = stacked(fields[:1]), stacked(fields[1:])
+    if count == 1:
+        return gs(x)[None], jnp.zeros((0, len(fields) - 1, x.shape[0], x.shape[0]), x.dtype)
 
-    def ladder(x):
-        return (stacked(gs)(x),)
+    def ladder(y):
+        return (gs(y),)
 
     def longer(shorter):
-        def step(x):
-            direction = stacked([f])(x)
-            found, changes = along(shorter, x, direction)
-            _, bends = along(stacked([f]), x, found[-1])
+        def step(y):
+            found, changes = along(shorter, y, f(y))
+            _, bends = along(f, y, found[-1])
             return (*found, changes[-1][0] - bends[:, 0])
 
         return step
 
-    for _ in range(count - 1):
+    for _ in range(count - 2):
         ladder = longer(ladder)
-    return lambda x: jnp.stack(ladder(x))
+    # The slopes of the last one give the next one, without differentiating once more.
+    found, slopes = along(ladder, x, jnp.eye(x.shape[0], dtype=x.dtype))
+    slopes = jnp.moveaxis(jnp.stack(slopes), 1, -1)  # (count − 1, m, n, n)
+    _, bends = along(f, x, found[-1])
+    return jnp.stack([*found, slopes[-1] @ f(x)[0] - bends[:, 0]]), slopes
 
 
 def _outside(spanned, members, slopes):

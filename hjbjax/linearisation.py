@@ -147,10 +147,14 @@ class Linearisation:
             raise ValueError("linearising_feedback: the fields are traced and no x was given; give a concrete x=")
         with jax.ensure_compile_time_eval():  # only the length of the state is needed, which a tracer has too
             origin = jnp.zeros(states, dtype)
-            answer = _relative_degree(
-                (self.fields, self.output), origin, jnp.finfo(origin.dtype).eps ** 0.5, radius=0.1, samples=16
-            )
-        return _degrees_or_refuse(answer, "the origin")
+
+            def rule(depth):
+                tolerance = jnp.finfo(origin.dtype).eps ** 0.5
+                return _relative_degree(
+                    (self.fields, self.output), origin, tolerance, radius=0.1, samples=16, depth=depth
+                )
+
+            return _degrees_or_refuse(_deepen(rule, states), "the origin")
 
 
 def relative_degree(
@@ -191,7 +195,11 @@ def relative_degree(
     """
     check_count("relative_degree", "samples", samples)
     functions = (tuple(as_partial(field) for field in (f, *as_fields(g))), as_partial(h))
-    return decide(_relative_degree, functions, x, tolerance, radius=float(radius), samples=int(samples))
+    settings = {"radius": float(radius), "samples": int(samples)}
+    states = np.shape(x)[0] if np.ndim(x) else 1
+    if is_traced(functions, x, tolerance):
+        return decide(_relative_degree, functions, x, tolerance, **settings, depth=states)
+    return _deepen(lambda depth: decide(_relative_degree, functions, x, tolerance, **settings, depth=depth), states)
 
 
 def linearising_feedback(f: Field, g: Field | Sequence[Field], h: Callable, x: Any = None) -> Linearisation:
@@ -223,6 +231,15 @@ def linearising_feedback(f: Field, g: Field | Sequence[Field], h: Callable, x: A
         raise ValueError("linearising_feedback: got traced values; decide the relative degree outside of the trace")
     answer = relative_degree(f, g, h, x)
     return Linearisation(fields, output, _degrees_or_refuse(answer, f"x = {np.asarray(x).tolist()}"))
+
+
+def _deepen(rule: Callable, states: int) -> RelativeDegree:
+    """The rule with as many derivatives as it takes: every one more than doubles its program."""
+    for depth in range(1, states):
+        answer = rule(depth)
+        if np.all(np.asarray(answer.degrees) > 0):
+            return answer
+    return rule(states)
 
 
 def _degrees_or_refuse(answer: RelativeDegree, place: str) -> tuple[int, ...]:
@@ -274,17 +291,18 @@ def _derivatives(f, h, count):
     return ladder
 
 
-def _relative_degree(functions, x, tolerance, *, radius, samples):
+def _relative_degree(functions, x, tolerance, *, radius, samples, depth):
+    """Looks at L_g L_f^k h for k < depth."""
     (f, *gs), h = functions
-    n, ladder = x.shape[0], _derivatives(f, h, x.shape[0])
+    n, ladder = x.shape[0], _derivatives(f, h, depth)
 
     def at(y):
         inputs = stacked(gs)(y)
-        slopes = jnp.stack(jax.jacfwd(ladder)(y))  # (n, outputs, n)
+        slopes = jnp.stack(jax.jacfwd(ladder)(y))  # (depth, outputs, n)
         steepness = jax.lax.cummax(jnp.sqrt(jnp.sum(slopes * slopes, axis=-1)), axis=0)
         return slopes @ inputs.T, steepness * jnp.sqrt(jnp.sum(inputs * inputs))
 
-    effects, scales = jax.vmap(at)(near(x, radius, samples))  # (points, n, outputs, m) and (points, n, outputs)
+    effects, scales = jax.vmap(at)(near(x, radius, samples))  # (points, depth, outputs, m); without m
     appears = jnp.any(jnp.max(jnp.abs(effects), axis=-1) > tolerance * scales, axis=0)
     first, reached = jnp.argmax(appears, axis=0), jnp.any(appears, axis=0)
     outputs = jnp.arange(first.shape[0])

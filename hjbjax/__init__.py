@@ -1,6 +1,6 @@
 """hjbjax: Hamilton–Jacobi–Bellman and Isaacs equations on grids, with JAX."""
 
-from hjbjax import chain, plotting, zoo
+from hjbjax import chain, geometry, plotting, stability, zoo
 from hjbjax._version import __version__
 from hjbjax.batch import solve_batch
 from hjbjax.convergence import convergence_study
@@ -8,6 +8,7 @@ from hjbjax.fields import FallbackWarning
 from hjbjax.files import FileError
 from hjbjax.grid import Grid
 from hjbjax.iteration import Nested, PolicyIteration, ValueIteration
+from hjbjax.lyapunov import lyapunov_check
 from hjbjax.preparation import SolveWarning
 from hjbjax.problem import Problem
 from hjbjax.relaxation import Direct, Krylov, Sweeps
@@ -43,10 +44,13 @@ __all__ = [
     "__version__",
     "chain",
     "convergence_study",
+    "geometry",
     "load",
+    "lyapunov_check",
     "plotting",
     "simulate",
     "solve",
     "solve_batch",
+    "stability",
     "zoo",
 ]

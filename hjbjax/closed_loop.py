@@ -30,16 +30,17 @@ from hjbjax.problem import Problem
 from hjbjax.pytree import node
 
 
-@node(static=("clamp",))
+@node(static=("clamp", "time_varying"))
 class Loop:
     """The closed loop as functions of (t, x).
 
     Args:
       problem: the system and its costs.
-      control: a pytree that is called with the problem's state arguments; None where there is no control.
+      control: a pytree that is called with the state, or with ``(t, x)``; None where there is no control.
       opponent: likewise, for the disturbance.
       grid: the Grid in whose box the players are known; None where that is everywhere.
       clamp: outside the box, whether to go on with what the players say at its nearest point.
+      time_varying: whether the players take ``(t, x)``; always where the problem is time-dependent.
     """
 
     problem: Problem
@@ -47,6 +48,7 @@ class Loop:
     opponent: Any
     grid: Any
     clamp: bool
+    time_varying: bool = False
 
     def wrap(self, x):
         """The state with its periodic entries in the box."""
@@ -65,7 +67,11 @@ class Loop:
         if self.grid is not None:
             x, (lo, hi) = self.grid.wrap(x), self._corners(x)
             x = jnp.where(np.array(self.grid.periodic), x, jnp.clip(x, lo, hi))
-        return jnp.asarray(player(*self.problem.state_arguments(x, t)), x.dtype)
+        return jnp.asarray(player(*self.player_arguments(t, x)), x.dtype)
+
+    def player_arguments(self, t, x):
+        """What the players are called with."""
+        return (t, x) if self.time_varying or self.problem.time_dependent else (x,)
 
     def _corners(self, x):
         return jnp.asarray(self.grid.lo, x.dtype), jnp.asarray(self.grid.hi, x.dtype)

@@ -25,6 +25,7 @@ def simulate(
     *,
     steps: int | None = None,
     disturbance: Callable | None = None,
+    time_varying: bool = False,
     key: Any = None,
     hold: Any = False,
     grid: Grid | None = None,
@@ -36,7 +37,8 @@ def simulate(
 ) -> Path:
     """The path of the closed loop from ``x0``, in float64.
 
-    Callables take ``(x)``; they take ``(t, x)`` exactly when ``problem.time_dependent``. Periodic states are
+    Callables take ``(x)``; they take ``(t, x)`` exactly when ``problem.time_dependent``, and feedback and disturbance
+    also when ``time_varying``. Periodic states are
     wrapped into the grid before anything sees them. Called again with the same functions and shapes, it does
     not compile again, whatever the numbers.
 
@@ -49,6 +51,7 @@ def simulate(
     Keyword Args:
       steps: number of output intervals; ``None`` is 200, or the sampling intervals under ``hold``.
       disturbance: a function that returns the opponent's d, shape (l,). ``None``: the Solution's own worst case.
+      time_varying: whether feedback and disturbance take ``(t, x)`` though the problem does not depend on time.
       key: a JAX random key or an integer; wanted exactly when the problem has noise.
       hold: the sampling interval of a zero-order hold of the control, in units of time; ``False`` for none.
       grid: the box to stay in, for a feedback that is a function; a Solution brings its own.
@@ -77,7 +80,7 @@ def simulate(
     """
     if is_traced(problem, feedback, x0, duration, key, grid):
         raise ValueError("simulate: got traced values; inside jit, vmap or grad use hjbjax.simulation.rollout")
-    loop = _close(problem, feedback, disturbance, grid, clamp)
+    loop = _close(problem, feedback, disturbance, grid, clamp, time_varying)
     x0 = _initial(x0, loop.grid)
     hold = None if hold is False else hold
     times = _times(_positive(duration, "duration"), steps, hold)
@@ -116,6 +119,7 @@ def rollout(
     times: Any,
     *,
     disturbance: Callable | None = None,
+    time_varying: bool = False,
     key: Any = None,
     hold: bool = False,
     grid: Grid | None = None,
@@ -137,7 +141,7 @@ def rollout(
       times: output times, shape (k+1,), increasing; the first is where discounting starts.
 
     Keyword Args:
-      disturbance: as in ``simulate``.
+      disturbance: as in ``simulate``, like ``time_varying``.
       key: a JAX random key; wanted exactly when the problem has noise.
       hold: whether the control is held from one output time to the next.
       grid: as in ``simulate``, like ``clamp``, ``rtol``, ``atol``, ``max_step`` and ``max_steps``.
@@ -161,13 +165,13 @@ def rollout(
     if not jnp.issubdtype(x0.dtype, jnp.floating):
         raise ValueError(f"rollout: x0 has dtype {x0.dtype}, wanted floating point: the path follows it")
     _check_key(problem, key)
-    loop = _close(problem, feedback, disturbance, grid, clamp)
+    loop = _close(problem, feedback, disturbance, grid, clamp, time_varying)
     _probe(loop, x0)
     stepping = Stepping(rtol, atol, np.inf if max_step is None else max_step, max_steps, hold)
     return integrate(loop, x0, jnp.asarray(times, x0.dtype), key, stepping)[0]
 
 
-def _close(problem: Problem, feedback: Any, disturbance: Any, grid: Any, clamp: bool) -> Loop:
+def _close(problem: Problem, feedback: Any, disturbance: Any, grid: Any, clamp: bool, time_varying: Any) -> Loop:
     """The loop through a Solution, which brings its grid and its worst case, or through functions."""
     if disturbance is not None and not problem.is_game:
         raise ValueError(
@@ -188,7 +192,9 @@ def _close(problem: Problem, feedback: Any, disturbance: Any, grid: Any, clamp: 
             opponent = jax.tree_util.Partial(_from_solution, as_partial(feedback.disturbance_at))
     if grid is not None and not isinstance(grid, Grid):
         raise TypeError(f"simulate: grid is {grid!r}, wanted a Grid or None")
-    signature = "(t, x)" if problem.time_dependent else "(x)"
+    if not isinstance(time_varying, bool):
+        raise TypeError(f"simulate: time_varying is {time_varying!r}, wanted True or False")
+    signature = "(t, x)" if problem.time_dependent or time_varying else "(x)"
     if problem.disturbances is not None and opponent is None:
         raise ValueError(
             "simulate: the problem has disturbances, and only a Solution of it knows the worst case; "
@@ -198,7 +204,7 @@ def _close(problem: Problem, feedback: Any, disturbance: Any, grid: Any, clamp: 
         if not callable(function) and not (function is None and optional):
             raise TypeError(f"simulate: {name} is {function!r}, wanted a Solution or a function {signature}")
     control = None if problem.controls is None else as_partial(control)
-    return Loop(problem, control, as_partial(opponent), grid, bool(clamp))
+    return Loop(problem, control, as_partial(opponent), grid, bool(clamp), time_varying)
 
 
 def _from_solution(look_up: Callable, *arguments: Any) -> Any:
@@ -261,13 +267,13 @@ def _probe(loop: Loop, x0: Any) -> None:
     m = 0 if problem.controls is None else problem.controls.dim
     opponents = 0 if problem.disturbances is None else problem.disturbances.dim
     u, d = jnp.zeros(m, x0.dtype), jnp.zeros(opponents, x0.dtype)
-    players, state = problem.state_arguments(x0, x0[0]), problem.arguments(x0, u, d, x0[0])
+    players, state = loop.player_arguments(x0[0], x0), problem.arguments(x0, u, d, x0[0])
     for name, function, arguments, wanted in (
         ("feedback", loop.control, players, (m,)),
         ("disturbance", loop.opponent, players, (opponents,)),
         ("drift", problem.drift, state, (n,)),
         ("cost", problem.cost, state, ()),
-        ("target", problem.target, players, ()),
+        ("target", problem.target, problem.state_arguments(x0, x0[0]), ()),
     ):
         if function is None:
             continue

@@ -325,6 +325,31 @@ def test_bad_input_is_refused_before_anything_is_compiled(problem, feedback, x0,
         simulate(problem, x0=x0, **options)
 
 
+def by_time(t, x):
+    return jnp.cos(t)[None] - 0 * x
+
+
+def test_a_feedback_may_depend_on_time_though_the_problem_does_not():
+    """ẋ = cos t gives x = sin t and the cost ∫ sin² + cos² = T; a hold keeps the control of the interval's start."""
+    path = simulate(PLAIN, by_time, [0.0], 2.0, time_varying=True, rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose(path.states[:, 0], np.sin(path.times), atol=1e-8)
+    assert path.cost == pytest.approx(2.0, abs=1e-8)
+    held = simulate(PLAIN, by_time, [0.0], 2.0, time_varying=True, hold=0.5)
+    np.testing.assert_allclose(np.diff(held.states[:, 0]), 0.5 * np.cos(held.times[:-1]), atol=1e-8)
+    game = Problem(lambda x, u, d: u + d, None, UNIT, disturbances=UNIT)
+    quiet = simulate(game, by_time, [0.0], 2.0, time_varying=True, disturbance=lambda t, x: -by_time(t, x))
+    np.testing.assert_allclose(quiet.states, 0, atol=1e-12)
+    traced = jax.jit(lambda x0: rollout(PLAIN, by_time, x0, jnp.linspace(0, 2, 5), time_varying=True).states)
+    np.testing.assert_allclose(traced(jnp.zeros(1))[:, 0], np.sin(np.linspace(0, 2, 5)), atol=1e-5)
+
+
+def test_time_varying_is_a_choice_of_two():
+    with pytest.raises(TypeError, match="time_varying is 1"):
+        simulate(PLAIN, by_time, [0.0], 1.0, time_varying=1)
+    with pytest.raises(TypeError, match=r"function \(t, x\)"):
+        simulate(PLAIN, 3, [0.0], 1.0, time_varying=True)
+
+
 def test_what_cannot_be_called_is_a_type_error():
     with pytest.raises(TypeError, match="wanted a Solution or a function"):
         simulate(PLAIN, [-1.0], [1.0], 1.0)

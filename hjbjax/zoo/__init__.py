@@ -13,6 +13,7 @@ all under the names of the command line.
 
 from hjbjax.zoo.entry import Entry
 from hjbjax.zoo.finance import Merton, merton, merton_exact
+from hjbjax.zoo.geometric import Angle, CarWithTrailers, OneWay, Pomet, Unicycle
 from hjbjax.zoo.linear_quadratic import (
     LinearScalar,
     double_integrator_lq,
@@ -24,7 +25,15 @@ from hjbjax.zoo.linear_quadratic import (
 )
 from hjbjax.zoo.manipulator import Manipulator, manipulator
 from hjbjax.zoo.manufactured import Smooth, smooth, smooth_exact
-from hjbjax.zoo.mechanical import Pendulum, VanDerPol, pendulum, pendulum_near_upright, van_der_pol
+from hjbjax.zoo.mechanical import (
+    BallAndBeam,
+    FlexibleJoint,
+    Pendulum,
+    VanDerPol,
+    pendulum,
+    pendulum_near_upright,
+    van_der_pol,
+)
 from hjbjax.zoo.minimum_time import (
     Boat,
     DoubleIntegrator,
@@ -114,17 +123,24 @@ _ENTRIES = (
 catalogue: dict[str, Entry] = {entry.name: entry for entry in _ENTRIES}
 
 __all__ = [
+    "Angle",
+    "BallAndBeam",
     "BangBang",
     "Boat",
+    "CarWithTrailers",
     "DoubleIntegrator",
     "Dubins",
     "Entry",
+    "FlexibleJoint",
     "LinearScalar",
     "Manipulator",
     "Merton",
+    "OneWay",
     "Pendulum",
+    "Pomet",
     "SingleIntegrator",
     "Smooth",
+    "Unicycle",
     "VanDerPol",
     "bang_bang",
     "bang_bang_exact",

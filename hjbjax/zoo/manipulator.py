@@ -1,12 +1,15 @@
 """A planar arm of n links by differentiating its Lagrangian.
 
     M(q) q̈ + V(q, w) + G(q) = τ                                             (5.5)
+    τ = M(q) τ' + V(q, w) + G(q), which makes q̈ = τ'                        (5.6)
 
 q₁ is the angle of the first link from upright, q_i that of link i from the one before; each link is massless with
 a point mass at its far end, so that one link is the pendulum. With the kinetic energy T = ½ w'M(q)w and the
 potential energy U,
 
-    M e_j = ∂T/∂w at w = e_j,    V = (∂/∂q ∂T/∂w) w − ∂T/∂q,    G = ∂U/∂q.
+    M e_j = ∂T/∂w at w = e_j,    V = (∂/∂q ∂T/∂w) w − ∂T/∂q,    G = ∂U/∂q,
+
+and V = C w with the matrix C_ij = ½ Σ_k (∂M_ij/∂q_k + ∂M_ik/∂q_j − ∂M_jk/∂q_i) w_k, for which Ṁ − 2C is skew.
 
 Everything is done on lists of scalars: n is static, the loops unroll, and only elementwise operations are left,
 which a solver can evaluate on a whole grid without forming a matrix a node.
@@ -21,7 +24,7 @@ import numpy as np
 
 from hjbjax.grid import Grid
 from hjbjax.problem import Problem
-from hjbjax.pytree import node
+from hjbjax.pytree import as_partial, node
 from hjbjax.sets import Box
 from hjbjax.zoo.ingredients import QuadraticCost, positive
 
@@ -100,17 +103,51 @@ class Manipulator:
         """V(q, w), shape (n,): the centrifugal and Coriolis torques."""
         return jnp.stack(self._coriolis(_scalars(q, self.links), _scalars(w, self.links)))
 
+    def coriolis_matrix(self, q: Any, w: Any) -> Any:
+        """C(q, w) of Christoffel's symbols, shape (n, n): C w is ``coriolis``, and Ṁ − 2C is skew."""
+        slopes = jax.jacfwd(self.mass_matrix)(jnp.stack(_scalars(q, self.links)))  # ∂M_ij/∂q_k
+        symbols = slopes + slopes.swapaxes(1, 2) - slopes.transpose(2, 1, 0)
+        return 0.5 * symbols @ jnp.stack(_scalars(w, self.links))
+
     def gravity(self, q: Any) -> Any:
         """G(q), shape (n,)."""
-        return jnp.stack(jax.grad(self.potential_energy)(_scalars(q, self.links)))
+        return jnp.stack(self._gravity(_scalars(q, self.links)))
 
-    def drift(self, x: Any, u: Any) -> Any:
+    def computed_torque(self, q: Any, w: Any, acceleration: Any) -> Any:
+        """(5.6), the torque M τ' + V + G under which q̈ is the acceleration τ', shape (n,).
+
+        Example:
+          >>> arm = Manipulator(links=2)
+          >>> q, w = jnp.array([0.3, -0.2]), jnp.array([1.0, 2.0])
+          >>> x, torque = jnp.concatenate([q, w]), arm.computed_torque(q, w, jnp.array([5.0, -4.0]))
+          >>> arm.drift(x, torque)[2:].round(3).tolist()
+          [5.0, -4.0]
+        """
+        n = self.links
+        angles, rates, wanted = (_scalars(vector, n) for vector in (q, w, acceleration))
+        matrix, bias, weight = self._mass(angles), self._coriolis(angles, rates), self._gravity(angles)
+        return jnp.stack([sum(matrix[i][j] * wanted[j] for j in range(n)) + bias[i] + weight[i] for i in range(n)])
+
+    def tracking(self, reference: Any = None, damping: Any = 3.0, stiffness: Any = 2.0) -> Any:
+        """A feedback for ``simulate`` by computed torque: q̈ = q̈* − damping·(w − q̇*) − stiffness·(q − q*).
+
+        Args:
+          reference: q*, a function of time that returns shape (n,); the feedback then takes ``(t, x)``, so give
+            ``time_varying=True`` as well. ``None``: upright, and the feedback takes ``(x)``.
+          damping: per unit of time.
+          stiffness: per unit of time squared.
+        """
+        if reference is None:
+            return jax.tree_util.Partial(_hold_upright, self, damping, stiffness)
+        return jax.tree_util.Partial(_track, self, damping, stiffness, as_partial(reference, "Manipulator.tracking"))
+
+    def drift(self, x: Any, tau: Any) -> Any:
         """(w, M⁻¹(τ − V − G))."""
         n = self.links
         numbers = _scalars(x, 2 * n)
         q, w = numbers[:n], numbers[n:]
-        bias, weight = self._coriolis(q, w), jax.grad(self.potential_energy)(q)
-        rest = [u[i] - bias[i] - weight[i] for i in range(n)]
+        bias, weight = self._coriolis(q, w), self._gravity(q)
+        rest = [tau[i] - bias[i] - weight[i] for i in range(n)]
         return jnp.stack([*w, *_solve_positive(self._mass(q), rest)])
 
     def _mass(self, q: list) -> list[list]:
@@ -126,6 +163,24 @@ class Manipulator:
         _, change = jax.jvp(momentum, (q,), (w,))
         pull = jax.grad(self.kinetic_energy, argnums=0)(q, w)
         return [change[i] - pull[i] for i in range(self.links)]
+
+    def _gravity(self, q: list) -> list:
+        return jax.grad(self.potential_energy)(q)
+
+
+def _hold_upright(arm, damping, stiffness, x):
+    q, w = x[: arm.links], x[arm.links :]
+    return arm.computed_torque(q, w, -damping * w - stiffness * q)
+
+
+def _track(arm, damping, stiffness, reference, t, x):
+    def rate(time):
+        return jax.jvp(reference, (time,), (jnp.ones_like(time),))[1]
+
+    q, w = x[: arm.links], x[arm.links :]
+    acceleration = jax.jvp(rate, (t,), (jnp.ones_like(t),))[1]
+    wanted = acceleration - damping * (w - rate(t)) - stiffness * (q - reference(t))
+    return arm.computed_torque(q, w, wanted)
 
 
 def _scalars(vector: Any, count: int) -> list:

@@ -2,6 +2,8 @@
 
     pendulum         θ̈ = g sin θ + τ/m           θ from upright, on S¹ × R
     Van der Pol      ẍ = μ(1 − x²)ẋ − x + u
+    ball and beam    r̈ = B(r θ̇² − g sin θ), θ̈ = u
+    flexible joint   I q̈₁ + M g L sin q₁ + k(q₁ − q₂) = 0, J q̈₂ + k(q₂ − q₁) = u
 
 The pendulum follows from mθ̈ − mg sin θ = τ; (9.4) of the chapter prints the input gain g/m, kept as
 ``as_printed=True`` since figures 10 to 12 may come from it.
@@ -50,6 +52,14 @@ class Pendulum:
         """(θ̇, g sin θ + gain·τ)."""
         return jnp.stack([x[1], self.g * jnp.sin(x[0]) + self.gain * u[0]])
 
+    def linearising_torque(self, x: Any) -> Any:
+        """(2.8), τ = −mg sin θ − 3mθ̇ − 2mθ: the loop is θ̈ + 3θ̇ + 2θ = 0, however large the angle."""
+        return jnp.stack([-(self.g * jnp.sin(x[0]) + 3 * x[1] + 2 * x[0]) / self.gain])
+
+    def linear_torque(self, x: Any) -> Any:
+        """The same design for the pendulum linearised upright, τ = −mgθ − 3mθ̇ − 2mθ."""
+        return jnp.stack([-(self.g * x[0] + 3 * x[1] + 2 * x[0]) / self.gain])
+
 
 @node()
 class VanDerPol:
@@ -64,6 +74,62 @@ class VanDerPol:
     def drift(self, x: Any, u: Any) -> Any:
         """(ẋ, μ(1 − x²)ẋ − x + u)."""
         return jnp.stack([x[1], self.stiffness * (1 - x[0] * x[0]) * x[1] - x[0] + u[0]])
+
+
+@node()
+class BallAndBeam:
+    """A ball that rolls on a beam, state (r, ṙ, θ, θ̇), control θ̈; the model of Hauser, Sastry and Kokotović (1992).
+
+    Its output r has no relative degree where r θ̇ = 0, in particular at rest, and feedback cannot linearise it.
+
+    Args:
+      inertia: B, of the ball; 5/7 for a solid one.
+      g: gravity; 9.81 m/s².
+    """
+
+    inertia: Any = 5 / 7
+    g: Any = 9.81
+
+    def drift(self, x: Any, u: Any) -> Any:
+        """(ṙ, B(r θ̇² − g sin θ), θ̇, u)."""
+        return jnp.stack([x[1], self.inertia * (x[0] * x[3] * x[3] - self.g * jnp.sin(x[2])), x[3], u[0]])
+
+    def output(self, x: Any) -> Any:
+        """r, the place of the ball."""
+        return x[0]
+
+
+@node()
+class FlexibleJoint:
+    """A link driven through a spring, state (q₁, q̇₁, q₂, q̇₂), q₁ of the link from hanging, q₂ of the motor.
+
+    Feedback linearises it as long as k > 0; the angle of the link has relative degree 4.
+
+    Args:
+      link: I, the inertia of the link.
+      motor: J, the inertia of the motor.
+      weight: M g L, the torque of gravity on the level link.
+      stiffness: k, of the spring.
+    """
+
+    link: Any = 1.0
+    motor: Any = 1.0
+    weight: Any = 9.81
+    stiffness: Any = 10.0
+
+    def __post_init__(self):
+        positive("FlexibleJoint", link=self.link, motor=self.motor)
+
+    def drift(self, x: Any, u: Any) -> Any:
+        """(q̇₁, −(MgL sin q₁ + k(q₁ − q₂))/I, q̇₂, (k(q₁ − q₂) + u)/J)."""
+        spring = self.stiffness * (x[0] - x[2])
+        return jnp.stack(
+            [x[1], -(self.weight * jnp.sin(x[0]) + spring) / self.link, x[3], (spring + u[0]) / self.motor]
+        )
+
+    def output(self, x: Any) -> Any:
+        """q₁, the angle of the link."""
+        return x[0]
 
 
 def pendulum(

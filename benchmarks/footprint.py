@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 import hjbjax as hjb
-from hjbjax import driver, iteration
+from hjbjax import driver
 from hjbjax.preparation import choose, judge, prepare
 from hjbjax.pytree import cast
 
@@ -16,11 +16,6 @@ def bytes_of(lowered: Any) -> int:
     found = lowered.compile().memory_analysis()
     total = found.argument_size_in_bytes + found.output_size_in_bytes + found.temp_size_in_bytes
     return int(total - found.alias_size_in_bytes)
-
-
-def loop() -> Any:
-    """The compiled loop that ``solve`` calls again and again, as ``loop()(task, state, until)``."""
-    return driver.compiled(iteration.run)
 
 
 def of_solve(problem: Any, grid: Any, tol: float, *, method: Any = None, dtype: Any = np.float64) -> dict[str, Any]:
@@ -36,4 +31,4 @@ def of_solve(problem: Any, grid: Any, tol: float, *, method: Any = None, dtype: 
             return task, driver.begin(task, jax.numpy.zeros(grid.shape, kind))
 
         shapes = jax.eval_shape(begin, *cast((problem, grid), kind))
-        return {"bytes_per_node": bytes_of(loop().lower(*shapes, 1)) / grid.size}
+        return {"bytes_per_node": bytes_of(driver.run.lower(*shapes, 1)) / grid.size}

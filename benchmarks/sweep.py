@@ -21,7 +21,7 @@ import numpy as np
 
 import hjbjax as hjb
 from benchmarks import floors, questions
-from benchmarks.footprint import bytes_of, loop
+from benchmarks.footprint import bytes_of
 from benchmarks.report import RESULTS, attempt, picture, stamped, table, without, write_json
 from benchmarks.timing import interleaved
 from hjbjax import bellman, driver, memory
@@ -155,10 +155,10 @@ def whole_steps(problem: Any, grid: hjb.Grid, count: int) -> Any:
     """Steps of ``solve`` with value iteration, as its host loop runs them."""
     method = hjb.ValueIteration()
     task, _, _ = prepare_on_host(problem, grid, method=method, scheme=SCHEME, tol=1e-30, dtype=KIND)
-    states = [loop()(task, driver.begin(task, started(grid)), 0)]
+    states = [driver.run(task, driver.begin(task, started(grid)), 0)]
 
     def call():
-        states[0] = loop()(task, states[0], int(states[0].step) + count)
+        states[0] = driver.run(task, states[0], int(states[0].step) + count)
         return states[0].value
 
     return call

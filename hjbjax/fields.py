@@ -21,59 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core as jex
 
-# Which operands of a data-moving primitive are data; the others are indices and must be known.
-_MOVES: dict[str, Callable[[int], Sequence[int]]] = {
-    "broadcast_in_dim": lambda n: (0,),
-    "reshape": lambda n: (0,),
-    "squeeze": lambda n: (0,),
-    "expand_dims": lambda n: (0,),
-    "transpose": lambda n: (0,),
-    "rev": lambda n: (0,),
-    "slice": lambda n: (0,),
-    "split": lambda n: (0,),
-    "dynamic_slice": lambda n: (0,),
-    "gather": lambda n: (0,),
-    "concatenate": range,
-    "stack": range,
-    "unstack": lambda n: (0,),
-    "tile": lambda n: (0,),
-    "pad": range,
-    "dynamic_update_slice": lambda n: (0, 1),
-    "scatter": lambda n: (0, 2),
-}
-# The commonest of them for labels in NumPy: JAX would compile each on its first use.
-_IN_NUMPY: dict[str, Callable[..., np.ndarray]] = {
-    "slice": lambda x, start_indices, limit_indices, strides: x[
-        tuple(map(slice, start_indices, limit_indices, strides or (None,) * x.ndim))
-    ],
-    "squeeze": lambda x, dimensions: np.squeeze(x, dimensions),
-    "stack": lambda *xs, axis: np.stack(xs, axis),
-    "concatenate": lambda *xs, dimension: np.concatenate(xs, dimension),
-}
-
-_SCATTERS = {"scatter-add": jax.lax.add, "scatter-sub": jax.lax.sub, "scatter-mul": jax.lax.mul}
-_SCATTERS |= {"scatter-min": jax.lax.min, "scatter-max": jax.lax.max}
-
-_ENTRYWISE = frozenset(
-    """abs acos acosh add add_any and asin asinh atan atan2 atanh bessel_i0e bessel_i1e cbrt ceil clamp
-    convert_element_type copy copy_p cos cosh digamma div eq erf erf_inv erfc exp exp2 expm1 floor ge gt imag
-    integer_pow is_finite le lgamma log log1p log2 logistic lt max min mul ne neg nextafter not or pow real
-    reduce_precision rem round rsqrt select_n sign sin sinh sqrt square stop_gradient sub tan tanh xor""".split()  # noqa: SIM905
-)
-
-_REDUCTIONS: dict[str, Callable] = {
-    "reduce_sum": jax.lax.add,
-    "reduce_prod": jax.lax.mul,
-    "reduce_max": jax.lax.max,
-    "reduce_min": jax.lax.min,
-    "reduce_and": jax.lax.bitwise_and,
-    "reduce_or": jax.lax.bitwise_or,
-}
-
-_CUMULATIVE = {"cumsum": jax.lax.add, "cumprod": jax.lax.mul, "cummax": jax.lax.max, "cummin": jax.lax.min}
-
-_CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr"}
-_CALLS |= {"checkpoint": "jaxpr", "remat": "jaxpr", "remat2": "jaxpr", "custom_jvp_call": "call_jaxpr"}
+from hjbjax.primitives import CALLS, CUMULATIVE, ENTRYWISE, IN_NUMPY, MOVES, REDUCTIONS, SCATTERS
 
 
 class FallbackWarning(UserWarning):
@@ -164,8 +112,8 @@ def _apply(eqn: Any, operands: list[Any], algebra: Any) -> list[Any]:
     name = eqn.primitive.name
     if not any(map(_is_components, operands)):
         return _uniform(eqn, operands)
-    if name in _CALLS and _CALLS[name] in eqn.params:
-        inner = eqn.params[_CALLS[name]]
+    if name in CALLS and CALLS[name] in eqn.params:
+        inner = eqn.params[CALLS[name]]
         inner = inner if isinstance(inner, jex.ClosedJaxpr) else jex.ClosedJaxpr(inner, ())
         return (
             algebra.custom_jvp(eqn, inner, operands)
@@ -174,19 +122,19 @@ def _apply(eqn: Any, operands: list[Any], algebra: Any) -> list[Any]:
         )
     if name == "cond":
         return _branch(eqn, operands, algebra)
-    if name in _MOVES:
+    if name in MOVES:
         moved = _move(eqn, operands, algebra)
         if moved is not None:
             return moved
-    elif name in _ENTRYWISE:
+    elif name in ENTRYWISE:
         return [_entrywise(eqn, operands, algebra)]
-    elif name in _SCATTERS:
+    elif name in SCATTERS:
         scattered = _scatter(eqn, operands, algebra)
         if scattered is not None:
             return [scattered]
-    elif name in _CUMULATIVE:
+    elif name in CUMULATIVE:
         return [_accumulate(eqn, _lift(operands[0], algebra), algebra)]
-    elif name in _REDUCTIONS:
+    elif name in REDUCTIONS:
         return [_reduce(eqn, _lift(operands[0], algebra), algebra)]
     elif name == "dot_general":
         return [_contract(eqn, _lift(operands[0], algebra), _lift(operands[1], algebra), algebra)]
@@ -214,7 +162,7 @@ def _known(values: Sequence[Any]) -> bool:
 
 def _move(eqn: Any, operands: list[Any], algebra: Any) -> list[Any] | None:
     """Where every entry of a data-moving primitive goes, found by moving integer labels."""
-    data = set(_MOVES[eqn.primitive.name](len(operands)))
+    data = set(MOVES[eqn.primitive.name](len(operands)))
     if not _known([value for position, value in enumerate(operands) if position not in data]):
         return None
     pool: list[Any] = []
@@ -227,8 +175,8 @@ def _move(eqn: Any, operands: list[Any], algebra: Any) -> list[Any] | None:
     pool.append(algebra.constant(np.asarray(np.nan if fill is None else fill), ()))
     if fill is not None:
         eqn = eqn.replace(params=eqn.params | {"fill_value": -1})
-    if eqn.primitive.name in _IN_NUMPY:
-        moved = [_IN_NUMPY[eqn.primitive.name](*labelled, **eqn.params)]
+    if eqn.primitive.name in IN_NUMPY:
+        moved = [IN_NUMPY[eqn.primitive.name](*labelled, **eqn.params)]
     else:
         with jax.ensure_compile_time_eval():
             moved = _bind(eqn, labelled)
@@ -244,7 +192,7 @@ def _scatter(eqn: Any, operands: list[Any], algebra: Any) -> np.ndarray | None:
         return None
     entries, updates = _lift(target, algebra).copy(), _lift(updates, algebra)
     numbers, mode = eqn.params["dimension_numbers"], eqn.params["mode"]
-    combine = functools.partial(algebra.combine, _SCATTERS[eqn.primitive.name], eqn.invars[0].aval.dtype)
+    combine = functools.partial(algebra.combine, SCATTERS[eqn.primitive.name], eqn.invars[0].aval.dtype)
     for position in np.ndindex(*updates.shape):
         one = np.zeros(updates.shape, np.int32)
         one[position] = 1
@@ -287,13 +235,13 @@ def _reduce(eqn: Any, entries: np.ndarray, algebra: Any) -> np.ndarray:
     if entries.size == 0:  # the neutral element
         return _lift(_uniform(eqn, [np.zeros(entries.shape, eqn.invars[0].aval.dtype)])[0], algebra)
     rows = entries.transpose(*kept, *axes).reshape(math.prod(shape), -1)
-    combine = functools.partial(algebra.combine, _REDUCTIONS[eqn.primitive.name], eqn.invars[0].aval.dtype)
+    combine = functools.partial(algebra.combine, REDUCTIONS[eqn.primitive.name], eqn.invars[0].aval.dtype)
     return _object_array([functools.reduce(combine, row) for row in rows], shape)
 
 
 def _accumulate(eqn: Any, entries: np.ndarray, algebra: Any) -> np.ndarray:
     axis, step = eqn.params["axis"], -1 if eqn.params["reverse"] else 1
-    combine = functools.partial(algebra.combine, _CUMULATIVE[eqn.primitive.name], eqn.invars[0].aval.dtype)
+    combine = functools.partial(algebra.combine, CUMULATIVE[eqn.primitive.name], eqn.invars[0].aval.dtype)
     rows = np.moveaxis(entries, axis, -1)[..., ::step]
     result = np.empty(rows.shape, dtype=object)
     for index in np.ndindex(*rows.shape[:-1]):

@@ -1,0 +1,60 @@
+"""JAX's primitives by the rule that evaluates them component by component; see ``fields``."""
+
+from collections.abc import Callable, Sequence
+
+import jax
+import numpy as np
+
+# Which operands of a data-moving primitive are data; the others are indices and must be known.
+MOVES: dict[str, Callable[[int], Sequence[int]]] = {
+    "broadcast_in_dim": lambda n: (0,),
+    "reshape": lambda n: (0,),
+    "squeeze": lambda n: (0,),
+    "expand_dims": lambda n: (0,),
+    "transpose": lambda n: (0,),
+    "rev": lambda n: (0,),
+    "slice": lambda n: (0,),
+    "split": lambda n: (0,),
+    "dynamic_slice": lambda n: (0,),
+    "gather": lambda n: (0,),
+    "concatenate": range,
+    "stack": range,
+    "unstack": lambda n: (0,),
+    "tile": lambda n: (0,),
+    "pad": range,
+    "dynamic_update_slice": lambda n: (0, 1),
+    "scatter": lambda n: (0, 2),
+}
+# The commonest of them for labels in NumPy: JAX would compile each on its first use.
+IN_NUMPY: dict[str, Callable[..., np.ndarray]] = {
+    "slice": lambda x, start_indices, limit_indices, strides: x[
+        tuple(map(slice, start_indices, limit_indices, strides or (None,) * x.ndim))
+    ],
+    "squeeze": lambda x, dimensions: np.squeeze(x, dimensions),
+    "stack": lambda *xs, axis: np.stack(xs, axis),
+    "concatenate": lambda *xs, dimension: np.concatenate(xs, dimension),
+}
+
+SCATTERS = {"scatter-add": jax.lax.add, "scatter-sub": jax.lax.sub, "scatter-mul": jax.lax.mul}
+SCATTERS |= {"scatter-min": jax.lax.min, "scatter-max": jax.lax.max}
+
+ENTRYWISE = frozenset(
+    """abs acos acosh add add_any and asin asinh atan atan2 atanh bessel_i0e bessel_i1e cbrt ceil clamp
+    convert_element_type copy copy_p cos cosh digamma div eq erf erf_inv erfc exp exp2 expm1 floor ge gt imag
+    integer_pow is_finite le lgamma log log1p log2 logistic lt max min mul ne neg nextafter not or pow real
+    reduce_precision rem round rsqrt select_n sign sin sinh sqrt square stop_gradient sub tan tanh xor""".split()  # noqa: SIM905
+)
+
+REDUCTIONS: dict[str, Callable] = {
+    "reduce_sum": jax.lax.add,
+    "reduce_prod": jax.lax.mul,
+    "reduce_max": jax.lax.max,
+    "reduce_min": jax.lax.min,
+    "reduce_and": jax.lax.bitwise_and,
+    "reduce_or": jax.lax.bitwise_or,
+}
+
+CUMULATIVE = {"cumsum": jax.lax.add, "cumprod": jax.lax.mul, "cummax": jax.lax.max, "cummin": jax.lax.min}
+
+CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr"}
+CALLS |= {"checkpoint": "jaxpr", "remat": "jaxpr", "remat2": "jaxpr", "custom_jvp_call": "call_jaxpr"}

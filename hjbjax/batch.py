@@ -130,20 +130,29 @@ def _solve_together(
 
 
 def _finish_lanes(tasks: Task, states: State, count: int, max_steps: int) -> tuple[list[State], list[list]]:
-    """Chunks of steps for the lanes that still run; the number of lanes in a chunk is a power of two."""
-    final = [_lane(states, i) for i in range(count)]
+    """Chunks of steps until every lane is done; lanes that are done are taken out where that halves the work."""
+    final: list[Any] = [None] * count
     histories: list[list] = [[] for _ in range(count)]
-    active = list(range(count))
-    while active:
-        width = min(count, 1 << (len(active) - 1).bit_length())
-        rows = np.array((active + active[-1:] * width)[:width])
-        before = [int(final[i].step) for i in rows]
-        until = jnp.asarray([min(step + CHUNK, max_steps) for step in before])
-        part = _run(_take(tasks, rows), _stack([final[i] for i in rows]), until)
-        for lane, (index, began) in enumerate(zip(rows[: len(active)], before, strict=False)):
-            final[index] = _lane(part, lane)
-            histories[index].append(np.asarray(final[index].history)[: int(final[index].step) - began])
-        active = [i for i in active if final[i].code == Status.RUNNING and final[i].step < max_steps]
+    lanes = np.arange(count)  # which lane each row holds; −1 in rows that only fill up
+    while lanes.size:
+        before = np.asarray(states.step)
+        states = _run(tasks, states, np.minimum(before + CHUNK, max_steps))
+        codes, steps, history = jax.device_get((states.code, states.step, states.history))
+        going = (codes == Status.RUNNING) & (steps < max_steps) & (lanes >= 0)
+        live = [row for row, lane in enumerate(lanes) if lane >= 0 and final[lane] is None]
+        for row in live:
+            histories[lanes[row]].append(history[row, : steps[row] - before[row]])
+        ended = [row for row in live if not going[row]]
+        if ended:
+            on_host = jax.device_get(states)
+            for row in ended:
+                final[lanes[row]] = jax.tree.map(lambda leaf, row=row: leaf[row].copy(), on_host)
+        left = np.flatnonzero(going)
+        width = 1 << (left.size - 1).bit_length() if left.size else 0
+        if width < lanes.size:
+            kept = np.resize(left, width)
+            lanes = np.where(np.arange(width) < left.size, lanes[kept], -1)
+            tasks, states = _take(tasks, kept), _take(states, kept)
     return final, histories
 
 
@@ -153,7 +162,3 @@ def _stack(trees: Sequence[Any]) -> Any:
 
 def _take(tree: Any, rows: np.ndarray) -> Any:
     return jax.tree.map(lambda leaf: leaf[rows], tree)
-
-
-def _lane(tree: Any, index: int) -> Any:
-    return jax.tree.map(lambda leaf: leaf[index], tree)

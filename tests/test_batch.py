@@ -1,0 +1,108 @@
+"""Many problems on one grid: every lane is what a solve of its own gives."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hjbjax as hjb
+from hjbjax.pytree import node
+
+GRID = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (13, 11))
+
+
+@node()
+class Oscillator:
+    """ẍ = −k x + u, with running cost w |x|² + u²."""
+
+    k: object
+    w: object = 1.0
+
+    def drift(self, x, u):
+        return jnp.stack([x[1], u[0] - self.k * x[0]])
+
+    def cost(self, x, u):
+        return self.w * (x @ x) + u @ u
+
+    def log_cost(self, x, u):
+        return jnp.log(self.w) + x @ x + u @ u
+
+
+def problem(k, discount=0.5, **options):
+    system = Oscillator(k, **options)
+    return hjb.Problem(system.drift, system.cost, hjb.Box([-1.0], [1.0]), discount=discount)
+
+
+def alone(question, **options):
+    return hjb.solve(question, GRID, method=hjb.PolicyIteration(), tol=1e-6, **options)
+
+
+def test_each_lane_is_its_own_solve_bit_for_bit():
+    """Discounts far apart take different numbers of steps, so that lanes are taken out on the way."""
+    questions = [
+        problem(k, beta) for k, beta in zip((0.0, 1.0, 2.0, 0.5, 3.0), (5.0, 0.01, 1.0, 0.02, 9.0), strict=True)
+    ]
+    together = hjb.solve_batch(questions, GRID, tol=1e-6)
+    assert len({solution.steps for solution in together}) > 2
+    for solution, question in zip(together, questions, strict=True):
+        single = alone(question)
+        assert solution.status is hjb.Status.CONVERGED
+        assert solution.steps == single.steps
+        assert np.array_equal(solution.value, single.value)
+        assert np.array_equal(solution.policy, single.policy)
+        assert np.array_equal(solution.residuals, single.residuals)
+        assert np.allclose(solution.bounds, single.bounds, rtol=0, atol=1e-12)
+
+
+def test_problems_of_different_kinds_keep_their_places():
+    finite = dataclasses.replace(problem(1.0), controls=hjb.Finite([[-1.0], [0.0], [1.0]]))
+    questions = [problem(0.0), finite, problem(2.0), finite]
+    together = hjb.solve_batch(questions, GRID, tol=1e-6)
+    for solution, question in zip(together, questions, strict=True):
+        assert np.array_equal(solution.value, alone(question).value)
+
+
+def test_rounds_that_fit_into_memory_change_nothing():
+    questions = [problem(k) for k in np.linspace(0, 2, 5)]
+    whole, parts = (hjb.solve_batch(questions, GRID, tol=1e-6, max_memory=limit) for limit in (None, 150_000))
+    assert parts[0].stats["lanes"] < whole[0].stats["lanes"] == 5
+    for left, right in zip(whole, parts, strict=True):
+        assert np.array_equal(left.value, right.value)
+
+
+def test_a_lane_that_runs_out_of_steps_is_named_and_the_others_are_whole():
+    questions = [problem(1.0, 9.0), problem(1.0, 0.01)]
+    steps = alone(questions[0]).steps
+    slow, unfinished = hjb.solve_batch(questions, GRID, tol=1e-6, max_steps=steps, throw=False)
+    assert slow.status is hjb.Status.CONVERGED
+    assert unfinished.status is hjb.Status.MAX_STEPS
+    assert unfinished.steps == steps
+    with pytest.raises(hjb.SolveError, match="lane 1: MAX_STEPS") as caught:
+        hjb.solve_batch(questions, GRID, tol=1e-6, max_steps=steps)
+    assert np.array_equal(caught.value.solution.value, unfinished.value)
+
+
+def test_one_lane_that_goes_nan_leaves_the_others_bitwise_unchanged():
+    systems = [Oscillator(1.0, w) for w in (1.0, -1.0, 2.0)]  # the logarithm of −1 is no number
+    questions = [hjb.Problem(s.drift, s.log_cost, hjb.Box([-1.0], [1.0]), discount=1.0) for s in systems]
+    first, spoiled, last = hjb.solve_batch(questions, GRID, tol=1e-6, throw=False)
+    assert spoiled.status is hjb.Status.NONFINITE
+    for solution, question in ((first, questions[0]), (last, questions[2])):
+        assert np.array_equal(solution.value, alone(question).value)
+
+
+def test_a_lane_without_an_answer_is_named():
+    with pytest.raises(ValueError, match="lane 1: .*no finite solution"):
+        hjb.solve_batch([problem(1.0, 1.0), dataclasses.replace(problem(1.0), cost=None, discount=0.0)], GRID)
+
+
+def test_no_problems_have_no_solutions():
+    assert hjb.solve_batch([], GRID) == []
+
+
+def test_lanes_keep_single_precision():
+    (solution,) = hjb.solve_batch([problem(1.0)], GRID, tol=1e-2, dtype="float32")
+    assert solution.value.dtype == np.float32
+    assert not jax.config.jax_enable_x64

@@ -156,11 +156,14 @@ def optimise(here: Local, how: Setting, isaacs: str | None = None) -> tuple[jax.
 
 def best_response(here: Local, player: Player, join: Callable) -> tuple[jax.Array, Action]:
     """One player's optimum against a given action of the other; ``join(mine)`` makes the pair (u, d)."""
-    if player.choices is None or player.exact:
-        action = [] if player.choices is None else _exact(here, player, join)
-        return here.at(*join(action)), action
-    value, action, _ = _sampled(here, player, lambda action: (here.at(*join(action)), []), weight=1)
-    return value, action
+    if player.choices is None:
+        return here.at(*join([])), []
+    if player.exact:
+        action = _exact(here, player, join)
+    else:
+        _, action, _ = _sampled(here, player, lambda action: (here.at(*join(action)), []), weight=1)
+    action = jax.lax.optimization_barrier(action)  # or the search is done twice, for the action and for the value
+    return here.at(*join(action)), action
 
 
 def _nested(here: Local, outer: Player, inner: Player, join: Callable) -> tuple[jax.Array, Action, Action]:

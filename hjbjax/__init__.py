@@ -7,11 +7,13 @@ from hjbjax.convergence import convergence_study
 from hjbjax.fields import FallbackWarning
 from hjbjax.files import FileError
 from hjbjax.grid import Grid
+from hjbjax.horizon import march
 from hjbjax.iteration import Nested, PolicyIteration, ValueIteration
+from hjbjax.marching import Explicit, Implicit
 from hjbjax.preparation import SolveWarning
 from hjbjax.problem import Problem
 from hjbjax.relaxation import Direct, Krylov, Sweeps
-from hjbjax.schemes import Limited, Upwind
+from hjbjax.schemes import Eno2, Limited, Upwind, Weno5
 from hjbjax.sets import Ball, Box, Finite
 from hjbjax.simulation import simulate
 from hjbjax.solution import Solution, SolveError, load
@@ -23,10 +25,13 @@ __all__ = [
     "Ball",
     "Box",
     "Direct",
+    "Eno2",
+    "Explicit",
     "FallbackWarning",
     "FileError",
     "Finite",
     "Grid",
+    "Implicit",
     "Krylov",
     "Limited",
     "Nested",
@@ -40,10 +45,12 @@ __all__ = [
     "Sweeps",
     "Upwind",
     "ValueIteration",
+    "Weno5",
     "__version__",
     "chain",
     "convergence_study",
     "load",
+    "march",
     "plotting",
     "simulate",
     "solve",

@@ -21,11 +21,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax import chain, sets, stencil, structure, subcell
+from hjbjax import chain, sets, stencil, structure, subcell, weno
 from hjbjax.grid import Grid
 from hjbjax.minimisers import Action, Kinked, enumerate_actions, kinked_ball, piecewise_input, refine
 from hjbjax.problem import Problem
-from hjbjax.schemes import Limited, Scheme
+from hjbjax.schemes import Eno2, Limited, Scheme, Upwind, Weno5
 from hjbjax.sets import AdmissibleSet, Ball, Box, Finite
 
 SAMPLES = 33  # points of a continuum before refinement
@@ -65,12 +65,14 @@ class Setting:
 
     Attributes:
       control, disturbance: the players.
-      decoupled: whether their choices do not touch each other; then the Isaacs condition holds.
+      separable: whether drift and cost are sums of what each player does, and noise is neither's.
+      decoupled: whether they drive different components as well; then the Isaacs condition holds on every grid.
       disturbance_costs: whether the running cost depends on the disturbance.
     """
 
     control: Player
     disturbance: Player
+    separable: bool
     decoupled: bool
     disturbance_costs: bool
 
@@ -100,7 +102,8 @@ def setting(problem: Problem, n: int, dtype: Any) -> Setting:
         entry is None or any(set(term) & set(inputs_u) and set(term) & set(inputs_d) for term in entry)
         for entry in (*drift.entries, *cost.entries)
     )
-    return Setting(mine, theirs, separate and not crossed and noise.is_constant, not cost.free_of(inputs_d))
+    separable = not crossed and noise.is_constant
+    return Setting(mine, theirs, separable, separate and separable, not cost.free_of(inputs_d))
 
 
 def _player(
@@ -125,7 +128,7 @@ class Local:
     """The Hamiltonian around one value function: coordinates, slopes, and how to evaluate H(u, d).
 
     Attributes:
-      up, down: the slopes that drift sees; D⁺ and D⁻, or limited ones.
+      up, down: the slopes that drift sees; D⁺ and D⁻, or those of a scheme of higher order.
       links: the distances to the neighbours along every axis.
       bends: D⁺ − D⁻ along every axis, which noise sees.
     """
@@ -149,7 +152,7 @@ class Local:
             return upwind
         link = self.links[axis]
         h_up, h_down = link.up, link.down
-        if isinstance(self.scheme, Limited):
+        if not isinstance(self.scheme, Upwind):
             return upwind + jnp.maximum(a, 0) * self.bends[axis] / (h_up + h_down)
         e = chain.excess(f, a, self.grid, axis, self.scheme, link)
         upward, downward = (e + h_down * f) / (h_up + h_down), (e - h_up * f) / (h_up + h_down)
@@ -199,7 +202,12 @@ def local(problem: Problem, grid: Grid, value: jax.Array, *, scheme: Scheme, t: 
     links = tuple(subcell.links(problem, grid, subcell=scheme.subcell, dtype=value.dtype, t=t))
     differences = [stencil.one_sided(value, grid, axis, link) for axis, link in enumerate(links)]
     bends = tuple(up - down for up, down in differences)
-    if isinstance(scheme, Limited):
+    if isinstance(scheme, Weno5):
+        differences = weno.slopes(value, grid)
+    elif isinstance(scheme, Eno2):
+        pairs = zip(differences, links, strict=True)
+        differences = [stencil.limited(*ends, grid, i, link, stencil.smaller) for i, (ends, link) in enumerate(pairs)]
+    elif isinstance(scheme, Limited):
         differences = _limited(problem, grid, x, differences, links, t)
     up, down = zip(*differences, strict=True)
     return Local(problem, grid, scheme, value.dtype, t, x, value, up, down, bends, links)
@@ -207,7 +215,10 @@ def local(problem: Problem, grid: Grid, value: jax.Array, *, scheme: Scheme, t: 
 
 def _limited(problem: Problem, grid: Grid, x: list, differences: list, links: tuple, t: Any) -> list:
     """Limited slopes; central ones where noise keeps those monotone, a_ii ≥ h |f_i| for all actions."""
-    slopes = [stencil.limited(up, down, grid, axis, links[axis]) for axis, (up, down) in enumerate(differences)]
+    slopes = [
+        stencil.limited(up, down, grid, axis, links[axis], stencil.van_albada)
+        for axis, (up, down) in enumerate(differences)
+    ]
     if problem.noise is None:
         return slopes
     dtype = differences[0][0].dtype
@@ -345,7 +356,7 @@ def _kinked(here: Local, base: tuple[Action, Action], axis: int, offset: Any, sl
     def gain(f):
         return here.gain(axis, f, left)
 
-    if left is None or isinstance(here.scheme, Limited) or not here.scheme.central:
+    if left is None or not isinstance(here.scheme, Upwind) or not here.scheme.central:
         return Kinked(gain, offset, slope, (0.0,), (down, up))
     h_up, h_down = here.links[axis].up, here.links[axis].down
     edge = stencil.on_edge(here.grid, axis, 1) | stencil.on_edge(here.grid, axis, -1)

@@ -5,7 +5,7 @@ zero, which projects outward drift back onto the box and reflects noise.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -93,10 +93,13 @@ def one_sided(values: jax.Array, grid: Grid, axis: int, link: Links | None = Non
     return (up - values) / link.up, (values - down) / link.down
 
 
-def limited(up: jax.Array, down: jax.Array, grid: Grid, axis: int, link: Links) -> tuple[jax.Array, jax.Array]:
+def limited(
+    up: jax.Array, down: jax.Array, grid: Grid, axis: int, link: Links, limiter: Callable
+) -> tuple[jax.Array, jax.Array]:
     """Second-order one-sided slopes from the differences D⁺, D⁻ along one axis; zero across an edge as they are.
 
-    Next to an edge, and to the boundary of a target, the second difference is continued as a constant.
+    Next to an edge, and to the boundary of a target, the second difference is continued as a constant. The
+    ``limiter`` makes one of two neighbouring second differences: ``van_albada``, or ``smaller``.
     """
     upper, lower = on_edge(grid, axis, 1), on_edge(grid, axis, -1)
     bend = 2 * (up - down) / (link.up + link.down)
@@ -107,13 +110,19 @@ def limited(up: jax.Array, down: jax.Array, grid: Grid, axis: int, link: Links) 
         above = jnp.where(link.meets_up[0], bend, above)
     if link.meets_down is not None:
         below = jnp.where(link.meets_down[0], bend, below)
-    up = jnp.where(upper, 0, up - link.up / 2 * _van_albada(bend, above))
-    return up, jnp.where(lower, 0, down + link.down / 2 * _van_albada(bend, below))
+    up = jnp.where(upper, 0, up - link.up / 2 * limiter(bend, above))
+    return up, jnp.where(lower, 0, down + link.down / 2 * limiter(bend, below))
 
 
-def _van_albada(a: jax.Array, b: jax.Array) -> jax.Array:
+def van_albada(a: jax.Array, b: jax.Array) -> jax.Array:
+    """ab (a + b)/(a² + b²) where the two have one sign, else zero."""
     agree = a * b > 0
     return jnp.where(agree, a * b * (a + b) / jnp.where(agree, a * a + b * b, 1), 0)
+
+
+def smaller(a: jax.Array, b: jax.Array) -> jax.Array:
+    """The one that is smaller in size; the first only if it is."""
+    return jnp.where(jnp.abs(a) < jnp.abs(b), a, b)
 
 
 def sparse(offsets: Sequence[tuple[int, ...]], values: Sequence[np.ndarray], diagonal: np.ndarray, grid: Grid) -> Any:

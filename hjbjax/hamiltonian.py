@@ -21,7 +21,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax import chain, sets, stencil, structure, subcell, weno
+from hjbjax import chain, sets, slopes, stencil, structure, subcell
 from hjbjax.grid import Grid
 from hjbjax.minimisers import Action, Kinked, enumerate_actions, kinked_ball, piecewise_input, refine
 from hjbjax.problem import Problem
@@ -203,10 +203,9 @@ def local(problem: Problem, grid: Grid, value: jax.Array, *, scheme: Scheme, t: 
     differences = [stencil.one_sided(value, grid, axis, link) for axis, link in enumerate(links)]
     bends = tuple(up - down for up, down in differences)
     if isinstance(scheme, Weno5):
-        differences = weno.slopes(value, grid)
+        differences = slopes.weno5(value, grid)
     elif isinstance(scheme, Eno2):
-        pairs = zip(differences, links, strict=True)
-        differences = [stencil.limited(*ends, grid, i, link, stencil.smaller) for i, (ends, link) in enumerate(pairs)]
+        differences = slopes.eno2(value, grid)
     elif isinstance(scheme, Limited):
         differences = _limited(problem, grid, x, differences, links, t)
     up, down = zip(*differences, strict=True)
@@ -215,12 +214,9 @@ def local(problem: Problem, grid: Grid, value: jax.Array, *, scheme: Scheme, t: 
 
 def _limited(problem: Problem, grid: Grid, x: list, differences: list, links: tuple, t: Any) -> list:
     """Limited slopes; central ones where noise keeps those monotone, a_ii ≥ h |f_i| for all actions."""
-    slopes = [
-        stencil.limited(up, down, grid, axis, links[axis], stencil.van_albada)
-        for axis, (up, down) in enumerate(differences)
-    ]
+    found = [stencil.limited(up, down, grid, axis, links[axis]) for axis, (up, down) in enumerate(differences)]
     if problem.noise is None:
-        return slopes
+        return found
     dtype = differences[0][0].dtype
     calm: list = [True] * grid.ndim
     for u, d in itertools.product(sets.probes(problem.controls, dtype), sets.probes(problem.disturbances, dtype)):
@@ -233,8 +229,8 @@ def _limited(problem: Problem, grid: Grid, x: list, differences: list, links: tu
     for axis, ((up, down), link) in enumerate(zip(differences, links, strict=True)):
         inner = calm[axis] & ~(stencil.on_edge(grid, axis, 1) | stencil.on_edge(grid, axis, -1))
         middle = (link.down * up + link.up * down) / (link.up + link.down)
-        slopes[axis] = (jnp.where(inner, middle, slopes[axis][0]), jnp.where(inner, middle, slopes[axis][1]))
-    return slopes
+        found[axis] = (jnp.where(inner, middle, found[axis][0]), jnp.where(inner, middle, found[axis][1]))
+    return found
 
 
 def optimise(here: Local, how: Setting, isaacs: str | None = None) -> tuple[jax.Array, Action, Action]:

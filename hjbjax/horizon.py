@@ -122,8 +122,10 @@ def _check(problem: Any, grid: Any, scheme: Any, method: Any, step: Any, time_li
         raise TypeError(f"march: method is {method!r}; wanted hjb.Explicit(...) or hjb.Implicit(...)")
     if isinstance(method, Implicit) and not isinstance(scheme, Upwind):
         raise ValueError(f"march: Implicit(...) solves with the matrix of a chain; got {scheme!r}, wanted Upwind(...)")
-    if isinstance(scheme, Weno5) and any(each is not None for each in grid.stretch or ()):
-        raise ValueError("march: Weno5() wants equal spacings; leave out Grid.stretch, or use Upwind() or Limited()")
+    if isinstance(scheme, (Eno2, Weno5)) and any(each is not None for each in grid.stretch or ()):
+        raise ValueError(
+            f"march: {scheme!r} wants equal spacings; leave out Grid.stretch, or use Upwind() or Limited()"
+        )
     if step is not None and not _is_positive(step):
         raise ValueError(f"march: step = {step!r}; wanted a finite number > 0, in units of time")
     if time_limit is not None and not (_is_positive(time_limit) or time_limit == math.inf):

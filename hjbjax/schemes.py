@@ -61,7 +61,7 @@ class Eno2:
 
         D⁺ − (h/2) m(s_i, s_{i+1}),   D⁻ + (h/2) m(s_i, s_{i−1}),   m(a, b) = a if |a| < |b| else b.
 
-    C.-W. Shu and S. Osher's choice of the smoother stencil, node by node; kinks cost no more than their own cells.
+    The smoother stencil, node by node, as C.-W. Shu and S. Osher choose it. Wants equal spacings.
     """
 
     subcell = False
@@ -78,7 +78,7 @@ class Eno2:
 class Weno5:
     """Fifth order where the value is smooth, for ``march``: weighted essentially non-oscillatory slopes.
 
-    Each one-sided slope is a mean of three third-order ones with weights that favour the smoothest (see ``weno``).
+    Each one-sided slope is a mean of three third-order ones with weights that favour the smoothest (see ``slopes``).
     Wants equal spacings and at least seven points an axis.
     """
 

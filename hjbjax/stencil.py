@@ -5,7 +5,7 @@ zero, which projects outward drift back onto the box and reflects noise.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -85,7 +85,10 @@ def links(grid: Grid, axis: int) -> Links:
 def one_sided(values: jax.Array, grid: Grid, axis: int, link: Links | None = None) -> tuple[jax.Array, jax.Array]:
     """The differences D⁺ = (V(x+h⁺) − V(x))/h⁺ and D⁻ = (V(x) − V(x−h⁻))/h⁻ along one axis; zero across an edge."""
     link = link or links(grid, axis)
-    up, down = (neighbour(values, grid, unit(grid, axis, step)) for step in (1, -1))
+    if grid.ndim > 2:
+        up, down = _shifted(values, grid, axis)
+    else:
+        up, down = (neighbour(values, grid, unit(grid, axis, step)) for step in (1, -1))
     if link.meets_up is not None:
         up = jnp.where(*link.meets_up, up)
     if link.meets_down is not None:
@@ -93,13 +96,23 @@ def one_sided(values: jax.Array, grid: Grid, axis: int, link: Links | None = Non
     return (up - values) / link.up, (values - down) / link.down
 
 
-def limited(
-    up: jax.Array, down: jax.Array, grid: Grid, axis: int, link: Links, limiter: Callable
-) -> tuple[jax.Array, jax.Array]:
+def _shifted(values: jax.Array, grid: Grid, axis: int) -> tuple[jax.Array, jax.Array]:
+    """The two neighbours along an axis, made of pieces.
+
+    In three dimensions and more XLA's loops over such pieces ran up to six times faster than over ``neighbour``; in
+    the plane it is the other way round, by a factor of one and a half to two (measured on a CPU).
+    """
+    count = grid.shape[axis]
+    first, last = (jax.lax.slice_in_dim(values, k, k + 1, axis=axis) for k in (0, count - 1))
+    before, after = (last, first) if grid.periodic[axis] else (first, last)  # type: ignore[index]
+    up = jnp.concatenate([jax.lax.slice_in_dim(values, 1, count, axis=axis), after], axis)
+    return up, jnp.concatenate([before, jax.lax.slice_in_dim(values, 0, count - 1, axis=axis)], axis)
+
+
+def limited(up: jax.Array, down: jax.Array, grid: Grid, axis: int, link: Links) -> tuple[jax.Array, jax.Array]:
     """Second-order one-sided slopes from the differences D⁺, D⁻ along one axis; zero across an edge as they are.
 
-    Next to an edge, and to the boundary of a target, the second difference is continued as a constant. The
-    ``limiter`` makes one of two neighbouring second differences: ``van_albada``, or ``smaller``.
+    Next to an edge, and to the boundary of a target, the second difference is continued as a constant.
     """
     upper, lower = on_edge(grid, axis, 1), on_edge(grid, axis, -1)
     bend = 2 * (up - down) / (link.up + link.down)
@@ -110,19 +123,13 @@ def limited(
         above = jnp.where(link.meets_up[0], bend, above)
     if link.meets_down is not None:
         below = jnp.where(link.meets_down[0], bend, below)
-    up = jnp.where(upper, 0, up - link.up / 2 * limiter(bend, above))
-    return up, jnp.where(lower, 0, down + link.down / 2 * limiter(bend, below))
+    up = jnp.where(upper, 0, up - link.up / 2 * _van_albada(bend, above))
+    return up, jnp.where(lower, 0, down + link.down / 2 * _van_albada(bend, below))
 
 
-def van_albada(a: jax.Array, b: jax.Array) -> jax.Array:
-    """ab (a + b)/(a² + b²) where the two have one sign, else zero."""
+def _van_albada(a: jax.Array, b: jax.Array) -> jax.Array:
     agree = a * b > 0
     return jnp.where(agree, a * b * (a + b) / jnp.where(agree, a * a + b * b, 1), 0)
-
-
-def smaller(a: jax.Array, b: jax.Array) -> jax.Array:
-    """The one that is smaller in size; the first only if it is."""
-    return jnp.where(jnp.abs(a) < jnp.abs(b), a, b)
 
 
 def sparse(offsets: Sequence[tuple[int, ...]], values: Sequence[np.ndarray], diagonal: np.ndarray, grid: Grid) -> Any:

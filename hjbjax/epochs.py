@@ -139,8 +139,8 @@ def _message(task: March, front: Front, code: Status) -> str:
     if code is Status.CONVERGED:
         return f"Marched from t = {horizon:g} to t = {t:g}."
     what = {
-        Status.DIVERGED: "The value blows up: the worst disturbance reached its bound inside the box. If the bound is "
-        "meant, give wide=False; if not, and a wider box changes the time little, there is no finite value before it.",
+        Status.DIVERGED: "The value blows up: the worst disturbance reached its bound inside the box. A wider box of "
+        "disturbances tells how fast; where the bound is meant, give inner=0.",
         Status.NONFINITE: "NaN or infinity appeared in the step after, and the last finite value is kept; check drift "
         "and costs there, or take a shorter step.",
         Status.STALLED: "The policy iteration of an implicit step did not come to its end; take a shorter step.",

@@ -42,7 +42,7 @@ def march(
     scheme: Scheme = Upwind(),
     method: Explicit | Implicit | None = None,
     step: float | None = None,
-    wide: bool | None = None,
+    inner: float | None = None,
     dtype: Any = None,
     time_limit: float | None = None,
     throw: bool = True,
@@ -64,9 +64,9 @@ def march(
       scheme: ``Upwind(...)``, ``Limited()``, ``Eno2()`` or ``Weno5()``.
       method: ``Explicit(...)``, the default, whose steps the grid limits, or ``Implicit(...)``, of any step.
       step: the longest time step; ``None`` is the stable one, if implicit a hundredth of the horizon.
-      wide: whether the disturbance's box stands for all of R^l and is wide enough to be inactive; then the march
-        stops, DIVERGED, where the worst disturbance reaches its bound in the inner half of the box: there the
-        value blows up. ``None``: yes if the cost is quadratic in every disturbance (an L₂ gain), else no.
+      inner: for a disturbance that is bounded only by the size of its ``Box``, as in an L₂ gain: the march stops,
+        DIVERGED, where the worst disturbance reaches that bound in this share of the grid's box about its middle,
+        since a value that blows up does. ``None``: ½ if the cost is quadratic in every disturbance, else 0, never.
       dtype: ``None`` is float64; ``"float32"`` for memory and accelerators.
       time_limit: at most so many seconds.
       throw: raise when the march does not come to its end; otherwise the status says it.
@@ -101,7 +101,7 @@ def march(
         needed = memory.fitting(_bytes(problem, grid, kept, method, kind), grid, max_memory)
         checks.shapes(problem, grid, scheme)
         checks.values(_without_moving_target(problem), grid, scheme, kind)
-        task = _prepare(problem, grid, horizon, scheme, method, step, wide, kind)
+        task = _prepare(problem, grid, horizon, scheme, method, step, inner, kind)
         slices, front, code = epochs.drive(task, kept, clock)
         solution = epochs.assemble(task, grid, slices, front, code)
     solution.stats.update(
@@ -186,7 +186,7 @@ def _prepare(
     scheme: Scheme,
     method: Any,
     step: float | None,
-    wide: bool | None,
+    inner: float | None,
     dtype: Any,
 ) -> March:
     """The task of a march, all arrays in ``dtype``, with a given step held against the limit."""
@@ -208,7 +208,7 @@ def _prepare(
         step = horizon / FEWEST if moving or isinstance(method, Implicit) else math.inf
     return March(
         problem, grid, method, None if moving else _rules(problem, grid, dtype), limit, jnp.asarray(step, dtype),
-        jnp.asarray(horizon, dtype), _watched(problem, grid, wide, dtype), scheme,
+        jnp.asarray(horizon, dtype), _watched(problem, grid, inner, dtype), scheme,
     )  # fmt: skip
 
 
@@ -226,22 +226,24 @@ def _evaluation(problem: Problem, grid: Grid) -> Any:
     return Direct() if grid.ndim == 1 and not is_traced(problem, grid) else Krylov()
 
 
-def _watched(problem: Problem, grid: Grid, wide: bool | None, dtype: Any) -> Any:
-    """The nodes of the inner half of the box, where a disturbance at its bound is taken for a blow-up; or None."""
-    if wide is False or not problem.is_game:
+def _watched(problem: Problem, grid: Grid, share: float | None, dtype: Any) -> Any:
+    """The nodes where a disturbance at its bound is taken for a blow-up; or None."""
+    if share is None:
+        how = hamiltonian.setting(problem, grid.ndim, dtype).disturbance
+        share = 0.5 if isinstance(how.choices, Box) and all(how.curved) else 0.0
+    if not 0 <= share <= 1:
+        raise ValueError(f"march: inner = {share!r}; wanted the share of the box that is watched, from 0 (none) to 1")
+    if share == 0:
         return None
-    how = hamiltonian.setting(problem, grid.ndim, dtype).disturbance
-    if wide is None and not (isinstance(how.choices, Box) and all(how.curved)):
-        return None
-    if not isinstance(how.choices, Box):
-        raise ValueError(f"march: wide=True wants a Box of disturbances, got {how.choices!r}")
-    inner = np.ones(grid.shape, bool)
+    if not isinstance(problem.disturbances, Box):
+        raise ValueError(f"march: inner = {share:g} watches a Box of disturbances; got {problem.disturbances!r}")
+    watched = np.ones(grid.shape, bool)
     for axis in range(grid.ndim):
         if not grid.periodic[axis]:  # type: ignore[index]
             nodes, lo, hi = np.asarray(grid.axis(axis)), float(grid.lo[axis]), float(grid.hi[axis])
-            inside = np.abs(nodes - (lo + hi) / 2) <= (hi - lo) / 4
-            inner &= inside.reshape([-1 if i == axis else 1 for i in range(grid.ndim)])
-    return jnp.asarray(inner)
+            inside = np.abs(nodes - (lo + hi) / 2) <= share * (hi - lo) / 2
+            watched &= inside.reshape([-1 if i == axis else 1 for i in range(grid.ndim)])
+    return jnp.asarray(watched)
 
 
 def _march_traced(

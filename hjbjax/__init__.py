@@ -12,6 +12,7 @@ from hjbjax.iteration import Nested, PolicyIteration, ValueIteration
 from hjbjax.marching import Explicit, Implicit
 from hjbjax.preparation import SolveWarning
 from hjbjax.problem import Problem
+from hjbjax.reachability import avoid, reach, reach_avoid
 from hjbjax.relaxation import Direct, Krylov, Sweeps
 from hjbjax.schemes import Eno2, Limited, Upwind, Weno5
 from hjbjax.sets import Ball, Box, Finite
@@ -47,11 +48,14 @@ __all__ = [
     "ValueIteration",
     "Weno5",
     "__version__",
+    "avoid",
     "chain",
     "convergence_study",
     "load",
     "march",
     "plotting",
+    "reach",
+    "reach_avoid",
     "simulate",
     "solve",
     "solve_batch",

@@ -51,7 +51,7 @@ def march(
 ) -> Solution:
     """March a finite-horizon problem backward from its terminal cost at t = horizon to t = 0.
 
-    min{ max{ β V − V_t − H(x, DV, D²V), V − ψ }, V − g } = 0, V(·, horizon) = terminal cost (None is zero).
+    min{ max{ β V − V_t − H(x, DV, D²V), V − ψ }, V − g } = 0,  V(·, horizon) = terminal cost (else ψ, else g, else 0).
 
     Order 1 in space with ``Upwind()``, monotone, which never leaves the range that the data allow; 2 with
     ``Limited()`` or ``Eno2()`` and 5 with ``Weno5()`` where V is smooth. In time see ``Explicit`` and ``Implicit``.

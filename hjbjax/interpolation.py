@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.grid import Grid
-from hjbjax.pytree import is_traced
+from hjbjax.pytree import cast, is_traced
 
 
 def query(
@@ -44,6 +44,8 @@ def query(
         # Inside somebody's jit a constant must come out, and float64 must not be switched on in the middle of it.
         with jax.ensure_compile_time_eval(), jax.enable_x64(True):
             when = None if times is None else _moment(times, t, np.float64, name)
+            # JAX keeps what it made of a NumPy array in float32, outside of here, and would hand it in for float64.
+            grid = cast(grid, np.float64)
             return np.array(look(grid, values, _states(grid, x, np.float64, name), clamp, when))[()]
     dtype = jnp.result_type(*traced) if traced else jnp.result_type(float)
     if not jnp.issubdtype(dtype, jnp.floating):

@@ -125,9 +125,15 @@ def stable(problem: Problem, grid: Grid, scheme: Scheme, t: Any, dtype: Any) -> 
 
 
 def terminal(problem: Problem, grid: Grid, horizon: Any, dtype: Any) -> jax.Array:
-    """V at the horizon: the terminal cost, with given values and constraints put in."""
+    """V at the horizon: the terminal cost, with given values and constraints put in.
+
+    Without one a stopping cost is paid at the latest then, and a running maximum is g itself; else nothing is paid.
+    """
     rules = bellman.conditions(problem, grid, dtype, horizon)
-    return rules.impose(bellman.at_nodes(problem, grid, problem.terminal_cost, dtype, horizon))
+    cost = problem.terminal_cost
+    if cost is None:
+        cost = problem.running_max if problem.stopping_cost is None else problem.stopping_cost
+    return rules.impose(bellman.at_nodes(problem, grid, cost, dtype, horizon))
 
 
 def begin(march: March, value: jax.Array) -> Front:

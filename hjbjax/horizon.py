@@ -19,7 +19,7 @@ from hjbjax.iteration import PolicyIteration
 from hjbjax.marching import Explicit, Implicit, March
 from hjbjax.problem import Problem
 from hjbjax.pytree import cast, is_traced
-from hjbjax.relaxation import Direct, Krylov, Sweeps
+from hjbjax.relaxation import Krylov, Sweeps
 from hjbjax.schemes import Eno2, Limited, Scheme, Upwind, Weno5
 from hjbjax.sets import Box, Finite
 from hjbjax.solution import Solution, SolveError
@@ -202,7 +202,7 @@ def _prepare(
             _check_step(step, float(limit))
         limit = None if moving else jnp.asarray(limit * method.fraction if step is None else limit, dtype)
     else:
-        evaluation = method.evaluation or _evaluation(problem, grid)
+        evaluation = method.evaluation or _evaluation(problem)
         method = Implicit(evaluation, jnp.asarray(method.tol, dtype), method.max_steps)
     if step is None:
         step = horizon / FEWEST if moving or isinstance(method, Implicit) else math.inf
@@ -220,10 +220,8 @@ def _check_step(step: float | None, limit: float) -> None:
         )
 
 
-def _evaluation(problem: Problem, grid: Grid) -> Any:
-    if problem.noise is None:
-        return Sweeps()
-    return Direct() if grid.ndim == 1 and not is_traced(problem, grid) else Krylov()
+def _evaluation(problem: Problem) -> Any:
+    return Sweeps() if problem.noise is None else Krylov()
 
 
 def _watched(problem: Problem, grid: Grid, share: float | None, dtype: Any) -> Any:
@@ -266,7 +264,7 @@ def _march_traced(
     if isinstance(method, Explicit):
         method = Explicit(method.stages or scheme.stages, method.fraction)
     else:
-        method = Implicit(method.evaluation or _evaluation(problem, grid), method.tol, method.max_steps)
+        method = Implicit(method.evaluation or _evaluation(problem), method.tol, method.max_steps)
     problem, grid = cast(problem, kind), cast(grid, kind)
     rules = None if problem.time_dependent else bellman.conditions(problem, grid, kind)
     task = March(problem, grid, method, rules, jnp.inf, step, horizon, None, scheme)

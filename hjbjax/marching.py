@@ -59,7 +59,7 @@ class Implicit:
     """Implicit Euler steps, each by policy iteration: any length, first order in time.
 
     Args:
-      evaluation: how a policy is evaluated; ``None`` picks as ``solve`` does.
+      evaluation: how a policy is evaluated; ``None`` is ``Krylov()`` with noise and ``Sweeps()`` without.
       tol: bound on what the policy iterations leave over the whole march, in cost units.
       max_steps: policy improvements in one step, at most.
     """

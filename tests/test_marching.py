@@ -307,6 +307,7 @@ def test_upwind_and_its_steps_agree_with_the_stationary_solution():
 # --- closed loops ---
 
 
+@pytest.mark.slow
 def test_closed_loops_with_noise_cost_what_the_value_says():
     """The mean over 500 paths, within three standard errors plus the error of the grid, V − V_exact."""
     sigma = 0.5

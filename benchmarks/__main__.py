@@ -18,6 +18,7 @@ NAMES = {
     "batch": "solve_batch of pendulums of different mass, against one after the other",
     "startup": "from process start to pictures, cold and with the compile cache",
     "precision": "error against seconds: what second order is worth",
+    "march": "marching beside hj_reachability: seconds and bytes at equal scheme",
 }
 
 

@@ -7,12 +7,15 @@ from hjbjax.convergence import convergence_study
 from hjbjax.fields import FallbackWarning
 from hjbjax.files import FileError
 from hjbjax.grid import Grid
+from hjbjax.horizon import march
 from hjbjax.iteration import Nested, PolicyIteration, ValueIteration
 from hjbjax.lyapunov import lyapunov_check
+from hjbjax.marching import Explicit, Implicit
 from hjbjax.preparation import SolveWarning
 from hjbjax.problem import Problem
+from hjbjax.reachability import avoid, reach, reach_avoid
 from hjbjax.relaxation import Direct, Krylov, Sweeps
-from hjbjax.schemes import Limited, Upwind
+from hjbjax.schemes import Eno2, Limited, Upwind, Weno5
 from hjbjax.sets import Ball, Box, Finite
 from hjbjax.simulation import simulate
 from hjbjax.solution import Solution, SolveError, load
@@ -24,10 +27,13 @@ __all__ = [
     "Ball",
     "Box",
     "Direct",
+    "Eno2",
+    "Explicit",
     "FallbackWarning",
     "FileError",
     "Finite",
     "Grid",
+    "Implicit",
     "Krylov",
     "Limited",
     "Nested",
@@ -41,13 +47,18 @@ __all__ = [
     "Sweeps",
     "Upwind",
     "ValueIteration",
+    "Weno5",
     "__version__",
+    "avoid",
     "chain",
     "convergence_study",
     "geometry",
     "load",
     "lyapunov_check",
+    "march",
     "plotting",
+    "reach",
+    "reach_avoid",
     "simulate",
     "solve",
     "solve_batch",

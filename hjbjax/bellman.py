@@ -76,16 +76,21 @@ class Correction:
 
 def conditions(problem: Problem, grid: Grid, dtype: Any, t: Any = 0.0) -> Conditions:
     """Target, stopping cost and running maximum at the nodes."""
-    x = grid.components(dtype)
-
-    def at_nodes(ingredient):
-        return jnp.broadcast_to(fields.scalar(ingredient, *problem.state_arguments(x, t), dtype=dtype), grid.shape)
-
-    held = jnp.zeros(grid.shape, bool) if problem.target is None else at_nodes(problem.target) <= 0
-    given = jnp.zeros((), dtype) if problem.exit_cost is None else jnp.where(held, at_nodes(problem.exit_cost), 0)
-    stop = None if problem.stopping_cost is None else at_nodes(problem.stopping_cost)
-    floor = None if problem.running_max is None else at_nodes(problem.running_max)
+    target, exit_cost, stop, floor = (
+        None if ingredient is None else at_nodes(problem, grid, ingredient, dtype, t)
+        for ingredient in (problem.target, problem.exit_cost, problem.stopping_cost, problem.running_max)
+    )
+    held = jnp.zeros(grid.shape, bool) if target is None else target <= 0
+    given = jnp.zeros((), dtype) if exit_cost is None else jnp.where(held, exit_cost, 0)
     return Conditions(held, given, stop, floor, ended=held)
+
+
+def at_nodes(problem: Problem, grid: Grid, ingredient: Any, dtype: Any, t: Any = 0.0) -> jax.Array:
+    """A function of the state alone, or a number, at every node, shape (*grid); None is zero."""
+    entry = 0.0 if ingredient is None else ingredient
+    return jnp.broadcast_to(
+        fields.scalar(entry, *problem.state_arguments(grid.components(dtype), t), dtype=dtype), grid.shape
+    )
 
 
 def greedy(

@@ -1,7 +1,7 @@
 """Closed loops and their integration: what a feedback does to the system, and what that costs.
 
     dx = f(x, u, d) dt + σ(x, u, d) dw,  u = control(x),  d = opponent(x)
-    cost = ∫ e^{−βt} L(x, u, d) dt  (+ e^{−βτ} exit cost, where the target is reached at τ)
+    cost = ∫ e^{−βt} L(x, u, d) dt  (+ e^{−βτ} exit cost, where the target is reached at τ; else e^{−βT} terminal cost)
 
 The running cost is one more state of the integrator, so it has the accuracy of the path.
 
@@ -30,17 +30,16 @@ from hjbjax.problem import Problem
 from hjbjax.pytree import node
 
 
-@node(static=("clamp", "time_varying"))
+@node(static=("clamp",))
 class Loop:
     """The closed loop as functions of (t, x).
 
     Args:
       problem: the system and its costs.
-      control: a pytree that is called with the state, or with ``(t, x)``; None where there is no control.
+      control: a pytree that is called with (t, x); None where there is no control.
       opponent: likewise, for the disturbance.
       grid: the Grid in whose box the players are known; None where that is everywhere.
       clamp: outside the box, whether to go on with what the players say at its nearest point.
-      time_varying: whether the players take ``(t, x)``; always where the problem is time-dependent.
     """
 
     problem: Problem
@@ -48,7 +47,6 @@ class Loop:
     opponent: Any
     grid: Any
     clamp: bool
-    time_varying: bool = False
 
     def wrap(self, x):
         """The state with its periodic entries in the box."""
@@ -67,11 +65,7 @@ class Loop:
         if self.grid is not None:
             x, (lo, hi) = self.grid.wrap(x), self._corners(x)
             x = jnp.where(np.array(self.grid.periodic), x, jnp.clip(x, lo, hi))
-        return jnp.asarray(player(*self.player_arguments(t, x)), x.dtype)
-
-    def player_arguments(self, t, x):
-        """What the players are called with."""
-        return (t, x) if self.time_varying or self.problem.time_dependent else (x,)
+        return jnp.asarray(player(t, x), x.dtype)
 
     def _corners(self, x):
         return jnp.asarray(self.grid.lo, x.dtype), jnp.asarray(self.grid.hi, x.dtype)
@@ -159,11 +153,16 @@ def integrate(loop: Loop, x0: Any, times: Any, key: Any, stepping: Stepping) -> 
     (t, y, code, count), (later, states, controls, disturbances, active) = jax.lax.scan(interval, first, times[1:])
     hit = code == PathStatus.TARGET
     times, states = jnp.append(start, later), jnp.concatenate([x0[None], states])
+    ended = code == PathStatus.DURATION
     if loop.problem.running_max is None:
-        exit_cost = loop.discount(t - start) * loop.number(loop.problem.exit_cost, t, y[:-1])
-        cost = y[-1] + jnp.where(hit, exit_cost, 0)
+        exit_cost, final = (loop.number(c, t, y[:-1]) for c in (loop.problem.exit_cost, loop.problem.terminal_cost))
+        due = jnp.where(hit, exit_cost, jnp.where(ended, final, 0))
+        cost = y[-1] + loop.discount(t - start) * due
     else:
         cost = jnp.max(jax.vmap(lambda t, x: loop.number(loop.problem.running_max, t, x))(times, states))
+        if loop.problem.terminal_cost is not None:
+            final = loop.number(loop.problem.terminal_cost, t, y[:-1])
+            cost = jnp.where(ended, jnp.maximum(cost, final), cost)
     return Path(times, states, controls, disturbances, cost, jnp.where(hit, t, jnp.inf), code, count), active
 
 

@@ -53,7 +53,7 @@ def drive(task: Task, guess: jax.Array, clock: Clock, most: int | None = None) -
     if clock.interrupted:
         return state, Status.INTERRUPTED, residuals[0]
     code = Status.RUNNING
-    with _bar(clock.progress, float(task.tol)) as show, _noting_interrupts(clock):
+    with _bar(clock.progress, float(task.tol)) as show, noting_interrupts(clock):
         try:
             state = run(task, state, 0)  # compiles, and looks at the guess
             jax.block_until_ready(state)
@@ -80,7 +80,7 @@ def drive(task: Task, guess: jax.Array, clock: Clock, most: int | None = None) -
 
 
 @contextlib.contextmanager
-def _noting_interrupts(clock: Clock) -> Any:
+def noting_interrupts(clock: Clock) -> Any:
     """Ctrl-C leaves a note on the clock instead of an exception, which a callback of the runtime might swallow.
 
     A second Ctrl-C is the usual one. Only in the main thread, and not over a handler of the user's own.
@@ -114,5 +114,23 @@ def _bar(progress: bool | None, tol: float) -> Any:
         def show(steps, error):
             bar.update(steps)
             bar.set_postfix_str(f"error {error:.2e}, tol {tol:.0e}", refresh=False)
+
+        yield show
+
+
+@contextlib.contextmanager
+def ticker(progress: bool | None, total: float, what: str) -> Any:
+    """A progress bar over the problem's own time; ``show(done, steps)`` moves it."""
+    if progress is False or (progress is None and not sys.stderr.isatty()):
+        yield lambda done, steps: None
+        return
+    from tqdm import tqdm
+
+    form = "{desc}: {percentage:3.0f}% |{bar}| t {n:.3g} of {total:.3g}{postfix} [{elapsed}<{remaining}]"
+    with tqdm(desc=what, total=total, delay=1, leave=False, bar_format=form) as bar:
+
+        def show(done, steps):
+            bar.update(done - bar.n)
+            bar.set_postfix_str(f"{steps} steps", refresh=False)
 
         yield show

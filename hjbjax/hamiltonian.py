@@ -21,13 +21,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax import chain, fields, sets, stencil, subcell
+from hjbjax import chain, fields, sets, slopes, stencil, subcell
 from hjbjax.grid import Grid
 from hjbjax.minimisers import Action, best_of, enumerate_actions, refine
 from hjbjax.piecewise import Kinked, kinked_ball, piecewise_input, piecewise_pair
 from hjbjax.players import SAMPLES, Player, Setting, shared
 from hjbjax.problem import Problem
-from hjbjax.schemes import Limited, Scheme
+from hjbjax.schemes import Eno2, Limited, Scheme, Upwind, Weno5
 from hjbjax.sets import AdmissibleSet, Ball, Box, Finite
 
 
@@ -36,7 +36,7 @@ class Local:
     """The Hamiltonian around one value function: coordinates, slopes, and how to evaluate H(u, d).
 
     Attributes:
-      up, down: the slopes that drift sees; D⁺ and D⁻, or limited ones.
+      up, down: the slopes that drift sees; D⁺ and D⁻, or those of a scheme of higher order.
       links: the distances to the neighbours along every axis.
       bends: D⁺ − D⁻ along every axis, which noise sees.
       tried: an action of each player that is a candidate beside the samples; with the actions of the last step
@@ -63,7 +63,7 @@ class Local:
             return upwind
         link = self.links[axis]
         h_up, h_down = link.up, link.down
-        if isinstance(self.scheme, Limited):
+        if not isinstance(self.scheme, Upwind):
             return upwind + jnp.maximum(a, 0) * self.bends[axis] / (h_up + h_down)
         e = chain.excess(f, a, self.grid, axis, self.scheme, link)
         upward, downward = (e + h_down * f) / (h_up + h_down), (e - h_up * f) / (h_up + h_down)
@@ -112,7 +112,11 @@ def local(problem: Problem, grid: Grid, value: jax.Array, *, scheme: Scheme, t: 
     links = tuple(subcell.links(problem, grid, subcell=scheme.subcell, dtype=value.dtype, t=t))
     differences = [stencil.one_sided(value, grid, axis, link) for axis, link in enumerate(links)]
     bends = tuple(up - down for up, down in differences)
-    if isinstance(scheme, Limited):
+    if isinstance(scheme, Weno5):
+        differences = slopes.weno5(value, grid)
+    elif isinstance(scheme, Eno2):
+        differences = slopes.eno2(value, grid)
+    elif isinstance(scheme, Limited):
         differences = _limited(problem, grid, x, differences, links, t)
     up, down = zip(*differences, strict=True)
     return Local(problem, grid, scheme, value.dtype, t, x, value, up, down, bends, links)
@@ -120,9 +124,9 @@ def local(problem: Problem, grid: Grid, value: jax.Array, *, scheme: Scheme, t: 
 
 def _limited(problem: Problem, grid: Grid, x: list, differences: list, links: tuple, t: Any) -> list:
     """Limited slopes; central ones where noise keeps those monotone, a_ii ≥ h |f_i| for all actions."""
-    slopes = [stencil.limited(up, down, grid, axis, links[axis]) for axis, (up, down) in enumerate(differences)]
+    found = [stencil.limited(up, down, grid, axis, links[axis]) for axis, (up, down) in enumerate(differences)]
     if problem.noise is None:
-        return slopes
+        return found
     dtype = differences[0][0].dtype
     calm: list = [True] * grid.ndim
     for u, d in itertools.product(sets.probes(problem.controls, dtype), sets.probes(problem.disturbances, dtype)):
@@ -134,8 +138,8 @@ def _limited(problem: Problem, grid: Grid, x: list, differences: list, links: tu
     for axis, ((up, down), link) in enumerate(zip(differences, links, strict=True)):
         inner = calm[axis] & ~(stencil.on_edge(grid, axis, 1) | stencil.on_edge(grid, axis, -1))
         middle = (link.down * up + link.up * down) / (link.up + link.down)
-        slopes[axis] = (jnp.where(inner, middle, slopes[axis][0]), jnp.where(inner, middle, slopes[axis][1]))
-    return slopes
+        found[axis] = (jnp.where(inner, middle, found[axis][0]), jnp.where(inner, middle, found[axis][1]))
+    return found
 
 
 def optimise(here: Local, how: Setting, isaacs: str | None = None) -> tuple[jax.Array, Action, Action]:
@@ -263,7 +267,7 @@ def _kinked(here: Local, base: tuple[Action, Action], axis: int, offset: Any, sl
     def gain(f):
         return here.gain(axis, f, left)
 
-    if left is None or isinstance(here.scheme, Limited) or not here.scheme.central:
+    if left is None or not isinstance(here.scheme, Upwind) or not here.scheme.central:
         return Kinked(gain, offset, slope, (0.0,), (down, up))
     h_up, h_down = here.links[axis].up, here.links[axis].down
     edge = stencil.on_edge(here.grid, axis, 1) | stencil.on_edge(here.grid, axis, -1)

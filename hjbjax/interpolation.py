@@ -5,6 +5,7 @@ V(x) = Σ_c w_c V_c: second order, exact for multilinear V, and never beyond the
 """
 
 import functools
+import itertools
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -13,19 +14,23 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.grid import Grid
-from hjbjax.pytree import is_traced
+from hjbjax.pytree import cast, is_traced
 
 
-def query(look: Callable, grid: Grid, values: Any, x: Any, *, clamp: bool, name: str) -> Any:
+def query(
+    look: Callable, grid: Grid, values: Any, x: Any, *, clamp: bool, name: str, times: Any = None, t: Any = None
+) -> Any:
     """``look`` at node values between the nodes: float64 NumPy from concrete data, else as the tracer is.
 
     Args:
       look: ``between``, ``between_defined`` or ``nearest``.
       grid: the nodes.
-      values: shape (*grid, ...).
+      values: shape (*grid, ...); (k, *grid, ...) with ``times``.
       x: states, shape (..., n).
       clamp: outside the grid take the nearest point of its box; otherwise the answer there is NaN.
       name: who asks, for refusals.
+      times: shape (k,), of a marched solution; between them the answer is linear, or that of the nearest.
+      t: when, broadcasts against ``x.shape[:-1]``; outside ``times`` as outside the grid.
 
     Returns:
       Shape ``x.shape[:-1] + values.shape[n:]``.
@@ -34,15 +39,35 @@ def query(look: Callable, grid: Grid, values: Any, x: Any, *, clamp: bool, name:
       TypeError: states that are not real numbers.
       ValueError: states of another length.
     """
-    traced = [leaf for leaf in jax.tree.leaves((values, x)) if isinstance(leaf, jax.core.Tracer)]
+    traced = [leaf for leaf in jax.tree.leaves((values, x, times, t)) if isinstance(leaf, jax.core.Tracer)]
     if not traced and not is_traced(grid):
         # Inside somebody's jit a constant must come out, and float64 must not be switched on in the middle of it.
         with jax.ensure_compile_time_eval(), jax.enable_x64(True):
-            return np.array(look(grid, values, _states(grid, x, np.float64, name), clamp))[()]
+            when = None if times is None else _moment(times, t, np.float64, name)
+            # JAX keeps what it made of a NumPy array in float32, outside of here, and would hand it in for float64.
+            grid = cast(grid, np.float64)
+            return np.array(look(grid, values, _states(grid, x, np.float64, name), clamp, when))[()]
     dtype = jnp.result_type(*traced) if traced else jnp.result_type(float)
     if not jnp.issubdtype(dtype, jnp.floating):
         dtype = jnp.result_type(float)
-    return look(grid, values, _states(grid, x, dtype, name), clamp).astype(dtype)
+    when = None if times is None else _moment(times, t, dtype, name)
+    return look(grid, values, _states(grid, x, dtype, name), clamp, when).astype(dtype)
+
+
+def _moment(times: Any, t: Any, dtype: Any, name: str) -> tuple[Any, Any, Any]:
+    """The kept time before t, the share of the one after it, and whether t lies between the first and the last."""
+    try:
+        t = jnp.asarray(t if is_traced(t) else np.asarray(t, np.float64), dtype)
+    except (TypeError, ValueError):
+        raise TypeError(f"{name}: got t = {t!r}, wanted a time") from None
+    times = jnp.asarray(times, dtype)
+    slack = 8 * jnp.finfo(dtype).eps * jnp.max(jnp.abs(times))
+    inside = (t >= times[0] - slack) & (t <= times[-1] + slack)
+    if len(times) == 1:
+        return jnp.zeros(t.shape, int), jnp.zeros(t.shape, dtype), inside
+    before = jnp.clip(jnp.searchsorted(times, t, side="right") - 1, 0, len(times) - 2)
+    share = (t - times[before]) / (times[before + 1] - times[before])
+    return before, jnp.clip(share, 0, 1), inside & ~jnp.isnan(t)
 
 
 def _states(grid: Grid, x: Any, dtype: Any, name: str) -> Any:
@@ -60,17 +85,22 @@ def _states(grid: Grid, x: Any, dtype: Any, name: str) -> Any:
 
 
 @functools.partial(jax.jit, static_argnames="clamp")
-def between(grid: Grid, values: Any, x: Any, clamp: bool) -> jax.Array:
+def between(grid: Grid, values: Any, x: Any, clamp: bool, when: Any = None) -> jax.Array:
     """The multilinear interpolant, with NaN and infinity wherever a node that counts has them."""
-    return grid.interpolate(values, x, clamp=clamp)
+    if when is None:
+        return grid.interpolate(values, x, clamp=clamp)
+    total: Any = 0.0
+    for weight, hidden, there in _corners(grid, values, x, clamp, when):
+        total = total + jnp.where(hidden, jnp.nan, weight * jnp.where((weight == 0) & ~jnp.isfinite(there), 0, there))
+    return total
 
 
 @functools.partial(jax.jit, static_argnames="clamp")
-def between_defined(grid: Grid, values: Any, x: Any, clamp: bool) -> jax.Array:
+def between_defined(grid: Grid, values: Any, x: Any, clamp: bool, when: Any = None) -> jax.Array:
     """The mean over those nodes of the cell where no entry is NaN."""
     total: Any = 0.0
     sum_of_weights: Any = 0.0
-    for weight, defined, there in _corners(grid, values, x, clamp):
+    for weight, defined, there in _defined(grid, values, x, clamp, when):
         weight = jnp.where(defined, weight, 0)[..., None]
         total, sum_of_weights = total + weight * jnp.where(defined[..., None], there, 0), sum_of_weights + weight
     some = sum_of_weights > 0
@@ -78,19 +108,26 @@ def between_defined(grid: Grid, values: Any, x: Any, clamp: bool) -> jax.Array:
 
 
 @functools.partial(jax.jit, static_argnames="clamp")
-def nearest(grid: Grid, values: Any, x: Any, clamp: bool) -> jax.Array:
+def nearest(grid: Grid, values: Any, x: Any, clamp: bool, when: Any = None) -> jax.Array:
     """The values at the nearest node of the cell where no entry is NaN; of equally near ones the lower."""
     answer: Any = jnp.nan
     largest: Any = 0.0
-    for weight, defined, there in _corners(grid, values, x, clamp):
+    for weight, defined, there in _defined(grid, values, x, clamp, when):
         # A node is nearer in every axis exactly if its weight is larger; half way, rounding must not choose.
         nearer = defined & (weight > largest * (1 + 8 * jnp.finfo(x.dtype).eps))
         answer, largest = jnp.where(nearer[..., None], there, answer), jnp.where(nearer, weight, largest)
     return answer
 
 
-def _corners(grid: Grid, values: Any, x: Any, clamp: bool) -> Iterator[tuple[Any, Any, Any]]:
-    """The 2^n nodes around each state: weight, whether the values there are defined and count, and the values.
+def _defined(grid: Grid, values: Any, x: Any, clamp: bool, when: Any) -> Iterator[tuple[Any, Any, Any]]:
+    """The nodes around each state: weight, whether the values there are defined and count, and the values."""
+    for weight, hidden, there in _corners(grid, values, x, clamp, when):
+        # On a node its neighbours have no weight, so where it has no control, they have no say.
+        yield weight, (weight > 0) & ~hidden & ~jnp.any(jnp.isnan(there), axis=-1), there
+
+
+def _corners(grid: Grid, values: Any, x: Any, clamp: bool, when: Any) -> Iterator[tuple[Any, Any, Any]]:
+    """The 2^n nodes around each state, at two times if marched: weight, whether the answer is hidden, and the values.
 
     The cell, the weights and what is outside are those of ``Grid.interpolate``. Gathering before looking for NaN
     keeps a query as cheap as a few nodes, however many the grid has.
@@ -98,10 +135,15 @@ def _corners(grid: Grid, values: Any, x: Any, clamp: bool) -> Iterator[tuple[Any
     values, x = jnp.asarray(values), grid.wrap(x)
     cells, fractions, inside = zip(*(grid._locate(axis, x[..., axis]) for axis in range(grid.ndim)), strict=True)
     hidden = jnp.any(jnp.isnan(x), axis=-1) | ((not clamp) & ~jnp.all(jnp.stack(inside), axis=0))
-    for corner in np.ndindex(*(2,) * grid.ndim):
-        weight = jnp.ones((), x.dtype)
+    layers: list[tuple[Any, tuple]] = [(jnp.ones((), x.dtype), ())]
+    if when is not None:
+        before, share, known = when
+        last = values.shape[0] - 1
+        layers = [(1 - share, (before,)), (share, (jnp.minimum(before + 1, last),))]
+        hidden |= (not clamp) & ~known
+    for (layer, moment), corner in itertools.product(layers, np.ndindex(*(2,) * grid.ndim)):
+        weight = layer
         for fraction, bit in zip(fractions, corner, strict=True):
             weight = weight * (fraction if bit else 1 - fraction)
-        there = values[tuple((cell + bit) % n for cell, bit, n in zip(cells, corner, grid.shape, strict=True))]
-        # On a node its neighbours have no weight, so where it has no control, they have no say.
-        yield weight, (weight > 0) & ~hidden & ~jnp.any(jnp.isnan(there), axis=-1), there
+        nodes = tuple((cell + bit) % n for cell, bit, n in zip(cells, corner, grid.shape, strict=True))
+        yield weight, hidden, values[moment + nodes]

@@ -56,7 +56,11 @@ def require(problem: Problem, grid: Grid, method: Method, dtype: Any, limit: int
     Raises:
       MemoryError: with the estimate, what is free, and the largest N that fits.
     """
-    needed = estimate(problem, grid, method, dtype)
+    return fitting(estimate(problem, grid, method, dtype), grid, limit)
+
+
+def fitting(needed: int, grid: Grid, limit: int | None) -> int:
+    """``needed`` bytes, if they fit into what is free, or into ``limit``; refusals as for ``require``."""
     free = available() if limit is None else limit
     if grid.size >= INDEXABLE:
         largest = math.floor((INDEXABLE - 1) ** (1 / grid.ndim))

@@ -71,12 +71,14 @@ class Setting:
 
     Attributes:
       control, disturbance: the players.
-      decoupled: whether their choices do not touch each other; then the Isaacs condition holds.
+      separable: whether drift and cost are sums of what each player does, and noise is neither's.
+      decoupled: whether they drive different components as well; then the Isaacs condition holds on every grid.
       disturbance_costs: whether the running cost depends on the disturbance.
     """
 
     control: Player
     disturbance: Player
+    separable: bool
     decoupled: bool
     disturbance_costs: bool
 
@@ -106,7 +108,8 @@ def setting(problem: Problem, n: int, dtype: Any) -> Setting:
         entry is None or any(set(term) & set(inputs_u) and set(term) & set(inputs_d) for term in entry)
         for entry in (*drift.entries, *cost.entries)
     )
-    return Setting(mine, theirs, separate and not crossed and noise.is_constant, not cost.free_of(inputs_d))
+    separable = not crossed and noise.is_constant
+    return Setting(mine, theirs, separable, separate and separable, not cost.free_of(inputs_d))
 
 
 def _player(

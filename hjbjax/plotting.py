@@ -29,11 +29,13 @@ from hjbjax.canvas import (
     styled,
 )
 from hjbjax.grid import Grid
+from hjbjax.level_sets import animation, zero_level_set
 from hjbjax.sections import at_time, feedback, folded, lifted, section_of, zeros
 
 __all__ = [
     "COLOURS",
     "GREY",
+    "animation",
     "closed_loop",
     "controls",
     "convergence",
@@ -43,6 +45,7 @@ __all__ = [
     "switching_curve",
     "trajectory",
     "value",
+    "zero_level_set",
 ]
 
 

@@ -20,6 +20,8 @@ class Upwind:
 
     central: bool = True
     subcell: bool = False
+    stages = 1  # of the Runge–Kutta method that goes with the slopes when they march
+    points = 2  # an axis must have
 
     @property
     def chain(self) -> "Upwind":
@@ -44,6 +46,8 @@ class Limited:
     """
 
     subcell: bool = True
+    stages = 2
+    points = 2
 
     @property
     def chain(self) -> Upwind:
@@ -51,4 +55,41 @@ class Limited:
         return Upwind(subcell=self.subcell)
 
 
-Scheme = Upwind | Limited
+@node()
+class Eno2:
+    """Second order for ``march``: one-sided differences corrected by the smaller of two second differences.
+
+        D⁺ − (h/2) m(s_i, s_{i+1}),   D⁻ + (h/2) m(s_i, s_{i−1}),   m(a, b) = a if |a| < |b| else b.
+
+    The smoother stencil, node by node, as C.-W. Shu and S. Osher choose it. Wants equal spacings.
+    """
+
+    subcell = False
+    stages = 2
+    points = 3
+
+    @property
+    def chain(self) -> Upwind:
+        """The monotone chain with the same fastest rate."""
+        return Upwind()
+
+
+@node()
+class Weno5:
+    """Fifth order where the value is smooth, for ``march``: weighted essentially non-oscillatory slopes.
+
+    Each one-sided slope is a mean of three third-order ones with weights that favour the smoothest (see ``slopes``).
+    Wants equal spacings and at least seven points an axis.
+    """
+
+    subcell = False
+    stages = 3
+    points = 7
+
+    @property
+    def chain(self) -> Upwind:
+        """The monotone chain with the same fastest rate."""
+        return Upwind()
+
+
+Scheme = Upwind | Limited | Eno2 | Weno5

@@ -68,7 +68,7 @@ def section_of(
         )
     cuts: dict[int, float] = {}
     for key, place in dict(fixed or {}).items():
-        axis = _axis_number(key, grid)
+        axis = axis_number(key, grid)
         if axis in cuts:
             raise ValueError(f"{what}: fixed gives axis {axis} ({grid.names[axis]}) twice; give each axis once")
         if not np.ndim(place) == 0 or not np.isreal(place):
@@ -99,7 +99,8 @@ def _how_many(grid: Grid, free: tuple[int, ...]) -> str:
     )
 
 
-def _axis_number(key: Any, grid: Grid) -> int:
+def axis_number(key: Any, grid: Grid) -> int:
+    """The axis that a number or a name means."""
     if isinstance(key, str) and key in grid.names:
         return grid.names.index(key)
     if isinstance(key, (int, np.integer)) and not isinstance(key, bool) and 0 <= key < grid.ndim:

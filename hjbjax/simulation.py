@@ -1,5 +1,6 @@
 """Simulation: ``simulate`` at the host, with checks and a report; ``rollout``, the same as a pure function."""
 
+import copy
 import math
 from collections.abc import Callable
 from typing import Any
@@ -13,6 +14,8 @@ from hjbjax.grid import Grid
 from hjbjax.path import Path, truncated
 from hjbjax.problem import Problem
 from hjbjax.pytree import as_partial, cast, is_traced
+
+FEWEST = 10  # intervals between kept times that a marched feedback must have over a path
 
 _compiled = jax.jit(integrate)
 
@@ -45,6 +48,8 @@ def simulate(
     Args:
       problem: the system and its costs.
       feedback: a Solution, or a function that returns the control, shape (m,). ``None`` if there is no control.
+        A marched Solution must have been kept at enough times: at least ten over the duration. Its terminal cost,
+        and that of any problem, is paid at the end of a path that lasts as long as the horizon.
       x0: the state at time 0, shape (n,).
       duration: how long to run unless the target is reached before, in units of time.
 
@@ -80,6 +85,8 @@ def simulate(
     """
     if is_traced(problem, feedback, x0, duration, key, grid):
         raise ValueError("simulate: got traced values; inside jit, vmap or grad use hjbjax.simulation.rollout")
+    if getattr(feedback, "times", None) is not None:
+        problem = _within_horizon(problem, feedback, _positive(duration, "duration"))
     loop = _close(problem, feedback, disturbance, grid, clamp, time_varying)
     x0 = _initial(x0, loop.grid)
     hold = None if hold is False else hold
@@ -179,17 +186,13 @@ def _close(problem: Problem, feedback: Any, disturbance: Any, grid: Any, clamp: 
         )
     control, opponent = feedback, disturbance
     if hasattr(feedback, "control_at"):
-        if feedback.times is not None:
-            raise ValueError(
-                "simulate: the solution was marched over times, and simulate closes loops with stationary solutions; "
-                "give the feedback as a function (t, x) of a problem with time_dependent=True"
-            )
         if grid is not None and grid is not feedback.grid:
             raise ValueError("simulate: the solution brings its own grid; leave out grid=")
         grid = feedback.grid
-        control = jax.tree_util.Partial(_from_solution, as_partial(feedback.control_at))
+        ask = _from_solution if feedback.times is None else _from_marched
+        control = jax.tree_util.Partial(ask, as_partial(feedback.control_at))
         if problem.is_game and disturbance is None and feedback.disturbance is not None:
-            opponent = jax.tree_util.Partial(_from_solution, as_partial(feedback.disturbance_at))
+            opponent = jax.tree_util.Partial(ask, as_partial(feedback.disturbance_at))
     if grid is not None and not isinstance(grid, Grid):
         raise TypeError(f"simulate: grid is {grid!r}, wanted a Grid or None")
     if not isinstance(time_varying, bool):
@@ -203,13 +206,50 @@ def _close(problem: Problem, feedback: Any, disturbance: Any, grid: Any, clamp: 
     for name, function, optional in (("feedback", control, problem.controls is None), ("disturbance", opponent, True)):
         if not callable(function) and not (function is None and optional):
             raise TypeError(f"simulate: {name} is {function!r}, wanted a Solution or a function {signature}")
+    if not (problem.time_dependent or time_varying):
+        control, opponent = (
+            jax.tree_util.Partial(_timeless, as_partial(player)) if player is not None and player is given else player
+            for player, given in ((control, feedback), (opponent, disturbance))
+        )
     control = None if problem.controls is None else as_partial(control)
-    return Loop(problem, control, as_partial(opponent), grid, bool(clamp), time_varying)
+    return Loop(problem, control, as_partial(opponent), grid, bool(clamp))
 
 
-def _from_solution(look_up: Callable, *arguments: Any) -> Any:
+def _timeless(function: Callable, t: Any, x: Any) -> Any:
+    """A user's function of the state alone."""
+    return function(x)
+
+
+def _from_solution(look_up: Callable, t: Any, x: Any) -> Any:
     """A stationary solution's answer; the state comes clamped, and must not be refused for a rounding."""
-    return look_up(arguments[-1], clamp=True)
+    return look_up(x, clamp=True)
+
+
+def _from_marched(look_up: Callable, t: Any, x: Any) -> Any:
+    """A marched solution's answer, between its kept times."""
+    return look_up(t, x, clamp=True)
+
+
+def _within_horizon(problem: Problem, solution: Any, duration: float) -> Problem:
+    """Refuse a marched feedback that is not known well enough; without the terminal cost if the path ends before."""
+    times = np.asarray(solution.times, np.float64)
+    horizon = float(getattr(solution, "stats", {}).get("horizon", times[-1]))
+    if duration > horizon * (1 + 1e-9):
+        raise ValueError(
+            f"simulate: duration = {duration:g} goes beyond the horizon {horizon:g} of the solution; shorten it"
+        )
+    between = np.concatenate([[0.0], times[(times > 0) & (times < duration)], [duration]])
+    gap = float(np.max(np.diff(between)))
+    if times[0] > 0 or times[-1] < duration * (1 - 1e-9) or gap > duration / FEWEST * (1 + 1e-9):
+        raise ValueError(
+            f"simulate: the solution was marched and kept at {times.size} times from {times[0]:g} to {times[-1]:g}; "
+            f"a feedback up to t = {duration:g} wants all of that covered,\nat most {duration / FEWEST:g} apart: "
+            f"march(..., times=np.linspace(0, {horizon:g}, 41))"
+        )
+    if duration < horizon * (1 - 1e-9) and problem.terminal_cost is not None:
+        problem = copy.copy(problem)
+        object.__setattr__(problem, "terminal_cost", None)
+    return problem
 
 
 def _initial(x0: Any, grid: Grid | None) -> np.ndarray:
@@ -267,7 +307,7 @@ def _probe(loop: Loop, x0: Any) -> None:
     m = 0 if problem.controls is None else problem.controls.dim
     opponents = 0 if problem.disturbances is None else problem.disturbances.dim
     u, d = jnp.zeros(m, x0.dtype), jnp.zeros(opponents, x0.dtype)
-    players, state = loop.player_arguments(x0[0], x0), problem.arguments(x0, u, d, x0[0])
+    players, state = (x0[0], x0), problem.arguments(x0, u, d, x0[0])
     for name, function, arguments, wanted in (
         ("feedback", loop.control, players, (m,)),
         ("disturbance", loop.opponent, players, (opponents,)),

@@ -129,25 +129,26 @@ class Solution:
         """The last residual; ``None`` where none was kept."""
         return float(self.residuals[-1]) if len(self.residuals) else None
 
-    def value_at(self, x: Any, *, clamp: bool = False) -> Any:
-        """V between the nodes: multilinear interpolation, second order; jit- and vmap-able.
+    def value_at(self, *where: Any, clamp: bool = False) -> Any:
+        """V between the nodes: ``value_at(x)``, or ``value_at(t, x)`` of a marched solution; jit- and vmap-able.
 
-        Concrete states and data give float64 NumPy; under a tracer the answer has the tracer's dtype.
+        Multilinear interpolation, second order, in the time as well. Concrete states and data give float64 NumPy;
+        under a tracer the answer has the tracer's dtype.
 
         Args:
-          x: states, shape (n,) or (..., n).
-          clamp: outside the grid take the nearest point of its box; otherwise the answer there is NaN.
+          where: states x, shape (n,) or (..., n); of a marched solution first the time, a number or shape (...).
+          clamp: outside the grid, and outside the kept times, take the nearest point; otherwise NaN.
 
         Returns:
           Shape ``x.shape[:-1]``, in cost units.
 
         Raises:
-          ValueError: a state of another length; a marched solution; a batch of solutions.
+          ValueError: a state of another length; a time too many or too few; a batch of solutions.
           TypeError: states that are not numbers.
         """
-        return self._query("value_at", between, self.value, 0, x, clamp)
+        return self._query("value_at", between, self.value, 0, where, clamp)
 
-    def control_at(self, x: Any, *, clamp: bool = False) -> Any:
+    def control_at(self, *where: Any, clamp: bool = False) -> Any:
         """u between the nodes, shape ``x.shape[:-1] + (m,)``; arguments and refusals as for ``value_at``.
 
         Only nodes of the cell where a control is defined count, with their weights scaled to sum to one, so
@@ -155,16 +156,16 @@ class Solution:
         cell has one, the answer is NaN. Enumerated controls are not averaged: the nearest such node's is taken.
         """
         look = nearest if self.discrete else between_defined
-        return self._query("control_at", look, self.policy, 1, x, clamp)
+        return self._query("control_at", look, self.policy, 1, where, clamp)
 
-    def disturbance_at(self, x: Any, *, clamp: bool = False) -> Any:
+    def disturbance_at(self, *where: Any, clamp: bool = False) -> Any:
         """The opponent's d between the nodes, shape ``x.shape[:-1] + (l,)``; as ``control_at``."""
         look = nearest if self.discrete_disturbance else between_defined
-        return self._query("disturbance_at", look, self.disturbance, 1, x, clamp)
+        return self._query("disturbance_at", look, self.disturbance, 1, where, clamp)
 
-    def _query(self, name: str, look: Any, values: Any, trailing: int, x: Any, clamp: bool) -> Any:
-        _check_query(self, name, values, trailing)
-        return query(look, self.grid, values, x, clamp=clamp, name=f"Solution.{name}")
+    def _query(self, name: str, look: Any, values: Any, trailing: int, where: tuple, clamp: bool) -> Any:
+        t, x = _check_query(self, name, values, trailing, where)
+        return query(look, self.grid, values, x, clamp=clamp, name=f"Solution.{name}", times=self.times, t=t)
 
     def save(self, path: Any, *, force: bool = False) -> None:
         """Write the solution to ``path``, whole or not at all; ``load`` gives back the same bits.
@@ -259,22 +260,24 @@ def _rebuild(header: dict, arrays: dict[str, np.ndarray]) -> Solution:
     return Solution(**{"policy": None, **arrays, "grid": grid, **{name: header[name] for name in KINDS}})
 
 
-def _check_query(solution: Solution, name: str, values: Any, trailing: int) -> None:
-    """Refuse what has no answer at a state."""
+def _check_query(solution: Solution, name: str, values: Any, trailing: int, where: tuple) -> tuple[Any, Any]:
+    """The time, None if stationary, and the state; refuses what has no answer."""
     if values is None:
         what = "policy" if name == "control_at" else "disturbance: the problem is not a game"
         raise ValueError(f"Solution.{name}: this solution has no {what}")
-    if solution.times is not None:
-        raise ValueError(
-            f"Solution.{name}: got a solution marched over {np.shape(solution.times)[-1]} times, wanted a stationary "
-            "one; choose a time k: solution.grid.interpolate(solution.value[k], x)"
-        )
+    marched = solution.times is not None
+    if len(where) != 1 + marched:
+        kind, call = ("marched over times", f"{name}(t, x)") if marched else ("stationary", f"{name}(x)")
+        raise ValueError(f"Solution.{name}: got {len(where)} arguments; this solution is {kind}: call {call}")
     shape, wanted = np.shape(values), solution.grid.shape
+    if marched:
+        wanted = np.shape(solution.times) + wanted
     if shape[: len(wanted)] != wanted or len(shape) != len(wanted) + trailing:
         raise ValueError(
             f"Solution.{name}: got node values of shape {shape} on a grid of shape {wanted}; of a batch of solutions "
             f"ask one at a time, as in jax.vmap(lambda solution, x: solution.{name}(x))"
         )
+    return (where[0] if marched else None), where[-1]
 
 
 def _screen(solution: Solution) -> str:

@@ -141,8 +141,10 @@ def test_what_is_not_there_is_refused():
         solution_of(lambda a, b: a, policy=None).control_at([0.0, 1.0])
     marched = Solution(GRID, np.zeros((3, 5, 4)), np.zeros((3, 5, 4, 1)), times=np.arange(3.0))
     for query in (marched.value_at, marched.control_at):
-        with pytest.raises(ValueError, match=r"marched over 3 times.*choose a time k"):
+        with pytest.raises(ValueError, match=r"got 1 arguments; this solution is marched over times: call \w+\(t, x\)"):
             query([0.0, 1.0])
+    with pytest.raises(ValueError, match=r"got 2 arguments; this solution is stationary: call value_at\(x\)"):
+        LINEAR.value_at(0.0, [0.0, 1.0])
 
 
 # Controls

@@ -1,0 +1,164 @@
+"""Marching beside hj_reachability at equal scheme: seconds a step, memory, and whether the zero levels agree.
+
+Both go backward over the same short horizon on the same grid in the same precision, with steps of the same length and
+equal order in space and time; the fastest of several runs in turn counts, compiling stands apart. Memory is what XLA
+says that the compiled step needs. Writes ``march.json``.
+"""
+
+import itertools
+import time
+from pathlib import Path
+from typing import Any
+
+import click
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import hjbjax as hjb
+from benchmarks.report import RESULTS, attempt, stamped, table, write_json
+from hjbjax import epochs, horizon, marching
+
+COLUMNS = ("problem", "scheme", "who", "shape", "ms_per_step", "times", "bytes_per_node", "compile_seconds", "differs")
+SCHEMES = {"low": hjb.Upwind(), "medium": hjb.Eno2(), "very_high": hjb.Weno5()}
+FRACTION = 0.75  # of the stability limit, hj_reachability's own
+UNIT = hjb.Box([-1.0], [1.0])
+
+
+def collision(x: Any, u: Any, d: Any) -> Any:
+    """Air3D in hj_reachability's own terms."""
+    return jnp.stack([-5 + 5 * jnp.cos(x[2]) + u[0] * x[1], 5 * jnp.sin(x[2]) - u[0] * x[0], d[0] - u[0]])
+
+
+def car(x: Any, u: Any) -> Any:
+    """Position, speed and heading; steers and accelerates."""
+    return jnp.stack([x[2] * jnp.cos(x[3]), x[2] * jnp.sin(x[3]), u[0], u[1]])
+
+
+def disc(radius: float) -> Any:
+    return lambda x: jnp.sqrt(x[0] ** 2 + x[1] ** 2) - radius
+
+
+def cases(scale: float) -> dict[str, tuple[Any, Any]]:
+    """The problems and their grids; ``scale`` thins the nodes."""
+
+    def shape(*counts):
+        return tuple(max(8, round(count * scale)) for count in counts)
+
+    pi = np.pi
+    air = hjb.Grid([-6.0, -10.0, 0.0], [20.0, 10.0, 2 * pi], shape(101, 79, 100), (False, False, True))
+    road = hjb.Grid([-5.0, -5.0, -1.0, -pi], [5.0, 5.0, 1.0, pi], shape(40, 40, 50, 50), (False,) * 3 + (True,))
+    return {
+        "Air3D": (hjb.avoid(collision, UNIT, disc(5.0), disturbances=UNIT), air),
+        "4-D car": (hjb.reach(car, hjb.Box([-1.0, -1.0], [1.0, 1.0]), disc(1.0)), road),
+    }
+
+
+def ours(problem: Any, grid: Any, scheme: Any, steps: int) -> tuple[Any, float, float, float]:
+    """A function that marches so many steps, how far that goes, bytes a node and seconds to compile."""
+    began = time.perf_counter()
+    dtype = np.dtype(np.float32)
+    task = horizon._prepare(problem, grid, 1e3, scheme, hjb.Explicit(fraction=FRACTION), None, None, dtype)
+    start = marching.begin(task, epochs._terminal(task.problem, task.grid, task.horizon, dtype))
+    until = jnp.asarray(0.0, dtype)
+    compiled = jax.jit(marching.run).lower(task, start, until, steps).compile()
+    seconds = time.perf_counter() - began
+    return lambda: compiled(task, start, until, steps).value, float(task.limit), _bytes(compiled, grid), seconds
+
+
+def theirs(problem: Any, grid: Any, accuracy: str, duration: float) -> tuple[Any, float, float]:
+    """The same of hj_reachability, for the same time."""
+    import hj_reachability as hj
+
+    began = time.perf_counter()
+    game = problem.is_game
+    sets = [
+        hj.sets.Box(jnp.asarray(each.lo), jnp.asarray(each.hi))
+        for each in (problem.controls, problem.disturbances or UNIT)
+    ]
+
+    class Affine(hj.ControlAndDisturbanceAffineDynamics):
+        def __init__(self):
+            super().__init__("max" if game else "min", "min", *sets)
+
+        def open_loop_dynamics(self, state, time):
+            zero = jnp.zeros(problem.controls.dim)
+            return problem.drift(state, zero, jnp.zeros(1)) if game else problem.drift(state, zero)
+
+        def control_jacobian(self, state, time):
+            zero = jnp.zeros(problem.controls.dim)
+            return jax.jacfwd(lambda u: problem.drift(state, u, jnp.zeros(1)) if game else problem.drift(state, u))(
+                zero
+            )
+
+        def disturbance_jacobian(self, state, time):
+            if not game:
+                return jnp.zeros((grid.ndim, 1))
+            return jax.jacfwd(lambda d: problem.drift(state, jnp.zeros(problem.controls.dim), d))(jnp.zeros(1))
+
+    lattice = hj.Grid.from_lattice_parameters_and_boundary_conditions(
+        hj.sets.Box(jnp.asarray(grid.lo), jnp.asarray(grid.hi)),
+        grid.shape,
+        periodic_dims=tuple(axis for axis in range(grid.ndim) if grid.periodic[axis]),
+    )
+    settings = hj.SolverSettings.with_accuracy(
+        accuracy, hamiltonian_postprocessor=hj.solver.backwards_reachable_tube, CFL_number=FRACTION
+    )
+    distance = jnp.linalg.norm(lattice.states[..., :2], axis=-1) - (5.0 if game else 1.0)
+    dynamics = Affine()
+
+    def march():
+        return hj.step(settings, dynamics, lattice, 0.0, distance, -duration, progress_bar=False)
+
+    compiled = hj.step.lower(settings, dynamics, lattice, 0.0, distance, -duration, progress_bar=False).compile()
+    jax.block_until_ready(march())
+    return march, _bytes(compiled, grid), time.perf_counter() - began
+
+
+def _bytes(compiled: Any, grid: Any) -> float:
+    """Scratch, arguments and result of a compiled function, a node."""
+    memory = compiled.memory_analysis()
+    total = memory.temp_size_in_bytes + memory.argument_size_in_bytes + memory.output_size_in_bytes
+    return total / grid.size
+
+
+def measure(problem: Any, grid: Any, accuracy: str, steps: int, runs: int) -> list[dict[str, Any]]:
+    """One row for each of the two."""
+    scheme = SCHEMES[accuracy]
+    mine, dt, my_bytes, my_compile = ours(problem, grid, scheme, steps)
+    # a little less than so many steps: rounding must not add one that is almost empty
+    other, their_bytes, their_compile = theirs(problem, grid, accuracy, steps * dt * (1 - 1e-4))
+    best = [np.inf, np.inf]
+    values: list[Any] = [None, None]
+    for _, who in itertools.product(range(runs), range(2)):
+        began = time.perf_counter()
+        values[who] = jax.block_until_ready((mine, other)[who]())
+        best[who] = min(best[who], (time.perf_counter() - began) / steps)
+    sign = -1 if problem.is_game else 1  # avoid: unsafe where V ≥ 0
+    differs = float(np.mean((sign * np.asarray(values[0]) <= 0) != (np.asarray(values[1]) <= 0)))
+    about = {"scheme": repr(scheme).split("(")[0], "shape": grid.shape, "steps": steps, "differs": differs}
+    return [
+        about | {"who": "hjbjax", "ms_per_step": 1e3 * best[0], "times": best[1] / best[0], "bytes_per_node": my_bytes,
+                 "compile_seconds": my_compile},
+        about | {"who": "hj_reachability", "ms_per_step": 1e3 * best[1], "times": 1.0, "bytes_per_node": their_bytes,
+                 "compile_seconds": their_compile},
+    ]  # fmt: skip
+
+
+@click.command(help=__doc__)
+@click.option("--scale", default=1.0, help="Thins the grids: 1 is 101 x 79 x 100 and 40 x 40 x 50 x 50.")
+@click.option("--steps", default=6, help="Time steps in one run.")
+@click.option("--runs", default=3, help="Runs of each; the fastest counts.")
+@click.option("--problem", "wanted", default=None, help="Air3D or 4-D car; both without.")
+@click.option("--out", type=click.Path(path_type=Path), default=RESULTS, help="Folder for march.json.")
+def command(scale: float, steps: int, runs: int, wanted: str | None, out: Path) -> None:
+    rows: list[dict[str, Any]] = []
+    for name, (problem, grid) in cases(scale).items():
+        if wanted in (None, name):
+            for accuracy in SCHEMES:
+                rows += attempt(lambda: measure(problem, grid, accuracy, steps, runs), {"problem": name})  # noqa: B023
+    click.echo(table(rows, COLUMNS))
+    for row in rows:
+        if "reason" in row:
+            click.echo(f"{row['problem']}: {row['reason']}")
+    write_json(out / "march.json", stamped(rows))

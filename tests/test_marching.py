@@ -1,0 +1,324 @@
+"""Marching against exact answers, with fitted orders in space and in time; moving targets and obstacles."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from systems import SEEDS, random_grid, random_problem
+
+import hjbjax as hjb
+from hjbjax import simulation
+from hjbjax.sets import Box
+
+
+def order_of(errors, ratio=2.0):
+    return -np.polyfit(np.arange(len(errors)) * np.log(ratio), np.log(errors), 1)[0]
+
+
+def inner(grid):
+    """The nodes of the inner half of the box, where its edge is not felt."""
+    lo, hi = np.asarray(grid.lo), np.asarray(grid.hi)
+    return np.all(np.abs(grid.nodes() - (lo + hi) / 2) <= (hi - lo) / 4 + 1e-12, axis=-1)
+
+
+def error(solution, exact):
+    where = inner(solution.grid)
+    return float(np.max(np.abs(solution.value[0] - exact(solution.grid.nodes()))[where]))
+
+
+def plane(x, u):
+    return u
+
+
+def quadratic(x, u):
+    return x @ x + u @ u
+
+
+def line(count, reach=2.0):
+    return hjb.Grid([-reach], [reach], (count,))
+
+
+LQ = hjb.Problem(plane, quadratic, Box([-6.0], [6.0]))
+
+
+# --- exact answers ---
+
+
+def test_riccati_in_time_has_the_order_of_its_stages():
+    """V = tanh(T) x²: the slopes of Weno5 are exact on a quadratic, so that only the steps in time err."""
+    for stages in (1, 2, 3):
+        errors = [
+            error(
+                hjb.march(LQ, line(41), 1.0, scheme=hjb.Weno5(), method=hjb.Explicit(stages), step=step),
+                lambda x: np.tanh(1.0) * x[..., 0] ** 2,
+            )
+            for step in (1 / 64, 1 / 128, 1 / 256)
+        ]
+        assert order_of(errors) == pytest.approx(stages, abs=0.15)
+    assert errors[-1] < 1e-7
+
+
+def test_riccati_with_noise():
+    """V = tanh(T) x² + σ² ln cosh T: first order by upwinding, second where central differences are monotone."""
+
+    def exact(x):
+        return np.tanh(1.0) * x[..., 0] ** 2 + 0.49 * np.log(np.cosh(1.0))
+
+    problem = hjb.Problem(plane, quadratic, Box([-9.0], [9.0]), noise=0.7)
+    grids = [line(count, 4.0) for count in (33, 65, 129)]
+    plain = [error(hjb.march(problem, grid, 1.0, scheme=hjb.Upwind(central=False)), exact) for grid in grids]
+    assert order_of(plain) == pytest.approx(1, abs=0.15)
+    sharp = [error(hjb.march(problem, grid, 1.0, scheme=hjb.Weno5()), exact) for grid in grids]
+    assert sharp[-1] < 2e-3
+    assert sharp[-1] < plain[-1] / 10
+
+
+@pytest.mark.parametrize(("scheme", "order"), [(hjb.Upwind(), 1), (hjb.Eno2(), 2), (hjb.Weno5(), 5)])
+def test_a_wave_that_is_carried_along(scheme, order):
+    """ẋ = 1 on a circle: V(x, 0) = ψ(x + T), with steps so short that the order is that of the slopes."""
+    problem = hjb.Problem(lambda x, u: jnp.ones(1), terminal_cost=lambda x: jnp.sin(x[0]))
+    errors = []
+    for count in (20, 40, 80):
+        grid = hjb.Grid([0.0], [2 * np.pi], (count,), (True,))
+        step = 0.5 * (2 * np.pi / count) ** (5 / 3 if order == 5 else 1)
+        solution = hjb.march(problem, grid, 1.0, scheme=scheme, step=step)
+        errors.append(np.mean(np.abs(solution.value[0] - np.sin(grid.axis(0) + 1.0))))
+    assert order_of(errors) == pytest.approx(order, abs=0.15 if order < 5 else 0.3)
+
+
+def test_hopf_and_lax():
+    """f = u, L = ½|u|², ψ = ½|x|²: V = |x|²/(2(1 + T)), in the plane."""
+    problem = hjb.Problem(
+        plane,
+        lambda x, u: 0.5 * u @ u,
+        Box([-3.0, -3.0], [3.0, 3.0]),
+        terminal_cost=lambda x: 0.5 * x @ x,
+    )
+
+    def exact(x):
+        return np.sum(x * x, -1) / 4
+
+    grids = [hjb.Grid([-2.0, -2.0], [2.0, 2.0], (count, count)) for count in (17, 33, 65)]
+    assert order_of([error(hjb.march(problem, grid, 1.0), exact) for grid in grids]) == pytest.approx(1, abs=0.15)
+    assert error(hjb.march(problem, grids[0], 1.0, scheme=hjb.Weno5()), exact) < 1e-4
+
+
+def test_cole_and_hopf():
+    """f = u, L = ½u², σ = 1, ψ = ½x²: V(1, 0) = .5965735903 at T = 1."""
+    problem = hjb.Problem(
+        plane, lambda x, u: 0.5 * u @ u, Box([-9.0], [9.0]), noise=1.0, terminal_cost=lambda x: 0.5 * x @ x
+    )
+    errors = []
+    for count in (33, 65, 129):
+        solution = hjb.march(problem, line(count, 8.0), 1.0, scheme=hjb.Eno2())
+        errors.append(abs(solution.value_at(0.0, [1.0]) - 0.5965735903))
+    assert errors[-1] < 1e-4
+    assert errors[-1] < errors[0]
+
+
+def game(gamma, bound):
+    def cost(x, u, d):
+        return x @ x + u @ u - gamma**2 * d @ d
+
+    return hjb.Problem(lambda x, u, d: u + d, cost, Box([-9.0], [9.0]), disturbances=Box([-bound], [bound]))
+
+
+def test_the_game_of_finite_horizon():
+    """ẋ = u + d: V = tanh(kT)/k x² with k² = 1 − γ⁻²; both players drive one component."""
+    k = np.sqrt(1 - 1 / 4)
+    errors = [
+        error(hjb.march(game(2.0, 3.7), line(count), 1.0), lambda x: np.tanh(k) / k * x[..., 0] ** 2)
+        for count in (41, 81, 161)
+    ]
+    assert order_of(errors) == pytest.approx(1, abs=0.15)
+    solution = hjb.march(game(2.0, 3.7), line(41), 1.0, scheme=hjb.Weno5())
+    assert error(solution, lambda x: np.tanh(k) / k * x[..., 0] ** 2) < 1e-4
+    assert solution.isaacs_gap == 0
+
+
+def test_a_game_without_a_value_is_reported_as_blowing_up():
+    """γ = .8: V = tan(kτ)/k x² blows up at τ = π/2k; before that it is returned, after that nothing is."""
+    k = np.sqrt(0.8**-2 - 1)
+    blow_up = 3.0 - np.pi / 2 / k
+    with pytest.raises(hjb.SolveError, match=r"DIVERGED: .* stopped at t = .*blows up") as caught:
+        hjb.march(game(0.8, 3.7), line(81), 3.0, times=np.linspace(0, 3, 7), inner=1 / 16, scheme=hjb.Weno5())
+    solution = caught.value.solution
+    assert solution.times[0] == pytest.approx(blow_up, abs=0.1)  # 5 % of the time to go
+    np.testing.assert_allclose(solution.times[1:], [1.0, 1.5, 2.0, 2.5, 3.0])
+    assert solution.value_at(2.0, [0.5]) == pytest.approx(np.tan(k) / k / 4, rel=1e-5)
+    assert np.isnan(solution.value_at(0.5, [0.5]))
+
+
+def put():
+    """The American put in y = ln(S/40): the holder stops, and maximises the payoff; K = 40, r = .06, σ = .2."""
+
+    def payoff(y):
+        return -jnp.maximum(40.0 - 40.0 * jnp.exp(y[0]), 0.0)
+
+    return hjb.Problem(
+        lambda y, u: jnp.array([0.06 - 0.02]), noise=0.2, discount=0.06, terminal_cost=payoff, stopping_cost=payoff
+    )
+
+
+def test_the_american_put():
+    """2.31958 at S = 40: first order by upwinding, better where the noise allows central differences."""
+
+    def off(count, scheme):
+        return abs(-hjb.march(put(), line(count, 1.2), 1.0, scheme=scheme).value_at(0.0, [0.0]) - 2.31958)
+
+    assert order_of([off(count, hjb.Upwind(central=False)) for count in (49, 97, 193)]) == pytest.approx(1, abs=0.15)
+    assert off(193, hjb.Upwind()) < 5e-4
+    coarse = hjb.march(put(), line(193, 1.2), 1.0, method=hjb.Implicit(), step=1 / 200)
+    assert -coarse.value_at(0.0, [0.0]) == pytest.approx(2.31958, abs=5e-3)
+
+
+# --- implicit ---
+
+
+def test_implicit_steps_of_any_length_have_order_one_in_time():
+    grid = line(41)
+    limit = hjb.march(LQ, grid, 1.0, method=hjb.Explicit(3)).value[0]
+    errors = []
+    for count in (10, 20, 40):
+        solution = hjb.march(LQ, grid, 1.0, method=hjb.Implicit(), step=1 / count)
+        assert solution.steps == count
+        errors.append(np.max(np.abs(solution.value[0] - limit)))
+    assert order_of(errors) == pytest.approx(1, abs=0.15)
+
+
+def test_implicit_games_agree_with_explicit_ones():
+    grid = line(41)
+    explicit = hjb.march(game(2.0, 3.7), grid, 1.0, method=hjb.Explicit(3)).value[0]
+    step = hjb.march(game(2.0, 3.7), grid, 1.0, method=hjb.Implicit(), step=1 / 400).value[0]
+    # the one upwinds the players apart, the other their sum: the difference is one of first order in h
+    assert np.max(np.abs(step - explicit)[inner(grid)]) < 0.02
+
+
+# --- in time ---
+
+
+def pursued(time, x):
+    return jnp.abs(x[0] - 0.5 * time) - 0.25
+
+
+def test_a_moving_target_by_hand():
+    """|ẋ| ≤ 1, target |x − t/2| ≤ ¼, cost 1: from above (x − ¼)/1.5, from below (−¼ − x)/½, at most T."""
+    problem = hjb.Problem(
+        lambda t, x, u: u, lambda t, x, u: 1.0, Box([-1.0], [1.0]), target=pursued, time_dependent=True
+    )
+    errors = []
+    for count in (97, 193, 385):
+        grid = line(count, 3.0)
+        x = np.asarray(grid.axis(0))
+        exact = np.maximum(np.maximum((x - 0.25) / 1.5, (-0.25 - x) / 0.5), 0)
+        solution = hjb.march(problem, grid, 1.5)
+        errors.append(np.mean(np.abs(solution.value[0] - np.minimum(exact, 1.5))))
+    assert order_of(errors) > 0.6  # a kink that is carried along smears like √h
+    assert errors[-1] < 0.01
+
+
+def test_a_moving_obstacle_by_hand():
+    """An obstacle ¼ − |x − 2t| passes a runner of speed 1: from x ≥ 0 it goes ¼ deep if T ≥ x, else ¼ − (x − T)."""
+
+    def depth(t, x):
+        return 0.25 - jnp.abs(x[0] - 2 * t)
+
+    problem = hjb.Problem(
+        lambda t, x, u: u, None, Box([-1.0], [1.0]), terminal_cost=depth, running_max=depth, time_dependent=True
+    )
+    errors = []
+    for count in (121, 241, 481):
+        grid = line(count, 3.0)
+        x = np.asarray(grid.axis(0))
+        exact = np.where(x >= 0, 0.25 - np.maximum(x - 1.0, 0), 0.25 + x)
+        # constraints are looked at where steps end
+        value = hjb.march(problem, grid, 1.0, scheme=hjb.Eno2(), step=3 / count).value[0]
+        errors.append(np.mean(np.abs(value - exact)[np.abs(x) <= 2]))
+    assert order_of(errors) > 0.8
+    assert errors[-1] < 0.01
+
+
+def test_costs_and_drifts_that_change_in_time():
+    """ẋ = cos t on a circle, L = sin t: V = sin(x + sin T) + 1 − cos T."""
+    problem = hjb.Problem(
+        lambda t, x, u: jnp.cos(t) * jnp.ones(1),
+        lambda t, x, u: jnp.sin(t),
+        terminal_cost=lambda t, x: jnp.sin(x[0]),
+        time_dependent=True,
+    )
+    grid = hjb.Grid([0.0], [2 * np.pi], (60,), (True,))
+    solution = hjb.march(problem, grid, 2.0, scheme=hjb.Weno5(), times=[0.0, 1.0, 2.0])
+    x = np.asarray(grid.axis(0))
+    for value, t in zip(solution.value, solution.times, strict=True):
+        exact = np.sin(x + np.sin(2.0) - np.sin(t)) + np.cos(t) - np.cos(2.0)
+        np.testing.assert_allclose(value, exact, rtol=0, atol=2e-5)
+
+
+# --- laws ---
+
+
+def wave(k, extra, x):
+    return jnp.cos(k @ x) + extra * x[0] ** 2
+
+
+def with_waves(problem, k, extra=0.0, floor=None, cost=None):
+    """The system of ``problem`` with a wavy terminal cost; the functions are the same ones every time."""
+    return hjb.Problem(
+        problem.drift,
+        cost,
+        problem.controls,
+        noise=problem.noise,
+        terminal_cost=jax.tree_util.Partial(wave, k, extra),
+        running_max=None if floor is None else jax.tree_util.Partial(wave, floor, -0.5),
+    )
+
+
+@settings(max_examples=25)
+@given(SEEDS)
+def test_upwind_never_leaves_the_range_of_the_data(seed):
+    """No cost, no discount: every value is a mean of values before, or one of the constraints."""
+    rng = np.random.default_rng(seed)
+    grid = random_grid(rng, 2)
+    k, floor = 3 * rng.normal(size=(2, 2))
+    problem = with_waves(random_problem(rng, grid, "diagonal"), k, floor=floor)
+    value = hjb.march(problem, grid, 0.3, times=[0.0, 0.3]).value
+    assert value[0].min() >= value[1].min()
+    assert value[0].max() <= value[1].max()
+
+
+@settings(max_examples=25)
+@given(SEEDS)
+def test_a_higher_terminal_cost_gives_a_higher_value(seed):
+    rng = np.random.default_rng(seed)
+    grid = random_grid(rng, 2)
+    base, k, more = random_problem(rng, grid, "diagonal"), rng.normal(size=2), rng.uniform(0, 1)
+    lower, upper = (hjb.march(with_waves(base, k, extra, cost=base.cost), grid, 0.3).value for extra in (0.0, more))
+    assert np.all(upper >= lower - 1e-12)
+
+
+def test_upwind_and_its_steps_agree_with_the_stationary_solution():
+    problem = hjb.Problem(plane, quadratic, Box([-3.0], [3.0]), discount=1.0)
+    grid = line(41)
+    marched = hjb.march(problem, grid, 16.0, method=hjb.Implicit(), step=0.5)
+    np.testing.assert_allclose(marched.value[0], hjb.solve(problem, grid, tol=1e-9).value, rtol=0, atol=1e-4)
+
+
+# --- closed loops ---
+
+
+@pytest.mark.slow
+def test_closed_loops_with_noise_cost_what_the_value_says():
+    """The mean over 500 paths, within three standard errors plus the error of the grid, V − V_exact."""
+    sigma = 0.5
+    problem = hjb.Problem(plane, quadratic, Box([-8.0], [8.0]), noise=sigma, terminal_cost=lambda x: x @ x)
+    solution = hjb.march(problem, line(81, 4.0), 1.0, times=np.linspace(0, 1, 21))
+    keys = jax.random.split(jax.random.key(0), 500)
+    paths = jax.vmap(
+        lambda key: simulation.rollout(problem, solution, jnp.array([1.0]), jnp.linspace(0.0, 1.0, 21), key=key)
+    )(keys)
+    costs = np.asarray(paths.cost)
+    exact = 1.0 + sigma**2  # P = 1 solves the Riccati equation
+    of_the_grid = abs(solution.value_at(0.0, [1.0]) - exact)
+    assert abs(costs.mean() - exact) <= 3 * costs.std() / np.sqrt(len(costs)) + of_the_grid
+    assert of_the_grid < 0.05

@@ -157,7 +157,7 @@ def _finish_lanes(tasks: Task, states: State, count: int, max_steps: int) -> tup
 
 
 def _stack(trees: Sequence[Any]) -> Any:
-    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *trees)
+    return jax.tree.map(lambda *leaves: jnp.stack(jnp.broadcast_arrays(*leaves)), *trees)
 
 
 def _take(tree: Any, rows: np.ndarray) -> Any:

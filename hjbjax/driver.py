@@ -49,34 +49,32 @@ def drive(task: Task, guess: jax.Array, clock: Clock, most: int | None = None) -
       The last state, how it ended, and the residuals of all steps, that of the guess first.
     """
     limit = clock.max_steps if most is None else min(most, clock.max_steps)
-    state, residuals, chunk = begin(task, guess), [np.zeros(0)], 1
+    state, residuals, chunk, done = begin(task, guess), [np.zeros(0)], 1, -1  # step −1 is the look at the guess
     if clock.interrupted:
         return state, Status.INTERRUPTED, residuals[0]
     code = Status.RUNNING
     with _bar(clock.progress, float(task.tol)) as show, noting_interrupts(clock):
         try:
-            state = run(task, state, 0)  # compiles, and looks at the guess
-            jax.block_until_ready(state)
-            residuals, code = [np.asarray(state.history)[:1]], Status(int(state.code))
             while code is Status.RUNNING:
-                done, began = int(state.step), time.perf_counter()
-                if clock.interrupted:
-                    code = Status.INTERRUPTED
+                began = time.perf_counter()
+                if done >= 0 and (clock.interrupted or done >= limit or clock.elapsed() >= clock.seconds):
+                    late = Status.MAX_STEPS if done >= limit else Status.TIME_LIMIT
+                    code = Status.INTERRUPTED if clock.interrupted else late
                     break
-                if done >= limit or clock.elapsed() >= clock.seconds:
-                    code = Status.MAX_STEPS if done >= limit else Status.TIME_LIMIT
-                    break
-                state = run(task, state, int(min(done + chunk, limit)))  # at once a state: an interrupt may come now
-                jax.block_until_ready(state)
-                took = time.perf_counter() - began
-                clock.stepping += took
+                until = 0 if done < 0 else min(done + chunk, limit)  # the look compiles, too
+                state = run(task, state, int(until))  # at once a state: an interrupt may come from here on
                 code, steps = Status(int(state.code)), int(state.step) - done
                 residuals.append(np.asarray(state.history)[:steps])
-                chunk = int(np.clip(chunk * CHUNK_SECONDS / max(took, 1e-4), 1, min(HISTORY, 8 * chunk)))
-                show(steps, float(state.gap.error))
+                if done >= 0:
+                    took = time.perf_counter() - began
+                    clock.stepping += took
+                    chunk = int(np.clip(chunk * CHUNK_SECONDS / max(took, 1e-4), 1, min(HISTORY, 8 * chunk)))
+                    show(steps, float(state.gap.error))
+                done += steps
         except KeyboardInterrupt:
             clock.interrupted, code = True, Status.INTERRUPTED
-    return state, code, np.concatenate(residuals)
+            residuals.append(np.asarray(state.history)[: int(state.step) - done])  # of steps not yet written down
+    return state, code, np.concatenate(residuals)[: int(state.step) + 1]
 
 
 @contextlib.contextmanager

@@ -8,9 +8,10 @@ written with one-sided differences, so that nothing but the value is read from m
 axis the gain of a drift component f is [(e + h⁻ f) D⁺ − (e − h⁺ f) D⁻]/(h⁺ + h⁻). As a function of u it has
 kinks where f changes sign (and at |f| = a/h under central differences): minimising it is piecewise.
 
-Exact where the drift is affine in u, the cost separable and quadratic, the noise free of u, and no more than two
-inputs drive a component together (read from the jaxpr, see ``structure``): all ends, kinks and stationary points
-are tried. Otherwise samples and a pattern search, and certificates hold for the refined sample.
+Exact where the drift is affine in u, the cost separable and quadratic, the noise free of u, and the inputs fall into
+groups of one or two that drive components of their own, not too many (read from the jaxpr, see ``players``): all
+ends, kinks and stationary points are tried. Otherwise samples and a pattern search, and certificates hold for the
+refined sample.
 """
 
 import dataclasses
@@ -24,7 +25,7 @@ import jax.numpy as jnp
 from hjbjax import chain, fields, sets, slopes, stencil, subcell
 from hjbjax.grid import Grid
 from hjbjax.minimisers import Action, best_of, enumerate_actions, refine
-from hjbjax.piecewise import Kinked, kinked_ball, piecewise_input, piecewise_pair
+from hjbjax.piecewise import Kinked, inverse_root, kinked_ball, piecewise_input, piecewise_pair
 from hjbjax.players import SAMPLES, Player, Setting, shared
 from hjbjax.problem import Problem
 from hjbjax.schemes import Eno2, Limited, Scheme, Upwind, Weno5
@@ -40,7 +41,7 @@ class Local:
       links: the distances to the neighbours along every axis.
       bends: D⁺ − D⁻ along every axis, which noise sees.
       tried: an action of each player that is a candidate beside the samples; with the actions of the last step
-        among them a sampled policy never gets worse, and policy iteration cannot cycle.
+        among them a sampled policy never gets worse.
     """
 
     problem: Problem
@@ -197,8 +198,7 @@ def _projection(choices: Box | Ball) -> Callable[[Action], Action]:
         return lambda action: [jnp.clip(u, choices.lo[j], choices.hi[j]) for j, u in enumerate(action)]
 
     def onto_ball(action):
-        norm = jnp.sqrt(sum(u * u for u in action))
-        shrink = jnp.minimum(1, choices.radius / jnp.where(norm == 0, 1, norm))
+        shrink = jnp.minimum(1, choices.radius * inverse_root(sum(u * u for u in action)))
         return [shrink * u for u in action]
 
     return onto_ball

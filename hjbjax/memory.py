@@ -18,20 +18,31 @@ INDEXABLE = 2**31  # nodes that 32-bit indices can number
 def estimate(problem: Problem, grid: Grid, method: Method, dtype: Any) -> int:
     """Bytes that a solve keeps at its peak, from a count of the arrays that live at once.
 
-    Value, residual, policy and what the certificate needs; for policy iteration the 2n weights and the source in
-    double and, sheared, in single precision; eight vectors for a Krylov method.
+    The state is the value, the rate that is left and the policy. A look at it makes the next one beside it; sweeps
+    need the weights (one an axis without noise, two with it) and the source twice, as they are and sheared, in single
+    precision; a Krylov method its vectors.
     """
     if isinstance(method, Nested):
         return estimate(problem, grid, method.inner, dtype)
     word, n = np.dtype(dtype).itemsize, grid.ndim
     actions = sum(choices.dim for choices in (problem.controls, problem.disturbances) if choices is not None)
-    per_node = word * (6 + 2 * actions) + 2
+    conditions = (problem.exit_cost, problem.stopping_cost, problem.running_max, problem.disturbances)
+    kept = word * (2 + actions + sum(each is not None for each in conditions) + (not _discounted(problem))) + 2
+    look, correction = word * (5 + actions), 0
     if isinstance(method, PolicyIteration):
-        jumps = 2 * n if np.ndim(problem.noise) < 2 and not callable(problem.noise) else 2 * n * n
-        per_node += word * (jumps + 2)
-        per_node += 4 * 2 * (jumps + 4) if isinstance(method.evaluation, Sweeps) else 2 * word * (jumps + 4)
-        per_node += 8 * word * isinstance(method.evaluation, Krylov)
-    return per_node * grid.size
+        jumps = 2 * n * n if np.ndim(problem.noise) == 2 or callable(problem.noise) else 2 * n
+        if isinstance(method.evaluation, Sweeps):
+            weights = n if problem.noise is None else jumps
+            correction = 4 * (2 * weights + 2) + 2 * word
+        else:
+            correction = word * (2 * jumps + 4 + 8 * isinstance(method.evaluation, Krylov))
+    else:
+        look += word  # the pace
+    return (kept + max(look, correction)) * grid.size
+
+
+def _discounted(problem: Problem) -> bool:
+    return isinstance(problem.discount, jax.core.Tracer) or bool(np.all(np.asarray(problem.discount) > 0))
 
 
 def available() -> int | None:

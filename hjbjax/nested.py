@@ -57,10 +57,8 @@ def warm(task: Task, guess: Any, clock: Clock) -> jax.Array:
     """
     if guess is not None:
         return guess
-    value = jnp.asarray(np.zeros(task.grid.shape, task.tol.dtype))
-    if (
-        np.asarray(task.problem.discount) == 0
-    ):  # a constraint alone has many fixed points: ψ is above, g is below all of them
+    value = jnp.asarray(np.zeros(task.grid.shape, task.tol.dtype))  # NumPy's zeros: nothing to compile
+    if np.asarray(task.problem.discount) == 0:  # constraints alone have many fixed points between g and ψ
         value = value if task.rules.stop is None else task.rules.stop
         floor = task.rules.floor
         if floor is not None:

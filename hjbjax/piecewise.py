@@ -25,13 +25,6 @@ class Kinked:
         self.gain, self.offset, self.slope = gain, offset, slope
         self.kinks, self.derivatives = tuple(kinks), tuple(derivatives)
 
-    def derivative(self, f: Any) -> Any:
-        """The slope of the gain at f; at a kink the one above it."""
-        result = self.derivatives[0]
-        for kink, above in zip(self.kinks, self.derivatives[1:], strict=True):
-            result = jnp.where(f >= kink, above, result)
-        return result
-
     def on_line(self, point: Sequence[Any], direction: Sequence[Any]) -> "Kinked":
         """The same along point + t · direction, as a function of one input t."""
         at, along = (sum(g * c for g, c in zip(self.slope, vector, strict=True)) for vector in (point, direction))
@@ -44,14 +37,20 @@ def inverse(number: Any) -> Any:
     return jnp.where(zero, 0, 1 / jnp.where(zero, 1, number))
 
 
+def inverse_root(number: Any) -> Any:
+    """1/√number, 0 for zero, with a derivative of zero there."""
+    zero = number == 0
+    return jnp.where(zero, 0, 1 / jnp.sqrt(jnp.where(zero, 1, number)))
+
+
 def piecewise_input(
     sign: int, lo: Any, hi: Any, linear: Any, square: Any, pieces: Sequence[Kinked], *, curved: bool
 ) -> Any:
     """The exact optimum over one input u ∈ [lo, hi] of  l u + q u² + Σ_i gain_i(b_i + G_i u).
 
-    Each gain is linear between its kinks, so the optimum is an end, a kink, or the stationary point of a piece
-    clipped to [lo, hi]; all are tried. Concave pieces and G_i = 0 need no special care: every candidate is
-    admissible and is judged by its own value.
+    Each gain is linear between its kinks, so the optimum is an end, a kink, or the stationary point of one choice of
+    pieces, clipped to [lo, hi]; all are tried, also choices that no u makes, so that kinks may coincide. Concave
+    pieces and G_i = 0 need no special care: every candidate is admissible and is judged by its own value.
 
     Args:
       sign: +1 to minimise, −1 to maximise.
@@ -66,22 +65,11 @@ def piecewise_input(
         return sum((piece.gain(piece.offset + piece.slope * u) for piece in pieces), start=value)
 
     candidates = [lo, hi]
-    slopes = []
-    for index, piece in enumerate(pieces):
-        for position, kink in enumerate(piece.kinks):
-            at = jnp.clip((kink - piece.offset) * inverse(piece.slope), lo, hi)
-            candidates.append(at)
-            others = sum(
-                (
-                    other.slope * other.derivative(other.offset + other.slope * at)
-                    for k, other in enumerate(pieces)
-                    if k != index
-                ),
-                start=linear,
-            )
-            slopes += [others + piece.slope * d for d in piece.derivatives[position : position + 2]]
+    for piece in pieces:
+        candidates += [jnp.clip((kink - piece.offset) * inverse(piece.slope), lo, hi) for kink in piece.kinks]
     if curved:
-        for slope in slopes or [linear]:
+        for choice in itertools.product(*(piece.derivatives for piece in pieces)):
+            slope = linear + sum(piece.slope * d for piece, d in zip(pieces, choice, strict=True))
             candidates.append(jnp.clip(-slope * inverse(2 * square), lo, hi))
     best_u, best_value = jnp.asarray(candidates[0]), total(candidates[0])
     for u in candidates[1:]:
@@ -160,7 +148,7 @@ def piecewise_pair(
 def _kink_line(piece: Kinked, kink: Any) -> tuple[list[Any], list[Any]]:
     """A point and a unit direction of the line b + G·u = kink; the origin and no direction where G = 0."""
     g1, g2 = piece.slope
-    shrink = inverse(jnp.sqrt(g1 * g1 + g2 * g2))
+    shrink = inverse_root(g1 * g1 + g2 * g2)
     g1, g2 = g1 * shrink, g2 * shrink
     away = (kink - piece.offset) * shrink
     return [away * g1, away * g2], [-g2, g1]
@@ -181,8 +169,7 @@ def _within(point: Sequence[Any], direction: Sequence[Any], lo: Sequence[Any], h
 
 def ball_directions(gradients: Sequence[Any], radius: Any, sign: int) -> Action:
     """The optimum of g·u over |u| ≤ radius: −sign · radius · g/|g|; the centre where g = 0."""
-    norm = jnp.sqrt(sum(g * g for g in gradients))
-    scale = -sign * radius / jnp.where(norm == 0, 1, norm)
+    scale = -sign * radius * inverse_root(sum(g * g for g in gradients))
     return [scale * g for g in gradients]
 
 

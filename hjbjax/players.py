@@ -1,7 +1,8 @@
 """The two players: what each may do, and how the Hamiltonian depends on it, read from the problem's functions.
 
 The optimum over a player's actions is exact where the drift is affine in them, the cost separable and quadratic, the
-noise free of them, and no more than two inputs of a box drive a component together (none of a ball); see ``piecewise``.
+noise free of them, and the inputs of a box fall into groups of one or two that drive components of their own, few
+enough that all their pieces can be tried; in a ball each input drives one component of its own. See ``piecewise``.
 """
 
 import dataclasses
@@ -16,7 +17,7 @@ from hjbjax.problem import Problem
 from hjbjax.sets import AdmissibleSet, Ball, Box, Finite
 
 SAMPLES = 33  # points of a continuum before refinement
-MOST_SHARED = 3  # components that two inputs may drive together: every combination of their pieces is tried
+CELLS = {1: 64, 2: 16}  # by the inputs of a group: combinations of pieces that are tried at most
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,6 +30,7 @@ class Player:
       exact: whether the optimum is found exactly rather than by samples.
       driven: for every input the drift components that it drives.
       groups: the inputs by what they drive together; the groups drive disjoint sets of components.
+      cells: for every group in how many pieces the Hamiltonian may fall.
       curved: for every input whether the cost may hold its square.
     """
 
@@ -37,6 +39,7 @@ class Player:
     exact: bool
     driven: tuple[tuple[int, ...], ...]
     groups: tuple[tuple[int, ...], ...]
+    cells: tuple[int, ...]
     curved: tuple[bool, ...]
 
     def derivative(self, problem: Problem, function: Callable, j: int) -> Callable:
@@ -62,7 +65,11 @@ class Player:
             return 1
         if isinstance(self.choices, Finite):
             return len(self.choices.points)
-        return 3 if self.exact else SAMPLES
+        if not self.exact:
+            return SAMPLES
+        return sum(
+            3 + cells if len(group) == 1 else 10 * cells for group, cells in zip(self.groups, self.cells, strict=True)
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,8 +108,9 @@ def setting(problem: Problem, n: int, dtype: Any) -> Setting:
     cost = constant if problem.cost is None else structure.dependence(problem.cost, *arguments, dtype=dtype)
     noise = structure.dependence(problem.noise, *arguments, dtype=dtype) if callable(problem.noise) else constant
     inputs_u, inputs_d = range(m), range(m, m + k)
-    mine = _player(problem.controls, 1, inputs_u, drift, cost, noise)
-    theirs = _player(problem.disturbances, -1, inputs_d, drift, cost, noise)
+    branches = 2 if problem.noise is None else 4  # central differences have three kinks a component
+    mine = _player(problem.controls, 1, inputs_u, drift, cost, noise, branches)
+    theirs = _player(problem.disturbances, -1, inputs_d, drift, cost, noise, branches)
     separate = not set(drift.driven_by(inputs_u)) & set(drift.driven_by(inputs_d))
     crossed = any(
         entry is None or any(set(term) & set(inputs_u) and set(term) & set(inputs_d) for term in entry)
@@ -119,17 +127,19 @@ def _player(
     drift: structure.Dependence,
     cost: structure.Dependence,
     noise: structure.Dependence,
+    branches: int,
 ) -> Player:
     driven = tuple(drift.driven_by([j]) for j in inputs)
     curved = tuple(cost.has_square([j]) for j in inputs)
     groups = _groups(driven)
+    cells = tuple(branches ** len(shared(driven, group)) for group in groups)
     suits = drift.affine_in(inputs) and cost.separable_quadratic_in(inputs) and noise.free_of(inputs)
     if isinstance(choices, Box):
-        suits &= all(len(g) == 1 or (len(g) == 2 and len(shared(driven, g)) <= MOST_SHARED) for g in groups)
+        suits &= all(count <= CELLS.get(len(group), 0) for group, count in zip(groups, cells, strict=True))
     elif isinstance(choices, Ball):
         apart = all(len(group) == 1 for group in groups) and all(len(components) <= 1 for components in driven)
         suits &= choices.dim <= 3 and not any(curved) and apart
-    return Player(choices, sign, suits and isinstance(choices, (Box, Ball)), driven, groups, curved)
+    return Player(choices, sign, suits and isinstance(choices, (Box, Ball)), driven, groups, cells, curved)
 
 
 def _groups(driven: tuple[tuple[int, ...], ...]) -> tuple[tuple[int, ...], ...]:

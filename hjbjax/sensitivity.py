@@ -55,7 +55,8 @@ def _residual(task: Task, state: State, equation: Correction) -> jax.Array:
     problem, grid, value, policy = task.problem, task.grid, state.value, state.policy
     rules = bellman.conditions(problem, grid, value.dtype)
     u, d = list(policy.controls), list(policy.disturbances)
-    rate = bellman.greedy(problem, grid, value, jax.lax.stop_gradient(task.rules.held), scheme=task.scheme).rate
+    held = jax.lax.stop_gradient(task.rules.held)
+    rate = bellman.greedy(problem, grid, value, held, scheme=task.scheme, incumbent=policy).rate
     scheme = task.scheme.chain
     total = chain.rates(problem, grid, u, d, scheme=scheme, dtype=value.dtype).total()
     pace = jax.lax.stop_gradient(total + problem.discount)
@@ -65,7 +66,6 @@ def _residual(task: Task, state: State, equation: Correction) -> jax.Array:
         phi = jnp.where(bound & (value >= jax.lax.stop_gradient(rules.stop)), rules.stop - value, phi)
     if rules.floor is not None:
         phi = jnp.where(bound & (value <= jax.lax.stop_gradient(rules.floor)), rules.floor - value, phi)
-    held = jax.lax.stop_gradient(task.rules.held)
     return jnp.where(held, rules.given - value, phi)
 
 

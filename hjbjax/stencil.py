@@ -15,16 +15,11 @@ import numpy as np
 from hjbjax.grid import Grid
 
 
-def outermost(grid: Grid, axis: int, step: int) -> np.ndarray:
-    """Which nodes are the last ones in direction ``step`` along ``axis``; broadcasts against the node axes."""
-    mask = np.zeros(grid.shape[axis], dtype=bool)
-    mask[-1 if step > 0 else 0] = True
-    return mask.reshape([-1 if i == axis else 1 for i in range(grid.ndim)])
-
-
 def on_edge(grid: Grid, axis: int, step: int) -> np.ndarray:
     """Which nodes have no neighbour in direction ``step`` along ``axis``; broadcasts against the node axes."""
-    return outermost(grid, axis, step) & (not grid.periodic[axis])  # type: ignore[index]
+    mask = np.zeros(grid.shape[axis], dtype=bool)
+    mask[-1 if step > 0 else 0] = not grid.periodic[axis]  # type: ignore[index]
+    return mask.reshape([-1 if i == axis else 1 for i in range(grid.ndim)])
 
 
 def neighbour(values: jax.Array, grid: Grid, offset: tuple[int, ...], *, ghost: bool = True) -> jax.Array:

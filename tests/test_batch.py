@@ -98,6 +98,29 @@ def test_a_lane_without_an_answer_is_named():
         hjb.solve_batch([problem(1.0, 1.0), dataclasses.replace(problem(1.0), cost=None, discount=0.0)], GRID)
 
 
+def lost(rate):
+    """Minimum time to the left end against a current; where it is stronger than the boat nobody arrives."""
+    return hjb.Problem(Current(rate).drift, lambda x, u: 1.0, hjb.Box([-1.0], [1.0]), target=lambda x: x[0] + 1 - 1e-9)
+
+
+@node()
+class Current:
+    """ẋ = u + r (1 + sgn x)/2."""
+
+    rate: object
+
+    def drift(self, x, u):
+        return u + jnp.where(x > 0, self.rate, 0)
+
+
+def test_lanes_that_arrive_and_lanes_that_do_not_go_together():
+    line = hjb.Grid([-1.0], [1.0], (41,))
+    with pytest.warns(hjb.SolveWarning, match="cannot reach the target"):
+        arrives, never = hjb.solve_batch([lost(0.5), lost(2.0)], line, tol=1e-6)
+    assert np.all(np.isfinite(arrives.value))
+    assert np.array_equal(np.isinf(never.value), np.asarray(line.axis(0)) > 1e-12)
+
+
 def test_no_problems_have_no_solutions():
     assert hjb.solve_batch([], GRID) == []
 

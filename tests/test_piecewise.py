@@ -107,9 +107,21 @@ def test_two_inputs_are_optimal_over_a_scan(count, kinks, curved, seed):
         assert np.all(sign * value <= np.min(sign * scan, axis=(0, 1)) + 1e-11)
 
 
-def test_slope_above_a_kink_counts_at_the_kink():
-    piece = Kinked(abs, 0.0, 1.0, (0.0,), (-1.0, 1.0))
-    assert [float(piece.derivative(f)) for f in (-1.0, 0.0, 2.0)] == [-1.0, 1.0, 1.0]
+@pytest.mark.parametrize("count", [2, 3])
+@given(seed=SEEDS)
+@settings(max_examples=15)
+def test_kinks_that_coincide_hide_no_stationary_point(count, seed):
+    """Without drift of its own every component turns at u = 0: no choice of pieces is next to one kink alone."""
+    rng = np.random.default_rng(seed)
+    offset, slope, at, derivatives = random_pieces(rng, count, 1)
+    pieces = (0 * offset, slope, 0 * at, derivatives)
+    linear, square = rng.normal(size=NODES), rng.uniform(0.1, 1, NODES)
+    _, value, scan = map(np.asarray, best_input(1, pieces, linear, square, -1.5, 1.5, True))
+    assert np.all(value <= np.min(scan, axis=0) + 1e-12)
+    slopes = rng.normal(size=(count, 2, NODES))
+    twice = np.stack([linear, -linear]), np.stack([square, square])
+    _, value, scan = map(np.asarray, best_pair(1, pieces, slopes, *twice, -np.ones(2), np.ones(2), True))
+    assert np.all(value <= np.min(scan, axis=(0, 1)) + 1e-11)
 
 
 @functools.partial(jax.jit, static_argnames="sign")

@@ -162,3 +162,33 @@ def test_traced_solves_take_the_dtype_of_their_inputs():
 def test_fixed_steps_under_jit_report_that_they_ran_out():
     result = jax.jit(lambda mass: hjb.solve(question(mass=mass), GRID, tol=1e-6, max_steps=1))(jnp.float32(1.2))
     assert hjb.Status(int(result.code)) is not hjb.Status.CONVERGED
+
+
+@node()
+class Wavy:
+    """A drift and a cost that are not affine and quadratic in u, so that actions are sampled."""
+
+    gain: object
+
+    def drift(self, x, u):
+        return self.gain * jnp.sin(2 * u) - 0.3 * x
+
+    def cost(self, x, u):
+        return jnp.sum(x * x + 0.3 * u * u + 0.05 * jnp.cos(97 * u + 9 * x))
+
+
+def test_the_gradient_is_that_of_the_policy_that_was_found():
+    """Sampled actions may be better with the last step's among them: the derivative must take the same."""
+    line = hjb.Grid([-1.0], [1.0], (21,))
+
+    def value(gain):
+        wavy = Wavy(gain)
+        problem = hjb.Problem(wavy.drift, wavy.cost, hjb.Box([-1.0], [1.0]), discount=0.5)
+        return jnp.sum(hjb.solve(problem, line, tol=1e-11).value)
+
+    with jax.enable_x64(True):
+        slope = float(jax.jit(jax.grad(value))(1.0))
+        step = 1e-5
+        plain = jax.jit(value)
+        difference = float(plain(1.0 + step) - plain(1.0 - step)) / (2 * step)
+    assert slope == pytest.approx(difference, rel=1e-5)

@@ -66,8 +66,8 @@ def best_of(objective: Objective, actions: Sequence[Action], sign: int, best: An
         if best is None:
             best = (value, *chosen)
             continue
-        optimum = jnp.minimum(best[0], value) if sign > 0 else jnp.maximum(best[0], value)  # a NaN stays one
-        best = (optimum, *pick(better(sign, value, best[0]), chosen, best[1:]))
+        wins = better(sign, value, best[0]) | jnp.isnan(value)  # so that the action found has a NaN, too
+        best = pick(wins, (value, *chosen), best)
     return best
 
 

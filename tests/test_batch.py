@@ -66,7 +66,7 @@ def test_problems_of_different_kinds_keep_their_places():
 
 def test_rounds_that_fit_into_memory_change_nothing():
     questions = [problem(k) for k in np.linspace(0, 2, 5)]
-    whole, parts = (hjb.solve_batch(questions, GRID, tol=1e-6, max_memory=limit) for limit in (None, 150_000))
+    whole, parts = (hjb.solve_batch(questions, GRID, tol=1e-6, max_memory=limit) for limit in (None, 50_000))
     assert parts[0].stats["lanes"] < whole[0].stats["lanes"] == 5
     for left, right in zip(whole, parts, strict=True):
         assert np.array_equal(left.value, right.value)

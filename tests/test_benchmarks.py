@@ -95,6 +95,7 @@ def test_the_timed_sweep_is_that_of_the_exported_chain(shape):
     np.testing.assert_allclose(found, value + rate / (pace + problem.discount), rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_sweep_is_compared_with_the_peer_before_it_is_timed(monkeypatch):
     pytest.importorskip("numba")
     problem, grid = questions.pendulum(32, 21)
@@ -137,6 +138,7 @@ def test_sizes_are_fitted_to_the_machine(monkeypatch):
 # --- peers ---
 
 
+@pytest.mark.slow
 def test_the_peers_agree_on_the_pendulum(tmp_path):
     for peer in ("numba", "quantecon", "mdpsolver"):
         pytest.importorskip(peer)
@@ -207,6 +209,7 @@ def test_the_value_of_states_apart_is_a_sum():
     np.testing.assert_array_equal(questions.sum_over_axes(line, 2), [[2.0, 3.0], [3.0, 4.0]])
 
 
+@pytest.mark.slow
 def test_scaling_checks_its_value(tmp_path):
     rows = rows_of(scaling, tmp_path, "--dimension", "1", "--dimension", "2")
     assert [row["dimension"] for row in rows] == [1, 1, 2, 2]
@@ -225,6 +228,7 @@ def test_more_controls_never_cost_more_to_the_controlled(tmp_path):
         assert {row["bound"] for row in rows if row["part"] == "error"} == {-5.0}
 
 
+@pytest.mark.slow
 def test_a_batch_gives_the_values_of_its_members(tmp_path):
     together, apart = rows_of(batch, tmp_path)
     assert (together["code"], apart["code"]) == ("solve_batch", "solve")

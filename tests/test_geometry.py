@@ -272,11 +272,13 @@ def test_a_car_with_one_trailer_has_degree_three_everywhere():
         assert nonholonomy(1, [0.4, 0.4 - bend], 4) == 3
 
 
+@pytest.mark.slow
 def test_a_car_with_two_trailers_is_harder_to_move_when_they_are_perpendicular():
     assert nonholonomy(2, [0.4, 0.1, -0.3], 5) == 4
     assert nonholonomy(2, [0.4, 0.4 - np.pi / 2, 0.4 - np.pi], 5) == 5
 
 
+@pytest.mark.slow
 def test_the_ball_and_beam_has_no_relative_degree_at_rest_and_is_not_linearisable():
     system = zoo.BallAndBeam()
     f, gs = geometry.affine_fields(system.drift, 1)
@@ -326,6 +328,7 @@ def pushed(feedback, drift, x, v):
     return jax.jvp(feedback.coordinates, (x,), (drift(x, feedback.control(x, v)),))
 
 
+@pytest.mark.slow
 def test_a_linearised_flexible_joint_follows_a_linear_equation():
     """ξ = (q, q̇, q̈, q⃛) under v = −(s + 1)⁴ obeys e^{−t}(c₀ + c₁t + c₂t² + c₃t³)."""
     system = zoo.FlexibleJoint()
@@ -346,6 +349,7 @@ def test_a_linearised_flexible_joint_follows_a_linear_equation():
     np.testing.assert_allclose(path.states[:, 0], exact, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_an_arm_of_two_links_is_linearised_by_its_computed_torque():
     arm = zoo.Manipulator(links=2, masses=(1.3, 0.7))
     f, gs = geometry.affine_fields(arm.drift, 2)
@@ -363,6 +367,7 @@ def test_an_arm_of_two_links_is_linearised_by_its_computed_torque():
 
 
 @pytest.mark.parametrize("zero", [-2.0, 0.5])
+@pytest.mark.slow
 def test_zero_dynamics_are_the_zeros_of_a_linear_system(zero):
     """y = (s − zero)/(s³ + 2s² + 3s + 4) u has relative degree 2 and one zero."""
     a = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [-4.0, -3.0, -2.0]])
@@ -435,6 +440,7 @@ def test_decisions_can_be_traced():
     assert not verdicts(0.0, x)[3]
 
 
+@pytest.mark.slow
 def test_the_relative_degree_around_the_origin_can_be_found_inside_a_trace():
     f, g, h = (lambda x: jnp.stack([x[1], jnp.sin(x[0])])), constant([0.0, 2.0]), lambda x: x[0]
     feedback = geometry.linearising_feedback(f, g, h)

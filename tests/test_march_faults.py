@@ -128,6 +128,7 @@ def test_how_long_a_chunk_is_changes_no_bit(monkeypatch):
 # --- what is kept ---
 
 
+@pytest.mark.slow
 def test_times_and_what_they_hold(tmp_path):
     problem = dataclasses.replace(LQ, terminal_cost=lambda x: jnp.cos(x[0]))
     solution = hjb.march(problem, GRID, 1.0, times=[0.0, 0.3, 1.0], scheme=hjb.Eno2())
@@ -172,6 +173,7 @@ def at_one(weight, method=None, step=1 / 64):
     return hjb.march(problem, GRID, 1.0, step=step, method=method).value[0, 30]
 
 
+@pytest.mark.slow
 def test_it_can_be_compiled_batched_and_differentiated():
     with jax.enable_x64(True):
         plain = float(at_one(1.0))

@@ -59,6 +59,7 @@ def test_riccati_in_time_has_the_order_of_its_stages():
     assert errors[-1] < 1e-7
 
 
+@pytest.mark.slow
 def test_riccati_with_noise():
     """V = tanh(T) x² + σ² ln cosh T: first order by upwinding, second where central differences are monotone."""
 
@@ -87,6 +88,7 @@ def test_a_wave_that_is_carried_along(scheme, order):
     assert order_of(errors) == pytest.approx(order, abs=0.15 if order < 5 else 0.3)
 
 
+@pytest.mark.slow
 def test_hopf_and_lax():
     """f = u, L = ½|u|², ψ = ½|x|²: V = |x|²/(2(1 + T)), in the plane."""
     problem = hjb.Problem(
@@ -124,6 +126,7 @@ def game(gamma, bound):
     return hjb.Problem(lambda x, u, d: u + d, cost, Box([-9.0], [9.0]), disturbances=Box([-bound], [bound]))
 
 
+@pytest.mark.slow
 def test_the_game_of_finite_horizon():
     """ẋ = u + d: V = tanh(kT)/k x² with k² = 1 − γ⁻²; both players drive one component."""
     k = np.sqrt(1 - 1 / 4)

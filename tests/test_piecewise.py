@@ -88,7 +88,9 @@ def best_pair(sign, pieces, slopes, linear, square, lo, hi, curved):
     return jnp.stack(jnp.broadcast_arrays(*u)), value(u), value(scan)
 
 
-@pytest.mark.parametrize(("count", "kinks"), [(1, 1), (2, 1), (3, 1), (2, 3)])
+@pytest.mark.parametrize(
+    ("count", "kinks"), [(1, 1), (2, 1), *(pytest.param(*each, marks=pytest.mark.slow) for each in ((3, 1), (2, 3)))]
+)
 @pytest.mark.parametrize("curved", [False, True])
 @given(seed=SEEDS)
 @settings(max_examples=15)

@@ -211,6 +211,6 @@ def test_grids_that_do_not_fit_are_refused_within_a_second(shape, words):
 
 
 def test_max_memory_overrides_what_is_free():
-    error = refusal(MemoryError, "80 nodes", "1e-05 GB", max_memory=10_000)
+    error = refusal(MemoryError, "80 nodes", "5e-06 GB", max_memory=5_000)
     assert "max_memory" in str(error)
     assert hjb.solve(problem(), GRID, max_memory=10**6).status is hjb.Status.CONVERGED

@@ -69,6 +69,7 @@ def distance(x):
 
 
 @pytest.mark.parametrize("speed", [1.0, -1.0])
+@pytest.mark.slow
 def test_the_tubes_of_example_41(speed):
     """The least distance to the origin on the way, forwards and backwards in time.
 
@@ -131,6 +132,7 @@ def test_the_path_of_pomet_falls_like_one_over_the_root_of_time():
     assert slope == pytest.approx(-0.5, abs=0.05)
 
 
+@pytest.mark.slow
 def test_the_lyapunov_function_of_pomet_survives_the_search():
     region = hjb.Box([-1.0] * 3, [1.0] * 3)
     report = hjb.lyapunov_check(POMET.lyapunov, POMET.closed_loop, region, times=(0.0, 2 * np.pi))
@@ -156,6 +158,7 @@ def energy(x):
     return 0.5 * (x @ x)
 
 
+@pytest.mark.slow
 def test_the_worst_point_is_found():
     """dV/dt = −(1 − x₁²) x₂², largest at a corner of the box, and in the disc of radius 2 where x₁² = 5/2."""
     box = hjb.lyapunov_check(energy, oscillator, hjb.Box([-2.0, -2.0], [2.0, 2.0]))

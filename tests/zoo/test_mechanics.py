@@ -132,6 +132,7 @@ def test_one_link_is_the_pendulum():
 
 
 @given(*[st.floats(-3, 3) for _ in range(4)])
+@pytest.mark.slow
 def test_two_links_are_the_textbook_arm(q1, q2, w1, w2):
     """Craig's two-link arm with point masses at the ends; his first angle is from the horizontal, ours from upright."""
     m1, m2, l1, l2, g = 1.3, 0.7, 0.9, 1.4, 9.81
@@ -170,6 +171,7 @@ def test_the_manipulator_problem_grows_with_its_links():
     assert zoo.catalogue["manipulator"].initial_state(4) == (2.0, 0.0, 0.0, 0.0)
 
 
+@pytest.mark.slow
 def test_one_link_is_raised_as_the_pendulum_is():
     shape = (24, 25)
     (arm, grid), (pendulum, _) = zoo.manipulator(discount=0.0, shape=shape), zoo.pendulum(shape=shape)

@@ -300,6 +300,7 @@ def test_the_ball_and_beam_has_no_relative_degree_at_rest_and_is_not_linearisabl
     assert geometry.is_feedback_linearisable(f, gs, np.zeros(4), samples=0).involutive
 
 
+@pytest.mark.slow
 def test_the_flexible_joint_is_linearised_by_feedback():
     system = zoo.FlexibleJoint(link=0.5, motor=0.2, weight=7.0, stiffness=100.0)
     f, gs = geometry.affine_fields(system.drift, 1)
@@ -389,6 +390,7 @@ def test_zero_dynamics_are_the_zeros_of_a_linear_system(zero):
     np.testing.assert_allclose(rate, 0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_two_inputs_can_share_a_chain():
     """Brunovský's form with indices 3 and 1, hidden by a change of coordinates, is found again."""
     a = np.zeros((4, 4))
@@ -417,6 +419,7 @@ def test_two_inputs_can_share_a_chain():
     assert not geometry.is_feedback_linearisable(*spoiled, [0.2, -0.1, 0.4, 0.3]).linearisable
 
 
+@pytest.mark.slow
 def test_decisions_can_be_traced():
     system = zoo.FlexibleJoint()
     x = jnp.array([0.3, 0.1, -0.2, 0.5])

@@ -194,6 +194,7 @@ def test_traced_use_wants_a_step():
         jax.jit(lambda horizon: hjb.march(LQ, GRID, horizon, step=0.01).value)(1.0)
 
 
+@pytest.mark.slow
 def test_a_marched_feedback_must_be_known_densely_enough():
     few = hjb.march(LQ, GRID, 1.0, times=[0.0, 1.0])
     with pytest.raises(ValueError, match=r"kept at 2 times from 0 to 1; a feedback up to t = 1 wants all of that"):

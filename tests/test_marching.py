@@ -106,6 +106,7 @@ def test_hopf_and_lax():
     assert error(hjb.march(problem, grids[0], 1.0, scheme=hjb.Weno5()), exact) < 1e-4
 
 
+@pytest.mark.slow
 def test_cole_and_hopf():
     """f = u, L = ½u², σ = 1, ψ = ½x²: V(1, 0) = .5965735903 at T = 1."""
     problem = hjb.Problem(
@@ -164,6 +165,7 @@ def put():
     )
 
 
+@pytest.mark.slow
 def test_the_american_put():
     """2.31958 at S = 40: first order by upwinding, better where the noise allows central differences."""
 
@@ -190,6 +192,7 @@ def test_implicit_steps_of_any_length_have_order_one_in_time():
     assert order_of(errors) == pytest.approx(1, abs=0.15)
 
 
+@pytest.mark.slow
 def test_implicit_games_agree_with_explicit_ones():
     grid = line(41)
     explicit = hjb.march(game(2.0, 3.7), grid, 1.0, method=hjb.Explicit(3)).value[0]
@@ -279,6 +282,7 @@ def with_waves(problem, k, extra=0.0, floor=None, cost=None):
 
 @settings(max_examples=25)
 @given(SEEDS)
+@pytest.mark.slow
 def test_upwind_never_leaves_the_range_of_the_data(seed):
     """No cost, no discount: every value is a mean of values before, or one of the constraints."""
     rng = np.random.default_rng(seed)

@@ -41,6 +41,7 @@ def test_the_pendulum_under_28_follows_the_closed_form(mass, start):
     np.testing.assert_allclose(path.states[:, 0], linear_angle(path.times, start), atol=1e-8)
 
 
+@pytest.mark.slow
 def test_the_linear_controller_follows_it_near_upright_only():
     system = zoo.Pendulum()
     problem = hjb.Problem(system.drift, None, hjb.Box([-100.0], [100.0]))
@@ -117,6 +118,7 @@ def test_the_derivative_identity_of_pomet(t, x1, x2, x3):
     assert found <= 1e-10
 
 
+@pytest.mark.slow
 def test_the_path_of_pomet_falls_like_one_over_the_root_of_time():
     problem = hjb.Problem(POMET.drift, None, hjb.Box([-9.0, -9.0], [9.0, 9.0]))
     start = [1.0, 1.0, 0.5]
@@ -173,6 +175,7 @@ def test_the_worst_point_is_found():
 
 
 @given(st.floats(-0.8, 0.8), st.floats(-0.8, 0.8))
+@pytest.mark.slow
 def test_a_narrow_violation_is_climbed_to(a, b):
     """A bump of width 0.15 in dV/dt, which is negative elsewhere."""
     report = hjb.lyapunov_check(Bump(a, b).level, Bump(a, b).decay, hjb.Box([-1.0, -1.0], [1.0, 1.0]))

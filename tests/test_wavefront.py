@@ -47,7 +47,7 @@ def sweeps(equation, grid, rounds):
     return wavefront.gauss_seidel(equation, grid, rounds)
 
 
-@pytest.mark.parametrize("shape", [(9,), (6, 5), (4, 7), (4, 3, 5), (3, 4, 3, 3)])
+@pytest.mark.parametrize("shape", [(9,), (6, 5), (4, 7), (4, 3, 5), pytest.param((3, 4, 3, 3), marks=pytest.mark.slow)])
 @pytest.mark.parametrize("periodic", ["", "0", "1", "02", "123"])
 @given(seed=SEEDS)
 @settings(max_examples=2)

@@ -99,6 +99,7 @@ def test_computed_torque_gives_the_acceleration_asked_for(links):
     np.testing.assert_allclose(moved(q, w, wanted), wanted, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_an_arm_under_computed_torque_is_linear():
     """Upright from hanging: each joint obeys θ̈ + 3θ̇ + 2θ = 0, the closed form of (2.7)."""
     arm, start = zoo.Manipulator(links=2, masses=(1.3, 0.7)), np.array([3.0, -0.5, 0.0, 1.0])
@@ -113,6 +114,7 @@ def circle(t):
     return jnp.stack([0.5 * jnp.sin(2 * t), jnp.cos(t)])
 
 
+@pytest.mark.slow
 def test_an_arm_tracks_a_motion_by_computed_torque():
     """The error from the motion obeys ë + 3ė + 2e = 0, and is zero on the motion itself."""
     arm = zoo.Manipulator(links=2)

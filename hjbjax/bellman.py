@@ -87,10 +87,7 @@ def conditions(problem: Problem, grid: Grid, dtype: Any, t: Any = 0.0) -> Condit
 
 def at_nodes(problem: Problem, grid: Grid, ingredient: Any, dtype: Any, t: Any = 0.0) -> jax.Array:
     """A function of the state alone, or a number, at every node, shape (*grid); None is zero."""
-    entry = 0.0 if ingredient is None else ingredient
-    return jnp.broadcast_to(
-        fields.scalar(entry, *problem.state_arguments(grid.components(dtype), t), dtype=dtype), grid.shape
-    )
+    return jnp.broadcast_to(fields.of_state(problem, ingredient, grid.components(dtype), t, dtype), grid.shape)
 
 
 def greedy(

@@ -22,6 +22,7 @@ import numpy as np
 from jax.extend import core as jex
 
 from hjbjax.primitives import CALLS, CUMULATIVE, ENTRYWISE, IN_NUMPY, MOVES, REDUCTIONS, SCATTERS
+from hjbjax.problem import Problem
 
 
 class FallbackWarning(UserWarning):
@@ -53,6 +54,12 @@ def scalar(function: Any, *arguments: Any, dtype: Any) -> Any:
     if entries.shape != ():
         raise ValueError(f"a function returned shape {entries.shape}, expected a scalar ()")
     return entries.item()
+
+
+def of_state(problem: Problem, ingredient: Any, x: list, t: Any, dtype: Any) -> Any:
+    """A problem's function of the state alone, or a number in its place, or None for zero: one per-node scalar."""
+    entry = 0.0 if ingredient is None else ingredient
+    return scalar(entry, *problem.state_arguments(x, t), dtype=dtype)
 
 
 def trace(function: Callable, *arguments: Any, dtype: Any) -> tuple[jex.ClosedJaxpr, list[np.ndarray]]:

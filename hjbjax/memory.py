@@ -9,7 +9,7 @@ import numpy as np
 
 from hjbjax.grid import Grid
 from hjbjax.iteration import Method, Nested, PolicyIteration
-from hjbjax.problem import Problem
+from hjbjax.problem import Problem, may_be_positive
 from hjbjax.relaxation import Krylov, Sweeps
 
 INDEXABLE = 2**31  # nodes that 32-bit indices can number
@@ -27,7 +27,10 @@ def estimate(problem: Problem, grid: Grid, method: Method, dtype: Any) -> int:
     word, n = np.dtype(dtype).itemsize, grid.ndim
     actions = sum(choices.dim for choices in (problem.controls, problem.disturbances) if choices is not None)
     conditions = (problem.exit_cost, problem.stopping_cost, problem.running_max, problem.disturbances)
-    kept = word * (2 + actions + sum(each is not None for each in conditions) + (not _discounted(problem))) + 2
+    kept = (
+        word * (2 + actions + sum(each is not None for each in conditions) + (not may_be_positive(problem.discount)))
+        + 2
+    )
     look, correction = word * (5 + actions), 0
     if isinstance(method, PolicyIteration):
         jumps = 2 * n * n if np.ndim(problem.noise) == 2 or callable(problem.noise) else 2 * n
@@ -39,10 +42,6 @@ def estimate(problem: Problem, grid: Grid, method: Method, dtype: Any) -> int:
     else:
         look += word  # the pace
     return (kept + max(look, correction)) * grid.size
-
-
-def _discounted(problem: Problem) -> bool:
-    return isinstance(problem.discount, jax.core.Tracer) or bool(np.all(np.asarray(problem.discount) > 0))
 
 
 def available() -> int | None:

@@ -204,6 +204,5 @@ def _branches(linear: Any, piece: Kinked | None) -> list[tuple[str, Any]]:
     """What one input may do: follow the gradient of a piece, or sit at a kink."""
     if piece is None:
         return [("slope", linear)]
-    moving = piece.slope != 0
-    kinks = [jnp.where(moving, (k - piece.offset) / jnp.where(moving, piece.slope, 1), 0) for k in piece.kinks]
+    kinks = [(k - piece.offset) * inverse(piece.slope) for k in piece.kinks]
     return [("slope", linear + piece.slope * d) for d in piece.derivatives] + [("kink", u) for u in kinks]

@@ -13,8 +13,8 @@ from hjbjax import bellman, checks, iteration, players, proper
 from hjbjax.certificates import Certificate
 from hjbjax.grid import Grid
 from hjbjax.iteration import Method, Nested, PolicyIteration, Task, ValueIteration
-from hjbjax.problem import Problem
-from hjbjax.pytree import cast, is_traced
+from hjbjax.problem import Problem, may_be_positive
+from hjbjax.pytree import cast
 from hjbjax.relaxation import Direct, Krylov, Sweeps
 from hjbjax.schemes import Upwind
 
@@ -72,11 +72,6 @@ def _rules(
         return rules, None
     rests, least = iteration.rest_nodes(problem, grid, scheme=scheme, dtype=dtype)
     return dataclasses.replace(rules, held=rules.held | rests), least
-
-
-def may_be_positive(discount: Any) -> bool:
-    """Whether the discount is positive; a traced one is taken for positive."""
-    return is_traced(discount) or bool(discount > 0)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -141,6 +141,11 @@ class Problem:
         return jnp.diag(sigma) if sigma.ndim == 1 else sigma
 
 
+def may_be_positive(discount: Any) -> bool:
+    """Whether the discount is positive; a traced one is taken for positive."""
+    return is_traced(discount) or bool(np.asarray(discount) > 0)
+
+
 def _is_nonzero(discount: Any) -> bool:
     return is_traced(discount) or bool(discount != 0)
 

@@ -26,8 +26,7 @@ def links(problem: Problem, grid: Grid, *, subcell: bool, dtype: Any, t: Any = 0
     x = grid.components(dtype)
 
     def at(ingredient: Any, x: list) -> Any:
-        values = fields.scalar(ingredient, *problem.state_arguments(x, t), dtype=dtype)
-        return jnp.broadcast_to(values, grid.shape)
+        return jnp.broadcast_to(fields.of_state(problem, ingredient, x, t, dtype), grid.shape)
 
     level = at(problem.target, x)
 
@@ -37,7 +36,7 @@ def links(problem: Problem, grid: Grid, *, subcell: bool, dtype: Any, t: Any = 0
         meets = (level > 0) & (beyond <= 0)
         theta = jnp.where(meets, jnp.maximum(level / jnp.where(meets, level - beyond, 1), SHORTEST), 1)
         boundary = [entry + step * theta * length if i == axis else entry for i, entry in enumerate(x)]
-        return theta * length, (meets, at(0.0 if problem.exit_cost is None else problem.exit_cost, boundary))
+        return theta * length, (meets, at(problem.exit_cost, boundary))
 
     result = []
     for axis, link in enumerate(plain):

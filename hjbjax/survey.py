@@ -81,14 +81,14 @@ def _sound(problem: Problem, grid: Grid, actions: tuple[Any, Any], dtype: Any) -
     x = grid.components(dtype)
     amiss, inside = jnp.zeros((), bool), jnp.ones((), bool)
     if problem.target is not None:
-        distance = jnp.broadcast_to(_of_state(problem, problem.target, x, dtype), grid.shape)
+        distance = jnp.broadcast_to(fields.of_state(problem, problem.target, x, 0.0, dtype), grid.shape)
         inside = distance <= 0
         amiss |= ~jnp.all(jnp.isfinite(distance)) | ~jnp.any(inside) | jnp.all(inside)
     for name in STATE_COSTS:
         ingredient = getattr(problem, name)
         if ingredient is not None:
             relevant = inside if name == "exit_cost" else True
-            amiss |= jnp.any(relevant & ~jnp.isfinite(_of_state(problem, ingredient, x, dtype)))
+            amiss |= jnp.any(relevant & ~jnp.isfinite(fields.of_state(problem, ingredient, x, 0.0, dtype)))
 
     def look(amiss, action):
         here, (u, d) = jax.lax.optimization_barrier((x, action))  # or XLA keeps an array of all nodes per invariant
@@ -106,7 +106,7 @@ def _survey(problem: Problem, grid: Grid, actions: tuple[Any, Any], dtype: Any) 
     found: dict[str, Any] = {}
     inside: Any = True
     if problem.target is not None:
-        distance = jnp.broadcast_to(_of_state(problem, problem.target, x, dtype), grid.shape)
+        distance = jnp.broadcast_to(fields.of_state(problem, problem.target, x, 0.0, dtype), grid.shape)
         inside = distance <= 0
         found["target"] = _count(~jnp.isfinite(distance), grid)
         found["inside"] = jnp.sum(inside)
@@ -115,7 +115,7 @@ def _survey(problem: Problem, grid: Grid, actions: tuple[Any, Any], dtype: Any) 
         ingredient = getattr(problem, name)
         if ingredient is not None:
             relevant = inside if name == "exit_cost" else True
-            found[name] = _count(relevant & ~jnp.isfinite(_of_state(problem, ingredient, x, dtype)), grid)
+            found[name] = _count(relevant & ~jnp.isfinite(fields.of_state(problem, ingredient, x, 0.0, dtype)), grid)
 
     def body(carry, index_and_action):
         index, u, d = index_and_action
@@ -133,11 +133,6 @@ def _survey(problem: Problem, grid: Grid, actions: tuple[Any, Any], dtype: Any) 
     names = jax.eval_shape(lambda: _of_action(problem, grid, x, list(us[0]), list(ds[0]), dtype))
     carry, _ = jax.lax.scan(body, dict.fromkeys(names, nothing), (jnp.arange(len(us)), us, ds))
     return found | carry
-
-
-def _of_state(problem: Problem, ingredient: Any, x: list, dtype: Any) -> Any:
-    """A function of the state alone, or a number, on per-node scalars."""
-    return jnp.asarray(fields.scalar(ingredient, *problem.state_arguments(x, 0.0), dtype=dtype))
 
 
 def _of_action(problem: Problem, grid: Grid, x: list, u: list, d: list | None, dtype: Any) -> dict[str, Any]:

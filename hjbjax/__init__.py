@@ -12,6 +12,7 @@ from hjbjax.iteration import Nested, PolicyIteration, ValueIteration
 from hjbjax.lyapunov import lyapunov_check
 from hjbjax.marching import Explicit, Implicit
 from hjbjax.preparation import SolveWarning
+from hjbjax.probabilities import expected_exit_time, reach_probability, stay_probability
 from hjbjax.problem import Problem
 from hjbjax.reachability import avoid, reach, reach_avoid
 from hjbjax.relaxation import Direct, Krylov, Sweeps
@@ -52,6 +53,7 @@ __all__ = [
     "avoid",
     "chain",
     "convergence_study",
+    "expected_exit_time",
     "geometry",
     "load",
     "lyapunov_check",
@@ -59,9 +61,11 @@ __all__ = [
     "plotting",
     "reach",
     "reach_avoid",
+    "reach_probability",
     "simulate",
     "solve",
     "solve_batch",
     "stability",
+    "stay_probability",
     "zoo",
 ]

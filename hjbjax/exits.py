@@ -102,9 +102,9 @@ def ending(problem: Problem, target: Any, obstacle: Any, cost: float, exit_cost:
     )  # fmt: skip
 
 
-def outside(region: Callable) -> Any:
+def outside(region: Callable, *where: Any) -> Any:
     """The complement of a set given by a function ≤ 0 inside."""
-    return jax.tree_util.Partial(_negative, region)
+    return -region(*where)
 
 
 def timed(function: Any, needed: bool) -> Any:
@@ -123,10 +123,6 @@ def _inside(look_up: Callable, *where: Any) -> Any:
 
 def _constant(value: Any, *arguments: Any) -> Any:
     return jnp.asarray(value, jnp.result_type(float))
-
-
-def _negative(distance: Callable, *where: Any) -> Any:
-    return -distance(*where)
 
 
 def _nearest(sets: tuple, *where: Any) -> Any:

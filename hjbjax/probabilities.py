@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from hjbjax import checks, exits, proper, survey
@@ -24,7 +23,7 @@ from hjbjax.problem import Problem
 from hjbjax.pytree import as_partial, is_traced
 from hjbjax.schemes import Upwind
 from hjbjax.solution import Solution, SolveError
-from hjbjax.solver import as_dtype, solve
+from hjbjax.solver import as_dtype, check_arguments, solve
 
 TOL = 1e-6
 TOL_OF_STEPS = 1e-9  # value iteration stops by its last step, which is much smaller than what is left
@@ -67,8 +66,8 @@ def reach_probability(
 
     Example:
       >>> import hjbjax as hjb
-      >>> ruin = hjb.Problem(lambda x, u: 0.5 + 0 * x, noise=1.0)  # wins at 1, is ruined at 0
-      >>> chance = hjb.reach_probability(ruin, hjb.Grid([0.0], [1.0], (101,)), lambda x: 1 - x[0], obstacle=lambda x: x[0])
+      >>> gambler, grid = hjb.Problem(lambda x, u: 0.5 + 0 * x, noise=1.0), hjb.Grid([0.0], [1.0], (101,))
+      >>> chance = hjb.reach_probability(gambler, grid, lambda x: 1 - x[0], obstacle=lambda x: x[0])
       >>> round(float(chance.value_at([0.5])), 4)  # (1 − e^{−2·½·½})/(1 − e^{−2·½})
       0.6225
     """
@@ -78,9 +77,8 @@ def reach_probability(
     question = exits.ending(problem, inside, hit, 0.0, sign)
     with _quiet(feedback):
         if horizon is None:
-            options = _without_end(question, grid, 1.0 if least else 0.0, options)
-            question = options.pop("question")
-        return _answer(question, grid, horizon, options, 0.0, sign)
+            question, options = _without_end(question, grid, 1.0 if least else 0.0, options)
+        return _answer(question, grid, horizon, options, sign)
 
 
 def stay_probability(
@@ -114,20 +112,16 @@ def stay_probability(
       SolveError: no convergence, with the partial solution.
 
     Example:
+      >>> import jax.numpy as jnp
       >>> import hjbjax as hjb
       >>> walk, grid = hjb.Problem(lambda x, u: 0 * x, noise=1.0), hjb.Grid([-1.0], [1.0], (41,))
       >>> kept = hjb.stay_probability(walk, grid, lambda x: jnp.abs(x[0]) - 1, horizon=1.0)
       >>> round(float(kept.value_at(0.0, [0.0])), 2)  # (4/π) e^{−π²/8} − ...
       0.37
     """
-    leaving = exits.outside(as_partial(region, "stay_probability: region"))
-    try:
-        left = reach_probability(
-            problem, grid, leaving, horizon=horizon, least=not least, feedback=feedback, **options
-        )
-    except SolveError as error:
-        assert error.solution is not None
-        raise SolveError(str(error), _scaled(error.solution, 1.0, -1.0)) from error
+    leaving = jax.tree_util.Partial(exits.outside, as_partial(region, "stay_probability: region"))
+    with _scaled_errors(1.0, -1.0):
+        left = reach_probability(problem, grid, leaving, horizon=horizon, least=not least, feedback=feedback, **options)
     return _scaled(left, 1.0, -1.0)
 
 
@@ -164,6 +158,7 @@ def expected_exit_time(
       SolveError: no convergence, with the partial solution.
 
     Example:
+      >>> import jax.numpy as jnp
       >>> import hjbjax as hjb
       >>> walk, grid = hjb.Problem(lambda x, u: 0 * x, noise=2.0), hjb.Grid([-1.0], [1.0], (41,))
       >>> time = hjb.expected_exit_time(walk, grid, lambda x: 1 - jnp.abs(x[0]))
@@ -175,11 +170,11 @@ def expected_exit_time(
     sign = -1.0 if greatest else 1.0
     question = exits.ending(problem, inside, None, sign, 0.0)
     with _quiet(feedback):
-        if horizon is None and not is_traced(question, grid):
+        if horizon is None:
             options = {"tol": TOL} | options
             if greatest:
                 _refuse_staying(question, grid, options)
-        return _answer(question, grid, horizon, options, 0.0, sign)
+        return _answer(question, grid, horizon, options, sign)
 
 
 def _asked(problem: Any, target: Any, obstacle: Any, feedback: Any, name: str) -> tuple[Problem, Any, Any]:
@@ -206,29 +201,28 @@ def _quiet(feedback: Any) -> Iterator[None]:
         yield
 
 
-def _without_end(question: Problem, grid: Grid, most: float, options: dict) -> dict:
-    """The options for all times with the question itself: where one may stay away for ever, the least solution.
+def _without_end(question: Problem, grid: Grid, most: float, options: dict) -> tuple[Problem, dict]:
+    """The question for all times, with what finds the least of its solutions where one may stay away for ever.
 
-    ``most`` is a bound on the value that holds by itself. Given as a stopping cost it says that there is something to
-    fall back on, so that no node is taken for one without a value.
+    ``most`` bounds the value from above by itself. Given as a stopping cost it says that there is something to fall
+    back on, so that no node is taken for one without a value.
     """
-    if is_traced(question, grid) or not _may_stay(question, grid, options):
-        return {"tol": TOL, "question": question} | options
+    if not _may_stay(question, grid, {"tol": TOL} | options):
+        return question, {"tol": TOL} | options
     question = dataclasses.replace(question, stopping_cost=most)
-    return {
-        "tol": TOL_OF_STEPS, "method": ValueIteration(), "guess": np.zeros(grid.shape), "question": question,
-    } | options  # fmt: skip
+    return question, {"tol": TOL_OF_STEPS, "method": ValueIteration(), "guess": np.zeros(grid.shape)} | options
 
 
-def _may_stay(question: Problem, grid: Grid, options: dict) -> np.ndarray:
-    """Whether some actions keep the state away from every end for ever, as the number of such nodes."""
-    scheme, kind = options.get("scheme", Upwind()).chain, as_dtype(options.get("dtype"))
-    if question.time_dependent:
-        raise ValueError("a question that depends on the time has no answer for all times; give horizon=")
+def _may_stay(question: Problem, grid: Grid, options: dict) -> int:
+    """The number of nodes at which some actions keep the state away from every end for ever; 0 while traced."""
+    scheme, kind = options.get("scheme", Upwind()), as_dtype(options.get("dtype"))
+    check_arguments(question, grid, options.get("method"), scheme, options["tol"], None, None)
+    if is_traced(question, grid):
+        return 0
     with jax.enable_x64(kind == np.float64):
         checks.shapes(question, grid, scheme)
         survey.values(question, grid, kind)
-        return np.sum(np.asarray(proper.refuge(question, grid, scheme=scheme, dtype=kind)))
+        return int(np.sum(np.asarray(proper.refuge(question, grid, scheme=scheme.chain, dtype=kind))))
 
 
 def _refuse_staying(question: Problem, grid: Grid, options: dict) -> None:
@@ -240,16 +234,22 @@ def _refuse_staying(question: Problem, grid: Grid, options: dict) -> None:
         )
 
 
-def _answer(
-    question: Problem, grid: Grid, horizon: float | None, options: dict, offset: float, sign: float
-) -> Solution:
-    """offset + sign · V of the question, also for a partial solution."""
-    try:
+def _answer(question: Problem, grid: Grid, horizon: float | None, options: dict, sign: float) -> Solution:
+    """sign · V of the question, also for a partial solution."""
+    with _scaled_errors(0.0, sign):
         found = solve(question, grid, **options) if horizon is None else march(question, grid, horizon, **options)
+    return _scaled(found, 0.0, sign)
+
+
+@contextlib.contextmanager
+def _scaled_errors(offset: float, sign: float) -> Iterator[None]:
+    """An error's partial solution is scaled as the whole one is."""
+    try:
+        yield
     except SolveError as error:
-        assert error.solution is not None
-        raise SolveError(str(error), _scaled(error.solution, offset, sign)) from error
-    return _scaled(found, offset, sign)
+        if error.solution is not None:
+            error.solution = _scaled(error.solution, offset, sign)
+        raise
 
 
 def _scaled(solution: Solution, offset: float, sign: float) -> Solution:

@@ -16,6 +16,7 @@ from hjbjax.probabilities import expected_exit_time, reach_probability, stay_pro
 from hjbjax.problem import Problem
 from hjbjax.reachability import avoid, reach, reach_avoid
 from hjbjax.relaxation import Direct, Krylov, Sweeps
+from hjbjax.safety import least_restrictive
 from hjbjax.schemes import Eno2, Limited, Upwind, Weno5
 from hjbjax.sets import Ball, Box, Finite
 from hjbjax.simulation import simulate
@@ -55,6 +56,7 @@ __all__ = [
     "convergence_study",
     "expected_exit_time",
     "geometry",
+    "least_restrictive",
     "load",
     "lyapunov_check",
     "march",

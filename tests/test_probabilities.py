@@ -1,5 +1,6 @@
 """Probabilities and exit times against scale functions, reflection, linear algebra and simulated paths."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -67,7 +68,7 @@ class Edge:
 # --- for all times ---
 
 
-@pytest.mark.parametrize(("central", "order"), [(True, 2), (False, 1)])
+@pytest.mark.parametrize(("central", "order"), [(True, 2), pytest.param(False, 1, marks=pytest.mark.slow)])
 def test_the_ruin_of_a_gambler(central, order):
     problem, errors = hjb.Problem(carried, noise=SIGMA), []
     for count in (33, 65, 129):
@@ -79,7 +80,7 @@ def test_the_ruin_of_a_gambler(central, order):
 
 
 @pytest.mark.parametrize("least", [False, True])
-@pytest.mark.parametrize("opponent", [False, True])
+@pytest.mark.parametrize("opponent", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_the_best_and_the_worst_gambler(least, opponent):
     """The drift is at its bound; a disturbance of half the strength is against the control, whatever that wants."""
     push = (lambda x, u, d: u + 0.5 * d) if opponent else pushed
@@ -119,7 +120,7 @@ def test_the_exit_time_of_a_random_walk():
     assert found.error <= 1e-6
 
 
-@pytest.mark.parametrize("greatest", [False, True])
+@pytest.mark.parametrize("greatest", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_the_exit_time_of_who_wants_out_and_of_who_wants_to_stay(greatest):
     """½σ²T'' ± T' = −1 on [0, 1] with T'(0) = 0, T(1) = 0."""
     c, errors = (-DEADLY if greatest else DEADLY), []
@@ -137,6 +138,7 @@ def out_of_square(x):
     return 1 - jnp.maximum(jnp.abs(x[0]), jnp.abs(x[1]))
 
 
+@pytest.mark.slow
 def test_the_exit_time_from_a_square():
     errors = []
     for count in (9, 17, 33):
@@ -322,6 +324,35 @@ def test_without_noise_the_answer_is_yes_or_no(least):
 def test_a_greatest_time_without_end_is_refused():
     with pytest.raises(ValueError, match=r"greatest time is infinite: at 39 of 41 nodes some action keeps"):
         hjb.expected_exit_time(hjb.Problem(pushed, controls=UNIT), interval(41, lo=-1.0), out_of_unit, greatest=True)
+
+
+# --- transformations ---
+
+
+def drifting(mu, x, u):
+    return mu + 0 * x
+
+
+def chance(mu, horizon=None, **options):
+    problem = hjb.Problem(jax.tree_util.Partial(drifting, mu), noise=SIGMA)
+    found = hjb.reach_probability(problem, interval(33), above_one, obstacle=below_zero, horizon=horizon, **options)
+    return found.value_at(*([] if horizon is None else [0.0]), jnp.array([0.5]))
+
+
+@pytest.mark.slow
+def test_a_probability_can_be_compiled_and_differentiated():
+    """d/dμ of (1 − e^{−kμ/2})/(1 − e^{−kμ}) = 1/(1 + e^{−kμ/2})."""
+    with jax.enable_x64(True):
+        exact = 1 / (1 + np.exp(-DEADLY * 0.8 / 2))
+        ours = chance(0.8)
+        assert ours == pytest.approx(exact, abs=1e-3)
+        assert float(jax.jit(chance)(0.8)) == pytest.approx(ours, abs=1e-5)
+        slope = float(jax.grad(chance)(0.8))
+        assert slope == pytest.approx(DEADLY / 2 * exact * (1 - exact), abs=2e-3)
+        soon = {"horizon": 0.2, "step": 5e-4}
+        assert float(jax.jit(lambda mu: chance(mu, **soon))(0.8)) == pytest.approx(chance(0.8, **soon), abs=1e-9)
+        slope = float(jax.grad(lambda mu: chance(mu, **soon))(0.8))
+        assert slope == pytest.approx((chance(0.81, **soon) - chance(0.79, **soon)) / 0.02, rel=1e-3)
 
 
 # --- refusals ---

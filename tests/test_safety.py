@@ -101,6 +101,7 @@ def test_a_wider_margin_stops_farther_away(tube):
     assert reached[2] == pytest.approx(-1.0, abs=0.1)
 
 
+@pytest.mark.slow
 def test_the_nominal_control_may_be_a_solution(tube):
     """The fastest way through the wall."""
     race = hjb.Problem(braking, lambda x, u: 1.0, UNIT, target=lambda x: jnp.hypot(x[0] - 0.5, x[1]) - 0.2)

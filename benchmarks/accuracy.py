@@ -77,15 +77,14 @@ def ours(case: Case, nodes: Sequence[int], scheme: Any, tol: float) -> list[dict
     return [{**row, "order": study.order, "mean_order": study.mean_order, "tol": tol} for row in study.rows]
 
 
-def theirs(case: Case, nodes: Sequence[int], tol: float) -> list[dict[str, Any]]:
+def marched(problem: Any, grids: Sequence[Any], exact: Any, *, tol: float, region: Any = None) -> list[dict[str, Any]]:
     """One row a grid from hj_reachability, or one row with the reason why there is none."""
-    problem, grids, exact = case.questions(nodes)
     if reason := marching.obstacle(problem, grids[0]):
         return [{"status": "SKIPPED", "reason": reason}]
     rows = []
     for grid in grids:
         run = marching.march(problem, grid, exact, tol=tol, horizon=HORIZON, time_limit=TIME_LIMIT)
-        mask = mask_of(case.region, grid)
+        mask = mask_of(region, grid)
         off = distance(run.pop("value"), at_nodes_of(exact, grid, mask))[mask]
         error, mean = float(np.max(off)), float(np.mean(off))
         about = {"shape": list(grid.shape), "nodes": grid.size, "h": mean_spacing(grid), "tol": tol}
@@ -109,7 +108,8 @@ def measure(cases: Sequence[Case], *, quick: bool, tol: float) -> list[dict[str,
             label = {"code": "hjbjax", "scheme": type(scheme).__name__, "options": str(scheme)}
             found += attempt(lambda scheme=scheme: ours(case, nodes, scheme, tol), about | label)  # noqa: B023
         label = {"code": "hj_reachability", "scheme": "hj_reachability very_high"}
-        found += attempt(lambda: theirs(case, nodes, tol), about | label)  # noqa: B023
+        problem, grids, exact = case.questions(nodes)
+        found += attempt(lambda: marched(problem, grids, exact, tol=tol, region=case.region), about | label)  # noqa: B023
         click.echo(table([row for row in found if "shape" in row], COLUMNS))
         for row in found:
             if "reason" in row:

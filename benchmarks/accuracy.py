@@ -14,7 +14,7 @@ import numpy as np
 
 import hjbjax as hjb
 from benchmarks import marching
-from benchmarks.report import RESULTS, attempt, picture, stamped, table, write_json
+from benchmarks.report import RESULTS, attempt, publish, table
 from hjbjax.convergence import fitted_order
 from hjbjax.reference import at_nodes_of, distance, mask_of, mean_spacing
 from hjbjax.zoo import catalogue
@@ -136,7 +136,5 @@ def command(quick: bool, names: tuple[str, ...], tol: float, out: Path) -> None:
     if unknown := [name for name in names if name not in known]:
         raise click.UsageError(f"got --problem {', '.join(unknown)}, wanted some of {', '.join(known)}")
     cases = [case for case in CASES if not names or case.entry in names]
-    rows = stamped(measure(cases, quick=quick, tol=tol))
-    write_json(out / "accuracy.json", rows)
-    picture(out / "accuracy.png", rows, panel="problem", line="scheme", x=("h", "seconds"), y="error")
-    click.echo(f"{len(rows)} rows in {out / 'accuracy.json'}, the picture in {out / 'accuracy.png'}")
+    rows = measure(cases, quick=quick, tol=tol)
+    publish(out, "accuracy", rows, panel="problem", line="scheme", x=("h", "seconds"), y="error")

@@ -21,7 +21,7 @@ import numpy as np
 
 import hjbjax as hjb
 from benchmarks import accuracy, questions
-from benchmarks.report import RESULTS, attempt, picture, stamped, table, write_json
+from benchmarks.report import RESULTS, attempt, publish, table
 from benchmarks.timing import timed
 
 COLUMNS = ("problem", "scheme", "shape", "error", "seconds", "compile_seconds", "status")
@@ -138,10 +138,7 @@ def command(quick: bool, out: Path) -> None:
     about = {"benchmark": "precision", "dtype": "float64"}
     rows = attempt(lambda: pendulum(PENDULUM[:2] if quick else PENDULUM), about)
     rows += attempt(lambda: double_integrator(DOUBLE_INTEGRATOR[:2] if quick else DOUBLE_INTEGRATOR), about)
-    rows = stamped(rows)
     click.echo(table(rows, COLUMNS))
     for sentence in verdicts(rows):
         click.echo(sentence)
-    write_json(out / "precision.json", rows)
-    picture(out / "precision.png", rows, panel="problem", line="scheme", x=("seconds",), y="error", across=2)
-    click.echo(f"{len(rows)} rows in {out / 'precision.json'}, the picture in {out / 'precision.png'}")
+    publish(out, "precision", rows, panel="problem", line="scheme", x=("seconds",), y="error", across=2)

@@ -62,10 +62,9 @@ def test_ratios_are_taken_round_by_round():
 
 
 @pytest.mark.parametrize(("measured", "met"), [(1.5, True), (1.49, False), (math.nan, False)])
-def test_a_floor_is_met_or_missed(measured, met):
-    line = floors.verdicts({"sweep 1024": measured})[0]
-    assert line.endswith("met" if met else "MISSED")
-    (row,) = floors.as_rows({"sweep 1024": measured}, "sweep")
+def test_a_floor_is_met_or_missed(measured, met, capsys):
+    (row,) = floors.announced({"sweep 1024": measured}, "sweep")
+    assert capsys.readouterr().out.endswith("met\n" if met else "MISSED\n")
     assert row["status"] == ("MET" if met else "MISSED")
 
 

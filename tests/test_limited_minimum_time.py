@@ -11,6 +11,7 @@ import hjbjax as hjb
 from benchmarks import questions
 from hjbjax import zoo
 
+pytestmark = pytest.mark.slow  # 161 x 161 nodes, and every problem twice
 PLAIN = hjb.Upwind(central=False)
 
 
@@ -24,7 +25,6 @@ def solved(n, scheme):
     return solution, np.abs(solution.value - np.asarray(known).reshape(n, n))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("n", [41, 81, 161])
 def test_mean_error_against_the_plain_chain(n):
     """The value has a square root at the switching curve, so that halving the error is what can be had.
@@ -38,7 +38,6 @@ def test_mean_error_against_the_plain_chain(n):
         assert limited == pytest.approx(4.15e-3, rel=0.02)
 
 
-@pytest.mark.slow
 def test_largest_error_is_smaller_too():
     assert np.max(solved(161, hjb.Limited())[1]) <= 0.7 * np.max(solved(161, PLAIN)[1])
 
@@ -95,7 +94,6 @@ def errors(question, exact, where=1.0):
     return [np.max(np.abs(value - known)[inner & np.isfinite(known)]) for value in values]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", KINKED)
 def test_shortest_paths_are_never_worse(name):
     plain, limited = errors(zoo.eikonal(shape=(41, 41), **KINKED[name]), zoo.eikonal_exact(**KINKED[name]))
@@ -103,7 +101,6 @@ def test_shortest_paths_are_never_worse(name):
     assert limited <= 0.6 * plain  # and indeed better
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("discount", [0.0, 1.0])
 @pytest.mark.parametrize("radius", [0.0, 0.2])
 def test_minimum_time_in_a_larger_box_is_never_worse(discount, radius):
@@ -114,7 +111,6 @@ def test_minimum_time_in_a_larger_box_is_never_worse(discount, radius):
     assert limited <= 1.05 * plain + 1e-8
 
 
-@pytest.mark.slow
 def test_boat_in_a_current_is_never_worse():
     plain, limited = errors(zoo.zermelo(shape=(41, 41)), zoo.zermelo_exact(), where=1)
     assert limited <= 0.3 * plain

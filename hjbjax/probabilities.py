@@ -253,7 +253,7 @@ def _scaled_errors(offset: float, sign: float) -> Iterator[None]:
 
 
 def _scaled(solution: Solution, offset: float, sign: float) -> Solution:
-    """The solution with offset + sign · V for V; the bounds change places with the sign."""
-    bounds = [None if each is None else offset + sign * each for each in (solution.lower, solution.upper)]
-    lower, upper = bounds if sign > 0 else bounds[::-1]
-    return dataclasses.replace(solution, value=offset + sign * solution.value, lower=lower, upper=upper)
+    """The solution with offset + sign · V for V; no certificate holds for a cost that is negative."""
+    if sign > 0:
+        return dataclasses.replace(solution, value=offset + solution.value)
+    return dataclasses.replace(solution, value=offset - solution.value, lower=None, upper=None)

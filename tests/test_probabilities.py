@@ -5,11 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.stats import norm
 from systems import SEEDS, random_grid, random_problem
 
 import hjbjax as hjb
-from hjbjax import chain
+from hjbjax import chain, exits
 from hjbjax.pytree import node
 
 UNIT = hjb.Box([-1.0], [1.0])
@@ -92,14 +93,37 @@ def test_the_best_and_the_worst_gambler(least, opponent):
     assert np.all(np.isnan(found.policy[[0, -1]]))
 
 
-def test_without_drift_the_chance_is_linear_also_between_the_nodes():
-    """The boundaries .13 and .88 lie between nodes; a linear answer has no other error than theirs."""
+def beyond(place, sign, x):
+    return sign * (place - x[0])
+
+
+BETWEEN = st.floats(0.05, 0.95)  # of a cell: a link shorter than .01 is made longer
+
+
+@given(st.integers(1, 3), BETWEEN, st.integers(6, 8), BETWEEN)
+@settings(max_examples=15)
+def test_without_drift_the_chance_is_linear_also_between_the_nodes(k, low, m, high):
+    """The boundaries lie between nodes .1 apart; a linear answer has no other error than theirs."""
+    lo, hi = 0.1 * (k + low), 0.1 * (m + high)
+    target, obstacle = jax.tree_util.Partial(beyond, hi, 1.0), jax.tree_util.Partial(beyond, lo, -1.0)
     found = hjb.reach_probability(
-        hjb.Problem(still, noise=SIGMA), interval(11), lambda x: 0.88 - x[0], obstacle=lambda x: x[0] - 0.13,
-        scheme=hjb.Upwind(subcell=True),
-    )  # fmt: skip
-    exact = np.clip((np.asarray(found.grid.axis(0)) - 0.13) / 0.75, 0, 1)
+        hjb.Problem(still, noise=SIGMA), interval(11), target, obstacle=obstacle, scheme=hjb.Upwind(subcell=True)
+    )
+    exact = np.clip((np.asarray(found.grid.axis(0)) - lo) / (hi - lo), 0, 1)
     np.testing.assert_allclose(found.value, exact, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("x", "paid"),
+    [(0.4, 0.0), (0.4 + 1e-16, 0.0), (0.3, 0.0), (0.6, 1.0), (0.6 - 1e-16, 1.0), (0.7, 1.0), (0.95, 0.0)],
+)
+def test_who_ends_on_a_boundary_ends_in_the_set_that_it_met(x, paid):
+    """The target is x ≥ .6, the obstacle x ≤ .4 and x ≥ .9; on a boundary rounding decides of the sign."""
+    question = exits.ending(
+        hjb.Problem(still), lambda x: 0.6 - x[0], lambda x: jnp.minimum(x[0] - 0.4, 0.9 - x[0]), 0.0, 1.0
+    )
+    with jax.enable_x64(True):
+        assert question.exit_cost(jnp.array([x])) == paid
 
 
 def test_an_obstacle_wins_where_it_covers_the_target():
@@ -258,11 +282,15 @@ def test_a_feedback_makes_an_ornstein_uhlenbeck_process():
 
 
 def test_the_policy_attains_what_the_value_says():
-    """For all times and up to a horizon, where it changes with the time."""
     problem, grid = hjb.Problem(pushed, controls=UNIT, noise=SIGMA), interval(41)
     best = hjb.reach_probability(problem, grid, above_one, obstacle=below_zero)
     again = hjb.reach_probability(problem, grid, above_one, obstacle=below_zero, feedback=best)
     np.testing.assert_allclose(again.value, best.value, rtol=0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_policy_that_changes_with_the_time_attains_it_too():
+    problem, grid = hjb.Problem(pushed, controls=UNIT, noise=SIGMA), interval(41)
     times = np.linspace(0, 0.2, 41)
     kept = hjb.stay_probability(problem, grid, near_the_middle, horizon=0.2, times=times)
     kept_again = hjb.stay_probability(problem, grid, near_the_middle, horizon=0.2, feedback=kept)

@@ -44,7 +44,8 @@ def reach_probability(
 
     V(x) = sup_u inf_d P(x(τ) in the target, τ ≤ horizon), τ the first time in the target or in the obstacle, from
     min max (V_t + f·DV + ½ tr σσᵀD²V) = 0 with V = 1 on the target and 0 on the obstacle. Order and cost are those
-    of ``march``, and of ``solve`` without a horizon. There is no certificate.
+    of ``march``, and of ``solve`` without a horizon. There is no certificate. Where for all times the state may stay
+    away from both, value iteration from zero finds the probability among several solutions, which is slower.
 
     Args:
       problem: the system; its costs and its discount play no part.
@@ -195,9 +196,11 @@ def _asked(problem: Any, target: Any, obstacle: Any, feedback: Any, name: str) -
 @contextlib.contextmanager
 def _quiet(feedback: Any) -> Iterator[None]:
     """A feedback that is a Solution is looked up node by node; that is no fault of the user's functions."""
+    if not hasattr(feedback, "control_at"):
+        yield
+        return
     with warnings.catch_warnings():
-        if hasattr(feedback, "control_at"):
-            warnings.simplefilter("ignore", FallbackWarning)
+        warnings.simplefilter("ignore", FallbackWarning)
         yield
 
 

@@ -297,6 +297,17 @@ def test_a_policy_that_changes_with_the_time_attains_it_too():
     np.testing.assert_allclose(kept_again.value[0], kept.value[0], rtol=0, atol=1e-3)
 
 
+@pytest.mark.slow
+def test_a_disturbance_plays_against_a_feedback():
+    """u = 1 given, |d| ≤ ½ against it: a drift of ½; and where the control's least is asked, d helps instead."""
+    problem = hjb.Problem(lambda x, u, d: u + 0.5 * d, controls=UNIT, disturbances=UNIT, noise=SIGMA)
+    for least, mu in ((False, 0.5), (True, 1.5)):
+        found = hjb.reach_probability(
+            problem, interval(65), above_one, obstacle=below_zero, feedback=lambda x: jnp.ones(1), least=least
+        )
+        np.testing.assert_allclose(found.value, ruin(np.asarray(found.grid.axis(0)), mu), rtol=0, atol=4e-4)
+
+
 def test_where_a_solution_has_no_action_the_state_stays():
     """A policy that ends at .5 never brings anyone to 1."""
     grid = interval(41)

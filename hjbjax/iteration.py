@@ -21,7 +21,7 @@ from hjbjax.bellman import Conditions, Correction, Greedy
 from hjbjax.certificates import Certificate, Gap
 from hjbjax.grid import Grid
 from hjbjax.problem import Problem
-from hjbjax.pytree import node
+from hjbjax.pytree import altered, node
 from hjbjax.relaxation import Evaluation, Sweeps
 from hjbjax.schemes import Limited, Scheme
 from hjbjax.status import Status
@@ -133,7 +133,13 @@ def run(task: Task, state: State, until: Any) -> State:
     def goes_on(state):
         return (state.code == Status.RUNNING) & (state.step < until)
 
-    return jax.lax.while_loop(goes_on, lambda state: advance(task, state, start), state)
+    def step(state):
+        # loop variant, or XLA compiles a kernel for every scalar of every action that it can hoist
+        controls, grid, count = jax.lax.optimization_barrier((task.problem.controls, task.grid, state.step))
+        here = dataclasses.replace(task, problem=altered(task.problem, controls=controls), grid=grid)
+        return advance(here, dataclasses.replace(state, step=count), start)
+
+    return jax.lax.while_loop(goes_on, step, state)
 
 
 def advance(task: Task, state: State, start: Any) -> State:

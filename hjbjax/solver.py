@@ -20,7 +20,7 @@ from hjbjax.grid import Grid
 from hjbjax.iteration import Method, Nested, PolicyIteration, ValueIteration
 from hjbjax.preparation import choose, judge, prepare, prepare_on_host
 from hjbjax.problem import Problem
-from hjbjax.pytree import is_traced
+from hjbjax.pytree import altered, is_traced
 from hjbjax.report import assemble, describe, finish
 from hjbjax.schemes import Limited, Scheme, Upwind
 from hjbjax.solution import Solution, SolveError
@@ -129,9 +129,7 @@ def _solve_traced(
     start = jnp.zeros(grid.shape, kind) if guess is None else jnp.asarray(guess, kind)
     frozen, start = jax.lax.stop_gradient((task, start))
     state = iteration.run(frozen, iteration.begin(frozen, start), max_steps or TRACED_STEPS)
-    solution = assemble(task, state, verdict)
-    object.__setattr__(solution, "value", sensitivity.attach(task, state))
-    return solution
+    return altered(assemble(task, state, verdict), value=sensitivity.attach(task, state))
 
 
 def as_dtype(dtype: Any) -> np.dtype:

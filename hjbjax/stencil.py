@@ -15,6 +15,9 @@ import numpy as np
 from hjbjax.grid import Grid
 
 
+LONGER = 4  # axes up to which neighbours along the last one are slices of a longer array
+
+
 def on_edge(grid: Grid, axis: int, step: int) -> np.ndarray:
     """Which nodes have no neighbour in direction ``step`` along ``axis``; broadcasts against the node axes."""
     mask = np.zeros(grid.shape[axis], dtype=bool)
@@ -92,9 +95,9 @@ def _neighbours(values: jax.Array, grid: Grid, axis: int) -> tuple[jax.Array, ja
     """The values one step up and one step down along an axis.
 
     XLA fuses a concatenation into the loop over the nodes, except one along the last axis. There two slices of a
-    longer array are fused: one array is filled in place of two.
+    longer array are fused: one array is filled in place of two. In many dimensions, where memory rules, none is.
     """
-    if axis < grid.ndim - 1:
+    if axis < grid.ndim - 1 or grid.ndim > LONGER:
         return neighbour(values, grid, unit(grid, axis, 1)), neighbour(values, grid, unit(grid, axis, -1))
     count = grid.shape[axis]
     ends = [jax.lax.slice_in_dim(values, k, k + 1, axis=axis) for k in (0, count - 1)]

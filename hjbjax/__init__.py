@@ -4,6 +4,7 @@ from hjbjax import chain, geometry, plotting, stability, zoo
 from hjbjax._version import __version__
 from hjbjax.batch import solve_batch
 from hjbjax.convergence import convergence_study
+from hjbjax.dissipation import dissipation
 from hjbjax.fields import FallbackWarning
 from hjbjax.files import FileError
 from hjbjax.gain import attenuation, saturation
@@ -55,6 +56,7 @@ __all__ = [
     "avoid",
     "chain",
     "convergence_study",
+    "dissipation",
     "geometry",
     "hinf_level",
     "load",

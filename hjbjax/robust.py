@@ -40,6 +40,7 @@ from hjbjax.solution import Solution, SolveError
 from hjbjax.status import Status
 
 DOUBLINGS = 6  # of the time marched, at most
+CLOSE, FALL = 10.0, 1 / 3  # growth so near settle counts as settled if it falls by this factor; at the level it halves
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -188,31 +189,32 @@ def _try(
     inside = grid.inner(inner)
     if not np.all([np.sum(np.any(inside, axis=_others(grid, k))) >= 3 for k in range(grid.ndim)]):
         raise ValueError(f"hinf_level: inner = {inner:g} of {grid.shape} nodes holds fewer than 3 along an axis")
-    value, total, span, growth = np.zeros(grid.shape), 0.0, horizon / 2**DOUBLINGS, math.inf
+    value, total, span, gains = np.zeros(grid.shape), 0.0, horizon / 2**DOUBLINGS, [math.inf]
     while True:
         solution = march(problem, grid, span, start=value, inner=watch, throw=False, **options)
         after, total = np.asarray(solution.value[0]), total + span - float(solution.times[0])
-        size = float(np.max(np.abs(after[inside])))
-        growth = float(np.max((after - value)[inside])) / size if size > 0 else 0.0
+        size, gain = (float(np.max(np.abs(each[inside]))) for each in (after, after - value))
         bound = saturation(solution, problem, inner=inner)
-        reason = _reason(solution.status, bound, growth if total > span else math.inf, settle, total >= horizon)
-        if reason:
+        reason = _reason(solution.status, bound, gain / size if size else 0.0, gain / gains[-1], settle)
+        if reason or total >= horizon * (1 - 1e-9):
             break
-        value, span = after, total
+        value, span, gains = after, total, [*gains, gain]
     if solution.status in (Status.INTERRUPTED, Status.TIME_LIMIT):
         raise SolveError(f"hinf_level: at gamma = {gamma:g}: {solution.message}", solution)
     first = {name: getattr(solution, name)[0] for name in ("value", "policy", "disturbance")}
     kept = dataclasses.replace(solution, times=None, stats={**solution.stats, "horizon": total}, **first)
+    reason, growth = reason or "growing", gain / size if size else 0.0
     return Trial(gamma, reason == "settled", reason, total, growth, size, bound, kept)
 
 
-def _reason(status: Status, bound: Saturation, growth: float, settle: float, late: bool) -> str:
+def _reason(status: Status, bound: Saturation, growth: float, ratio: float, settle: float) -> str:
     """Why to stop here; empty to go on."""
     if status is Status.DIVERGED or bound.share > 0:
         return "saturated"
     if status is not Status.CONVERGED:
         return "not finite"
-    return "settled" if growth <= settle else "growing" if late else ""
+    falls = growth <= CLOSE * settle and ratio <= FALL
+    return "settled" if growth <= settle or falls else ""
 
 
 def _why(trial: Trial, settle: float) -> str:

@@ -13,6 +13,7 @@ from hjbjax.horizon import march
 from hjbjax.iteration import Nested, PolicyIteration, ValueIteration
 from hjbjax.lyapunov import lyapunov_check
 from hjbjax.marching import Explicit, Implicit
+from hjbjax.perturbations import perturbation_study
 from hjbjax.preparation import SolveWarning
 from hjbjax.problem import Problem
 from hjbjax.reachability import avoid, reach, reach_avoid
@@ -62,6 +63,7 @@ __all__ = [
     "load",
     "lyapunov_check",
     "march",
+    "perturbation_study",
     "plotting",
     "reach",
     "reach_avoid",

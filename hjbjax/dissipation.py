@@ -14,7 +14,6 @@ that they are neither all weak nor all so strong that the inequality says nothin
 """
 
 import dataclasses
-import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -58,7 +57,7 @@ class Dissipation:
 
     @property
     def margin(self) -> np.ndarray:
-        """stored + supplied − output, shape (p,): not negative where the inequality holds; NaN where a path broke off."""
+        """stored + supplied − output, shape (p,): ≥ 0 where the inequality holds; NaN where a path broke off."""
         return self.stored + self.supplied - self.output
 
     @property
@@ -92,7 +91,7 @@ def dissipation(
 
     Args:
       problem: the game, with cost ½|z|² − ½γ²|d|² or like it.
-      solution: its stationary solution, which brings V, the feedback and the worst case; as ``hinf_level(...).solution``.
+      solution: its stationary solution, such as ``hinf_level(...).solution``, which brings V, feedback and worst case.
       x0s: where paths start, shape (k, n), or (n,) for one; in the grid.
       duration: how long each runs, in units of time, unless it leaves the grid before.
       disturbances: more signals, functions (t, x) -> (l,).
@@ -147,8 +146,7 @@ def _lanes(problem: Problem, starts: np.ndarray, random: int, key: Any) -> tuple
     choices, count = problem.disturbances, random * len(starts)
     assert choices is not None
     strength = np.geomspace(WEAKEST, 1.0, random) if random > 1 else np.ones(random)
-    points = np.asarray(_uniform(choices, key, (count, POINTS))).reshape(random, -1, POINTS, choices.dim)
-    points = (strength[:, None, None, None] * points).reshape(count, POINTS, choices.dim)
+    points = np.repeat(strength, len(starts))[:, None, None] * np.asarray(_uniform(choices, key, (count, POINTS)))
     still = np.zeros((len(starts), POINTS, choices.dim))
     weight = np.repeat([1.0, 0.0], [len(starts), count])
     lanes = np.tile(starts, (1 + random, 1)), weight, np.concatenate([still, points])

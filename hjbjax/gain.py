@@ -52,6 +52,7 @@ def attenuation(problem: Problem, gamma: Any, disturbances: AdmissibleSet, *, en
     level = numbers(gamma, "attenuation: gamma")
     if np.ndim(level) or (isinstance(level, np.ndarray) and not 0 < level < math.inf):
         raise ValueError(f"attenuation: got gamma = {gamma!r}, wanted a finite number > 0")
+    level = float(level) if isinstance(level, np.ndarray) else level
     enters = as_partial(enters) if callable(enters) else None if enters is None else numbers(enters, "enters")
     return dataclasses.replace(
         problem,
@@ -66,12 +67,12 @@ def _pushed(drift: Callable, enters: Any, *arguments: Any) -> Any:
     *seen, d = arguments
     if enters is None:
         return drift(*seen) + d
-    return drift(*seen) + (enters(seen[-2]) if callable(enters) else jnp.asarray(enters, d.dtype)) @ d
+    return drift(*seen) + jnp.matmul(enters(seen[-2]) if callable(enters) else enters, d)
 
 
 def _charged(cost: Callable, gamma: Any, *arguments: Any) -> Any:
     *seen, d = arguments
-    return cost(*seen) - 0.5 * jnp.asarray(gamma, d.dtype) ** 2 * (d @ d)
+    return cost(*seen) - 0.5 * gamma**2 * (d @ d)
 
 
 def _blind(noise: Callable, *arguments: Any) -> Any:
@@ -133,7 +134,7 @@ def saturation(solution: Solution, problem: Problem, *, inner: float = 0.5) -> S
     size = np.where(inside, _relative(choices, d), -1.0)
     index = np.unravel_index(int(np.argmax(size)), size.shape)
     share = float(np.mean(size[inside] >= 1 - NEAR))
-    return Saturation(share, float(size[index]), solution.grid.state(index), float(inner))
+    return Saturation(share, float(size[index]), solution.grid.state([int(i) for i in index]), float(inner))
 
 
 def _relative(choices: Box | Ball, d: np.ndarray) -> np.ndarray:

@@ -111,7 +111,7 @@ class Grid:
         return np.stack(np.meshgrid(*(np.asarray(self.axis(i)) for i in range(self.ndim)), indexing="ij"), axis=-1)
 
     def inner(self, share: float) -> np.ndarray:
-        """The nodes in the middle ``share`` of the box along every axis that is not periodic, bool (*grid); host level."""
+        """The nodes in the middle ``share`` of every axis that is not periodic, bool (*grid); host level."""
         inside = np.ones(self.shape, bool)
         for axis in range(self.ndim):
             if not self.periodic[axis]:  # type: ignore[index]

@@ -10,15 +10,18 @@ How infeasible is told from feasible, where a bounded set of disturbances makes 
 value V_T of the problem over the time T grows with T, since d = 0 is allowed and costs nothing, and its limit is V, so
 that γ is feasible if and only if V_T stays bounded. In an inner box, away from the edge, one of three things is seen:
 
-* V_T settles: from T to 2T it grows by less than a small fraction, and no d sits on its bound. Feasible.
+* V_T settles, and no d sits on its bound: from T to 2T it grows by less than a small fraction, or by not ten times as
+  much and by less than a third of what it grew by before. Feasible.
 * The worst disturbance comes to its bound: what would be unbounded is cut off there. Infeasible.
 * V_T still grows at the horizon, be it that the worst disturbance takes the state to the edge of the grid and gains
   there at a constant rate, or that the growth is slow near the level. Not shown to be feasible.
 
-Doubling T has no scale: what grows at a constant rate grows by one half of itself, at any rate and in any unit. Both
-errors of the rule are on one side, a level too high, and both fall: with a wider set and grid, and a longer horizon.
-Just below the level V_T passes its bottleneck slowly; settle = 10⁻³ is ten times below the growth there at a γ that is
-a percent too low. ``Weno5()`` is exact on quadratics and feels the edge of the grid least.
+Doubling T has no scale: a constant rate makes growth one half, in any unit. At the level itself a P that stays finite
+is approached like 1/T, so that what is gained halves with each doubling; above the level it falls faster each time,
+below it, behind a bottleneck, slower, and rises. A third tells them apart sooner than waiting until all has settled:
+for a time constant τ of the closed loop a level that is off by the fraction e shows at T of about τ/√e. A narrow set, a
+small grid and a short horizon make the level too high; so do coarse grids where P grows without bound
+at the level. ``Weno5()`` is exact on quadratics, and of all schemes feels the edge of the grid least.
 Source: A. van der Schaft, L₂-gain and passivity techniques in nonlinear control; T. Başar and P. Bernhard,
 H∞-optimal control and related minimax design problems.
 """

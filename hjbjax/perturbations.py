@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from hjbjax.canvas import COLOURS, GREY, axes_of, label_axes, legend, logarithmic
+from hjbjax.canvas import COLOURS, GREY, axes_of, label_axes, logarithmic
 from hjbjax.convergence import fitted_order
 from hjbjax.gain import attenuation, saturation
 from hjbjax.grid import Grid
@@ -40,7 +40,8 @@ class Series:
       errors: the largest |V' − V| over the nodes of the region.
       feedback_errors: the largest |u' − u| there.
       solutions: the perturbed solutions.
-      fitted: which entries count for the orders: converged, and with an error of V that rises above the tolerance.
+      fitted: which entries count for the order of V: converged, and with a change that rises above the tolerance.
+      feedback_fitted: which count for that of u: of these, where |u' − u| rises above the tolerance over the spacing.
     """
 
     name: str
@@ -49,6 +50,7 @@ class Series:
     feedback_errors: np.ndarray
     solutions: tuple[Solution, ...]
     fitted: np.ndarray
+    feedback_fitted: np.ndarray
 
     @property
     def order(self) -> float:
@@ -57,8 +59,8 @@ class Series:
 
     @property
     def feedback_order(self) -> float:
-        """The fitted slope of the feedback, from the same entries."""
-        return fitted_order(self.parameters[self.fitted], self.feedback_errors[self.fitted])
+        """The fitted slope of the feedback, likewise."""
+        return fitted_order(self.parameters[self.feedback_fitted], self.feedback_errors[self.feedback_fitted])
 
     def __str__(self) -> str:
         lines = [f"{self.name:>9} {'value':>10} {'feedback':>10}  status"]
@@ -181,7 +183,9 @@ def _series(
     feedback = np.array([np.max(each, initial=0.0) for each in inputs])
     converged = np.array([each.status is Status.CONVERGED for each in solutions])
     fitted = converged & np.isfinite(errors) & (errors > tol)
-    return Series(name, parameters, errors, feedback, tuple(solutions), fitted)
+    finest = min(float(nominal.grid.spacing(axis)) for axis in range(nominal.grid.ndim))
+    seen = fitted & (feedback > tol / finest)  # a slope of V is known no better than that
+    return Series(name, parameters, errors, feedback, tuple(solutions), fitted, seen)
 
 
 def perturbation(study: Perturbation, *, ax: Any = None) -> list[Any]:
@@ -202,7 +206,7 @@ def perturbation(study: Perturbation, *, ax: Any = None) -> list[Any]:
       ValueError: no change is positive and finite.
     """
     artists = []
-    ax = axes_of(ax, wide=True)
+    ax = axes_of(ax)
     for series, color in ((study.noise, COLOURS[0]), (study.gain, COLOURS[1])):
         if not np.any((series.errors > 0) & np.isfinite(series.errors)):
             raise ValueError(f"perturbation: the changes over {series.name} are {series.errors}; none has a logarithm")
@@ -220,5 +224,6 @@ def perturbation(study: Perturbation, *, ax: Any = None) -> list[Any]:
             artists += ax.plot(x, middle * x**series.order, color=GREY, linewidth=3, zorder=0)
     logarithmic(ax)
     label_axes(ax, "ε, 1/γ", "largest change")
-    artists.append(legend(ax))
+    # lines that rise leave this corner free
+    artists.append(ax.legend(loc="upper left", fontsize=8, frameon=False, borderaxespad=0.2, handlelength=1.4))
     return artists

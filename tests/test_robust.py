@@ -118,10 +118,10 @@ def test_the_level_of_a_lag():
 
 
 def test_the_level_of_an_integrator():
-    """ẋ = u + d: γ = 1, where P grows without bound and the worst disturbance comes to its bound."""
+    """ẋ = u + d: γ = 1, where P grows without bound."""
     level = hjb.hinf_level(INTEGRATOR.game(), cube(1, 41), 0.95, 1.1)
     assert level.gamma == pytest.approx(1.0, rel=0.02)
-    assert {trial.reason for trial in level.trials} >= {"settled"}
+    assert all(trial.growth > 0.1 for trial in level.trials if not trial.feasible)
 
 
 def test_a_bound_that_is_felt_is_infeasible():

@@ -14,7 +14,7 @@ import numpy as np
 
 import hjbjax as hjb
 from benchmarks import marching
-from benchmarks.report import RESULTS, attempt, picture, stamped, table, write_json
+from benchmarks.report import RESULTS, attempt, publish, table
 from hjbjax.convergence import fitted_order
 from hjbjax.reference import at_nodes_of, distance, mask_of, mean_spacing
 from hjbjax.zoo import catalogue
@@ -77,15 +77,14 @@ def ours(case: Case, nodes: Sequence[int], scheme: Any, tol: float) -> list[dict
     return [{**row, "order": study.order, "mean_order": study.mean_order, "tol": tol} for row in study.rows]
 
 
-def theirs(case: Case, nodes: Sequence[int], tol: float) -> list[dict[str, Any]]:
+def marched(problem: Any, grids: Sequence[Any], exact: Any, *, tol: float, region: Any = None) -> list[dict[str, Any]]:
     """One row a grid from hj_reachability, or one row with the reason why there is none."""
-    problem, grids, exact = case.questions(nodes)
     if reason := marching.obstacle(problem, grids[0]):
         return [{"status": "SKIPPED", "reason": reason}]
     rows = []
     for grid in grids:
         run = marching.march(problem, grid, exact, tol=tol, horizon=HORIZON, time_limit=TIME_LIMIT)
-        mask = mask_of(case.region, grid)
+        mask = mask_of(region, grid)
         off = distance(run.pop("value"), at_nodes_of(exact, grid, mask))[mask]
         error, mean = float(np.max(off)), float(np.mean(off))
         about = {"shape": list(grid.shape), "nodes": grid.size, "h": mean_spacing(grid), "tol": tol}
@@ -109,7 +108,8 @@ def measure(cases: Sequence[Case], *, quick: bool, tol: float) -> list[dict[str,
             label = {"code": "hjbjax", "scheme": type(scheme).__name__, "options": str(scheme)}
             found += attempt(lambda scheme=scheme: ours(case, nodes, scheme, tol), about | label)  # noqa: B023
         label = {"code": "hj_reachability", "scheme": "hj_reachability very_high"}
-        found += attempt(lambda: theirs(case, nodes, tol), about | label)  # noqa: B023
+        problem, grids, exact = case.questions(nodes)
+        found += attempt(lambda: marched(problem, grids, exact, tol=tol, region=case.region), about | label)  # noqa: B023
         click.echo(table([row for row in found if "shape" in row], COLUMNS))
         for row in found:
             if "reason" in row:
@@ -136,7 +136,5 @@ def command(quick: bool, names: tuple[str, ...], tol: float, out: Path) -> None:
     if unknown := [name for name in names if name not in known]:
         raise click.UsageError(f"got --problem {', '.join(unknown)}, wanted some of {', '.join(known)}")
     cases = [case for case in CASES if not names or case.entry in names]
-    rows = stamped(measure(cases, quick=quick, tol=tol))
-    write_json(out / "accuracy.json", rows)
-    picture(out / "accuracy.png", rows, panel="problem", line="scheme", x=("h", "seconds"), y="error")
-    click.echo(f"{len(rows)} rows in {out / 'accuracy.json'}, the picture in {out / 'accuracy.png'}")
+    rows = measure(cases, quick=quick, tol=tol)
+    publish(out, "accuracy", rows, panel="problem", line="scheme", x=("h", "seconds"), y="error")

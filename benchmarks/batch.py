@@ -12,7 +12,7 @@ import numpy as np
 
 import hjbjax as hjb
 from benchmarks import floors, questions
-from benchmarks.report import RESULTS, attempt, stamped, table, write_json
+from benchmarks.report import RESULTS, attempt, publish, table
 from benchmarks.timing import interleaved
 
 COLUMNS = (
@@ -64,7 +64,5 @@ def command(quick: bool, lanes: int | None, nodes: int | None, repeats: int | No
     figures = {}
     if "throughput" in rows[0] and (rows[0]["shape"], lanes) == ([100, 101], 64):
         figures["batch"] = rows[0]["throughput"]
-    click.echo("\n".join(floors.verdicts(figures)))
-    rows = stamped([*rows, *floors.as_rows(figures, "batch")])
-    write_json(out / "batch.json", rows)
-    click.echo(f"{len(rows)} rows in {out / 'batch.json'}")
+    rows += floors.announced(figures, "batch")
+    publish(out, "batch", rows)

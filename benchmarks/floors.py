@@ -5,8 +5,10 @@ size it is meant for has no line.
 """
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
+
+import click
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,21 +56,21 @@ FLOORS = {
 }
 
 
-def verdicts(measured: Mapping[str, float]) -> list[str]:
-    """One line for every figure measured."""
-    return [FLOORS[name].line(value) for name, value in measured.items()]
-
-
-def as_rows(measured: Mapping[str, float], benchmark: str) -> Iterable[dict[str, Any]]:
-    """The verdicts as rows of a JSON file."""
+def announced(measured: Mapping[str, float], benchmark: str) -> list[dict[str, Any]]:
+    """Says one line for every figure measured; the same as rows of a JSON file."""
+    rows = []
     for name, value in measured.items():
         floor = FLOORS[name]
-        yield {
-            "benchmark": benchmark,
-            "figure": floor.figure,
-            "measured": value,
-            "floor": floor.bound,
-            "aim": floor.aim,
-            "dtype": None,
-            "status": "MET" if floor.met(value) else "MISSED",
-        }
+        click.echo(floor.line(value))
+        rows.append(
+            {
+                "benchmark": benchmark,
+                "figure": floor.figure,
+                "measured": value,
+                "floor": floor.bound,
+                "aim": floor.aim,
+                "dtype": None,
+                "status": "MET" if floor.met(value) else "MISSED",
+            }
+        )
+    return rows

@@ -18,7 +18,7 @@ import numpy as np
 
 import hjbjax as hjb
 from benchmarks import floors, footprint, questions
-from benchmarks.report import RESULTS, attempt, picture, stamped, table, write_json
+from benchmarks.report import RESULTS, attempt, publish, table
 from benchmarks.timing import interleaved
 from hjbjax.convergence import fitted_order
 
@@ -121,8 +121,5 @@ def command(
         click.echo(table(mine, COLUMNS) + "\n")
         rows += mine
     figures = judged([row for row in rows if "nodes" in row])
-    click.echo("\n".join(floors.verdicts(figures)))
-    rows = stamped([*rows, *floors.as_rows(figures, "growth")])
-    write_json(out / "growth.json", rows)
-    picture(out / "growth.png", rows, panel="problem", line="benchmark", x=("nodes",), y="seconds")
-    click.echo(f"{len(rows)} rows in {out / 'growth.json'}, the picture in {out / 'growth.png'}")
+    rows += floors.announced(figures, "growth")
+    publish(out, "growth", rows, panel="problem", line="benchmark", x=("nodes",), y="seconds")

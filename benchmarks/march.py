@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import hjbjax as hjb
-from benchmarks.report import RESULTS, attempt, stamped, table, write_json
+from benchmarks.report import RESULTS, attempt, publish, table
 from hjbjax import epochs, horizon, marching
 
 COLUMNS = ("problem", "scheme", "who", "shape", "ms_per_step", "times", "bytes_per_node", "compile_seconds", "differs")
@@ -161,4 +161,4 @@ def command(scale: float, steps: int, runs: int, wanted: str | None, out: Path) 
     for row in rows:
         if "reason" in row:
             click.echo(f"{row['problem']}: {row['reason']}")
-    write_json(out / "march.json", stamped(rows))
+    publish(out, "march", rows)

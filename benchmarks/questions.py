@@ -8,6 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import hjbjax as hjb
+from hjbjax.zoo.minimum_time import DoubleIntegrator
+
+ARRIVAL = DoubleIntegrator().arrival_time
 
 
 def pendulum(nodes: int, actions: int | None = 21, mass: float = 1.0) -> tuple[hjb.Problem, hjb.Grid]:
@@ -28,6 +31,14 @@ def dubins(nodes: int, discount: float) -> tuple[hjb.Problem, hjb.Grid]:
 def manipulator(nodes: int) -> tuple[hjb.Problem, hjb.Grid]:
     """The zoo's arm of two links, discount .5; nodes² angles and (nodes + 1)² velocities."""
     return hjb.zoo.manipulator(links=2, discount=0.5, shape=(nodes, nodes, nodes + 1, nodes + 1))
+
+
+def double_integrator(nodes: int, *, discount: float = 1.0) -> tuple[hjb.Problem, hjb.Grid]:
+    """Minimum time of the double integrator on [−1, 1]², exact values on {T ≤ .5} and on the edge of the box."""
+    exact = hjb.zoo.double_integrator_exact(discount=discount)
+    problem, _ = hjb.zoo.double_integrator(discount=discount)
+    problem = dataclasses.replace(problem, target=_within_half, exit_cost=exact)
+    return problem, hjb.Grid([-1.0, -1.0], [1.0, 1.0], (nodes, nodes))
 
 
 def integrators(shape: tuple[int, ...], actions: int = 3) -> tuple[hjb.Problem, hjb.Grid]:
@@ -52,6 +63,10 @@ def sum_over_axes(value: np.ndarray, dim: int) -> np.ndarray:
     for axis in range(dim):
         total = total + value.reshape([-1 if i == axis else 1 for i in range(dim)])
     return total
+
+
+def _within_half(x: Any) -> Any:
+    return jnp.minimum(ARRIVAL(x) - 0.5, 1 - 1e-6 - jnp.max(jnp.abs(x)))
 
 
 def _push(x: Any, u: Any) -> Any:

@@ -14,6 +14,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import click
+
 RESULTS = Path(__file__).parent / "results"
 PACKAGES = ("jax", "numpy", "scipy", "hj-reachability", "quantecon", "numba", "mdpsolver", "scikit-fmm")
 
@@ -70,6 +72,15 @@ def write_json(path: Path, rows: Sequence[dict[str, Any]]) -> None:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def publish(out: Path, name: str, rows: Sequence[dict[str, Any]], **drawing: Any) -> None:
+    """The rows, stamped, in ``name``.json; what ``drawing`` says of them (see ``picture``) in ``name``.png."""
+    rows = stamped(rows)
+    write_json(out / f"{name}.json", rows)
+    if drawing:
+        picture(out / f"{name}.png", rows, **drawing)
+    click.echo(f"{len(rows)} rows in {out / name}.json{', the picture beside it' if drawing else ''}")
 
 
 def picture(

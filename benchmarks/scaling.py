@@ -14,7 +14,7 @@ import numpy as np
 
 import hjbjax as hjb
 from benchmarks import footprint, growth, questions
-from benchmarks.report import RESULTS, attempt, picture, stamped, table, write_json
+from benchmarks.report import RESULTS, attempt, publish, table
 from benchmarks.timing import interleaved
 
 COLUMNS = (
@@ -67,8 +67,5 @@ def command(quick: bool, dimensions: tuple[int, ...], repeats: int | None, times
         growth.fit([row for row in mine if "nodes" in row])
         click.echo(table(mine, COLUMNS) + "\n")
         rows += mine
-    rows = stamped(rows)
-    write_json(out / "scaling.json", rows)
-    lines = [row | {"dimensions": f"{row['dimension']}-D"} for row in rows]
-    picture(out / "scaling.png", lines, panel="problem", line="dimensions", x=("nodes",), y="seconds")
-    click.echo(f"{len(rows)} rows in {out / 'scaling.json'}, the picture in {out / 'scaling.png'}")
+    rows = [row | {"dimensions": f"{row['dimension']}-D"} for row in rows]
+    publish(out, "scaling", rows, panel="problem", line="dimensions", x=("nodes",), y="seconds")

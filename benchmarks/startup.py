@@ -16,7 +16,7 @@ from typing import Any
 import click
 
 from benchmarks import floors
-from benchmarks.report import RESULTS, attempt, stamped, table, write_json
+from benchmarks.report import RESULTS, attempt, publish, table
 
 ROOT = Path(__file__).parents[1]
 COLUMNS = ("start", "seconds", "fastest", "cpu_seconds", "repeats", "pictures", "status")
@@ -71,7 +71,5 @@ def command(quick: bool, problem: str, repeats: int | None, out: Path) -> None:
     figures = {}
     if not quick and problem == "double-integrator" and rows[0]["status"] == "DONE":
         figures = {f"{row['start']} start": row["seconds"] for row in rows}
-    click.echo("\n".join(floors.verdicts(figures)))
-    rows = stamped([*rows, *floors.as_rows(figures, "startup")])
-    write_json(out / "startup.json", rows)
-    click.echo(f"{len(rows)} rows in {out / 'startup.json'}")
+    rows += floors.announced(figures, "startup")
+    publish(out, "startup", rows)

@@ -22,7 +22,7 @@ import numpy as np
 import hjbjax as hjb
 from benchmarks import floors, questions
 from benchmarks.footprint import bytes_of
-from benchmarks.report import RESULTS, attempt, picture, stamped, table, without, write_json
+from benchmarks.report import RESULTS, attempt, publish, table, without
 from benchmarks.timing import interleaved
 from hjbjax import bellman, driver, memory
 from hjbjax.preparation import prepare_on_host
@@ -282,8 +282,5 @@ def command(quick: bool, repeats: int | None, controls: int, few: int, out: Path
         click.echo(table(found, COLUMNS) + "\n")
         rows += found
     figures = judged(rows)
-    click.echo("\n".join(floors.verdicts(figures)))
-    rows = stamped([*rows, *floors.as_rows(figures, "sweep")])
-    write_json(out / "sweep.json", rows)
-    picture(out / "sweep.png", rows, panel="problem", line="kernel", x=("nodes",), y="node_controls_per_second")
-    click.echo(f"{len(rows)} rows in {out / 'sweep.json'}, the picture in {out / 'sweep.png'}")
+    rows += floors.announced(figures, "sweep")
+    publish(out, "sweep", rows, panel="problem", line="kernel", x=("nodes",), y="node_controls_per_second")

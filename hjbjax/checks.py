@@ -14,6 +14,7 @@ import numpy as np
 from hjbjax import sets
 from hjbjax.grid import Grid
 from hjbjax.problem import Problem
+from hjbjax.pytree import by_structure
 
 OF_ACTION = ("drift", "cost", "noise")
 STATE_COSTS = ("exit_cost", "terminal_cost", "stopping_cost", "running_max")
@@ -138,15 +139,9 @@ def _probe(problem: Problem, name: str, n: int) -> tuple[int, ...] | str:
     """What a function returns on one state, found by tracing it."""
     function, names, said_call = getattr(problem, name), _names(problem, name), call(problem, name)
     lengths = {"x": (n,), "u": (_dim(problem.controls),), "d": (_dim(problem.disturbances),), "t": ()}
-    arguments = [jax.ShapeDtypeStruct(lengths[letter], np.float64) for letter in names]
-    verdicts = []
-
-    def probe(*arguments):
-        verdicts.append(_verdict(function(*arguments)))
-
     _check_arity(problem, name)
     try:
-        jax.eval_shape(probe, *arguments)
+        return _traced(function, tuple(lengths[letter] for letter in names))
     except Exception as error:
         fed = ", ".join(f"{letter} of shape {lengths[letter]}" for letter in names)
         for kind, advice in _TRACED:
@@ -157,6 +152,17 @@ def _probe(problem: Problem, name: str, n: int) -> tuple[int, ...] | str:
             raise ValueError(f"{said_call} failed on one state, with {fed}:\n{said[:400]}") from error
         error.add_note(f"raised by {said_call}, traced on one state, with {fed}")
         raise
+
+
+@by_structure
+def _traced(function: Callable, lengths: tuple[tuple[int, ...], ...]) -> tuple[int, ...] | str:
+    """What a function returns for arguments of these shapes."""
+    verdicts = []
+
+    def probe(*arguments):
+        verdicts.append(_verdict(function(*arguments)))
+
+    jax.eval_shape(probe, *(jax.ShapeDtypeStruct(shape, np.float64) for shape in lengths))
     return verdicts[0]
 
 

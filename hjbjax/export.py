@@ -40,8 +40,7 @@ def target(problem: Problem, grid: Grid, t: float = 0.0) -> tuple[np.ndarray, np
         x = grid.components(np.float64)
         for ingredient, default in ((problem.target, 1.0), (problem.exit_cost, 0.0)):
             entry = default if ingredient is None else ingredient
-            values = fields.scalar(entry, *problem.state_arguments(x, t), dtype=np.float64)
-            arrays.append(np.broadcast_to(values, grid.shape))
+            arrays.append(np.broadcast_to(fields.of_state(problem, entry, x, t, np.float64), grid.shape))
     return arrays[0] <= 0, arrays[1]
 
 

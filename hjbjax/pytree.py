@@ -7,6 +7,7 @@ tracers and stacked arrays, which no check of values could pass.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeVar, dataclass_transform
 
@@ -14,6 +15,7 @@ import jax
 import numpy as np
 
 T = TypeVar("T")
+REMEMBERED = 256  # answers of one function that are kept, the latest
 
 
 @dataclass_transform(frozen_default=True, eq_default=False)
@@ -89,6 +91,28 @@ def _default(field: dataclasses.Field) -> Callable[[], Any]:
 def is_traced(*trees: Any) -> bool:
     """Whether any leaf of the trees is a tracer, that is, whether we run inside a JAX transformation."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
+
+
+def by_structure(function: Callable[..., T]) -> Callable[..., T]:
+    """Remember answers by the structure of the first argument, not by its numbers.
+
+    For facts read off a trace of a function of the user's: they are the same for every mass and every discount, and
+    tracing costs more than a small solve. The other arguments must be hashable; only answers are kept, no exceptions.
+    """
+    answers: dict[Any, T] = {}
+
+    @functools.wraps(function)
+    def ask(tree: Any, *arguments: Any, **options: Any) -> T:
+        leaves, structure = jax.tree.flatten(tree)
+        kinds = tuple((jax.numpy.shape(leaf), jax.numpy.result_type(leaf)) for leaf in leaves)
+        key = (structure, kinds, arguments, tuple(options.items()))
+        if key not in answers:
+            answers[key] = function(tree, *arguments, **options)
+            if len(answers) > REMEMBERED:
+                del answers[next(iter(answers))]
+        return answers[key]
+
+    return ask
 
 
 def numbers(value: Any, name: str) -> Any:

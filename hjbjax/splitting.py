@@ -21,6 +21,7 @@ from hjbjax.grid import Grid
 from hjbjax.minimisers import Action
 from hjbjax.players import setting
 from hjbjax.problem import Problem
+from hjbjax.pytree import node
 from hjbjax.schemes import Scheme
 
 
@@ -56,27 +57,23 @@ def halves(problem: Problem, grid: Grid, dtype: Any) -> list[Problem]:
     assert problem.disturbances is not None
     no_u, no_d = jnp.zeros(m, dtype), jnp.zeros(problem.disturbances.dim, dtype)
     mine = Problem(
-        _without_opponent(problem.drift, no_d),
-        None if problem.cost is None else _without_opponent(problem.cost, no_d),
+        _Alone(problem.drift, no_d),
+        None if problem.cost is None else _Alone(problem.cost, no_d),
         problem.controls,
-        noise=_without_opponent(problem.noise, no_d) if callable(problem.noise) else problem.noise,
+        noise=_Alone(problem.noise, no_d) if callable(problem.noise) else problem.noise,
         target=problem.target,
         exit_cost=problem.exit_cost,
         time_dependent=problem.time_dependent,
     )
     theirs = Problem(
-        _difference(problem.drift, no_u, no_d, _driven(problem.drift, problem, grid.ndim, m, no_d.size, dtype)),
-        None if problem.cost is None else _difference(problem.cost, no_u, no_d, None),
+        _Added(problem.drift, no_u, no_d, _driven(problem.drift, problem, grid.ndim, m, no_d.size, dtype)),
+        None if problem.cost is None else _Added(problem.cost, no_u, no_d),
         disturbances=problem.disturbances,
         target=problem.target,
         exit_cost=problem.exit_cost,
         time_dependent=problem.time_dependent,
     )
     return [mine, theirs]
-
-
-def _without_opponent(function: Any, no_d: Any) -> Any:
-    return lambda *arguments: function(*arguments, no_d)
 
 
 def _driven(function: Any, problem: Problem, n: int, m: int, k: int, dtype: Any) -> tuple[int, ...]:
@@ -87,14 +84,29 @@ def _driven(function: Any, problem: Problem, n: int, m: int, k: int, dtype: Any)
     )
 
 
-def _difference(function: Any, no_u: Any, no_d: Any, driven: tuple[int, ...] | None) -> Any:
-    """What the disturbance adds, f(x, 0, d) − f(x, 0, 0); an exact zero where it drives nothing."""
+@node()
+class _Alone:
+    """What a function of (t), x, u, d is without the disturbance, f(x, u, 0)."""
 
-    def part(*arguments):
+    function: Any
+    no_d: Any
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self.function(*arguments, self.no_d)
+
+
+@node(static=("driven",))
+class _Added:
+    """What the disturbance adds, f(x, 0, d) − f(x, 0, 0); an exact zero in the components that it does not drive."""
+
+    function: Any
+    no_u: Any
+    no_d: Any
+    driven: tuple[int, ...] | None = None
+
+    def __call__(self, *arguments: Any) -> Any:
         *rest, _, d = arguments  # (t), x, u, d
-        added = function(*rest, no_u, d) - function(*rest, no_u, no_d)
-        if driven is None:
+        added = self.function(*rest, self.no_u, d) - self.function(*rest, self.no_u, self.no_d)
+        if self.driven is None:
             return added
-        return jnp.stack([added[i] if i in driven else jnp.zeros((), added.dtype) for i in range(added.shape[0])])
-
-    return part
+        return jnp.stack([added[i] if i in self.driven else jnp.zeros((), added.dtype) for i in range(added.shape[0])])

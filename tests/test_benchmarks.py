@@ -62,10 +62,9 @@ def test_ratios_are_taken_round_by_round():
 
 
 @pytest.mark.parametrize(("measured", "met"), [(1.5, True), (1.49, False), (math.nan, False)])
-def test_a_floor_is_met_or_missed(measured, met):
-    line = floors.verdicts({"sweep 1024": measured})[0]
-    assert line.endswith("met" if met else "MISSED")
-    (row,) = floors.as_rows({"sweep 1024": measured}, "sweep")
+def test_a_floor_is_met_or_missed(measured, met, capsys):
+    (row,) = floors.announced({"sweep 1024": measured}, "sweep")
+    assert capsys.readouterr().out.endswith("met\n" if met else "MISSED\n")
     assert row["status"] == ("MET" if met else "MISSED")
 
 
@@ -161,6 +160,7 @@ def test_a_peer_that_disagrees_is_marked():
     assert "status" not in peers.checked([{"difference": 2e-3, "tol": 1e-3}])[0]
 
 
+@pytest.mark.slow
 def test_a_peer_that_is_not_there_is_skipped(tmp_path, monkeypatch):
     monkeypatch.setattr(peers, "without", lambda module: f"{module} is not installed")
     rows = rows_of(peers, tmp_path)
@@ -177,7 +177,8 @@ def test_bytes_of_a_solve_hold_at_least_what_it_keeps():
     assert double["bytes_per_node"] > single["bytes_per_node"] > 2 * (4 + 4 + 4)  # value, rate and control, twice
 
 
-@pytest.mark.parametrize("problem", ["pendulum", pytest.param("dubins", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("problem", ["pendulum", "dubins"])
 def test_growth_solves_what_it_times(tmp_path, problem):
     rows = rows_of(growth, tmp_path, "--problem", problem)
     assert {row["problem"] for row in rows} == {problem}

@@ -2,57 +2,30 @@
 
 import functools
 import warnings
-from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import hjbjax as hjb
+from benchmarks import questions
 from hjbjax import zoo
-from hjbjax.pytree import node
-from hjbjax.zoo.ingredients import unit_cost
-from hjbjax.zoo.minimum_time import DoubleIntegrator
 
+pytestmark = pytest.mark.slow  # 161 x 161 nodes, and every problem twice
 PLAIN = hjb.Upwind(central=False)
-MASS = DoubleIntegrator(1.0)
-
-
-@node()
-class Held:
-    """Where the exact value is given: arrival within ``time``, and the faces of the cube |x_i| ≤ 1."""
-
-    system: Any
-    time: Any
-
-    def level(self, x):
-        return jnp.minimum(self.system.arrival_time(x) - self.time, 1 - 1e-6 - jnp.max(jnp.abs(x)))
 
 
 @functools.cache
-def solved(n, scheme, discount=1.0):
-    exact = zoo.double_integrator_exact(discount=discount)
-    problem = hjb.Problem(
-        MASS.drift,
-        unit_cost,
-        hjb.Box([-1.0], [1.0]),
-        discount=discount,
-        target=Held(MASS, 0.5).level,
-        exit_cost=exact,
-    )
-    grid = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (n, n))
+def solved(n, scheme):
+    exact = zoo.double_integrator_exact()
+    problem, grid = questions.double_integrator(n)
     solution = hjb.solve(problem, grid, scheme=scheme, tol=1e-6)
     with jax.enable_x64(True):
         known = jax.jit(jax.vmap(exact))(grid.nodes().reshape(-1, 2))
     return solution, np.abs(solution.value - np.asarray(known).reshape(n, n))
 
 
-SLOW = pytest.mark.slow
-
-
-@pytest.mark.parametrize("n", [pytest.param(41, marks=SLOW), pytest.param(81, marks=SLOW), 161])
-@pytest.mark.slow
+@pytest.mark.parametrize("n", [41, 81, 161])
 def test_mean_error_against_the_plain_chain(n):
     """The value has a square root at the switching curve, so that halving the error is what can be had.
 
@@ -65,7 +38,6 @@ def test_mean_error_against_the_plain_chain(n):
         assert limited == pytest.approx(4.15e-3, rel=0.02)
 
 
-@pytest.mark.slow
 def test_largest_error_is_smaller_too():
     assert np.max(solved(161, hjb.Limited())[1]) <= 0.7 * np.max(solved(161, PLAIN)[1])
 
@@ -122,18 +94,15 @@ def errors(question, exact, where=1.0):
     return [np.max(np.abs(value - known)[inner & np.isfinite(known)]) for value in values]
 
 
-@pytest.mark.parametrize("name", [name if "one" not in name else pytest.param(name, marks=SLOW) for name in KINKED])
-@pytest.mark.slow
+@pytest.mark.parametrize("name", KINKED)
 def test_shortest_paths_are_never_worse(name):
     plain, limited = errors(zoo.eikonal(shape=(41, 41), **KINKED[name]), zoo.eikonal_exact(**KINKED[name]))
     assert limited <= 1.05 * plain + 1e-8
     assert limited <= 0.6 * plain  # and indeed better
 
 
-@SLOW
 @pytest.mark.parametrize("discount", [0.0, 1.0])
 @pytest.mark.parametrize("radius", [0.0, 0.2])
-@pytest.mark.slow
 def test_minimum_time_in_a_larger_box_is_never_worse(discount, radius):
     options = {"discount": discount, "radius": radius}
     plain, limited = errors(
@@ -142,7 +111,6 @@ def test_minimum_time_in_a_larger_box_is_never_worse(discount, radius):
     assert limited <= 1.05 * plain + 1e-8
 
 
-@pytest.mark.slow
 def test_boat_in_a_current_is_never_worse():
     plain, limited = errors(zoo.zermelo(shape=(41, 41)), zoo.zermelo_exact(), where=1)
     assert limited <= 0.3 * plain

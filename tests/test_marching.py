@@ -75,7 +75,9 @@ def test_riccati_with_noise():
     assert sharp[-1] < plain[-1] / 10
 
 
-@pytest.mark.parametrize(("scheme", "order"), [(hjb.Upwind(), 1), (hjb.Eno2(), 2), (hjb.Weno5(), 5)])
+@pytest.mark.parametrize(
+    ("scheme", "order"), [(hjb.Upwind(), 1), pytest.param(hjb.Eno2(), 2, marks=pytest.mark.slow), (hjb.Weno5(), 5)]
+)
 def test_a_wave_that_is_carried_along(scheme, order):
     """ẋ = 1 on a circle: V(x, 0) = ψ(x + T), with steps so short that the order is that of the slopes."""
     problem = hjb.Problem(lambda x, u: jnp.ones(1), terminal_cost=lambda x: jnp.sin(x[0]))

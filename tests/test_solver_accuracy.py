@@ -39,7 +39,7 @@ def fitted_order(errors):
     ("noise", "scheme", "known", "order"),
     [
         (0.0, PLAIN, (5.577e-2, 2.879e-2, 1.462e-2), 1),
-        (NOISE, PLAIN, (4.581e-2, 2.358e-2, 1.198e-2), 1),
+        pytest.param(NOISE, PLAIN, (4.581e-2, 2.358e-2, 1.198e-2), 1, marks=pytest.mark.slow),
         (NOISE, hjb.Upwind(), (6.05e-4, 1.52e-4, 3.79e-5), 2),
     ],
     ids=["no noise", "noise, upwind", "noise, central where monotone"],
@@ -72,7 +72,8 @@ def arrival(x):
     return -jnp.expm1(-distance(x))
 
 
-@pytest.mark.parametrize("count", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [2, 3])
 def test_eikonal_errors_and_order(count):
     problem = hjb.Problem(velocity, unit_cost, CIRCLE, discount=1.0, target=distance, exit_cost=arrival)
     grids = [hjb.Grid([-1.0, -1.0], [1.0, 1.0], (n, n)) for n in (41, 81, 161)[:count]]
@@ -91,6 +92,7 @@ def test_smooth_nonlinear_problem_errors_and_order():
     assert abs(fitted_order(errors) - 1) <= 0.15
 
 
+@pytest.mark.slow
 def test_minimum_time_of_the_double_integrator_with_one_target_node():
     """T = −log(1 − S) at (1, 0), where it is 2 exactly: slow convergence, since T is only Hölder."""
     times = []
@@ -121,7 +123,7 @@ def test_slowing_down_is_exact():
         assert np.max(off[away]) <= 1e-10
 
 
-@pytest.mark.parametrize("dim", [1, 2, 3])
+@pytest.mark.parametrize("dim", [1, 2, pytest.param(3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("discount", [0.0, 1.0])
 def test_moving_along_the_axes_is_exact(dim, discount):
     problem, grid = zoo.eikonal(norm=1, dim=dim, discount=discount, radius=0.0, shape=(11,) * dim)
@@ -136,7 +138,7 @@ def test_moving_along_the_axes_is_exact(dim, discount):
     assert np.sign(solution.policy[here][axis]) == -np.sign(here[axis] - 5)
 
 
-@pytest.mark.parametrize("dim", [1, 2, 3, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dim", [1, 2, *(pytest.param(dim, marks=pytest.mark.slow) for dim in (3, 4))])
 def test_brownian_exit_from_a_ball_is_exact_in_any_dimension(dim):
     question = zoo.brownian_ball(dim=dim, noise=0.7, shape=(9,) * dim)
     assert largest_error(question, zoo.brownian_ball_exact(dim=dim, noise=0.7), tol=1e-10) <= 1e-9

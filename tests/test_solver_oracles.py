@@ -186,9 +186,8 @@ def position(x, u, d):
     return x[0]
 
 
-@pytest.mark.parametrize(
-    "method", [hjb.ValueIteration(), pytest.param(hjb.PolicyIteration(hjb.Direct()), marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [hjb.ValueIteration(), hjb.PolicyIteration(hjb.Direct())])
 def test_upper_and_lower_values_of_a_game_without_value(method):
     grid, solutions = hjb.Grid([-1.0], [1.0], (21,)), {}
     for isaacs in ("upper", "lower"):

@@ -117,6 +117,7 @@ def test_avoid_tube_of_the_floating_boat():
     assert np.all(solution.value[(y > 1) | (np.abs(x) > 1.5)] < 0)  # past the square, or beside it
 
 
+@pytest.mark.slow
 def test_a_nested_solve_where_the_drift_cancels_at_a_node():
     """A drift of rounding size is no motion: dividing by it sent the value to infinity."""
     problem, grid = zoo.pendulum(as_printed=True, shape=(100, 101))
@@ -125,6 +126,7 @@ def test_a_nested_solve_where_the_drift_cancels_at_a_node():
     assert np.max(np.abs(nested.value - plain.value)) <= 2e-3
 
 
+@pytest.mark.slow
 def test_a_second_order_game_where_the_drift_cancels_at_a_node():
     problem, grid = zoo.lq_game(shape=(81,))
     solution = hjb.solve(problem, grid, scheme=hjb.Limited(), tol=1e-6)

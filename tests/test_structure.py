@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from hjbjax import structure
+from hjbjax.pytree import as_partial
 
 MATRIX = np.array([[1.0, 2.0], [0.5, -1.0]])
 ARGUMENTS = ((3, False), (2, True))  # a state of three entries, a control of two
 
 
 def dependence(function, arguments=ARGUMENTS):
-    return structure.dependence(function, *arguments, dtype="float32")
+    return structure.dependence(as_partial(function), *arguments, dtype="float32")
 
 
 def verdict(function):

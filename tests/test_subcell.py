@@ -57,6 +57,7 @@ def errors(scheme, counts):
     return found
 
 
+@pytest.mark.slow
 def test_the_plain_scheme_on_a_disc():
     """The table of first-order errors: 2.8e-2 with nodes snapped to zero, 9.2e-3 with exact values inside."""
     (snapped,), (cut,) = errors(hjb.Upwind(), (41,)), errors(hjb.Upwind(subcell=True), (41,))

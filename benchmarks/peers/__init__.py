@@ -20,7 +20,7 @@ import numpy as np
 import hjbjax as hjb
 from benchmarks import floors, questions
 from benchmarks.peers import decision
-from benchmarks.report import RESULTS, attempt, picture, stamped, table, without, write_json
+from benchmarks.report import RESULTS, attempt, publish, table, without
 from benchmarks.timing import interleaved, timed
 
 PAIRS = 2_000_000  # of state and action in a chain: beyond that it takes gigabytes
@@ -152,8 +152,5 @@ def command(quick: bool, nodes: tuple[int, ...], repeats: int | None, controls: 
         click.echo(table(found, COLUMNS))
         click.echo("\n".join(f"{row['status'].lower()}: {row['reason']}" for row in found if "reason" in row))
     figures = judged(rows)
-    click.echo("\n".join(floors.verdicts(figures)))
-    rows = stamped([*rows, *floors.as_rows(figures, "peers")])
-    write_json(out / "peers.json", rows)
-    picture(out / "peers.png", rows, panel="problem", line="code", x=("nodes",), y="seconds")
-    click.echo(f"{len(rows)} rows in {out / 'peers.json'}, the picture in {out / 'peers.png'}")
+    rows += floors.announced(figures, "peers")
+    publish(out, "peers", rows, panel="problem", line="code", x=("nodes",), y="seconds")

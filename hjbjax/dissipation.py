@@ -109,7 +109,8 @@ def dissipation(
     Example:
       >>> import hjbjax as hjb
       >>> problem, grid = hjb.zoo.lq_game(shape=(41,))
-      >>> solution = hjb.solve(problem, grid, scheme=hjb.Limited())
+      >>> x, p = grid.nodes(), 2 / 3**0.5  # V = px², u = −px, d = px/γ² with γ = 2, as ``solve`` finds them
+      >>> solution = hjb.Solution(grid, p * x[..., 0] ** 2, -p * x, p * x / 4)
       >>> bool(hjb.dissipation(problem, solution, [[0.5]], 3.0, random=3).worst > -1e-3)
       True
     """

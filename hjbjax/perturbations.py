@@ -135,8 +135,8 @@ def perturbation_study(
     Example:
       >>> import hjbjax as hjb
       >>> plant = hjb.Problem(lambda x, u: u, lambda x, u: 0.5 * (x @ x + u @ u), hjb.Box([-4.0], [4.0]), discount=1.0)
-      >>> study = hjb.perturbation_study(plant, hjb.Grid([-2.0], [2.0], (41,)), noises=[0.05, 0.1], gammas=[5.0, 10.0],
-      ...     disturbances=hjb.Box([-1.0], [1.0]))
+      >>> study = hjb.perturbation_study(plant, hjb.Grid([-2.0], [2.0], (21,)), noises=[0.05, 0.1], gammas=[5.0, 10.0],
+      ...     disturbances=hjb.Box([-1.0], [1.0]), scheme=hjb.Upwind(central=False))
       >>> round(study.noise.order, 1), round(study.gain.order, 1)
       (2.0, 2.0)
     """

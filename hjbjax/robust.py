@@ -19,9 +19,9 @@ that γ is feasible if and only if V_T stays bounded. In an inner box, away from
 Doubling T has no scale: a constant rate makes growth one half, in any unit. At the level itself a P that stays finite
 is approached like 1/T, so that what is gained halves with each doubling; above the level it falls faster each time,
 below it, behind a bottleneck, slower, and rises. A third tells them apart sooner than waiting until all has settled:
-for a time constant τ of the closed loop a level that is off by the fraction e shows at T of about τ/√e. A narrow set, a
-small grid and a short horizon make the level too high; so do coarse grids where P grows without bound
-at the level. ``Weno5()`` is exact on quadratics, and of all schemes feels the edge of the grid least.
+for a time constant τ of the closed loop a level that is off by the fraction e shows at T of about τ/√e. Narrow sets of
+controls or disturbances, a small grid and a short horizon make the level too high; so do coarse grids where P grows
+without bound at the level. ``Weno5()`` is exact on quadratics, and of all schemes feels the edge of the grid least.
 Source: A. van der Schaft, L₂-gain and passivity techniques in nonlinear control; T. Başar and P. Bernhard,
 H∞-optimal control and related minimax design problems.
 """
@@ -119,9 +119,9 @@ def hinf_level(
 ) -> Level:
     """The least γ that a feedback can hold, by bisection; the rule is in the module's docstring.
 
-    Each γ takes one march, which stops as soon as it is decided. The level comes out too high where the set of
-    disturbances is too narrow, where worst paths from the inner box leave the grid, or where the horizon is short;
-    the table says which of these ended the marches below it.
+    Each γ takes one march, which stops as soon as it is decided. The level comes out too high where a set of controls
+    or disturbances is too narrow, where worst paths from the inner box leave the grid, or where the horizon is short;
+    the table says how the marches below it ended.
 
     Args:
       problem_of_gamma: γ to the game with cost L − ½γ²|d|², as ``lambda gamma: hjb.attenuation(plant, gamma, set)``.

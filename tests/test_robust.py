@@ -6,10 +6,13 @@ import functools
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import hjbjax as hjb
 from hjbjax import zoo
 from hjbjax.path import PathStatus
+from hjbjax.pytree import node
 from hjbjax.robust import Trial
 from hjbjax.sets import Ball, Box, Finite
 
@@ -122,6 +125,40 @@ def test_the_level_of_an_integrator():
     level = hjb.hinf_level(INTEGRATOR.game(), cube(1, 41), 0.95, 1.1)
     assert level.gamma == pytest.approx(1.0, rel=0.02)
     assert all(trial.growth > 0.1 for trial in level.trials if not trial.feasible)
+
+
+@node()
+class Scalar:
+    """ẋ = a x + u + e d, z = (c x, u), all numbers leaves."""
+
+    a: object
+    e: object
+    c: object
+
+    def drift(self, x, u):
+        return self.a * x + u
+
+    def cost(self, x, u):
+        return 0.5 * (self.c**2 * x @ x + u @ u)
+
+    def entry(self, x):
+        return jnp.full((1, 1), self.e)
+
+
+@pytest.mark.slow
+@settings(max_examples=15)
+@given(st.floats(-2.0, -0.5), st.floats(0.5, 1.5), st.floats(0.5, 1.4))
+def test_the_level_of_any_stable_scalar_plant(a, e, c):
+    """γ² = e²c²/(a² + c²), where P = c²/|a|, at most 4: the bound of 6 on both players is slack."""
+    wanted = e * c / np.hypot(a, c)
+    system = Scalar(a, e, c)
+    plant = hjb.Problem(system.drift, system.cost, Box([-6.0], [6.0]))
+
+    def game(gamma):
+        return hjb.attenuation(plant, gamma, Box([-6.0], [6.0]), enters=system.entry)
+
+    level = hjb.hinf_level(game, cube(1, 41), 0.8 * wanted, 1.2 * wanted)
+    assert level.gamma == pytest.approx(wanted, rel=0.02)
 
 
 def test_a_bound_that_is_felt_is_infeasible():

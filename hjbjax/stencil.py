@@ -14,7 +14,6 @@ import numpy as np
 
 from hjbjax.grid import Grid
 
-
 LONGER = 4  # axes up to which neighbours along the last one are slices of a longer array
 
 

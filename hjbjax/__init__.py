@@ -15,10 +15,12 @@ from hjbjax.lyapunov import lyapunov_check
 from hjbjax.marching import Explicit, Implicit
 from hjbjax.perturbations import perturbation_study
 from hjbjax.preparation import SolveWarning
+from hjbjax.probabilities import expected_exit_time, reach_probability, stay_probability
 from hjbjax.problem import Problem
 from hjbjax.reachability import avoid, reach, reach_avoid
 from hjbjax.relaxation import Direct, Krylov, Sweeps
 from hjbjax.robust import hinf_level
+from hjbjax.safety import least_restrictive
 from hjbjax.schemes import Eno2, Limited, Upwind, Weno5
 from hjbjax.sets import Ball, Box, Finite
 from hjbjax.simulation import simulate
@@ -58,8 +60,10 @@ __all__ = [
     "chain",
     "convergence_study",
     "dissipation",
+    "expected_exit_time",
     "geometry",
     "hinf_level",
+    "least_restrictive",
     "load",
     "lyapunov_check",
     "march",
@@ -67,10 +71,12 @@ __all__ = [
     "plotting",
     "reach",
     "reach_avoid",
+    "reach_probability",
     "saturation",
     "simulate",
     "solve",
     "solve_batch",
     "stability",
+    "stay_probability",
     "zoo",
 ]

@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax import export, fields, stencil
+from hjbjax import export, fields, recurrence, stencil
 from hjbjax.grid import Grid
 from hjbjax.problem import Problem
 from hjbjax.pytree import cast, node
@@ -236,6 +236,51 @@ def matrix(
     jumps = _under_policy(problem, grid, policy, disturbance, scheme, t)
     steps = jumps.scaled(export.time_step(jumps.total()))
     return stencil.sparse(steps.offsets, steps.values, np.maximum(1 - steps.total(), 0), grid)
+
+
+def stationary_density(
+    problem: Problem,
+    grid: Grid,
+    policy: Any = None,
+    *,
+    disturbance: Any = None,
+    scheme: Upwind = Upwind(),
+    t: float = 0.0,
+) -> np.ndarray:
+    """The density in which the chain under one policy is found after a long time: 𝓛*p = 0, integral one.
+
+    The chain's law over the nodes, divided by the cells that its rates belong to, in which a wall that reflects
+    stands half a spacing beyond the end of the box; then scaled to the integral one over the box itself,
+    ``np.sum(density * grid.volumes())``. Second order where central differences are monotone, first elsewhere; by
+    a sparse LU factorisation, see ``recurrence``. Arguments are those of ``generator``.
+
+    Returns:
+      The density at the nodes, shape (*grid), in 1/(units of the states); zero where the chain never comes back.
+
+    Raises:
+      ValueError: a target, where paths end; several recurrent classes, or one that hangs together by no more than
+        rounding: then where the chain is found depends on where it started; and what ``generator`` refuses.
+
+    Example:
+      >>> import numpy as np
+      >>> grid = Grid([-4.0], [4.0], (161,))
+      >>> density = stationary_density(Problem(lambda x, u: -x, noise=1.0), grid)
+      >>> float(round(density[80], 3)), float(round(np.sum(density * grid.volumes()), 12))  # 1/√π
+      (0.564, 1.0)
+    """
+    if problem.target is not None:
+        raise ValueError(
+            "stationary_density: got a problem with a target, where paths end, so that nothing goes on for ever; leave "
+            "it out, or ask for hjb.reach_probability or hjb.expected_exit_time"
+        )
+    jumps = _under_policy(problem, grid, policy, disturbance, scheme, t)
+    moves = stencil.sparse(jumps.offsets, jumps.values, -jumps.total(), grid)
+    probabilities = export.single_law(recurrence.classes(moves), moves, grid)
+    density = probabilities.reshape(grid.shape)
+    with jax.enable_x64(True):
+        for link in (stencil.links(cast(grid, np.float64), axis) for axis in range(grid.ndim)):
+            density = density / np.asarray((link.up + link.down) / 2)
+    return density / np.sum(density * grid.volumes())
 
 
 def transition_arrays(

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from hjbjax import fields, stencil
+from hjbjax import fields, recurrence, stencil
 from hjbjax.grid import Grid
 from hjbjax.problem import Problem
 from hjbjax.sets import AdmissibleSet, Finite
@@ -31,6 +31,29 @@ def refuse(what: str, where: np.ndarray, grid: Grid) -> None:
         first = tuple(int(i) for i in np.argwhere(where)[0])
         state = np.array2string(grid.state(first), separator=", ")
         raise ValueError(f"chain: {what} at {int(np.sum(where))} nodes, the first {first} with state {state}")
+
+
+def single_law(classes: list[np.ndarray], generator: Any, grid: Grid) -> np.ndarray:
+    """The stationary probabilities of a chain with one recurrent class, shape (S,).
+
+    Raises:
+      ValueError: more than one class, or one that rounding may take for several.
+    """
+    why = "where the chain is found after a long time depends on where it starts"
+    fix = "connect them by noise, or look at a part of the box by itself"
+    if len(classes) > 1:
+        first = [np.array2string(grid.state(np.unravel_index(c[0], grid.shape)), separator=", ") for c in classes[:2]]
+        raise ValueError(
+            f"stationary_density: got {len(classes)} recurrent classes, wanted one: {why};\nthe first two hold the "
+            f"states {first[0]} and {first[1]}, {len(classes[0])} and {len(classes[1])} nodes; {fix}"
+        )
+    probabilities, error = recurrence.law(generator, classes[0])
+    if error > recurrence.LARGEST_ERROR:
+        raise ValueError(
+            f"stationary_density: parts of the box exchange so little that rounding alone may move {error:.2g} of the "
+            f"probability between them, wanted at most {recurrence.LARGEST_ERROR:g}:\n{why}; {fix}"
+        )
+    return probabilities
 
 
 def target(problem: Problem, grid: Grid, t: float = 0.0) -> tuple[np.ndarray, np.ndarray]:

@@ -120,6 +120,20 @@ class Grid:
                 inside &= near.reshape([-1 if i == axis else 1 for i in range(self.ndim)])
         return inside
 
+    def volumes(self) -> np.ndarray:
+        """The part of the box that belongs to each node, shape (*grid), host level: half cells at ends that are nodes.
+
+        Their sum is the volume of the box, and sums of node values weighted by them are trapezoidal integrals.
+        """
+        total = np.ones(())
+        for axis, count in enumerate(self.shape):
+            gaps = np.diff(np.append(np.asarray(self.axis(axis)), self.hi[axis] if self.periodic[axis] else []))  # type: ignore[index]
+            share = np.zeros(count)
+            share[: len(gaps)] += gaps / 2
+            share[-len(gaps) :] += gaps / 2
+            total = np.multiply.outer(total, share)
+        return total
+
     def wrap(self, x: Any) -> Any:
         """States with their periodic entries brought into [lo, hi); the others as they are."""
         x = _states(x)

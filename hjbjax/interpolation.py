@@ -45,7 +45,7 @@ def query(
         with jax.ensure_compile_time_eval(), jax.enable_x64(True):
             when = None if times is None else _moment(times, t, np.float64, name)
             # JAX keeps what it made of a NumPy array in float32, outside of here, and would hand it in for float64.
-            grid = cast(grid, np.float64)
+            grid, values = cast((grid, values), np.float64)
             return np.array(look(grid, values, _states(grid, x, np.float64, name), clamp, when))[()]
     dtype = jnp.result_type(*traced) if traced else jnp.result_type(float)
     if not jnp.issubdtype(dtype, jnp.floating):

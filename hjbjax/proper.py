@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax import chain, sets, stencil
+from hjbjax import chain, fields, sets, stencil
 from hjbjax.chain import Rates
 from hjbjax.grid import Grid
 from hjbjax.problem import Problem
@@ -58,6 +58,37 @@ def reached(problem: Problem, grid: Grid, held: np.ndarray, *, scheme: Upwind, d
         if not surely or np.array_equal(found, inside):
             return found
         inside = found
+
+
+@functools.partial(jax.jit, static_argnames=("scheme", "dtype"))
+def refuge(problem: Problem, grid: Grid, *, scheme: Upwind, dtype: Any) -> jax.Array:
+    """The nodes from which some actions of both players keep the state off the target for ever, bool (*grid).
+
+    The largest set in which every node has an action whose jumps all stay in it: nodes without one are taken away until
+    nothing changes. Empty means that under every policy the target is reached with probability one.
+    """
+    u, d = (
+        jnp.asarray(np.zeros((1, 0)) if choices is None else sets.samples(choices, SAMPLES), dtype)
+        for choices in (problem.controls, problem.disturbances)
+    )
+    level = fields.of_state(problem, problem.target, grid.components(dtype), 0.0, dtype)
+
+    def shrink(carry):
+        inside, _ = carry
+
+        def also(found, pair):
+            rates = chain.rates(problem, grid, list(u[pair[0]]), list(d[pair[1]]), scheme=scheme, dtype=dtype)
+            stays = jnp.ones(grid.shape, bool)
+            for offset, c in zip(rates.offsets, rates.values, strict=True):
+                stays &= (c <= 0) | stencil.neighbour(inside, grid, offset)
+            return found | stays, None
+
+        pairs = jnp.stack(jnp.meshgrid(jnp.arange(len(u)), jnp.arange(len(d)), indexing="ij"), -1).reshape(-1, 2)
+        found = inside & jax.lax.scan(also, jnp.zeros(grid.shape, bool), pairs)[0]
+        return found, jnp.any(found != inside)
+
+    start = jnp.broadcast_to(level > 0, grid.shape)
+    return jax.lax.while_loop(lambda carry: carry[1], shrink, (start, jnp.ones((), bool)))[0]
 
 
 def _leads_to(held: np.ndarray, jumps: Rates, grid: Grid) -> np.ndarray:

@@ -1,0 +1,259 @@
+"""Front doors of probabilities and exit times: ``reach_probability``, ``stay_probability``, ``expected_exit_time``.
+
+The equations are those of ``solve`` and ``march`` with the exit costs of ``exits``; nothing is solved here. For all
+times without discount a chain that may stay away for ever has more than one solution: there value iteration from zero
+finds the least one, which is the probability; where every pair of actions must end, any method does.
+"""
+
+import contextlib
+import dataclasses
+import warnings
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import numpy as np
+
+from hjbjax import checks, exits, proper, survey
+from hjbjax.fields import FallbackWarning
+from hjbjax.grid import Grid
+from hjbjax.horizon import march
+from hjbjax.iteration import ValueIteration
+from hjbjax.problem import Problem
+from hjbjax.pytree import as_partial, is_traced
+from hjbjax.schemes import Upwind
+from hjbjax.solution import Solution, SolveError
+from hjbjax.solver import as_dtype, check_arguments, solve
+
+TOL = 1e-6
+TOL_OF_STEPS = 1e-9  # value iteration stops by its last step, which is much smaller than what is left
+
+
+def reach_probability(
+    problem: Problem,
+    grid: Grid,
+    target: Callable | None = None,
+    *,
+    obstacle: Callable | None = None,
+    horizon: float | None = None,
+    least: bool = False,
+    feedback: Any = None,
+    **options: Any,
+) -> Solution:
+    """The greatest probability with which the control can bring the state into the target.
+
+    V(x) = sup_u inf_d P(x(τ) in the target, τ ≤ horizon), τ the first time in the target or in the obstacle, from
+    min max (V_t + f·DV + ½ tr σσᵀD²V) = 0 with V = 1 on the target and 0 on the obstacle. Order and cost are those
+    of ``march``, and of ``solve`` without a horizon. There is no certificate.
+
+    Args:
+      problem: the system; its costs and its discount play no part.
+      grid: the nodes.
+      target: a function ≤ 0 inside; ``None`` is the problem's own target.
+      obstacle: likewise: a path that comes there first has failed, also where the two overlap.
+      horizon: until when, in units of time; ``None`` is for all times.
+      least: the least probability instead: the control keeps away.
+      feedback: a Solution or a function of the state that acts in place of the control; then nothing is optimised.
+        Where a Solution has no action the state stays for ever.
+      options: anything else that ``march`` takes, or ``solve`` without a horizon: times, scheme, method, tol, ...
+
+    Returns:
+      A Solution whose value is the probability, and whose policy attains it.
+
+    Raises:
+      ValueError: no target; a feedback without controls; and what ``march`` and ``solve`` refuse.
+      SolveError: no convergence, with the partial solution.
+
+    Example:
+      >>> import hjbjax as hjb
+      >>> gambler, grid = hjb.Problem(lambda x, u: 0.5 + 0 * x, noise=1.0), hjb.Grid([0.0], [1.0], (101,))
+      >>> chance = hjb.reach_probability(gambler, grid, lambda x: 1 - x[0], obstacle=lambda x: x[0])
+      >>> round(float(chance.value_at([0.5])), 4)  # (1 − e^{−2·½·½})/(1 − e^{−2·½})
+      0.6225
+    """
+    name = "reach_probability"
+    problem, inside, hit = _asked(problem, target, obstacle, feedback, name)
+    sign = 1.0 if least else -1.0
+    question = exits.ending(problem, inside, hit, 0.0, sign)
+    with _quiet(feedback):
+        if horizon is None:
+            question, options = _without_end(question, grid, 1.0 if least else 0.0, options)
+        return _answer(question, grid, horizon, options, sign)
+
+
+def stay_probability(
+    problem: Problem,
+    grid: Grid,
+    region: Callable,
+    *,
+    horizon: float | None = None,
+    least: bool = False,
+    feedback: Any = None,
+    **options: Any,
+) -> Solution:
+    """The greatest probability with which the control can keep the state in a region.
+
+    V(x) = sup_u inf_d P(x(s) in the region for all s ≤ horizon), one minus the least probability of leaving it.
+
+    Args:
+      problem: the system; its costs, its discount and its target play no part.
+      grid: the nodes; the region must not cover all of them, since at the edge of the box noise reflects.
+      region: a function ≤ 0 inside; its boundary counts as outside.
+      horizon: as in ``reach_probability``.
+      least: the least probability instead: the control wants to get out.
+      feedback: as in ``reach_probability``.
+      options: as in ``reach_probability``.
+
+    Returns:
+      A Solution whose value is the probability, and whose policy attains it.
+
+    Raises:
+      ValueError: as ``reach_probability``.
+      SolveError: no convergence, with the partial solution.
+
+    Example:
+      >>> import jax.numpy as jnp
+      >>> import hjbjax as hjb
+      >>> walk, grid = hjb.Problem(lambda x, u: 0 * x, noise=1.0), hjb.Grid([-1.0], [1.0], (41,))
+      >>> kept = hjb.stay_probability(walk, grid, lambda x: jnp.abs(x[0]) - 1, horizon=1.0)
+      >>> round(float(kept.value_at(0.0, [0.0])), 2)  # (4/π) e^{−π²/8} − ...
+      0.37
+    """
+    leaving = jax.tree_util.Partial(exits.outside, as_partial(region, "stay_probability: region"))
+    with _scaled_errors(1.0, -1.0):
+        left = reach_probability(problem, grid, leaving, horizon=horizon, least=not least, feedback=feedback, **options)
+    return _scaled(left, 1.0, -1.0)
+
+
+def expected_exit_time(
+    problem: Problem,
+    grid: Grid,
+    target: Callable | None = None,
+    *,
+    horizon: float | None = None,
+    greatest: bool = False,
+    feedback: Any = None,
+    **options: Any,
+) -> Solution:
+    """The least expected time in which the control can bring the state into the target.
+
+    V(x) = inf_u sup_d E τ, τ the first time in the target: min max (1 + f·DV + ½ tr σσᵀD²V) = 0, V = 0 there. The
+    bound on |V − V_h| is certified, except for the greatest time.
+
+    Args:
+      problem: the system; its costs and its discount play no part.
+      grid: the nodes.
+      target: a function ≤ 0 inside; ``None`` is the problem's own. To leave a region r ≤ 0 give −r.
+      horizon: E min(τ, horizon) instead, by ``march``.
+      greatest: the greatest expected time instead: the control stays as long as it can.
+      feedback: as in ``reach_probability``.
+      options: anything else that ``solve`` takes, or ``march`` with a horizon.
+
+    Returns:
+      A Solution whose value is the time, inf where the target is not reached for certain.
+
+    Raises:
+      ValueError: no target; a control that may stay away for ever, asked for the greatest time; and what ``solve``
+        and ``march`` refuse.
+      SolveError: no convergence, with the partial solution.
+
+    Example:
+      >>> import jax.numpy as jnp
+      >>> import hjbjax as hjb
+      >>> walk, grid = hjb.Problem(lambda x, u: 0 * x, noise=2.0), hjb.Grid([-1.0], [1.0], (41,))
+      >>> time = hjb.expected_exit_time(walk, grid, lambda x: 1 - jnp.abs(x[0]))
+      >>> round(float(time.value_at([0.5])), 6)  # (1 − x²)/σ²
+      0.1875
+    """
+    name = "expected_exit_time"
+    problem, inside, _ = _asked(problem, target, None, feedback, name)
+    sign = -1.0 if greatest else 1.0
+    question = exits.ending(problem, inside, None, sign, 0.0)
+    with _quiet(feedback):
+        if horizon is None:
+            options = {"tol": TOL} | options
+            if greatest:
+                _refuse_staying(question, grid, options)
+        return _answer(question, grid, horizon, options, sign)
+
+
+def _asked(problem: Any, target: Any, obstacle: Any, feedback: Any, name: str) -> tuple[Problem, Any, Any]:
+    """The system that runs, with its loop closed if there is a feedback, its target and its obstacle."""
+    if not isinstance(problem, Problem):
+        raise TypeError(f"{name}: got {type(problem).__name__}, wanted a Problem")
+    inside = problem.target if target is None else as_partial(target, f"{name}: target")
+    if inside is None:
+        raise ValueError(f"{name}: there is nothing to reach: give target=, a function ≤ 0 inside, or problem.target")
+    hit = as_partial(obstacle, f"{name}: obstacle")
+    if feedback is None:
+        return problem, inside, hit
+    loop = exits.closed(problem, feedback, name)
+    needs_time = loop.time_dependent and not problem.time_dependent
+    return loop, exits.timed(inside, needs_time), exits.timed(hit, needs_time)
+
+
+@contextlib.contextmanager
+def _quiet(feedback: Any) -> Iterator[None]:
+    """A feedback that is a Solution is looked up node by node; that is no fault of the user's functions."""
+    with warnings.catch_warnings():
+        if hasattr(feedback, "control_at"):
+            warnings.simplefilter("ignore", FallbackWarning)
+        yield
+
+
+def _without_end(question: Problem, grid: Grid, most: float, options: dict) -> tuple[Problem, dict]:
+    """The question for all times, with what finds the least of its solutions where one may stay away for ever.
+
+    ``most`` bounds the value from above by itself. Given as a stopping cost it says that there is something to fall
+    back on, so that no node is taken for one without a value.
+    """
+    if not _may_stay(question, grid, {"tol": TOL} | options):
+        return question, {"tol": TOL} | options
+    question = dataclasses.replace(question, stopping_cost=most)
+    return question, {"tol": TOL_OF_STEPS, "method": ValueIteration(), "guess": np.zeros(grid.shape)} | options
+
+
+def _may_stay(question: Problem, grid: Grid, options: dict) -> int:
+    """The number of nodes at which some actions keep the state away from every end for ever; 0 while traced."""
+    scheme, kind = options.get("scheme", Upwind()), as_dtype(options.get("dtype"))
+    check_arguments(question, grid, options.get("method"), scheme, options["tol"], None, None)
+    if is_traced(question, grid):
+        return 0
+    with jax.enable_x64(kind == np.float64):
+        checks.shapes(question, grid, scheme)
+        survey.values(question, grid, kind)
+        return int(np.sum(np.asarray(proper.refuge(question, grid, scheme=scheme.chain, dtype=kind))))
+
+
+def _refuse_staying(question: Problem, grid: Grid, options: dict) -> None:
+    count = _may_stay(question, grid, options)
+    if count:
+        raise ValueError(
+            f"expected_exit_time: the greatest time is infinite: at {count} of {grid.size} nodes some action keeps the "
+            "state away from the target for ever;\ngive horizon= for E min(τ, horizon), or noise that drives it out"
+        )
+
+
+def _answer(question: Problem, grid: Grid, horizon: float | None, options: dict, sign: float) -> Solution:
+    """sign · V of the question, also for a partial solution."""
+    with _scaled_errors(0.0, sign):
+        found = solve(question, grid, **options) if horizon is None else march(question, grid, horizon, **options)
+    return _scaled(found, 0.0, sign)
+
+
+@contextlib.contextmanager
+def _scaled_errors(offset: float, sign: float) -> Iterator[None]:
+    """An error's partial solution is scaled as the whole one is."""
+    try:
+        yield
+    except SolveError as error:
+        if error.solution is not None:
+            error.solution = _scaled(error.solution, offset, sign)
+        raise
+
+
+def _scaled(solution: Solution, offset: float, sign: float) -> Solution:
+    """The solution with offset + sign · V for V; the bounds change places with the sign."""
+    bounds = [None if each is None else offset + sign * each for each in (solution.lower, solution.upper)]
+    lower, upper = bounds if sign > 0 else bounds[::-1]
+    return dataclasses.replace(solution, value=offset + sign * solution.value, lower=lower, upper=upper)

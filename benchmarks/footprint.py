@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 import hjbjax as hjb
-from hjbjax import driver
+from hjbjax import driver, iteration
 from hjbjax.preparation import choose, judge, prepare
 from hjbjax.pytree import cast
 
@@ -28,7 +28,7 @@ def of_solve(problem: Any, grid: Any, tol: float, *, method: Any = None, dtype: 
 
         def begin(problem, grid):
             task = prepare(problem, grid, method=inner, scheme=hjb.Upwind(), tol=tol, dtype=kind, verdict=verdict)
-            return task, driver.begin(task, jax.numpy.zeros(grid.shape, kind))
+            return task, iteration.begin(task, jax.numpy.zeros(grid.shape, kind))
 
         shapes = jax.eval_shape(begin, *cast((problem, grid), kind))
         return {"bytes_per_node": bytes_of(driver.run.lower(*shapes, 1)) / grid.size}

@@ -24,7 +24,7 @@ from benchmarks import floors, questions
 from benchmarks.footprint import bytes_of
 from benchmarks.report import RESULTS, attempt, publish, table, without
 from benchmarks.timing import interleaved
-from hjbjax import bellman, driver, memory
+from hjbjax import bellman, driver, iteration, memory
 from hjbjax.preparation import prepare_on_host
 from hjbjax.pytree import cast
 
@@ -155,7 +155,7 @@ def whole_steps(problem: Any, grid: hjb.Grid, count: int) -> Any:
     """Steps of ``solve`` with value iteration, as its host loop runs them."""
     method = hjb.ValueIteration()
     task, _, _ = prepare_on_host(problem, grid, method=method, scheme=SCHEME, tol=1e-30, dtype=KIND)
-    states = [driver.run(task, driver.begin(task, started(grid)), 0)]
+    states = [driver.run(task, iteration.begin(task, started(grid)), 0)]
 
     def call():
         states[0] = driver.run(task, states[0], int(states[0].step) + count)

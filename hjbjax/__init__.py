@@ -4,18 +4,22 @@ from hjbjax import chain, geometry, plotting, stability, zoo
 from hjbjax._version import __version__
 from hjbjax.batch import solve_batch
 from hjbjax.convergence import convergence_study
+from hjbjax.dissipation import dissipation
 from hjbjax.fields import FallbackWarning
 from hjbjax.files import FileError
+from hjbjax.gain import attenuation, saturation
 from hjbjax.grid import Grid
 from hjbjax.horizon import march
 from hjbjax.iteration import Nested, PolicyIteration, ValueIteration
 from hjbjax.lyapunov import lyapunov_check
 from hjbjax.marching import Explicit, Implicit
+from hjbjax.perturbations import perturbation_study
 from hjbjax.preparation import SolveWarning
 from hjbjax.probabilities import expected_exit_time, reach_probability, stay_probability
 from hjbjax.problem import Problem
 from hjbjax.reachability import avoid, reach, reach_avoid
 from hjbjax.relaxation import Direct, Krylov, Sweeps
+from hjbjax.robust import hinf_level
 from hjbjax.safety import least_restrictive
 from hjbjax.schemes import Eno2, Limited, Upwind, Weno5
 from hjbjax.sets import Ball, Box, Finite
@@ -51,19 +55,24 @@ __all__ = [
     "ValueIteration",
     "Weno5",
     "__version__",
+    "attenuation",
     "avoid",
     "chain",
     "convergence_study",
+    "dissipation",
     "expected_exit_time",
     "geometry",
+    "hinf_level",
     "least_restrictive",
     "load",
     "lyapunov_check",
     "march",
+    "perturbation_study",
     "plotting",
     "reach",
     "reach_avoid",
     "reach_probability",
+    "saturation",
     "simulate",
     "solve",
     "solve_batch",

@@ -20,7 +20,6 @@ from hjbjax.status import Status
 
 CHUNK_SECONDS = 0.2
 
-begin = jax.jit(iteration.begin)
 run = jax.jit(iteration.run, donate_argnames="state")  # a state is used once: the next one takes its place in memory
 
 
@@ -49,7 +48,12 @@ def drive(task: Task, guess: jax.Array, clock: Clock, most: int | None = None) -
       The last state, how it ended, and the residuals of all steps, that of the guess first.
     """
     limit = clock.max_steps if most is None else min(most, clock.max_steps)
-    state, residuals, chunk, done = begin(task, guess), [np.zeros(0)], 1, -1  # step −1 is the look at the guess
+    state, residuals, chunk, done = (
+        iteration.begin(task, guess),
+        [np.zeros(0)],
+        1,
+        -1,
+    )  # step −1 is the look at the guess
     if clock.interrupted:
         return state, Status.INTERRUPTED, residuals[0]
     code = Status.RUNNING

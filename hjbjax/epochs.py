@@ -63,10 +63,11 @@ class Slices:
                 array[self.first, ..., j] = np.where(ended, np.nan, entry)
 
 
-def drive(task: March, kept: np.ndarray, clock: Clock) -> tuple[Slices, Front, Status]:
+def drive(task: March, kept: np.ndarray, start: Any, clock: Clock) -> tuple[Slices, Front, Status]:
     """From kept time to kept time in chunks; stops at a code, at the time limit, or at Ctrl-C."""
     dtype, slices, chunk = np.dtype(task.horizon.dtype), Slices(task, kept), 1
-    front = marching.begin(task, _terminal(task.problem, task.grid, task.horizon, dtype))
+    start = None if start is None else jnp.asarray(start, dtype)
+    front = marching.begin(task, _terminal(task.problem, task.grid, task.horizon, dtype, start))
     code = Status.RUNNING if bool(jnp.all(jnp.isfinite(front.value))) else Status.NONFINITE
     with ticker(clock.progress, float(task.horizon), "march") as show, noting_interrupts(clock):
         try:

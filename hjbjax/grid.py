@@ -110,6 +110,16 @@ class Grid:
         """All states, shape (*grid, n), at host level: a table for tests and pictures, not for solvers."""
         return np.stack(np.meshgrid(*(np.asarray(self.axis(i)) for i in range(self.ndim)), indexing="ij"), axis=-1)
 
+    def inner(self, share: float) -> np.ndarray:
+        """The nodes in the middle ``share`` of every axis that is not periodic, bool (*grid); host level."""
+        inside = np.ones(self.shape, bool)
+        for axis in range(self.ndim):
+            if not self.periodic[axis]:  # type: ignore[index]
+                nodes, lo, hi = np.asarray(self.axis(axis)), float(self.lo[axis]), float(self.hi[axis])
+                near = np.abs(nodes - (lo + hi) / 2) <= share * (hi - lo) / 2 * (1 + 1e-9)
+                inside &= near.reshape([-1 if i == axis else 1 for i in range(self.ndim)])
+        return inside
+
     def volumes(self) -> np.ndarray:
         """The part of the box that belongs to each node, shape (*grid), host level: half cells at ends that are nodes.
 

@@ -23,7 +23,7 @@ from hjbjax.relaxation import Krylov, Sweeps
 from hjbjax.schemes import Eno2, Limited, Scheme, Upwind, Weno5
 from hjbjax.sets import Box, Finite
 from hjbjax.solution import Solution, SolveError
-from hjbjax.solver import as_dtype
+from hjbjax.solver import as_dtype, check_node_values
 from hjbjax.status import Status
 
 PROBES = 33  # times at which a given step is held against the limit of a time-dependent problem
@@ -39,6 +39,7 @@ def march(
     horizon: float,
     *,
     times: Any = None,
+    start: Any = None,
     scheme: Scheme = Upwind(),
     method: Explicit | Implicit | None = None,
     step: float | None = None,
@@ -61,6 +62,7 @@ def march(
       grid: the nodes.
       horizon: T > 0, in units of time.
       times: the times to keep, increasing, in [0, horizon]; ``None`` is (0.0,). Nothing else is kept.
+      start: node values at the horizon in place of the terminal cost, shape (*grid), to go on from another march.
       scheme: ``Upwind(...)``, ``Limited()``, ``Eno2()`` or ``Weno5()``.
       method: ``Explicit(...)``, the default, whose steps the grid limits, or ``Implicit(...)``, of any step.
       step: the longest time step; ``None`` is the stable one, if implicit a hundredth of the horizon.
@@ -93,16 +95,17 @@ def march(
     method = Explicit() if method is None else method
     _check(problem, grid, scheme, method, step, time_limit)
     horizon, kept = _times(horizon, times)
-    if is_traced(problem, grid, method):
-        return _march_traced(problem, grid, horizon, kept, scheme, method, step, dtype)
+    if is_traced(problem, grid, method, start):
+        return _march_traced(problem, grid, horizon, kept, start, scheme, method, step, dtype)
     kind = as_dtype(dtype)
+    check_node_values(start, grid, "march: start")
     clock = Clock(10**9, math.inf if time_limit is None else time_limit, progress)
     with jax.enable_x64(kind == np.float64):
         needed = memory.fitting(_bytes(problem, grid, kept, method, kind), grid, max_memory)
         checks.shapes(problem, grid, scheme)
         survey.values(_without_moving_target(problem), grid, kind)
         task = _prepare(problem, grid, horizon, scheme, method, step, inner, kind)
-        slices, front, code = epochs.drive(task, kept, clock)
+        slices, front, code = epochs.drive(task, kept, start, clock)
         solution = epochs.assemble(task, grid, slices, front, code)
     solution.stats.update(
         seconds=clock.stepping, compile_seconds=clock.elapsed() - clock.stepping, bytes=needed, horizon=horizon
@@ -235,13 +238,7 @@ def _watched(problem: Problem, grid: Grid, share: float | None, dtype: Any) -> A
         return None
     if not isinstance(problem.disturbances, Box):
         raise ValueError(f"march: inner = {share:g} watches a Box of disturbances; got {problem.disturbances!r}")
-    watched = np.ones(grid.shape, bool)
-    for axis in range(grid.ndim):
-        if not grid.periodic[axis]:  # type: ignore[index]
-            nodes, lo, hi = np.asarray(grid.axis(axis)), float(grid.lo[axis]), float(grid.hi[axis])
-            inside = np.abs(nodes - (lo + hi) / 2) <= share * (hi - lo) / 2
-            watched &= inside.reshape([-1 if i == axis else 1 for i in range(grid.ndim)])
-    return jnp.asarray(watched)
+    return jnp.asarray(grid.inner(share))
 
 
 def _march_traced(
@@ -249,6 +246,7 @@ def _march_traced(
     grid: Grid,
     horizon: float,
     kept: np.ndarray,
+    start: Any,
     scheme: Scheme,
     method: Any,
     step: float | None,
@@ -268,10 +266,10 @@ def _march_traced(
     problem, grid = cast(problem, kind), cast(grid, kind)
     rules = None if problem.time_dependent else bellman.conditions(problem, grid, kind)
     task = March(problem, grid, method, rules, jnp.inf, step, horizon, None, scheme)
-    value, values, actions, count = marching.terminal(problem, grid, horizon, kind), [], [], 0
-    for start, end in itertools.pairwise([horizon, *kept[::-1].tolist()]):
-        steps = max(math.ceil((start - end) / step - 1e-6), int(start > end))
-        value, count = marching.repeat(task, value, start, end, steps), count + steps
+    value, values, actions, count = marching.terminal(problem, grid, horizon, kind, start), [], [], 0
+    for begin, end in itertools.pairwise([horizon, *kept[::-1].tolist()]):
+        steps = max(math.ceil((begin - end) / step - 1e-6), int(begin > end))
+        value, count = marching.repeat(task, value, begin, end, steps), count + steps
         values.append(value)
         actions.append(marching.greedy(task, value, end))
     u, d = (

@@ -9,7 +9,6 @@ additive certificate of that problem is small enough, or the residual is roundin
 problem is solved against the outer player's policy (Hoffman–Karp), since improving both at once may cycle.
 """
 
-import copy
 import dataclasses
 from typing import Any
 
@@ -21,7 +20,7 @@ from hjbjax.bellman import Conditions, Correction, Greedy
 from hjbjax.certificates import Certificate
 from hjbjax.grid import Grid
 from hjbjax.problem import Problem
-from hjbjax.pytree import node
+from hjbjax.pytree import altered, node
 from hjbjax.relaxation import Evaluation
 from hjbjax.schemes import Scheme
 
@@ -94,8 +93,7 @@ def advance(
       tol: bound on the algebraic error of the step, cost units.
       max_steps: policy improvements, at most.
     """
-    shifted = copy.copy(problem)  # ``dataclasses.replace`` would refuse a discount beside a running maximum
-    object.__setattr__(shifted, "discount", problem.discount + 1 / dt)
+    shifted = altered(problem, discount=problem.discount + 1 / dt)  # a problem refuses it beside a running maximum
     step = Step(shifted, grid, scheme, rules, value / dt, t)
 
     def look(value):

@@ -15,13 +15,14 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from hjbjax import bellman, certificates, hamiltonian, players, relaxation
 from hjbjax.bellman import Conditions, Correction, Greedy
 from hjbjax.certificates import Certificate, Gap
 from hjbjax.grid import Grid
 from hjbjax.problem import Problem
-from hjbjax.pytree import node
+from hjbjax.pytree import altered, is_traced, node
 from hjbjax.relaxation import Evaluation, Sweeps
 from hjbjax.schemes import Limited, Scheme
 from hjbjax.status import Status
@@ -114,16 +115,20 @@ class State:
 
 
 def begin(task: Task, guess: jax.Array) -> State:
-    """The state before the first look at a guess; step −1 of ``run`` is that look, so that all is one program."""
+    """The state before the first look at a guess; step −1 of ``run`` is that look, so that all is one program.
+
+    At host level it is filled by NumPy: there is nothing to compile.
+    """
+    xp: Any = jnp if is_traced(task, guess) else np
     dtype, shape = guess.dtype, task.grid.shape
     inputs = [0 if choices is None else choices.dim for choices in (task.problem.controls, task.problem.disturbances)]
-    policy = Greedy(jnp.zeros(shape, dtype), *(tuple(jnp.zeros(shape, dtype) for _ in range(m)) for m in inputs))
-    infinite = jnp.asarray(jnp.inf, dtype)
-    gap = Gap(-infinite, infinite, jnp.zeros((), dtype), infinite, infinite)
-    counter = jnp.zeros((), jnp.int32)
-    code = jnp.asarray(int(Status.RUNNING), jnp.int32)
-    history = jnp.full(HISTORY, jnp.nan, dtype)
-    return State(task.rules.impose(guess), policy, gap, counter - 1, jnp.stack([infinite] * 2), counter, code, history)
+    policy = Greedy(xp.zeros(shape, dtype), *(tuple(xp.zeros(shape, dtype) for _ in range(m)) for m in inputs))
+    infinite = xp.asarray(xp.inf, dtype)
+    gap = Gap(-infinite, infinite, xp.zeros((), dtype), infinite, infinite)
+    counter = xp.zeros((), xp.int32)
+    code = xp.asarray(int(Status.RUNNING), xp.int32)
+    history = xp.full(HISTORY, xp.nan, dtype)
+    return State(xp.array(guess), policy, gap, counter - 1, xp.stack([infinite] * 2), counter, code, history)
 
 
 def run(task: Task, state: State, until: Any) -> State:
@@ -133,7 +138,13 @@ def run(task: Task, state: State, until: Any) -> State:
     def goes_on(state):
         return (state.code == Status.RUNNING) & (state.step < until)
 
-    return jax.lax.while_loop(goes_on, lambda state: advance(task, state, start), state)
+    def step(state):
+        # loop variant, or XLA compiles a kernel for every scalar of every action that it can hoist
+        controls, grid, count = jax.lax.optimization_barrier((task.problem.controls, task.grid, state.step))
+        here = dataclasses.replace(task, problem=altered(task.problem, controls=controls), grid=grid)
+        return advance(here, dataclasses.replace(state, step=count), start)
+
+    return jax.lax.while_loop(goes_on, step, state)
 
 
 def advance(task: Task, state: State, start: Any) -> State:

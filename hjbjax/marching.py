@@ -124,12 +124,14 @@ def stable(problem: Problem, grid: Grid, scheme: Scheme, t: Any, dtype: Any) -> 
     return jnp.where(rate > 0, 1 / jnp.where(rate > 0, rate, 1), jnp.inf)
 
 
-def terminal(problem: Problem, grid: Grid, horizon: Any, dtype: Any) -> jax.Array:
-    """V at the horizon: the terminal cost, with given values and constraints put in.
+def terminal(problem: Problem, grid: Grid, horizon: Any, dtype: Any, start: Any = None) -> jax.Array:
+    """V at the horizon: ``start`` or the terminal cost, with given values and constraints put in.
 
-    Without one a stopping cost is paid at the latest then, and a running maximum is g itself; else nothing is paid.
+    Without either a stopping cost is paid at the latest then, and a running maximum is g itself; else nothing is paid.
     """
     rules = bellman.conditions(problem, grid, dtype, horizon)
+    if start is not None:
+        return rules.impose(jnp.asarray(start, dtype))
     cost = problem.terminal_cost
     if cost is None:
         cost = problem.running_max if problem.stopping_cost is None else problem.stopping_cost

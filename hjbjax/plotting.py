@@ -30,6 +30,7 @@ from hjbjax.canvas import (
 )
 from hjbjax.grid import Grid
 from hjbjax.level_sets import animation, zero_level_set
+from hjbjax.perturbations import perturbation
 from hjbjax.sections import at_time, feedback, folded, lifted, section_of, zeros
 
 __all__ = [
@@ -39,6 +40,7 @@ __all__ = [
     "closed_loop",
     "controls",
     "convergence",
+    "perturbation",
     "policy",
     "residuals",
     "styled",

@@ -6,6 +6,7 @@ the object is flattened, default when it is rebuilt). Rebuilding never runs ``__
 tracers and stacked arrays, which no check of values could pass.
 """
 
+import copy
 import dataclasses
 import functools
 from collections.abc import Callable, Iterable, Sequence
@@ -142,6 +143,14 @@ def as_partial(function: Callable | None, name: str = "function") -> jax.tree_ut
     if owner is not None and hasattr(function, "__func__") and not jax.tree_util.all_leaves([owner]):
         return jax.tree_util.Partial(function.__func__, owner)
     return jax.tree_util.Partial(function)
+
+
+def altered(tree: T, **fields: Any) -> T:
+    """A copy with other fields and without the checks that ``dataclasses.replace`` would run on tracers."""
+    result = copy.copy(tree)
+    for name, value in fields.items():
+        object.__setattr__(result, name, value)
+    return result
 
 
 def cast(tree: T, dtype: Any) -> T:

@@ -115,9 +115,7 @@ def mask_of(region: Any, grid: Grid) -> np.ndarray:
     elif isinstance(region, (int, float)) and not isinstance(region, bool):
         if not 0 < region <= 1:
             raise ValueError(f"convergence_study: got region = {region!r}; wanted a share of the box in (0, 1]")
-        centre, half = (np.asarray(grid.lo) + grid.hi) / 2, (np.asarray(grid.hi) - grid.lo) / 2
-        near = np.abs(grid.nodes() - centre) <= region * half * (1 + 1e-9)
-        inside = np.all(near | np.array(grid.periodic), axis=-1)
+        inside = grid.inner(region)
     else:
         raise TypeError(f"convergence_study: got region = {region!r}; wanted a function of one state, or a share")
     if not inside.any():

@@ -20,7 +20,7 @@ from hjbjax.grid import Grid
 from hjbjax.iteration import Method, Nested, PolicyIteration, ValueIteration
 from hjbjax.preparation import choose, judge, prepare, prepare_on_host
 from hjbjax.problem import Problem
-from hjbjax.pytree import is_traced
+from hjbjax.pytree import altered, is_traced
 from hjbjax.report import assemble, describe, finish
 from hjbjax.schemes import Limited, Scheme, Upwind
 from hjbjax.solution import Solution, SolveError
@@ -83,7 +83,7 @@ def solve(
     if is_traced(problem, grid, guess, tol):
         return _solve_traced(problem, grid, method, scheme, tol, guess, dtype, max_steps)
     kind = as_dtype(dtype)
-    _check_guess(guess, grid)
+    check_node_values(guess, grid, "solve: the guess")
     method = method or choose(problem, grid, traced=False)
     clock = Clock(max_steps or 10**9, math.inf if time_limit is None else time_limit, progress)
     with jax.enable_x64(kind == np.float64):
@@ -129,9 +129,7 @@ def _solve_traced(
     start = jnp.zeros(grid.shape, kind) if guess is None else jnp.asarray(guess, kind)
     frozen, start = jax.lax.stop_gradient((task, start))
     state = iteration.run(frozen, iteration.begin(frozen, start), max_steps or TRACED_STEPS)
-    solution = assemble(task, state, verdict)
-    object.__setattr__(solution, "value", sensitivity.attach(task, state))
-    return solution
+    return altered(assemble(task, state, verdict), value=sensitivity.attach(task, state))
 
 
 def as_dtype(dtype: Any) -> np.dtype:
@@ -169,14 +167,15 @@ def _is_positive(number: Any) -> bool:
     return isinstance(number, (int, float, np.number)) and math.isfinite(number) and bool(number > 0)
 
 
-def _check_guess(guess: Any, grid: Grid) -> None:
-    if guess is None:
+def check_node_values(values: Any, grid: Grid, name: str) -> None:
+    """Refuse what cannot be a value at the nodes; None is none."""
+    if values is None:
         return
-    values = np.asarray(guess)
-    if values.dtype.kind not in "fiu":
-        raise ValueError(f"solve: the guess holds {values.dtype}; wanted real node values of shape {grid.shape}")
-    if values.shape != grid.shape:
-        hint = "; it looks transposed" if values.shape == grid.shape[::-1] else ""
-        raise ValueError(f"solve: the guess has shape {values.shape}, the grid {grid.shape}{hint}")
-    if not np.all(np.isfinite(values)):
-        raise ValueError(f"solve: the guess is NaN or infinite at {int(np.sum(~np.isfinite(values)))} nodes")
+    array = np.asarray(values)
+    if array.dtype.kind not in "fiu":
+        raise ValueError(f"{name} holds {array.dtype}; wanted real node values of shape {grid.shape}")
+    if array.shape != grid.shape:
+        hint = "; it looks transposed" if array.shape == grid.shape[::-1] else ""
+        raise ValueError(f"{name} has shape {array.shape}, the grid {grid.shape}{hint}")
+    if not np.all(np.isfinite(array)):
+        raise ValueError(f"{name} is NaN or infinite at {int(np.sum(~np.isfinite(array)))} nodes")

@@ -14,6 +14,8 @@ import numpy as np
 
 from hjbjax.grid import Grid
 
+LONGER = 4  # axes up to which neighbours along the last one are slices of a longer array
+
 
 def on_edge(grid: Grid, axis: int, step: int) -> np.ndarray:
     """Which nodes have no neighbour in direction ``step`` along ``axis``; broadcasts against the node axes."""
@@ -80,12 +82,27 @@ def links(grid: Grid, axis: int) -> Links:
 def one_sided(values: jax.Array, grid: Grid, axis: int, link: Links | None = None) -> tuple[jax.Array, jax.Array]:
     """The differences D⁺ = (V(x+h⁺) − V(x))/h⁺ and D⁻ = (V(x) − V(x−h⁻))/h⁻ along one axis; zero across an edge."""
     link = link or links(grid, axis)
-    up, down = (neighbour(values, grid, unit(grid, axis, step)) for step in (1, -1))
+    up, down = _neighbours(values, grid, axis)
     if link.meets_up is not None:
         up = jnp.where(*link.meets_up, up)
     if link.meets_down is not None:
         down = jnp.where(*link.meets_down, down)
     return (up - values) / link.up, (values - down) / link.down
+
+
+def _neighbours(values: jax.Array, grid: Grid, axis: int) -> tuple[jax.Array, jax.Array]:
+    """The values one step up and one step down along an axis.
+
+    XLA fuses a concatenation into the loop over the nodes, except one along the last axis. There two slices of a
+    longer array are fused: one array is filled in place of two. In many dimensions, where memory rules, none is.
+    """
+    if axis < grid.ndim - 1 or grid.ndim > LONGER:
+        return neighbour(values, grid, unit(grid, axis, 1)), neighbour(values, grid, unit(grid, axis, -1))
+    count = grid.shape[axis]
+    ends = [jax.lax.slice_in_dim(values, k, k + 1, axis=axis) for k in (0, count - 1)]
+    first, last = reversed(ends) if grid.periodic[axis] else ends  # type: ignore[index]
+    wide = jax.lax.optimization_barrier(jnp.concatenate([first, values, last], axis=axis))
+    return jax.lax.slice_in_dim(wide, 2, count + 2, axis=axis), jax.lax.slice_in_dim(wide, 0, count, axis=axis)
 
 
 def limited(up: jax.Array, down: jax.Array, grid: Grid, axis: int, link: Links) -> tuple[jax.Array, jax.Array]:

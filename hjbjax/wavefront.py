@@ -64,7 +64,8 @@ def _wrapped(planes: jax.Array, grid: Grid) -> jax.Array:
             for margin, source, shift in ((count + 1, 1, count), (0, count, -count)):
                 inner = planes[(*core[:axis], source, *core[axis + 1 :])]
                 planes = planes.at[(*core[:axis], margin, *core[axis + 1 :])].set(jnp.roll(inner, shift, axis=0))
-    return planes.at[0].set(planes[-2]).at[-1].set(planes[1])
+    planes = planes.at[0].set(planes[-2])
+    return planes.at[-1].set(planes[1])  # of the result, or XLA copies all planes to keep the old ones
 
 
 def _sweep(source: jax.Array, weights: list[tuple[jax.Array, ...]], planes: jax.Array, up: bool) -> jax.Array:
@@ -101,4 +102,7 @@ def _sheared(values: jax.Array, flips: list[jax.Array], *, back: bool = False) -
         for column, count, flip in zip(columns, values.shape[1:], flips, strict=True)
     ]
     row = row + sum(flipped) if back else row - sum(columns)
-    return values.at[(row % values.shape[0], *flipped)].get(mode="promise_in_bounds")
+    place = row % values.shape[0]
+    for column, count in zip(flipped, values.shape[1:], strict=True):
+        place = place * count + column
+    return values.reshape(-1).at[place].get(mode="promise_in_bounds")

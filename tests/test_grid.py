@@ -229,3 +229,13 @@ def test_interpolation_refuses_shapes(values, states):
 def test_names():
     assert Grid([0.0, 0.0], [1.0, 1.0], (2, 2)).names == ("x1", "x2")
     assert Grid([0.0], [1.0], (2,), names=("angle",)).names == ("angle",)
+
+
+def test_the_inner_share_of_a_box():
+    grid = Grid([-1.0, 0.0, 0.0], [1.0, 4.0, 1.0], (5, 9, 4), (False, False, True))
+    inside = grid.inner(0.5)
+    assert inside.shape == grid.shape
+    assert np.any(inside, axis=(1, 2)).tolist() == [False, True, True, True, False]
+    assert np.flatnonzero(np.any(inside, axis=(0, 2))).tolist() == [2, 3, 4, 5, 6]
+    assert np.all(inside[2, 4])  # a periodic axis has no edge to keep away from
+    assert grid.inner(1.0).all()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hjbjax import Ball, Box, Finite, Grid, Problem
-from hjbjax.pytree import as_partial, cast, is_traced, node, numbers
+from hjbjax.pytree import REMEMBERED, altered, as_partial, by_structure, cast, is_traced, node, numbers
 
 
 @node(static=("kind",), host=("history", "note"))
@@ -185,3 +185,38 @@ def test_numbers_takes_any_nesting_of_numbers_and_tracers():
     assert numbers([True, 2, np.float32(0.5)], "mass").tolist() == [1.0, 2.0, 0.5]
     nested = jax.jit(lambda x: numbers([[x, 0.0], [0.0, 1.0]], "mass"))
     assert nested(3.0).tolist() == [[3.0, 0.0], [0.0, 1.0]]
+
+
+# --- answers by structure, copies without checks ---
+
+
+def test_an_answer_is_asked_for_once_a_structure():
+    asked = []
+
+    @by_structure
+    def shape(tree, unit="m", *, scale=1):
+        asked.append(tree)
+        return f"{jnp.shape(tree.value)} {unit} {scale}"
+
+    assert shape(Record(np.zeros(2))) == shape(Record(np.ones(2))) == "(2,) m 1"  # numbers do not matter
+    assert len(asked) == 1
+    assert shape(Record(np.zeros(3))) == "(3,) m 1"
+    assert shape(Record(np.zeros(2), kind="other")) == "(2,) m 1"
+    assert shape(Record(np.zeros(2)), "s") == "(2,) s 1"
+    assert shape(Record(np.zeros(2)), scale=2) == "(2,) m 2"
+    assert len(asked) == 5
+    with pytest.raises(AttributeError):
+        shape(1.0)
+    for count in range(REMEMBERED):
+        shape(Record(np.zeros(2)), str(count))
+    assert shape(Record(np.zeros(2))) == "(2,) m 1"
+    assert len(asked) == 7 + REMEMBERED  # with the one that failed: the oldest answer is forgotten
+
+
+def test_a_copy_may_hold_what_the_checks_refuse():
+    problem = Problem(lambda x, u: x, running_max=lambda x: x[0])
+    changed = altered(problem, discount=1.0)
+    assert (changed.discount, problem.discount) == (1.0, 0.0)
+    assert changed.drift is problem.drift
+    with pytest.raises(ValueError, match="running_max"):
+        dataclasses.replace(problem, discount=1.0)

@@ -23,6 +23,7 @@ def line():
     return hjb.perturbation_study(PLANT, GRID, **SETS, tol=1e-8)
 
 
+@pytest.mark.slow
 def test_the_changes_on_a_line_are_exact(line):
     """V^ε = V + ½ε²p/β everywhere; V^γ has (1 − γ⁻²)p² + p = 1, and the feedback is −p x."""
     np.testing.assert_allclose(line.noise.parameters, sorted(NOISES))
@@ -44,6 +45,7 @@ def test_a_feedback_that_does_not_change_has_no_order():
     assert study.gain.feedback_order == pytest.approx(2, abs=0.05)
 
 
+@pytest.mark.slow
 def test_what_it_prints_and_draws(line):
     text = str(line)
     assert text.count("order") == 2
@@ -61,6 +63,7 @@ def test_what_it_prints_and_draws(line):
     assert mine[0].axes is ax
 
 
+@pytest.mark.slow
 def test_changes_below_the_tolerance_are_not_fitted(line):
     noise = dataclasses.replace(line.noise, fitted=np.array([False, True, True]))
     study = dataclasses.replace(line, noise=noise)

@@ -228,6 +228,7 @@ def swing(x, u):
     return jnp.stack([x[1], -x[0] - x[1]])
 
 
+@pytest.mark.slow
 def test_simulated_paths_arrive_as_often():
     """An oscillator under noise, x ≥ 1 within 2: 20000 Euler paths, three standard errors and the grid's own error."""
     problem, values = hjb.Problem(swing, noise=[0.0, 1.0]), []
@@ -267,6 +268,7 @@ def home(x):
     return -x
 
 
+@pytest.mark.slow
 def test_a_feedback_makes_an_ornstein_uhlenbeck_process():
     """u = −x: the scale function is ∫ exp(x²/σ²); as a function, and as a Solution that plays it."""
     grid = interval(81)
@@ -281,6 +283,7 @@ def test_a_feedback_makes_an_ornstein_uhlenbeck_process():
         np.testing.assert_allclose(found.value, exact, rtol=0, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_policy_attains_what_the_value_says():
     problem, grid = hjb.Problem(pushed, controls=UNIT, noise=SIGMA), interval(41)
     best = hjb.reach_probability(problem, grid, above_one, obstacle=below_zero)
@@ -318,6 +321,7 @@ def test_where_a_solution_has_no_action_the_state_stays():
     assert found.value[-1] == 1
 
 
+@pytest.mark.slow
 @given(SEEDS)
 @settings(max_examples=10)
 def test_any_feedback_lies_between_the_least_and_the_greatest(seed):

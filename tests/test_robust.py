@@ -120,6 +120,7 @@ def test_the_level_of_a_lag():
     assert ball.gamma == pytest.approx(LAG.level(), rel=0.04)
 
 
+@pytest.mark.slow
 def test_the_level_of_an_integrator():
     """ẋ = u + d: γ = 1, where P grows without bound."""
     level = hjb.hinf_level(INTEGRATOR.game(), cube(1, 41), 0.95, 1.1)
@@ -339,6 +340,7 @@ def test_the_inequality_fails_below_the_level(top):
     assert found.worst < 0
 
 
+@pytest.mark.slow
 def test_the_energies_are_those_of_simulate(top, energies):
     """Both integrals against quadrature along a path of ``simulate``."""
     path = hjb.simulate(OSCILLATOR.game()(top.gamma), top.solution, STARTS[0], 15.0, steps=6000)

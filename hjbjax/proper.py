@@ -3,7 +3,7 @@
 Without discount the value is finite exactly where some policy reaches the held nodes with probability one (a
 proper policy). The largest such set R is a fixed point: take away the nodes from which no path of jumps leads
 to the target by actions that keep every jump inside R, until nothing changes. Jumps under sampled actions are
-found on the device, paths by a breadth-first search on the host.
+found on the device, paths by a breadth-first search on the host, or on large grids on the device as well.
 """
 
 import functools
@@ -20,20 +20,23 @@ from hjbjax.problem import Problem
 from hjbjax.schemes import Upwind
 
 SAMPLES = 33  # actions of a continuum that are tried
+LARGE = 200_000  # nodes beyond which paths are first followed on the device, all at once
+LONG = 4  # times the nodes of all axes together: jumps of a path that are followed there
 
 
 @functools.partial(jax.jit, static_argnames=("scheme", "dtype"))
-def _open_jumps(problem: Problem, grid: Grid, inside: jax.Array, scheme: Upwind, dtype: Any) -> Rates:
-    """For every jump whether some action makes it while all jumps of that action stay ``inside``."""
+def _open_jumps(problem: Problem, grid: Grid, inside: jax.Array | None, scheme: Upwind, dtype: Any) -> Rates:
+    """For every jump whether some action makes it while all jumps of that action stay ``inside``; None is the box."""
     points = sets.samples(problem.controls, SAMPLES) if problem.controls is not None else np.zeros((1, 0))
     start = chain.rates(problem, grid, list(jnp.asarray(points[0], dtype)), None, scheme=scheme, dtype=dtype)
 
     def also(known, action):
         rates = chain.rates(problem, grid, list(action), None, scheme=scheme, dtype=dtype)
         jumps = [c > 0 for c in rates.values]
-        stays = jnp.ones(grid.shape, bool)
-        for offset, jump in zip(rates.offsets, jumps, strict=True):
-            stays &= ~jump | stencil.neighbour(inside, grid, offset)
+        stays = jnp.ones((), bool)
+        if inside is not None:
+            for offset, jump in zip(rates.offsets, jumps, strict=True):
+                stays &= ~jump | stencil.neighbour(inside, grid, offset)
         return tuple(p | (q & stays) for p, q in zip(known, jumps, strict=True)), None
 
     none = tuple(jnp.zeros(grid.shape, bool) for _ in start.offsets)
@@ -51,13 +54,12 @@ def reached(problem: Problem, grid: Grid, held: np.ndarray, *, scheme: Upwind, d
     Returns:
       bool (*grid).
     """
+    found = _leads_to(held, _open_jumps(problem, grid, None, scheme, dtype), grid)
     inside = np.ones(grid.shape, bool)
-    while True:
-        jumps = _open_jumps(problem, grid, jnp.asarray(inside), scheme, dtype)
-        found = _leads_to(held, jumps, grid) & inside
-        if not surely or np.array_equal(found, inside):
-            return found
+    while surely and not np.array_equal(found, inside):
         inside = found
+        found = inside & _leads_to(held, _open_jumps(problem, grid, jnp.asarray(inside), scheme, dtype), grid)
+    return found
 
 
 @functools.partial(jax.jit, static_argnames=("scheme", "dtype"))
@@ -93,6 +95,33 @@ def refuge(problem: Problem, grid: Grid, *, scheme: Upwind, dtype: Any) -> jax.A
 
 def _leads_to(held: np.ndarray, jumps: Rates, grid: Grid) -> np.ndarray:
     """Nodes with a path of jumps to a held node."""
+    if grid.size > LARGE:
+        found, settled = _spread(jnp.asarray(held), jumps, grid)
+        if settled:
+            return np.asarray(found)
+    return _searched(held, jumps, grid)
+
+
+@jax.jit
+def _spread(held: jax.Array, jumps: Rates, grid: Grid) -> tuple[jax.Array, jax.Array]:
+    """Nodes that lead to a held one by paths of not too many jumps, and whether these are all there are."""
+
+    def further(carry):
+        found, _, step = carry
+        more = found
+        for offset, jump in zip(jumps.offsets, jumps.values, strict=True):
+            more |= jump & stencil.neighbour(more, grid, offset)
+        return more, jnp.any(more != found), step + 1
+
+    def goes_on(carry):
+        return carry[1] & (carry[2] < LONG * sum(grid.shape))
+
+    found, unsettled, _ = jax.lax.while_loop(goes_on, further, (held, jnp.ones((), bool), 0))
+    return found, ~unsettled
+
+
+def _searched(held: np.ndarray, jumps: Rates, grid: Grid) -> np.ndarray:
+    """The same by a breadth-first search, however long the paths are."""
     from scipy.sparse import bmat, csr_array
     from scipy.sparse.csgraph import breadth_first_order
 

@@ -93,6 +93,26 @@ def test_reached_nodes_in_the_plane(corner, noise, surely):
     assert not found[:, corner[1] + 1 :].any()  # everything moves upwards
 
 
+@pytest.mark.parametrize("long", [4, 0])
+@pytest.mark.parametrize("surely", [True, False])
+def test_paths_followed_on_the_device_are_those_of_the_search(monkeypatch, surely, long):
+    """With ``long`` = 0 no path is short enough, and the search has the last word."""
+    problem = hjb.Problem(turning, None, hjb.Finite(MOVES), noise=[0.5, 0.0], discount=1.0)
+    held = np.zeros(PLANE.shape, bool)
+    held[3, 4] = True
+    searched = reached(problem, PLANE, held, surely)
+    monkeypatch.setattr(proper, "LARGE", 0)
+    monkeypatch.setattr(proper, "LONG", long)
+    proper._spread.clear_cache()
+    np.testing.assert_array_equal(reached(problem, PLANE, held, surely), searched)
+    with jax.enable_x64(True):
+        jumps = proper._open_jumps(problem, PLANE, None, hjb.Upwind(), np.dtype(np.float64))
+        found, settled = proper._spread(jnp.asarray(held), jumps, PLANE)
+    proper._spread.clear_cache()
+    assert bool(settled) == (long > 0)
+    assert np.array_equal(found, proper._searched(held, jumps, PLANE)) == (long > 0)
+
+
 def test_certain_arrival_is_more_than_possible_arrival():
     """Noise carries the state either way, and only one end is the target: an absorbing trap waits at the other."""
     noises = np.full((8, 3), 0.5)

@@ -4,6 +4,7 @@ from hjbjax import chain, geometry, plotting, stability, zoo
 from hjbjax._version import __version__
 from hjbjax.batch import solve_batch
 from hjbjax.convergence import convergence_study
+from hjbjax.extremals import FreeTime, pontryagin
 from hjbjax.fields import FallbackWarning
 from hjbjax.files import FileError
 from hjbjax.grid import Grid
@@ -32,6 +33,7 @@ __all__ = [
     "FallbackWarning",
     "FileError",
     "Finite",
+    "FreeTime",
     "Grid",
     "Implicit",
     "Krylov",
@@ -57,6 +59,7 @@ __all__ = [
     "lyapunov_check",
     "march",
     "plotting",
+    "pontryagin",
     "reach",
     "reach_avoid",
     "simulate",

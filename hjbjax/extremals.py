@@ -72,7 +72,7 @@ def pontryagin(
       horizon: the final time; ``FreeTime(guess)`` where it is sought. ``None``: free if the problem has a target or
         ``terminal`` gives states, otherwise infinite, closed by the Riccati costate of a rest.
       terminal: how the path ends: an array (n,) of end states, NaN for those that are free; or a function ψ, paid at
-        the end. ``None``: on the target, with ``exit_cost``; with a given horizon, ``terminal_cost``.
+        the end in place of ``terminal_cost``. ``None``: without a horizon on the target, with ``exit_cost``.
       guess: a Solution, whose closed loop and DV are the first guess, or another extremal. ``None``: a line to the end
         states, or the loop under the Riccati costate.
       rest: a state near the rest of an infinite horizon; ``None``: the least node of a Solution, else the origin.
@@ -159,7 +159,7 @@ def _question(problem: Problem, x0: Any, horizon: Any, terminal: Any, grid: Grid
     if isinstance(horizon, FreeTime) and terminal is None and problem.target is not None:
         closing = Closing.TARGET
     if final is None:
-        final = problem.exit_cost if problem.target is not None and free else problem.terminal_cost
+        final = problem.exit_cost if closing is Closing.TARGET else problem.terminal_cost
     if closing is Closing.REST and (problem.time_dependent or rule.jumps):
         why = "depends on time" if problem.time_dependent else "has controls that jump, without a Riccati equation"
         raise ValueError(f"pontryagin: got no horizon, and the problem {why}; give horizon=, or terminal= end states")

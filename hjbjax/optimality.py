@@ -113,8 +113,10 @@ def assemble(ask: TwoPoint, s: np.ndarray, y: np.ndarray, theta: np.ndarray, cod
     for begin, length, z, corner in zip(begins, lengths, stacked, np.asarray(ask.arcs), strict=True):
         t = begin + s * length
         part = {name: np.asarray(each) for name, each in measure(arrays, t, z, corner).items()}
-        with np.errstate(all="ignore"):
-            gone = moved + length * cumulative_simpson(part["moving"], x=s, initial=0.0)
+        gone = np.full(len(s), moved)
+        if ask.problem.time_dependent:  # a mesh that crowds may repeat a node
+            once, back = np.unique(s, return_index=True, return_inverse=True)[1:]
+            gone += length * cumulative_simpson(part["moving"][once], x=s[once], initial=0.0)[back]
         part["constant"], moved = part["constant"] - gone, gone[-1]
         if code is Status.CONVERGED and length <= EMPTY * lengths.sum():  # an arc that begins where it ends
             continue

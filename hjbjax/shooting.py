@@ -8,6 +8,8 @@ held against the necessary conditions before it counts as converged.
 import dataclasses
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from hjbjax import first_guess
@@ -65,9 +67,14 @@ class Found:
         return self.s * self.horizon
 
     @property
+    def lengths(self) -> np.ndarray:
+        """The durations of the arcs."""
+        return np.asarray(self.ask.durations(np.asarray(self.theta)))
+
+    @property
     def horizon(self) -> float:
         """The final time."""
-        return float(np.sum(np.asarray(self.ask.durations(np.asarray(self.theta)))))
+        return float(np.sum(self.lengths))
 
 
 def attempt(ask: TwoPoint, s: Any, y: Any, theta: Any, limits: Limits) -> Found:
@@ -107,9 +114,23 @@ def smooth(ask: TwoPoint, times: np.ndarray, columns: np.ndarray, limits: Limits
 
 
 def unknowns(ask: TwoPoint, times: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """First guesses of the final time and of ν."""
-    theta = [times[-1]] if ask.timed else []
-    return np.array(theta + [1.0] * (ask.closing is Closing.TARGET))
+    """First guesses of the final time and of ν, whatever the guess makes of p(T) = ψ_x + ν l_x."""
+    theta = [times[-1]] * ask.timed
+    if ask.closing is Closing.TARGET:
+        theta.append(float(_multiplier(ask, times[-1], columns[:, -1])))
+    return np.array(theta)
+
+
+@jax.jit
+def _multiplier(ask: TwoPoint, t: Any, z: Any) -> Any:
+    x, p, _ = ask.split(z)
+    slope, normal = jax.grad(ask.psi, 1)(t, x), jax.grad(ask.level, 1)(t, x)
+    return jnp.nan_to_num((p - slope) @ normal / jnp.maximum(normal @ normal, 1e-300))
+
+
+@jax.jit
+def _levels(ask: TwoPoint, t: Any, x: Any) -> Any:
+    return jax.vmap(ask.level)(t, x)
 
 
 def _continued(failed: Found, limits: Limits) -> Found:
@@ -157,6 +178,14 @@ def report(found: Found) -> Extremal:
     check = extremal.optimality_check
     if not found.solved:
         return extremal
+    if np.min(found.lengths) < -GAP * found.horizon:
+        missed = "an arc came out with a negative duration; give another guess"
+        return dataclasses.replace(extremal, code=int(Status.STALLED), message=missed)
+    if found.ask.closing is Closing.TARGET:
+        inside = np.asarray(_levels(found.ask, extremal.times, extremal.states))
+        if np.min(inside) < -GAP * (1 + np.max(np.abs(inside))):
+            missed = "the path crosses the target before its end, where it would have stopped; give another guess"
+            return dataclasses.replace(extremal, code=int(Status.STALLED), message=missed)
     if not check.gap <= GAP * (1 + check.scale):
         missed = f"the Hamiltonian misses its minimum by {check.gap:.3g}: no extremal; give another guess"
         return dataclasses.replace(extremal, code=int(Status.STALLED), message=missed)

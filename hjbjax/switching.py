@@ -71,12 +71,10 @@ def _mixtures(ask: TwoPoint, times: np.ndarray, columns: np.ndarray, rough: Limi
 
 def _walk(ask: TwoPoint, times: np.ndarray, columns: np.ndarray, rough: Limits) -> Iterator[Found]:
     """Mixtures with given final times, from one that is long enough to where H fits a free one."""
-    nu = np.ones(int(ask.closing is Closing.TARGET))
     columns = np.concatenate([columns[: ask.n], 0 * columns[ask.n :]])  # no costate prefers a control
     for factor in BRIDGES:
-        found = attempt(
-            dataclasses.replace(ask, free=False, horizon=factor * times[-1]), times / times[-1], columns, nu, rough
-        )
+        fixed = dataclasses.replace(ask, free=False, horizon=factor * times[-1])
+        found = attempt(fixed, times / times[-1], columns, unknowns(fixed, times, columns), rough)
         if found.solved:
             break
     yield found
@@ -106,7 +104,7 @@ def _sharpened(ask: TwoPoint, blurred: Found, limits: Limits, least: float) -> F
         return dataclasses.replace(blurred, code=Status.STALLED, trouble=trouble)
     first = found = _arcs(ask, blurred, order, starts, limits)
     for _ in range(MOST_ARCS):
-        lengths = np.asarray(found.ask.durations(found.theta))
+        lengths = found.lengths
         kept = lengths > (-EMPTY if found.solved else SHORT) * max(lengths.sum(), 0.0)
         if kept.all() or not kept.any():
             break
@@ -127,7 +125,7 @@ def _with_an_empty_arc(
     for value in first_guess.values(blurred.ask):
         if not np.array_equal(value, order[0], equal_nan=True):
             found = _arcs(ask, blurred, np.concatenate([value[None], order]), np.append(0.0, starts), limits)
-            if found.solved:
+            if found.solved and np.min(found.lengths) > -EMPTY * found.horizon:
                 return found
     return None
 

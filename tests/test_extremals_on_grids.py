@@ -1,0 +1,72 @@
+"""Two roads to one costate: DV of the solution on a grid along the path, and Pontryagin's λ.
+
+The grid's own error is how much its value along the path moves when the spacing is halved.
+"""
+
+import functools
+
+import numpy as np
+import pytest
+
+import hjbjax as hjb
+from hjbjax import zoo
+
+PROBLEMS = {"pendulum": (zoo.pendulum, (200, 201)), "van-der-pol": (zoo.van_der_pol, (241, 241))}
+
+
+@functools.cache
+def solved(name, halved):
+    build, shape = PROBLEMS[name]
+    problem, grid = build(shape=tuple((n - n % 2) // 2 + n % 2 for n in shape) if halved else shape)
+    return problem, hjb.solve(problem, grid, scheme=hjb.Limited(), tol=1e-5)
+
+
+def agree(name, start):
+    (problem, fine), (_, coarse) = (solved(name, halved) for halved in (False, True))
+    extremal = hjb.pontryagin(problem, start, guess=fine, tol=1e-6)
+    check = extremal.optimality_check
+    assert extremal.status is hjb.Status.CONVERGED
+    assert max(check.drift, check.gap) < 1e-6 * check.scale
+    states = fine.grid.wrap(extremal.states)
+    error = np.max(np.abs(fine.value_at(states) - coarse.value_at(states)))
+    assert error < 5e-3 * extremal.cost  # or it would bound nothing
+    assert abs(float(fine.value_at(start)) - extremal.cost) <= error
+    assert np.max(np.abs(fine.value_at(states) - extremal.values)) <= error
+    sizes = np.linalg.norm(extremal.costates, axis=1)
+    counted = sizes > 0.01 * np.max(sizes)
+    off = np.linalg.norm(fine.costate_at(states) - extremal.costates, axis=1)
+    assert np.max(off[counted] / sizes[counted]) < 0.02
+    assert np.max(off) < 0.02 * np.max(sizes)
+    return extremal
+
+
+@pytest.mark.parametrize("start", [(2.0, 0.0), (0.5, -1.0)])
+def test_van_der_pol(start):
+    extremal = agree("van-der-pol", start)
+    assert np.max(np.abs(extremal.controls)) == pytest.approx(1)  # the bound is met on the way
+
+
+@pytest.mark.slow
+def test_the_pendulum():
+    extremal = agree("pendulum", (0.5, 0.0))
+    assert extremal.cost == pytest.approx(7.4805, abs=1e-3)
+
+
+def test_a_finite_horizon():
+    """A marched solution: its DV at every time along the path, and as the first guess."""
+    problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x + u @ u, hjb.Box([-9.0], [9.0]))
+    grid, times = hjb.Grid([-1.5], [1.5], (121,)), np.linspace(0, 1.5, 31)
+    marched = hjb.march(problem, grid, 1.5, times=times, scheme=hjb.Weno5())
+    extremal = hjb.pontryagin(problem, [1.0], horizon=1.5, guess=marched)
+    assert extremal.cost == pytest.approx(np.tanh(1.5), abs=1e-8)
+    slopes = marched.costate_at(extremal.times, extremal.states)
+    np.testing.assert_allclose(slopes, extremal.costates, atol=0.02 * np.max(extremal.costates))
+
+
+def test_least_time_from_the_solution_on_a_grid():
+    """To rest at the origin; the grid's feedback chatters where the extremal switches once."""
+    problem, grid = zoo.double_integrator(shape=(41, 41))
+    solution = hjb.solve(problem, grid, tol=1e-4)
+    extremal = hjb.pontryagin(problem, [1.0, 0.0], terminal=[0.0, 0.0], guess=solution)
+    assert extremal.cost == pytest.approx(1 - np.exp(-2), abs=1e-6)
+    assert extremal.switches == pytest.approx([1], abs=1e-6)

@@ -239,6 +239,7 @@ GAME = hjb.Problem(
 NOISY = hjb.Problem(lambda x, u: u, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), noise=0.1, discount=1.0)
 PUSHED = hjb.Problem(lambda x, u: u, lambda x, u: 1 + x @ x + u @ u, hjb.Box([-1.0], [1.0]))
 IDLE = hjb.Problem(lambda x, u: u, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), discount=1.0)
+ADRIFT = hjb.Problem(lambda x, u: 2 + u, lambda x, u: x @ x + u @ u, hjb.Box([-1.0], [1.0]), discount=1.0)
 HELD = hjb.Problem(lambda x, u: x + u, lambda x, u: (u[0] - 1) ** 2 + 0 * x[0], hjb.Box([1.0], [2.0]))
 
 
@@ -256,7 +257,8 @@ HELD = hjb.Problem(lambda x, u: x + u, lambda x, u: (u[0] - 1) ** 2 + 0 * x[0], 
         (lambda: hjb.pontryagin(RIDER, [1.0], tol=0.0), ValueError, "tol = 0.0"),
         (lambda: hjb.pontryagin(RIDER, [1.0], max_nodes=0), ValueError, "max_nodes = 0"),
         (lambda: hjb.pontryagin(PUSHED, [1.0]), ValueError, "costs 1 per unit time, without discount"),
-        (lambda: hjb.pontryagin(HELD, [1.0]), ValueError, "no rest of the Hamiltonian flow"),
+        (lambda: hjb.pontryagin(HELD, [1.0]), ValueError, "at its bound, and the Riccati equation needs room"),
+        (lambda: hjb.pontryagin(ADRIFT, [1.0]), ValueError, "no rest of the Hamiltonian flow near x = .0.0."),
         (lambda: hjb.pontryagin(IDLE, [1.0]), ValueError, "controls that jump, without a Riccati equation"),
         (lambda: hjb.FreeTime(0.0), ValueError, "guess = 0.0, wanted a finite number > 0"),
     ],

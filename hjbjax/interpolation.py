@@ -159,7 +159,7 @@ def _slope_along(grid: Grid, values: Any, axis: int, moment: tuple, nodes: list,
     count, cyclic = grid.shape[axis], grid.periodic[axis]  # type: ignore[index]
     row, at = [], []
     coordinates = jnp.asarray(grid.axis(axis), fraction.dtype)
-    for shift in (-1, 0, 1, 2):
+    for shift in (-2, -1, 0, 1, 2):
         index = cell + shift
         there = list(nodes)
         there[axis] = index % count if cyclic else jnp.clip(index, 0, count - 1)
@@ -167,18 +167,19 @@ def _slope_along(grid: Grid, values: Any, axis: int, moment: tuple, nodes: list,
         row.append(jnp.where(outside, jnp.nan, values[(*moment, *there)]))
         at.append(coordinates[there[axis]])
     spacing = grid.spacing(axis)
-    widths = [jnp.asarray(spacing, fraction.dtype)] * 3 if cyclic else [b - a for a, b in itertools.pairwise(at)]
+    widths = [jnp.asarray(spacing, fraction.dtype)] * 4 if cyclic else [b - a for a, b in itertools.pairwise(at)]
     widths = [jnp.where(width > 0, width, 1) for width in widths]
-    down, here, up = (
+    far, down, here, up = (
         jnp.where(jnp.isfinite(b - a), b - a, jnp.nan) / width
         for (a, b), width in zip(itertools.pairwise(row), widths, strict=True)
     )
-    bend_down, bend_up = (here - down) / (widths[0] + widths[1]), (up - here) / (widths[1] + widths[2])
+    slopes = (far, down, here, up)
+    bend_far, bend_down, bend_up = ((slopes[k + 1] - slopes[k]) / (widths[k] + widths[k + 1]) for k in range(3))
     first_bend = jnp.where(jnp.isnan(bend_down), jnp.nan_to_num(bend_up), bend_down)
     last_bend = jnp.where(jnp.isnan(bend_up), jnp.nan_to_num(bend_down), bend_up)
-    # at a node whose neighbour in the cell is lost, the slope from the other side is all there is
-    first = jnp.where(jnp.isnan(here), down, here - widths[1] * first_bend)
-    last = jnp.where(jnp.isnan(here), up, here + widths[1] * last_bend)
+    # on the last node before an infinite one the cell is lost, and the parabola is that of the other side
+    first = jnp.where(jnp.isnan(here), down + widths[1] * jnp.nan_to_num(bend_far), here - widths[2] * first_bend)
+    last = here + widths[2] * last_bend
     mixed = (1 - fraction) * first + fraction * last
     return jnp.where(fraction == 0, first, jnp.where(fraction == 1, last, mixed))
 

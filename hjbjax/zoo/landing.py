@@ -12,6 +12,7 @@ the edge of that region where its burn begins, so the value elsewhere does not c
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 from hjbjax.grid import Grid
@@ -20,7 +21,8 @@ from hjbjax.pytree import node
 from hjbjax.sets import Box
 from hjbjax.zoo.ingredients import answer, positive
 
-NEWTON = 10  # steps for the square root of E, which is nearly linear in q: quadratic from the first on
+NEWTON = 6  # steps for the square root of E, which is nearly linear in q: quadratic from the first on
+EXACT = 2  # of them, the last ones, carry derivatives: the first and the second
 
 
 @node()
@@ -69,7 +71,9 @@ class Lander:
         pull = self.thrust / mass
         # with a constant mass E = v²/2 · U/(U − gm), and a lighter rocket needs less
         q = self.consumption * jnp.sqrt(2 * energy * pull / jnp.maximum(pull - self.gravity, 0.1 * pull))
-        for _ in range(NEWTON):
+        for step in range(NEWTON):
+            if step == NEWTON - EXACT:
+                q = jax.lax.stop_gradient(q)
             duration, first, start = self._begin(q, mass)
             needed = 0.5 * first * first + self.gravity * start
             # ∂E/∂q = v₁ ∂v₁/∂q + g ∂h₁/∂q

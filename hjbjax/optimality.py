@@ -110,7 +110,9 @@ def assemble(ask: TwoPoint, s: np.ndarray, y: np.ndarray, theta: np.ndarray, cod
     lengths = np.asarray(ask.durations(jnp.asarray(theta)))
     begins, stacked = np.cumsum(lengths) - lengths, y.reshape(ask.count, -1, len(s))
     parts, moved = [], 0.0
-    for begin, length, z, corner in zip(begins, lengths, stacked, np.asarray(ask.arcs), strict=True):
+    for number, (begin, length, z, corner) in enumerate(
+        zip(begins, lengths, stacked, np.asarray(ask.arcs), strict=True)
+    ):
         t = begin + s * length
         part = {name: np.asarray(each) for name, each in measure(arrays, t, z, corner).items()}
         gone = np.full(len(s), moved)
@@ -120,7 +122,8 @@ def assemble(ask: TwoPoint, s: np.ndarray, y: np.ndarray, theta: np.ndarray, cod
         part["constant"], moved = part["constant"] - gone, gone[-1]
         if code is Status.CONVERGED and length <= EMPTY * lengths.sum():  # an arc that begins where it ends
             continue
-        parts.append({**part, "t": t, "z": z.T})
+        states = z[: ask.n].T + (0.0 if ask.shifts is None else ask.shifts[number])
+        parts.append({**part, "t": t, "z": np.concatenate([states, z[ask.n :].T], 1)})
 
     def joined(name, last=True):
         """Over all arcs; at a switch the next arc's."""
@@ -141,7 +144,7 @@ def assemble(ask: TwoPoint, s: np.ndarray, y: np.ndarray, theta: np.ndarray, cod
         controls=joined("u", last=False),
         costates=z[:, n : 2 * n],
         values=z[:, -1],
-        switches=np.array([part["t"][0] for part in parts[1:]]),
+        switches=np.array([part["t"][0] for part in parts[1:] if not ask.seams]),
         cost=float(z[0, -1]),
         horizon=float(lengths.sum()),
         optimality_check=check,

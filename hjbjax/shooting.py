@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax import first_guess
+from hjbjax import first_guess, seams
 from hjbjax.optimality import Extremal, assemble
 from hjbjax.status import Status
 from hjbjax.two_point import Closing, TwoPoint, collocate
@@ -105,6 +105,10 @@ def smooth(ask: TwoPoint, times: np.ndarray, columns: np.ndarray, limits: Limits
       limits: how far to go.
       trusted: whether the guess is of the very problem, so that easier ones would lead away from it.
     """
+    apart = seams.split(ask, times, columns)
+    if apart is not None:
+        multiplier = unknowns(ask, times, columns)[int(ask.timed) :]
+        return _arrived(attempt(*apart[:3], np.append(apart[3], multiplier), limits))
     found = attempt(ask, times / times[-1], columns, unknowns(ask, times, columns), limits)
     if not found.solved and not trusted:
         found = _continued(found, limits)
@@ -155,13 +159,26 @@ def _continued(failed: Found, limits: Limits) -> Found:
     return found or failed
 
 
+def _arrived(found: Found) -> Found:
+    """A path over an infinite horizon, unless it has not come near its rest."""
+    ask = found.ask
+    last = found.y.reshape(ask.count, -1, len(found.s))[-1, : ask.n, -1]
+    if ask.closing is not Closing.REST or not found.solved or _near(ask, last):
+        return found
+    trouble = f"the path has not settled at its rest by t = {found.horizon:.3g}; give another guess"
+    return dataclasses.replace(found, code=Status.STALLED, trouble=trouble)
+
+
+def _near(ask: TwoPoint, last: np.ndarray) -> bool:
+    return bool(np.linalg.norm(last - ask.rest.state) <= SETTLED * (1 + np.linalg.norm(ask.rest.state)))
+
+
 def _settled(found: Found, limits: Limits) -> Found:
     """An infinite horizon cut where the path is near enough to its rest."""
     for _ in range(EXTENSIONS):
         ask = found.ask
         last = found.y[: ask.n, -1]
-        near = np.linalg.norm(last - ask.rest.state) <= SETTLED * (1 + np.linalg.norm(ask.rest.state))
-        if near or not found.solved:
+        if _near(ask, last) or not found.solved:
             return found
         more = float(ask.horizon) * (LONGER - 1)
         times, columns = first_guess.into_rest(ask, last, more)

@@ -60,7 +60,7 @@ class Rest:
     matrix: Any
 
 
-@node(static=("rule", "law", "closing", "held", "free"))
+@node(static=("rule", "law", "closing", "held", "free", "seams"))
 class TwoPoint:
     """One boundary-value problem.
 
@@ -74,11 +74,15 @@ class TwoPoint:
       rest: of an infinite horizon.
       arcs: the value of the jumping inputs on every arc, shape (k, m); (1, m) without arcs.
       epsilon: ε of a mixture, in cost units per unit time.
+      shifts: what is to be added to the states of every arc, shape (k, n): whole periods, between arcs that end at the
+        seam of a periodic axis; ``None`` for zero.
+      places: where on its axis every such arc but the last ends, shape (k−1,).
       rule: how the Hamiltonian is minimised.
       law: where the control comes from.
       closing: what holds at the end.
       held: which end states are given.
       free: whether the final time is sought.
+      seams: the axis along which every arc but the last meets its end; empty where arcs end by a switch.
     """
 
     problem: Problem
@@ -95,6 +99,9 @@ class TwoPoint:
     closing: Closing
     held: tuple[bool, ...]
     free: bool
+    shifts: Any = None
+    places: Any = None
+    seams: tuple[int, ...] = ()
 
     @property
     def count(self) -> int:
@@ -182,8 +189,12 @@ def conditions(ask: TwoPoint, first: Any, last: Any, theta: Any) -> Any:
     """What has to vanish at the ends of the arcs, shape (k·(2n+1) + unknowns,)."""
     first, last = first.reshape(ask.count, -1), last.reshape(ask.count, -1)
     times = jnp.cumsum(ask.durations(theta))
-    left = [first[0, : ask.n] - ask.start, (last[:-1] - first[1:]).reshape(-1)]
-    for i in range(ask.count - 1):
+    joints = last[:-1] - first[1:]
+    if ask.seams:
+        joints = joints.at[:, : ask.n].add(ask.shifts[:-1] - ask.shifts[1:])
+    left = [first[0, : ask.n] - ask.start, joints.reshape(-1)]
+    left += [(last[i, axis] - ask.places[i])[None] for i, axis in enumerate(ask.seams)]
+    for i in range(ask.count - 1 if not ask.seams else 0):
         x, p, _ = ask.split(last[i])
         before, after = (_energy(ask, times[i], x, p, ask.arcs[i + j]) for j in (0, 1))
         left.append((before - after)[None])
@@ -201,7 +212,8 @@ def _closing(ask: TwoPoint, t: Any, z: Any, theta: Any) -> Any:
     if ask.closing is Closing.REST:
         away, rest = x - ask.rest.state, ask.rest
         bent = rest.matrix @ away
-        return jnp.concatenate([p - rest.costate - bent, (w - rest.value - (rest.costate + bent / 2) @ away)[None]])
+        left = [p - rest.costate - bent, (w - rest.value - (rest.costate + bent / 2) @ away)[None]]
+        return jnp.concatenate([*left, (t - ask.horizon)[None]] if ask.count > 1 else left)
     given = [ask.ends[i] if held else x[i] for i, held in enumerate(ask.held)]
     # A value that is only Hölder at a given end must not be differentiated there.
     end = jax.lax.stop_gradient(ask.ends) if all(ask.held) else jnp.stack(given)

@@ -189,6 +189,21 @@ def test_a_ball_and_the_edge_of_a_target():
     np.testing.assert_allclose(disc.costates, slopes, atol=1e-6)
 
 
+@pytest.mark.parametrize("way", [1, -1])
+def test_across_a_seam(way):
+    """The cost 2 − 2 cos x is smooth there, so that one collocation over the seam is right as well."""
+    problem = hjb.Problem(lambda x, u: u, lambda x, u: 2 - 2 * jnp.cos(x[0]) + u @ u, hjb.Box([-9.0], [9.0]))
+    grid = hjb.Grid([-np.pi], [np.pi], (8,), (True,))
+    straight = {"horizon": 2.0, "terminal": [way * 4.0]}
+    parted = hjb.pontryagin(problem, [way * 2.0], grid=grid, **straight)
+    whole = hjb.pontryagin(problem, [way * 2.0], **straight)
+    assert passes(parted)
+    assert parted.cost == pytest.approx(whole.cost, abs=1e-7)
+    np.testing.assert_allclose(parted.costates[[0, -1]], whole.costates[[0, -1]], atol=1e-6)
+    np.testing.assert_allclose(parted.states[[0, -1], 0], [2 * way, 4 * way], atol=1e-9)
+    assert np.any(np.abs(parted.states[:, 0] - way * np.pi) < 1e-9)
+
+
 def test_a_failed_solve_says_so():
     """Against ẋ = −x no force below ½ gets beyond ½."""
     slow = hjb.Problem(lambda x, u: u - x, lambda x, u: u @ u, hjb.Box([-0.5], [0.5]))

@@ -46,9 +46,24 @@ def test_van_der_pol(start):
     assert np.max(np.abs(extremal.controls)) == pytest.approx(1)  # the bound is met on the way
 
 
-def test_the_pendulum():
-    extremal = agree("pendulum", (0.5, 0.0))
-    assert extremal.cost == pytest.approx(7.4805, abs=1e-3)
+@pytest.mark.parametrize(
+    ("start", "turns"),
+    [((0.5, 0.0), 0), ((2.8, 0.0), 0), pytest.param((-2.0, -2.0), -1, marks=pytest.mark.slow)],
+)
+def test_the_pendulum(start, turns):
+    """Lifted straight up; swung to and fro across the seam at ±π; and all the way round."""
+    extremal = agree("pendulum", start)
+    np.testing.assert_allclose(extremal.states[-1], [2 * np.pi * turns, 0], atol=1e-4)
+    assert np.all(np.abs(np.diff(extremal.states[:, 0])) < 0.5)  # no jump where the angle is wrapped
+    assert len(extremal.switches) == 0
+
+
+@pytest.mark.slow
+def test_going_round_costs_what_another_code_says():
+    """The number of ``test_limited_pendulum``, which follows the extremals from many first guesses of its own."""
+    problem, solution = solved("pendulum", False)
+    extremal = hjb.pontryagin(problem, [np.pi / 4, 0.0], guess=solution)
+    assert extremal.cost == pytest.approx(13.3240, abs=1e-3)
 
 
 def test_a_finite_horizon():

@@ -59,7 +59,7 @@ def rule_of(problem: Problem, n: int) -> Rule:
     inputs = tuple(range(problem.controls.dim))
     lengths = [(None, False)] * problem.time_dependent + [(n, False), (len(inputs), True)]
     functions = [problem.drift] if problem.cost is None else [problem.drift, problem.cost]
-    found = [dependence(function, *lengths, dtype=np.float64) for function in functions]
+    found = [dependence(function, *lengths, dtype=jnp.result_type(float)) for function in functions]
     if not all(each.separable_quadratic_in(inputs) for each in found):
         return Rule(exact=False)
     straight = tuple(j for j in inputs if not any(each.has_square((j,)) for each in found))

@@ -5,6 +5,7 @@ from hjbjax._version import __version__
 from hjbjax.batch import solve_batch
 from hjbjax.convergence import convergence_study
 from hjbjax.dissipation import dissipation
+from hjbjax.extremals import FreeTime, pontryagin
 from hjbjax.fields import FallbackWarning
 from hjbjax.files import FileError
 from hjbjax.gain import attenuation, saturation
@@ -38,6 +39,7 @@ __all__ = [
     "FallbackWarning",
     "FileError",
     "Finite",
+    "FreeTime",
     "Grid",
     "Implicit",
     "Krylov",
@@ -69,6 +71,7 @@ __all__ = [
     "march",
     "perturbation_study",
     "plotting",
+    "pontryagin",
     "reach",
     "reach_avoid",
     "reach_probability",

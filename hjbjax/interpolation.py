@@ -2,6 +2,8 @@
 
 With the cell's corners c and fractions s_i of the way along each axis, w_c = Π_i (s_i or 1 − s_i) and
 V(x) = Σ_c w_c V_c: second order, exact for multilinear V, and never beyond the range of the corners.
+
+The slopes DV are found at the nodes and interpolated likewise: second order where V is smooth, exact for quadratic V.
 """
 
 import functools
@@ -117,6 +119,69 @@ def nearest(grid: Grid, values: Any, x: Any, clamp: bool, when: Any = None) -> j
         nearer = defined & (weight > largest * (1 + 8 * jnp.finfo(x.dtype).eps))
         answer, largest = jnp.where(nearer[..., None], there, answer), jnp.where(nearer, weight, largest)
     return answer
+
+
+@functools.partial(jax.jit, static_argnames="clamp")
+def slopes_between(grid: Grid, values: Any, x: Any, clamp: bool, when: Any = None) -> jax.Array:
+    """DV, shape ``x.shape[:-1] + (n,)``: the slopes at the corners of the cell, interpolated."""
+    values, x = jnp.asarray(values), grid.wrap(x)
+    places = [grid._locate(axis, x[..., axis]) for axis in range(grid.ndim)]
+    hidden = jnp.any(jnp.isnan(x), axis=-1) | ((not clamp) & ~jnp.all(jnp.stack([p[2] for p in places]), axis=0))
+    layers: list[tuple[Any, tuple]] = [(jnp.ones((), x.dtype), ())]
+    if when is not None:
+        before, share, known = when
+        layers = [(1 - share, (before,)), (share, (jnp.minimum(before + 1, values.shape[0] - 1),))]
+        hidden |= (not clamp) & ~known
+    slopes = []
+    for axis in range(grid.ndim):
+        total: Any = 0.0
+        others = [(0, 1) if other != axis else (0,) for other in range(grid.ndim)]
+        for (layer, moment), corner in itertools.product(layers, itertools.product(*others)):
+            weight, nodes = layer, []
+            for other, bit in enumerate(corner):
+                cell, fraction, _ = places[other]
+                nodes.append((cell + bit) % grid.shape[other])
+                if other != axis:
+                    weight = weight * (fraction if bit else 1 - fraction)
+            row = _slope_along(grid, values, axis, moment, nodes, places[axis])
+            total = total + weight * jnp.where((weight == 0) & ~jnp.isfinite(row), 0, row)
+        slopes.append(total)
+    return jnp.where(hidden[..., None], jnp.nan, jnp.stack(slopes, axis=-1))
+
+
+def _slope_along(grid: Grid, values: Any, axis: int, moment: tuple, nodes: list, place: tuple) -> Any:
+    """The slope along one axis on the edge of the cell that begins at ``nodes``, linear between its two ends.
+
+    At a node it is that of the parabola through it and its neighbours; beside an end of the axis, or a node whose value
+    is not finite, that of the parabola through the next three, or what is left of it.
+    """
+    cell, fraction, _ = place
+    count, cyclic = grid.shape[axis], grid.periodic[axis]  # type: ignore[index]
+    row, at = [], []
+    coordinates = jnp.asarray(grid.axis(axis), fraction.dtype)
+    for shift in (-2, -1, 0, 1, 2):
+        index = cell + shift
+        there = list(nodes)
+        there[axis] = index % count if cyclic else jnp.clip(index, 0, count - 1)
+        outside = jnp.zeros((), bool) if cyclic else (index < 0) | (index > count - 1)
+        row.append(jnp.where(outside, jnp.nan, values[(*moment, *there)]))
+        at.append(coordinates[there[axis]])
+    spacing = grid.spacing(axis)
+    widths = [jnp.asarray(spacing, fraction.dtype)] * 4 if cyclic else [b - a for a, b in itertools.pairwise(at)]
+    widths = [jnp.where(width > 0, width, 1) for width in widths]
+    far, down, here, up = (
+        jnp.where(jnp.isfinite(b - a), b - a, jnp.nan) / width
+        for (a, b), width in zip(itertools.pairwise(row), widths, strict=True)
+    )
+    slopes = (far, down, here, up)
+    bend_far, bend_down, bend_up = ((slopes[k + 1] - slopes[k]) / (widths[k] + widths[k + 1]) for k in range(3))
+    first_bend = jnp.where(jnp.isnan(bend_down), jnp.nan_to_num(bend_up), bend_down)
+    last_bend = jnp.where(jnp.isnan(bend_up), jnp.nan_to_num(bend_down), bend_up)
+    # on the last node before an infinite one the cell is lost, and the parabola is that of the other side
+    first = jnp.where(jnp.isnan(here), down + widths[1] * jnp.nan_to_num(bend_far), here - widths[2] * first_bend)
+    last = here + widths[2] * last_bend
+    mixed = (1 - fraction) * first + fraction * last
+    return jnp.where(fraction == 0, first, jnp.where(fraction == 1, last, mixed))
 
 
 def _defined(grid: Grid, values: Any, x: Any, clamp: bool, when: Any) -> Iterator[tuple[Any, Any, Any]]:

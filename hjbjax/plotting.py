@@ -30,6 +30,7 @@ from hjbjax.canvas import (
 )
 from hjbjax.grid import Grid
 from hjbjax.level_sets import animation, zero_level_set
+from hjbjax.momenta import costates
 from hjbjax.perturbations import perturbation
 from hjbjax.sections import at_time, feedback, folded, lifted, section_of, zeros
 
@@ -40,6 +41,7 @@ __all__ = [
     "closed_loop",
     "controls",
     "convergence",
+    "costates",
     "perturbation",
     "policy",
     "residuals",

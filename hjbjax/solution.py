@@ -16,7 +16,7 @@ import numpy as np
 from hjbjax import files
 from hjbjax.files import Expected, FileError
 from hjbjax.grid import Grid
-from hjbjax.interpolation import between, between_defined, nearest, query
+from hjbjax.interpolation import between, between_defined, nearest, query, slopes_between
 from hjbjax.pytree import is_traced, node
 from hjbjax.status import Status
 from hjbjax.stretching import Sinh
@@ -39,7 +39,7 @@ KINDS: dict[str, tuple[type, ...]] = {  # what a file's header holds, as JSON ha
 class SolveError(RuntimeError):
     """A solve that did not converge: the ``message`` says how it ended, ``.solution`` is what there is."""
 
-    def __init__(self, message: str, solution: "Solution | None" = None):
+    def __init__(self, message: str, solution: Any = None):
         super().__init__(message)
         self.solution = solution
 
@@ -147,6 +147,15 @@ class Solution:
           TypeError: states that are not numbers.
         """
         return self._query("value_at", between, self.value, 0, where, clamp)
+
+    def costate_at(self, *where: Any, clamp: bool = False) -> Any:
+        """DV between the nodes, shape ``x.shape[:-1] + (n,)``; arguments and refusals as for ``value_at``.
+
+        The costate of Pontryagin's principle, in current value. Central differences at the nodes (parabolas through
+        three of them beside an end), interpolated: second order where V is smooth; a kink is smeared over two cells.
+        Beside infinite values the differences are one-sided; where there are none, NaN.
+        """
+        return self._query("costate_at", slopes_between, self.value, 0, where, clamp)
 
     def control_at(self, *where: Any, clamp: bool = False) -> Any:
         """u between the nodes, shape ``x.shape[:-1] + (m,)``; arguments and refusals as for ``value_at``.

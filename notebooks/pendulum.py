@@ -99,6 +99,25 @@ plotting.closed_loop(solution, path)[0].figure
 # The cost that the simulated path really pays and the value computed on the grid are two roads to one number. The path
 # uses the feedback between the nodes; the value carries the error of the scheme.
 #
+# ## Pontryagin's costates
+#
+# A third road needs no grid: along an optimal path the costate $\lambda$ of Pontryagin's principle is the gradient of
+# the value. Its boundary-value problem is solved by collocation, from the Riccati feedback as the first guess; the
+# gradient is that of a value by limited slopes, second order.
+
+# %%
+start = [0.5, 0.0]
+extremal = hjb.pontryagin(problem, start, grid=grid)
+limited = hjb.solve(problem, grid, scheme=hjb.Limited())
+print(extremal)
+print(f"V{tuple(start)}: by limited slopes {limited.value_at(start):.4f}, Pontryagin {extremal.cost:.4f}")
+
+figure, ax = plt.subplots(figsize=(6.4, 3.4), layout="constrained")
+plotting.costates(extremal, solution=limited, ax=ax)
+ax.set_xlim(0, 4)
+plt.show()
+
+# %% [markdown]
 # ## As printed
 #
 # The chapter prints (9.4) with the input gain $g/m$ in place of $1/m$. The figures there may have been made with it, so

@@ -457,3 +457,22 @@ def test_a_batch_is_refused():
     solution = line()
     with pytest.raises(ValueError, match="draw one lane at a time"):
         plotting.value(Solution(solution.grid, np.stack([solution.value] * 2), solution.policy))
+
+
+def test_costates_and_the_slopes_of_the_value_lie_on_each_other():
+    grid = Grid([-1.0, -1.0], [1.0, 1.0], (9, 9), names=("place", "speed"))
+    solution = Solution(grid, np.sum(grid.nodes() ** 2, axis=-1), None, code=1)
+    times = np.linspace(0, 1, 6)
+    states = np.stack([0.9 - times, 0.5 - times], axis=-1)
+    states[-1] = [3.0, 0.0]  # outside the grid nothing is drawn
+    extremal = SimpleNamespace(times=times, states=states, costates=2 * states)
+    artists = plotting.costates(extremal, solution=solution)
+    own, slopes = artists[:2], artists[2:4]
+    assert [line.get_label() for line in artists[:4]] == ["λ, place", "λ, speed", "DV, place", "DV, speed"]
+    for line, slope in zip(own, slopes, strict=True):
+        np.testing.assert_allclose(slope.get_ydata()[:-1], line.get_ydata()[:-1], atol=1e-12)
+        assert np.ma.getmaskarray(slope.get_ydata())[-1]
+        assert line.get_color() == slope.get_color()
+    alone = plotting.costates(extremal)
+    assert [line.get_label() for line in alone[:2]] == ["λ, x1", "λ, x2"]
+    assert len(alone) == 3

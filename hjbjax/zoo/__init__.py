@@ -14,6 +14,7 @@ all under the names of the command line.
 from hjbjax.zoo.entry import Entry
 from hjbjax.zoo.finance import Merton, merton, merton_exact
 from hjbjax.zoo.geometric import Angle, CarWithTrailers, OneWay, Pomet, Unicycle
+from hjbjax.zoo.landing import Lander, moon_landing, moon_landing_exact
 from hjbjax.zoo.linear_quadratic import (
     LinearScalar,
     double_integrator_lq,
@@ -117,6 +118,14 @@ _ENTRIES = (
         start=(0.0,),
         duration=10.0,
     ),
+    Entry(
+        "moon-landing",
+        "land a rocket with the least fuel: when to start the engine",
+        moon_landing,
+        moon_landing_exact,
+        start=(1.0, 0.0, 1.0),
+        duration=2.0,
+    ),
     Entry("smooth", "a smooth nonlinear problem made for a known value", smooth, smooth_exact, start=(0.8, 0.5)),
 )
 
@@ -132,6 +141,7 @@ __all__ = [
     "Dubins",
     "Entry",
     "FlexibleJoint",
+    "Lander",
     "LinearScalar",
     "Manipulator",
     "Merton",
@@ -161,6 +171,8 @@ __all__ = [
     "manipulator",
     "merton",
     "merton_exact",
+    "moon_landing",
+    "moon_landing_exact",
     "pendulum",
     "pendulum_near_upright",
     "smooth",

@@ -64,6 +64,8 @@ ANSWERS = [
     ("eikonal", {}, 1e-5),
     ("eikonal", {"norm": 1, "dim": 3, "discount": 0.5}, 1e-12),
     ("eikonal", {"norm": np.inf, "speed": 2.0}, 1e-12),
+    ("moon-landing", {}, 1e-10),
+    ("moon-landing", {"thrust": 2.5, "consumption": 0.4, "gravity": 1.2}, 1e-10),
     ("smooth", {}, 1e-5),
     ("smooth", {"discount": 1.5}, 1e-5),
     ("merton", {}, 1e-10),
@@ -85,7 +87,9 @@ def candidate_controls(name, problem, parameters):
         return directions(2000)
     if problem.is_game:
         return problem.controls.grid(1001).points
-    return problem.controls.grid(3 if name in ("bang-bang", "double-integrator", "eikonal") else 4001).points
+    return problem.controls.grid(
+        3 if name in ("bang-bang", "double-integrator", "eikonal", "moon-landing") else 4001
+    ).points
 
 
 @pytest.mark.parametrize(("name", "parameters", "tolerance"), ANSWERS)
@@ -96,6 +100,9 @@ def test_the_answer_satisfies_its_equation(name, parameters, tolerance, sample_s
     candidates = candidate_controls(name, problem, parameters)
     opponents = problem.disturbances.grid(1001).points if problem.is_game else None
     states = jnp.stack([sample_state(grid, seed) for seed in range(12)])
+    if name == "moon-landing":  # who falls too fast has no landing, and a value that is held
+        states = states[jax.vmap(problem.target)(states) > 0]
+        assert len(states) > 4
     if name == "brownian-ball":
         states = states * 0.5
     residual = jax.jit(equation_residuals)(problem, value, states, candidates, opponents)
@@ -111,7 +118,10 @@ def test_a_wrong_answer_does_not_satisfy_the_equation(entry, sample_state):
     candidates = candidate_controls(entry.name, problem, {})
     opponents = problem.disturbances.grid(1001).points if problem.is_game else None
     x = sample_state(grid, 5, shrink=0.6)
-    off = jax.jit(lambda x: equation_residual(problem, lambda y: 1.01 * value(y), x, candidates, opponents))(x)
+    # Fuel is not spent while coasting, so that equation is homogeneous: there the wrong value is one that leans.
+    lean = 0.01 if entry.name == "moon-landing" else 0.0
+    wrong = lambda y: 1.01 * value(y) + lean * y[1]  # noqa: E731
+    off = jax.jit(lambda x: equation_residual(problem, wrong, x, candidates, opponents))(x)
     assert abs(off) > 1e-3 * min(1.0, float(value(x)))
 
 

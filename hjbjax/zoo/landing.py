@@ -1,0 +1,143 @@
+"""The Moon landing with the least fuel: ḣ = v, v̇ = −g + u/m, ṁ = −ku, 0 ≤ u ≤ U, from (h, v, m) to h = v = 0.
+
+The best thrust is none, then all. On a coast neither the mass nor the energy E = ½v² + gh changes, so the burn that
+starts at mass m and brings E to zero is all there is to find. With e^{−q} the share of the mass that is left,
+
+    τ = m(1 − e^{−q})/(kU),   v₁ = gτ − q/k,   h₁ = −v₁τ + ½gτ² − (m/(k²U))(1 − e^{−q}(1 + q)),   ½v₁² + g h₁ = E
+
+are its duration, its first velocity and height, and the equation for q; the fuel is m(1 − e^{−q}). Who falls faster
+than v₁ crashes. On a grid the value is held there, at the number that the same formula gives: a path that lands meets
+the edge of that region where its burn begins, so the value elsewhere does not change.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from hjbjax.grid import Grid
+from hjbjax.problem import Problem
+from hjbjax.pytree import node
+from hjbjax.sets import Box
+from hjbjax.zoo.ingredients import answer, positive
+
+NEWTON = 6  # steps for the square root of E, which is nearly linear in q: quadratic from the first on
+EXACT = 2  # of them, the last ones, carry derivatives: the first and the second
+
+
+@node()
+class Lander:
+    """A rocket above the ground, state (h, v, m), its thrust u upwards.
+
+    Args:
+      thrust: U, above g·m or it cannot hold itself.
+      consumption: k, mass per unit of thrust and time.
+      gravity: g.
+
+    Example:
+      >>> round(float(Lander().fuel(jnp.array([1.0, 0.0, 1.0]))), 4)
+      0.4102
+    """
+
+    thrust: Any = 2.0
+    consumption: Any = 0.3
+    gravity: Any = 1.0
+
+    def __post_init__(self):
+        positive("Lander", thrust=self.thrust, consumption=self.consumption, gravity=self.gravity)
+
+    def drift(self, x: Any, u: Any) -> Any:
+        """(v, −g + u/m, −ku)."""
+        return jnp.stack([x[1], -self.gravity + u[0] / x[2], -self.consumption * u[0]])
+
+    def fuel_rate(self, x: Any, u: Any) -> Any:
+        """ku, mass per unit of time."""
+        return self.consumption * u[0]
+
+    def _begin(self, q: Any, mass: Any) -> tuple[Any, Any, Any]:
+        """Duration, first velocity and first height of the burn that leaves the share e^{−q} of a mass."""
+        left, k = jnp.exp(-q), self.consumption
+        duration = mass * (1 - left) / (k * self.thrust)
+        velocity = self.gravity * duration - q / k
+        climbed = mass * (1 - left * (1 + q)) / (k * k * self.thrust)
+        return duration, velocity, -velocity * duration + 0.5 * self.gravity * duration * duration - climbed
+
+    def _ratio(self, x: Any) -> Any:
+        """q; zero at rest on the ground."""
+        height, velocity, mass = x[0], x[1], x[2]
+        energy = 0.5 * velocity * velocity + self.gravity * height
+        resting = energy <= 0
+        energy = jnp.where(resting, 1.0, energy)
+        pull = self.thrust / mass
+        # with a constant mass E = v²/2 · U/(U − gm), and a lighter rocket needs less
+        q = self.consumption * jnp.sqrt(2 * energy * pull / jnp.maximum(pull - self.gravity, 0.1 * pull))
+        for step in range(NEWTON):
+            if step == NEWTON - EXACT:
+                q = jax.lax.stop_gradient(q)
+            duration, first, start = self._begin(q, mass)
+            needed = 0.5 * first * first + self.gravity * start
+            # ∂E/∂q = v₁ ∂v₁/∂q + g ∂h₁/∂q
+            longer = mass * jnp.exp(-q) / (self.consumption * self.thrust)
+            faster = self.gravity * longer - 1 / self.consumption
+            higher = (
+                -faster * duration - first * longer + self.gravity * duration * longer - q * longer / self.consumption
+            )
+            slope = first * faster + self.gravity * higher
+            # Newton's step for √needed − √energy
+            q = q - 2 * (needed - jnp.sqrt(needed * energy)) / slope
+        return jnp.where(resting, 0.0, q)
+
+    def fuel(self, x: Any) -> Any:
+        """The least fuel to land, m(1 − e^{−q}); of a rocket that falls too fast what the formula gives."""
+        x = jnp.asarray(x)
+        return x[2] * (1 - jnp.exp(-self._ratio(x)))
+
+    def margin(self, x: Any) -> Any:
+        """v − v₁: how much faster it may yet fall; 0 where the burn has to begin, below it crashes."""
+        return x[1] - self._begin(self._ratio(x), x[2])[1]
+
+    def ignition(self, x: Any) -> tuple[Any, Any]:
+        """When the engine starts, and how long it burns."""
+        x = jnp.asarray(x)
+        return self.margin(x) / self.gravity, self._begin(self._ratio(x), x[2])[0]
+
+
+def moon_landing(
+    *,
+    thrust: Any = 2.0,
+    consumption: Any = 0.3,
+    gravity: Any = 1.0,
+    shape: tuple[int, ...] = (41, 51, 9),
+) -> tuple[Problem, Grid]:
+    """Land on the Moon with the least fuel, on [0, 1.5] × [−2, 0.5] × [0.3, 1]; 0 ≤ u ≤ thrust.
+
+    The value is held where a soft landing takes full thrust or more; the grid has to find the coast. Give
+    ``pontryagin`` the end ``terminal=[0, 0, nan]``, and it finds the burn as well. Close to the ceiling, rising, the
+    box is left.
+
+    Args:
+      thrust: U, the largest.
+      consumption: k.
+      gravity: g.
+      shape: nodes in height, velocity and mass.
+    """
+    lander = Lander(thrust, consumption, gravity)
+    problem = Problem(
+        lander.drift,
+        lander.fuel_rate,
+        Box([0.0], [thrust]),
+        target=lander.margin,
+        exit_cost=answer(lander.fuel),
+    )
+    return problem, Grid([0.0, -2.0, 0.3], [1.5, 0.5, 1.0], shape, names=("height", "velocity", "mass"))
+
+
+def moon_landing_exact(*, thrust: Any = 2.0, consumption: Any = 0.3, gravity: Any = 1.0) -> Any:
+    """m(1 − e^{−q}), with q of the burn that takes away the energy ½v² + gh.
+
+    Args:
+      thrust: U.
+      consumption: k.
+      gravity: g.
+    """
+    return answer(Lander(thrust, consumption, gravity).fuel)

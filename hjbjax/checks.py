@@ -14,7 +14,7 @@ import numpy as np
 from hjbjax import sets
 from hjbjax.grid import Grid
 from hjbjax.problem import Problem
-from hjbjax.pytree import by_structure
+from hjbjax.pytree import remembered
 
 OF_ACTION = ("drift", "cost", "noise")
 STATE_COSTS = ("exit_cost", "terminal_cost", "stopping_cost", "running_max")
@@ -154,7 +154,7 @@ def _probe(problem: Problem, name: str, n: int) -> tuple[int, ...] | str:
         raise
 
 
-@by_structure
+@remembered
 def _traced(function: Callable, lengths: tuple[tuple[int, ...], ...]) -> tuple[int, ...] | str:
     """What a function returns for arguments of these shapes."""
     verdicts = []

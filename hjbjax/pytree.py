@@ -9,6 +9,7 @@ tracers and stacked arrays, which no check of values could pass.
 import copy
 import dataclasses
 import functools
+import hashlib
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeVar, dataclass_transform
 
@@ -94,19 +95,20 @@ def is_traced(*trees: Any) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
 
 
-def by_structure(function: Callable[..., T]) -> Callable[..., T]:
-    """Remember answers by the structure of the first argument, not by its numbers.
+def remembered(function: Callable[..., T]) -> Callable[..., T]:
+    """Remember answers by the first argument, a pytree, with the numbers in it; while those are traced ask anew.
 
-    For facts read off a trace of a function of the user's: they are the same for every mass and every discount, and
-    tracing costs more than a small solve. The other arguments must be hashable; only answers are kept, no exceptions.
+    For facts read off a trace of a function of the user's: tracing costs more than a small solve. The other arguments
+    must be hashable; only answers are kept, no exceptions.
     """
     answers: dict[Any, T] = {}
 
     @functools.wraps(function)
     def ask(tree: Any, *arguments: Any, **options: Any) -> T:
+        if is_traced(tree):
+            return function(tree, *arguments, **options)
         leaves, structure = jax.tree.flatten(tree)
-        kinds = tuple((jax.numpy.shape(leaf), jax.numpy.result_type(leaf)) for leaf in leaves)
-        key = (structure, kinds, arguments, tuple(options.items()))
+        key = (structure, tuple(map(_digest, leaves)), arguments, tuple(options.items()))
         if key not in answers:
             answers[key] = function(tree, *arguments, **options)
             if len(answers) > REMEMBERED:
@@ -114,6 +116,12 @@ def by_structure(function: Callable[..., T]) -> Callable[..., T]:
         return answers[key]
 
     return ask
+
+
+def _digest(leaf: Any) -> tuple[Any, ...]:
+    """What tells one leaf from another: its type, its shape and its numbers."""
+    array = np.ascontiguousarray(leaf)
+    return type(leaf), array.shape, array.dtype, hashlib.blake2b(array.tobytes(), digest_size=16).digest()
 
 
 def numbers(value: Any, name: str) -> Any:

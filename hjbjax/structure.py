@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from hjbjax import fields
-from hjbjax.pytree import by_structure
+from hjbjax.pytree import remembered
 
 Monomials = frozenset | None
 CONSTANT: Monomials = frozenset({()})
@@ -62,12 +62,12 @@ class Dependence:
         return any(entry is None or any(m == (j, j) for m in entry for j in inputs) for entry in self.entries)
 
 
-@by_structure
+@remembered
 def dependence(function: Callable, *arguments: tuple[int | None, bool], dtype: Any) -> Dependence:
     """The dependence of ``function`` on those of its arguments that are controls.
 
     Args:
-      function: a function of one state, as a problem holds it: a pytree, whose numbers do not matter.
+      function: a function of one state, as a problem holds it: a pytree.
       *arguments: for every argument (length, counts): its length (``None`` for a scalar), and whether its
         entries are inputs; inputs are numbered through all counted arguments.
       dtype: the floating-point type in which it is traced.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hjbjax import structure
-from hjbjax.pytree import as_partial
+from hjbjax.pytree import as_partial, node
 
 MATRIX = np.array([[1.0, 2.0], [0.5, -1.0]])
 ARGUMENTS = ((3, False), (2, True))  # a state of three entries, a control of two
@@ -115,3 +115,19 @@ def test_inputs_are_numbered_through_both_players():
 
 def test_a_control_without_entries():
     assert dependence(lambda x, u: x + jnp.sum(u), ((3, False), (0, True))).is_constant
+
+
+@node()
+class Power:
+    """(u₀ − ½)^p with p a number of the problem: what it is decides what can be proved."""
+
+    exponent: object
+
+    def __call__(self, x, u):
+        return (u[0] - 0.5) ** self.exponent
+
+
+def test_numbers_decide_what_is_proved():
+    assert dependence(Power(2)).separable_quadratic_in([0])
+    assert not dependence(Power(4)).separable_quadratic_in([0])
+    assert dependence(Power(2)).separable_quadratic_in([0])

@@ -5,6 +5,7 @@ between two chunks.
 """
 
 import contextlib
+import dataclasses
 import signal
 import sys
 import threading
@@ -12,6 +13,7 @@ import time
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from hjbjax import iteration
@@ -48,14 +50,10 @@ def drive(task: Task, guess: jax.Array, clock: Clock, most: int | None = None) -
       The last state, how it ended, and the residuals of all steps, that of the guess first.
     """
     limit = clock.max_steps if most is None else min(most, clock.max_steps)
-    state, residuals, chunk, done = (
-        iteration.begin(task, guess),
-        [np.zeros(0)],
-        1,
-        -1,
-    )  # step −1 is the look at the guess
+    state, residuals = iteration.begin(task, guess), [np.zeros(0)]
+    chunk, done = 1, -1  # step −1 is the look at the guess
     if clock.interrupted:
-        return state, Status.INTERRUPTED, residuals[0]
+        return _imposed(task, state), Status.INTERRUPTED, residuals[0]
     code = Status.RUNNING
     with _bar(clock.progress, float(task.tol)) as show, noting_interrupts(clock):
         try:
@@ -78,7 +76,14 @@ def drive(task: Task, guess: jax.Array, clock: Clock, most: int | None = None) -
         except KeyboardInterrupt:
             clock.interrupted, code = True, Status.INTERRUPTED
             residuals.append(np.asarray(state.history)[: int(state.step) - done])  # of steps not yet written down
+    if code in (Status.INTERRUPTED, Status.NONFINITE):
+        state = _imposed(task, state)
     return state, code, np.concatenate(residuals)[: int(state.step) + 1]
+
+
+def _imposed(task: Task, state: State) -> State:
+    """The state with what is given at its nodes, which a guess that nobody looked at does not have."""
+    return dataclasses.replace(state, value=task.rules.impose(jnp.asarray(state.value)))
 
 
 @contextlib.contextmanager

@@ -144,6 +144,8 @@ def _message(task: March, front: Front, code: Status) -> str:
         "disturbances tells how fast; where the bound is meant, give inner=0.",
         Status.NONFINITE: "NaN or infinity appeared in the step after, and the last finite value is kept; check drift "
         "and costs there, or take a shorter step.",
+        Status.TIME_LIMIT: "The time ran out; raise time_limit, or march on from the value so far with start=.",
+        Status.INTERRUPTED: "It was interrupted and the value so far is kept; march on from it with start=.",
         Status.STALLED: "The policy iteration of an implicit step did not come to its end; take a shorter step.",
     }
     return f"The march stopped at t = {t:.6g} on its way from {horizon:g}. {what.get(code, code.message)}"

@@ -32,10 +32,10 @@ class Status(enum.IntEnum):
 MESSAGES = {
     Status.RUNNING: "The solve has not ended; let it run on.",
     Status.CONVERGED: "The residual meets the tolerance; nothing is left to do.",
-    Status.MAX_STEPS: "The steps ran out above the tolerance; raise max_steps, or start again from the value so far.",
+    Status.MAX_STEPS: "The steps ran out above the tolerance; raise max_steps, or go on from here with guess=.",
     Status.STALLED: "The residual stopped falling above the tolerance; loosen tol or compute in float64.",
     Status.DIVERGED: "The residual grew; check discount and target, take a better guess or another method.",
     Status.NONFINITE: "NaN or infinity appeared and the last finite value is kept; check drift and cost there.",
-    Status.INTERRUPTED: "The solve was interrupted and the value so far is kept; start again from it.",
-    Status.TIME_LIMIT: "The time ran out above the tolerance; raise time_limit, or start again from the value so far.",
+    Status.INTERRUPTED: "The solve was interrupted and the value so far is kept; go on from it with guess=.",
+    Status.TIME_LIMIT: "The time ran out above the tolerance; raise time_limit, or go on from here with guess=.",
 }

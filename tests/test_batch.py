@@ -118,6 +118,7 @@ class Current:
         return u + jnp.where(x > 0, self.rate, 0)
 
 
+@pytest.mark.slow
 def test_lanes_that_arrive_and_lanes_that_do_not_go_together():
     line = hjb.Grid([-1.0], [1.0], (41,))
     with pytest.warns(hjb.SolveWarning, match="cannot reach the target"):
@@ -130,6 +131,7 @@ def test_no_problems_have_no_solutions():
     assert hjb.solve_batch([], GRID) == []
 
 
+@pytest.mark.slow
 def test_lanes_keep_single_precision():
     (solution,) = hjb.solve_batch([problem(1.0)], GRID, tol=1e-2, dtype="float32")
     assert solution.value.dtype == np.float32

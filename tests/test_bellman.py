@@ -124,7 +124,7 @@ class Turned:
         return self.sign * jnp.stack([x[self.order.index(i)] for i in range(len(self.order))])
 
 
-@pytest.mark.parametrize("n", [2, 3])
+@pytest.mark.parametrize("n", [2, pytest.param(3, marks=pytest.mark.slow)])
 @given(seed=SEEDS)
 @settings(max_examples=6)
 def test_axes_may_be_permuted(n, seed):

@@ -76,7 +76,7 @@ def test_a_floor_from_above():
 # --- sweep ---
 
 
-@pytest.mark.parametrize("shape", [(6,), (5, 4), (4, 3, 4), (3, 3, 3, 4)])
+@pytest.mark.parametrize("shape", [(6,), (5, 4), (4, 3, 4), pytest.param((3, 3, 3, 4), marks=pytest.mark.slow)])
 def test_the_timed_sweep_is_that_of_the_exported_chain(shape):
     problem, grid = questions.integrators(shape)
     value = np.random.default_rng(0).uniform(-1, 1, shape)

@@ -80,6 +80,7 @@ def test_two_nodes_make_a_line():
     np.testing.assert_allclose(solution.costate_at([[0.0], [0.7], [2.0]])[:, 0], 1.5)
 
 
+@pytest.mark.slow
 def test_of_a_marched_solution_and_under_transformations():
     times = np.array([0.0, 0.5, 2.0])
     values = np.stack([(1 + t) * (PLAIN.nodes()[..., 0] ** 2 + PLAIN.nodes()[..., 1]) for t in times])

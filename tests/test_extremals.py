@@ -146,6 +146,7 @@ def test_enumerated_controls_jump_as_well():
     assert extremal.switches == pytest.approx([1], abs=1e-6)
 
 
+@pytest.mark.slow
 def test_one_input_jumps_and_one_does_not():
     """Home in x takes a time of 1 at full speed; y has as much, at the cost ¼."""
     problem = hjb.Problem(lambda x, u: u, lambda x, u: 1 + u[1] ** 2, hjb.Box([-1.0, -5.0], [1.0, 5.0]))
@@ -155,7 +156,9 @@ def test_one_input_jumps_and_one_does_not():
     np.testing.assert_allclose(extremal.controls, [[-1.0, -0.5]] * len(extremal.controls), atol=1e-6)
 
 
-@pytest.mark.parametrize("start", [(1.0, 0.0, 1.0), (1.0, -0.5, 1.0), (0.6, 0.4, 0.8)])
+@pytest.mark.parametrize(
+    "start", [(1.0, 0.0, 1.0), *(pytest.param(x, marks=pytest.mark.slow) for x in ((1.0, -0.5, 1.0), (0.6, 0.4, 0.8)))]
+)
 def test_the_moon_landing(start):
     problem, _ = zoo.moon_landing()
     extremal = hjb.pontryagin(problem, start, terminal=[0.0, 0.0, np.nan])
@@ -174,6 +177,7 @@ def test_the_moon_landing(start):
     np.testing.assert_allclose(extremal.costates[0], slope, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_ball_and_the_edge_of_a_target():
     problem, _ = zoo.zermelo(discount=0.4)
     start, value = [1.0, -1.0], zoo.zermelo_exact(discount=0.4)
@@ -189,6 +193,7 @@ def test_a_ball_and_the_edge_of_a_target():
     np.testing.assert_allclose(disc.costates, slopes, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", [1, -1])
 def test_across_a_seam(way):
     """The cost 2 − 2 cos x is smooth there, so that one collocation over the seam is right as well."""

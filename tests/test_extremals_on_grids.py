@@ -40,12 +40,14 @@ def agree(name, start):
     return extremal
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", [(2.0, 0.0), (0.5, -1.0)])
 def test_van_der_pol(start):
     extremal = agree("van-der-pol", start)
     assert np.max(np.abs(extremal.controls)) == pytest.approx(1)  # the bound is met on the way
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("start", "turns"),
     [((0.5, 0.0), 0), ((2.8, 0.0), 0), pytest.param((-2.0, -2.0), -1, marks=pytest.mark.slow)],
@@ -77,6 +79,7 @@ def test_a_finite_horizon():
     np.testing.assert_allclose(slopes, extremal.costates, atol=0.02 * np.max(extremal.costates))
 
 
+@pytest.mark.slow
 def test_least_time_from_the_solution_on_a_grid():
     """To rest at the origin; the grid's feedback chatters where the extremal switches once."""
     problem, grid = zoo.double_integrator(shape=(41, 41))

@@ -134,6 +134,7 @@ def test_slopes_of_a_quadratic_are_exact():
     assert largest_error(zoo.double_integrator_lq(shape=(81, 81)), exact, inside(1.0)) <= 1e-6
 
 
+@pytest.mark.slow
 def test_value_with_a_kink_in_its_policy_is_second_order():
     """Bang-bang without noise."""
     errors = [largest_error(zoo.bang_bang(shape=(n,)), zoo.bang_bang_exact()) for n in (41, 81, 161)]

@@ -99,6 +99,7 @@ def test_a_time_limit_keeps_what_there_is(monkeypatch):
     assert solution.status is hjb.Status.TIME_LIMIT
     assert 0 < solution.times[0] <= 1
     assert "stopped at t = " in solution.message
+    assert "start=" in solution.message
 
 
 def test_an_interrupt_keeps_what_there_is(monkeypatch):

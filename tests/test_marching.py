@@ -123,6 +123,7 @@ def test_cole_and_hopf():
     assert off(129, hjb.Eno2()) < 1e-4
 
 
+@pytest.mark.slow
 def test_cole_and_hopf_on_a_circle():
     """ψ = cos x: V = −ln E exp(−cos(x + w)) is no quadratic, so that the second differences of the noise rule."""
     problem = hjb.Problem(
@@ -310,6 +311,7 @@ def test_upwind_never_leaves_the_range_of_the_data(seed):
     assert value[0].max() <= value[1].max()
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(SEEDS)
 def test_a_higher_terminal_cost_gives_a_higher_value(seed):

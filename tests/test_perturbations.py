@@ -38,6 +38,7 @@ def test_the_changes_on_a_line_are_exact(line):
     assert line.gain.feedback_order == pytest.approx(2, abs=0.05)
 
 
+@pytest.mark.slow
 def test_a_feedback_that_does_not_change_has_no_order():
     """That of a quadratic V with noise: what is left is the tolerance."""
     study = hjb.perturbation_study(PLANT, GRID, **SETS)

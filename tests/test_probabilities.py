@@ -144,6 +144,7 @@ def test_the_exit_time_of_a_random_walk():
     assert found.error <= 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("greatest", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_the_exit_time_of_who_wants_out_and_of_who_wants_to_stay(greatest):
     """½σ²T'' ± T' = −1 on [0, 1] with T'(0) = 0, T(1) = 0."""

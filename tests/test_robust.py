@@ -107,6 +107,7 @@ def test_the_level_of_an_oscillator(oscillator):
     assert repr(oscillator).startswith("Level(gamma=0.9")
 
 
+@pytest.mark.slow
 def test_the_level_of_a_lag():
     """ẋ = −x + u + d: γ = 1/√2, with a level of its own from a ball of disturbances."""
     game = LAG.game()

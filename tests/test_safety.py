@@ -158,6 +158,7 @@ def test_a_wall_that_comes_nearer():
     assert -0.5 < nearest(guarded) < 0
 
 
+@pytest.mark.slow
 def test_a_marched_tube_guards_a_system_that_does_not_know_the_time():
     tube = hjb.march(AVOID, GRID, 3.0, times=np.linspace(0, 3, 31))
     guarded = hjb.least_restrictive(tube, lambda t, x: full_throttle(x))

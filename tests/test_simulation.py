@@ -225,6 +225,7 @@ def test_running_maximum_is_the_cost_where_the_problem_has_one():
     assert path.controls.shape == (400, 0)
 
 
+@pytest.mark.slow
 def test_ornstein_uhlenbeck_has_its_mean_and_variance():
     theta, sigma, count = 1.5, 0.7, 2000
     problem = Problem(lambda x, u: -theta * x, lambda x, u: x @ x, noise=sigma, discount=0.5)
@@ -254,6 +255,7 @@ def test_state_dependent_noise_is_taken_in_the_sense_of_ito():
     assert abs(np.mean(end) - math.exp(sigma**2 / 2)) > 4 * math.sqrt(math.expm1(sigma**2) / count)
 
 
+@pytest.mark.slow
 def test_a_key_is_one_brownian_path_whatever_the_steps():
     problem = Problem(lambda x, u: 0 * x, noise=np.array([[1.0, 0.5], [0.0, 2.0]]))
     longest = (None, 0.01)
@@ -329,6 +331,7 @@ def by_time(t, x):
     return jnp.cos(t)[None] - 0 * x
 
 
+@pytest.mark.slow
 def test_a_feedback_may_depend_on_time_though_the_problem_does_not():
     """ẋ = cos t gives x = sin t and the cost ∫ sin² + cos² = T; a hold keeps the control of the interval's start."""
     path = simulate(PLAIN, by_time, [0.0], 2.0, time_varying=True, rtol=1e-9, atol=1e-11)

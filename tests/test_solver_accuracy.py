@@ -82,6 +82,7 @@ def test_eikonal_errors_and_order(count):
     assert abs(fitted_order(errors) - 1) <= 0.15
 
 
+@pytest.mark.slow
 def test_smooth_nonlinear_problem_errors_and_order():
     def inner(x):
         return (np.abs(x[..., 0]) <= 0.5) & (np.abs(x[..., 1]) <= 0.45)
@@ -151,6 +152,7 @@ def test_discounted_brownian_exit_is_second_order():
     assert errors[-1] <= 1e-4
 
 
+@pytest.mark.slow
 def test_brownian_exit_from_the_square():
     problem, grid = zoo.brownian_exit(dim=2, shape=(41, 41))
     assert float(hjb.solve(problem, grid, tol=1e-9).value_at([0.0, 0.0])) == pytest.approx(0.5893708182, abs=3e-4)
@@ -252,6 +254,7 @@ def put_exact(price):
     return np.where(price <= best, STRIKE - price, (STRIKE - best) * (price / best) ** -power)
 
 
+@pytest.mark.slow
 def test_perpetual_put_on_a_log_price_grid():
     assert float(put_exact(100.0)) == pytest.approx(23.21468, abs=1e-5)
     lo, hi = np.log(20.0), np.log(500.0)

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
+from hjbjax.driver import Clock, drive
+from hjbjax.preparation import prepare_on_host
 from hjbjax.pytree import node
 
 GRID = hjb.Grid([-1.0, -2.0], [1.0, 2.0], (17, 18))
@@ -215,3 +217,23 @@ def test_two_threads_in_different_dtypes_get_their_own():
         for repeat in range(3):
             assert found[dtype, repeat].dtype == dtype
             np.testing.assert_array_equal(found[dtype, repeat], alone)
+
+
+def test_what_stops_before_the_first_look_keeps_what_is_given():
+    """A guess that is no number of the problem's: nothing but the exit cost is known."""
+    problem = hjb.Problem(
+        lambda x, u: u,
+        lambda x, u: 1 + jnp.sqrt(jnp.where(x[0] > 0.5, x[0] - 0.75, 1.0)) * 0,
+        hjb.Box([-1.0], [1.0]),
+        discount=1.0,
+        target=lambda x: 1 - jnp.abs(x[0]),
+        exit_cost=3.0,
+    )
+    task, _, _ = prepare_on_host(
+        problem, hjb.Grid([-1.0], [1.0], (21,)), method=hjb.ValueIteration(), scheme=hjb.Upwind(), tol=1e-3,
+        dtype=np.dtype(np.float32),
+    )  # fmt: skip
+    state, code, _ = drive(task, jnp.full(21, 7.0), Clock(10, np.inf, False))
+    assert code is hjb.Status.NONFINITE
+    assert np.all(np.isfinite(state.value))
+    assert (state.value[0], state.value[10], state.value[-1]) == (3.0, 7.0, 3.0)

@@ -133,7 +133,11 @@ def test_forward_and_reverse_mode_agree_and_a_game_is_differentiable():
     assert float(reverse) == pytest.approx(wanted, rel=1e-5)
 
 
-@pytest.mark.parametrize("method", [hjb.PolicyIteration(hjb.Sweeps()), hjb.ValueIteration()], ids=["policy", "value"])
+@pytest.mark.parametrize(
+    "method",
+    [hjb.PolicyIteration(hjb.Sweeps()), pytest.param(hjb.ValueIteration(), marks=pytest.mark.slow)],
+    ids=["policy", "value"],
+)
 def test_jit_and_vmap_over_a_parameter_equal_single_solves(method):
     masses = np.array([0.8, 1.0, 1.7])
 
@@ -177,6 +181,7 @@ class Wavy:
         return jnp.sum(x * x + 0.3 * u * u + 0.05 * jnp.cos(97 * u + 9 * x))
 
 
+@pytest.mark.slow
 def test_the_gradient_is_that_of_the_policy_that_was_found():
     """Sampled actions may be better with the last step's among them: the derivative must take the same."""
     line = hjb.Grid([-1.0], [1.0], (21,))

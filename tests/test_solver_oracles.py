@@ -107,7 +107,7 @@ def test_all_methods_agree_and_their_bounds_hold_the_discrete_solution(name):
         assert np.max(np.abs(value - values[0])) <= 2 * TOL
 
 
-@pytest.mark.parametrize("name", ["one player", "with noise", "minimum time"])
+@pytest.mark.parametrize("name", ["one player", "with noise", pytest.param("minimum time", marks=pytest.mark.slow)])
 def test_the_direct_solution_solves_the_linear_system_of_its_policy(name):
     """(I − P) V = Δt (L − β V) off the target, with the exported transition matrix and SciPy's solver."""
     from scipy.sparse import diags_array, eye_array
@@ -307,6 +307,7 @@ def cost_of_time(x, u):
     return 1.0
 
 
+@pytest.mark.slow
 def test_a_current_stronger_than_the_boat():
     problem = hjb.Problem(swept, cost_of_time, hjb.Ball(1.0, 2), target=disc)
     grid = hjb.Grid([-2.0, -2.0], [2.0, 2.0], (21, 21))

@@ -81,6 +81,7 @@ def test_an_exit_cost_is_met_where_the_boundary_is():
     np.testing.assert_allclose(solution.value[:10], 0.93 + 0.93 - grid.axis(0)[:10], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_certificates_and_derivatives_hold_with_cut_links():
 
     grid = hjb.Grid([-2.0], [2.0], (41,))

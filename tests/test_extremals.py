@@ -113,6 +113,25 @@ def test_what_depends_on_time():
     )
 
 
+@pytest.mark.parametrize("speed", [0.5, -0.3])
+def test_a_target_that_moves(speed):
+    """To x ≥ 1 + ct at 1 + u²: in 1/(u − c), at the cost (1 + u²)/(u − c), which is least for u = c + √(c² + 1)."""
+    problem = hjb.Problem(
+        lambda t, x, u: u,
+        lambda t, x, u: 1 + u @ u,
+        hjb.Box([-9.0], [9.0]),
+        target=lambda t, x: 1 + speed * t - x[0],
+        time_dependent=True,
+    )
+    extremal = hjb.pontryagin(problem, [0.0], guess=hjb.pontryagin(HURRY, [0.0], terminal=[1.5]))
+    best = speed + np.sqrt(speed**2 + 1)
+    assert passes(extremal)
+    np.testing.assert_allclose(extremal.controls, best, atol=1e-7)
+    assert extremal.horizon == pytest.approx(1 / (best - speed), abs=1e-7)
+    assert extremal.cost == pytest.approx(2 * best, abs=1e-7)
+    np.testing.assert_allclose(extremal.optimality_check.hamiltonian, -2 * best * speed, atol=1e-7)
+
+
 @pytest.mark.parametrize("discount", [0.0, 1.0])
 @pytest.mark.parametrize("start", [(1.0, 0.0), (0.0, 1.0), (1.0, 1.0), (-0.7, -1.3)])
 def test_least_time_of_the_double_integrator(start, discount):

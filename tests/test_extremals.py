@@ -223,6 +223,19 @@ def test_across_a_seam(way):
     assert np.any(np.abs(parted.states[:, 0] - way * np.pi) < 1e-9)
 
 
+def test_a_target_behind_a_seam_is_not_crossed():
+    """From 2.5 up to an arc around −2.5 = 3.78: its near edge is an end, and its far edge is reached through it."""
+    grid = hjb.Grid([-np.pi], [np.pi], (8,), (True,))
+    arc = dataclasses.replace(HURRY, target=lambda x: jnp.abs(x[0] + 2.5) - 0.2)
+    near, far = (hjb.pontryagin(HURRY, [2.5], terminal=[2 * np.pi + end]) for end in (-2.7, -2.3))
+    extremal = hjb.pontryagin(arc, [2.5], guess=near, grid=grid)
+    assert passes(extremal)
+    assert extremal.horizon == pytest.approx(2 * np.pi - 5.2, abs=1e-8)
+    through = hjb.pontryagin(arc, [2.5], guess=far, grid=grid, throw=False)
+    assert through.status is hjb.Status.STALLED
+    assert "crosses the target before its end" in through.message
+
+
 def test_a_failed_solve_says_so():
     """Against ẋ = −x no force below ½ gets beyond ½."""
     slow = hjb.Problem(lambda x, u: u - x, lambda x, u: u @ u, hjb.Box([-0.5], [0.5]))

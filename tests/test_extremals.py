@@ -289,6 +289,13 @@ IDLE = hjb.Problem(lambda x, u: u, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), d
 ADRIFT = hjb.Problem(lambda x, u: 2 + u, lambda x, u: x @ x + u @ u, hjb.Box([-1.0], [1.0]), discount=1.0)
 HELD = hjb.Problem(lambda x, u: x + u, lambda x, u: (u[0] - 1) ** 2 + 0 * x[0], hjb.Box([1.0], [2.0]))
 
+DOUBLED = hjb.Problem(lambda x, u: jnp.append(u, u), lambda x, u: u @ u, hjb.Box([-1.0], [1.0]))
+VECTOR = hjb.Problem(lambda x, u: u, lambda x, u: u * u, hjb.Box([-1.0], [1.0]))
+PLANE = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (5, 5), (True, True))
+FLAT = hjb.Solution(PLANE, np.zeros((5, 5)), np.zeros((5, 5, 1)), code=1)
+LINE = hjb.Grid([-2.0], [2.0], (5,))
+MARCHED = hjb.Solution(LINE, np.zeros((3, 5)), np.zeros((3, 5, 1)), code=1, times=np.linspace(0, 2, 3))
+
 
 @pytest.mark.parametrize(
     ("call", "error", "message"),
@@ -297,6 +304,16 @@ HELD = hjb.Problem(lambda x, u: x + u, lambda x, u: (u[0] - 1) ** 2 + 0 * x[0], 
         (lambda: hjb.pontryagin(NOISY, [1.0]), ValueError, "with noise, wanted one without"),
         (lambda: hjb.pontryagin(RIDER, [[1.0]]), ValueError, "one finite number a state"),
         (lambda: hjb.pontryagin(RIDER, ["a"]), TypeError, "one number a state"),
+        (lambda: hjb.pontryagin(RIDER, [1.0, 2.0]), ValueError, r"shape \(1,\), .*: n = 2 is the length of x0"),
+        (lambda: hjb.pontryagin(DOUBLED, [1.0]), ValueError, r"drift\(x, u\) returned shape \(2,\), expected \(1,\)"),
+        (lambda: hjb.pontryagin(RIDER, [1.0], horizon=1.0, terminal=lambda x: x), ValueError, r"returned shape \(1,\)"),
+        (lambda: hjb.pontryagin(VECTOR, [1.0]), ValueError, r"cost\(x, u\) returned shape \(1,\), expected \(\)"),
+        (lambda: hjb.pontryagin(RIDER, [1.0], rest=[0.0, 0.0]), ValueError, "rest = .0.0, 0.0., wanted shape .1,."),
+        (lambda: hjb.pontryagin(RIDER, [1.0], grid=PLANE), ValueError, "a grid of 2 axes, wanted 1, the length of x0"),
+        (lambda: hjb.pontryagin(RIDER, [1.0], grid=3), TypeError, "grid = 3, wanted a Grid or None"),
+        (lambda: hjb.pontryagin(RIDER, [1.0], guess=FLAT), ValueError, "on a grid of 2 axes, wanted 1, the length of"),
+        (lambda: hjb.pontryagin(RIDER, [1.0], guess=MARCHED), ValueError, "marched Solution as the guess, and no"),
+        (lambda: hjb.pontryagin(RIDER, [1.0], guess=MARCHED, terminal=[0.0]), ValueError, "known up to t = 2 only;\n"),
         (lambda: hjb.pontryagin(RIDER, [1.0], horizon=-1.0), ValueError, "horizon = -1.0, wanted"),
         (lambda: hjb.pontryagin(RIDER, [1.0], terminal=[np.nan]), ValueError, "at least one that is not"),
         (lambda: hjb.pontryagin(RIDER, [1.0], terminal=lambda x: x @ x), ValueError, "a terminal cost and no horizon"),

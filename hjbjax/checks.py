@@ -51,13 +51,29 @@ def shapes(problem: Problem, grid: Grid, scheme: Any) -> None:
     n = grid.ndim
     if any(grid.stretch or ()) and np.ndim(problem.noise) == 2:
         raise ValueError("correlated noise wants equal spacings: leave out Grid.stretch, or give noise by axis, (n,)")
+    of_one_state(problem, n, "the number of axes of the grid")
+
+
+def of_one_state(problem: Problem, n: int, meaning: str) -> None:
+    """The same without a grid, for a state of ``n`` numbers.
+
+    Args:
+      problem: the problem.
+      n: the number of states.
+      meaning: what n is, for refusals.
+
+    Raises:
+      ValueError: as ``shapes``.
+    """
+
+    def expect(name: str, wanted: str, fits: Callable[[tuple], bool]) -> None:
+        _expect(problem, name, n, wanted, fits, "a scalar" if wanted == "()" else f"n = {n} is {meaning}")
+
     with jax.enable_x64(True):
-        _expect(problem, "drift", n, f"({n},)", lambda shape: shape == (n,))
-        _expect(
-            problem, "noise", n, f"(), ({n},) or ({n}, k)", lambda shape: shape[:1] in ((), (n,)) and len(shape) <= 2
-        )
+        expect("drift", f"({n},)", lambda shape: shape == (n,))
+        expect("noise", f"(), ({n},) or ({n}, k)", lambda shape: shape[:1] in ((), (n,)) and len(shape) <= 2)
         for name in ("cost", "target", *STATE_COSTS):
-            _expect(problem, name, n, "()", lambda shape: shape == ())
+            expect(name, "()", lambda shape: shape == ())
 
 
 def ill_posed(problem: Problem, has_rest: bool) -> None:
@@ -97,7 +113,7 @@ def _names(problem: Problem, name: str) -> tuple[str, ...]:
     return problem.state_arguments("x", "t")
 
 
-def _expect(problem: Problem, name: str, n: int, wanted: str, fits: Callable[[tuple], bool]) -> None:
+def _expect(problem: Problem, name: str, n: int, wanted: str, fits: Callable[[tuple], bool], why: str) -> None:
     """Refuse an ingredient of the wrong kind or shape."""
     ingredient = getattr(problem, name)
     if ingredient is None:
@@ -113,8 +129,7 @@ def _expect(problem: Problem, name: str, n: int, wanted: str, fits: Callable[[tu
             f"{call(problem, name)} returned {verdict}, expected floating-point numbers of shape {wanted}{hint}"
         )
     if not fits(verdict):
-        axes = "a scalar" if wanted == "()" else f"n = {n} is the number of axes of the grid"
-        raise ValueError(f"{call(problem, name)} returned shape {verdict}, expected {wanted}: {axes}")
+        raise ValueError(f"{call(problem, name)} returned shape {verdict}, expected {wanted}: {why}")
 
 
 def _verdict(result: Any) -> tuple[int, ...] | str:

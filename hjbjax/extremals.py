@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from hjbjax import first_guess, rests, shooting, switching
+from hjbjax import checks, first_guess, rests, shooting, switching
 from hjbjax.grid import Grid
 from hjbjax.optimality import Extremal
 from hjbjax.pointwise import rule_of
@@ -100,9 +100,13 @@ def pontryagin(
     if is_traced(problem, x0, guess, terminal):
         raise ValueError("pontryagin: got traced values; it runs at the host: call it outside of jit, vmap and grad")
     _check(problem, tol, max_nodes)
-    _check_guess(guess)
+    start = _numbers(x0, "x0")
+    paid = dataclasses.replace(problem, terminal_cost=terminal) if callable(terminal) else problem
+    checks.of_one_state(paid, len(start), "the length of x0")
+    _check_guess(guess, len(start), horizon)
+    _check_grid(grid, len(start))
     with jax.enable_x64(True):
-        ask = _question(problem, x0, horizon, terminal, getattr(guess, "grid", grid))
+        ask = _question(problem, start, horizon, terminal, getattr(guess, "grid", grid))
         limits = shooting.Limits(tol, max_nodes)
         if ask.closing is Closing.REST:
             ask, times, columns = _to_rest(ask, guess, rest)
@@ -137,14 +141,36 @@ def _check(problem: Any, tol: Any, max_nodes: Any) -> None:
         raise ValueError(f"pontryagin: got max_nodes = {max_nodes!r}, wanted a positive integer")
 
 
-def _check_guess(guess: Any) -> None:
+def _check_guess(guess: Any, n: int, horizon: Any) -> None:
     if guess is not None and not (hasattr(guess, "costate_at") or isinstance(guess, Extremal)):
         raise TypeError(f"pontryagin: got guess = {guess!r}, wanted a Solution, an Extremal or None")
+    if not hasattr(guess, "costate_at"):
+        return
+    if guess.grid.ndim != n:
+        raise ValueError(
+            f"pontryagin: got a guess on a grid of {guess.grid.ndim} axes, wanted {n}, the length of x0; "
+            "give the Solution of this problem, or no guess"
+        )
+    if guess.times is not None and horizon is None:
+        raise ValueError(
+            "pontryagin: got a marched Solution as the guess, and no horizon: its feedback is known up to "
+            f"t = {float(guess.times[-1]):g} only;\ngive horizon=, or FreeTime() to seek it, or a Solution of solve"
+        )
 
 
-def _question(problem: Problem, x0: Any, horizon: Any, terminal: Any, grid: Grid | None) -> TwoPoint:
+def _check_grid(grid: Any, n: int) -> None:
+    if grid is None:
+        return
+    if not isinstance(grid, Grid):
+        raise TypeError(f"pontryagin: got grid = {grid!r}, wanted a Grid or None")
+    if grid.ndim != n:
+        raise ValueError(
+            f"pontryagin: got a grid of {grid.ndim} axes, wanted {n}, the length of x0; give one axis a state"
+        )
+
+
+def _question(problem: Problem, start: np.ndarray, horizon: Any, terminal: Any, grid: Grid | None) -> TwoPoint:
     """The boundary-value problem, all but its rest."""
-    start = _numbers(x0, "x0")
     n = len(start)
     rule = rule_of(problem, n)
     held, ends, final = _ends(terminal, n)
@@ -225,6 +251,8 @@ def _to_rest(ask: TwoPoint, guess: Any, rest: Any) -> tuple[TwoPoint, np.ndarray
     """The boundary-value problem with its rest, and where the solver starts."""
     n, solution = ask.n, guess if hasattr(guess, "costate_at") else None
     near = np.zeros(n) if rest is None else _numbers(rest, "rest")
+    if len(near) != n:
+        raise ValueError(f"pontryagin: got rest = {near.tolist()}, wanted shape ({n},), like x0: a state near the rest")
     if solution is not None and rest is None:
         near = solution.grid.state(np.unravel_index(np.nanargmin(solution.value), solution.grid.shape))
     if isinstance(guess, Extremal) and rest is None:

@@ -53,15 +53,18 @@ def into_rest(ask: TwoPoint, start: np.ndarray, duration: float) -> tuple[np.nda
 
 
 def along_loop(ask: TwoPoint, solution: Any, duration: float) -> tuple[np.ndarray, np.ndarray]:
-    """Times and columns (x, p, w) of the closed loop of a solution, as far as it gets."""
+    """Times and columns (x, p, w) of the closed loop of a solution, as far as it gets; a line where it gets nowhere."""
     grid, marched = solution.grid, solution.times is not None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # where a guess ends is seen from its times
         path = simulate(ask.problem, solution, ask.start, duration, hold=duration / SAMPLES, clamp=True)
     times, states = path.times, path.states
-    if not ask.problem.target and ask.free:
+    if not ask.problem.target and ask.free and any(ask.held):
         nearest = int(np.argmin(np.linalg.norm((states - ask.ends)[:, np.array(ask.held)], axis=1)))
-        times, states = times[: nearest + 1], states[: nearest + 1]
+        if nearest:  # else it starts where it ends, though only in the states that are given there
+            times, states = times[: nearest + 1], states[: nearest + 1]
+    if len(times) == 1:  # in the target from the first
+        return straight(ask, duration)
     kept = np.unique(np.linspace(0, len(times) - 1, 2 * COLUMNS).astype(int))
     times, states = times[kept], states[kept]
     inside = np.asarray(grid.wrap(states))

@@ -180,8 +180,10 @@ def _slope_along(grid: Grid, values: Any, axis: int, moment: tuple, nodes: list,
     # on the last node before an infinite one the cell is lost, and the parabola is that of the other side
     first = jnp.where(jnp.isnan(here), down + widths[1] * jnp.nan_to_num(bend_far), here - widths[2] * first_bend)
     last = here + widths[2] * last_bend
-    mixed = (1 - fraction) * first + fraction * last
-    return jnp.where(fraction == 0, first, jnp.where(fraction == 1, last, mixed))
+    # On a node an end that is not finite has no say; one that is keeps the derivative along the axis.
+    lone_first, lone_last = (fraction == 0) & ~jnp.isfinite(last), (fraction == 1) & ~jnp.isfinite(first)
+    first, last = jnp.where(lone_last, last, first), jnp.where(lone_first, first, last)
+    return (1 - fraction) * first + fraction * last
 
 
 def _defined(grid: Grid, values: Any, x: Any, clamp: bool, when: Any) -> Iterator[tuple[Any, Any, Any]]:

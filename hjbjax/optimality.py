@@ -21,8 +21,8 @@ class Optimality:
     """How well an extremal meets the necessary conditions, in cost units per unit time.
 
     Args:
-      hamiltonian: e^{−βt}(H − βw) less what ∂H/∂t makes of it, at every time, shape (k+1,): a constant, −V_t at the
-        start; zero for an infinite horizon or a free final time.
+      hamiltonian: e^{−βt}(H − βw) less what ∂H/∂t makes of it, at every time, shape (k+1,): a constant, which is
+        zero for an infinite horizon, and for a free final time unless the end itself, ψ or the target, depends on time.
       drift: how much it varies, largest less least.
       gap: the largest excess of H(u) over the least H among many admissible controls, over all times.
       scale: the largest size of the terms of H, which both are to be compared with.

@@ -133,8 +133,13 @@ def _multiplier(ask: TwoPoint, t: Any, z: Any) -> Any:
 
 
 @jax.jit
-def _levels(ask: TwoPoint, t: Any, x: Any) -> Any:
-    return jax.vmap(ask.level)(t, x)
+def _levels(ask: TwoPoint, s: Any, y: Any, theta: Any) -> Any:
+    """The target's function along every arc, each in its own coordinates: the target knows no unwound angles."""
+    lengths = ask.durations(theta)
+    begins = jnp.cumsum(lengths) - lengths
+    states = y.reshape(ask.count, -1, len(s))[:, : ask.n]
+    along = jax.vmap(ask.level, (0, 1))
+    return jax.vmap(lambda begin, length, x: along(begin + s * length, x))(begins, lengths, states)
 
 
 def _continued(failed: Found, limits: Limits) -> Found:
@@ -199,7 +204,7 @@ def report(found: Found) -> Extremal:
         missed = "an arc came out with a negative duration; give another guess"
         return dataclasses.replace(extremal, code=int(Status.STALLED), message=missed)
     if found.ask.closing is Closing.TARGET:
-        inside = np.asarray(_levels(found.ask, extremal.times, extremal.states))
+        inside = np.asarray(_levels(found.ask, found.s, found.y, found.theta))
         if np.min(inside) < -GAP * (1 + np.max(np.abs(inside))):
             missed = "the path crosses the target before its end, where it would have stopped; give another guess"
             return dataclasses.replace(extremal, code=int(Status.STALLED), message=missed)

@@ -8,9 +8,10 @@ Along an extremal, with the current-value costate p (the DV of the grid), the co
     given end states     x_i(T) = c_i instead of the i-th condition on p
     target l ≤ 0         p(T) = ψ_x + ν l_x,  l(x(T)) = 0, with a number ν that is sought
     infinite horizon     p(T) = p̄ + P(x(T) − x̄), from there on by the Riccati equation of the rest (x̄, p̄)
-    free final time      H = βψ − ψ_t at T, which is sought
+    free final time      H = βψ − ψ_t − ν l_t at T, which is sought (ν = 0 without a target)
 
-e^{−βt}(H − βw) is constant where nothing depends on time; it is −V_t, and zero for an infinite horizon or a free end.
+e^{−βt}(H − βw) is constant where neither drift nor cost depends on time. It is zero for an infinite horizon; at a free
+end it is −e^{−βT}(ψ_t + ν l_t), zero unless what ends the path depends on time.
 
 Where u* jumps, the problem is solved twice. First with weights exp(−H_k/ε)/Σ over the values u_k between which it
 jumps, which makes the Hamiltonian −ε log Σ exp(−H_k/ε), up to a constant, for smaller and smaller ε. Then with one arc
@@ -219,15 +220,14 @@ def _closing(ask: TwoPoint, t: Any, z: Any, theta: Any) -> Any:
     end = jax.lax.stop_gradient(ask.ends) if all(ask.held) else jnp.stack(given)
     psi, slope = jax.value_and_grad(ask.psi, 1)(t, end)
     if ask.closing is Closing.TARGET:
-        level, normal = jax.value_and_grad(lambda x: ask.problem.target(*ask.problem.state_arguments(ask.wrap(x), t)))(
-            x
-        )
+        level, (sliding, normal) = jax.value_and_grad(ask.level, (0, 1))(t, x)
         left = [p - slope - theta[-1] * normal, (w - psi)[None], level[None]]
     else:
         held = [x[i] - ask.ends[i] if known else p[i] - slope[i] for i, known in enumerate(ask.held)]
         left = [jnp.stack(held), (w - psi)[None]]
     if ask.free:
         waiting = jax.grad(ask.psi, 0)(t, end) if ask.problem.time_dependent and callable(ask.final) else 0.0
+        waiting += theta[-1] * sliding if ask.closing is Closing.TARGET else 0.0
         left.append((_energy(ask, t, x, p, ask.arcs[-1]) - ask.problem.discount * psi + waiting)[None])
     elif ask.count > 1:
         left.append((t - ask.horizon)[None])

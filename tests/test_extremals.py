@@ -113,6 +113,25 @@ def test_what_depends_on_time():
     )
 
 
+@pytest.mark.parametrize("speed", [0.5, -0.3])
+def test_a_target_that_moves(speed):
+    """To x ≥ 1 + ct at 1 + u²: in 1/(u − c), at the cost (1 + u²)/(u − c), which is least for u = c + √(c² + 1)."""
+    problem = hjb.Problem(
+        lambda t, x, u: u,
+        lambda t, x, u: 1 + u @ u,
+        hjb.Box([-9.0], [9.0]),
+        target=lambda t, x: 1 + speed * t - x[0],
+        time_dependent=True,
+    )
+    extremal = hjb.pontryagin(problem, [0.0], guess=hjb.pontryagin(HURRY, [0.0], terminal=[1.5]))
+    best = speed + np.sqrt(speed**2 + 1)
+    assert passes(extremal)
+    np.testing.assert_allclose(extremal.controls, best, atol=1e-7)
+    assert extremal.horizon == pytest.approx(1 / (best - speed), abs=1e-7)
+    assert extremal.cost == pytest.approx(2 * best, abs=1e-7)
+    np.testing.assert_allclose(extremal.optimality_check.hamiltonian, -2 * best * speed, atol=1e-7)
+
+
 @pytest.mark.parametrize("discount", [0.0, 1.0])
 @pytest.mark.parametrize("start", [(1.0, 0.0), (0.0, 1.0), (1.0, 1.0), (-0.7, -1.3)])
 def test_least_time_of_the_double_integrator(start, discount):
@@ -209,6 +228,19 @@ def test_across_a_seam(way):
     assert np.any(np.abs(parted.states[:, 0] - way * np.pi) < 1e-9)
 
 
+def test_a_target_behind_a_seam_is_not_crossed():
+    """From 2.5 up to an arc around −2.5 = 3.78: its near edge is an end, and its far edge is reached through it."""
+    grid = hjb.Grid([-np.pi], [np.pi], (8,), (True,))
+    arc = dataclasses.replace(HURRY, target=lambda x: jnp.abs(x[0] + 2.5) - 0.2)
+    near, far = (hjb.pontryagin(HURRY, [2.5], terminal=[2 * np.pi + end]) for end in (-2.7, -2.3))
+    extremal = hjb.pontryagin(arc, [2.5], guess=near, grid=grid)
+    assert passes(extremal)
+    assert extremal.horizon == pytest.approx(2 * np.pi - 5.2, abs=1e-8)
+    through = hjb.pontryagin(arc, [2.5], guess=far, grid=grid, throw=False)
+    assert through.status is hjb.Status.STALLED
+    assert "crosses the target before its end" in through.message
+
+
 def test_a_failed_solve_says_so():
     """Against ẋ = −x no force below ½ gets beyond ½."""
     slow = hjb.Problem(lambda x, u: u - x, lambda x, u: u @ u, hjb.Box([-0.5], [0.5]))
@@ -262,6 +294,13 @@ IDLE = hjb.Problem(lambda x, u: u, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), d
 ADRIFT = hjb.Problem(lambda x, u: 2 + u, lambda x, u: x @ x + u @ u, hjb.Box([-1.0], [1.0]), discount=1.0)
 HELD = hjb.Problem(lambda x, u: x + u, lambda x, u: (u[0] - 1) ** 2 + 0 * x[0], hjb.Box([1.0], [2.0]))
 
+DOUBLED = hjb.Problem(lambda x, u: jnp.append(u, u), lambda x, u: u @ u, hjb.Box([-1.0], [1.0]))
+VECTOR = hjb.Problem(lambda x, u: u, lambda x, u: u * u, hjb.Box([-1.0], [1.0]))
+PLANE = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (5, 5), (True, True))
+FLAT = hjb.Solution(PLANE, np.zeros((5, 5)), np.zeros((5, 5, 1)), code=1)
+LINE = hjb.Grid([-2.0], [2.0], (5,))
+MARCHED = hjb.Solution(LINE, np.zeros((3, 5)), np.zeros((3, 5, 1)), code=1, times=np.linspace(0, 2, 3))
+
 
 @pytest.mark.parametrize(
     ("call", "error", "message"),
@@ -270,6 +309,16 @@ HELD = hjb.Problem(lambda x, u: x + u, lambda x, u: (u[0] - 1) ** 2 + 0 * x[0], 
         (lambda: hjb.pontryagin(NOISY, [1.0]), ValueError, "with noise, wanted one without"),
         (lambda: hjb.pontryagin(RIDER, [[1.0]]), ValueError, "one finite number a state"),
         (lambda: hjb.pontryagin(RIDER, ["a"]), TypeError, "one number a state"),
+        (lambda: hjb.pontryagin(RIDER, [1.0, 2.0]), ValueError, r"shape \(1,\), .*: n = 2 is the length of x0"),
+        (lambda: hjb.pontryagin(DOUBLED, [1.0]), ValueError, r"drift\(x, u\) returned shape \(2,\), expected \(1,\)"),
+        (lambda: hjb.pontryagin(RIDER, [1.0], horizon=1.0, terminal=lambda x: x), ValueError, r"returned shape \(1,\)"),
+        (lambda: hjb.pontryagin(VECTOR, [1.0]), ValueError, r"cost\(x, u\) returned shape \(1,\), expected \(\)"),
+        (lambda: hjb.pontryagin(RIDER, [1.0], rest=[0.0, 0.0]), ValueError, "rest = .0.0, 0.0., wanted shape .1,."),
+        (lambda: hjb.pontryagin(RIDER, [1.0], grid=PLANE), ValueError, "a grid of 2 axes, wanted 1, the length of x0"),
+        (lambda: hjb.pontryagin(RIDER, [1.0], grid=3), TypeError, "grid = 3, wanted a Grid or None"),
+        (lambda: hjb.pontryagin(RIDER, [1.0], guess=FLAT), ValueError, "on a grid of 2 axes, wanted 1, the length of"),
+        (lambda: hjb.pontryagin(RIDER, [1.0], guess=MARCHED), ValueError, "marched Solution as the guess, and no"),
+        (lambda: hjb.pontryagin(RIDER, [1.0], guess=MARCHED, terminal=[0.0]), ValueError, "known up to t = 2 only;\n"),
         (lambda: hjb.pontryagin(RIDER, [1.0], horizon=-1.0), ValueError, "horizon = -1.0, wanted"),
         (lambda: hjb.pontryagin(RIDER, [1.0], terminal=[np.nan]), ValueError, "at least one that is not"),
         (lambda: hjb.pontryagin(RIDER, [1.0], terminal=lambda x: x @ x), ValueError, "a terminal cost and no horizon"),

@@ -5,8 +5,10 @@ The grid's own error is how much its value along the path moves when the spacing
 
 import functools
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 import hjbjax as hjb
 from hjbjax import zoo
@@ -87,3 +89,32 @@ def test_least_time_from_the_solution_on_a_grid():
     extremal = hjb.pontryagin(problem, [1.0, 0.0], terminal=[0.0, 0.0], guess=solution)
     assert extremal.cost == pytest.approx(1 - np.exp(-2), abs=1e-6)
     assert extremal.switches == pytest.approx([1], abs=1e-6)
+
+
+def test_a_loop_as_the_guess_of_a_free_time_without_end_states():
+    """At full unit speed until a final cost of 2x² pays no more, at x = ½."""
+    grid = hjb.Grid([-3.0], [3.0], (25,))
+    x = grid.nodes()
+    solution = hjb.Solution(grid, 2 * np.abs(x[..., 0]), -np.sign(x), code=1)
+    problem = hjb.Problem(lambda x, u: u, lambda x, u: 1 + u @ u, hjb.Box([-9.0], [9.0]))
+    free = {"horizon": hjb.FreeTime(2.0), "terminal": lambda x: 2 * x @ x}
+    extremal = hjb.pontryagin(problem, [1.0], guess=solution, **free)
+    assert (extremal.horizon, extremal.cost) == pytest.approx((0.5, 1.5), abs=1e-7)
+
+
+def test_a_loop_as_the_guess_where_the_start_is_at_rest_and_the_end_has_to_be():
+    """Over d = 1 − x(T) in T = √(6d) at the cost 4/3 T; where to stop is up to the final cost 10x²."""
+    grid = hjb.Grid([-2.0, -2.0], [2.0, 2.0], (9, 9))
+    x = grid.nodes()
+    solution = hjb.Solution(grid, np.sum(x**2, -1), -np.sum(x, -1, keepdims=True), code=1)
+    problem = hjb.Problem(
+        lambda x, u: jnp.stack([x[1], u[0]]),
+        lambda x, u: 1 + u @ u,
+        hjb.Box([-9.0], [9.0]),
+        terminal_cost=lambda x: 10 * x[0] ** 2,
+    )
+    ends = {"horizon": hjb.FreeTime(3.0), "terminal": [np.nan, 0.0]}
+    extremal = hjb.pontryagin(problem, [1.0, 0.0], guess=solution, **ends)
+    far = brentq(lambda d: 2 / 3 * np.sqrt(6 / d) - 20 * (1 - d), 0.5, 1.0)
+    assert extremal.horizon == pytest.approx(np.sqrt(6 * far), abs=1e-6)
+    assert extremal.cost == pytest.approx(4 / 3 * np.sqrt(6 * far) + 10 * (1 - far) ** 2, abs=1e-6)

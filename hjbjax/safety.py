@@ -39,6 +39,7 @@ class Filter:
     def __call__(self, *where: Any) -> jax.Array:
         """The control, shape (m,)."""
         wanted = jnp.asarray(self.nominal(*where))
+        wanted = wanted.astype(jnp.result_type(wanted, float))  # or integers would cut off the safe action
         acts = self.acts(*where)
         safe = jnp.asarray(self.tube.control_at(*self._asked(where), clamp=True), wanted.dtype)
         return jnp.where(acts, safe, wanted)

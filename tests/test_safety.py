@@ -77,6 +77,14 @@ def test_where_it_is_safe_the_nominal_control_is_untouched_to_the_bit(tube):
     assert np.all(u[acts & (x[:, 1] > 0.1) & (exact < 0)] == -1)  # brakes, and never half
 
 
+def test_a_nominal_control_of_integers_does_not_cut_off_the_safe_one():
+    grid = hjb.Grid([-1.0], [1.0], (5,))
+    tube = hjb.Solution(grid, np.asarray(grid.axis(0)), np.full((5, 1), -0.5), code=hjb.Status.CONVERGED)
+    guarded = hjb.least_restrictive(tube, lambda x: jnp.array([1]), margin=0.1)
+    assert guarded(jnp.array([0.5])).tolist() == [-0.5]
+    assert guarded(jnp.array([-0.5])).tolist() == [1.0]
+
+
 def test_it_can_be_compiled(tube):
     guarded = hjb.least_restrictive(tube, full_throttle)
     for x in ([-2.5, 0.0], [-0.2, 1.0]):

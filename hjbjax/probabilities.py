@@ -55,7 +55,8 @@ def reach_probability(
       horizon: until when, in units of time; ``None`` is for all times.
       least: the least probability instead: the control keeps away.
       feedback: a Solution or a function of the state that acts in place of the control; then nothing is optimised.
-        Where a Solution has no action the state stays for ever.
+        Where a Solution has no action the state stays for ever. A marched one must have been kept at times that
+        are dense enough up to the horizon.
       options: anything else that ``march`` takes, or ``solve`` without a horizon: times, scheme, method, tol, ...
 
     Returns:
@@ -73,7 +74,7 @@ def reach_probability(
       0.6225
     """
     name = "reach_probability"
-    problem, inside, hit = _asked(problem, target, obstacle, feedback, name)
+    problem, inside, hit = _asked(problem, target, obstacle, feedback, horizon, name)
     sign = 1.0 if least else -1.0
     question = exits.ending(problem, inside, hit, 0.0, sign)
     with _quiet(feedback):
@@ -167,7 +168,7 @@ def expected_exit_time(
       0.1875
     """
     name = "expected_exit_time"
-    problem, inside, _ = _asked(problem, target, None, feedback, name)
+    problem, inside, _ = _asked(problem, target, None, feedback, horizon, name)
     sign = -1.0 if greatest else 1.0
     question = exits.ending(problem, inside, None, sign, 0.0)
     with _quiet(feedback):
@@ -178,7 +179,9 @@ def expected_exit_time(
         return _answer(question, grid, horizon, options, sign)
 
 
-def _asked(problem: Any, target: Any, obstacle: Any, feedback: Any, name: str) -> tuple[Problem, Any, Any]:
+def _asked(
+    problem: Any, target: Any, obstacle: Any, feedback: Any, horizon: Any, name: str
+) -> tuple[Problem, Any, Any]:
     """The system that runs, with its loop closed if there is a feedback, its target and its obstacle."""
     if not isinstance(problem, Problem):
         raise TypeError(f"{name}: got {type(problem).__name__}, wanted a Problem")
@@ -188,7 +191,7 @@ def _asked(problem: Any, target: Any, obstacle: Any, feedback: Any, name: str) -
     hit = as_partial(obstacle, f"{name}: obstacle")
     if feedback is None:
         return problem, inside, hit
-    loop = exits.closed(problem, feedback, name)
+    loop = exits.closed(problem, feedback, horizon, name)
     needs_time = loop.time_dependent and not problem.time_dependent
     return loop, exits.timed(inside, needs_time), exits.timed(hit, needs_time)
 

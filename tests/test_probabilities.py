@@ -432,6 +432,22 @@ def test_bad_questions_are_refused(changes, error, reason):
     assert len(str(caught.value).splitlines()) <= 6
 
 
+@pytest.mark.parametrize(
+    ("times", "reason"),
+    [
+        ([0.0], r"_probability: horizon = 5 goes beyond the horizon 0 of the solution"),
+        ([0.0, 5.0], r"_probability: horizon = 5, but the solution was marched and kept at 2 times"),
+        (np.linspace(1, 5, 41), r"kept at 41 times from 1 to 5"),
+    ],
+)
+def test_a_marched_feedback_that_is_not_known_up_to_the_horizon_is_refused(times, reason):
+    grid, problem = interval(5), hjb.Problem(pushed, controls=UNIT, noise=SIGMA)
+    policy = hjb.Solution(grid, np.zeros((len(times), 5)), np.ones((len(times), 5, 1)), times=np.asarray(times))
+    for ask, target in ((hjb.reach_probability, above_one), (hjb.stay_probability, near_the_middle)):
+        with pytest.raises(ValueError, match=reason):
+            ask(problem, grid, target, feedback=policy, horizon=5.0)
+
+
 def test_a_partial_answer_is_a_probability_too():
     problem = hjb.Problem(pushed, controls=UNIT, noise=SIGMA)
     with pytest.raises(hjb.SolveError, match=r"MAX_STEPS") as caught:

@@ -222,6 +222,12 @@ def test_what_guards_nothing_is_refused(tube, arguments, changes, error, reason)
     assert len(str(caught.value).splitlines()) <= 6
 
 
+def test_a_marched_tube_that_is_kept_at_one_time_is_refused(tube):
+    once = hjb.Solution(GRID, tube.value[None], tube.policy[None], code=tube.code, times=np.zeros(1))
+    with pytest.raises(ValueError, match=r"marched and kept at one time only.* times=np.linspace"):
+        hjb.least_restrictive(once, full_throttle)
+
+
 def test_traced_use_wants_a_margin(tube):
     with pytest.raises(ValueError, match=r"inside jit, vmap and grad give margin="):
         jax.jit(lambda tube: hjb.least_restrictive(tube, full_throttle)(jnp.zeros(2)))(tube)

@@ -36,7 +36,7 @@ import numpy as np
 from hjbjax.gain import Saturation, saturation
 from hjbjax.grid import Grid
 from hjbjax.horizon import march
-from hjbjax.problem import Problem
+from hjbjax.problem import Problem, may_be_positive
 from hjbjax.schemes import Scheme, Weno5
 from hjbjax.sets import Ball, Box
 from hjbjax.solution import Solution, SolveError
@@ -140,7 +140,8 @@ def hinf_level(
       The level with its bracket, and what was found at every γ.
 
     Raises:
-      ValueError: not 0 < lo < hi; feasible at lo, infeasible at hi; a problem without disturbances.
+      ValueError: not 0 < lo < hi; feasible at lo, infeasible at hi; a problem without disturbances, or with a discount,
+        a target or anything else with which V tells no gain.
       TypeError: something that makes no problem.
       SolveError: a march was interrupted or ran out of time.
 
@@ -263,8 +264,13 @@ def _check_problem(problem: Any, gamma: float) -> None:
             f"hinf_level: problem_of_gamma({gamma:g}) has disturbances {problem.disturbances!r:.60}; wanted a Box or a "
             "Ball, as hjb.attenuation(plant, gamma, hjb.Box(...)) makes one"
         )
-    for name in ("noise", "terminal_cost", "stopping_cost", "running_max"):
+    for name in ("noise", "terminal_cost", "stopping_cost", "running_max", "target"):
         if getattr(problem, name) is not None:
             raise ValueError(f"hinf_level: the problem has a {name}, with which V no longer tells a gain; leave it out")
+    if may_be_positive(problem.discount):
+        raise ValueError(
+            f"hinf_level: the problem has discount = {problem.discount}, with which V settles also where the gain is "
+            "violated; leave it out"
+        )
     if problem.time_dependent or problem.cost is None:
         raise ValueError("hinf_level: wanted a problem that has a cost and does not depend on the time")

@@ -202,6 +202,16 @@ def test_a_march_goes_on_from_another():
             ValueError,
             r"the problem has a noise, with which V no longer tells a gain",
         ),
+        (
+            {"problem_of_gamma": lambda gamma: dataclasses.replace(LAG.game()(gamma), discount=0.5)},
+            ValueError,
+            r"the problem has discount = 0.5, with which V settles also where the gain is violated",
+        ),
+        (
+            {"problem_of_gamma": lambda gamma: dataclasses.replace(LAG.game()(gamma), target=lambda x: x @ x - 0.1)},
+            ValueError,
+            r"the problem has a target, with which V no longer tells a gain",
+        ),
     ],
 )
 def test_bad_input_is_refused(changes, error, reason):

@@ -29,6 +29,7 @@ H∞-optimal control and related minimax design problems.
 import dataclasses
 import math
 from collections.abc import Callable
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -43,6 +44,7 @@ from hjbjax.solution import Solution, SolveError
 from hjbjax.status import Status
 
 DOUBLINGS = 6  # of the time marched, at most
+SOON = 1e-6  # seconds: a limit that ends a march after its first look
 CLOSE, FALL = 10.0, 1 / 3  # growth so near settle counts as settled if it falls by this factor; at the level it halves
 
 
@@ -134,7 +136,7 @@ def hinf_level(
       settle: growth of V over a doubling of the time below which it has settled.
       horizon: the longest time to march, in units of time: many times the slowest of the closed loop.
       scheme: as for ``march``.
-      time_limit: seconds for one γ.
+      time_limit: seconds for one γ, all of its marches together.
 
     Returns:
       The level with its bracket, and what was found at every γ.
@@ -159,7 +161,7 @@ def hinf_level(
     def at(gamma: float) -> Trial:
         problem = problem_of_gamma(gamma)
         _check_problem(problem, gamma)
-        return _try(problem, grid, float(gamma), inner, settle, horizon, scheme=scheme, time_limit=time_limit)
+        return _try(problem, grid, float(gamma), inner, settle, horizon, scheme, time_limit)
 
     top = at(hi)
     if not top.feasible:
@@ -186,16 +188,18 @@ def _try(
     inner: float,
     settle: float,
     horizon: float,
-    **options: Any,
+    scheme: Scheme,
+    time_limit: float | None,
 ) -> Trial:
     """March until the value settles, saturates or the horizon is there, doubling the time."""
+    began, left = perf_counter(), time_limit
     watch = inner if isinstance(problem.disturbances, Box) else 0.0
     inside = grid.inner(inner)
     if not np.all([np.sum(np.any(inside, axis=_others(grid, k))) >= 3 for k in range(grid.ndim)]):
         raise ValueError(f"hinf_level: inner = {inner:g} of {grid.shape} nodes holds fewer than 3 along an axis")
     value, total, span, gains = np.zeros(grid.shape), 0.0, horizon / 2**DOUBLINGS, [math.inf]
     while True:
-        solution = march(problem, grid, span, start=value, inner=watch, throw=False, **options)
+        solution = march(problem, grid, span, start=value, inner=watch, throw=False, scheme=scheme, time_limit=left)
         after, total = np.asarray(solution.value[0]), total + span - float(solution.times[0])
         size, gain = (float(np.max(np.abs(each[inside]))) for each in (after, after - value))
         bound = saturation(solution, problem, inner=inner)
@@ -203,6 +207,7 @@ def _try(
         if reason or total >= horizon * (1 - 1e-9):
             break
         value, span, gains = after, total, [*gains, gain]
+        left = time_limit and max(time_limit - (perf_counter() - began), SOON)
     if solution.status in (Status.INTERRUPTED, Status.TIME_LIMIT):
         raise SolveError(f"hinf_level: at gamma = {gamma:g}: {solution.message}", solution)
     first = {name: getattr(solution, name)[0] for name in ("value", "policy", "disturbance")}

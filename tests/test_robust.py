@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import hjbjax as hjb
-from hjbjax import zoo
+from hjbjax import robust, zoo
 from hjbjax.path import PathStatus
 from hjbjax.pytree import node
 from hjbjax.robust import Trial
@@ -232,6 +232,22 @@ def test_brackets_that_do_not_hold_the_level():
 def test_a_march_that_runs_out_of_time_is_no_verdict():
     with pytest.raises(hjb.SolveError, match=r"hinf_level: at gamma = 0.9"):
         hjb.hinf_level(LAG.game(), cube(1, 21), 0.6, 0.9, time_limit=1e-9)
+
+
+def test_the_marches_of_one_gamma_share_its_time(monkeypatch):
+    now, limits = [100.0], []
+
+    def slow(*arguments, time_limit, **options):
+        limits.append(time_limit)
+        now[0] += 3.0
+        return hjb.march(*arguments, **options)
+
+    monkeypatch.setattr(robust, "march", slow)
+    monkeypatch.setattr(robust, "perf_counter", lambda: now[0])
+    with pytest.raises(ValueError, match=r"hi = 0.6 is not feasible"):
+        hjb.hinf_level(LAG.game(), cube(1, 21), 0.5, 0.6, horizon=8.0, time_limit=10.0)
+    assert limits[:4] == [10.0, 7.0, 4.0, 1.0]
+    assert max(limits[4:]) < 1e-3
 
 
 # --- the problem and its saturation ---

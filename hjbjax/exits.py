@@ -76,7 +76,7 @@ def closed(problem: Problem, feedback: Any, horizon: Any, name: str) -> Problem:
         raise TypeError(f"{name}: feedback is {feedback!r}, wanted a Solution or a function {signature}")
     marched = feedback.times is not None if solved else problem.time_dependent
     if solved and marched and isinstance(horizon, (int, float, np.number)) and not is_traced(feedback.times):
-        check_kept(feedback, horizon, f"{name}: horizon")
+        check_kept(feedback, float(horizon), f"{name}: horizon")
     look = jax.tree_util.Partial(_inside, as_partial(feedback.control_at)) if solved else as_partial(feedback)
     loop = Closed(problem, look, marched, marched or problem.time_dependent)
     still = solved or callable(problem.noise)  # a function always has a control, and leaves a number what it is

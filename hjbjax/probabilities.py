@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from hjbjax import checks, exits, proper, survey
+from hjbjax import checks, exits, memory, proper, survey
 from hjbjax.fields import FallbackWarning
 from hjbjax.grid import Grid
 from hjbjax.horizon import march
@@ -225,7 +225,9 @@ def _may_stay(question: Problem, grid: Grid, options: dict) -> int:
     check_arguments(question, grid, options.get("method"), scheme, options["tol"], None, None)
     if is_traced(question, grid):
         return 0
+    method = options.get("method") or ValueIteration()  # needs the least; solve asks again for what it takes
     with jax.enable_x64(kind == np.float64):
+        memory.require(question, grid, method, kind, options.get("max_memory"))
         checks.shapes(question, grid, scheme)
         survey.values(question, grid, kind)
         return int(np.sum(np.asarray(proper.refuge(question, grid, scheme=scheme.chain, dtype=kind))))

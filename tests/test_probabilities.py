@@ -10,7 +10,7 @@ from scipy.stats import norm
 from systems import SEEDS, random_grid, random_problem
 
 import hjbjax as hjb
-from hjbjax import chain, exits, marching
+from hjbjax import chain, exits, marching, probabilities
 from hjbjax.pytree import node
 
 UNIT = hjb.Box([-1.0], [1.0])
@@ -446,6 +446,17 @@ def test_a_marched_feedback_that_is_not_known_up_to_the_horizon_is_refused(times
     for ask, target in ((hjb.reach_probability, above_one), (hjb.stay_probability, near_the_middle)):
         with pytest.raises(ValueError, match=reason):
             ask(problem, grid, target, feedback=policy, horizon=5.0)
+
+
+@pytest.mark.parametrize("ask", [hjb.reach_probability, hjb.expected_exit_time])
+def test_a_grid_that_does_not_fit_is_refused_before_any_node_is_looked_at(ask, monkeypatch):
+    def looked(*arguments, **options):
+        raise AssertionError
+
+    monkeypatch.setattr(probabilities.survey, "values", looked)
+    options = {"greatest": True} if ask is hjb.expected_exit_time else {}
+    with pytest.raises(MemoryError, match=r"41 nodes need about"):
+        ask(hjb.Problem(pushed, controls=UNIT), interval(41), above_one, max_memory=100, **options)
 
 
 def test_a_partial_answer_is_a_probability_too():

@@ -2,7 +2,8 @@
 
 The equations are those of ``solve`` and ``march`` with the exit costs of ``exits``; nothing is solved here. For all
 times without discount a chain that may stay away for ever has more than one solution: there value iteration from zero
-finds the least one, which is the probability; where every pair of actions must end, any method does.
+finds the least one, which is the probability; where every pair of actions must end, any method does. The chain
+tells at host level; inside jit, vmap and grad it is taken for granted that every pair must end.
 """
 
 import contextlib
@@ -27,6 +28,7 @@ from hjbjax.solver import as_dtype, check_arguments, solve
 
 TOL = 1e-6
 TOL_OF_STEPS = 1e-9  # value iteration stops by its last step, which is much smaller than what is left
+ROUNDING = 32  # units in the last place of a probability, below which no step is asked for
 
 
 def reach_probability(
@@ -45,7 +47,11 @@ def reach_probability(
     V(x) = sup_u inf_d P(x(τ) in the target, τ ≤ horizon), τ the first time in the target or in the obstacle, from
     min max (V_t + f·DV + ½ tr σσᵀD²V) = 0 with V = 1 on the target and 0 on the obstacle. Order and cost are those
     of ``march``, and of ``solve`` without a horizon. There is no certificate. Where for all times the state may stay
-    away from both, value iteration from zero finds the probability among several solutions, which is slower.
+    away from both, value iteration from zero finds the probability among several solutions, which is slower. It stops
+    at a step of at most 1e-9 (4e-6 in float32), which bounds nothing: where steps shrink slowly more is left.
+
+    Inside ``jit``, ``vmap`` and ``grad`` it is not looked for whether the state may stay away for ever: where it may,
+    the answer there may be wrong.
 
     Args:
       problem: the system; its costs and its discount play no part.
@@ -57,7 +63,8 @@ def reach_probability(
       feedback: a Solution or a function of the state that acts in place of the control; then nothing is optimised.
         Where a Solution has no action the state stays for ever. A marched one must have been kept at times that
         are dense enough up to the horizon.
-      options: anything else that ``march`` takes, or ``solve`` without a horizon: times, scheme, method, tol, ...
+      options: anything else that ``march`` takes, or ``solve`` without a horizon: times, scheme, method, ...; tol is
+        that of ``solve``, 1e-6 by default: a bound on the residual and the last step.
 
     Returns:
       A Solution whose value is the probability, and whose policy attains it.
@@ -213,10 +220,14 @@ def _without_end(question: Problem, grid: Grid, most: float, options: dict) -> t
     ``most`` bounds the value from above by itself. Given as a stopping cost it says that there is something to fall
     back on, so that no node is taken for one without a value.
     """
-    if not _may_stay(question, grid, {"tol": TOL} | options):
-        return question, {"tol": TOL} | options
+    options = {"tol": TOL} | options
+    if not _may_stay(question, grid, options):
+        return question, options
     question = dataclasses.replace(question, stopping_cost=most)
-    return question, {"tol": TOL_OF_STEPS, "method": ValueIteration(), "guess": np.zeros(grid.shape)} | options
+    smallest = max(TOL_OF_STEPS, ROUNDING * float(np.finfo(as_dtype(options.get("dtype"))).eps))
+    tol = options["tol"] if is_traced(options["tol"]) else min(options["tol"], smallest)
+    defaults = {"method": ValueIteration(), "guess": np.zeros(grid.shape)}
+    return question, defaults | options | {"tol": tol}
 
 
 def _may_stay(question: Problem, grid: Grid, options: dict) -> int:

@@ -162,8 +162,8 @@ def expected_exit_time(
       A Solution whose value is the time, inf where the target is not reached for certain.
 
     Raises:
-      ValueError: no target; a control that may stay away for ever, asked for the greatest time; and what ``solve``
-        and ``march`` refuse.
+      ValueError: no target; asked for the greatest time, a control that may stay away for ever, in a game also if it
+        needs the disturbance's help, which is not looked for inside ``jit``; and what ``solve`` and ``march`` refuse.
       SolveError: no convergence, with the partial solution.
 
     Example:
@@ -247,9 +247,10 @@ def _may_stay(question: Problem, grid: Grid, options: dict) -> int:
 def _refuse_staying(question: Problem, grid: Grid, options: dict) -> None:
     count = _may_stay(question, grid, options)
     if count:
+        how, who = ("may be", "actions of both players keep") if question.is_game else ("is", "action keeps")
         raise ValueError(
-            f"expected_exit_time: the greatest time is infinite: at {count} of {grid.size} nodes some action keeps the "
-            "state away from the target for ever;\ngive horizon= for E min(τ, horizon), or noise that drives it out"
+            f"expected_exit_time: the greatest time {how} infinite: at {count} of {grid.size} nodes some {who} the state "
+            "away from the target for ever;\ngive horizon= for E min(τ, horizon), or noise that drives it out"
         )
 
 

@@ -374,6 +374,13 @@ def test_a_greatest_time_without_end_is_refused():
         hjb.expected_exit_time(hjb.Problem(pushed, controls=UNIT), interval(41, lo=-1.0), out_of_unit, greatest=True)
 
 
+def test_in_a_game_the_greatest_time_without_end_is_a_possibility():
+    """ẋ = u + 2 d: who wants out can push twice as hard, and both together can stay."""
+    problem = hjb.Problem(lambda x, u, d: u + 2 * d, controls=UNIT, disturbances=UNIT)
+    with pytest.raises(ValueError, match=r"may be infinite: at 39 of 41 nodes some actions of both players keep"):
+        hjb.expected_exit_time(problem, interval(41, lo=-1.0), out_of_unit, greatest=True)
+
+
 # --- transformations ---
 
 

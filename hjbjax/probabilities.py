@@ -249,8 +249,8 @@ def _refuse_staying(question: Problem, grid: Grid, options: dict) -> None:
     if count:
         how, who = ("may be", "actions of both players keep") if question.is_game else ("is", "action keeps")
         raise ValueError(
-            f"expected_exit_time: the greatest time {how} infinite: at {count} of {grid.size} nodes some {who} the state "
-            "away from the target for ever;\ngive horizon= for E min(τ, horizon), or noise that drives it out"
+            f"expected_exit_time: the greatest time {how} infinite: at {count} of {grid.size} nodes some {who} the "
+            "state away from the target for ever;\ngive horizon= for E min(τ, horizon), or noise that drives it out"
         )
 
 

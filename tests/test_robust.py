@@ -396,6 +396,30 @@ def test_dissipation_refuses(top, changes, error, reason):
         hjb.dissipation(**arguments)
 
 
+def test_random_disturbances_stay_in_a_box_without_zero():
+    """ẋ = −x and cost −½d²: what is supplied is ½∫d², with 1 ≤ d ≤ 2."""
+    problem = hjb.Problem(
+        lambda x, u, d: -x + 0 * d, lambda x, u, d: -0.5 * (d @ d), Box([-1.0], [1.0]), disturbances=Box([1.0], [2.0])
+    )
+    solution = solution_with(np.ones((5, 1)), hjb.Grid([-1.0], [1.0], (5,)))
+    found = hjb.dissipation(problem, solution, [0.5], 2.0, random=4)
+    assert np.all((found.supplied >= 1 - 1e-6) & (found.supplied <= 4))
+    assert np.ptp(found.supplied) > 0.5
+
+
+def test_random_disturbances_of_a_finite_set_are_refused():
+    problem = hjb.Problem(
+        lambda x, u, d: -x + 0 * d,
+        lambda x, u, d: -0.5 * (d @ d),
+        Box([-1.0], [1.0]),
+        disturbances=Finite([[0.0], [1.0]]),
+    )
+    solution = solution_with(np.ones((5, 1)), hjb.Grid([-1.0], [1.0], (5,)))
+    with pytest.raises(ValueError, match=r"the disturbances are 2 points, .* wanted a Box or a Ball, or random=0"):
+        hjb.dissipation(problem, solution, [0.5], 2.0)
+    assert hjb.dissipation(problem, solution, [0.5], 2.0, random=0).supplied == pytest.approx(1.0)
+
+
 def test_dissipation_refuses_a_marched_solution(top):
     marched = dataclasses.replace(top.solution, times=np.array([0.0]))
     with pytest.raises(ValueError, match=r"wanted a stationary problem and solution"):

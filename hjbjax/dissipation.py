@@ -25,7 +25,7 @@ import numpy as np
 from hjbjax.path import PathStatus
 from hjbjax.problem import Problem
 from hjbjax.pytree import as_partial, cast, is_traced
-from hjbjax.sets import Ball, Box, Finite
+from hjbjax.sets import Box, Finite
 from hjbjax.simulation import rollout
 from hjbjax.solution import Solution
 

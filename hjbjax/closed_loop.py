@@ -29,6 +29,37 @@ from hjbjax.path import Path, PathStatus
 from hjbjax.problem import Problem
 from hjbjax.pytree import node
 
+FEWEST = 10  # intervals between kept times that a marched feedback must have over a path
+
+
+def check_kept(solution: Any, duration: float, name: str) -> float:
+    """Refuse a marched feedback that is not known well enough up to the duration.
+
+    Args:
+      solution: a marched solution, its times known numbers.
+      duration: how long it is to act, from t = 0.
+      name: who asks and what it calls the duration, for refusals.
+
+    Returns:
+      The horizon up to which it was marched.
+
+    Raises:
+      ValueError: the kept times end before, or are too far apart.
+    """
+    times = np.asarray(solution.times, np.float64)
+    horizon = float(getattr(solution, "stats", {}).get("horizon", times[-1]))
+    if duration > horizon * (1 + 1e-9):
+        raise ValueError(f"{name} = {duration:g} goes beyond the horizon {horizon:g} of the solution; shorten it")
+    between = np.concatenate([[0.0], times[(times > 0) & (times < duration)], [duration]])
+    gap = float(np.max(np.diff(between)))
+    if times[0] > 0 or times[-1] < duration * (1 - 1e-9) or gap > duration / FEWEST * (1 + 1e-9):
+        raise ValueError(
+            f"{name} = {duration:g}, but the solution was marched and kept at {times.size} times from {times[0]:g} to "
+            f"{times[-1]:g}; a feedback up to t = {duration:g} wants all of that covered,\n"
+            f"at most {duration / FEWEST:g} apart: march(..., times=np.linspace(0, {horizon:g}, 41))"
+        )
+    return horizon
+
 
 @node(static=("clamp",))
 class Loop:

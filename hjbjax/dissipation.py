@@ -10,7 +10,8 @@ the set of disturbances was felt (see ``saturation``) nothing is claimed of wide
 
 Both integrals are made by the integrator of ``simulate``, with its accuracy. Random disturbances run linearly between
 independent points at equally spaced times; those are uniform in the set times a strength, which goes from .01 to 1, so
-that they are neither all weak nor all so strong that the inequality says nothing.
+that they are neither all weak nor all so strong that the inequality says nothing. A box without 0 is scaled about its
+point nearest to 0, so that they stay in it.
 """
 
 import dataclasses
@@ -24,7 +25,7 @@ import numpy as np
 from hjbjax.path import PathStatus
 from hjbjax.problem import Problem
 from hjbjax.pytree import as_partial, cast, is_traced
-from hjbjax.sets import Ball, Box
+from hjbjax.sets import Box, Finite
 from hjbjax.simulation import rollout
 from hjbjax.solution import Solution
 
@@ -95,7 +96,7 @@ def dissipation(
       x0s: where paths start, shape (k, n), or (n,) for one; in the grid.
       duration: how long each runs, in units of time, unless it leaves the grid before.
       disturbances: more signals, functions (t, x) -> (l,).
-      random: how many random disturbances from each start.
+      random: how many random disturbances from each start; 0 for those of a finite set.
       key: a JAX random key or an integer.
       rtol: relative error of an internal step.
 
@@ -103,7 +104,7 @@ def dissipation(
       The energies of k (1 + random + given) paths and their margins; ``print`` shows the tightest of each kind.
 
     Raises:
-      ValueError: no disturbances, noise, a marched solution, or starts outside the grid.
+      ValueError: no disturbances, random ones of a finite set, noise, a marched solution, or starts outside the grid.
       TypeError: a signal that cannot be called.
 
     Example:
@@ -147,7 +148,9 @@ def _lanes(problem: Problem, starts: np.ndarray, random: int, key: Any) -> tuple
     choices, count = problem.disturbances, random * len(starts)
     assert choices is not None
     strength = np.geomspace(WEAKEST, 1.0, random) if random > 1 else np.ones(random)
-    points = np.repeat(strength, len(starts))[:, None, None] * np.asarray(_uniform(choices, key, (count, POINTS)))
+    least = np.clip(0.0, choices.lo, choices.hi) if isinstance(choices, Box) else np.zeros(choices.dim)
+    away = np.asarray(_uniform(choices, key, (count, POINTS))) - least if count else np.zeros((0, POINTS, choices.dim))
+    points = least + np.repeat(strength, len(starts))[:, None, None] * away
     still = np.zeros((len(starts), POINTS, choices.dim))
     weight = np.repeat([1.0, 0.0], [len(starts), count])
     lanes = np.tile(starts, (1 + random, 1)), weight, np.concatenate([still, points])
@@ -158,9 +161,7 @@ def _uniform(choices: Any, key: Any, shape: tuple[int, ...]) -> jax.Array:
     """Points of a set, shape (*shape, l)."""
     if isinstance(choices, Box):
         return jax.random.uniform(key, (*shape, choices.dim), minval=choices.lo, maxval=choices.hi)
-    if isinstance(choices, Ball):
-        return choices.radius * jax.random.ball(key, choices.dim, shape=shape)
-    return choices.points[jax.random.randint(key, shape, 0, len(choices.points))]
+    return choices.radius * jax.random.ball(key, choices.dim, shape=shape)
 
 
 def _mixed(look: Callable, weight: Any, points: Any, duration: Any, t: Any, x: Any) -> Any:
@@ -220,6 +221,11 @@ def _check(problem: Any, solution: Any, x0s: Any, duration: Any, signals: Any, r
         raise ValueError(f"dissipation: duration is {duration!r}, wanted a finite number > 0")
     if isinstance(random, bool) or not isinstance(random, int) or random < 0:
         raise ValueError(f"dissipation: random is {random!r}, wanted how many, an integer ≥ 0")
+    if random and isinstance(problem.disturbances, Finite):
+        raise ValueError(
+            f"dissipation: the disturbances are {len(problem.disturbances.points)} points, between which random ones "
+            "would run; wanted a Box or a Ball, or random=0"
+        )
     for signal in signals:
         if not callable(signal):
             raise TypeError(f"dissipation: got {signal!r} among the disturbances, wanted functions (t, x) -> (l,)")

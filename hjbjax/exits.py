@@ -12,9 +12,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from hjbjax.closed_loop import check_kept
 from hjbjax.problem import Problem
-from hjbjax.pytree import as_partial, node
+from hjbjax.pytree import as_partial, is_traced, node
 
 
 @node(static=("marched", "timed"))
@@ -53,16 +55,17 @@ class Closed:
         return t, x, jnp.where(acts, u, 0), d, acts
 
 
-def closed(problem: Problem, feedback: Any, name: str) -> Problem:
+def closed(problem: Problem, feedback: Any, horizon: Any, name: str) -> Problem:
     """The problem with its control replaced by a feedback, and with none of its costs.
 
     Args:
       problem: the problem, with controls.
       feedback: a Solution, or a function of x (of t and x if the problem depends on the time).
+      horizon: how long it is to act; a marched one must be kept at times that are dense enough up to there.
       name: who asks, for refusals.
 
     Raises:
-      ValueError: there is no control to replace.
+      ValueError: there is no control to replace; a marched feedback that is not known up to the horizon.
       TypeError: the feedback cannot be called.
     """
     if problem.controls is None:
@@ -72,6 +75,8 @@ def closed(problem: Problem, feedback: Any, name: str) -> Problem:
         signature = "(t, x)" if problem.time_dependent else "(x)"
         raise TypeError(f"{name}: feedback is {feedback!r}, wanted a Solution or a function {signature}")
     marched = feedback.times is not None if solved else problem.time_dependent
+    if solved and marched and isinstance(horizon, (int, float, np.number)) and not is_traced(feedback.times):
+        check_kept(feedback, float(horizon), f"{name}: horizon")
     look = jax.tree_util.Partial(_inside, as_partial(feedback.control_at)) if solved else as_partial(feedback)
     loop = Closed(problem, look, marched, marched or problem.time_dependent)
     still = solved or callable(problem.noise)  # a function always has a control, and leaves a number what it is

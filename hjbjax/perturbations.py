@@ -14,8 +14,10 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import numpy as np
 
+from hjbjax import checks
 from hjbjax.canvas import COLOURS, GREY, axes_of, label_axes, logarithmic
 from hjbjax.convergence import fitted_order
 from hjbjax.gain import attenuation, saturation
@@ -24,7 +26,7 @@ from hjbjax.iteration import Method
 from hjbjax.problem import Problem
 from hjbjax.reference import mask_of
 from hjbjax.schemes import Limited, Scheme
-from hjbjax.sets import AdmissibleSet
+from hjbjax.sets import AdmissibleSet, Ball, Box
 from hjbjax.solution import Solution
 from hjbjax.solver import solve
 from hjbjax.status import Status
@@ -145,14 +147,18 @@ def perturbation_study(
         raise ValueError("perturbation_study: the problem has noise or disturbances already; leave them out")
     if not np.asarray(problem.discount) > 0:
         raise ValueError("perturbation_study: with noise and no discount the cost has no end; give a discount > 0")
-    mask = mask_of(region, grid)
+    mask = mask_of(region, grid, "perturbation_study")
+    games = [attenuation(problem, gamma, disturbances, enters=enters) for gamma in levels[1][::-1]]
+    if not isinstance(disturbances, (Box, Ball)):
+        raise ValueError(f"perturbation_study: the disturbances are {disturbances!r:.60}; wanted a Box or a Ball")
+    with jax.enable_x64(True):
+        checks.shapes(games[0], grid, scheme)
 
     def solved(which: Problem, throw: bool = False) -> Solution:
         return solve(which, grid, scheme=scheme, method=method, tol=tol, throw=throw)
 
     nominal = solved(problem, throw=True)
     noisy = [solved(dataclasses.replace(problem, noise=epsilon)) for epsilon in levels[0]]
-    games = [attenuation(problem, gamma, disturbances, enters=enters) for gamma in levels[1][::-1]]
     robust = [solved(game) for game in games]
     felt = saturation(dataclasses.replace(robust[-1], disturbance=_within(robust[-1], mask)), games[-1], inner=1.0)
     if felt.share > 0:

@@ -2,7 +2,8 @@
 
 The equations are those of ``solve`` and ``march`` with the exit costs of ``exits``; nothing is solved here. For all
 times without discount a chain that may stay away for ever has more than one solution: there value iteration from zero
-finds the least one, which is the probability; where every pair of actions must end, any method does.
+finds the least one, which is the probability; where every pair of actions must end, any method does. The chain
+tells at host level; inside jit, vmap and grad it is taken for granted that every pair must end.
 """
 
 import contextlib
@@ -14,7 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from hjbjax import checks, exits, proper, survey
+from hjbjax import checks, exits, memory, proper, survey
 from hjbjax.fields import FallbackWarning
 from hjbjax.grid import Grid
 from hjbjax.horizon import march
@@ -27,6 +28,7 @@ from hjbjax.solver import as_dtype, check_arguments, solve
 
 TOL = 1e-6
 TOL_OF_STEPS = 1e-9  # value iteration stops by its last step, which is much smaller than what is left
+ROUNDING = 32  # units in the last place of a probability, below which no step is asked for
 
 
 def reach_probability(
@@ -45,7 +47,11 @@ def reach_probability(
     V(x) = sup_u inf_d P(x(τ) in the target, τ ≤ horizon), τ the first time in the target or in the obstacle, from
     min max (V_t + f·DV + ½ tr σσᵀD²V) = 0 with V = 1 on the target and 0 on the obstacle. Order and cost are those
     of ``march``, and of ``solve`` without a horizon. There is no certificate. Where for all times the state may stay
-    away from both, value iteration from zero finds the probability among several solutions, which is slower.
+    away from both, value iteration from zero finds the probability among several solutions, which is slower. It stops
+    at a step of at most 1e-9 (4e-6 in float32), which bounds nothing: where steps shrink slowly more is left.
+
+    Inside ``jit``, ``vmap`` and ``grad`` it is not looked for whether the state may stay away for ever: where it may,
+    the answer there may be wrong.
 
     Args:
       problem: the system; its costs and its discount play no part.
@@ -55,8 +61,10 @@ def reach_probability(
       horizon: until when, in units of time; ``None`` is for all times.
       least: the least probability instead: the control keeps away.
       feedback: a Solution or a function of the state that acts in place of the control; then nothing is optimised.
-        Where a Solution has no action the state stays for ever.
-      options: anything else that ``march`` takes, or ``solve`` without a horizon: times, scheme, method, tol, ...
+        Where a Solution has no action the state stays for ever. A marched one must have been kept at times that
+        are dense enough up to the horizon.
+      options: anything else that ``march`` takes, or ``solve`` without a horizon: times, scheme, method, ...; tol is
+        that of ``solve``, 1e-6 by default: a bound on the residual and the last step.
 
     Returns:
       A Solution whose value is the probability, and whose policy attains it.
@@ -73,7 +81,7 @@ def reach_probability(
       0.6225
     """
     name = "reach_probability"
-    problem, inside, hit = _asked(problem, target, obstacle, feedback, name)
+    problem, inside, hit = _asked(problem, target, obstacle, feedback, horizon, name)
     sign = 1.0 if least else -1.0
     question = exits.ending(problem, inside, hit, 0.0, sign)
     with _quiet(feedback):
@@ -154,8 +162,8 @@ def expected_exit_time(
       A Solution whose value is the time, inf where the target is not reached for certain.
 
     Raises:
-      ValueError: no target; a control that may stay away for ever, asked for the greatest time; and what ``solve``
-        and ``march`` refuse.
+      ValueError: no target; asked for the greatest time, a control that may stay away for ever, in a game also if it
+        needs the disturbance's help, which is not looked for inside ``jit``; and what ``solve`` and ``march`` refuse.
       SolveError: no convergence, with the partial solution.
 
     Example:
@@ -167,7 +175,7 @@ def expected_exit_time(
       0.1875
     """
     name = "expected_exit_time"
-    problem, inside, _ = _asked(problem, target, None, feedback, name)
+    problem, inside, _ = _asked(problem, target, None, feedback, horizon, name)
     sign = -1.0 if greatest else 1.0
     question = exits.ending(problem, inside, None, sign, 0.0)
     with _quiet(feedback):
@@ -178,7 +186,9 @@ def expected_exit_time(
         return _answer(question, grid, horizon, options, sign)
 
 
-def _asked(problem: Any, target: Any, obstacle: Any, feedback: Any, name: str) -> tuple[Problem, Any, Any]:
+def _asked(
+    problem: Any, target: Any, obstacle: Any, feedback: Any, horizon: Any, name: str
+) -> tuple[Problem, Any, Any]:
     """The system that runs, with its loop closed if there is a feedback, its target and its obstacle."""
     if not isinstance(problem, Problem):
         raise TypeError(f"{name}: got {type(problem).__name__}, wanted a Problem")
@@ -188,7 +198,7 @@ def _asked(problem: Any, target: Any, obstacle: Any, feedback: Any, name: str) -
     hit = as_partial(obstacle, f"{name}: obstacle")
     if feedback is None:
         return problem, inside, hit
-    loop = exits.closed(problem, feedback, name)
+    loop = exits.closed(problem, feedback, horizon, name)
     needs_time = loop.time_dependent and not problem.time_dependent
     return loop, exits.timed(inside, needs_time), exits.timed(hit, needs_time)
 
@@ -210,10 +220,14 @@ def _without_end(question: Problem, grid: Grid, most: float, options: dict) -> t
     ``most`` bounds the value from above by itself. Given as a stopping cost it says that there is something to fall
     back on, so that no node is taken for one without a value.
     """
-    if not _may_stay(question, grid, {"tol": TOL} | options):
-        return question, {"tol": TOL} | options
+    options = {"tol": TOL} | options
+    if not _may_stay(question, grid, options):
+        return question, options
     question = dataclasses.replace(question, stopping_cost=most)
-    return question, {"tol": TOL_OF_STEPS, "method": ValueIteration(), "guess": np.zeros(grid.shape)} | options
+    smallest = max(TOL_OF_STEPS, ROUNDING * float(np.finfo(as_dtype(options.get("dtype"))).eps))
+    tol = options["tol"] if is_traced(options["tol"]) else min(options["tol"], smallest)
+    defaults = {"method": ValueIteration(), "guess": np.zeros(grid.shape)}
+    return question, defaults | options | {"tol": tol}
 
 
 def _may_stay(question: Problem, grid: Grid, options: dict) -> int:
@@ -222,7 +236,9 @@ def _may_stay(question: Problem, grid: Grid, options: dict) -> int:
     check_arguments(question, grid, options.get("method"), scheme, options["tol"], None, None)
     if is_traced(question, grid):
         return 0
+    method = options.get("method") or ValueIteration()  # needs the least; solve asks again for what it takes
     with jax.enable_x64(kind == np.float64):
+        memory.require(question, grid, method, kind, options.get("max_memory"))
         checks.shapes(question, grid, scheme)
         survey.values(question, grid, kind)
         return int(np.sum(np.asarray(proper.refuge(question, grid, scheme=scheme.chain, dtype=kind))))
@@ -231,8 +247,9 @@ def _may_stay(question: Problem, grid: Grid, options: dict) -> int:
 def _refuse_staying(question: Problem, grid: Grid, options: dict) -> None:
     count = _may_stay(question, grid, options)
     if count:
+        how, who = ("may be", "actions of both players keep") if question.is_game else ("is", "action keeps")
         raise ValueError(
-            f"expected_exit_time: the greatest time is infinite: at {count} of {grid.size} nodes some action keeps the "
+            f"expected_exit_time: the greatest time {how} infinite: at {count} of {grid.size} nodes some {who} the "
             "state away from the target for ever;\ngive horizon= for E min(τ, horizon), or noise that drives it out"
         )
 

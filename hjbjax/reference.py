@@ -95,31 +95,31 @@ def at_nodes_of(reference: Any, grid: Grid, mask: np.ndarray) -> np.ndarray:
     return values
 
 
-def evaluate(function: Callable, grid: Grid, what: str) -> np.ndarray:
-    """A function of one state at all nodes, in float64."""
+def evaluate(function: Callable, grid: Grid, what: str, name: str = "convergence_study") -> np.ndarray:
+    """A function of one state at all nodes, in float64; ``name`` is who asks, for refusals."""
     with jax.enable_x64(True):
         got = jax.eval_shape(function, jax.ShapeDtypeStruct((grid.ndim,), np.float64))
         if getattr(got, "shape", None) != ():
             shape = getattr(got, "shape", got)
-            raise ValueError(f"convergence_study: {what} returned shape {shape} for one state; wanted a scalar, ()")
+            raise ValueError(f"{name}: {what} returned shape {shape} for one state; wanted a scalar, ()")
         states = grid.nodes().reshape(-1, grid.ndim)
         return np.asarray(jax.jit(jax.vmap(function))(states)).reshape(grid.shape)
 
 
-def mask_of(region: Any, grid: Grid) -> np.ndarray:
-    """The nodes that count, bool (*grid)."""
+def mask_of(region: Any, grid: Grid, name: str = "convergence_study") -> np.ndarray:
+    """The nodes that count, bool (*grid); ``name`` is who asks, for refusals."""
     if region is None:
         return np.ones(grid.shape, bool)
     if callable(region):
-        inside = evaluate(region, grid, "the region").astype(bool)
+        inside = evaluate(region, grid, "the region", name).astype(bool)
     elif isinstance(region, (int, float)) and not isinstance(region, bool):
         if not 0 < region <= 1:
-            raise ValueError(f"convergence_study: got region = {region!r}; wanted a share of the box in (0, 1]")
+            raise ValueError(f"{name}: got region = {region!r}; wanted a share of the box in (0, 1]")
         inside = grid.inner(region)
     else:
-        raise TypeError(f"convergence_study: got region = {region!r}; wanted a function of one state, or a share")
+        raise TypeError(f"{name}: got region = {region!r}; wanted a function of one state, or a share")
     if not inside.any():
-        raise ValueError(f"convergence_study: no node of the grid {grid.shape} lies in the region; enlarge it")
+        raise ValueError(f"{name}: no node of the grid {grid.shape} lies in the region; enlarge it")
     return inside
 
 

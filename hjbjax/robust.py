@@ -29,6 +29,7 @@ H∞-optimal control and related minimax design problems.
 import dataclasses
 import math
 from collections.abc import Callable
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -36,13 +37,14 @@ import numpy as np
 from hjbjax.gain import Saturation, saturation
 from hjbjax.grid import Grid
 from hjbjax.horizon import march
-from hjbjax.problem import Problem
+from hjbjax.problem import Problem, may_be_positive
 from hjbjax.schemes import Scheme, Weno5
 from hjbjax.sets import Ball, Box
 from hjbjax.solution import Solution, SolveError
 from hjbjax.status import Status
 
 DOUBLINGS = 6  # of the time marched, at most
+SOON = 1e-6  # seconds: a limit that ends a march after its first look
 CLOSE, FALL = 10.0, 1 / 3  # growth so near settle counts as settled if it falls by this factor; at the level it halves
 
 
@@ -134,13 +136,14 @@ def hinf_level(
       settle: growth of V over a doubling of the time below which it has settled.
       horizon: the longest time to march, in units of time: many times the slowest of the closed loop.
       scheme: as for ``march``.
-      time_limit: seconds for one γ.
+      time_limit: seconds for one γ, all of its marches together.
 
     Returns:
       The level with its bracket, and what was found at every γ.
 
     Raises:
-      ValueError: not 0 < lo < hi; feasible at lo, infeasible at hi; a problem without disturbances.
+      ValueError: not 0 < lo < hi; feasible at lo, infeasible at hi; a problem without disturbances, or with a discount,
+        a target or anything else with which V tells no gain.
       TypeError: something that makes no problem.
       SolveError: a march was interrupted or ran out of time.
 
@@ -158,7 +161,7 @@ def hinf_level(
     def at(gamma: float) -> Trial:
         problem = problem_of_gamma(gamma)
         _check_problem(problem, gamma)
-        return _try(problem, grid, float(gamma), inner, settle, horizon, scheme=scheme, time_limit=time_limit)
+        return _try(problem, grid, float(gamma), inner, settle, horizon, scheme, time_limit)
 
     top = at(hi)
     if not top.feasible:
@@ -185,16 +188,18 @@ def _try(
     inner: float,
     settle: float,
     horizon: float,
-    **options: Any,
+    scheme: Scheme,
+    time_limit: float | None,
 ) -> Trial:
     """March until the value settles, saturates or the horizon is there, doubling the time."""
+    began, left = perf_counter(), time_limit
     watch = inner if isinstance(problem.disturbances, Box) else 0.0
     inside = grid.inner(inner)
     if not np.all([np.sum(np.any(inside, axis=_others(grid, k))) >= 3 for k in range(grid.ndim)]):
         raise ValueError(f"hinf_level: inner = {inner:g} of {grid.shape} nodes holds fewer than 3 along an axis")
     value, total, span, gains = np.zeros(grid.shape), 0.0, horizon / 2**DOUBLINGS, [math.inf]
     while True:
-        solution = march(problem, grid, span, start=value, inner=watch, throw=False, **options)
+        solution = march(problem, grid, span, start=value, inner=watch, throw=False, scheme=scheme, time_limit=left)
         after, total = np.asarray(solution.value[0]), total + span - float(solution.times[0])
         size, gain = (float(np.max(np.abs(each[inside]))) for each in (after, after - value))
         bound = saturation(solution, problem, inner=inner)
@@ -202,6 +207,7 @@ def _try(
         if reason or total >= horizon * (1 - 1e-9):
             break
         value, span, gains = after, total, [*gains, gain]
+        left = time_limit and max(time_limit - (perf_counter() - began), SOON)
     if solution.status in (Status.INTERRUPTED, Status.TIME_LIMIT):
         raise SolveError(f"hinf_level: at gamma = {gamma:g}: {solution.message}", solution)
     first = {name: getattr(solution, name)[0] for name in ("value", "policy", "disturbance")}
@@ -263,8 +269,13 @@ def _check_problem(problem: Any, gamma: float) -> None:
             f"hinf_level: problem_of_gamma({gamma:g}) has disturbances {problem.disturbances!r:.60}; wanted a Box or a "
             "Ball, as hjb.attenuation(plant, gamma, hjb.Box(...)) makes one"
         )
-    for name in ("noise", "terminal_cost", "stopping_cost", "running_max"):
+    for name in ("noise", "terminal_cost", "stopping_cost", "running_max", "target"):
         if getattr(problem, name) is not None:
             raise ValueError(f"hinf_level: the problem has a {name}, with which V no longer tells a gain; leave it out")
+    if may_be_positive(problem.discount):
+        raise ValueError(
+            f"hinf_level: the problem has discount = {problem.discount}, with which V settles also where the gain is "
+            "violated; leave it out"
+        )
     if problem.time_dependent or problem.cost is None:
         raise ValueError("hinf_level: wanted a problem that has a cost and does not depend on the time")

@@ -39,6 +39,7 @@ class Filter:
     def __call__(self, *where: Any) -> jax.Array:
         """The control, shape (m,)."""
         wanted = jnp.asarray(self.nominal(*where))
+        wanted = wanted.astype(jnp.result_type(wanted, float))  # or integers would cut off the safe action
         acts = self.acts(*where)
         safe = jnp.asarray(self.tube.control_at(*self._asked(where), clamp=True), wanted.dtype)
         return jnp.where(acts, safe, wanted)
@@ -72,7 +73,8 @@ def least_restrictive(solution: Solution, nominal: Any, *, margin: float | None 
 
     Raises:
       TypeError: no Solution, or a nominal control that cannot be called.
-      ValueError: a tube without controls, that did not converge, or is nowhere safe; a margin that is negative or NaN.
+      ValueError: a tube without controls, that did not converge, is nowhere safe, or was marched and kept at one time
+        only; a margin that is negative or NaN.
 
     Example:
       >>> import hjbjax as hjb
@@ -87,6 +89,11 @@ def least_restrictive(solution: Solution, nominal: Any, *, margin: float | None 
     if not isinstance(solution, Solution):
         raise TypeError(f"least_restrictive: got {type(solution).__name__}, wanted the Solution of a tube")
     control = _nominal(nominal)
+    if solution.times is not None and np.size(solution.times) < 2:
+        raise ValueError(
+            "least_restrictive: the tube was marched and kept at one time only, as if it were the same at all others; "
+            "keep more of them, as in march(..., times=np.linspace(0, horizon, 41))"
+        )
     if solution.policy is None or np.shape(solution.policy)[-1] == 0:
         raise ValueError("least_restrictive: the tube has no controls, so that there is nothing to take over with")
     tube = Solution(

@@ -9,13 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.closed_loop import Loop, Stepping, integrate
+from hjbjax.closed_loop import Loop, Stepping, check_kept, integrate
 from hjbjax.grid import Grid
 from hjbjax.path import Path, truncated
 from hjbjax.problem import Problem
 from hjbjax.pytree import as_partial, cast, is_traced
-
-FEWEST = 10  # intervals between kept times that a marched feedback must have over a path
 
 _compiled = jax.jit(integrate)
 
@@ -232,20 +230,7 @@ def _from_marched(look_up: Callable, t: Any, x: Any) -> Any:
 
 def _within_horizon(problem: Problem, solution: Any, duration: float) -> Problem:
     """Refuse a marched feedback that is not known well enough; without the terminal cost if the path ends before."""
-    times = np.asarray(solution.times, np.float64)
-    horizon = float(getattr(solution, "stats", {}).get("horizon", times[-1]))
-    if duration > horizon * (1 + 1e-9):
-        raise ValueError(
-            f"simulate: duration = {duration:g} goes beyond the horizon {horizon:g} of the solution; shorten it"
-        )
-    between = np.concatenate([[0.0], times[(times > 0) & (times < duration)], [duration]])
-    gap = float(np.max(np.diff(between)))
-    if times[0] > 0 or times[-1] < duration * (1 - 1e-9) or gap > duration / FEWEST * (1 + 1e-9):
-        raise ValueError(
-            f"simulate: the solution was marched and kept at {times.size} times from {times[0]:g} to {times[-1]:g}; "
-            f"a feedback up to t = {duration:g} wants all of that covered,\nat most {duration / FEWEST:g} apart: "
-            f"march(..., times=np.linspace(0, {horizon:g}, 41))"
-        )
+    horizon = check_kept(solution, duration, "simulate: duration")
     if duration < horizon * (1 - 1e-9) and problem.terminal_cost is not None:
         problem = copy.copy(problem)
         object.__setattr__(problem, "terminal_cost", None)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
-from hjbjax import plotting, zoo
+from hjbjax import perturbations, plotting, zoo
 from hjbjax.perturbations import Series
-from hjbjax.sets import Box
+from hjbjax.sets import Box, Finite
 
 PLANT = hjb.Problem(lambda x, u: u, lambda x, u: 0.5 * (x @ x + u @ u), Box([-4.0], [4.0]), discount=1.0)
 GRID = hjb.Grid([-2.0], [2.0], (41,))
@@ -84,10 +84,20 @@ def test_changes_below_the_tolerance_are_not_fitted(line):
         ({"gammas": [1.0, -2.0]}, r"got gammas = \[1.0, -2.0\]"),
         ({"problem": dataclasses.replace(PLANT, noise=0.1)}, r"has noise or disturbances already"),
         ({"problem": dataclasses.replace(PLANT, discount=0.0)}, r"give a discount > 0"),
-        ({"region": 2.0}, r"region = 2.0; wanted a share of the box"),
+        ({"region": 2.0}, r"perturbation_study: got region = 2.0; wanted a share of the box"),
+        ({"region": lambda x: x}, r"perturbation_study: the region returned shape \(1,\)"),
+        ({"region": lambda x: x[0] > 9}, r"perturbation_study: no node of the grid"),
+        ({"problem": dataclasses.replace(PLANT, cost=None)}, r"attenuation: the problem has no cost"),
+        ({"disturbances": None}, r"the disturbances are None; wanted a Box or a Ball"),
+        ({"disturbances": Finite([[0.0], [1.0]])}, r"(?s)the disturbances are Finite.* wanted a Box or a Ball"),
+        ({"disturbances": Box([-1.0] * 2, [1.0] * 2)}, r"drift"),
     ],
 )
-def test_bad_input_is_refused(changes, reason):
+def test_bad_input_is_refused_before_anything_is_solved(changes, reason, monkeypatch):
+    def solved(*arguments, **options):
+        raise AssertionError
+
+    monkeypatch.setattr(perturbations, "solve", solved)
     arguments = {"problem": PLANT, "grid": GRID} | SETS | changes
     with pytest.raises(ValueError, match=reason):
         hjb.perturbation_study(**arguments)

@@ -10,7 +10,7 @@ from scipy.stats import norm
 from systems import SEEDS, random_grid, random_problem
 
 import hjbjax as hjb
-from hjbjax import chain, exits, marching
+from hjbjax import chain, exits, marching, probabilities
 from hjbjax.pytree import node
 
 UNIT = hjb.Box([-1.0], [1.0])
@@ -349,12 +349,15 @@ def calm_in_the_middle(x, u):
     return jnp.where(jnp.abs(x) <= 0.275, 0.0, 1.0)
 
 
-def test_who_may_stay_for_ever_need_not_arrive():
+@pytest.mark.parametrize(
+    ("options", "atol"), [({}, 1e-5), ({"tol": 1e-2}, 1e-5), ({"dtype": "float32", "tol": 1e-2}, 1e-3)]
+)
+def test_who_may_stay_for_ever_need_not_arrive(options, atol):
     """Noise only beyond the nodes ±¼: what is inside stays; from outside one comes to rest there, or to ±1."""
     grid = interval(41, lo=-1.0)
-    found = hjb.reach_probability(hjb.Problem(still, noise=calm_in_the_middle), grid, out_of_unit)
+    found = hjb.reach_probability(hjb.Problem(still, noise=calm_in_the_middle), grid, out_of_unit, **options)
     x = np.abs(np.asarray(grid.axis(0)))
-    np.testing.assert_allclose(found.value, np.clip((x - 0.25) / 0.75, 0, 1), rtol=0, atol=1e-5)
+    np.testing.assert_allclose(found.value, np.clip((x - 0.25) / 0.75, 0, 1), rtol=0, atol=atol)
     assert found.reached is None
 
 
@@ -370,6 +373,13 @@ def test_without_noise_the_answer_is_yes_or_no(least):
 def test_a_greatest_time_without_end_is_refused():
     with pytest.raises(ValueError, match=r"greatest time is infinite: at 39 of 41 nodes some action keeps"):
         hjb.expected_exit_time(hjb.Problem(pushed, controls=UNIT), interval(41, lo=-1.0), out_of_unit, greatest=True)
+
+
+def test_in_a_game_the_greatest_time_without_end_is_a_possibility():
+    """ẋ = u + 2 d: who wants out can push twice as hard, and both together can stay."""
+    problem = hjb.Problem(lambda x, u, d: u + 2 * d, controls=UNIT, disturbances=UNIT)
+    with pytest.raises(ValueError, match=r"may be infinite: at 39 of 41 nodes some actions of both players keep"):
+        hjb.expected_exit_time(problem, interval(41, lo=-1.0), out_of_unit, greatest=True)
 
 
 # --- transformations ---
@@ -431,6 +441,33 @@ def test_bad_questions_are_refused(changes, error, reason):
     with pytest.raises(error, match=reason) as caught:
         hjb.reach_probability(**arguments)
     assert len(str(caught.value).splitlines()) <= 6
+
+
+@pytest.mark.parametrize(
+    ("times", "reason"),
+    [
+        ([0.0], r"_probability: horizon = 5 goes beyond the horizon 0 of the solution"),
+        ([0.0, 5.0], r"_probability: horizon = 5, but the solution was marched and kept at 2 times"),
+        (np.linspace(1, 5, 41), r"kept at 41 times from 1 to 5"),
+    ],
+)
+def test_a_marched_feedback_that_is_not_known_up_to_the_horizon_is_refused(times, reason):
+    grid, problem = interval(5), hjb.Problem(pushed, controls=UNIT, noise=SIGMA)
+    policy = hjb.Solution(grid, np.zeros((len(times), 5)), np.ones((len(times), 5, 1)), times=np.asarray(times))
+    for ask, target in ((hjb.reach_probability, above_one), (hjb.stay_probability, near_the_middle)):
+        with pytest.raises(ValueError, match=reason):
+            ask(problem, grid, target, feedback=policy, horizon=5.0)
+
+
+@pytest.mark.parametrize("ask", [hjb.reach_probability, hjb.expected_exit_time])
+def test_a_grid_that_does_not_fit_is_refused_before_any_node_is_looked_at(ask, monkeypatch):
+    def looked(*arguments, **options):
+        raise AssertionError
+
+    monkeypatch.setattr(probabilities.survey, "values", looked)
+    options = {"greatest": True} if ask is hjb.expected_exit_time else {}
+    with pytest.raises(MemoryError, match=r"41 nodes need about"):
+        ask(hjb.Problem(pushed, controls=UNIT), interval(41), above_one, max_memory=100, **options)
 
 
 def test_a_partial_answer_is_a_probability_too():

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import hjbjax as hjb
-from hjbjax import zoo
+from hjbjax import robust, zoo
 from hjbjax.path import PathStatus
 from hjbjax.pytree import node
 from hjbjax.robust import Trial
@@ -203,6 +203,16 @@ def test_a_march_goes_on_from_another():
             ValueError,
             r"the problem has a noise, with which V no longer tells a gain",
         ),
+        (
+            {"problem_of_gamma": lambda gamma: dataclasses.replace(LAG.game()(gamma), discount=0.5)},
+            ValueError,
+            r"the problem has discount = 0.5, with which V settles also where the gain is violated",
+        ),
+        (
+            {"problem_of_gamma": lambda gamma: dataclasses.replace(LAG.game()(gamma), target=lambda x: x @ x - 0.1)},
+            ValueError,
+            r"the problem has a target, with which V no longer tells a gain",
+        ),
     ],
 )
 def test_bad_input_is_refused(changes, error, reason):
@@ -223,6 +233,22 @@ def test_brackets_that_do_not_hold_the_level():
 def test_a_march_that_runs_out_of_time_is_no_verdict():
     with pytest.raises(hjb.SolveError, match=r"hinf_level: at gamma = 0.9"):
         hjb.hinf_level(LAG.game(), cube(1, 21), 0.6, 0.9, time_limit=1e-9)
+
+
+def test_the_marches_of_one_gamma_share_its_time(monkeypatch):
+    now, limits = [100.0], []
+
+    def slow(*arguments, time_limit, **options):
+        limits.append(time_limit)
+        now[0] += 3.0
+        return hjb.march(*arguments, **options)
+
+    monkeypatch.setattr(robust, "march", slow)
+    monkeypatch.setattr(robust, "perf_counter", lambda: now[0])
+    with pytest.raises(ValueError, match=r"hi = 0.6 is not feasible"):
+        hjb.hinf_level(LAG.game(), cube(1, 21), 0.5, 0.6, horizon=8.0, time_limit=10.0)
+    assert limits[:4] == [10.0, 7.0, 4.0, 1.0]
+    assert max(limits[4:]) < 1e-3
 
 
 # --- the problem and its saturation ---
@@ -369,6 +395,30 @@ def test_dissipation_refuses(top, changes, error, reason):
     arguments = {"problem": OSCILLATOR.game()(1.0), "solution": top.solution, "x0s": STARTS, "duration": 1.0} | changes
     with pytest.raises(error, match=reason):
         hjb.dissipation(**arguments)
+
+
+def test_random_disturbances_stay_in_a_box_without_zero():
+    """ẋ = −x and cost −½d²: what is supplied is ½∫d², with 1 ≤ d ≤ 2."""
+    problem = hjb.Problem(
+        lambda x, u, d: -x + 0 * d, lambda x, u, d: -0.5 * (d @ d), Box([-1.0], [1.0]), disturbances=Box([1.0], [2.0])
+    )
+    solution = solution_with(np.ones((5, 1)), hjb.Grid([-1.0], [1.0], (5,)))
+    found = hjb.dissipation(problem, solution, [0.5], 2.0, random=4)
+    assert np.all((found.supplied >= 1 - 1e-6) & (found.supplied <= 4))
+    assert np.ptp(found.supplied) > 0.5
+
+
+def test_random_disturbances_of_a_finite_set_are_refused():
+    problem = hjb.Problem(
+        lambda x, u, d: -x + 0 * d,
+        lambda x, u, d: -0.5 * (d @ d),
+        Box([-1.0], [1.0]),
+        disturbances=Finite([[0.0], [1.0]]),
+    )
+    solution = solution_with(np.ones((5, 1)), hjb.Grid([-1.0], [1.0], (5,)))
+    with pytest.raises(ValueError, match=r"the disturbances are 2 points, .* wanted a Box or a Ball, or random=0"):
+        hjb.dissipation(problem, solution, [0.5], 2.0)
+    assert hjb.dissipation(problem, solution, [0.5], 2.0, random=0).supplied == pytest.approx(1.0)
 
 
 def test_dissipation_refuses_a_marched_solution(top):

@@ -77,6 +77,14 @@ def test_where_it_is_safe_the_nominal_control_is_untouched_to_the_bit(tube):
     assert np.all(u[acts & (x[:, 1] > 0.1) & (exact < 0)] == -1)  # brakes, and never half
 
 
+def test_a_nominal_control_of_integers_does_not_cut_off_the_safe_one():
+    grid = hjb.Grid([-1.0], [1.0], (5,))
+    tube = hjb.Solution(grid, np.asarray(grid.axis(0)), np.full((5, 1), -0.5), code=hjb.Status.CONVERGED)
+    guarded = hjb.least_restrictive(tube, lambda x: jnp.array([1]), margin=0.1)
+    assert guarded(jnp.array([0.5])).tolist() == [-0.5]
+    assert guarded(jnp.array([-0.5])).tolist() == [1.0]
+
+
 def test_it_can_be_compiled(tube):
     guarded = hjb.least_restrictive(tube, full_throttle)
     for x in ([-2.5, 0.0], [-0.2, 1.0]):
@@ -213,6 +221,12 @@ def test_what_guards_nothing_is_refused(tube, arguments, changes, error, reason)
     with pytest.raises(error, match=reason) as caught:
         hjb.least_restrictive(**arguments)
     assert len(str(caught.value).splitlines()) <= 6
+
+
+def test_a_marched_tube_that_is_kept_at_one_time_is_refused(tube):
+    once = hjb.Solution(GRID, tube.value[None], tube.policy[None], code=tube.code, times=np.zeros(1))
+    with pytest.raises(ValueError, match=r"marched and kept at one time only.* times=np.linspace"):
+        hjb.least_restrictive(once, full_throttle)
 
 
 def test_traced_use_wants_a_margin(tube):

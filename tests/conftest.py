@@ -2,7 +2,10 @@
 
 import gc
 import os
+from pathlib import Path
 
+import jax
+import pytest
 from hypothesis import settings
 
 os.environ["MPLBACKEND"] = "Agg"  # for this process and for the commands and notebooks that tests start
@@ -13,3 +16,15 @@ gc.set_threshold(100_000, 20, 20)
 # The first example of a law compiles what the others reuse, so a deadline would time the compiler.
 settings.register_profile("hjbjax", deadline=None, print_blob=True)
 settings.load_profile("hjbjax")
+
+MAPS = 20_000  # of the 65 530 that Linux allows a process; every compiled kernel takes a few, and XLA crashes beyond
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _room_for_code():
+    """Compiled programs are forgotten after a file of tests once they take much room."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > MAPS:
+        jax.clear_caches()
+        gc.collect()

@@ -44,6 +44,7 @@ def same(left, right):
     return np.allclose(left, right, rtol=1e-9, atol=1e-9, equal_nan=True)
 
 
+@pytest.mark.slow
 def test_each_lane_is_its_own_solve():
     """Discounts far apart take different numbers of steps, so that lanes are taken out on the way."""
     questions = [

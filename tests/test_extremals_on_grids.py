@@ -70,6 +70,7 @@ def test_going_round_costs_what_another_code_says():
     assert extremal.cost == pytest.approx(13.3240, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_a_finite_horizon():
     """A marched solution: its DV at every time along the path, and as the first guess."""
     problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x + u @ u, hjb.Box([-9.0], [9.0]))
@@ -102,6 +103,7 @@ def test_a_loop_as_the_guess_of_a_free_time_without_end_states():
     assert (extremal.horizon, extremal.cost) == pytest.approx((0.5, 1.5), abs=1e-7)
 
 
+@pytest.mark.slow
 def test_a_loop_as_the_guess_where_the_start_is_at_rest_and_the_end_has_to_be():
     """Over d = 1 − x(T) in T = √(6d) at the cost 4/3 T; where to stop is up to the final cost 10x²."""
     grid = hjb.Grid([-2.0, -2.0], [2.0, 2.0], (9, 9))

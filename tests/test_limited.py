@@ -128,6 +128,7 @@ def test_manufactured_problem_in_space_is_second_order():
     assert errors[0] <= 0.05 * largest_error(in_space(41), Space().value, inside(0.5), PLAIN, tol=1e-4)
 
 
+@pytest.mark.slow
 def test_slopes_of_a_quadratic_are_exact():
     """LQ on the inner half of the box, where no path is cut off; the plain chain is 1e-1 off."""
     exact = zoo.double_integrator_lq_exact()

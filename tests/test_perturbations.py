@@ -103,6 +103,7 @@ def test_bad_input_is_refused_before_anything_is_solved(changes, reason, monkeyp
         hjb.perturbation_study(**arguments)
 
 
+@pytest.mark.slow
 def test_a_set_that_is_felt_is_refused():
     """At γ = 5 the worst disturbance is p x/25, .0125 at x = ½."""
     with pytest.raises(ValueError, match=r"at gamma = 5 the worst disturbance sits on its bound at .* widen the set"):

@@ -345,6 +345,7 @@ def energies(top):
     return hjb.dissipation(game, top.solution, STARTS, 15.0, disturbances=[resonant], random=6, key=3)
 
 
+@pytest.mark.slow
 def test_the_inequality_holds_along_paths(top, energies):
     kinds = np.array(energies.disturbances)
     assert [int(np.sum(kinds == kind)) for kind in ("worst case", "random", "given")] == [3, 18, 3]

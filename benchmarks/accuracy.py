@@ -108,8 +108,7 @@ def measure(cases: Sequence[Case], *, quick: bool, tol: float) -> list[dict[str,
             label = {"code": "hjbjax", "scheme": type(scheme).__name__, "options": str(scheme)}
             found += attempt(lambda scheme=scheme: ours(case, nodes, scheme, tol), about | label)  # noqa: B023
         label = {"code": "hj_reachability", "scheme": "hj_reachability very_high"}
-        problem, grids, exact = case.questions(nodes)
-        found += attempt(lambda: marched(problem, grids, exact, tol=tol, region=case.region), about | label)  # noqa: B023
+        found += attempt(lambda: marched(*case.questions(nodes), tol=tol, region=case.region), about | label)  # noqa: B023
         click.echo(table([row for row in found if "shape" in row], COLUMNS))
         for row in found:
             if "reason" in row:

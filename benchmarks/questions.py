@@ -33,12 +33,10 @@ def manipulator(nodes: int) -> tuple[hjb.Problem, hjb.Grid]:
     return hjb.zoo.manipulator(links=2, discount=0.5, shape=(nodes, nodes, nodes + 1, nodes + 1))
 
 
-def double_integrator(nodes: int, *, discount: float = 1.0) -> tuple[hjb.Problem, hjb.Grid]:
+def double_integrator(nodes: int) -> tuple[hjb.Problem, hjb.Grid]:
     """Minimum time of the double integrator on [−1, 1]², exact values on {T ≤ .5} and on the edge of the box."""
-    exact = hjb.zoo.double_integrator_exact(discount=discount)
-    problem, _ = hjb.zoo.double_integrator(discount=discount)
-    problem = dataclasses.replace(problem, target=_within_half, exit_cost=exact)
-    return problem, hjb.Grid([-1.0, -1.0], [1.0, 1.0], (nodes, nodes))
+    problem, _ = hjb.zoo.double_integrator()
+    return dataclasses.replace(problem, target=_within_half), hjb.Grid([-1.0, -1.0], [1.0, 1.0], (nodes, nodes))
 
 
 def integrators(shape: tuple[int, ...], actions: int = 3) -> tuple[hjb.Problem, hjb.Grid]:

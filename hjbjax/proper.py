@@ -32,15 +32,19 @@ def _open_jumps(problem: Problem, grid: Grid, inside: jax.Array | None, scheme: 
 
     def also(known, action):
         rates = chain.rates(problem, grid, list(action), None, scheme=scheme, dtype=dtype)
-        jumps = [c > 0 for c in rates.values]
-        stays = jnp.ones((), bool)
-        if inside is not None:
-            for offset, jump in zip(rates.offsets, jumps, strict=True):
-                stays &= ~jump | stencil.neighbour(inside, grid, offset)
-        return tuple(p | (q & stays) for p, q in zip(known, jumps, strict=True)), None
+        stays = True if inside is None else _stays(rates, grid, inside)
+        return tuple(p | ((c > 0) & stays) for p, c in zip(known, rates.values, strict=True)), None
 
     none = tuple(jnp.zeros(grid.shape, bool) for _ in start.offsets)
     return Rates(start.offsets, jax.lax.scan(also, none, jnp.asarray(points, dtype))[0])
+
+
+def _stays(rates: Rates, grid: Grid, inside: jax.Array) -> jax.Array:
+    """Where all jumps that have a rate lead ``inside``, bool (*grid)."""
+    stays = jnp.ones(grid.shape, bool)
+    for offset, c in zip(rates.offsets, rates.values, strict=True):
+        stays &= (c <= 0) | stencil.neighbour(inside, grid, offset)
+    return stays
 
 
 def reached(problem: Problem, grid: Grid, held: np.ndarray, *, scheme: Upwind, dtype: Any, surely: bool) -> np.ndarray:
@@ -80,10 +84,7 @@ def refuge(problem: Problem, grid: Grid, *, scheme: Upwind, dtype: Any) -> jax.A
 
         def also(found, pair):
             rates = chain.rates(problem, grid, list(u[pair[0]]), list(d[pair[1]]), scheme=scheme, dtype=dtype)
-            stays = jnp.ones(grid.shape, bool)
-            for offset, c in zip(rates.offsets, rates.values, strict=True):
-                stays &= (c <= 0) | stencil.neighbour(inside, grid, offset)
-            return found | stays, None
+            return found | _stays(rates, grid, inside), None
 
         pairs = jnp.stack(jnp.meshgrid(jnp.arange(len(u)), jnp.arange(len(d)), indexing="ij"), -1).reshape(-1, 2)
         found = inside & jax.lax.scan(also, jnp.zeros(grid.shape, bool), pairs)[0]

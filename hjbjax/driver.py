@@ -1,7 +1,7 @@
 """The host's loop around the jitted iteration.
 
-``run`` is called in chunks of about a fifth of a second; progress, Ctrl-C, time limits and stops at NaN all live
-between two chunks.
+``run`` is called in chunks of about half a second, since every call takes its memory anew; progress, Ctrl-C, time
+limits and stops at NaN all live between two chunks.
 """
 
 import contextlib
@@ -20,7 +20,7 @@ from hjbjax import iteration
 from hjbjax.iteration import HISTORY, State, Task
 from hjbjax.status import Status
 
-CHUNK_SECONDS = 0.2
+CHUNK_SECONDS = 0.5
 
 run = jax.jit(iteration.run, donate_argnames="state")  # a state is used once: the next one takes its place in memory
 

@@ -1,6 +1,6 @@
 """The host's loop over the kept times of a march, and the solution that comes of it.
 
-Between two kept times the compiled ``run`` is called in chunks of about a fifth of a second; progress, Ctrl-C, time
+Between two kept times the compiled ``run`` is called in chunks of about half a second; progress, Ctrl-C, time
 limits and stops at NaN live between two chunks. How long a chunk is changes no bit of the answer.
 """
 

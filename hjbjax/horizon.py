@@ -1,6 +1,6 @@
 """The front door of finite horizons: ``march``.
 
-At host level it validates, finds the longest stable step, goes backward in chunks of about a fifth of a second from
+At host level it validates, finds the longest stable step, goes backward in chunks of about half a second from
 one kept time to the next, and reports. Under a tracer the same steps run in a scan of fixed length.
 """
 

@@ -34,7 +34,7 @@ def finish(
     solution = assemble(task, state, verdict)
     lost = ~np.asarray(task.counted)
     arrays = {name: getattr(solution, name) for name in ("value", "lower", "upper", "policy", "disturbance")}
-    arrays = {name: None if array is None else np.array(array) for name, array in arrays.items()}
+    arrays = {name: None if array is None else np.require(array, requirements="W") for name, array in arrays.items()}
     for array in (arrays["value"], arrays["lower"], arrays["upper"]):
         if array is not None:
             array[lost] = np.inf

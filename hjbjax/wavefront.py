@@ -9,6 +9,8 @@ so that such a hyperplane is one slice S[d] (several, folded); its neighbours st
 entry to the side for the axes beyond the first. A forward sweep goes through the slices upwards, a backward one
 downwards, and flipping axes beyond the first before shearing gives all 2ⁿ orders. What comes across the fold, or
 across the seam of a periodic axis, is as old as the last sweep.
+
+Where the arrays outgrow a processor's cache, slabs of slices take the place of single sweeps through all of them.
 """
 
 from typing import Any
@@ -19,6 +21,11 @@ import jax.numpy as jnp
 from hjbjax import stencil
 from hjbjax.bellman import Correction
 from hjbjax.grid import Grid
+
+Weights = list[tuple[jax.Array, ...]]  # for each axis, as ``_towards`` gives them
+
+CACHE = 2**25  # bytes that a processor keeps near by
+SLAB = 64  # slices
 
 
 def gauss_seidel(equation: Correction, grid: Grid, rounds: int) -> jax.Array:
@@ -33,16 +40,57 @@ def gauss_seidel(equation: Correction, grid: Grid, rounds: int) -> jax.Array:
         source = _sheared(equation.source, flips)
         weights = [_towards(equation, grid, axis, flips) for axis in range(grid.ndim)]
 
-        def sweep(planes: jax.Array, up: bool) -> jax.Array:
-            return _sweep(source, weights, _wrapped(planes, grid), up)
+        def whole(planes: jax.Array) -> jax.Array:
+            return _in_turns(source, weights, planes, grid, rounds)
 
-        def pair(_: Any, planes: jax.Array) -> jax.Array:
-            return sweep(sweep(planes, True), False)
+        def in_slabs(planes: jax.Array) -> jax.Array:
+            return _in_slabs(source, weights, planes, grid, rounds)
 
-        planes = jax.lax.fori_loop(0, rounds, pair, jnp.pad(_sheared(delta, flips), 1))
+        planes = jnp.pad(_sheared(delta, flips), 1)
+        arrays = 2 + sum(map(len, weights))
+        size = arrays * source.size * source.dtype.itemsize
+        if size > CACHE and SLAB * size / len(source) < CACHE / 2:
+            planes = jax.lax.platform_dependent(planes, cpu=in_slabs, default=whole)
+        else:
+            planes = whole(planes)
         return _sheared(planes[(slice(1, -1),) * grid.ndim], flips, back=True)
 
     return jax.lax.fori_loop(0, 2 ** (grid.ndim - 1), order, jnp.zeros_like(equation.source))
+
+
+def _in_turns(source: jax.Array, weights: Weights, planes: jax.Array, grid: Grid, rounds: int) -> jax.Array:
+    """All slices upwards and downwards, ``rounds`` times."""
+
+    def sweep(turn: jax.Array, planes: jax.Array) -> jax.Array:
+        return _sweep(source, weights, _wrapped(planes, grid), 0, len(source), up=turn % 2 == 0)
+
+    return jax.lax.fori_loop(0, 2 * rounds, sweep, planes)
+
+
+def _in_slabs(source: jax.Array, weights: Weights, planes: jax.Array, grid: Grid, rounds: int) -> jax.Array:
+    """Slab after slab upwards and once more downwards; each to and fro while it is in the cache.
+
+    What lies beyond the cache is read twice instead of 2 ``rounds`` times, and a slab at hand is swept for little:
+    2 ``rounds`` + 1 times.
+    """
+    count = len(source)
+    slabs = -(-count // SLAB)
+
+    def once(turn: jax.Array, planes: jax.Array) -> jax.Array:
+        up = turn == 0
+
+        def slab(index: jax.Array, planes: jax.Array) -> jax.Array:
+            first = SLAB * jnp.where(up, index, slabs - 1 - index)
+            last = jnp.minimum(first + SLAB, count)
+
+            def sweep(k: jax.Array, planes: jax.Array) -> jax.Array:
+                return _sweep(source, weights, planes, first, last, up=up == (k % 2 == 0))
+
+            return jax.lax.fori_loop(0, 2 * rounds + 1, sweep, planes)
+
+        return jax.lax.fori_loop(0, slabs, slab, _wrapped(planes, grid))
+
+    return jax.lax.fori_loop(0, 2, once, planes)
 
 
 def _towards(equation: Correction, grid: Grid, axis: int, flips: list[jax.Array]) -> tuple[jax.Array, ...]:
@@ -68,9 +116,8 @@ def _wrapped(planes: jax.Array, grid: Grid) -> jax.Array:
     return planes.at[-1].set(planes[1])  # of the result, or XLA copies all planes to keep the old ones
 
 
-def _sweep(source: jax.Array, weights: list[tuple[jax.Array, ...]], planes: jax.Array, up: bool) -> jax.Array:
-    """One pass over the slices; ``planes`` has a margin of one entry on every side."""
-    count = source.shape[0]
+def _sweep(source: jax.Array, weights: Weights, planes: jax.Array, first: Any, last: Any, *, up: Any) -> jax.Array:
+    """One pass over the slices from ``first`` to ``last``; ``planes`` has a margin of one entry on every side."""
 
     def row(values: jax.Array, d: Any) -> jax.Array:
         return jax.lax.dynamic_slice_in_dim(values, d, 1, allow_negative_indices=False)
@@ -82,7 +129,7 @@ def _sweep(source: jax.Array, weights: list[tuple[jax.Array, ...]], planes: jax.
         return slab[(slice(None), *cut)]
 
     def relax(k: jax.Array, planes: jax.Array) -> jax.Array:
-        d = k if up else count - 1 - k
+        d = jnp.where(up, k, first + last - 1 - k)
         below, above, new = row(planes, d), row(planes, d + 2), row(source, d)
         for axis, pair in enumerate(weights):
             rows = [row(w, d) for w in pair]
@@ -91,7 +138,7 @@ def _sweep(source: jax.Array, weights: list[tuple[jax.Array, ...]], planes: jax.
         start: tuple[Any, ...] = (d + 1, *(1 for _ in source.shape[1:]))
         return jax.lax.dynamic_update_slice(planes, new, start, allow_negative_indices=False)
 
-    return jax.lax.fori_loop(0, count, relax, planes)
+    return jax.lax.fori_loop(first, last, relax, planes)
 
 
 def _sheared(values: jax.Array, flips: list[jax.Array], *, back: bool = False) -> jax.Array:

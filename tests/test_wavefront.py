@@ -21,18 +21,27 @@ def _float64():
         yield
 
 
-def by_a_loop(dense, source, grid, rounds):
-    """Every order, forward and backward by hyperplanes: newest values, but across folds and seams those before."""
+def passes(count, rounds, slab=None):
+    """The slices in the order in which they are swept, a list for every time that folds and seams are looked across."""
+    if slab is None:
+        return [range(count), range(count)[::-1]] * rounds
+    slabs = [range(first, min(first + slab, count)) for first in range(0, count, slab)]
+    upwards = [d for part in slabs for k in range(2 * rounds + 1) for d in part[:: 1 - 2 * (k % 2)]]
+    downwards = [d for part in slabs[::-1] for k in range(2 * rounds + 1) for d in part[:: 2 * (k % 2) - 1]]
+    return [upwards, downwards]
+
+
+def by_a_loop(dense, source, grid, rounds, slab=None):
+    """Every order by hyperplanes: newest values, but across folds and seams those before the pass."""
     number, indices = np.arange(grid.size), np.indices(grid.shape)
     delta = np.zeros(grid.size)
     for index in range(2 ** (grid.ndim - 1)):
         flips = [False, *((index >> axis) & 1 for axis in range(grid.ndim - 1))]
         along = [n - 1 - i if flip else i for i, n, flip in zip(indices, grid.shape, flips, strict=True)]
         plane = np.ravel(sum(along) % grid.shape[0])
-        order = np.argsort(plane, kind="stable")
-        for sweep in (order, order[::-1]) * rounds:
+        for slices in passes(grid.shape[0], rounds, slab):
             old = delta.copy()
-            for here in sweep:
+            for here in itertools.chain.from_iterable(np.flatnonzero(plane == d) for d in slices):
                 next_to = np.abs(plane - plane[here]) <= 1
                 for axis in range(1, grid.ndim):
                     apart = np.abs(indices[axis].ravel() - indices[axis].ravel()[here])
@@ -57,6 +66,19 @@ def test_equals_a_loop_over_the_nodes(shape, periodic, seed):
     equation, dense, _ = random_equation(rng, grid)
     expected = by_a_loop(dense, np.ravel(equation.source), grid, 2)
     assert np.allclose(sweeps(equation, grid, 2), expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(("shape", "periodic"), [((7, 5), ""), ((8, 4), "01"), ((5, 3, 4), "2")])
+def test_slabs_equal_a_loop_over_the_nodes(shape, periodic, monkeypatch):
+    monkeypatch.setattr(wavefront, "SLAB", 2)
+    flags = tuple(str(axis) in periodic for axis in range(len(shape)))
+    grid = make_grid(len(shape), flags, shape)
+    equation, dense, _ = random_equation(np.random.default_rng(0), grid)
+    monkeypatch.setattr(wavefront, "CACHE", 8 * grid.size * (2 + 2 * grid.ndim) - 1)  # less than all takes
+    found = jax.jit(lambda equation: wavefront.gauss_seidel(equation, grid, 1))(equation)
+    in_slabs, in_turns = (by_a_loop(dense, np.ravel(equation.source), grid, 1, slab) for slab in (2, None))
+    assert np.allclose(found, in_slabs, rtol=0, atol=1e-12)
+    assert not np.allclose(found, in_turns, rtol=0, atol=1e-3)
 
 
 @given(seed=SEEDS)

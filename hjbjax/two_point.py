@@ -269,7 +269,7 @@ def collocate(ask: TwoPoint, s: Any, y: Any, theta: Any, *, tol: float, max_node
         return np.asarray(_rates(arrays, *_padded(s, y), theta))[:, : len(s)]
 
     def function_slopes(s, y, theta=nothing):
-        by_state, by_theta = (np.array(part[..., : len(s)]) for part in _slopes(arrays, *_padded(s, y), theta))
+        by_state, by_theta = (np.array(part)[..., : len(s)] for part in _slopes(arrays, *_padded(s, y), theta))
         return (by_state, by_theta) if len(theta) else by_state
 
     def ends(first, last, theta=nothing):

@@ -26,8 +26,6 @@
 # show $S$ and the feedback; here they stand beside the exact answer.
 
 # %%
-import os
-
 import jax
 import matplotlib.pyplot as plt
 import numpy as np
@@ -35,7 +33,7 @@ import numpy as np
 import hjbjax as hjb
 from hjbjax import plotting
 
-nodes = int(os.environ.get("HJBJAX_NOTEBOOK_NODES", 201))  # an axis; odd, so that the origin is a node
+nodes = 201  # an axis; odd, so that the origin is a node
 
 # %% [markdown]
 # The zoo has the problem with its exact answer. A single node resolves the target poorly, since $S$ is only Hölder

@@ -22,15 +22,13 @@
 # Figures 10 to 12 of the chapter show the value, the feedback and a stabilising trajectory.
 
 # %%
-import os
-
 import matplotlib.pyplot as plt
 import numpy as np
 
 import hjbjax as hjb
 from hjbjax import plotting
 
-nodes = int(os.environ.get("HJBJAX_NOTEBOOK_NODES", 201))  # velocities; odd, so that rest is a node
+nodes = 201  # velocities; odd, so that rest is a node
 
 # %%
 problem, grid = hjb.zoo.pendulum(shape=(nodes - 1, nodes))

@@ -62,6 +62,7 @@ def test_each_lane_is_its_own_solve():
         assert same(solution.bounds, single.bounds)
 
 
+@pytest.mark.slow
 def test_problems_of_different_kinds_keep_their_places():
     finite = dataclasses.replace(problem(1.0), controls=hjb.Finite([[-1.0], [0.0], [1.0]]))
     questions = [problem(0.0), finite, problem(2.0), finite]

@@ -101,6 +101,7 @@ def inside(half_width):
 # --- smooth values: order 2 ---
 
 
+@pytest.mark.slow
 def test_smooth_nonlinear_problem_is_second_order():
     def inner(x):
         return (np.abs(x[..., 0]) <= 0.5) & (np.abs(x[..., 1]) <= 0.45)

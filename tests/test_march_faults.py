@@ -179,10 +179,10 @@ def test_it_can_be_compiled_batched_and_differentiated():
     with jax.enable_x64(True):
         plain = float(at_one(1.0))
         assert float(jax.jit(at_one)(1.0)) == pytest.approx(plain, rel=1e-9)
-        both = jax.vmap(at_one)(jnp.array([1.0, 2.0]))
+        both = jax.jit(jax.vmap(at_one))(jnp.array([1.0, 2.0]))
         assert float(both[0]) == pytest.approx(plain, rel=1e-9)
-        slope = float(jax.grad(at_one)(1.0))
-        assert slope == pytest.approx(float(jax.jvp(at_one, (1.0,), (1.0,))[1]), rel=1e-9)
+        slope = float(jax.jit(jax.grad(at_one))(1.0))
+        assert slope == pytest.approx(float(jax.jit(lambda w: jax.jvp(at_one, (w,), (1.0,))[1])(1.0)), rel=1e-9)
         assert slope == pytest.approx(float(at_one(1.001) - at_one(0.999)) / 0.002, rel=1e-4)
         implicit = jax.jit(lambda weight: at_one(weight, hjb.Implicit()))(1.0)
         assert float(implicit) == pytest.approx(float(at_one(1.0, hjb.Implicit())), abs=1e-6)

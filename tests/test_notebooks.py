@@ -10,12 +10,10 @@ ROOT = Path(__file__).parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.py"))
 
 
-def run(path, folder, monkeypatch, nodes=None):
+def run(path, folder, monkeypatch):
     """Execute a notebook in ``folder`` against this checkout; its cells with their outputs."""
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.delenv("MPLBACKEND", raising=False)  # the kernel brings its own, which keeps the pictures
-    if nodes:
-        monkeypatch.setenv("HJBJAX_NOTEBOOK_NODES", str(nodes))
     notebook = jupytext.read(path)
     NotebookClient(
         notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(folder)}}
@@ -35,11 +33,7 @@ def test_both_are_there():
     assert {path.stem for path in NOTEBOOKS} >= {"minimum_time", "pendulum"}
 
 
-def test_a_notebook_runs_on_a_coarse_grid(tmp_path, monkeypatch):
-    check(run(ROOT / "notebooks" / "minimum_time.py", tmp_path, monkeypatch, nodes=41))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_runs_as_it_stands(path, tmp_path, monkeypatch):
+def test_a_notebook_runs(path, tmp_path, monkeypatch):
     check(run(path, tmp_path, monkeypatch))

@@ -403,11 +403,11 @@ def test_a_probability_can_be_compiled_and_differentiated():
         ours = chance(0.8)
         assert ours == pytest.approx(exact, abs=1e-3)
         assert float(jax.jit(chance)(0.8)) == pytest.approx(ours, abs=1e-5)
-        slope = float(jax.grad(chance)(0.8))
+        slope = float(jax.jit(jax.grad(chance))(0.8))
         assert slope == pytest.approx(DEADLY / 2 * exact * (1 - exact), abs=2e-3)
         soon = {"horizon": 0.2, "step": 5e-4}
         assert float(jax.jit(lambda mu: chance(mu, **soon))(0.8)) == pytest.approx(chance(0.8, **soon), abs=1e-9)
-        slope = float(jax.grad(lambda mu: chance(mu, **soon))(0.8))
+        slope = float(jax.jit(jax.grad(lambda mu: chance(mu, **soon)))(0.8))
         assert slope == pytest.approx((chance(0.81, **soon) - chance(0.79, **soon)) / 0.02, rel=1e-3)
 
 

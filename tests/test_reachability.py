@@ -139,6 +139,7 @@ def air3d_grid(shape):
     return hjb.Grid([-6.0, -10.0, 0.0], [20.0, 10.0, 2 * np.pi], shape, (False, False, True))
 
 
+@pytest.mark.slow
 def test_air3d_never_leaves_the_range_of_the_distance():
     grid = air3d_grid((27, 21, 24))
     solution = hjb.march(AIR3D, grid, 1.0, times=[0.0, 1.0])

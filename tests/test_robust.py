@@ -360,6 +360,7 @@ def test_the_inequality_holds_along_paths(top, energies):
     assert "worst case" in str(energies)
 
 
+@pytest.mark.slow
 def test_the_inequality_fails_below_the_level(top):
     """What is stored at γ = 1 does not cover a gain of .7: the check can fail."""
     below = OSCILLATOR.game()(0.7)

@@ -97,7 +97,10 @@ PARAMETERS = {
 }
 
 
-@pytest.mark.parametrize("name", PARAMETERS)
+LONG = {"noise", "exit cost as a number", "mass, with a target"}
+
+
+@pytest.mark.parametrize("name", [pytest.param(p, marks=[pytest.mark.slow] * (p in LONG)) for p in PARAMETERS])
 def test_gradients_match_central_differences(name):
     at, build = PARAMETERS[name]
 

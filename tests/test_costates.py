@@ -73,11 +73,11 @@ def test_away_from_a_kink_and_beside_infinity():
 def test_on_a_node_the_second_derivative_is_that_beside_it(grid, derivative):
     solution = solution_of(lambda x: x[..., 0] ** 2 + 3 * x[..., 0] * x[..., 1], grid)
     with jax.enable_x64(True):
-        bends = jax.vmap(derivative(lambda x: solution.costate_at(x)))
+        bends = jax.jit(jax.vmap(derivative(lambda x: solution.costate_at(x))))
         states = [[grid.axis(0)[2], 1.0], [grid.axis(0)[2] + 0.01, 1.0], [0.1, grid.axis(1)[2]]]
         np.testing.assert_allclose(bends(jnp.asarray(states)), [[[2.0, 3.0], [3.0, 0.0]]] * 3, atol=1e-10)
         walled = solution_of(lambda x: np.where(x[..., 0] > 0.55, np.inf, x[..., 0] ** 2), Grid([-1.0], [1.0], (21,)))
-        edge = jax.vmap(derivative(lambda x: walled.costate_at(x)))(jnp.array([[0.5], [0.4]]))
+        edge = jax.jit(jax.vmap(derivative(lambda x: walled.costate_at(x))))(jnp.array([[0.5], [0.4]]))
     np.testing.assert_allclose(edge[1], 2, atol=1e-10)
     assert np.all(np.isfinite(edge))
 

@@ -223,7 +223,7 @@ def test_a_finite_set_is_enumerated(count, seed):
 
 
 @pytest.mark.parametrize(("mine", "theirs"), [(3, 4), (11, 12)])  # the second is beyond what is unrolled
-@pytest.mark.parametrize("isaacs", ["upper", "lower"])
+@pytest.mark.parametrize("isaacs", ["upper", pytest.param("lower", marks=pytest.mark.slow)])
 @given(seed=SEEDS)
 @settings(max_examples=4)
 def test_min_max_against_all_pairs(isaacs, mine, theirs, seed):

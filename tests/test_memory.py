@@ -110,7 +110,7 @@ def test_nobody_says_what_is_free(monkeypatch):
     assert memory.require(PROBLEM, square(30_000), METHODS[0], np.float64, None) == needed
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", [*METHODS[:2], pytest.param(METHODS[2], marks=pytest.mark.slow)])
 def test_the_estimate_is_near_what_the_compiler_reports(method):
     """Between half and four times the peak of the compiled step."""
     import jax

@@ -101,12 +101,12 @@ def test_the_answer_satisfies_its_equation(name, parameters, tolerance, sample_s
     opponents = problem.disturbances.grid(1001).points if problem.is_game else None
     states = jnp.stack([sample_state(grid, seed) for seed in range(12)])
     if name == "moon-landing":  # who falls too fast has no landing, and a value that is held
-        states = states[jax.vmap(problem.target)(states) > 0]
+        states = states[jax.jit(jax.vmap(problem.target))(states) > 0]
         assert len(states) > 4
     if name == "brownian-ball":
         states = states * 0.5
     residual = jax.jit(equation_residuals)(problem, value, states, candidates, opponents)
-    scale = np.maximum(1.0, np.abs(jax.vmap(value)(states)))
+    scale = np.maximum(1.0, np.abs(jax.jit(jax.vmap(value))(states)))
     assert np.max(np.abs(residual) / scale) < tolerance
 
 
@@ -122,7 +122,7 @@ def test_a_wrong_answer_does_not_satisfy_the_equation(entry, sample_state):
     lean = 0.01 if entry.name == "moon-landing" else 0.0
     wrong = lambda y: 1.01 * value(y) + lean * y[1]  # noqa: E731
     off = jax.jit(lambda x: equation_residual(problem, wrong, x, candidates, opponents))(x)
-    assert abs(off) > 1e-3 * min(1.0, float(value(x)))
+    assert abs(off) > 1e-3 * min(1.0, float(jax.jit(value)(x)))
 
 
 @pytest.mark.parametrize("entry", WITH_ANSWER, ids=name_of)
@@ -131,9 +131,10 @@ def test_the_answer_meets_the_exit_cost(entry):
     if problem.target is None:
         return
     nodes = grid.nodes().reshape(-1, grid.ndim)
-    inside = nodes[np.asarray(jax.vmap(problem.target)(nodes)) <= 0]
-    exit_cost = jax.vmap(problem.exit_cost)(inside) if callable(problem.exit_cost) else problem.exit_cost or 0.0
-    np.testing.assert_allclose(jax.vmap(entry.exact())(inside), exit_cost, atol=1e-5)
+    inside = nodes[np.asarray(jax.jit(jax.vmap(problem.target))(nodes)) <= 0]
+    given = problem.exit_cost if callable(problem.exit_cost) else lambda x: problem.exit_cost or 0.0
+    found, wanted = jax.jit(jax.vmap(lambda x: (entry.exact()(x), given(x))))(inside)
+    np.testing.assert_allclose(found, wanted, atol=1e-5)
 
 
 def test_known_numbers():
@@ -220,5 +221,6 @@ def test_a_damped_game_is_solvable_below_one():
     value = zoo.lq_game_exact(gamma=0.8, rate=-1.0)
     problem, _ = zoo.lq_game(gamma=0.8, rate=-1.0)
     opponents = problem.disturbances.grid(2001).points
-    residual = equation_residual(problem, value, jnp.array([0.6]), problem.controls.grid(2001).points, opponents)
+    candidates = problem.controls.grid(2001).points
+    residual = jax.jit(lambda x: equation_residual(problem, value, x, candidates, opponents))(np.array([0.6]))
     assert abs(residual) < 1e-4

@@ -61,7 +61,7 @@ def test_functions_have_the_promised_shapes(entry):
     assert problem.diffusion(*inputs[:2]).shape[0] == grid.ndim
     if problem.target is not None:
         assert jax.eval_shape(problem.target, x).shape == ()
-        inside = jax.vmap(problem.target)(grid.nodes().reshape(-1, grid.ndim)) <= 0
+        inside = np.asarray(jax.jit(jax.vmap(problem.target))(grid.nodes().reshape(-1, grid.ndim))) <= 0
         assert 0 < np.mean(inside) < 0.5
     if callable(problem.exit_cost):
         assert jax.eval_shape(problem.exit_cost, x).shape == ()
@@ -72,16 +72,21 @@ def test_functions_are_evaluated_by_components(entry, sample_state):
     # FallbackWarning is an error here, so this says that every primitive of the zoo has a component rule.
     problem, grid = entry.build()
     states = np.stack([np.asarray(sample_state(grid, seed)) for seed in range(3)])
-    columns = list(jnp.asarray(states.T))
     functions = [(problem.drift, True), (problem.cost, True), (problem.target, False), (problem.exit_cost, False)]
-    for function, acts in functions:
-        if not callable(function):
-            continue
-        inputs = arguments(problem, jnp.asarray(states[0]))[1:] if acts else ()
-        packed = [[entry for entry in one] for one in inputs]
-        got = fields.components(function, columns, *packed, dtype=np.float64)
-        wanted = np.asarray(jax.vmap(lambda x, f=function, inputs=inputs: f(x, *inputs))(states))
-        rows = np.stack([np.broadcast_to(np.asarray(e), (3,)) for e in got.reshape(-1)], axis=-1)
+
+    @jax.jit
+    def both(states):
+        """Every function by components, entries in a row, and by ``vmap``."""
+        found = []
+        for function, acts in functions:
+            if callable(function):
+                inputs = arguments(problem, states[0])[1:] if acts else ()
+                entries = fields.components(function, list(states.T), *map(list, inputs), dtype=np.float64)
+                rows = jnp.stack([jnp.broadcast_to(entry, 3) for entry in entries.reshape(-1)], axis=-1)
+                found.append((rows, jax.vmap(lambda x, f=function, inputs=inputs: f(x, *inputs))(states)))
+        return found
+
+    for rows, wanted in both(states):
         np.testing.assert_allclose(rows.reshape(wanted.shape), wanted, rtol=1e-12, atol=1e-12)
 
 
@@ -134,13 +139,14 @@ def test_a_new_mass_traces_nothing_anew():
 
 def test_the_drift_is_differentiable_in_a_parameter():
     x, u = jnp.array([0.4, 0.0]), jnp.array([3.0])
-    slope = jax.grad(lambda m: zoo.pendulum(mass=m)[0].drift(x, u)[1])(2.0)
+    slope = jax.jit(jax.grad(lambda m: zoo.pendulum(mass=m)[0].drift(x, u)[1]))(2.0)
     assert slope == pytest.approx(-3.0 / 2.0**2)
-    lengths = jax.jacobian(lambda a: zoo.manipulator(links=2, lengths=a)[0].drift(jnp.ones(4), u.repeat(2)))(
-        jnp.ones(2)
+    push = u.repeat(2)
+    lengths = jax.jit(jax.jacobian(lambda a: zoo.manipulator(links=2, lengths=a)[0].drift(jnp.ones(4), push)))(
+        np.ones(2)
     )
     assert lengths.shape == (4, 2)
-    masses = jax.grad(lambda m: zoo.Manipulator(links=2, masses=[m, 1.0]).drift(jnp.ones(4), u.repeat(2))[2])(1.0)
+    masses = jax.jit(jax.grad(lambda m: zoo.Manipulator(links=2, masses=[m, 1.0]).drift(jnp.ones(4), push)[2]))(1.0)
     assert np.isfinite(masses)
     assert np.all(np.isfinite(lengths))
 

@@ -47,15 +47,20 @@ def gauss_seidel(equation: Correction, grid: Grid, rounds: int) -> jax.Array:
             return _in_slabs(source, weights, planes, grid, rounds)
 
         planes = jnp.pad(_sheared(delta, flips), 1)
-        arrays = 2 + sum(map(len, weights))
-        size = arrays * source.size * source.dtype.itemsize
-        if size > CACHE and SLAB * size / len(source) < CACHE / 2:
+        if _outgrows_the_cache(source, weights):
             planes = jax.lax.platform_dependent(planes, cpu=in_slabs, default=whole)
         else:
             planes = whole(planes)
         return _sheared(planes[(slice(1, -1),) * grid.ndim], flips, back=True)
 
     return jax.lax.fori_loop(0, 2 ** (grid.ndim - 1), order, jnp.zeros_like(equation.source))
+
+
+def _outgrows_the_cache(source: jax.Array, weights: Weights) -> bool:
+    """Whether all slices do, and a slab of them does not."""
+    arrays = 2 + sum(map(len, weights))
+    size = arrays * source.size * source.dtype.itemsize
+    return size > CACHE and SLAB * size / len(source) < CACHE / 2
 
 
 def _in_turns(source: jax.Array, weights: Weights, planes: jax.Array, grid: Grid, rounds: int) -> jax.Array:

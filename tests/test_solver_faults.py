@@ -1,6 +1,7 @@
 """How a solve ends when it does not converge, and what the host does around it."""
 
 import _thread
+import signal
 import threading
 import time
 
@@ -135,8 +136,12 @@ def test_overflow_stops_with_the_last_finite_value():
 
 @pytest.fixture
 def pressed(monkeypatch):
-    """Ctrl-C from another thread a while after the first step of a solve; when it was pressed."""
+    """Ctrl-C from another thread a while after the first step of a solve; when it was pressed.
+
+    A process that a shell started in the background ignores the signal; here it is in the foreground.
+    """
     times, run = [], driver.run
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def press():
         times.append(time.perf_counter())
@@ -148,7 +153,8 @@ def pressed(monkeypatch):
         return run(task, state, until)
 
     monkeypatch.setattr(driver, "run", watched)
-    return times
+    yield times
+    signal.signal(signal.SIGINT, before)
 
 
 def test_ctrl_c_keeps_the_partial_solution(pressed):

@@ -71,6 +71,7 @@ def test_problems_of_different_kinds_keep_their_places():
         assert same(solution.value, alone(question).value)
 
 
+@pytest.mark.slow
 def test_rounds_that_fit_into_memory_change_nothing():
     questions = [problem(k) for k in np.linspace(0, 2, 5)]
     whole, parts = (hjb.solve_batch(questions, GRID, tol=1e-6, max_memory=limit) for limit in (None, 50_000))

@@ -500,10 +500,11 @@ def environment():
     return {**os.environ, "PYTHONPATH": os.path.dirname(os.path.dirname(hjbjax.__file__)), "PYTHONWARNINGS": "error"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words",
     [
-        pytest.param(words.split(), marks=[pytest.mark.slow] * (words[:6] != "double"), id=words)
+        pytest.param(words.split(), id=words)
         for words in (
             "brownian-exit --shape 41",
             "lq-game --shape 41",

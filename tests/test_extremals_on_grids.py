@@ -92,6 +92,7 @@ def test_least_time_from_the_solution_on_a_grid():
     assert extremal.switches == pytest.approx([1], abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_loop_as_the_guess_of_a_free_time_without_end_states():
     """At full unit speed until a final cost of 2x² pays no more, at x = ½."""
     grid = hjb.Grid([-3.0], [3.0], (25,))

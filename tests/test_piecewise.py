@@ -89,7 +89,8 @@ def best_pair(sign, pieces, slopes, linear, square, lo, hi, curved):
 
 
 @pytest.mark.parametrize(
-    ("count", "kinks"), [(1, 1), (2, 1), *(pytest.param(*each, marks=pytest.mark.slow) for each in ((3, 1), (2, 3)))]
+    ("count", "kinks"),
+    [(1, 1), *(pytest.param(*each, marks=pytest.mark.slow) for each in ((2, 1), (3, 1), (2, 3)))],
 )
 @pytest.mark.parametrize("curved", [False, True])
 @given(seed=SEEDS)

@@ -136,9 +136,10 @@ def test_forward_and_reverse_mode_agree_and_a_game_is_differentiable():
     assert float(reverse) == pytest.approx(wanted, rel=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method",
-    [hjb.PolicyIteration(hjb.Sweeps()), pytest.param(hjb.ValueIteration(), marks=pytest.mark.slow)],
+    [hjb.PolicyIteration(hjb.Sweeps()), hjb.ValueIteration()],
     ids=["policy", "value"],
 )
 def test_jit_and_vmap_over_a_parameter_equal_single_solves(method):

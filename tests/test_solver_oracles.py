@@ -152,6 +152,7 @@ def one_mass(x, u):
     return jnp.stack([x[1], u[0]])
 
 
+@pytest.mark.slow
 def test_two_decoupled_masses_in_four_dimensions():
     box, short = hjb.Box([-1.0, -1.0], [1.0, 1.0]), hjb.Box([-1.0], [1.0])
     shape = (9, 8)
@@ -216,6 +217,7 @@ def tug(x, u, d):
     return x[0] ** 2 - x[1] ** 2 + 0.1 * u[0] ** 2 - 0.1 * d[0] ** 2
 
 
+@pytest.mark.slow
 def test_a_decoupled_game_has_no_gap():
     box, values = hjb.Box([-1.0], [1.0]), []
     for isaacs in ("upper", "lower"):

@@ -66,10 +66,12 @@ def _outgrows_the_cache(source: jax.Array, weights: Weights) -> bool:
 def _in_turns(source: jax.Array, weights: Weights, planes: jax.Array, grid: Grid, rounds: int) -> jax.Array:
     """All slices upwards and downwards, ``rounds`` times."""
 
-    def sweep(turn: jax.Array, planes: jax.Array) -> jax.Array:
-        return _sweep(source, weights, _wrapped(planes, grid), 0, len(source), up=turn % 2 == 0)
+    def pair(_: Any, planes: jax.Array) -> jax.Array:
+        for up in (True, False):
+            planes = _sweep(source, weights, _wrapped(planes, grid), 0, len(source), up=up)
+        return planes
 
-    return jax.lax.fori_loop(0, 2 * rounds, sweep, planes)
+    return jax.lax.fori_loop(0, rounds, pair, planes)
 
 
 def _in_slabs(source: jax.Array, weights: Weights, planes: jax.Array, grid: Grid, rounds: int) -> jax.Array:
@@ -80,12 +82,10 @@ def _in_slabs(source: jax.Array, weights: Weights, planes: jax.Array, grid: Grid
     """
     count = len(source)
     slabs = -(-count // SLAB)
+    for up in (True, False):
 
-    def once(turn: jax.Array, planes: jax.Array) -> jax.Array:
-        up = turn == 0
-
-        def slab(index: jax.Array, planes: jax.Array) -> jax.Array:
-            first = SLAB * jnp.where(up, index, slabs - 1 - index)
+        def slab(index: jax.Array, planes: jax.Array, up: bool = up) -> jax.Array:
+            first = SLAB * (index if up else slabs - 1 - index)
             last = jnp.minimum(first + SLAB, count)
 
             def sweep(k: jax.Array, planes: jax.Array) -> jax.Array:
@@ -93,9 +93,8 @@ def _in_slabs(source: jax.Array, weights: Weights, planes: jax.Array, grid: Grid
 
             return jax.lax.fori_loop(0, 2 * rounds + 1, sweep, planes)
 
-        return jax.lax.fori_loop(0, slabs, slab, _wrapped(planes, grid))
-
-    return jax.lax.fori_loop(0, 2, once, planes)
+        planes = jax.lax.fori_loop(0, slabs, slab, _wrapped(planes, grid))
+    return planes
 
 
 def _towards(equation: Correction, grid: Grid, axis: int, flips: list[jax.Array]) -> tuple[jax.Array, ...]:
@@ -110,15 +109,30 @@ def _towards(equation: Correction, grid: Grid, axis: int, flips: list[jax.Array]
 
 def _wrapped(planes: jax.Array, grid: Grid) -> jax.Array:
     """The margin filled with what lies across the fold of the shear and across the seams of periodic axes."""
-    core = (slice(1, -1),) * grid.ndim
     for axis in range(1, grid.ndim):
         if grid.periodic[axis]:  # type: ignore[index]
-            count = grid.shape[axis]
-            for margin, source, shift in ((count + 1, 1, count), (0, count, -count)):
-                inner = planes[(*core[:axis], source, *core[axis + 1 :])]
-                planes = planes.at[(*core[:axis], margin, *core[axis + 1 :])].set(jnp.roll(inner, shift, axis=0))
-    planes = planes.at[0].set(planes[-2])
-    return planes.at[-1].set(planes[1])  # of the result, or XLA copies all planes to keep the old ones
+            planes = _with_margins(planes, axis)
+    return _with_margins(planes, 0)
+
+
+def _with_margins(planes: jax.Array, axis: int) -> jax.Array:
+    """Both margins of an axis filled from its other end; across a seam a hyperplane goes on in another slice.
+
+    In a loop an update is made in place; out of one XLA copies all planes to keep the old ones.
+    """
+    count = planes.shape[axis] - 2
+
+    def fill(side: jax.Array, planes: jax.Array) -> jax.Array:
+        above = side == 0
+        inner = jax.lax.dynamic_slice_in_dim(planes, jnp.where(above, 1, count), 1, axis)
+        start: list[Any] = [0] * planes.ndim
+        if axis > 0:
+            inner = jnp.roll(inner[1:-1], jnp.where(above, count, -count), axis=0)
+            start[0] = 1
+        start[axis] = jnp.where(above, count + 1, 0)
+        return jax.lax.dynamic_update_slice(planes, inner, start)
+
+    return jax.lax.fori_loop(0, 2, fill, planes)
 
 
 def _sweep(source: jax.Array, weights: Weights, planes: jax.Array, first: Any, last: Any, *, up: Any) -> jax.Array:

@@ -28,7 +28,7 @@ from hjbjax.reference import mask_of
 from hjbjax.schemes import Limited, Scheme
 from hjbjax.sets import AdmissibleSet, Ball, Box
 from hjbjax.solution import Solution
-from hjbjax.solver import solve
+from hjbjax.solver import check_arguments, solve
 from hjbjax.status import Status
 
 
@@ -142,6 +142,7 @@ def perturbation_study(
       >>> round(study.noise.order, 1), round(study.gain.order, 1)
       (2.0, 2.0)
     """
+    check_arguments(problem, grid, method, scheme, tol, None, None)
     levels = _increasing("noises", noises), _increasing("gammas", gammas)
     if problem.is_game or problem.noise is not None:
         raise ValueError("perturbation_study: the problem has noise or disturbances already; leave them out")

@@ -91,6 +91,9 @@ def test_changes_below_the_tolerance_are_not_fitted(line):
         ({"disturbances": None}, r"the disturbances are None; wanted a Box or a Ball"),
         ({"disturbances": Finite([[0.0], [1.0]])}, r"(?s)the disturbances are Finite.* wanted a Box or a Ball"),
         ({"disturbances": Box([-1.0] * 2, [1.0] * 2)}, r"drift"),
+        ({"grid": 3}, r"got Problem, int; wanted a Problem and a Grid"),
+        ({"problem": None}, r"got NoneType, Grid; wanted a Problem and a Grid"),
+        ({"tol": 0.0}, r"tol = 0.0; wanted a finite number > 0"),
     ],
 )
 def test_bad_input_is_refused_before_anything_is_solved(changes, reason, monkeypatch):
@@ -99,7 +102,7 @@ def test_bad_input_is_refused_before_anything_is_solved(changes, reason, monkeyp
 
     monkeypatch.setattr(perturbations, "solve", solved)
     arguments = {"problem": PLANT, "grid": GRID} | SETS | changes
-    with pytest.raises(ValueError, match=reason):
+    with pytest.raises((TypeError, ValueError), match=reason):
         hjb.perturbation_study(**arguments)
 
 

@@ -159,7 +159,7 @@ def pressed(monkeypatch):
 
 def test_ctrl_c_keeps_the_partial_solution(pressed):
     solution = hjb.solve(**endless(), throw=False)
-    assert time.perf_counter() - pressed[0] < 5
+    assert time.perf_counter() - pressed[0] < driver.CHUNK_SECONDS + 0.3
     assert solution.status is hjb.Status.INTERRUPTED
     assert solution.steps > 0
     assert np.all(np.isfinite(solution.value))

@@ -2,15 +2,18 @@
 
 A method whose steps do not grow with the grid takes seconds in proportion to the nodes, an exponent of one; value
 iteration on one grid takes N times as many steps on N times as fine a one. Seconds are those of a whole ``solve`` once
-it is compiled, checks and coarser grids included; bytes a node are the peak of the program that ``solve`` runs on the
-finest grid, by that program's own account. Exponents are fitted over the grids with at least ``FITTED`` nodes: below
-that a solve is made of what it does once.
+it is compiled, checks and coarser grids included; the sizes of a problem take turns, and what one takes over another
+is the median over the rounds. Bytes a node are the peak of the program that ``solve`` runs on the finest grid, by that
+program's own account. Exponents are fitted over the grids with at least ``FITTED`` nodes: below that a solve is made
+of what it does once.
 """
 
 import dataclasses
+import functools
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import click
@@ -31,41 +34,49 @@ FITTED = 10_000
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """A family of questions by one number, the sizes at which it is asked, quick ones apart, and the tolerance."""
+    """A family of questions by one number, the sizes at which it is asked, quick ones apart, and the tolerance.
+
+    ``repeats`` is how often each is solved once it is compiled.
+    """
 
     name: str
     build: Callable[[int], tuple[hjb.Problem, hjb.Grid]]
     sizes: tuple[int, ...]
     quick: tuple[int, ...]
     tol: float
+    repeats: int = 3
 
 
 CASES = (
-    Case("pendulum", questions.pendulum, (100, 200, 400, 800, 1600), (16, 32), 1e-3),
+    Case("pendulum", questions.pendulum, (100, 200, 400, 800, 1600), (16, 32), 1e-3, repeats=9),
     Case("dubins", lambda n: questions.dubins(n, 1.0), (24, 50, 100), (10, 12), 1e-3),
     Case("dubins undiscounted", lambda n: questions.dubins(n, 0.0), (24, 50, 100), (10, 12), 1e-3),
     Case("manipulator", questions.manipulator, (14, 20, 28, 40), (4, 6), 1e-2),
 )
 
 
-def measure(case: Case, size: int, repeats: int, time_limit: float | None) -> list[dict[str, Any]]:
-    """One row: a solve that compiles, and ``repeats`` that do not."""
-    problem, grid = case.build(size)
-    about = {"shape": list(grid.shape), "nodes": grid.size, "tol": case.tol}
-    solutions: list[hjb.Solution] = []
+def measure(case: Case, sizes: Sequence[int], repeats: int, time_limit: float | None) -> list[dict[str, Any]]:
+    """One row a size: a solve that compiles, and ``repeats`` that do not, the sizes taking turns."""
+    asked = {size: case.build(size) for size in sizes}
 
-    def call():
+    def solve(size: int) -> hjb.Solution:
+        problem, grid = asked[size]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", hjb.SolveWarning)  # of nodes that cannot reach the target; see reached
-            solutions[:] = [hjb.solve(problem, grid, tol=case.tol, time_limit=time_limit, throw=False)]
+            return hjb.solve(problem, grid, tol=case.tol, time_limit=time_limit, throw=False)
 
-    _, timings = interleaved({case.name: call}, repeats)
-    (solution,), timing = solutions, timings[case.name]
-    row = about | timing.row | {"steps": solution.steps, "error": solution.error, "status": solution.status.name}
-    row |= {"method": solution.stats["method"], "levels": [list(shape) for shape in solution.stats["levels"]]}
-    row["reached"] = 1.0 if solution.reached is None else float(np.mean(solution.reached))
-    row["microseconds_per_node"] = 1e6 * timing.seconds / grid.size
-    return [row | footprint.of_solve(problem, grid, case.tol)]
+    calls = {str(size): functools.partial(solve, size) for size in sizes}
+    solutions, timings = interleaved(calls, repeats)
+    rows = []
+    for size, (problem, grid) in asked.items():
+        solution, timing = solutions[str(size)], timings[str(size)]
+        row = {"shape": list(grid.shape), "nodes": grid.size, "tol": case.tol} | timing.row
+        row |= {"rounds": list(timing.rounds), "microseconds_per_node": 1e6 * timing.seconds / grid.size}
+        row |= {"steps": solution.steps, "error": solution.error, "status": solution.status.name}
+        row |= {"method": solution.stats["method"], "levels": [list(shape) for shape in solution.stats["levels"]]}
+        row["reached"] = 1.0 if solution.reached is None else float(np.mean(solution.reached))
+        rows.append(row | footprint.of_solve(problem, grid, case.tol))
+    return rows
 
 
 def fit(rows: list[dict[str, Any]]) -> None:
@@ -81,7 +92,8 @@ def judged(rows: list[dict[str, Any]]) -> dict[str, float]:
     found = {(row["problem"], row["shape"][0]): row for row in rows if row["status"] == "CONVERGED"}
     figures = {}
     if {("pendulum", 400), ("pendulum", 1600)} <= set(found):
-        figures["growth"] = found["pendulum", 1600]["seconds"] / found["pendulum", 400]["seconds"]
+        rounds = zip(*(found["pendulum", size]["rounds"] for size in (1600, 400)), strict=True)
+        figures["growth"] = median(large / small for large, small in rounds)
     for key, name, size in (("dubins", "dubins", 101), ("manipulator", "manipulator", 40)):
         if (name, size) in found:
             row = found[name, size]
@@ -92,7 +104,7 @@ def judged(rows: list[dict[str, Any]]) -> dict[str, float]:
 @click.command()
 @click.option("--quick", is_flag=True, help="Small grids, one round.")
 @click.option("--problem", "names", multiple=True, type=click.Choice([case.name for case in CASES]))
-@click.option("--repeats", type=click.IntRange(1), default=None, help="Warm solves; 3 if not given, quick 1.")
+@click.option("--repeats", type=click.IntRange(1), default=None, help="Warm solves; if not given the case says.")
 @click.option("--largest", type=click.IntRange(1), default=None, help="Leave out grids with more nodes.")
 @click.option(
     "--time-limit", type=click.FloatRange(0, min_open=True), default=600, show_default=True, help="Of a solve."
@@ -111,12 +123,11 @@ def command(
     for case in CASES:
         if names and case.name not in names:
             continue
-        mine: list[dict[str, Any]] = []
-        for size in case.quick if quick else case.sizes:
-            if largest is None or case.build(size)[1].size <= largest:
-                about = {"benchmark": "growth", "problem": case.name, "dtype": "float64"}
-                again = repeats or (1 if quick else 3)
-                mine += attempt(lambda c=case, s=size, r=again: measure(c, s, r, time_limit), about)
+        sizes = case.quick if quick else case.sizes
+        sizes = tuple(size for size in sizes if largest is None or case.build(size)[1].size <= largest)
+        about = {"benchmark": "growth", "problem": case.name, "dtype": "float64"}
+        again = repeats or (1 if quick else case.repeats)
+        mine = attempt(lambda c=case, s=sizes, r=again: measure(c, s, r, time_limit), about) if sizes else []
         fit([row for row in mine if "nodes" in row])
         click.echo(table(mine, COLUMNS) + "\n")
         rows += mine

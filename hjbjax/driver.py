@@ -1,7 +1,7 @@
 """The host's loop around the jitted iteration.
 
 ``run`` is called in chunks of about half a second, since every call takes its memory anew; progress, Ctrl-C, time
-limits and stops at NaN all live between two chunks.
+limits and stops at NaN all live between two chunks. A first call of no steps compiles, so that the others can be timed.
 """
 
 import contextlib
@@ -18,26 +18,37 @@ import numpy as np
 
 from hjbjax import iteration
 from hjbjax.iteration import HISTORY, State, Task
+from hjbjax.relaxation import Direct, Krylov
 from hjbjax.status import Status
 
 CHUNK_SECONDS = 0.5
+FIRST_NODES = 20_000  # a first chunk steps over about so many nodes
 
 run = jax.jit(iteration.run, donate_argnames="state")  # a state is used once: the next one takes its place in memory
 
 
 class Clock:
-    """The limits of a solve, the time it has taken, that of its steps apart, and whether it was interrupted."""
+    """The limits of a solve, the time it has taken, that of its steps apart, and whether it was interrupted.
+
+    ``per_node`` is what a step cost at a node in the last chunk, from grid to grid; None before there was one.
+    """
 
     def __init__(self, max_steps: int, seconds: float, progress: bool | None):
         self.max_steps, self.seconds, self.progress = max_steps, seconds, progress
         self.began, self.stepping, self.interrupted = time.perf_counter(), 0.0, False
+        self.per_node: float | None = None
 
     def elapsed(self) -> float:
         """Seconds since the solve began."""
         return time.perf_counter() - self.began
 
+    def count(self, seconds: float, steps: int, nodes: int) -> None:
+        """Take note of a chunk of steps."""
+        self.stepping += seconds
+        self.per_node = max(seconds, 1e-4) / (steps * nodes)
 
-def drive(task: Task, guess: jax.Array, clock: Clock, most: int | None = None) -> tuple[State, Status, np.ndarray]:
+
+def drive(task: Task, guess: Any, clock: Clock, most: int | None = None) -> tuple[State, Status, np.ndarray]:
     """Chunks of steps until the state stops running, the steps or the time run out, or Ctrl-C.
 
     Args:
@@ -51,27 +62,28 @@ def drive(task: Task, guess: jax.Array, clock: Clock, most: int | None = None) -
     """
     limit = clock.max_steps if most is None else min(most, clock.max_steps)
     state, residuals = iteration.begin(task, guess), [np.zeros(0)]
-    chunk, done = 1, -1  # step −1 is the look at the guess
+    chunk, done = _first_chunk(task, clock), -1  # step −1 is the look at the guess
     if clock.interrupted:
         return _imposed(task, state), Status.INTERRUPTED, residuals[0]
     code = Status.RUNNING
     with _bar(clock.progress, float(task.tol)) as show, noting_interrupts(clock):
         try:
+            state = run(task, state, -1)  # compiles and does nothing
             while code is Status.RUNNING:
                 began = time.perf_counter()
-                if done >= 0 and (clock.interrupted or done >= limit or clock.elapsed() >= clock.seconds):
+                over = clock.interrupted or done >= limit or clock.elapsed() >= clock.seconds
+                if over and done >= 0:
                     late = Status.MAX_STEPS if done >= limit else Status.TIME_LIMIT
                     code = Status.INTERRUPTED if clock.interrupted else late
                     break
-                until = 0 if done < 0 else min(done + chunk, limit)  # the look compiles, too
+                until = 0 if over else min(max(done, 0) + chunk, limit)
                 state = run(task, state, int(until))  # at once a state: an interrupt may come from here on
                 code, steps = Status(int(state.code)), int(state.step) - done
                 residuals.append(np.asarray(state.history)[:steps])
-                if done >= 0:
-                    took = time.perf_counter() - began
-                    clock.stepping += took
-                    chunk = int(np.clip(chunk * CHUNK_SECONDS / max(took, 1e-4), 1, min(HISTORY, 8 * chunk)))
-                    show(steps, float(state.gap.error))
+                took = time.perf_counter() - began
+                clock.count(took, steps, task.grid.size)
+                chunk = int(np.clip(steps * CHUNK_SECONDS / max(took, 1e-4), 1, min(HISTORY, 8 * chunk)))
+                show(steps, float(state.gap.error))
                 done += steps
         except KeyboardInterrupt:
             clock.interrupted, code = True, Status.INTERRUPTED
@@ -79,6 +91,21 @@ def drive(task: Task, guess: jax.Array, clock: Clock, most: int | None = None) -
     if code in (Status.INTERRUPTED, Status.NONFINITE):
         state = _imposed(task, state)
     return state, code, np.concatenate(residuals)[: int(state.step) + 1]
+
+
+def _first_chunk(task: Task, clock: Clock) -> int:
+    """How many steps to take before anything is timed on this grid, beside the look at the guess.
+
+    A coarser grid tells what they take; a finer one may fall out of the cache, hence half a chunk.
+    """
+    method, nodes = task.method, task.grid.size
+    if clock.per_node is not None:
+        steps = CHUNK_SECONDS / (2 * clock.per_node * nodes)
+    elif task.problem.is_game or isinstance(getattr(method, "evaluation", None), (Krylov, Direct)):
+        steps = 1  # each may take many passes over the nodes
+    else:
+        steps = FIRST_NODES / nodes
+    return int(np.clip(steps, 1, HISTORY - 1))
 
 
 def _imposed(task: Task, state: State) -> State:

@@ -106,6 +106,7 @@ class State:
 
     value: jax.Array
     policy: Greedy
+    fastest: jax.Array
     gap: Gap
     step: jax.Array
     best: jax.Array
@@ -128,7 +129,7 @@ def begin(task: Task, guess: jax.Array) -> State:
     counter = xp.zeros((), xp.int32)
     code = xp.asarray(int(Status.RUNNING), xp.int32)
     history = xp.full(HISTORY, xp.nan, dtype)
-    return State(xp.array(guess), policy, gap, counter - 1, xp.stack([infinite] * 2), counter, code, history)
+    return State(xp.array(guess), policy, infinite, gap, counter - 1, xp.stack([infinite] * 2), counter, code, history)
 
 
 def run(task: Task, state: State, until: Any) -> State:
@@ -154,7 +155,7 @@ def advance(task: Task, state: State, start: Any) -> State:
     if isinstance(task.scheme, Limited):
         delta = jnp.where(state.step < FULL_STEPS, 1.0, 0.5).astype(delta.dtype) * delta
     value = task.rules.impose(state.value + delta)
-    policy, measured = _look(
+    policy, fastest, measured = _look(
         task, value, state.policy, moved=jnp.max(jnp.abs(jnp.where(task.counted, value - state.value, 0)))
     )
     measured = dataclasses.replace(measured, error=jnp.where(_unmeasured(task, state), jnp.inf, measured.error))
@@ -163,7 +164,7 @@ def advance(task: Task, state: State, start: Any) -> State:
     code = _judge(task, value, measured, state.best, since)
     history = state.history.at[state.step - start].set(measured.residual)
     best = jnp.fmin(state.best, measures)
-    new = State(value, policy, measured, state.step + 1, best, since, code, history)
+    new = State(value, policy, fastest, measured, state.step + 1, best, since, code, history)
     old = dataclasses.replace(state, step=new.step, since_best=since, code=code, history=history)
     return jax.tree.map(lambda after, before: jnp.where(code == Status.NONFINITE, before, after), new, old)
 
@@ -173,7 +174,7 @@ def _unmeasured(task: Task, state: State) -> Any:
     return (state.step < 0) & (task.certificate in (Certificate.NONE, Certificate.RESIDUAL))
 
 
-def _look(task: Task, value: jax.Array, incumbent: Greedy, moved: jax.Array) -> tuple[Greedy, Gap]:
+def _look(task: Task, value: jax.Array, incumbent: Greedy, moved: jax.Array) -> tuple[Greedy, jax.Array, Gap]:
     problem, grid, scheme = task.problem, task.grid, task.scheme
     policy = bellman.greedy(problem, grid, value, task.rules.held, scheme=scheme, incumbent=incumbent)
     equation = bellman.correction(problem, grid, value, policy, task.rules, scheme=scheme)
@@ -188,7 +189,7 @@ def _look(task: Task, value: jax.Array, incumbent: Greedy, moved: jax.Array) -> 
         counted=task.counted,
         moved=moved,
     )
-    return policy, measured
+    return policy, equation.fastest, measured
 
 
 def _judge(task: Task, value: jax.Array, measured: Gap, best: jax.Array, since: jax.Array) -> jax.Array:
@@ -208,11 +209,12 @@ def _correct(task: Task, state: State) -> jax.Array:
     assert isinstance(task.method, PolicyIteration)
     if task.problem.is_game:
         return _hoffman_karp(task, state)
-    return relaxation.solve(task.method.evaluation, _equation(task, state.value, state.policy), task.grid)
+    equation = _equation(task, state.value, state.policy, state.fastest)
+    return relaxation.solve(task.method.evaluation, equation, task.grid)
 
 
-def _equation(task: Task, value: jax.Array, policy: Greedy) -> Correction:
-    return bellman.correction(task.problem, task.grid, value, policy, task.rules, scheme=task.scheme)
+def _equation(task: Task, value: jax.Array, policy: Greedy, fastest: Any = None) -> Correction:
+    return bellman.correction(task.problem, task.grid, value, policy, task.rules, scheme=task.scheme, fastest=fastest)
 
 
 def _hoffman_karp(task: Task, state: State) -> jax.Array:

@@ -123,17 +123,17 @@ def _spread(held: jax.Array, jumps: Rates, grid: Grid) -> tuple[jax.Array, jax.A
 
 def _searched(held: np.ndarray, jumps: Rates, grid: Grid) -> np.ndarray:
     """The same by a breadth-first search, however long the paths are."""
-    from scipy.sparse import bmat, csr_array
+    from scipy.sparse import csr_array
     from scipy.sparse.csgraph import breadth_first_order
 
-    free = ~held
-    values = [(free & np.asarray(jump)).astype(np.float64) for jump in jumps.values]
-    graph = stencil.sparse(jumps.offsets, values, np.zeros(grid.shape), grid)
-    graph.eliminate_zeros()
-    backward = graph.T.tocsr()
-    source = csr_array(held.reshape(1, -1).astype(np.float64))  # one extra node that leads to every held one
-    whole = bmat([[backward, None], [source, csr_array((1, 1))]], format="csr")
-    order = breadth_first_order(whole, grid.size, directed=True, return_predecessors=False)
+    free, number = ~held, np.arange(grid.size).reshape(grid.shape)
+    ends, starts = [np.full(np.count_nonzero(held), grid.size)], [number[held]]  # one more node leads to all held ones
+    for offset, jump in zip(jumps.offsets, jumps.values, strict=True):
+        leaves = free & np.asarray(jump)
+        ends.append(np.roll(number, [-step for step in offset], axis=range(grid.ndim))[leaves])
+        starts.append(number[leaves])
+    backward = np.concatenate(ends), np.concatenate(starts)
+    graph = csr_array((np.ones(len(backward[0])), backward), shape=(grid.size + 1, grid.size + 1))
     found = np.zeros(grid.size + 1, bool)
-    found[order] = True
+    found[breadth_first_order(graph, grid.size, directed=True, return_predecessors=False)] = True
     return found[:-1].reshape(grid.shape)

@@ -96,15 +96,14 @@ def solve(
         task, verdict, reached = prepare_on_host(problem, grid, method=inner, scheme=scheme.chain, tol=tol, dtype=kind)
         state, code, residuals = drive(task, nested.warm(task, start, clock), clock)
         if isinstance(scheme, Limited):
-            monotone = state.value
+            monotone = np.array(state.value)
             verdict = dataclasses.replace(verdict, certificate=Certificate.RESIDUAL)
             task = dataclasses.replace(task, certificate=Certificate.RESIDUAL, scheme=scheme)
             state, code, residuals = drive(task, monotone, clock)
         solution = finish(task, state, code, reached, residuals, verdict, grid)
         if isinstance(scheme, Limited):
-            solution.stats["from_monotone"] = float(
-                jnp.max(jnp.abs(jnp.where(task.counted, state.value - monotone, 0)))
-            )
+            apart = np.abs(np.asarray(state.value) - monotone)
+            solution.stats["from_monotone"] = float(np.max(apart, where=np.asarray(task.counted), initial=0))
     solution.stats.update(
         method=describe(method, problem), levels=[*shapes, grid.shape], seconds=clock.stepping,
         compile_seconds=clock.elapsed() - clock.stepping, bytes=needed, tol=tol,

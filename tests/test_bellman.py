@@ -219,6 +219,27 @@ def test_the_source_is_the_residual_and_the_weights_are_the_chain(kind, seed):
     assert all(np.all(w >= 0) for w in equation.weights.values)
 
 
+@jax.jit
+def _told(problem, grid, value, policy, rules, fastest):
+    return bellman.correction(problem, grid, value, policy, rules, scheme=Upwind(), fastest=fastest)
+
+
+@pytest.mark.parametrize("kind", NOISES)
+@given(seed=SEEDS)
+@settings(max_examples=6)
+def test_an_equation_tells_the_fastest_rate_and_may_be_told_it(kind, seed):
+    rng = np.random.default_rng(seed)
+    problem, grid = random_question(rng, kind)
+    rules, value = random_rules(rng, grid), rng.normal(size=grid.shape)
+    policy, equation = jax.device_get(_equation(problem, grid, value, rules))
+    generator = chain.generator(problem, grid, np.stack(policy.controls, axis=-1)).toarray()
+    assert equation.fastest == pytest.approx(np.max(-np.diag(generator)) + problem.discount, rel=1e-12)
+    again = _told(problem, grid, value, policy, rules, equation.fastest)
+    np.testing.assert_allclose(again.source, equation.source, rtol=1e-12, atol=1e-15)
+    slow = _told(problem, grid, value, policy, rules, np.inf)
+    assert not np.any(slow.weights.total())  # where all drift counts as rounding, nothing moves
+
+
 @pytest.mark.parametrize("n", [1, 2])
 @given(seed=SEEDS)
 @settings(max_examples=6)

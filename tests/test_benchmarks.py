@@ -196,10 +196,10 @@ def test_exponents_are_those_of_the_large_grids_alone():
     assert rows[0]["exponent"] == pytest.approx(1.25)
 
 
-def test_growth_reads_its_figures_from_the_rows():
+def test_growth_is_the_median_of_the_rounds():
     rows = [
-        {"problem": "pendulum", "shape": [n, n + 1], "seconds": s, "status": "CONVERGED"}
-        for n, s in ((400, 0.5), (1600, 10.0))
+        {"problem": "pendulum", "shape": [n, n + 1], "rounds": rounds, "seconds": 0.0, "status": "CONVERGED"}
+        for n, rounds in ((400, [0.5, 1.0, 0.25]), (1600, [10.0, 10.0, 10.0]))  # a load that slows one of a round
     ]
     assert growth.judged(rows) == {"growth": 20.0}
     assert growth.judged([rows[0], rows[1] | {"status": "STALLED"}]) == {}

@@ -57,6 +57,29 @@ def test_converged_history_has_one_residual_a_step_and_one_for_the_guess():
     assert solution.residual == solution.residuals[-1]
 
 
+def test_a_first_chunk_is_as_long_as_coarser_grids_tell(monkeypatch):
+    """Half a chunk's time by what a step took at a node, and never more than the history of one chunk can hold."""
+    asked, run = [], driver.run
+
+    def watched(task, state, until):
+        asked.append(int(until))
+        return run(task, state, until)
+
+    monkeypatch.setattr(driver, "run", watched)
+    task, *_ = prepare_on_host(
+        question(1e-3), GRID, method=SLOW, scheme=hjb.Upwind(), tol=1e-13, dtype=np.dtype(np.float32)
+    )
+    for per_node, first in [(1e-9, driver.HISTORY - 1), (driver.CHUNK_SECONDS / (20 * GRID.size), 10), (1.0, 1)]:
+        clock = driver.Clock(300, np.inf, False)
+        clock.per_node = per_node
+        asked.clear()
+        state, code, residuals = driver.drive(task, jnp.zeros(GRID.shape), clock)
+        assert asked[:2] == [-1, first]  # one call that compiles, and the first chunk
+        assert (code, int(state.step)) == (hjb.Status.MAX_STEPS, 300)
+        assert residuals.shape == (301,)
+        assert np.all(np.isfinite(residuals))
+
+
 @pytest.mark.parametrize("steps", [1, 7])
 def test_max_steps(steps):
     with pytest.raises(hjb.SolveError, match=r"MAX_STEPS.*max_steps.*guess=") as caught:
@@ -147,9 +170,12 @@ def pressed(monkeypatch):
         times.append(time.perf_counter())
         _thread.interrupt_main()
 
+    timers = []
+
     def watched(task, state, until):
-        if until == 1:
-            threading.Timer(0.3, press).start()
+        if until > 0 and not timers:
+            timers.append(threading.Timer(0.3, press))
+            timers[0].start()
         return run(task, state, until)
 
     monkeypatch.setattr(driver, "run", watched)

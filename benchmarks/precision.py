@@ -6,14 +6,14 @@ read off its fitted order and off the fitted growth of its seconds. On the doubl
 Kružkov's form on [−1, 1]², exact values on {T ≤ ½} and on the edge) hj_reachability's "very_high" marches beside us,
 and seconds are compared at equal mean error.
 
-Writes ``precision.json`` and ``precision.png``. Our seconds are medians of whole solves, hj_reachability's those of a
-second march; compiling stands apart.
+Writes ``precision.json`` and ``precision.png``. Our seconds are medians of whole solves that take turns,
+hj_reachability's those of a second march; compiling stands apart.
 """
 
+import functools
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import click
@@ -22,7 +22,7 @@ import numpy as np
 import hjbjax as hjb
 from benchmarks import accuracy, questions
 from benchmarks.report import RESULTS, attempt, publish, table
-from benchmarks.timing import timed
+from benchmarks.timing import interleaved
 
 COLUMNS = ("problem", "scheme", "shape", "error", "seconds", "compile_seconds", "status")
 PLAIN, LIMITED = hjb.Upwind(central=False), hjb.Limited()
@@ -30,7 +30,7 @@ HELD = hjb.Limited(subcell=False)  # where a level set of time, no distance, say
 STATES = ((0.5, 0.0), (np.pi / 4, 0.0), (1.5, -1.0), (2.8, 1.5), (-2.0, -2.0))
 PENDULUM, DOUBLE_INTEGRATOR = (50, 100, 200, 400), (21, 41, 81, 161, 321)
 LEVELS = 25  # errors at which seconds are compared
-REPEATS = 7
+REPEATS = 15
 TOL = 1e-4
 
 
@@ -43,38 +43,46 @@ def pendulum(nodes: Sequence[int]) -> list[dict[str, Any]]:
     problem = hjb.zoo.pendulum()[0]
     fine = hjb.solve(problem, grid(2 * max(nodes)), scheme=LIMITED, tol=TOL)
     known = np.array([fine.value_at(state) for state in STATES])
-    rows = []
+    rows, asked = [], []
     for scheme in (PLAIN, LIMITED):
         study = hjb.convergence_study(problem, [grid(count) for count in nodes], fine, scheme=scheme, tol=TOL)
         for row, solution in zip(study.rows, study.solutions, strict=True):
             values = np.array([solution.value_at(state) for state in STATES])
             relative = np.abs(values / known - 1)
             label = {"problem": "pendulum", "code": "hjbjax", "scheme": _name(scheme), "tol": TOL}
-            seconds = median_seconds(problem, solution.grid, scheme)
-            about = {"error": float(np.mean(relative)), "relative": relative.tolist(), "seconds": seconds}
-            rows.append(row | label | about)
-    return rows
+            rows.append(row | label | {"error": float(np.mean(relative)), "relative": relative.tolist()})
+            asked.append((solution.grid, scheme))
+    return with_seconds(rows, problem, asked)
 
 
 def double_integrator(nodes: Sequence[int]) -> list[dict[str, Any]]:
     """One row a code, scheme and grid; the error is the mean one over the box."""
     exact = hjb.zoo.double_integrator_exact()
     problem, grids = questions.double_integrator(nodes[0])[0], [questions.double_integrator(n)[1] for n in nodes]
-    rows = []
+    rows, asked = [], []
     for scheme in (PLAIN, HELD):
         label = {"code": "hjbjax", "scheme": _name(scheme), "tol": TOL}
         study = hjb.convergence_study(problem, grids, exact, scheme=scheme, tol=TOL)
-        for row, grid in zip(study.rows, grids, strict=True):
-            rows.append(label | row | {"seconds": median_seconds(problem, grid, scheme)})
+        rows += [label | row for row in study.rows]
+        asked += [(grid, scheme) for grid in grids]
+    rows = with_seconds(rows, problem, asked)
     affordable = [grid for grid in grids if grid.shape[0] <= 161]
     theirs = accuracy.marched(problem, affordable, exact, tol=TOL)
     rows += [{"code": "hj_reachability", "scheme": "hj_reachability very_high"} | row for row in theirs]
     return [row | {"problem": "double integrator", "error": row.get("mean_error")} for row in rows]
 
 
-def median_seconds(problem: Any, grid: Any, scheme: Any) -> float:
-    """Wall time of a whole solve that compiles nothing any more, the median of ``REPEATS``."""
-    return median(timed(lambda: hjb.solve(problem, grid, scheme=scheme, tol=TOL).value)[1] for _ in range(REPEATS))
+def with_seconds(rows: list[dict[str, Any]], problem: Any, asked: Sequence[tuple[Any, Any]]) -> list[dict[str, Any]]:
+    """The rows with the wall time of a whole solve that compiles nothing any more, a grid and a scheme a row.
+
+    It is the median of ``REPEATS``, in which all rows take turns.
+    """
+    calls = {
+        str(number): functools.partial(hjb.solve, problem, grid, scheme=scheme, tol=TOL)
+        for number, (grid, scheme) in enumerate(asked)
+    }
+    _, timings = interleaved(calls, REPEATS)
+    return [row | {"seconds": timings[str(number)].seconds} for number, row in enumerate(rows)]
 
 
 def _name(scheme: Any) -> str:

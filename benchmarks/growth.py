@@ -11,7 +11,7 @@ of what it does once.
 import dataclasses
 import functools
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -22,7 +22,7 @@ import numpy as np
 import hjbjax as hjb
 from benchmarks import floors, footprint, questions
 from benchmarks.report import RESULTS, attempt, publish, table
-from benchmarks.timing import interleaved
+from benchmarks.timing import interleaved, timed
 from hjbjax.convergence import fitted_order
 
 COLUMNS = (
@@ -55,28 +55,37 @@ CASES = (
 )
 
 
-def measure(case: Case, sizes: Sequence[int], repeats: int, time_limit: float | None) -> list[dict[str, Any]]:
-    """One row a size: a solve that compiles, and ``repeats`` that do not, the sizes taking turns."""
-    asked = {size: case.build(size) for size in sizes}
+def first(case: Case, size: int, time_limit: float | None) -> dict[str, Any]:
+    """One row: what a solve that compiles finds, how long it takes, and how much memory."""
+    problem, grid = case.build(size)
+    solution, seconds = timed(lambda: solve(case, size, time_limit))
+    row = {"size": size, "shape": list(grid.shape), "nodes": grid.size, "tol": case.tol, "first_seconds": seconds}
+    row |= {"steps": solution.steps, "error": solution.error, "status": solution.status.name}
+    row |= {"method": solution.stats["method"], "levels": [list(shape) for shape in solution.stats["levels"]]}
+    row["reached"] = 1.0 if solution.reached is None else float(np.mean(solution.reached))
+    return row | footprint.of_solve(problem, grid, case.tol)
 
-    def solve(size: int) -> hjb.Solution:
-        problem, grid = asked[size]
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", hjb.SolveWarning)  # of nodes that cannot reach the target; see reached
-            return hjb.solve(problem, grid, tol=case.tol, time_limit=time_limit, throw=False)
 
-    calls = {str(size): functools.partial(solve, size) for size in sizes}
-    solutions, timings = interleaved(calls, repeats)
-    rows = []
-    for size, (problem, grid) in asked.items():
-        solution, timing = solutions[str(size)], timings[str(size)]
-        row = {"shape": list(grid.shape), "nodes": grid.size, "tol": case.tol} | timing.row
-        row |= {"rounds": list(timing.rounds), "microseconds_per_node": 1e6 * timing.seconds / grid.size}
-        row |= {"steps": solution.steps, "error": solution.error, "status": solution.status.name}
-        row |= {"method": solution.stats["method"], "levels": [list(shape) for shape in solution.stats["levels"]]}
-        row["reached"] = 1.0 if solution.reached is None else float(np.mean(solution.reached))
-        rows.append(row | footprint.of_solve(problem, grid, case.tol))
-    return rows
+def solve(case: Case, size: int, time_limit: float | None) -> hjb.Solution:
+    """The answer, whatever its status."""
+    problem, grid = case.build(size)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", hjb.SolveWarning)  # of nodes that cannot reach the target; see reached
+        return hjb.solve(problem, grid, tol=case.tol, time_limit=time_limit, throw=False)
+
+
+def in_turns(case: Case, rows: list[dict[str, Any]], repeats: int, time_limit: float | None) -> list[dict[str, Any]]:
+    """The rows with the seconds of ``repeats`` solves that compile nothing, the sizes taking turns."""
+    calls = {str(row["size"]): functools.partial(solve, case, row["size"], time_limit) for row in rows}
+    _, timings = interleaved(calls, repeats)
+    measured = []
+    for row in rows:
+        timing = timings[str(row["size"])]
+        about = timing.row | {"rounds": list(timing.rounds)}
+        about["compile_seconds"] = max(0.0, row["first_seconds"] - timing.seconds)
+        about["microseconds_per_node"] = 1e6 * timing.seconds / row["nodes"]
+        measured.append(row | about)
+    return measured
 
 
 def fit(rows: list[dict[str, Any]]) -> None:
@@ -123,11 +132,14 @@ def command(
     for case in CASES:
         if names and case.name not in names:
             continue
-        sizes = case.quick if quick else case.sizes
-        sizes = tuple(size for size in sizes if largest is None or case.build(size)[1].size <= largest)
         about = {"benchmark": "growth", "problem": case.name, "dtype": "float64"}
+        mine: list[dict[str, Any]] = []
+        for size in case.quick if quick else case.sizes:
+            if largest is None or case.build(size)[1].size <= largest:
+                mine += attempt(lambda c=case, s=size: [first(c, s, time_limit)], about)
+        known, failed = [row for row in mine if "size" in row], [row for row in mine if "size" not in row]
         again = repeats or (1 if quick else case.repeats)
-        mine = attempt(lambda c=case, s=sizes, r=again: measure(c, s, r, time_limit), about) if sizes else []
+        mine = failed + attempt(lambda c=case, k=known, r=again: in_turns(c, k, r, time_limit), about)
         fit([row for row in mine if "nodes" in row])
         click.echo(table(mine, COLUMNS) + "\n")
         rows += mine

@@ -30,7 +30,7 @@ run = jax.jit(iteration.run, donate_argnames="state")  # a state is used once: t
 class Clock:
     """The limits of a solve, the time it has taken, that of its steps apart, and whether it was interrupted.
 
-    ``per_node`` is what a step cost at a node in the last chunk, from grid to grid; None before there was one.
+    ``per_node`` is the seconds that a step took at a node in the last chunk, from grid to grid; None before the first.
     """
 
     def __init__(self, max_steps: int, seconds: float, progress: bool | None):
@@ -83,7 +83,7 @@ def drive(task: Task, guess: Any, clock: Clock, most: int | None = None) -> tupl
                 took = time.perf_counter() - began
                 clock.count(took, steps, task.grid.size)
                 chunk = int(np.clip(steps * CHUNK_SECONDS / max(took, 1e-4), 1, min(HISTORY, 8 * chunk)))
-                show(steps, float(state.gap.error))
+                show(steps - (done < 0), float(state.gap.error))
                 done += steps
         except KeyboardInterrupt:
             clock.interrupted, code = True, Status.INTERRUPTED
@@ -96,15 +96,16 @@ def drive(task: Task, guess: Any, clock: Clock, most: int | None = None) -> tupl
 def _first_chunk(task: Task, clock: Clock) -> int:
     """How many steps to take before anything is timed on this grid, beside the look at the guess.
 
-    A coarser grid tells what they take; a finer one may fall out of the cache, hence half a chunk.
+    A coarser grid tells what they take; a finer one may fall out of the cache, hence half a chunk's time. One alone
+    where a step may take many passes over the nodes, and more of them on a finer grid.
     """
     method, nodes = task.method, task.grid.size
-    if clock.per_node is not None:
-        steps = CHUNK_SECONDS / (2 * clock.per_node * nodes)
-    elif task.problem.is_game or isinstance(getattr(method, "evaluation", None), (Krylov, Direct)):
-        steps = 1  # each may take many passes over the nodes
-    else:
+    if task.problem.is_game or isinstance(getattr(method, "evaluation", None), (Krylov, Direct)):
+        return 1
+    if clock.per_node is None:
         steps = FIRST_NODES / nodes
+    else:
+        steps = min(CHUNK_SECONDS / 2, clock.seconds - clock.elapsed()) / (clock.per_node * nodes)
     return int(np.clip(steps, 1, HISTORY - 1))
 
 

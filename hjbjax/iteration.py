@@ -102,7 +102,10 @@ class Task:
 
 @node()
 class State:
-    """Where the iteration stands: a value, its greedy policy, its certificate, and the loop's book-keeping."""
+    """Where the iteration stands: a value, its greedy policy, its certificate, and the loop's book-keeping.
+
+    ``fastest`` is the policy's largest Q + β, infinite before the look at a guess.
+    """
 
     value: jax.Array
     policy: Greedy
@@ -115,7 +118,7 @@ class State:
     history: jax.Array
 
 
-def begin(task: Task, guess: jax.Array) -> State:
+def begin(task: Task, guess: Any) -> State:
     """The state before the first look at a guess; step −1 of ``run`` is that look, so that all is one program.
 
     At host level it is filled by NumPy: there is nothing to compile.

@@ -46,7 +46,7 @@ def finish(
         **arrays,
         grid=grid,
         code=int(code),
-        steps=int(state.step),
+        steps=max(int(state.step), 0),
         isaacs_gap=gap,
         reached=reached,
         discrete=solution.discrete,

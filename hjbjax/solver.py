@@ -102,8 +102,9 @@ def solve(
             state, code, residuals = drive(task, monotone, clock)
         solution = finish(task, state, code, reached, residuals, verdict, grid)
         if isinstance(scheme, Limited):
-            apart = np.abs(np.asarray(state.value) - monotone)
-            solution.stats["from_monotone"] = float(np.max(apart, where=np.asarray(task.counted), initial=0))
+            counted = np.asarray(task.counted)
+            apart = np.abs(np.asarray(state.value)[counted] - monotone[counted])
+            solution.stats["from_monotone"] = float(np.max(apart, initial=0))
     solution.stats.update(
         method=describe(method, problem), levels=[*shapes, grid.shape], seconds=clock.stepping,
         compile_seconds=clock.elapsed() - clock.stepping, bytes=needed, tol=tol,

@@ -69,6 +69,7 @@ def test_a_first_chunk_is_as_long_as_coarser_grids_tell(monkeypatch):
     task, *_ = prepare_on_host(
         question(1e-3), GRID, method=SLOW, scheme=hjb.Upwind(), tol=1e-13, dtype=np.dtype(np.float32)
     )
+    histories = []
     for per_node, first in [(1e-9, driver.HISTORY - 1), (driver.CHUNK_SECONDS / (20 * GRID.size), 10), (1.0, 1)]:
         clock = driver.Clock(300, np.inf, False)
         clock.per_node = per_node
@@ -76,8 +77,28 @@ def test_a_first_chunk_is_as_long_as_coarser_grids_tell(monkeypatch):
         state, code, residuals = driver.drive(task, jnp.zeros(GRID.shape), clock)
         assert asked[:2] == [-1, first]  # one call that compiles, and the first chunk
         assert (code, int(state.step)) == (hjb.Status.MAX_STEPS, 300)
-        assert residuals.shape == (301,)
-        assert np.all(np.isfinite(residuals))
+        histories.append(residuals)
+    assert histories[0].shape == (301,)
+    assert np.all(np.diff(histories[0]) < 0)  # value iteration is a contraction
+    assert all(np.array_equal(history, histories[0]) for history in histories)
+
+
+@pytest.mark.parametrize(
+    ("method", "first"),
+    [(SLOW, driver.FIRST_NODES // GRID.size), (hjb.PolicyIteration(), driver.FIRST_NODES // GRID.size)]
+    + [(hjb.PolicyIteration(evaluation), 1) for evaluation in (hjb.Krylov(), hjb.Direct())],
+)
+def test_where_nothing_is_known_a_first_chunk_is_short(monkeypatch, method, first):
+    """Of one step where a step may take many passes over the nodes, known or not."""
+    asked, run = [], driver.run
+
+    def watched(task, state, until):
+        asked.append(int(until))
+        return run(task, state, until)
+
+    monkeypatch.setattr(driver, "run", watched)
+    hjb.solve(question(), GRID, method=method)
+    assert asked[1] == first
 
 
 @pytest.mark.parametrize("steps", [1, 7])
@@ -159,7 +180,7 @@ def test_overflow_stops_with_the_last_finite_value():
 
 @pytest.fixture
 def pressed(monkeypatch):
-    """Ctrl-C from another thread a while after the first step of a solve; when it was pressed.
+    """Ctrl-C from another thread a while after the first chunk of a solve began; when it was pressed.
 
     A process that a shell started in the background ignores the signal; here it is in the foreground.
     """

@@ -121,9 +121,11 @@ class State:
 def begin(task: Task, guess: Any) -> State:
     """The state before the first look at a guess; step −1 of ``run`` is that look, so that all is one program.
 
-    At host level it is filled by NumPy: there is nothing to compile.
+    The guess is copied, since states are donated. At host level there is nothing to compile.
     """
-    xp: Any = jnp if is_traced(task, guess) else np
+    traced = is_traced(task, guess)
+    xp: Any = jnp if traced else np
+    value = jnp.array(guess) if traced else jax.device_put(guess, may_alias=False)
     dtype, shape = guess.dtype, task.grid.shape
     inputs = [0 if choices is None else choices.dim for choices in (task.problem.controls, task.problem.disturbances)]
     policy = Greedy(xp.zeros(shape, dtype), *(tuple(xp.zeros(shape, dtype) for _ in range(m)) for m in inputs))
@@ -132,7 +134,7 @@ def begin(task: Task, guess: Any) -> State:
     counter = xp.zeros((), xp.int32)
     code = xp.asarray(int(Status.RUNNING), xp.int32)
     history = xp.full(HISTORY, xp.nan, dtype)
-    return State(xp.array(guess), policy, infinite, gap, counter - 1, xp.stack([infinite] * 2), counter, code, history)
+    return State(value, policy, infinite, gap, counter - 1, xp.stack([infinite] * 2), counter, code, history)
 
 
 def run(task: Task, state: State, until: Any) -> State:

@@ -76,15 +76,13 @@ def solve(case: Case, size: int, time_limit: float | None) -> hjb.Solution:
 
 def in_turns(case: Case, rows: list[dict[str, Any]], repeats: int, time_limit: float | None) -> list[dict[str, Any]]:
     """The rows with the seconds of ``repeats`` solves that compile nothing, the sizes taking turns."""
-    calls = {str(row["size"]): functools.partial(solve, case, row["size"], time_limit) for row in rows}
+    calls = {row["size"]: functools.partial(solve, case, row["size"], time_limit) for row in rows}
     _, timings = interleaved(calls, repeats)
     measured = []
     for row in rows:
-        timing = timings[str(row["size"])]
-        about = timing.row | {"rounds": list(timing.rounds)}
-        about["compile_seconds"] = max(0.0, row["first_seconds"] - timing.seconds)
-        about["microseconds_per_node"] = 1e6 * timing.seconds / row["nodes"]
-        measured.append(row | about)
+        timing = dataclasses.replace(timings[row["size"]], first=row["first_seconds"])
+        about = {"rounds": list(timing.rounds), "microseconds_per_node": 1e6 * timing.seconds / row["nodes"]}
+        measured.append(row | timing.row | about)
     return measured
 
 

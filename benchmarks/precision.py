@@ -78,11 +78,11 @@ def with_seconds(rows: list[dict[str, Any]], problem: Any, asked: Sequence[tuple
     It is the median of ``REPEATS``, in which all rows take turns.
     """
     calls = {
-        str(number): functools.partial(hjb.solve, problem, grid, scheme=scheme, tol=TOL)
+        number: functools.partial(hjb.solve, problem, grid, scheme=scheme, tol=TOL)
         for number, (grid, scheme) in enumerate(asked)
     }
     _, timings = interleaved(calls, REPEATS)
-    return [row | {"seconds": timings[str(number)].seconds} for number, row in enumerate(rows)]
+    return [row | {"seconds": timings[number].seconds} for number, row in enumerate(rows)]
 
 
 def _name(scheme: Any) -> str:

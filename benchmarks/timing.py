@@ -6,12 +6,13 @@ quotes is the ratio, and the median over the rounds.
 
 import dataclasses
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from statistics import median
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 
+Name = TypeVar("Name", bound=Hashable)
 PAUSE = 0.02  # seconds between two candidates: the threads of some runtimes spin on for a few milliseconds
 
 
@@ -61,8 +62,8 @@ def _nothing() -> None:
 
 
 def interleaved(
-    candidates: Mapping[str, Callable[[], Any]], repeats: int, before: Mapping[str, Callable[[], Any]] | None = None
-) -> tuple[dict[str, Any], dict[str, Timing]]:
+    candidates: Mapping[Name, Callable[[], Any]], repeats: int, before: Mapping[Name, Callable[[], Any]] | None = None
+) -> tuple[dict[Name, Any], dict[Name, Timing]]:
     """Calls every candidate once, then ``repeats`` rounds of all of them in turn.
 
     Args:
@@ -73,9 +74,9 @@ def interleaved(
     Returns:
       The last result and the timing of every candidate.
     """
-    results: dict[str, Any] = {}
-    seconds: dict[str, list[float]] = {name: [] for name in candidates}
-    busy: dict[str, list[float]] = {name: [] for name in candidates}
+    results: dict[Name, Any] = {}
+    seconds: dict[Name, list[float]] = {name: [] for name in candidates}
+    busy: dict[Name, list[float]] = {name: [] for name in candidates}
     for _ in range(1 + repeats):
         for name, call in candidates.items():
             results[name] = None  # before the next one is made: two of them may not fit

@@ -47,6 +47,11 @@ class Clock:
         self.stepping += seconds
         self.per_node = max(seconds, 1e-4) / (steps * nodes)
 
+    def steps_in(self, seconds: float, nodes: int) -> float:
+        """How many steps take so long, by the last chunk."""
+        assert self.per_node is not None
+        return seconds / (self.per_node * nodes)
+
 
 def drive(task: Task, guess: Any, clock: Clock, most: int | None = None) -> tuple[State, Status, np.ndarray]:
     """Chunks of steps until the state stops running, the steps or the time run out, or Ctrl-C.
@@ -80,9 +85,8 @@ def drive(task: Task, guess: Any, clock: Clock, most: int | None = None) -> tupl
                 state = run(task, state, int(until))  # at once a state: an interrupt may come from here on
                 code, steps = Status(int(state.code)), int(state.step) - done
                 residuals.append(np.asarray(state.history)[:steps])
-                took = time.perf_counter() - began
-                clock.count(took, steps, task.grid.size)
-                chunk = int(np.clip(steps * CHUNK_SECONDS / max(took, 1e-4), 1, min(HISTORY, 8 * chunk)))
+                clock.count(time.perf_counter() - began, steps, task.grid.size)
+                chunk = int(np.clip(clock.steps_in(CHUNK_SECONDS, task.grid.size), 1, min(HISTORY, 8 * chunk)))
                 show(steps - (done < 0), float(state.gap.error))
                 done += steps
         except KeyboardInterrupt:
@@ -105,7 +109,7 @@ def _first_chunk(task: Task, clock: Clock) -> int:
     if clock.per_node is None:
         steps = FIRST_NODES / nodes
     else:
-        steps = min(CHUNK_SECONDS / 2, clock.seconds - clock.elapsed()) / (clock.per_node * nodes)
+        steps = clock.steps_in(min(CHUNK_SECONDS / 2, clock.seconds - clock.elapsed()), nodes)
     return int(np.clip(steps, 1, HISTORY - 1))
 
 

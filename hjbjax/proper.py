@@ -126,12 +126,12 @@ def _searched(held: np.ndarray, jumps: Rates, grid: Grid) -> np.ndarray:
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import breadth_first_order
 
-    free, number = ~held, np.arange(grid.size).reshape(grid.shape)
-    ends, starts = [np.full(np.count_nonzero(held), grid.size)], [number[held]]  # one more node leads to all held ones
+    starts = [np.flatnonzero(held)]
+    ends = [np.full_like(starts[0], grid.size)]  # one more node leads to all held ones
     for offset, jump in zip(jumps.offsets, jumps.values, strict=True):
-        leaves = free & np.asarray(jump)
-        ends.append(np.roll(number, [-step for step in offset], axis=range(grid.ndim))[leaves])
-        starts.append(number[leaves])
+        leaves = ~held & np.asarray(jump)
+        starts.append(np.flatnonzero(leaves))
+        ends.append(stencil.numbers(grid, offset)[leaves])
     backward = np.concatenate(ends), np.concatenate(starts)
     graph = csr_array((np.ones(len(backward[0])), backward), shape=(grid.size + 1, grid.size + 1))
     found = np.zeros(grid.size + 1, bool)

@@ -96,14 +96,14 @@ def solve(
         task, verdict, reached = prepare_on_host(problem, grid, method=inner, scheme=scheme.chain, tol=tol, dtype=kind)
         state, code, residuals = drive(task, nested.warm(task, start, clock), clock)
         if isinstance(scheme, Limited):
-            monotone = np.array(state.value)
+            monotone = state.value
             verdict = dataclasses.replace(verdict, certificate=Certificate.RESIDUAL)
             task = dataclasses.replace(task, certificate=Certificate.RESIDUAL, scheme=scheme)
             state, code, residuals = drive(task, monotone, clock)
         solution = finish(task, state, code, reached, residuals, verdict, grid)
         if isinstance(scheme, Limited):
             counted = np.asarray(task.counted)
-            apart = np.abs(np.asarray(state.value)[counted] - monotone[counted])
+            apart = np.abs(np.asarray(state.value)[counted] - np.asarray(monotone)[counted])
             solution.stats["from_monotone"] = float(np.max(apart, initial=0))
     solution.stats.update(
         method=describe(method, problem), levels=[*shapes, grid.shape], seconds=clock.stepping,

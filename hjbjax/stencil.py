@@ -128,6 +128,12 @@ def _van_albada(a: jax.Array, b: jax.Array) -> jax.Array:
     return jnp.where(agree, a * b * (a + b) / jnp.where(agree, a * a + b * b, 1), 0)
 
 
+def numbers(grid: Grid, offset: Sequence[int]) -> np.ndarray:
+    """The number in C order of the node x + offset for every node x, shape (*grid), round all axes; host level."""
+    number = np.arange(grid.size).reshape(grid.shape)
+    return np.roll(number, [-step for step in offset], axis=range(grid.ndim))
+
+
 def sparse(offsets: Sequence[tuple[int, ...]], values: Sequence[np.ndarray], diagonal: np.ndarray, grid: Grid) -> Any:
     """The matrix with ``diagonal`` and, for every offset o, entry values_o(x) in row x and column x + o.
 
@@ -138,13 +144,12 @@ def sparse(offsets: Sequence[tuple[int, ...]], values: Sequence[np.ndarray], dia
     """
     from scipy.sparse import coo_array
 
-    number = np.arange(grid.size).reshape(grid.shape)
-    rows, columns, entries = [number.ravel()], [number.ravel()], [np.asarray(diagonal, np.float64).ravel()]
+    number = np.arange(grid.size)
+    rows, columns, entries = [number], [number], [np.asarray(diagonal, np.float64).ravel()]
     for offset, value in zip(offsets, values, strict=True):
         nonzero = np.asarray(value).ravel() != 0
-        target = np.roll(number, [-step for step in offset], axis=range(grid.ndim)).ravel()
-        rows.append(number.ravel()[nonzero])
-        columns.append(target[nonzero])
+        rows.append(number[nonzero])
+        columns.append(numbers(grid, offset).ravel()[nonzero])
         entries.append(np.asarray(value, np.float64).ravel()[nonzero])
     index = (np.concatenate(rows), np.concatenate(columns))
     return coo_array((np.concatenate(entries), index), shape=(grid.size, grid.size)).tocsr()

@@ -57,15 +57,21 @@ def test_converged_history_has_one_residual_a_step_and_one_for_the_guess():
     assert solution.residual == solution.residuals[-1]
 
 
-def test_a_first_chunk_is_as_long_as_coarser_grids_tell(monkeypatch):
-    """Half a chunk's time by what a step took at a node, and never more than the history of one chunk can hold."""
-    asked, run = [], driver.run
+@pytest.fixture
+def asked(monkeypatch):
+    """Up to which step the driver runs, call by call."""
+    steps, run = [], driver.run
 
     def watched(task, state, until):
-        asked.append(int(until))
+        steps.append(int(until))
         return run(task, state, until)
 
     monkeypatch.setattr(driver, "run", watched)
+    return steps
+
+
+def test_a_first_chunk_is_as_long_as_coarser_grids_tell(asked):
+    """Half a chunk's time by what a step took at a node, and never more than the history of one chunk can hold."""
     task, *_ = prepare_on_host(
         question(1e-3), GRID, method=SLOW, scheme=hjb.Upwind(), tol=1e-13, dtype=np.dtype(np.float32)
     )
@@ -88,15 +94,8 @@ def test_a_first_chunk_is_as_long_as_coarser_grids_tell(monkeypatch):
     [(SLOW, driver.FIRST_NODES // GRID.size), (hjb.PolicyIteration(), driver.FIRST_NODES // GRID.size)]
     + [(hjb.PolicyIteration(evaluation), 1) for evaluation in (hjb.Krylov(), hjb.Direct())],
 )
-def test_where_nothing_is_known_a_first_chunk_is_short(monkeypatch, method, first):
-    """Of one step where a step may take many passes over the nodes, known or not."""
-    asked, run = [], driver.run
-
-    def watched(task, state, until):
-        asked.append(int(until))
-        return run(task, state, until)
-
-    monkeypatch.setattr(driver, "run", watched)
+def test_where_nothing_is_known_a_first_chunk_is_short(asked, method, first):
+    """Of one step where a step may take many passes over the nodes."""
     hjb.solve(question(), GRID, method=method)
     assert asked[1] == first
 

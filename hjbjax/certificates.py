@@ -19,9 +19,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from hjbjax.bellman import Conditions, Correction, Greedy
-from hjbjax.pytree import node
+from hjbjax.pytree import is_traced, node
 
 
 class Certificate(enum.Enum):
@@ -102,12 +103,16 @@ def gap(
     return Gap(zero, zero, zero, jnp.maximum(residual, moved), residual)
 
 
-def bounds(kind: Certificate, value: Any, measured: Gap) -> tuple[Any, Any] | None:
-    """The lower and upper bound arrays, or None without a certificate."""
+def enclosure(kind: Certificate, measured: Gap) -> Any:
+    """The bounds as affine functions of V, shape (2, 2): factor and shift of the lower and of the upper; or None."""
+    if kind not in (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE):
+        return None
+    xp: Any = jnp if is_traced(measured) else np
+    below, above, lift = (xp.asarray(number) for number in (measured.below, measured.above, measured.lift))
+    one = xp.ones_like(lift)
     if kind is Certificate.ADDITIVE:
-        return value + measured.below, value + measured.above
-    if kind is Certificate.MULTIPLICATIVE:
-        lifted = value + measured.lift
-        upper = jnp.where(jnp.isinf(measured.above), jnp.inf, lifted * measured.above - measured.lift)  # no 0 · inf
-        return lifted * measured.below - measured.lift, upper
-    return None
+        return xp.stack([xp.stack([one, below]), xp.stack([one, above])])
+    endless = xp.isinf(above)
+    factor = xp.where(endless, one, above)  # no 0 · inf
+    shift = xp.where(endless, xp.inf, lift * (factor - 1))
+    return xp.stack([xp.stack([below, lift * (below - 1)]), xp.stack([factor, shift])])

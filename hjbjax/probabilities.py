@@ -276,4 +276,4 @@ def _scaled(solution: Solution, offset: float, sign: float) -> Solution:
     """The solution with offset + sign · V for V; no certificate holds for a cost that is negative."""
     if sign > 0:
         return dataclasses.replace(solution, value=offset + solution.value)
-    return dataclasses.replace(solution, value=offset - solution.value, lower=None, upper=None)
+    return dataclasses.replace(solution, value=offset - solution.value, enclosure=None)

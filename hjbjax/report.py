@@ -1,4 +1,4 @@
-"""From a state of the iteration to a Solution: NumPy arrays, masks, bounds, the Isaacs gap, the message."""
+"""From a state of the iteration to a Solution: NumPy arrays, masks, the Isaacs gap, the message."""
 
 import warnings
 from typing import Any
@@ -33,17 +33,16 @@ def finish(
     state = jax.device_get(state)
     solution = assemble(task, state, verdict)
     lost = ~np.asarray(task.counted)
-    arrays = {name: getattr(solution, name) for name in ("value", "lower", "upper", "policy", "disturbance")}
+    arrays = {name: getattr(solution, name) for name in ("value", "policy", "disturbance")}
     arrays = {name: None if array is None else np.require(array, requirements="W") for name, array in arrays.items()}
-    for array in (arrays["value"], arrays["lower"], arrays["upper"]):
-        if array is not None:
-            array[lost] = np.inf
+    arrays["value"][lost] = np.inf
     idle = lost | np.asarray(task.rules.ended)
     for array in (arrays["policy"], arrays["disturbance"]):
         if array is not None:
             array[idle] = np.nan
     return Solution(
         **arrays,
+        enclosure=solution.enclosure,
         grid=grid,
         code=int(code),
         steps=max(int(state.step), 0),
@@ -66,8 +65,6 @@ def finish(
 def assemble(task: Task, state: State, verdict: Verdict) -> Solution:
     """The solution as it stands in the state; pure."""
     problem = task.problem
-    bounds = certificates.bounds(verdict.certificate, state.value, state.gap)
-    lower, upper = bounds if bounds is not None else (None, None)
     controls, disturbances = state.policy.controls, state.policy.disturbances
     xp: Any = jnp if is_traced(state) else np
     return Solution(
@@ -76,8 +73,7 @@ def assemble(task: Task, state: State, verdict: Verdict) -> Solution:
         disturbance=xp.stack(disturbances, axis=-1) if problem.is_game else None,
         code=state.code,
         steps=state.step,
-        lower=lower,
-        upper=upper,
+        enclosure=certificates.enclosure(verdict.certificate, state.gap),
         grid=task.grid,
         discrete=isinstance(problem.controls, Finite),
         discrete_disturbance=isinstance(problem.disturbances, Finite),

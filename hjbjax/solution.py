@@ -1,8 +1,9 @@
 """The answer: value, policy, how it ended, and how far it can be off.
 
 A ``Solution`` is a pytree, so it may leave ``jit`` and ``vmap`` and be differentiated; timings and residuals
-are host matter and do not survive such a passage. With certified bounds lower ≤ V_h ≤ upper on the exact
-discrete solution V_h, the error of the value V is at most max(upper − V, V − lower).
+are host matter and do not survive such a passage. Certified bounds lower ≤ V_h ≤ upper on the exact discrete
+solution V_h are affine in the value V, so that four numbers hold them; the error of V is at most
+max(upper − V, V − lower).
 """
 
 import dataclasses
@@ -55,8 +56,8 @@ class Solution:
       disturbance: d, shape (*grid, l), in a game.
       code: a ``Status`` number.
       steps: how many steps were taken.
-      lower: certified lower bound on the exact discrete solution, shape (*grid), or ``None``.
-      upper: certified upper bound, likewise.
+      enclosure: shape (2, 2), or ``None`` without a certificate: the exact discrete solution is certified to lie
+        between ``enclosure[0, 0] * value + enclosure[0, 1]`` and ``enclosure[1, 0] * value + enclosure[1, 1]``.
       isaacs_gap: the largest min-max minus max-min over the nodes, in cost units per unit time, in a game.
       reached: the nodes from which the target can be reached, bool (*grid); ``None`` means all.
       times: shape (k,) when marched; value and policy then have a leading axis.
@@ -80,8 +81,7 @@ class Solution:
     disturbance: Any = None
     code: Any = 0
     steps: Any = 0
-    lower: Any = None
-    upper: Any = None
+    enclosure: Any = None
     isaacs_gap: Any = None
     reached: Any = None
     times: Any = None
@@ -104,8 +104,21 @@ class Solution:
 
     @property
     def bounds(self) -> tuple[Any, Any] | None:
-        """The certified ``(lower, upper)``, each of shape (*grid), or ``None`` without a certificate."""
-        return None if self.lower is None or self.upper is None else (self.lower, self.upper)
+        """The certified ``(lower, upper)``, each of shape (*grid), made when asked for; infinite where V is.
+
+        ``None`` without a certificate.
+        """
+        if self.enclosure is None:
+            return None
+        xp: Any = jnp if is_traced(self.value, self.enclosure) else np
+        value, (factors, shifts) = xp.asarray(self.value), self._lines(xp)
+        finite, numbers = xp.isfinite(value), (..., *(None,) * self.grid.ndim)
+        center = xp.where(finite, value, 0)
+        lower, upper = (
+            xp.where(finite, factors[..., side][numbers] * center + shifts[..., side][numbers], value)
+            for side in (0, 1)
+        )
+        return lower, upper
 
     @property
     def error(self) -> Any:
@@ -113,16 +126,26 @@ class Solution:
 
         A NaN among the values or the bounds, or no finite node at all, makes it infinite: nothing is certified.
         """
-        if self.bounds is None:
+        if self.enclosure is None:
             return None
-        xp: Any = jnp if is_traced(self.value, self.bounds) else np
-        value, (lower, upper) = xp.asarray(self.value), self.bounds
-        finite = xp.isfinite(value)
-        center = xp.where(finite, value, 0)
-        off = xp.where(finite, xp.maximum(upper - center, center - lower), -xp.inf)
-        broken = xp.any(xp.isnan(value)) | xp.any(xp.isnan(off)) | ~xp.any(finite)
-        worst = xp.where(broken, xp.inf, xp.max(off))
+        xp: Any = jnp if is_traced(self.value, self.enclosure) else np
+        value, (factors, shifts) = xp.asarray(self.value), self._lines(xp)
+        finite, nodes = xp.isfinite(value), tuple(range(-self.grid.ndim, 0))
+        ends = xp.min(xp.where(finite, value, xp.inf), axis=nodes), xp.max(xp.where(finite, value, -xp.inf), axis=nodes)
+        least, most = (xp.where(xp.isfinite(end), end, 0) for end in ends)
+        off = [
+            sign * ((factors[..., side] - 1) * end + shifts[..., side])  # an affine function is largest at an end
+            for side, sign in enumerate((-1, 1))
+            for end in (least, most)
+        ]
+        worst = xp.max(xp.stack(off))
+        worst = xp.where(xp.isnan(worst) | xp.any(xp.isnan(value)) | ~xp.any(finite), xp.inf, worst)
         return worst if xp is jnp else float(worst)
+
+    def _lines(self, xp: Any) -> tuple[Any, Any]:
+        """Factors and shifts of the two bounds, each of shape (..., 2)."""
+        enclosure = xp.asarray(self.enclosure)
+        return enclosure[..., 0], enclosure[..., 1]
 
     @property
     def residual(self) -> float | None:
@@ -241,15 +264,14 @@ def _plan(header: dict) -> dict[str, Expected]:
     if not all(type(count) is int and count >= 2 for count in shape):
         raise FileError(f"its grid has shape {shape}")
     many, lead = (None,), () if marched is None else (marched,)
-    values, controls = Expected((lead + shape,)), Expected((lead + shape + many, many * len(lead) + shape + many))
+    controls = Expected((lead + shape + many, many * len(lead) + shape + many))
     return {
         "lo": Expected(((len(shape),),), optional=False),
         "hi": Expected(((len(shape),),), optional=False),
         "value": Expected((lead + shape,), optional=False),
         "policy": controls,
         "disturbance": controls,
-        "lower": values,
-        "upper": values,
+        "enclosure": Expected(((2, 2),)),
         "reached": Expected((shape, lead + shape), (np.bool_,)),
         "residuals": Expected((many,)),
         **({} if marched is None else {"times": Expected((lead,), optional=False)}),

@@ -34,8 +34,7 @@ def example(seed=0, **changes):
         "disturbance": random.normal(size=(4, 3, 1)),
         "code": Status.STALLED,
         "steps": 17,
-        "lower": value - 0.1,
-        "upper": value + 0.1,
+        "enclosure": random.normal(size=(2, 2)),
         "isaacs_gap": 0.1 + 0.2,
         "reached": random.random((4, 3)) < 0.5,
         "discrete": True,
@@ -46,7 +45,7 @@ def example(seed=0, **changes):
     return Solution(**{**fields, **changes})
 
 
-ARRAYS = ("value", "policy", "disturbance", "lower", "upper", "reached", "times", "residuals")
+ARRAYS = ("value", "policy", "disturbance", "enclosure", "reached", "times", "residuals")
 OTHERS = ("code", "steps", "isaacs_gap", "discrete", "discrete_disturbance", "stats", "message")
 
 
@@ -69,11 +68,11 @@ def assert_same(one, other):
     "changes",
     [
         {},
-        {"disturbance": None, "lower": None, "upper": None, "isaacs_gap": None, "reached": None, "policy": None},
+        {"disturbance": None, "enclosure": None, "isaacs_gap": None, "reached": None, "policy": None},
         {"policy": np.zeros((4, 3, 0)), "residuals": np.zeros(0), "stats": {}, "isaacs_gap": float("nan")},
         {"value": np.ones((4, 3), np.float32), "policy": np.asfortranarray(np.arange(24.0).reshape(4, 3, 2))},
         {"times": np.array([0.0, 0.5]), "value": np.arange(24.0).reshape(2, 4, 3), "policy": np.ones((2, 4, 3, 1))}
-        | {"lower": None, "upper": None, "disturbance": None},
+        | {"enclosure": None, "disturbance": None},
     ],
     ids=["all", "least", "empty", "float32", "marched"],
 )

@@ -54,8 +54,7 @@ def test_a_solution_leaves_jit_vmap_and_grad():
             value[..., None],
             code=code,
             steps=jnp.asarray(4),
-            lower=value - 1,
-            upper=value + 2,
+            enclosure=jnp.array([[1.0, -1.0], [1.0, 2.0]]),
             message="m",
         )
         if isinstance(code, jax.core.Tracer):  # in jit and vmap, and not in grad
@@ -82,6 +81,7 @@ def test_a_solution_leaves_jit_vmap_and_grad():
         [0.1, 0.4, 0.6],
         rtol=1e-5,
     )
+    np.testing.assert_allclose(batch.bounds, [batch.value - 1, batch.value + 2], rtol=1e-6)
     assert jax.tree.map(lambda leaf: leaf[0], batch).status is Status.MAX_STEPS
     assert jax.grad(lambda scale: solve(scale).value_at([0.5, 1.0]))(2.0) == pytest.approx(1.0)
     assert jax.jit(lambda scale: solve(scale).error)(2.0) == pytest.approx(2, abs=1e-5)
@@ -120,31 +120,41 @@ def test_rebuilding_does_not_validate():
 
 
 def test_error_and_bounds():
-    value = np.array([0.0, 1.0, np.inf, 2.0])
+    value = np.array([0.0, 1.0, np.inf, -4.0])
     grid = Grid([0.0], [3.0], (4,))
 
     def certified(lower, upper, value=value):
-        return Solution(grid, value, None, lower=lower, upper=upper)
+        return Solution(grid, value, None, enclosure=np.array([lower, upper]))
 
-    solution = certified(value - [0.1, 0, 0, 0.3], value + np.array([0.2, 0.1, 0, 0.1]))
-    assert solution.error == pytest.approx(0.3)
-    assert isinstance(solution.error, float)
-    assert solution.bounds[0] is solution.lower
-    assert solution.bounds[1] is solution.upper
-    assert certified(value, value + np.array([0.5, 0, 0, 0])).error == 0.5
-    assert certified(value, value).error == 0
-    assert certified(None, None).error is None
-    assert certified(value, None).bounds is None
-    assert certified(value, np.full(4, np.inf)).error == np.inf
+    shifted = certified([1.0, -0.3], [1.0, 0.2])
+    assert shifted.error == pytest.approx(0.3)
+    assert isinstance(shifted.error, float)
+    np.testing.assert_allclose(shifted.bounds, [[-0.3, 0.7, np.inf, -4.3], [0.2, 1.2, np.inf, -3.8]])
+    scaled = certified([0.75, -0.5], [2.0, 5.0])  # (V + 2) · ¾ − 2, (V + 5) · 2 − 5
+    np.testing.assert_allclose(scaled.bounds, [[-0.5, 0.25, np.inf, -3.5], [5.0, 7.0, np.inf, -3.0]])
+    for solution in (shifted, scaled, certified([0.5, 0.0], [1.0, 0.0], np.array([0.0, 1.0, np.inf, 4.0]))):
+        lower, upper = (side[solution.value < np.inf] for side in solution.bounds)
+        finite = solution.value[solution.value < np.inf]
+        assert solution.error == pytest.approx(np.max(np.maximum(upper - finite, finite - lower)))
+    assert certified([1.0, 0.0], [1.0, 0.0]).error == 0
+    endless = certified([0.0, 0.0], [1.0, np.inf])
+    assert endless.error == np.inf
+    np.testing.assert_array_equal(endless.bounds, [[0, 0, np.inf, 0], [np.inf] * 4])
+    bare = Solution(grid, value, None)
+    assert bare.error is None
+    assert bare.bounds is None
 
 
 @pytest.mark.parametrize("where", ["value", "lower", "upper", "all"])
 def test_nan_certifies_nothing(where):
-    fields = {name: np.zeros(4) for name in ("value", "lower", "upper")}
-    fields.get(where, np.zeros(4))[1] = np.nan
+    value, enclosure = np.zeros(4), np.array([[1.0, 0.0], [1.0, 0.0]])
     if where == "all":
-        fields["value"][:] = np.inf
-    solution = Solution(Grid([0.0], [3.0], (4,)), policy=None, **fields)
+        value[:] = np.inf
+    elif where == "value":
+        value[1] = np.nan
+    else:
+        enclosure[["lower", "upper"].index(where), 1] = np.nan
+    solution = Solution(Grid([0.0], [3.0], (4,)), value, None, enclosure=enclosure)
     assert solution.error == np.inf
     assert jax.jit(lambda solution: solution.error)(solution) == np.inf
 
@@ -175,8 +185,7 @@ def test_the_whole_screen():
         value[..., None],
         code=Status.CONVERGED,
         steps=7,
-        lower=value - 1e-7,
-        upper=value + 2e-7,
+        enclosure=np.array([[1.0, -1e-7], [1.0, 2e-7]]),
         isaacs_gap=0.125,
         reached=reached,
         residuals=np.array([1.0, 3e-8]),

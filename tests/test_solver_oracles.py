@@ -282,7 +282,7 @@ def test_states_that_cannot_reach_the_target():
     lost = x > 0.01
     np.testing.assert_array_equal(solution.reached, ~lost)
     np.testing.assert_array_equal(solution.value[lost], np.inf)
-    np.testing.assert_array_equal(solution.upper[lost], np.inf)
+    np.testing.assert_array_equal(np.stack(solution.bounds)[:, lost], np.inf)
     assert np.all(np.isnan(solution.policy[lost]))
     np.testing.assert_allclose(solution.value[~lost], -x[~lost] / 1.5, atol=1e-8)
     assert np.isfinite(solution.error)

@@ -196,7 +196,7 @@ def test_no_bound_where_the_theorem_says_nothing():
     assert np.isfinite(steep.below)
     free, _ = bounds_of(Certificate.MULTIPLICATIVE, problem, grid, 0.9 * exact, rules, np.array([1.0, 1, 0, 1, 1]))
     assert np.isinf(free.error)
-    assert certificates.bounds(Certificate.NONE, exact, free) is None
+    assert certificates.enclosure(Certificate.NONE, free) is None
 
 
 @pytest.mark.parametrize("kind", list(Certificate))

@@ -150,7 +150,8 @@ def correction(
 ) -> Correction:
     """The linear equation for δ under one policy; the active branch of the constraints is chosen node by node.
 
-    ``fastest``, where it is known of the same policy and time, spares a pass over the nodes.
+    ``fastest``, where it is known of the same policy and time, spares a pass over the nodes; so does zero, which says
+    that every rate counts, however small it is beside the others.
     """
     u, d = list(policy.controls), list(policy.disturbances)
     rates = chain.rates(problem, grid, u, d, scheme=scheme.chain, dtype=value.dtype, t=t)

@@ -82,13 +82,16 @@ def gap(
     free = counted & ~rules.held
     zero = jnp.zeros_like(residual)
     if kind is Certificate.ADDITIVE:
-        shift = policy.rate / discount
-        if rules.stop is not None:
-            shift = jnp.minimum(shift, rules.stop - value)
-        if rules.floor is not None:
-            shift = jnp.maximum(shift, rules.floor - value)
-        shift = jnp.where(rules.held, 0, shift)
-        below, above = jnp.min(shift), jnp.max(shift)
+        if rules.stop is None and rules.floor is None:
+            below, above = jnp.min(policy.rate) / discount, jnp.max(policy.rate) / discount
+        else:
+            shift = policy.rate / discount
+            if rules.stop is not None:
+                shift = jnp.minimum(shift, rules.stop - value)
+            if rules.floor is not None:
+                shift = jnp.maximum(shift, rules.floor - value)
+            shift = jnp.where(rules.held, 0, shift)
+            below, above = jnp.min(shift), jnp.max(shift)
         return Gap(below, above, zero, jnp.maximum(jnp.abs(below), jnp.abs(above)), residual)
     if kind is Certificate.MULTIPLICATIVE:
         safe = jnp.where(free & (least_cost > 0), least_cost, 1)

@@ -30,6 +30,7 @@ from hjbjax.status import Status
 FULL_STEPS = 10  # corrections of a limited scheme before they are halved, which ends limit cycles of the limiter
 HISTORY = 256  # steps whose residuals one chunk can record
 GROWTH = 1e6  # a residual that has grown by this factor over its smallest has diverged
+PATIENCE = 10  # steps without progress of a residual that is rounding
 ROUNDING = 64  # residuals below this many units in the last place of max|V| are rounding
 
 
@@ -104,7 +105,7 @@ class Task:
 class State:
     """Where the iteration stands: a value, its greedy policy, its certificate, and the loop's book-keeping.
 
-    ``fastest`` is the policy's largest Q + β, infinite before the look at a guess.
+    ``fastest`` is the policy's largest Q + β where the correction asks for it, infinite before the look at a guess.
     """
 
     value: jax.Array
@@ -182,7 +183,7 @@ def _unmeasured(task: Task, state: State) -> Any:
 def _look(task: Task, value: jax.Array, incumbent: Greedy, moved: jax.Array) -> tuple[Greedy, jax.Array, Gap]:
     problem, grid, scheme = task.problem, task.grid, task.scheme
     policy = bellman.greedy(problem, grid, value, task.rules.held, scheme=scheme, incumbent=incumbent)
-    equation = bellman.correction(problem, grid, value, policy, task.rules, scheme=scheme)
+    equation = _equation(task, value, policy)
     measured = certificates.gap(
         task.certificate,
         value,
@@ -199,8 +200,12 @@ def _look(task: Task, value: jax.Array, incumbent: Greedy, moved: jax.Array) -> 
 
 def _judge(task: Task, value: jax.Array, measured: Gap, best: jax.Array, since: jax.Array) -> jax.Array:
     finite = jnp.isfinite(measured.residual)
-    rounding = ROUNDING * jnp.finfo(value.dtype).eps * jnp.max(jnp.where(task.counted, jnp.abs(value), 0))
-    patience = jnp.where(measured.residual <= rounding, 10, 100 + 4 * sum(task.grid.shape))
+    matters = (since >= PATIENCE) | (measured.residual > GROWTH * best[1])  # else it changes no answer below
+    size = jax.lax.cond(
+        matters, lambda: jnp.max(jnp.where(task.counted, jnp.abs(value), 0)), lambda: jnp.zeros_like(best[1])
+    )
+    rounding = ROUNDING * jnp.finfo(value.dtype).eps * size
+    patience = jnp.where(measured.residual <= rounding, PATIENCE, 100 + 4 * sum(task.grid.shape))
     code = jnp.where(since >= patience, Status.STALLED, Status.RUNNING)
     code = jnp.where(measured.residual > GROWTH * jnp.maximum(best[1], rounding), Status.DIVERGED, code)
     code = jnp.where(measured.error <= task.tol, Status.CONVERGED, code)
@@ -219,6 +224,8 @@ def _correct(task: Task, state: State) -> jax.Array:
 
 
 def _equation(task: Task, value: jax.Array, policy: Greedy, fastest: Any = None) -> Correction:
+    if task.certificate is Certificate.ADDITIVE:  # no rate is only rounding: there is a discount
+        fastest = jnp.zeros((), value.dtype)
     return bellman.correction(task.problem, task.grid, value, policy, task.rules, scheme=task.scheme, fastest=fastest)
 
 

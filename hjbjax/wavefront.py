@@ -26,6 +26,7 @@ Weights = list[tuple[jax.Array, ...]]  # for each axis, as ``_towards`` gives th
 
 CACHE = 2**25  # bytes that a processor keeps near by
 SLAB = 64  # slices
+FOLDS = 4  # comparisons that take the place of a division, which XLA would not fuse
 
 
 def gauss_seidel(equation: Correction, grid: Grid, rounds: int) -> jax.Array:
@@ -162,13 +163,19 @@ def _sweep(source: jax.Array, weights: Weights, planes: jax.Array, first: Any, l
 
 def _sheared(values: jax.Array, flips: list[jax.Array], *, back: bool = False) -> jax.Array:
     """S[d, j] = X[(d − Σ_k j_k) mod n₀, j] of the flipped array; or ``back`` from S to X."""
-    row, *columns = (jax.lax.broadcasted_iota(jnp.int32, values.shape, axis) for axis in range(values.ndim))
+    zero, *flips = jax.lax.optimization_barrier((jnp.int32(0), *flips))  # or the loop over the orders keeps indices
+    count, *counts = values.shape
+    row, *columns = (jax.lax.broadcasted_iota(jnp.int32, values.shape, axis) + zero for axis in range(values.ndim))
     flipped = [
-        jnp.where(flip == 1, count - 1 - column, column)
-        for column, count, flip in zip(columns, values.shape[1:], flips, strict=True)
+        jnp.where(flip == 1, size - 1 - column, column)
+        for column, size, flip in zip(columns, counts, flips, strict=True)
     ]
-    row = row + sum(flipped) if back else row - sum(columns)
-    place = row % values.shape[0]
-    for column, count in zip(flipped, values.shape[1:], strict=True):
-        place = place * count + column
+    place = row + sum(flipped) if back else row - sum(columns)
+    folds = -(-(sum(counts) - len(counts)) // count)
+    if folds > FOLDS:
+        place = place % count
+    for _ in range(folds if folds <= FOLDS else 0):
+        place = jnp.where(place >= count, place - count, place) if back else jnp.where(place < 0, place + count, place)
+    for column, size in zip(flipped, counts, strict=True):
+        place = place * size + column
     return values.reshape(-1).at[place].get(mode="promise_in_bounds")

@@ -152,9 +152,11 @@ def _sweep(source: jax.Array, weights: Weights, planes: jax.Array, first: Any, l
         d = jnp.where(up, k, first + last - 1 - k)
         below, above, new = row(planes, d), row(planes, d + 2), row(source, d)
         for axis, pair in enumerate(weights):
-            rows = [row(w, d) for w in pair]
-            to_above, to_below = rows if len(rows) == 2 else (jnp.maximum(rows[0], 0), jnp.maximum(-rows[0], 0))
-            new = new + to_above * core(above, axis, 1) + to_below * core(below, axis, -1)
+            rows, up_there, down_there = [row(w, d) for w in pair], core(above, axis, 1), core(below, axis, -1)
+            if len(rows) == 2:
+                new = new + rows[0] * up_there + rows[1] * down_there
+            else:
+                new = new + rows[0] * jnp.where(rows[0] > 0, up_there, -down_there)
         start: tuple[Any, ...] = (d + 1, *(1 for _ in source.shape[1:]))
         return jax.lax.dynamic_update_slice(planes, new, start, allow_negative_indices=False)
 

@@ -78,8 +78,8 @@ def _in_turns(source: jax.Array, weights: Weights, planes: jax.Array, grid: Grid
 def _in_slabs(source: jax.Array, weights: Weights, planes: jax.Array, grid: Grid, rounds: int) -> jax.Array:
     """Slab after slab upwards and once more downwards; each to and fro while it is in the cache.
 
-    What lies beyond the cache is read twice instead of 2 ``rounds`` times, and a slab at hand is swept for little:
-    2 ``rounds`` + 1 times.
+    What lies beyond the cache is read twice instead of 2 ``rounds`` times, and a slab is swept 2 ``rounds`` - 1 times
+    while it is at hand.
     """
     count = len(source)
     slabs = -(-count // SLAB)
@@ -92,7 +92,7 @@ def _in_slabs(source: jax.Array, weights: Weights, planes: jax.Array, grid: Grid
             def sweep(k: jax.Array, planes: jax.Array) -> jax.Array:
                 return _sweep(source, weights, planes, first, last, up=up == (k % 2 == 0))
 
-            return jax.lax.fori_loop(0, 2 * rounds + 1, sweep, planes)
+            return jax.lax.fori_loop(0, 2 * rounds - 1, sweep, planes)
 
         planes = jax.lax.fori_loop(0, slabs, slab, _wrapped(planes, grid))
     return planes

@@ -70,7 +70,7 @@ class Greedy:
 class Correction:
     """The linear equation δ = source + Σ_o weights_o δ(x + o) for a correction δ of the value, in cost units.
 
-    ``fastest`` is the largest Q + β of the policy that it belongs to, per unit time.
+    ``fastest`` is the largest Q + β of the policy that it belongs to, per unit time, or what ``correction`` was told.
     """
 
     source: jax.Array
@@ -150,8 +150,8 @@ def correction(
 ) -> Correction:
     """The linear equation for δ under one policy; the active branch of the constraints is chosen node by node.
 
-    ``fastest``, where it is known of the same policy and time, spares a pass over the nodes; so does zero, which says
-    that every rate counts, however small it is beside the others.
+    ``fastest``, where it is known of the same policy and time, spares a pass over the nodes. Zero spares it, too: then
+    every rate counts, however small it is beside the others.
     """
     u, d = list(policy.controls), list(policy.disturbances)
     rates = chain.rates(problem, grid, u, d, scheme=scheme.chain, dtype=value.dtype, t=t)

@@ -70,7 +70,7 @@ def gap(
     Args:
       kind: which bound applies.
       value: V.
-      policy: the greedy policy at V with its rate r.
+      policy: the greedy policy at V with its rate r, zero where held.
       equation: the correction equation there, whose source is the residual.
       rules: held nodes and constraints.
       discount: β.
@@ -107,15 +107,21 @@ def gap(
 
 
 def enclosure(kind: Certificate, measured: Gap) -> Any:
-    """The bounds as affine functions of V, shape (2, 2): factor and shift of the lower and of the upper; or None."""
+    """Both bounds as affine functions of V: rows lower and upper, columns factor and shift, shape (2, 2).
+
+    ``None`` without a certificate.
+    """
     if kind not in (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE):
         return None
     xp: Any = jnp if is_traced(measured) else np
     below, above, lift = (xp.asarray(number) for number in (measured.below, measured.above, measured.lift))
-    one = xp.ones_like(lift)
-    if kind is Certificate.ADDITIVE:
-        return xp.stack([xp.stack([one, below]), xp.stack([one, above])])
-    endless = xp.isinf(above)
-    factor = xp.where(endless, one, above)  # no 0 · inf
-    shift = xp.where(endless, xp.inf, lift * (factor - 1))
-    return xp.stack([xp.stack([below, lift * (below - 1)]), xp.stack([factor, shift])])
+
+    def line(side: Any) -> Any:
+        one = xp.ones_like(side)
+        if kind is Certificate.ADDITIVE:
+            return xp.stack([one, side])
+        endless = xp.isinf(side)
+        factor = xp.where(endless, one, side)  # no 0 · inf
+        return xp.stack([factor, xp.where(endless, side, lift * (factor - 1))])
+
+    return xp.stack([line(below), line(above)])

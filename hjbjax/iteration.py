@@ -105,7 +105,8 @@ class Task:
 class State:
     """Where the iteration stands: a value, its greedy policy, its certificate, and the loop's book-keeping.
 
-    ``fastest`` is the policy's largest Q + β where the correction asks for it, infinite before the look at a guess.
+    ``fastest`` is the policy's largest Q + β, zero where every rate counts (under a discount), infinite before the look
+    at a guess.
     """
 
     value: jax.Array
@@ -183,19 +184,19 @@ def _unmeasured(task: Task, state: State) -> Any:
 def _look(task: Task, value: jax.Array, incumbent: Greedy, moved: jax.Array) -> tuple[Greedy, jax.Array, Gap]:
     problem, grid, scheme = task.problem, task.grid, task.scheme
     policy = bellman.greedy(problem, grid, value, task.rules.held, scheme=scheme, incumbent=incumbent)
-    equation = _equation(task, value, policy)
+    left = equation(task, value, policy)
     measured = certificates.gap(
         task.certificate,
         value,
         policy,
-        equation,
+        left,
         task.rules,
         discount=problem.discount,
         least_cost=task.least_cost,
         counted=task.counted,
         moved=moved,
     )
-    return policy, equation.fastest, measured
+    return policy, left.fastest, measured
 
 
 def _judge(task: Task, value: jax.Array, measured: Gap, best: jax.Array, since: jax.Array) -> jax.Array:
@@ -219,11 +220,12 @@ def _correct(task: Task, state: State) -> jax.Array:
     assert isinstance(task.method, PolicyIteration)
     if task.problem.is_game:
         return _hoffman_karp(task, state)
-    equation = _equation(task, state.value, state.policy, state.fastest)
-    return relaxation.solve(task.method.evaluation, equation, task.grid)
+    left = equation(task, state.value, state.policy, state.fastest)
+    return relaxation.solve(task.method.evaluation, left, task.grid)
 
 
-def _equation(task: Task, value: jax.Array, policy: Greedy, fastest: Any = None) -> Correction:
+def equation(task: Task, value: jax.Array, policy: Greedy, fastest: Any = None) -> Correction:
+    """The linear equation of a policy; ``fastest``, its largest Q + β, spares a pass where it is known and wanted."""
     if task.certificate is Certificate.ADDITIVE:  # no rate is only rounding: there is a discount
         fastest = jnp.zeros((), value.dtype)
     return bellman.correction(task.problem, task.grid, value, policy, task.rules, scheme=task.scheme, fastest=fastest)
@@ -237,9 +239,9 @@ def _hoffman_karp(task: Task, state: State) -> jax.Array:
 
     def reply(carry):
         value, policy, _, count = carry
-        value = task.rules.impose(value + relaxation.solve(evaluation, _equation(task, value, policy), task.grid))
+        value = task.rules.impose(value + relaxation.solve(evaluation, equation(task, value, policy), task.grid))
         policy = bellman.respond(task.problem, task.grid, value, held, policy, scheme=task.scheme)
-        left = jnp.max(jnp.where(task.counted, jnp.abs(_equation(task, value, policy).source), 0))
+        left = jnp.max(jnp.where(task.counted, jnp.abs(equation(task, value, policy).source), 0))
         return value, policy, left, count + 1
 
     def unfinished(carry):

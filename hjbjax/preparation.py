@@ -97,7 +97,7 @@ class Verdict:
 
 
 def judge(problem: Problem, grid: Grid, dtype: Any) -> Verdict:
-    """Read the verdict from the problem's structure; a traced discount is taken for positive."""
+    """Read the verdict from the problem's structure; a traced discount is taken for positive, which it must be."""
     how = players.setting(problem, grid.ndim, dtype)
     constrained = problem.stopping_cost is not None or problem.running_max is not None
     if may_be_positive(problem.discount):

@@ -17,7 +17,7 @@ class Sweeps:
     """Rough evaluation by Gauss–Seidel: in every order ``count`` times a forward and a backward sweep.
 
     The work is about that of ``count`` 2^n relaxations of every node. Runs in float32 on the correction. On a CPU whose
-    cache the grid outgrows, every slab of it is swept 2 ``count`` - 1 times on each of two ways through the memory.
+    cache the grid outgrows, every slab of it is swept 2 ``count`` - 1 times (three at least) on each of two ways.
     """
 
     count: int = 3

@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax import bellman, chain, relaxation
+from hjbjax import bellman, chain, iteration, relaxation
 from hjbjax.bellman import Correction
 from hjbjax.grid import Grid
 from hjbjax.iteration import PolicyIteration, State, Task
@@ -32,9 +32,8 @@ def attach(task: Task, state: State) -> jax.Array:
       state: a converged state of the same task, found without derivatives.
     """
     task_kept, state = jax.lax.stop_gradient((task, state))
-    policy, value, scheme = state.policy, state.value, task.scheme
-    equation = bellman.correction(task_kept.problem, task.grid, value, policy, task_kept.rules, scheme=scheme)
-    equation = jax.lax.stop_gradient(equation)
+    value = state.value
+    equation = jax.lax.stop_gradient(iteration.equation(task_kept, value, state.policy))
     evaluation = task.method.evaluation if isinstance(task.method, PolicyIteration) else Krylov()
 
     def solver(weights):

@@ -26,7 +26,7 @@ Weights = list[tuple[jax.Array, ...]]  # for each axis, as ``_towards`` gives th
 
 CACHE = 2**25  # bytes that a processor keeps near by
 SLAB = 64  # slices
-FOLDS = 4  # comparisons that take the place of a division, which XLA would not fuse
+FOLDS = 4  # up to so many comparisons take the place of a division, which XLA would not fuse
 
 
 def gauss_seidel(equation: Correction, grid: Grid, rounds: int) -> jax.Array:
@@ -79,7 +79,7 @@ def _in_slabs(source: jax.Array, weights: Weights, planes: jax.Array, grid: Grid
     """Slab after slab upwards and once more downwards; each to and fro while it is in the cache.
 
     What lies beyond the cache is read twice instead of 2 ``rounds`` times, and a slab is swept 2 ``rounds`` - 1 times
-    while it is at hand.
+    while it is at hand, three at least.
     """
     count = len(source)
     slabs = -(-count // SLAB)
@@ -92,7 +92,7 @@ def _in_slabs(source: jax.Array, weights: Weights, planes: jax.Array, grid: Grid
             def sweep(k: jax.Array, planes: jax.Array) -> jax.Array:
                 return _sweep(source, weights, planes, first, last, up=up == (k % 2 == 0))
 
-            return jax.lax.fori_loop(0, 2 * rounds - 1, sweep, planes)
+            return jax.lax.fori_loop(0, max(2 * rounds - 1, 3), sweep, planes)
 
         planes = jax.lax.fori_loop(0, slabs, slab, _wrapped(planes, grid))
     return planes

@@ -240,6 +240,18 @@ def test_an_equation_tells_the_fastest_rate_and_may_be_told_it(kind, seed):
     assert not np.any(slow.weights.total())  # where all drift counts as rounding, nothing moves
 
 
+def test_every_rate_counts_where_none_is_rounding():
+    problem = Problem(lambda x, u: jnp.where(x > 0.6, 1e6, 1e-10), None, Finite(np.zeros((1, 1))), discount=1e-9)
+    grid = Grid([0.0], [1.0], (5,))
+    policy = bellman.Greedy(jnp.ones(5), (jnp.zeros(5),), ())
+    rules, leaving = free_rules(grid), np.array([4e-10, 4e-10, 4e-10, 4e6, 0]) + 1e-9
+    found = _told(problem, grid, jnp.zeros(5), policy, rules, 0.0)
+    np.testing.assert_allclose(found.source, 1 / leaving, rtol=1e-12)
+    np.testing.assert_allclose(found.weights.total(), 1 - 1e-9 / leaving, rtol=1e-7)
+    slow = _told(problem, grid, jnp.zeros(5), policy, rules, 4e6)  # beside this one the others are rounding
+    np.testing.assert_allclose(slow.source[:3], 1 / 4e6, rtol=1e-12)
+
+
 @pytest.mark.parametrize("n", [1, 2])
 @given(seed=SEEDS)
 @settings(max_examples=6)

@@ -1,5 +1,6 @@
 """Every certificate contains a direct solution: policy iteration with dense matrices, written here."""
 
+import dataclasses
 import functools
 
 import jax
@@ -149,10 +150,13 @@ def test_the_undiscounted_bound_contains_the_exact_solution(n, kind, seed):
     exact, _ = exact_solution(problem, grid, rules, start)
     assert np.all(exact >= 0)
     least = 0.3 + (grid.nodes() - grid.lo) @ slope
+    deep = rng.choice([0.0, 5.0])  # exits that pay move the whole value
+    exact, rules = exact - deep, dataclasses.replace(rules, given=np.where(held, rules.given - deep, 0))
     for noise in (0.0, 1e-6, 0.2):
-        value = np.where(held, exact, exact * (1 + noise * rng.uniform(-1, 1, grid.shape)))
+        value = np.where(held, rules.given, (exact + deep) * (1 + noise * rng.uniform(-1, 1, grid.shape)) - deep)
         gap, (lower, upper) = bounds_of(Certificate.MULTIPLICATIVE, problem, grid, value, rules, least)
-        slack = 1e-8 * (1 + np.max(exact))
+        assert (gap.lift > 0) == (deep > 0)
+        slack = 1e-8 * (1 + np.max(np.abs(exact)))
         assert np.all(lower <= exact + slack)
         assert np.all(exact <= upper + slack)
         assert np.max(np.abs(value - exact)) <= gap.error + slack
@@ -165,6 +169,16 @@ def _away(speed, x, u):
 
 def _toll(slope, lo, x, u):
     return 0.3 + slope @ (x - lo) + 0.5 * u[0] ** 2
+
+
+def test_before_the_first_look_nothing_is_known():
+    infinite = np.asarray(np.inf)
+    unlooked = certificates.Gap(-infinite, infinite, np.zeros(()), infinite, infinite)
+    for kind in (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE):
+        value = np.array([0.0, 2.0, np.inf])
+        solution = Solution(Grid([0.0], [1.0], (3,)), value, None, enclosure=certificates.enclosure(kind, unlooked))
+        np.testing.assert_array_equal(solution.bounds, [[-np.inf, -np.inf, np.inf], [np.inf] * 3])
+        assert solution.error == np.inf
 
 
 def minimum_time():

@@ -54,7 +54,7 @@ def test_a_solution_leaves_jit_vmap_and_grad():
             value[..., None],
             code=code,
             steps=jnp.asarray(4),
-            enclosure=jnp.array([[1.0, -1.0], [1.0, 2.0]]),
+            enclosure=jnp.array([[1.0, -0.5], [1.0, 1.0]]) * jnp.stack([jnp.ones(()), scale]),
             message="m",
         )
         if isinstance(code, jax.core.Tracer):  # in jit and vmap, and not in grad
@@ -81,7 +81,9 @@ def test_a_solution_leaves_jit_vmap_and_grad():
         [0.1, 0.4, 0.6],
         rtol=1e-5,
     )
-    np.testing.assert_allclose(batch.bounds, [batch.value - 1, batch.value + 2], rtol=1e-6)
+    apart = np.array([0.5, 2.0, 3.0])[:, None, None]
+    np.testing.assert_allclose(batch.bounds, [batch.value - apart / 2, batch.value + apart], rtol=1e-6, atol=1e-6)
+    assert batch.error == pytest.approx(3, abs=1e-5)
     assert jax.tree.map(lambda leaf: leaf[0], batch).status is Status.MAX_STEPS
     assert jax.grad(lambda scale: solve(scale).value_at([0.5, 1.0]))(2.0) == pytest.approx(1.0)
     assert jax.jit(lambda scale: solve(scale).error)(2.0) == pytest.approx(2, abs=1e-5)

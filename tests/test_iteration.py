@@ -1,0 +1,57 @@
+"""How a step is judged: converged, stalled, diverged, not finite, or on."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hjbjax as hjb
+from hjbjax import iteration
+from hjbjax.certificates import Gap
+from hjbjax.preparation import prepare_on_host
+from hjbjax.status import Status
+
+GRID = hjb.Grid([-1.0], [1.0], (11,))
+LARGE = 1e6  # the size of the value, whose rounding is 64 eps of it
+ROUNDING = iteration.ROUNDING * np.finfo(np.float64).eps * LARGE
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _float64():
+    with jax.enable_x64(True):
+        yield
+
+
+def expected(residual, error, best, since, tol):
+    """The rules one after the other; later ones win."""
+    code = Status.RUNNING
+    if since >= (10 if residual <= ROUNDING else 100 + 4 * 11):
+        code = Status.STALLED
+    if residual > 1e6 * max(best, ROUNDING):
+        code = Status.DIVERGED
+    if error <= tol:
+        code = Status.CONVERGED
+    return code if np.isfinite(residual) else Status.NONFINITE
+
+
+def test_every_rule_of_a_verdict():
+    problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), discount=1.0)
+    method, dtype = hjb.PolicyIteration(), np.dtype(np.float64)
+    task, _, _ = prepare_on_host(problem, GRID, method=method, scheme=hjb.Upwind(), tol=1e-3, dtype=dtype)
+
+    @jax.jit
+    def judge(residual, error, best, since):
+        measured = Gap(-error, error, jnp.zeros(()), error, residual)
+        return iteration._judge(task, jnp.full(11, -LARGE), measured, jnp.stack([error, best]), since)
+
+    residuals = (0.0, 0.9 * ROUNDING, 1.1 * ROUNDING, 1.0, 0.9e6 * ROUNDING, 1.1e6 * ROUNDING, 1e7, np.inf, np.nan)
+    seen = set()
+    for residual, error, best, since in itertools.product(
+        residuals, (1e-4, 1.0, np.nan), (0.0, ROUNDING / 10, 2.0, np.inf), (0, 9, 10, 143, 144)
+    ):
+        found = Status(int(judge(residual, error, best, since)))
+        assert found is expected(residual, error, best, since, 1e-3), (residual, error, best, since)
+        seen.add(found)
+    assert len(seen) == 5

@@ -174,10 +174,12 @@ def _sheared(values: jax.Array, flips: list[jax.Array], *, back: bool = False) -
     ]
     place = row + sum(flipped) if back else row - sum(columns)
     folds = -(-(sum(counts) - len(counts)) // count)
+    step = -count if back else count
     if folds > FOLDS:
         place = place % count
-    for _ in range(folds if folds <= FOLDS else 0):
-        place = jnp.where(place >= count, place - count, place) if back else jnp.where(place < 0, place + count, place)
+    else:
+        for _ in range(folds):
+            place = jnp.where(place >= count if back else place < 0, place + step, place)
     for column, size in zip(flipped, counts, strict=True):
         place = place * size + column
     return values.reshape(-1).at[place].get(mode="promise_in_bounds")

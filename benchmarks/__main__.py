@@ -19,6 +19,7 @@ NAMES = {
     "startup": "from process start to pictures, cold and with the compile cache",
     "precision": "error against seconds: what second order is worth",
     "march": "marching beside hj_reachability: seconds and bytes at equal scheme",
+    "bounds": "random problems beside a dense solver: which certified bounds hold, and how tight they are",
 }
 
 

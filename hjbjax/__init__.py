@@ -6,6 +6,7 @@ from hjbjax.batch import solve_batch
 from hjbjax.convergence import convergence_study
 from hjbjax.dissipation import dissipation
 from hjbjax.extremals import FreeTime, pontryagin
+from hjbjax.feedback import greedy_feedback
 from hjbjax.fields import FallbackWarning
 from hjbjax.files import FileError
 from hjbjax.gain import attenuation, saturation
@@ -64,6 +65,7 @@ __all__ = [
     "dissipation",
     "expected_exit_time",
     "geometry",
+    "greedy_feedback",
     "hinf_level",
     "least_restrictive",
     "load",

@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax import chain, fields, hamiltonian, players, sets, stencil
+from hjbjax import chain, fields, hamiltonian, players, sets, stencil, subcell
 from hjbjax.chain import Rates
 from hjbjax.grid import Grid
 from hjbjax.problem import Problem
@@ -34,6 +34,7 @@ class Conditions:
       stop: ψ at the nodes, or None.
       floor: g at the nodes, or None.
       ended: bool (*grid), the held nodes that are targets, where no action is taken any more.
+      least_exit: the least exit cost on boundaries between the nodes, a number; zero if none is negative.
     """
 
     held: Any
@@ -41,6 +42,7 @@ class Conditions:
     stop: Any = None
     floor: Any = None
     ended: Any = False
+    least_exit: Any = 0.0
 
     def impose(self, value: jax.Array) -> jax.Array:
         """``value`` with the given values put in and the constraints respected: max(g, min(ψ, V))."""
@@ -49,6 +51,13 @@ class Conditions:
         if self.floor is not None:
             value = jnp.maximum(value, self.floor)
         return jnp.where(self.held, self.given, value)
+
+    def acting(self, value: jax.Array) -> Any:
+        """The nodes at which actions matter, bool (*grid): not held, and no constraint is the active branch."""
+        acts = ~self.held
+        if self.stop is not None:
+            acts &= value < self.stop
+        return acts if self.floor is None else acts & (value > self.floor)
 
 
 @node()
@@ -80,11 +89,11 @@ class Correction:
 
 def conditions(problem: Problem, grid: Grid, dtype: Any, t: Any = 0.0) -> Conditions:
     """Target, stopping cost and running maximum at the nodes."""
-    target, exit_cost, stop, floor = (
+    exit_cost, stop, floor = (
         None if ingredient is None else at_nodes(problem, grid, ingredient, dtype, t)
-        for ingredient in (problem.target, problem.exit_cost, problem.stopping_cost, problem.running_max)
+        for ingredient in (problem.exit_cost, problem.stopping_cost, problem.running_max)
     )
-    held = jnp.zeros(grid.shape, bool) if target is None else target <= 0
+    held = jnp.zeros(grid.shape, bool) if problem.target is None else subcell.level(problem, grid, dtype, t) <= 0
     given = jnp.zeros((), dtype) if exit_cost is None else jnp.where(held, exit_cost, 0)
     return Conditions(held, given, stop, floor, ended=held)
 

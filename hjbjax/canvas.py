@@ -11,6 +11,7 @@ from hjbjax.grid import Grid
 from hjbjax.sections import Section
 
 GREY = "#c9c9c9"
+FLAT = 1e-4  # a line that varies by less than this share of itself is drawn level: what a solve leaves of a constant
 COLOURS = (
     "#0072b2",
     "#d55e00",
@@ -80,6 +81,9 @@ def draw(
     if len(section.axes) == 1:
         artists = ax.plot(section.coordinates[0], section.values, color=COLOURS[0], linewidth=1.6)
         artists += bands(ax, section.coordinates[0], mask, hidden)
+        middle = np.mean(known) if known.size else 0.0
+        if known.size and np.ptp(known) < FLAT * abs(middle):  # or the axis would show its rounding
+            ax.set_ylim(*sorted((0.5 * middle, 1.5 * middle)))
     else:
         largest = np.abs(known).max() if known.any() else 1.0
         limits = (-largest, largest) if diverging else (known.min(), known.max()) if known.size else (0.0, 1.0)

@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax import export, fields, recurrence, stencil
+from hjbjax import correlation, edges, export, fields, recurrence, stencil
 from hjbjax.grid import Grid
 from hjbjax.problem import Problem
 from hjbjax.pytree import cast, node
@@ -55,7 +55,7 @@ class Rates:
     def apply(self, grid: Grid, values: jax.Array) -> jax.Array:
         """𝓛V for node values V, shape (*grid); cost per unit time."""
         jumps = zip(self.offsets, self.values, strict=True)
-        terms = [c * (stencil.neighbour(values, grid, offset) - values) for offset, c in jumps]
+        terms = [c * (stencil.continued(values, grid, offset) - values) for offset, c in jumps]
         return sum(terms[1:], start=terms[0])
 
     def scaled(self, factor: Any) -> "Rates":
@@ -104,10 +104,21 @@ def along_axis(a: dict[tuple[int, int], Any], grid: Grid, axis: int) -> Any:
     if left is None:
         return None
     for (i, j), entry in a.items():
+        if i != j:
+            correlation.refuse_stretched(grid)
         if i != j and axis in (i, j):
             other = j if axis == i else i
             left = left - jnp.abs(entry) * (grid.spacing(axis) / grid.spacing(other))
     return left
+
+
+def lacking(a: dict[tuple[int, int], Any], grid: Grid, dtype: Any) -> Any:
+    """Where the diagonal jumps take more than there is along some axis, per node; None without correlation."""
+    if all(i == j for i, j in a):
+        return None
+    slack = 16 * grid.ndim * jnp.finfo(dtype).eps  # rounding of σσᵀ and of the spacings
+    short = (along_axis(a, grid, i) < -slack * jnp.asarray(a[i, i], dtype) for i in range(grid.ndim))
+    return functools.reduce(jnp.logical_or, short)
 
 
 def excess(f: Any, a: Any, grid: Grid, axis: int, scheme: Upwind, link: Links) -> Any:
@@ -118,14 +129,19 @@ def excess(f: Any, a: Any, grid: Grid, axis: int, scheme: Upwind, link: Links) -
     a = jnp.maximum(a, 0)  # along_axis may leave a rounding error below zero
     if not scheme.central:
         return a + least
-    edge = stencil.on_edge(grid, axis, 1) | stencil.on_edge(grid, axis, -1)
-    return jnp.where(edge, a + least, jnp.maximum(a, least))  # projection wants drift and noise apart
+    return jnp.where(
+        stencil.walls(grid, axis), a + least, jnp.maximum(a, least)
+    )  # projection wants drift and noise apart
 
 
 def axis_rates(f: Any, a: Any, grid: Grid, axis: int, scheme: Upwind, link: Links) -> tuple[Any, Any]:
-    """c_i^+ and c_i^- before the projection at the edges."""
-    h_up, h_down, e = link.up, link.down, excess(f, a, grid, axis, scheme, link)
-    return (e + h_down * f) / (h_up * (h_up + h_down)), (e - h_up * f) / (h_down * (h_up + h_down))
+    """c_i^+ and c_i^- before the projection at the edges; where e and h f cancel, rounding leaves nothing negative."""
+    h_up, h_down = link.up, link.down
+    if a is None:  # the same numbers, without a difference
+        return jnp.maximum(f, 0) / h_up, jnp.maximum(-f, 0) / h_down
+    e = excess(f, a, grid, axis, scheme, link)
+    upward, downward = jnp.maximum(e + h_down * f, 0), jnp.maximum(e - h_up * f, 0)
+    return upward / (h_up * (h_up + h_down)), downward / (h_down * (h_up + h_down))
 
 
 def rates(
@@ -157,7 +173,7 @@ def rates(
 
 
 def _inside(rate: Any, grid: Grid, axis: int, step: int) -> Any:
-    return jnp.where(stencil.on_edge(grid, axis, step), 0, rate)
+    return jnp.where(stencil.wall(grid, axis, step), 0, rate)
 
 
 def _add_diagonal_jumps(table: dict[Offset, Any], entry: Any, grid: Grid, i: int, j: int) -> None:
@@ -166,7 +182,7 @@ def _add_diagonal_jumps(table: dict[Offset, Any], entry: Any, grid: Grid, i: int
     for step_i, step_j in itertools.product((1, -1), repeat=2):
         rate = jnp.maximum(entry * (step_i * step_j), 0) / scale
         along_i, along_j = stencil.unit(grid, i, step_i), stencil.unit(grid, j, step_j)
-        off_i, off_j = stencil.on_edge(grid, i, step_i), stencil.on_edge(grid, j, step_j)
+        off_i, off_j = stencil.wall(grid, i, step_i), stencil.wall(grid, j, step_j)
         table[tuple(p + q for p, q in zip(along_i, along_j, strict=True))] = jnp.where(off_i | off_j, 0, rate)
         table[along_j] = table[along_j] + jnp.where(off_i & ~off_j, rate, 0)
         table[along_i] = table[along_i] + jnp.where(off_j & ~off_i, rate, 0)
@@ -305,7 +321,7 @@ def transition_arrays(
 
     Returns:
       ``(costs (S*K,), probabilities CSR (S*K, S), state_index (S*K,), action_index (S*K,), discount_factor)``,
-      sorted by state, then by action.
+      sorted by state, then by action; pairs that lead out of the box across a constrained end are left out.
 
     Raises:
       ValueError: a problem that is no such decision problem, rates or costs that are not finite, or noise that
@@ -313,11 +329,15 @@ def transition_arrays(
     """
     actions = export.actions(problem)
     held, given = export.target(problem, grid)
-    found = (_checked(problem, grid, list(action), None, scheme, 0.0, ~held) for action in actions)
+    found = (
+        _checked(problem, grid, list(action), None, scheme, 0.0, ~held, np.finfo(np.float64).eps) for action in actions
+    )
     with jax.enable_x64(True):
         cut = links(cast(problem, np.float64), cast(grid, np.float64), subcell=scheme.subcell, dtype=np.float64)
         surcharge = export.surcharge(cut, given, grid)
-    tables = ((jumps.offsets, jumps.values, cost + export.paid(jumps, surcharge)) for jumps, cost in found)
+    tables = (
+        (jumps.offsets, jumps.values, cost + export.paid(jumps, surcharge), ~leaving) for jumps, cost, leaving in found
+    )
     return export.decision_problem(tables, grid, len(actions), held, given, float(problem.discount))
 
 
@@ -325,28 +345,42 @@ def _under_policy(problem: Problem, grid: Grid, policy: Any, disturbance: Any, s
     """The rates under a policy; zero on the target and where there is no action."""
     u, d, active = export.policies(problem, grid, policy, disturbance)
     active &= ~export.target(problem, grid, t)[0]
-    return _checked(problem, grid, u, d, scheme, t, active)[0]
+    kinds = [np.asarray(array).dtype for array in (policy, disturbance) if array is not None]
+    eps = max([np.finfo(kind).eps for kind in kinds if kind.kind == "f"], default=np.finfo(np.float64).eps)
+    jumps, _, leaving = _checked(problem, grid, u, d, scheme, t, active, eps)
+    export.refuse("the policy leaves the box across a constrained end", leaving, grid)
+    return jumps
 
 
 def _checked(
-    problem: Problem, grid: Grid, u: list, d: list | None, scheme: Upwind, t: float, active: np.ndarray
-) -> tuple[Rates, np.ndarray]:
-    """Rates and running cost at the ``active`` nodes, zero elsewhere; refuses what is not usable there."""
+    problem: Problem, grid: Grid, u: list, d: list | None, scheme: Upwind, t: float, active: np.ndarray, eps: Any
+) -> tuple[Rates, np.ndarray, np.ndarray]:
+    """Rates and running cost at the ``active`` nodes, zero elsewhere, and where an end forbids the actions there.
+
+    Refuses what is not usable.
+    """
+    if grid.sides("open"):
+        raise ValueError(
+            "chain: a grid with open ends has no chain: a value that is continued from inside makes negative "
+            "probabilities; choose edges='projected' or 'constrained'"
+        )
     with jax.enable_x64(True):
-        jumps, cost, lacking = jax.device_get(_evaluate(*cast((problem, grid, u, d), np.float64), t, scheme))
+        jumps, cost, lacking, leaving = jax.device_get(
+            _evaluate(*cast((problem, grid, u, d), np.float64), t, scheme, eps)
+        )
     export.refuse("the running cost is not finite", active & ~np.isfinite(cost), grid)
     export.refuse("a jump rate, made of drift and noise, is not finite", active & ~np.isfinite(jumps.total()), grid)
     export.refuse("the noise is correlated more than the spacings allow", active & lacking, grid)
-    return Rates(jumps.offsets, tuple(np.where(active, c, 0) for c in jumps.values)), np.where(active, cost, 0)
+    kept = Rates(jumps.offsets, tuple(np.where(active, c, 0) for c in jumps.values))
+    return kept, np.where(active, cost, 0), active & leaving
 
 
 @functools.partial(jax.jit, static_argnames="scheme")
-def _evaluate(problem: Problem, grid: Grid, u: list, d: list | None, t: Any, scheme: Upwind) -> Any:
-    """Rates and running cost at the nodes, and where the noise leaves a negative rate along an axis."""
+def _evaluate(problem: Problem, grid: Grid, u: list, d: list | None, t: Any, scheme: Upwind, eps: Any) -> Any:
+    """Rates and running cost at the nodes, where the noise leaves a negative rate, and where an end is crossed."""
     x, dtype = grid.components(np.float64), np.float64
     jumps = rates(problem, grid, u, d, scheme=scheme, dtype=dtype, t=t)
     cost = jnp.broadcast_to(running_cost(problem, x, u, d, t, dtype), grid.shape)
     a = diffusion(problem, x, u, d, t, dtype)
-    slack = 16 * grid.ndim * np.finfo(dtype).eps  # rounding of σσᵀ and of the spacings
-    lacking = [along_axis(a, grid, i) < -slack * entry for (i, j), entry in a.items() if i == j]
-    return jumps, cost, jnp.broadcast_to(sum(lacking, start=jnp.zeros((), bool)), grid.shape)
+    short, leaving = lacking(a, grid, dtype), edges.inadmissible(problem, grid, u, d, t, dtype, eps=eps)
+    return jumps, cost, jnp.broadcast_to(jnp.zeros((), bool) if short is None else short, grid.shape), leaving

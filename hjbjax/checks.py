@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax import sets
+from hjbjax import correlation, indices, sets
 from hjbjax.grid import Grid
 from hjbjax.problem import Problem
 from hjbjax.pytree import remembered
@@ -49,9 +49,11 @@ def shapes(problem: Problem, grid: Grid, scheme: Any) -> None:
         if count < needed:
             raise ValueError(f"axis {axis} has {count} points; {type(scheme).__name__} needs at least {needed}")
     n = grid.ndim
-    if any(grid.stretch or ()) and np.ndim(problem.noise) == 2:
-        raise ValueError("correlated noise wants equal spacings: leave out Grid.stretch, or give noise by axis, (n,)")
     of_one_state(problem, n, "the number of axes of the grid")
+    if problem.noise is not None:
+        with jax.enable_x64(True):
+            if len(_returned(problem, "noise", n)) == 2:
+                correlation.refuse_stretched(grid)
 
 
 def of_one_state(problem: Problem, n: int, meaning: str) -> None:
@@ -76,12 +78,13 @@ def of_one_state(problem: Problem, n: int, meaning: str) -> None:
             expect(name, "()", lambda shape: shape == ())
 
 
-def ill_posed(problem: Problem, has_rest: bool) -> None:
+def ill_posed(problem: Problem, has_rest: bool, grid: Grid) -> None:
     """Refuse an endless sum of costs: no discount, and nothing that ends the path or lets it rest at no cost.
 
     Args:
       problem: the problem.
       has_rest: whether there is a node where the system can rest at no cost.
+      grid: the nodes; where none stands in the middle of the box, the refusal says which shape puts one there.
 
     Raises:
       ValueError: there is no finite solution; with what would give one.
@@ -93,8 +96,19 @@ def ill_posed(problem: Problem, has_rest: bool) -> None:
         "Problem: there is no finite solution: discount = 0, and the cost is paid for ever, since there is no target,\n"
         "no stopping_cost, no running_max and no node where the system can rest at no cost.\n"
         "Give discount > 0, or a target, or put a rest point (drift 0 and cost 0 for some control) on a node,\n"
-        "or march over a finite horizon"
+        "or march over a finite horizon" + _middle(grid)
     )
+
+
+def _middle(grid: Grid) -> str:
+    """Which shape puts a node in the middle of the box: an even number on a periodic axis, an odd one on another."""
+    shape = tuple(
+        count - (count % 2 if cyclic else 1 - count % 2)
+        for count, cyclic in zip(grid.shape, grid.periodic or (), strict=True)
+    )
+    if shape == grid.shape or min(shape) < 2:
+        return ""
+    return f".\nNo node stands in the middle of the box, as in 0 on [-1, 1]; shape={shape} puts one there"
 
 
 # --- on one state ---
@@ -118,7 +132,7 @@ def _expect(problem: Problem, name: str, n: int, wanted: str, fits: Callable[[tu
     ingredient = getattr(problem, name)
     if ingredient is None:
         return
-    verdict = _probe(problem, name, n) if callable(ingredient) else _verdict(ingredient)
+    verdict = _returned(problem, name, n)
     if isinstance(verdict, str):
         hint = ""
         if verdict.startswith(("a list", "a tuple")) and wanted != "()":
@@ -130,6 +144,12 @@ def _expect(problem: Problem, name: str, n: int, wanted: str, fits: Callable[[tu
         )
     if not fits(verdict):
         raise ValueError(f"{call(problem, name)} returned shape {verdict}, expected {wanted}: {why}")
+
+
+def _returned(problem: Problem, name: str, n: int) -> tuple[int, ...] | str:
+    """The shape of what an ingredient is or returns; of anything but floating-point numbers a description."""
+    ingredient = getattr(problem, name)
+    return _probe(problem, name, n) if callable(ingredient) else _verdict(ingredient)
 
 
 def _verdict(result: Any) -> tuple[int, ...] | str:
@@ -153,10 +173,10 @@ def _verdict(result: Any) -> tuple[int, ...] | str:
 def _probe(problem: Problem, name: str, n: int) -> tuple[int, ...] | str:
     """What a function returns on one state, found by tracing it."""
     function, names, said_call = getattr(problem, name), _names(problem, name), call(problem, name)
-    lengths = {"x": (n,), "u": (_dim(problem.controls),), "d": (_dim(problem.disturbances),), "t": ()}
+    lengths = _lengths(problem, n)
     _check_arity(problem, name)
     try:
-        return _traced(function, tuple(lengths[letter] for letter in names))
+        verdict, outside, _ = _traced(function, names, tuple(lengths[letter] for letter in names))
     except Exception as error:
         fed = ", ".join(f"{letter} of shape {lengths[letter]}" for letter in names)
         for kind, advice in _TRACED:
@@ -167,18 +187,41 @@ def _probe(problem: Problem, name: str, n: int) -> tuple[int, ...] | str:
             raise ValueError(f"{said_call} failed on one state, with {fed}:\n{said[:400]}") from error
         error.add_note(f"raised by {said_call}, traced on one state, with {fed}")
         raise
+    if outside is not None:
+        raise ValueError(f"{said_call} asks for {outside}.\nJAX would take the nearest one, or none, without a word")
+    return verdict
+
+
+def _lengths(problem: Problem, n: int) -> dict[str, tuple[int, ...]]:
+    """The shapes of the arguments of one state."""
+    return {"x": (n,), "u": (_dim(problem.controls),), "d": (_dim(problem.disturbances),), "t": ()}
+
+
+def calls_back(problem: Problem, n: int) -> bool:
+    """Whether a function of a problem calls Python while it runs, where anything may happen."""
+    lengths = _lengths(problem, n)
+    with jax.enable_x64(True):
+        for name in (*OF_ACTION, "target", *STATE_COSTS):
+            function, names = getattr(problem, name), _names(problem, name)
+            if callable(function) and _traced(function, names, tuple(lengths[letter] for letter in names))[2]:
+                return True
+    return False
 
 
 @remembered
-def _traced(function: Callable, lengths: tuple[tuple[int, ...], ...]) -> tuple[int, ...] | str:
-    """What a function returns for arguments of these shapes."""
+def _traced(
+    function: Callable, names: tuple[str, ...], lengths: tuple[tuple[int, ...], ...]
+) -> tuple[tuple[int, ...] | str, str | None, bool]:
+    """What a function returns for arguments of these shapes, what it asks for outside an array, if it calls Python."""
     verdicts = []
 
     def probe(*arguments):
-        verdicts.append(_verdict(function(*arguments)))
+        result = function(*arguments)
+        verdicts.append(_verdict(result))
+        return () if isinstance(verdicts[0], str) else result
 
-    jax.eval_shape(probe, *(jax.ShapeDtypeStruct(shape, np.float64) for shape in lengths))
-    return verdicts[0]
+    closed = jax.make_jaxpr(probe)(*(jax.ShapeDtypeStruct(shape, np.float64) for shape in lengths))
+    return verdicts[0], indices.beyond(closed, names), indices.calls_back(closed)
 
 
 def _dim(choices: sets.AdmissibleSet | None) -> int:

@@ -9,12 +9,8 @@ Exit codes: 0 done, 1 a check of ``doctor`` failed, 2 usage, 3 not converged, 4 
 """
 
 import contextlib
-import difflib
 import json
-import math
-import os
 import signal
-import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -23,111 +19,13 @@ from typing import Any
 import click
 
 from hjbjax._version import __version__
+from hjbjax.command_line import Failure, Name, Number, OneLineGroup, Shape, finite, say, unknown
 
 FILES = ("solution.npz", "value.png", "policy.png", "trajectory.png")
 CODES = {"CONVERGED": 0, "DIVERGED": 4, "NONFINITE": 4, "INTERRUPTED": 130}  # any other status: 3, not converged
 METHODS = {"value-iteration": "ValueIteration", "policy-iteration": "PolicyIteration"}
 SCHEMES = {"upwind": "Upwind", "limited": "Limited", "eno2": "Eno2", "weno5": "Weno5"}
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "diffrax", "optax", "matplotlib", "tqdm", "click")
-
-
-class Failure(click.ClickException):
-    """A refusal or a fault: one line and an exit code."""
-
-    def __init__(self, message: Any, exit_code: int = 2):
-        super().__init__(" ".join(str(message).split()))
-        self.exit_code = exit_code  # type: ignore[misc]
-
-
-class OneLineGroup(click.Group):
-    """A group whose errors are one line on stderr, without the usage block."""
-
-    def main(
-        self,
-        args: Any = None,
-        prog_name: Any = None,
-        complete_var: Any = None,
-        standalone_mode: bool = True,
-        **extra: Any,
-    ) -> Any:
-        """Runs a command and, unless ``standalone_mode`` is off, ends the process with its exit code."""
-        if not standalone_mode:
-            return super().main(args, prog_name, complete_var, False, **extra)
-        try:
-            code = super().main(args, prog_name, complete_var, False, **extra)
-        except click.ClickException as error:
-            click.echo(f"hjbjax: {' '.join(error.format_message().split())}", err=True)
-            code = error.exit_code
-        except (click.Abort, KeyboardInterrupt):
-            click.echo("hjbjax: interrupted", err=True)
-            code = 130
-        if code == 130 and sys.stdout is sys.__stdout__:  # a process of our own
-            for stream in filter(None, (sys.stdout, sys.stderr)):
-                stream.flush()
-            os._exit(code)  # JAX may still be at work, which the usual exit waits for, or crashes on
-        sys.exit(code if isinstance(code, int) else 0)
-
-
-class Number(click.ParamType):
-    """A finite number above zero; click's own types let NaN and infinity through."""
-
-    name = "number"
-
-    def __init__(self, kind: type = float):
-        self.kind = kind
-
-    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
-        """The number, or a usage error."""
-        number = _finite(str(value), self.kind)
-        if number is None or number <= 0:
-            self.fail(f"got {value!r}, wanted a {'whole' if self.kind is int else 'finite'} number > 0", param, ctx)
-        return number
-
-
-class Shape(click.ParamType):
-    """Numbers of nodes with an x between them, as in 200x201."""
-
-    name = "NxN"
-
-    def convert(self, value: Any, param: Any, ctx: Any) -> tuple[int, ...]:
-        """One integer an axis, or a usage error."""
-        counts = [_finite(part, int) for part in str(value).lower().split("x")]
-        if any(count is None or count < 2 for count in counts):
-            self.fail(f"got {value!r}, wanted whole numbers of at least 2, one an axis, as in 200x201", param, ctx)
-        return tuple(counts)
-
-
-class Name(click.ParamType):
-    """One of some names; an unknown one gets the list and the nearest."""
-
-    name = "name"
-
-    def __init__(self, what: str, allowed: Callable[[], Iterable[str]]):
-        self.what, self.allowed = what, allowed
-
-    def convert(self, value: Any, param: Any, ctx: Any) -> str:
-        """The name, or a usage error."""
-        if value not in (names := list(self.allowed())):
-            self.fail(_unknown(self.what, value, names), param, ctx)
-        return value
-
-
-def _finite(text: str, kind: type) -> Any:
-    """``text`` as a finite number of a kind; ``None`` if it is none."""
-    try:
-        number = kind(text)
-    except ValueError:
-        return None
-    return number if kind is int or math.isfinite(number) else None
-
-
-def _unknown(what: str, got: str, allowed: Iterable[str]) -> str:
-    names = list(allowed)
-    near = difflib.get_close_matches(got.lower().replace("_", "-"), names, 1) or difflib.get_close_matches(
-        got, names, 1
-    )
-    hint = f"; did you mean {near[0]!r}?" if near else ""
-    return f"unknown {what} {got!r}; there are {', '.join(names)}{hint}"
 
 
 def _systems() -> Iterable[str]:
@@ -208,7 +106,9 @@ def solve(
         with _failing(OSError, 5, "the results could not be written: "):
             try:
                 start = entry.initial_state(grid.ndim)
-                for file, drawn in results.make(problem, solution, staging, start=start, duration=entry.duration):
+                finish = None if entry.finish is None else entry.finish(**parameters)
+                pictures = results.make(problem, solution, staging, start=start, duration=entry.duration, finish=finish)
+                for file, drawn in pictures:
                     made.append(file)
                     path = drawn
             finally:  # what is whole is kept
@@ -254,7 +154,7 @@ def _parameters(entry: Any, settings: tuple[str, ...]) -> dict[str, Any]:
         if key == "shape":
             raise Failure("--set: the shape has an option of its own: --shape 200x201")
         if key not in defaults:
-            raise Failure("--set: " + _unknown(f"parameter of {entry.name}", key, defaults))
+            raise Failure("--set: " + unknown(f"parameter of {entry.name}", key, defaults))
         if key in chosen:
             raise Failure(f"--set: {key} is given twice")
         chosen[key] = _value_of(key, text, defaults[key])
@@ -268,8 +168,8 @@ def _value_of(key: str, text: str, default: Any) -> Any:
         return text.lower() == "true"
     parts = text.split(",")
     kind = int if isinstance(default, int) else float
-    numbers = tuple(_finite(part, kind) for part in parts)
-    if default is None and len(parts) == 1 and (whole := _finite(text, int)) is not None:
+    numbers = tuple(finite(part, kind) for part in parts)
+    if default is None and len(parts) == 1 and (whole := finite(text, int)) is not None:
         numbers = (whole,)  # what has no default may be a count
     if None in numbers or (isinstance(default, tuple) and len(parts) != len(default)):
         wanted = "a whole number" if kind is int else "a finite number"
@@ -310,14 +210,11 @@ def _build(entry: Any, parameters: dict[str, Any], shape: tuple[int, ...] | None
 def _interruptible() -> Iterator[None]:
     """Ctrl-C and SIGTERM alike: the solver keeps what it has for either.
 
-    A shell starts background jobs with SIGINT ignored, so SIGTERM must not go by way of SIGINT.
+    A shell starts background jobs with SIGINT ignored, so SIGTERM must not go by way of SIGINT. While it runs the
+    solver notes what has the usual handler of Ctrl-C, and takes either for one.
     """
-
-    def stop(*_: Any) -> None:
-        raise KeyboardInterrupt
-
     try:
-        old = signal.signal(signal.SIGTERM, stop)
+        old = signal.signal(signal.SIGTERM, signal.default_int_handler)
     except ValueError:  # not the main thread: signals are another's business
         yield
         return
@@ -330,7 +227,7 @@ def _interruptible() -> Iterator[None]:
 @contextlib.contextmanager
 def _one_line_warnings() -> Iterator[None]:
     def show(message: Any, *_: Any, **__: Any) -> None:
-        click.echo(f"hjbjax: warning: {' '.join(str(message).split())}", err=True)
+        say(f"warning: {' '.join(str(message).split())}")
 
     with warnings.catch_warnings():
         warnings.simplefilter("always", UserWarning)

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from hjbjax.clock import Clock, noting_interrupts
 from hjbjax.grid import Grid
 from hjbjax.iteration import Method
 from hjbjax.problem import Problem
@@ -30,7 +31,7 @@ from hjbjax.reference import (
     words_for,
 )
 from hjbjax.schemes import Scheme, Upwind
-from hjbjax.solution import Solution
+from hjbjax.solution import Solution, SolveError
 from hjbjax.solver import solve
 from hjbjax.status import Status
 
@@ -182,6 +183,7 @@ def convergence_study(
       ValueError: fewer than two grids, or three without a reference; grids of different boxes; a reference of
         another shape, on a coarser grid, or NaN; a region without a node; and what ``solve`` refuses.
       TypeError: something that is no grid, no reference or no region.
+      SolveError: it was interrupted; ``.solution`` is the study of the grids so far.
 
     Example:
       >>> from hjbjax import zoo
@@ -198,17 +200,27 @@ def convergence_study(
     compared = ordered if reference is not None else ordered[:1] * len(ordered)  # the estimate lives on the coarsest
     masks = [mask_of(region, grid) for grid in compared]
     exact = [] if reference is None else list(map(at_nodes_of, repeat(reference), ordered, masks))
-    timed = [_timed(problem, grid, scheme=scheme, method=method, tol=tol, throw=False) for grid in ordered]
+    clock, timed = Clock(), []
+    with noting_interrupts(clock):
+        for grid in ordered:
+            timed.append(_timed(problem, grid, clock, scheme=scheme, method=method, tol=tol, throw=False))
+            if clock.interrupted:
+                break
+    whole = len(timed) == len(ordered)
+    ordered, masks, exact = ordered[: len(timed)], masks[: len(timed)], exact[: len(timed)]
     solutions = tuple(solution for solution, _, _ in timed)
     values = [np.asarray(solution.value) for solution in solutions]
     h = np.array([mean_spacing(grid) for grid in ordered])
     extrapolated, words = None, words_for(reference, ordered)
     if reference is None:
         values = [thinned(value, grid, ordered[0]) for value, grid in zip(values, ordered, strict=True)]
-        extrapolated, words = richardson(values[-3:], h[-3:], masks[0], tol)
+        if clock.interrupted:
+            words = "nothing: the study was interrupted"
+        else:
+            extrapolated, words = richardson(values[-3:], h[-3:], masks[0], tol)
         exact = [np.full(masks[0].shape, np.nan) if extrapolated is None else extrapolated] * len(values)
     off = [distance(*pair)[mask] for *pair, mask in zip(values, exact, masks, strict=True)]
-    return Study(
+    study = Study(
         ordered,
         solutions,
         scheme=str(scheme),
@@ -219,9 +231,13 @@ def convergence_study(
         errors=np.array([np.max(each) for each in off]),
         mean_errors=np.array([np.mean(each) for each in off]),
         seconds=np.array([warm for _, _, warm in timed]),
-        compile_seconds=np.array([max(0.0, cold - warm) for _, cold, warm in timed]),
+        compile_seconds=np.array([cold if math.isnan(warm) else max(0.0, cold - warm) for _, cold, warm in timed]),
         extrapolated=extrapolated,
     )
+    if clock.interrupted:
+        came = "after the last solve" if whole else f"on the grid {' x '.join(map(str, ordered[-1].shape))}"
+        raise SolveError(f"convergence_study: interrupted {came}; .solution is the study so far", study)
+    return study
 
 
 def fitted_order(h: Any, errors: Any) -> float:
@@ -233,12 +249,16 @@ def fitted_order(h: Any, errors: Any) -> float:
     return float(np.polyfit(np.log(h[usable]), np.log(errors[usable]), 1)[0])
 
 
-def _timed(problem: Problem, grid: Grid, **options: Any) -> tuple[Solution, float, float]:
-    """A solution, and the wall time of the first and of a second solve."""
+def _timed(problem: Problem, grid: Grid, clock: Clock, **options: Any) -> tuple[Solution, float, float]:
+    """A solution, and the wall time of the first and of a second solve, NaN where that was interrupted."""
     marks = [time.perf_counter()]
-    for _ in range(2):
-        solution = solve(problem, grid, **options)
+    solution = solve(problem, grid, **options)
+    marks.append(time.perf_counter())
+    if not clock.interrupted:
+        solve(problem, grid, **options)
         marks.append(time.perf_counter())
+    if clock.interrupted:
+        return solution, marks[1] - marks[0], math.nan
     return solution, marks[1] - marks[0], marks[2] - marks[1]
 
 

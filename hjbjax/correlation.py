@@ -16,6 +16,15 @@ import numpy as np
 from hjbjax.grid import Grid
 
 
+def refuse_stretched(grid: Grid) -> None:
+    """Refuse correlated noise, σ of shape (n, k), on a stretched grid: its diagonal jumps want equal spacings."""
+    if grid.ndim > 1 and any(each is not None for each in grid.stretch or ()):
+        raise ValueError(
+            "noise: correlated noise, σ of shape (n, k), wants equal spacings: leave out Grid.stretch, or give noise "
+            "by axis, (n,)"
+        )
+
+
 def spacings(a: Any, now: Any) -> np.ndarray | None:
     """Spacings h close to the given ones with a_ii/h_i ≥ Σ_j |a_ij|/h_j on every axis, if there are any.
 
@@ -69,3 +78,35 @@ def shape(a: Any, grid: Grid, wanted: Any) -> tuple[int, ...] | None:
         if np.all(np.diag(a) * density * (1 + 1e-15) >= off @ density) and np.all(intervals + ends >= 2):
             return tuple(int(count) for count in intervals + ends)
     return None
+
+
+def advice(a: Any, grid: Grid, *, everywhere: bool) -> str:
+    """What the chain needs to represent ``a``, and the shape or the spacings that would do, in two sentences.
+
+    Args:
+      a: the diffusion matrix at one node, shape (n, n).
+      grid: the grid.
+      everywhere: whether it is the matrix of all nodes.
+    """
+    h = np.array([grid.spacing(axis) for axis in range(grid.ndim)], dtype=float)
+    head = (
+        "Every axis i needs a_ii/h_i ≥ Σ_j |a_ij|/h_j (a = σσᵀ); here diag a = "
+        f"{_numbers(np.diag(a))}, h = {_numbers(h)}.\n"
+    )
+    wanted = spacings(a, h)
+    if wanted is None:
+        return head + (
+            "No spacing of these axes will do: turn the state's axes so that a becomes (nearly) diagonal, "
+            "or weaken the correlation"
+        )
+    fitting, where = shape(a, grid, wanted), "everywhere" if everywhere else "there"
+    if fitting is not None:
+        return head + f"Use Grid(..., shape={fitting}): representable {where}"
+    return head + (
+        f"Choose lo, hi and shape so that the spacings are as {_numbers(wanted / wanted[0])} to one another: "
+        f"representable {where}; with this box no shape near {grid.shape} has that ratio"
+    )
+
+
+def _numbers(entries: Any) -> str:
+    return "[" + ", ".join(f"{entry:.6g}" for entry in np.asarray(entries, dtype=float)) + "]"

@@ -5,13 +5,13 @@ import importlib.metadata
 import io
 import os
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 
+from hjbjax import placement
 from hjbjax._version import __version__
 
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "diffrax", "optax", "matplotlib", "tqdm", "click")
@@ -78,5 +78,8 @@ def _pictures() -> str:
 
 
 def _folder() -> str:
-    with tempfile.TemporaryDirectory(prefix=".hjbjax-", dir="."):
-        return f"{Path.cwd()} can be written"
+    placement.sweep(".")
+    folder = Path(placement.hidden_name("doctor"))
+    folder.mkdir()
+    folder.rmdir()
+    return f"{Path.cwd()} can be written"

@@ -6,9 +6,7 @@ limits and stops at NaN all live between two chunks. A first call of no steps co
 
 import contextlib
 import dataclasses
-import signal
 import sys
-import threading
 import time
 from typing import Any
 
@@ -16,41 +14,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax import iteration
+from hjbjax import checks, faults, iteration
+from hjbjax.clock import CUT, Clock
 from hjbjax.iteration import HISTORY, State, Task
 from hjbjax.relaxation import Direct, Krylov
 from hjbjax.status import Status
 
 CHUNK_SECONDS = 0.5
 FIRST_NODES = 20_000  # a first chunk steps over about so many nodes
+MANY_NODES = 2_000_000  # beyond which the look at the guess is a chunk of its own: a step may take many times as long
 
 run = jax.jit(iteration.run, donate_argnames="state")  # a state is used once: the next one takes its place in memory
-
-
-class Clock:
-    """The limits of a solve, the time it has taken, that of its steps apart, and whether it was interrupted.
-
-    ``per_node`` is the seconds that a step took at a node in the last chunk, from grid to grid; None before the first.
-    """
-
-    def __init__(self, max_steps: int, seconds: float, progress: bool | None):
-        self.max_steps, self.seconds, self.progress = max_steps, seconds, progress
-        self.began, self.stepping, self.interrupted = time.perf_counter(), 0.0, False
-        self.per_node: float | None = None
-
-    def elapsed(self) -> float:
-        """Seconds since the solve began."""
-        return time.perf_counter() - self.began
-
-    def count(self, seconds: float, steps: int, nodes: int) -> None:
-        """Take note of a chunk of steps."""
-        self.stepping += seconds
-        self.per_node = max(seconds, 1e-4) / (steps * nodes)
-
-    def steps_in(self, seconds: float, nodes: int) -> float:
-        """How many steps take so long, by the last chunk."""
-        assert self.per_node is not None
-        return seconds / (self.per_node * nodes)
+_run_kept = jax.jit(iteration.run)  # where Python is called on the way, and may raise, the state before must outlast it
 
 
 def drive(task: Task, guess: Any, clock: Clock, most: int | None = None) -> tuple[State, Status, np.ndarray]:
@@ -66,35 +41,57 @@ def drive(task: Task, guess: Any, clock: Clock, most: int | None = None) -> tupl
       The last state, how it ended, and the residuals of all steps, that of the guess first.
     """
     limit = clock.max_steps if most is None else min(most, clock.max_steps)
-    state, residuals = iteration.begin(task, guess), [np.zeros(0)]
-    chunk, done = _first_chunk(task, clock), -1  # step −1 is the look at the guess
-    if clock.interrupted:
-        return _imposed(task, state), Status.INTERRUPTED, residuals[0]
-    code = Status.RUNNING
-    with _bar(clock.progress, float(task.tol)) as show, noting_interrupts(clock):
+    state, residuals, nodes = iteration.begin(task, guess), [np.zeros(0)], " x ".join(map(str, task.grid.shape))
+    code = clock.over()
+    if code is not None:
+        return imposed(task, state), code, residuals[0]
+    chunk, done, code = _first_chunk(task, clock), -1, Status.RUNNING  # step −1 is the look at the guess
+    step, before = (_run_kept if _calls_back(task) else run), state
+    clock.phase = f"compiling for {nodes} nodes"
+    with _bar(clock.progress, float(task.tol)) as show:
         try:
-            state = run(task, state, -1)  # compiles and does nothing
+            before, state = state, step(task, state, -1)  # compiles and does nothing
             while code is Status.RUNNING:
                 began = time.perf_counter()
-                over = clock.interrupted or done >= limit or clock.elapsed() >= clock.seconds
-                if over and done >= 0:
-                    late = Status.MAX_STEPS if done >= limit else Status.TIME_LIMIT
-                    code = Status.INTERRUPTED if clock.interrupted else late
+                code = _ended(clock, done, limit, task.grid.size)
+                if code is not Status.RUNNING:
                     break
-                until = 0 if over else min(max(done, 0) + chunk, limit)
-                state = run(task, state, int(until))  # at once a state: an interrupt may come from here on
+                clock.phase = f"step {done + 1} on {nodes} nodes" + ", on the way to a guess" * (most is not None)
+                until = min(max(done, 0) + chunk, limit)
+                before, state = (
+                    state,
+                    step(task, state, int(until)),
+                )  # at once a state: an interrupt may come from here on
                 code, steps = Status(int(state.code)), int(state.step) - done
                 residuals.append(np.asarray(state.history)[:steps])
                 clock.count(time.perf_counter() - began, steps, task.grid.size)
-                chunk = int(np.clip(clock.steps_in(CHUNK_SECONDS, task.grid.size), 1, min(HISTORY, 8 * chunk)))
+                chunk = int(np.clip(clock.steps_in(CHUNK_SECONDS, task.grid.size), 1, min(HISTORY, 8 * max(chunk, 1))))
                 show(steps - (done < 0), float(state.gap.error))
                 done += steps
-        except KeyboardInterrupt:
+        except KeyboardInterrupt:  # the second one, or by a handler of the user's own
             clock.interrupted, code = True, Status.INTERRUPTED
             residuals.append(np.asarray(state.history)[: int(state.step) - done])  # of steps not yet written down
-    if code in (Status.INTERRUPTED, Status.NONFINITE):
-        state = _imposed(task, state)
+        except Exception as error:
+            faults.keep(error, task.grid, lambda: state.value, lambda: before.value, lambda: guess)
+            raise
+    if code is Status.NONFINITE or code in CUT:
+        state = imposed(task, state)
     return state, code, np.concatenate(residuals)[: int(state.step) + 1]
+
+
+def _calls_back(task: Task) -> bool:
+    evaluation = getattr(task.method, "evaluation", None)
+    return isinstance(evaluation, Direct) or checks.calls_back(task.problem, task.grid.ndim)
+
+
+def _ended(clock: Clock, done: int, limit: int, nodes: int) -> Status:
+    """Why no chunk may follow; else RUNNING. A step that would come too late by the pace of the last is not begun."""
+    code = clock.over()
+    if code is None and clock.per_node is not None and clock.steps_in(clock.seconds - clock.elapsed(), nodes) < 1:
+        code = Status.TIME_LIMIT
+    if done >= limit and code is not Status.INTERRUPTED:
+        return Status.MAX_STEPS
+    return Status.RUNNING if code is None else code
 
 
 def _first_chunk(task: Task, clock: Clock) -> int:
@@ -104,6 +101,8 @@ def _first_chunk(task: Task, clock: Clock) -> int:
     where a step may take many passes over the nodes, and more of them on a finer grid.
     """
     method, nodes = task.method, task.grid.size
+    if clock.per_node is None and nodes > MANY_NODES:
+        return 0
     if task.problem.is_game or isinstance(getattr(method, "evaluation", None), (Krylov, Direct)):
         return 1
     if clock.per_node is None:
@@ -113,31 +112,9 @@ def _first_chunk(task: Task, clock: Clock) -> int:
     return int(np.clip(steps, 1, HISTORY - 1))
 
 
-def _imposed(task: Task, state: State) -> State:
+def imposed(task: Task, state: State) -> State:
     """The state with what is given at its nodes, which a guess that nobody looked at does not have."""
     return dataclasses.replace(state, value=task.rules.impose(jnp.asarray(state.value)))
-
-
-@contextlib.contextmanager
-def noting_interrupts(clock: Clock) -> Any:
-    """Ctrl-C leaves a note on the clock instead of an exception, which a callback of the runtime might swallow.
-
-    A second Ctrl-C is the usual one. Only in the main thread, and not over a handler of the user's own.
-    """
-    usual = signal.default_int_handler
-    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) is not usual:
-        yield
-        return
-
-    def note(number: int, frame: Any) -> None:
-        clock.interrupted = True
-        signal.signal(signal.SIGINT, usual)
-
-    signal.signal(signal.SIGINT, note)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, usual)
 
 
 @contextlib.contextmanager

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.closed_loop import check_kept
+from hjbjax.feedback import check_kept
 from hjbjax.problem import Problem
 from hjbjax.pytree import as_partial, is_traced, node
 

@@ -10,13 +10,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from hjbjax import fields, recurrence, stencil
+from hjbjax import fields, recurrence, stencil, subcell
 from hjbjax.grid import Grid
 from hjbjax.problem import Problem
 from hjbjax.sets import AdmissibleSet, Finite
 
 Offsets = tuple[tuple[int, ...], ...]
-Table = tuple[Offsets, Sequence[Any], Any]
+Table = tuple[Offsets, Sequence[Any], Any, np.ndarray]
 
 
 def time_step(leaving: np.ndarray) -> float:
@@ -58,13 +58,12 @@ def single_law(classes: list[np.ndarray], generator: Any, grid: Grid) -> np.ndar
 
 def target(problem: Problem, grid: Grid, t: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Which nodes lie on the target, and the exit cost; both (*grid)."""
-    arrays = []
     with jax.enable_x64(True):
-        x = grid.components(np.float64)
-        for ingredient, default in ((problem.target, 1.0), (problem.exit_cost, 0.0)):
-            entry = default if ingredient is None else ingredient
-            arrays.append(np.broadcast_to(fields.of_state(problem, entry, x, t, np.float64), grid.shape))
-    return arrays[0] <= 0, arrays[1]
+        paid = fields.of_state(problem, problem.exit_cost, grid.components(np.float64), t, np.float64)
+        inside = np.zeros(grid.shape, bool)
+        if problem.target is not None:
+            inside = np.asarray(subcell.level(problem, grid, np.float64, t) <= 0)
+    return inside, np.broadcast_to(paid, grid.shape)
 
 
 def policies(problem: Problem, grid: Grid, policy: Any, disturbance: Any) -> tuple[list, list, np.ndarray]:
@@ -134,7 +133,8 @@ def decision_problem(
     """Costs, probabilities, indices and factor over pairs of state and action; see ``chain.transition_arrays``.
 
     Args:
-      tables: for each action the offsets, the rates and the running cost; one action in memory at a time.
+      tables: for each action the offsets, the rates, the running cost and where it is admissible; one action in
+        memory at a time.
       grid: the grid.
       count: the number K of actions.
       held: the nodes of the target, where the tables are zero.
@@ -145,10 +145,11 @@ def decision_problem(
 
     costs, entries = np.empty((grid.size, count)), np.empty((grid.size, count, 0))
     offsets: Offsets = ()
-    for k, (offsets, values, cost) in enumerate(tables):
+    admissible = np.ones((grid.size, count), bool)
+    for k, (offsets, values, cost, allowed) in enumerate(tables):
         if k == 0:  # the last entry of a row is its diagonal
             entries = np.empty((grid.size, count, len(offsets) + 1))
-        costs[:, k] = cost.ravel()
+        costs[:, k], admissible[:, k] = cost.ravel(), allowed.ravel()
         for column, c in enumerate(values):
             entries[:, k, column] = c.ravel()
     leaving = entries[..., :-1].sum(axis=-1)
@@ -165,5 +166,13 @@ def decision_problem(
     probabilities = csr_array(layout, shape=(costs.size, grid.size))
     probabilities.sum_duplicates()  # a jump over the seam of an axis with two nodes; sorts the columns as well
     probabilities.eliminate_zeros()
-    state, action = np.divmod(np.arange(costs.size), count)
-    return paid.ravel(), probabilities, state, action, factor
+    refuse(
+        "no action is admissible: all lead out across a constrained end",
+        np.logical_not(np.any(admissible, axis=1)).reshape(grid.shape),
+        grid,
+    )
+    pairs = np.flatnonzero(admissible)
+    state, action = np.divmod(pairs, count)
+    if pairs.size < costs.size:
+        probabilities = probabilities[pairs]
+    return paid.ravel()[pairs], probabilities, state, action, factor

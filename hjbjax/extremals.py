@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 from hjbjax import checks, first_guess, rests, shooting, switching
+from hjbjax.clock import Clock, Stopped, noting_interrupts
 from hjbjax.grid import Grid
 from hjbjax.optimality import Extremal
 from hjbjax.pointwise import rule_of
@@ -85,7 +86,8 @@ def pontryagin(
       An Extremal; with ``throw=False`` its ``status`` and ``message`` tell how a failed solve ended.
 
     Raises:
-      SolveError: the boundary-value problem was not solved; ``.solution`` is the Extremal so far.
+      SolveError: the boundary-value problem was not solved; ``.solution`` is the Extremal so far. After Ctrl-C that
+        is the last iterate, without controls; None, whatever ``throw`` says, on the way to a first guess.
       ValueError: an argument that is not admissible.
       TypeError: a guess, a horizon or a terminal condition of another kind.
 
@@ -105,18 +107,28 @@ def pontryagin(
     checks.of_one_state(paid, len(start), "the length of x0")
     _check_guess(guess, len(start), horizon)
     _check_grid(grid, len(start))
-    with jax.enable_x64(True):
-        ask = _question(problem, start, horizon, terminal, getattr(guess, "grid", grid))
-        limits = shooting.Limits(tol, max_nodes)
-        if ask.closing is Closing.REST:
-            ask, times, columns = _to_rest(ask, guess, rest)
-        else:
-            times, columns = _guess(ask, guess, horizon)
-            if not ask.free:
-                times = times * (float(ask.horizon) / times[-1])
-        solve = switching.switching if ask.rule.jumps else shooting.smooth
-        found = solve(ask, times, columns, limits, trusted=guess is not None)
-        extremal = shooting.report(found)
+    clock = Clock()
+    limits = shooting.Limits(tol, max_nodes, clock)
+    with noting_interrupts(clock), jax.enable_x64(True):
+        try:
+            ask = _question(problem, start, horizon, terminal, getattr(guess, "grid", grid))
+            if ask.closing is Closing.REST:
+                ask, times, columns = _to_rest(ask, guess, rest, clock)
+            else:
+                times, columns = _guess(ask, guess, horizon)
+                if not ask.free:
+                    times = times * (float(ask.horizon) / times[-1])
+            solve = switching.switching if ask.rule.jumps else shooting.smooth
+            found = solve(ask, times, columns, limits, trusted=guess is not None)
+            if clock.interrupted:
+                raise Stopped(Status.INTERRUPTED, dataclasses.replace(found, code=Status.INTERRUPTED))
+            extremal = shooting.report(found)
+            if clock.interrupted:
+                extremal = dataclasses.replace(extremal, code=int(Status.INTERRUPTED))
+        except Stopped as stop:
+            if stop.reached is None:
+                raise SolveError(f"pontryagin: {stop.status}: on the way to a first guess; there is no path") from None
+            extremal = shooting.report(stop.reached)
     if throw and extremal.status is not Status.CONVERGED:
         raise SolveError(f"pontryagin: {extremal.status}: {extremal.message}", extremal)
     return extremal
@@ -247,7 +259,7 @@ def _guess(ask: TwoPoint, guess: Any, horizon: Any) -> tuple[np.ndarray, np.ndar
     return first_guess.straight(ask, long or 1.0)
 
 
-def _to_rest(ask: TwoPoint, guess: Any, rest: Any) -> tuple[TwoPoint, np.ndarray, np.ndarray]:
+def _to_rest(ask: TwoPoint, guess: Any, rest: Any, clock: Clock) -> tuple[TwoPoint, np.ndarray, np.ndarray]:
     """The boundary-value problem with its rest, and where the solver starts."""
     n, solution = ask.n, guess if hasattr(guess, "costate_at") else None
     near = np.zeros(n) if rest is None else _numbers(rest, "rest")
@@ -258,9 +270,10 @@ def _to_rest(ask: TwoPoint, guess: Any, rest: Any) -> tuple[TwoPoint, np.ndarray
     if isinstance(guess, Extremal) and rest is None:
         near = guess.states[-1]
     found, slowest = rests.find(ask, near, np.zeros(n))
+    clock.look()
     ask = dataclasses.replace(ask, rest=found, horizon=SETTLED / slowest)
     if solution is None and guess is None:
-        return ask, *first_guess.into_rest(ask, ask.start, float(ask.horizon))
+        return ask, *first_guess.into_rest(ask, ask.start, float(ask.horizon), clock)
     if solution is None:
         times, columns = first_guess.earlier(ask, guess)
     else:

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core as jex
 
+from hjbjax import indices
 from hjbjax.primitives import CALLS, CUMULATIVE, ENTRYWISE, IN_NUMPY, MOVES, REDUCTIONS, SCATTERS
 from hjbjax.problem import Problem
 
@@ -66,7 +67,10 @@ def trace(function: Callable, *arguments: Any, dtype: Any) -> tuple[jex.ClosedJa
     """The jaxpr of ``function`` on one state, and the arguments as object arrays."""
     packed = [pack(argument) for argument in arguments]
     shapes = [jax.ShapeDtypeStruct(entries.shape, dtype) for entries in packed]
-    return jax.make_jaxpr(function)(*shapes), packed
+    closed = jax.make_jaxpr(function)(*shapes)
+    if (outside := indices.beyond(closed)) is not None:  # inside jit, where nobody has looked before
+        raise ValueError(f"a function of one state asks for {outside}")
+    return closed, packed
 
 
 def pack(argument: Any) -> np.ndarray:

@@ -2,15 +2,16 @@
 
 A file is an uncompressed zip of npy arrays, one of which, ``header``, is JSON in UTF-8. Writing goes to a
 temporary file in the same folder, then flush, fsync and ``os.replace``: after a crash at any time the file is
-the old one or the new one. Reading never unpickles, and believes no declared size that the file's own size
-does not bear out, so that a claim of 8 TB costs nothing. Every failure is one ``FileError``.
+the old one or the new one. Without leave to replace it ends in ``os.link``, which fails where another writer was
+faster. What a killed writer left behind is taken away by the next one in that folder. Reading never unpickles,
+and believes no declared size that the file's own size does not bear out, so that a claim of 8 TB costs nothing.
+Every failure is one ``FileError``.
 """
 
 import json
 import math
 import os
 import re
-import secrets
 import stat
 import struct
 import zipfile
@@ -19,17 +20,17 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from hjbjax import screen
+from hjbjax.placement import FileError, check_place, claimed, hidden_name, path_of, place, sweep
+
 T = TypeVar("T")
 
+REASON = 400  # characters of a refusal, which may quote the file
 MAX_HEADER = 1 << 24  # bytes; the header holds settings and timings, never data
 
 # The only text that numpy writes before an array of numbers. Matched, and not evaluated as numpy does: before
 # the checksum has been compared these may be any bytes.
 DECLARATION = re.compile(rb"\{'descr': '([<>|]\w\d)', 'fortran_order': False, 'shape': \(([0-9, ]{0,999})\), \} *\n")
-
-
-class FileError(OSError):
-    """A result file that could not be written or read; the message names the path and the reason."""
 
 
 class Expected(NamedTuple):
@@ -67,25 +68,30 @@ def write(path: Any, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
       force: whether an existing file may be replaced.
 
     Raises:
-      FileExistsError: the file exists and ``force`` is false.
-      FileError: the folder is missing or cannot be written, or the disk is full; no half file is left.
+      FileExistsError: the file exists and ``force`` is false; or another process made it meanwhile.
+      FileError: the folder is missing or cannot be written, the disk is full, or a folder, a device or a pipe has that
+        name; no half file is left.
     """
-    path = os.path.realpath(os.fspath(path))
-    if os.path.isdir(path):
-        raise FileError(f"{path}: cannot be written: it is a folder; give a file in it, as in 'run.npz'")
-    if not force and os.path.lexists(path):
-        raise FileExistsError(f"{path}: exists already; give another name, or force=True to replace it")
+    path = os.path.realpath(path_of(path, "written"))
+    check_place(path, force)
     # A damaged table of contents may hide whole entries, and no checksum covers it: so the header has the list.
     text = json.dumps({**header, "arrays": sorted(arrays)}, default=_plain).encode()
+    if len(text) > MAX_HEADER - 1000:  # of which the entry's own header takes some
+        raise FileError(f"{path}: cannot be written: message and statistics take {len(text):,} bytes of {MAX_HEADER:,}")
     members = {"header": np.frombuffer(text, np.uint8), **arrays}
     folder, name = os.path.split(path)
-    temporary = os.path.join(folder, f".{name[:64]}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    sweep(folder)
+    temporary = os.path.join(folder, hidden_name(name))
     try:
-        with open(temporary, "xb") as file:
-            _write_members(file, members)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
+        open(temporary, "xb").close()
+        with claimed(temporary):
+            with open(temporary, "r+b") as file:
+                _write_members(file, members)
+                file.flush()
+                os.fsync(file.fileno())
+            place(temporary, path, force)
+    except FileExistsError:
+        raise
     except OSError as error:
         raise FileError(f"{path}: cannot be written: {error.strerror or error}") from error
     finally:
@@ -142,7 +148,7 @@ def read(
     Raises:
       FileError: for every kind of bad file, before anything of the size that it claims is allocated.
     """
-    path = os.fspath(path)
+    path = path_of(path, "read")
     try:
         status = os.stat(path)
         if stat.S_ISDIR(status.st_mode):
@@ -159,7 +165,7 @@ def read(
         reason, cause = f"it is damaged: {error}", error
     except Exception as error:  # zipfile, json and numpy raise a dozen kinds on damaged bytes
         reason, cause = f"damaged or foreign ({type(error).__name__}: {' '.join(str(error).split())[:200]})", error
-    raise FileError(f"{path}: cannot be read: {reason}") from cause
+    raise FileError(f"{path}: cannot be read: {screen.one_line(reason, REASON)}") from cause
 
 
 def _read_archive(file: Any, size: int, form: str, version: int, plan: Callable) -> tuple[dict, dict]:

@@ -12,7 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax import pointwise
+from hjbjax.clock import Clock, Stopped
 from hjbjax.simulation import simulate
+from hjbjax.status import Status
 from hjbjax.two_point import TwoPoint
 
 COLUMNS = 101  # of a guess; the solver adds nodes where it wants them
@@ -27,7 +29,7 @@ def _rest_loop(ask: TwoPoint, x: Any) -> Any:
     return ask.flow(0.0, jnp.concatenate([x, p, jnp.zeros(1, x.dtype)]), ask.arcs[0])[: ask.n]
 
 
-def into_rest(ask: TwoPoint, start: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndarray]:
+def into_rest(ask: TwoPoint, start: np.ndarray, duration: float, clock: Clock) -> tuple[np.ndarray, np.ndarray]:
     """Times and columns (x, p, w) under the Riccati costate; a line to the rest where that loop runs away."""
     from scipy.integrate import solve_ivp
 
@@ -37,11 +39,13 @@ def into_rest(ask: TwoPoint, start: np.ndarray, duration: float) -> tuple[np.nda
     def away(t, x):
         return np.linalg.norm(x) - far
 
+    def flow(t, x):
+        clock.look()
+        return np.asarray(_rest_loop(arrays, x))
+
     away.terminal = True  # type: ignore[attr-defined]
     with np.errstate(all="ignore"):
-        path = solve_ivp(
-            lambda t, x: np.asarray(_rest_loop(arrays, x)), (0, duration), start, t_eval=times, events=away, rtol=1e-5
-        )
+        path = solve_ivp(flow, (0, duration), start, t_eval=times, events=away, rtol=1e-5)
     states = path.y
     if states.shape[1] < len(times) or not np.all(np.isfinite(states)):
         decay = np.exp(-5 * times / duration)
@@ -57,7 +61,10 @@ def along_loop(ask: TwoPoint, solution: Any, duration: float) -> tuple[np.ndarra
     grid, marched = solution.grid, solution.times is not None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # where a guess ends is seen from its times
-        path = simulate(ask.problem, solution, ask.start, duration, hold=duration / SAMPLES, clamp=True)
+        try:
+            path = simulate(ask.problem, solution, ask.start, duration, hold=duration / SAMPLES, clamp=True)
+        except KeyboardInterrupt:
+            raise Stopped(Status.INTERRUPTED) from None
     times, states = path.times, path.states
     if not ask.problem.target and ask.free and any(ask.held):
         nearest = int(np.argmin(np.linalg.norm((states - ask.ends)[:, np.array(ask.held)], axis=1)))

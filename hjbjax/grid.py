@@ -1,10 +1,13 @@
 """The box of nodes on which a value function lives.
 
 Node-centred: both ends of an ordinary axis are nodes; a periodic axis omits its upper end. Coordinates are
-computed where they are used, as x_i = (lo·(M − i) + hi·i)/M with M = N − 1 (M = N on a periodic axis), so
-that a node at zero is exactly zero, and are never stored as a table of all nodes.
+x_i = (lo·(M − i) + hi·i)/M with M = N − 1 (M = N on a periodic axis), so that a node at zero is exactly zero.
+They are computed once, in NumPy, one table an axis that travels with the grid: a compiled division rounds otherwise,
+and whether a node on the boundary of a target belongs to it must not depend on the program that asks.
 """
 
+import dataclasses
+import difflib
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -13,11 +16,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.pytree import node, numbers
+from hjbjax.pytree import altered, is_traced, node, numbers
 from hjbjax.stretching import Sinh, Stretching
 
+ROUNDINGS = 16  # units of eps of the largest coordinate by which the formula may miss its table
+EDGES = ("projected", "constrained", "open")  # names, as they carry no numbers: static, hashable, saved as they are
+Ends = tuple[str, str] | None  # of an axis: the kinds of its lower and its upper end; none where it is periodic
 
-@node(static=("shape", "periodic", "names"))
+
+COINCIDING = 16  # units in the last place of a coordinate, of which a spacing must be more
+TABLED = 2**24  # points of an axis whose coordinates are kept; a grid that is refused must not allocate them before
+
+
+@node(static=("shape", "periodic", "names", "edges"))
 class Grid:
     """A grid of nodes on a box in R^n, uniform along every axis that is not stretched.
 
@@ -28,9 +39,15 @@ class Grid:
       periodic: one bool an axis; ``None`` means none.
       names: one name an axis, used by pictures and printed tables.
       stretch: one ``Sinh(strength, center)`` or ``None`` an axis; ``None`` means uniform. Not on a periodic axis.
+      edges: what happens to drift that points out of the box: a name for every end, or one entry an axis, a name or
+        a pair (lower end, upper end); ``None`` on a periodic axis, which has no ends.
+        "projected": the component that leaves is cut off, while the control keeps what it costs and earns.
+        "constrained": actions whose drift leaves are not admissible: the state-constrained problem.
+        "open": paths may leave; the value goes on beyond the end as the parabola through its last three nodes.
+        Noise reflects at a projected and at a constrained end, and goes on at an open one.
 
     Raises:
-      ValueError: bounds that are not finite or not increasing, or lengths that differ.
+      ValueError: bounds that are not finite or not increasing, lengths that differ, or an unknown kind of end.
       TypeError: sizes that are not integers, periodicities that are not booleans.
 
     Example:
@@ -45,6 +62,8 @@ class Grid:
     periodic: tuple[bool, ...] | None = None
     names: tuple[str, ...] = ()
     stretch: tuple[Stretching | None, ...] | None = None
+    edges: Any = "projected"
+    coordinates: tuple[Any, ...] = dataclasses.field(init=False, repr=False)
 
     def __post_init__(self):
         lo, hi = _corner(self.lo, "lo"), _corner(self.hi, "hi")
@@ -63,9 +82,33 @@ class Grid:
             for axis, (low, high) in enumerate(zip(lo, hi, strict=True)):
                 if not (math.isfinite(low) and math.isfinite(high) and low < high):
                     raise ValueError(f"Grid: axis {axis} runs from {low:g} to {high:g}; wanted finite lo < hi")
-        checked = {"lo": lo, "hi": hi, "shape": shape, "periodic": periodic, "names": names, "stretch": stretch}
+        edges = _edges(self.edges, periodic, shape)
+        checked = {
+            "lo": lo, "hi": hi, "shape": shape, "periodic": periodic, "names": names, "stretch": stretch, "edges": edges
+        }  # fmt: skip
         for name, value in checked.items():
             object.__setattr__(self, name, value)
+        tables = (self._computed(axis) if count <= TABLED else None for axis, count in enumerate(shape))
+        object.__setattr__(self, "coordinates", tuple(tables))
+        self.check_spacings(np.float64)
+
+    def check_spacings(self, dtype: Any) -> None:
+        """Refuse nodes that coincide up to rounding in ``dtype``: differences of values would be rounding as well.
+
+        Raises:
+          ValueError: with the axis and its ends.
+        """
+        for axis, nodes in enumerate(self.coordinates):
+            if not isinstance(nodes, np.ndarray):
+                continue
+            largest = max(abs(nodes[0]), abs(nodes[-1]))
+            if np.min(np.diff(nodes)) <= COINCIDING * np.finfo(dtype).eps * largest:
+                lo, hi = float(nodes[0]), float(nodes[-1])
+                raise ValueError(
+                    f"Grid: axis {axis} has {len(nodes)} points between {lo:.17g} and {hi:.17g}: spacings that are "
+                    f"rounding of its coordinates in {np.dtype(dtype)}; take fewer points, or measure the state from a "
+                    "point in the box"
+                )
 
     @property
     def ndim(self) -> int:
@@ -77,6 +120,17 @@ class Grid:
         """The number of nodes, a Python integer of any size."""
         return math.prod(self.shape)
 
+    def sides(self, kind: str) -> list[tuple[int, int]]:
+        """The sides of the box with ends of this kind: pairs of an axis and a step, −1 lower and 1 upper."""
+        ends = ((axis, pair) for axis, pair in enumerate(self.edges) if pair is not None)
+        return [(axis, step) for axis, pair in ends for step, name in zip((-1, 1), pair, strict=True) if name == kind]
+
+    @property
+    def walled(self) -> "Grid":
+        """The grid with its open ends made projected ones."""
+        pairs = (pair and tuple("projected" if name == "open" else name for name in pair) for pair in self.edges)
+        return altered(self, edges=tuple(pairs))
+
     def intervals(self, axis: int) -> int:
         """The number M of intervals between ``lo`` and ``hi``."""
         return self.shape[axis] if self.periodic[axis] else self.shape[axis] - 1  # type: ignore[index]
@@ -86,8 +140,16 @@ class Grid:
         return (self.hi[axis] - self.lo[axis]) / self.intervals(axis)
 
     def axis(self, axis: int, dtype: Any = None) -> Any:
-        """The coordinates of the nodes along one axis, shape (N,)."""
-        index, last = np.arange(self.shape[axis], dtype=dtype or np.float64), self.intervals(axis)
+        """The coordinates of the nodes along one axis, shape (N,); the same numbers in every program."""
+        computed, table = self._computed(axis), self.coordinates[axis]
+        table = computed if table is None else table
+        if is_traced(computed, table):
+            return _tabled(*(jnp.asarray(each, dtype or jnp.result_type(float)) for each in (computed, table)))
+        return np.asarray(table, dtype or np.float64)
+
+    def _computed(self, axis: int) -> Any:
+        """The coordinates by the formula, in NumPy where the corners are known numbers."""
+        index, last = np.arange(self.shape[axis], dtype=np.float64), self.intervals(axis)
         stretching = self.stretch[axis]  # type: ignore[index]
         if stretching is not None:
             index = last * stretching.place(index / last)
@@ -199,7 +261,20 @@ class Grid:
         cell = jnp.clip(jnp.floor(jax.lax.stop_gradient(guess)).astype(int), 0, last - 1)
         cell = jnp.clip(cell + (x >= nodes[cell + 1]) - (x < nodes[cell]), 0, last - 1)  # rounding of the inverse map
         fraction = (x - nodes[cell]) / (nodes[cell + 1] - nodes[cell])
-        return cell, jnp.clip(jnp.nan_to_num(fraction), 0, 1), inside
+        fraction = jnp.nan_to_num(fraction)  # a clip would halve the derivative on a node, where it is 0 or 1
+        return cell, jnp.where((fraction >= 0) & (fraction <= 1), fraction, jnp.clip(fraction, 0, 1)), inside
+
+
+@jax.custom_jvp
+def _tabled(computed: jax.Array, table: jax.Array) -> jax.Array:
+    """The table, with the derivative of the formula; the formula where the corners were changed alone."""
+    slack = ROUNDINGS * jnp.finfo(table.dtype).eps * jnp.max(jnp.abs(computed))
+    return jnp.where(jnp.abs(computed - table) <= slack, table, computed)
+
+
+@_tabled.defjvp
+def _derivative_of_the_formula(primals: tuple, tangents: tuple) -> tuple:
+    return _tabled(*primals), tangents[0]
 
 
 def _states(x: Any) -> jax.Array:
@@ -213,6 +288,45 @@ def _check_stretch(stretch: tuple, periodic: tuple[bool, ...]) -> None:
             raise TypeError(f"Grid.stretch: entry {axis} is {stretching!r}; wanted Sinh(strength, center) or None")
         if stretching is not None and cyclic:
             raise ValueError(f"Grid.stretch: axis {axis} is periodic; only an axis with ends can be stretched")
+
+
+def _edges(edges: Any, periodic: tuple[bool, ...], shape: tuple[int, ...]) -> tuple[Ends, ...]:
+    """The kinds of both ends of every axis, checked."""
+    if edges is None or isinstance(edges, str):
+        _kind(edges, "every end")
+        edges = [None if cyclic else edges for cyclic in periodic]
+    if not isinstance(edges, Sequence) or len(edges) != len(periodic):
+        pair = '(("open", "constrained"),)' if len(periodic) == 1 else '("open", ("projected", "constrained"))'
+        raise ValueError(
+            f"Grid.edges: got {edges!r} for {len(periodic)} axes; wanted a name for all, or one entry an axis: a name "
+            f"or a pair (lower end, upper end), as in {pair}"
+        )
+    return tuple(_ends(entry, axis, periodic[axis], shape[axis]) for axis, entry in enumerate(edges))
+
+
+def _ends(entry: Any, axis: int, cyclic: bool, count: int) -> Ends:
+    """The kinds of the two ends of one axis."""
+    if cyclic and entry is not None:
+        raise ValueError(f"Grid.edges: axis {axis} is periodic and has no ends; got {entry!r} there, wanted None")
+    if cyclic:
+        return None
+    pair = (entry, entry) if entry is None or isinstance(entry, str) else entry
+    if not isinstance(pair, Sequence) or len(pair) != 2:
+        raise ValueError(f"Grid.edges: axis {axis} has {entry!r}; wanted a name or a pair (lower end, upper end)")
+    lower, upper = (_kind(name, f"axis {axis}") for name in pair)
+    if "open" in (lower, upper) and count < 3:
+        raise ValueError(f"Grid.edges: axis {axis} has {count} points; an open end continues the last three")
+    return lower, upper
+
+
+def _kind(name: Any, where: str) -> str:
+    if name is None:
+        return "projected"
+    if name not in EDGES:
+        near = difflib.get_close_matches(str(name), EDGES, 1, 0.4)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise ValueError(f"Grid.edges: got {name!r} for {where}; wanted one of {', '.join(map(repr, EDGES))}{hint}")
+    return name
 
 
 def _corner(value: Any, name: str) -> Any:

@@ -22,14 +22,17 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax import chain, fields, sets, slopes, stencil, subcell
+from hjbjax import chain, edges, fields, players, sets, slopes, stencil, subcell
 from hjbjax.grid import Grid
-from hjbjax.minimisers import Action, best_of, enumerate_actions, refine
+from hjbjax.minimisers import UNROLL, Action, best_of, enumerate_actions, refine
 from hjbjax.piecewise import Kinked, inverse_root, kinked_ball, piecewise_input, piecewise_pair
 from hjbjax.players import SAMPLES, Player, Setting, shared
 from hjbjax.problem import Problem
+from hjbjax.pytree import altered
 from hjbjax.schemes import Eno2, Limited, Scheme, Upwind, Weno5
 from hjbjax.sets import AdmissibleSet, Ball, Box, Finite
+
+INNER = 8  # evaluations written out of a search inside a search: with all 33 XLA gets up to five times the lines
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +45,7 @@ class Local:
       bends: D⁺ − D⁻ along every axis, which noise sees.
       tried: an action of each player that is a candidate beside the samples; with the actions of the last step
         among them a sampled policy never gets worse.
+      slack: for every axis what is rounding of the drift; None without constrained ends.
     """
 
     problem: Problem
@@ -56,9 +60,19 @@ class Local:
     bends: tuple[jax.Array, ...]
     links: tuple[stencil.Links, ...]
     tried: tuple[Action, Action] | None = None
+    slack: tuple[Any, ...] | None = None
 
     def gain(self, axis: int, f: Any, a: Any) -> Any:
-        """[(e + h⁻ f) D⁺ − (e − h⁺ f) D⁻]/(h⁺ + h⁻); with other slopes f⁺ P⁺ + f⁻ P⁻ + a (D⁺ − D⁻)/(h⁺ + h⁻)."""
+        """[(e + h⁻ f) D⁺ − (e − h⁺ f) D⁻]/(h⁺ + h⁻), or with other slopes; infinite where f leaves a constrained end.
+
+        So every candidate for an optimum is judged by what it may do: the kink at f = 0 is among them.
+        """
+        gain = self._free_gain(axis, f, a)
+        out = None if self.slack is None else edges.barred(f, self.grid, axis, self.slack[axis])
+        return gain if out is None else jnp.where(out, jnp.inf, gain)
+
+    def _free_gain(self, axis: int, f: Any, a: Any) -> Any:
+        """What ``gain`` is away from constrained ends; with other slopes f⁺ P⁺ + f⁻ P⁻ + a (D⁺ − D⁻)/(h⁺ + h⁻)."""
         upwind = jnp.maximum(f, 0) * self.up[axis] + jnp.minimum(f, 0) * self.down[axis]
         if a is None:
             return upwind
@@ -84,7 +98,7 @@ class Local:
 
     def _diagonal(self, i: int, j: int, entry: Any) -> Any:
         ends = {
-            (p, q): stencil.neighbour(
+            (p, q): stencil.continued(
                 self.value, self.grid, tuple(p * (k == i) + q * (k == j) for k in range(self.grid.ndim))
             )
             for p, q in itertools.product((1, -1), repeat=2)
@@ -96,14 +110,14 @@ class Local:
         ) / scale
 
 
-def at_rest(problem: Problem, grid: Grid, *, scheme: Scheme, dtype: Any) -> Local:
-    """A Hamiltonian with slopes D⁺ = 1 and D⁻ = −1 everywhere: H = L + Σ |f_i| and what noise adds.
+def at_rest(problem: Problem, grid: Grid, slopes: jax.Array, *, scheme: Scheme) -> Local:
+    """A Hamiltonian with slopes D⁺ = s_i and D⁻ = −s_i everywhere: H = L + Σ s_i |f_i| and what noise adds.
 
-    Its minimum is zero exactly where an action rests at no cost, if the cost is not negative.
+    With s > 0, shape (n,), its minimum is zero exactly where an action rests at no cost, if the cost is not negative.
     """
-    here = local(problem, grid, jnp.zeros(grid.shape, dtype), scheme=scheme)
-    one = jnp.ones(grid.shape, dtype)
-    ups, downs, bends = ((sign * one,) * grid.ndim for sign in (1, -1, 2))
+    here = local(problem, grid, jnp.zeros(grid.shape, slopes.dtype), scheme=scheme)
+    one = jnp.ones(grid.shape, slopes.dtype)
+    ups, downs, bends = (tuple(sign * slope * one for slope in slopes) for sign in (1, -1, 2))
     return dataclasses.replace(here, up=ups, down=downs, bends=bends)
 
 
@@ -120,7 +134,8 @@ def local(problem: Problem, grid: Grid, value: jax.Array, *, scheme: Scheme, t: 
     elif isinstance(scheme, Limited):
         differences = _limited(problem, grid, x, differences, links, t)
     up, down = zip(*differences, strict=True)
-    return Local(problem, grid, scheme, value.dtype, t, x, value, up, down, bends, links)
+    slack = tuple(edges.slack(problem, grid, t, value.dtype)) if grid.sides("constrained") else None
+    return Local(problem, grid, scheme, value.dtype, t, x, value, up, down, bends, links, slack=slack)
 
 
 def _limited(problem: Problem, grid: Grid, x: list, differences: list, links: tuple, t: Any) -> list:
@@ -137,7 +152,7 @@ def _limited(problem: Problem, grid: Grid, x: list, differences: list, links: tu
             left = chain.along_axis(a, grid, axis)
             calm[axis] &= left >= jnp.maximum(link.up, link.down) * jnp.abs(f[axis])
     for axis, ((up, down), link) in enumerate(zip(differences, links, strict=True)):
-        inner = calm[axis] & ~(stencil.on_edge(grid, axis, 1) | stencil.on_edge(grid, axis, -1))
+        inner = calm[axis] & ~stencil.walls(grid, axis)
         middle = (link.down * up + link.up * down) / (link.up + link.down)
         found[axis] = (jnp.where(inner, middle, found[axis][0]), jnp.where(inner, middle, found[axis][1]))
     return found
@@ -159,21 +174,27 @@ def optimise(here: Local, how: Setting, isaacs: str | None = None) -> tuple[jax.
     return value, u, d
 
 
-def best_response(here: Local, player: Player, join: Callable) -> tuple[jax.Array, Action]:
-    """One player's optimum against a given action of the other; ``join(mine)`` makes the pair (u, d)."""
+def best_response(here: Local, player: Player, join: Callable, most: int = UNROLL) -> tuple[jax.Array, Action]:
+    """One player's optimum against a given action of the other; ``join(mine)`` makes the pair (u, d).
+
+    ``most`` is how many evaluations may be written out, where it samples.
+    """
     if player.choices is None:
         return here.at(*join([])), []
     if player.exact:
         action = _exact(here, player, join)
     else:
-        _, action, _ = _sampled(here, player, lambda action: (here.at(*join(action)), []), weight=1)
+        start = _admissible(here, player, join)
+        _, action, _ = _sampled(
+            here, player, lambda action: (here.at(*join(action)), []), weight=1, most=most, start=start
+        )
     action = jax.lax.optimization_barrier(action)  # or the search is done twice, for the action and for the value
     return here.at(*join(action)), action
 
 
 def _nested(here: Local, outer: Player, inner: Player, join: Callable) -> tuple[jax.Array, Action, Action]:
     def objective(action):
-        return best_response(here, inner, lambda reply: join(action, reply))
+        return best_response(here, inner, lambda reply: join(action, reply), most=INNER)
 
     if outer.choices is None:
         value, answer = objective([])
@@ -181,16 +202,29 @@ def _nested(here: Local, outer: Player, inner: Player, join: Callable) -> tuple[
     return _sampled(here, outer, objective, weight=inner.weight)
 
 
-def _sampled(here: Local, player: Player, objective: Callable, weight: int) -> Any:
+def _admissible(here: Local, player: Player, join: Callable) -> Action | None:
+    """At constrained ends an action of a sampled control that does not leave, where that can be found exactly."""
+    if here.slack is None or player.sign < 0:
+        return None
+    free = altered(here.problem, cost=None)
+    alone = players.setting(free, here.grid.ndim, here.dtype).control
+    return _exact(dataclasses.replace(here, problem=free), alone, join) if alone.exact else None
+
+
+def _sampled(
+    here: Local, player: Player, objective: Callable, weight: int, most: int = UNROLL, start: Action | None = None
+) -> Any:
     assert player.choices is not None
     points = jnp.asarray(sets.samples(player.choices, SAMPLES), here.dtype)
-    best = enumerate_actions(objective, points, player.sign, weight=weight)
+    best = enumerate_actions(objective, points, player.sign, weight=weight, most=most)
     if isinstance(player.choices, Finite):
         return best
     project = _projection(player.choices)
+    if start is not None:
+        best = best_of(objective, [start], player.sign, best)
     if here.tried is not None:
         best = best_of(objective, [project(here.tried[0 if player.sign > 0 else 1])], player.sign, best)
-    return refine(objective, best, sets.spacing(player.choices, SAMPLES), project, player.sign)
+    return refine(objective, best, sets.spacing(player.choices, SAMPLES), project, player.sign, weight=weight)
 
 
 def _projection(choices: Box | Ball) -> Callable[[Action], Action]:
@@ -270,7 +304,7 @@ def _kinked(here: Local, base: tuple[Action, Action], axis: int, offset: Any, sl
     if left is None or not isinstance(here.scheme, Upwind) or not here.scheme.central:
         return Kinked(gain, offset, slope, (0.0,), (down, up))
     h_up, h_down = here.links[axis].up, here.links[axis].down
-    edge = stencil.on_edge(here.grid, axis, 1) | stencil.on_edge(here.grid, axis, -1)
+    edge = stencil.walls(here.grid, axis)
     width = jnp.maximum(left, 0)
     middle = (h_down * up + h_up * down) / (h_up + h_down)
     kinks = (jnp.where(edge, 0, -width / h_down), 0.0, jnp.where(edge, 0, width / h_up))

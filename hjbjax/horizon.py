@@ -4,6 +4,7 @@ At host level it validates, finds the longest stable step, goes backward in chun
 one kept time to the next, and reports. Under a tracer the same steps run in a scan of fixed length.
 """
 
+import functools
 import itertools
 import math
 from typing import Any
@@ -12,27 +13,31 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax import bellman, checks, epochs, marching, memory, players, survey
-from hjbjax.driver import Clock
+from hjbjax import admissibility, arguments, bellman, checks, epochs, faults, marching, memory, players, survey
+from hjbjax.clock import Clock, Stopped, noting_interrupts
+from hjbjax.closures import with_settled_functions
 from hjbjax.grid import Grid
 from hjbjax.iteration import PolicyIteration
 from hjbjax.marching import Explicit, Implicit, March
+from hjbjax.preparation import choose
 from hjbjax.problem import Problem
-from hjbjax.pytree import cast, is_traced
+from hjbjax.pytree import altered, cast, is_traced
 from hjbjax.relaxation import Krylov, Sweeps
+from hjbjax.report import closed, unstarted
 from hjbjax.schemes import Eno2, Limited, Scheme, Upwind, Weno5
 from hjbjax.sets import Box, Finite
 from hjbjax.solution import Solution, SolveError
 from hjbjax.solver import as_dtype, check_node_values
 from hjbjax.status import Status
 
-PROBES = 33  # times at which a given step is held against the limit of a time-dependent problem
-FEWEST = 100  # steps of an implicit march, and of a time-dependent one, unless a step is given
+PROBES = 33  # times at which a given step, and constrained ends, are held against a time-dependent problem
+FEWEST = 100  # steps where no stability limit is known for all of them: implicit, time-dependent, rates by samples
 
 _stable = jax.jit(marching.stable, static_argnames=("scheme", "dtype"))
 _rules = jax.jit(bellman.conditions, static_argnames="dtype")
 
 
+@with_settled_functions
 def march(
     problem: Problem,
     grid: Grid,
@@ -65,19 +70,21 @@ def march(
       start: node values at the horizon in place of the terminal cost, shape (*grid), to go on from another march.
       scheme: ``Upwind(...)``, ``Limited()``, ``Eno2()`` or ``Weno5()``.
       method: ``Explicit(...)``, the default, whose steps the grid limits, or ``Implicit(...)``, of any step.
-      step: the longest time step; ``None`` is the stable one, if implicit a hundredth of the horizon.
+      step: the longest time step; ``None`` is the stable one, and a hundredth of the horizon if implicit, if the
+        functions depend on the time, or if the fastest action may be between the samples of its set.
       inner: for a disturbance that is bounded only by the size of its ``Box``, as in an L₂ gain: the march stops,
         DIVERGED, where the worst disturbance reaches that bound in this share of the grid's box about its middle,
         since a value that blows up does. ``None``: ½ if the cost is quadratic in every disturbance, else 0, never.
       dtype: ``None`` is float64; ``"float32"`` for memory and accelerators.
-      time_limit: at most so many seconds.
+      time_limit: at most so many seconds, checks and compilation included.
       throw: raise when the march does not come to its end; otherwise the status says it.
       progress: a progress bar; ``None`` shows it on a terminal after one second.
       max_memory: bytes that the march may take, instead of what is free.
 
     Returns:
       The solution: ``value[i]`` is V(·, times[i]), shape (k, *grid), the policy likewise. One that stopped early
-      holds the times that it came to, and the last one it reached. Inside ``jit``, ``vmap`` and ``grad`` the
+      holds the times that it came to, and the last one it reached; one cut short by the time or by Ctrl-C may have no
+      policy there, which is NaN. Inside ``jit``, ``vmap`` and ``grad`` the
       value is traced; there ``horizon``, ``times`` and ``step`` must be known numbers, and no limit is checked.
 
     Raises:
@@ -99,20 +106,46 @@ def march(
         return _march_traced(problem, grid, horizon, kept, start, scheme, method, step, dtype)
     kind = as_dtype(dtype)
     check_node_values(start, grid, "march: start")
-    clock = Clock(10**9, math.inf if time_limit is None else time_limit, progress)
-    with jax.enable_x64(kind == np.float64):
+    grid.check_spacings(kind)
+    clock = Clock(seconds=time_limit, progress=progress)
+    with noting_interrupts(clock), jax.enable_x64(kind == np.float64):
         needed = memory.fitting(_bytes(problem, grid, kept, method, kind), grid, max_memory)
-        checks.shapes(problem, grid, scheme)
-        survey.values(_without_moving_target(problem), grid, kind)
-        task = _prepare(problem, grid, horizon, scheme, method, step, inner, kind)
-        slices, front, code = epochs.drive(task, kept, start, clock)
-        solution = epochs.assemble(task, grid, slices, front, code)
+        unmoved = functools.partial(_unmoved, problem, grid, horizon, start, scheme, kind)
+        with faults.explained(clock, needed, unmoved):
+            try:
+                checks.shapes(problem, grid, scheme)
+                survey.values(_without_moving_target(problem), grid, kind, clock)
+                for t in np.linspace(horizon, 0.0, PROBES) if problem.time_dependent else (0.0,):
+                    admissibility.values(problem, grid, kind, t)
+                clock.enter("the preparation")
+                task = _prepare(problem, grid, horizon, scheme, method, step, inner, kind)
+                slices, front, code = epochs.drive(task, kept, start, clock)
+                solution = epochs.assemble(task, grid, slices, front, code)
+            except Stopped as stop:
+                solution = _unstarted(problem, grid, horizon, start, scheme, stop.status, kind)
+        solution = closed(solution, clock)
     solution.stats.update(
         seconds=clock.stepping, compile_seconds=clock.elapsed() - clock.stepping, bytes=needed, horizon=horizon
     )
-    if throw and code is not Status.CONVERGED:
-        raise SolveError(f"{code.name}: {solution.message}", solution)
+    if throw and solution.status is not Status.CONVERGED:
+        raise SolveError(f"{solution.status.name}: {solution.message}", solution)
     return solution
+
+
+def _unmoved(
+    problem: Problem, grid: Grid, horizon: float, start: Any, scheme: Scheme, dtype: Any, kept: Any
+) -> Solution:
+    """The solution of a march that broke before its first step."""
+    return _unstarted(problem, grid, horizon, start, scheme, Status.INTERRUPTED, dtype)
+
+
+def _unstarted(
+    problem: Problem, grid: Grid, horizon: float, start: Any, scheme: Scheme, code: Status, dtype: Any
+) -> Solution:
+    """The solution of a march that ended before its first step: the value it was to start from; NaN if not known."""
+    value = np.full((1, *grid.shape), np.nan if start is None else np.asarray(start), dtype)
+    message = f"The march did not leave t = {horizon:g}. {epochs.ADVICE[code]}"
+    return altered(unstarted(problem, grid, value, scheme, code), times=np.array([horizon]), message=message)
 
 
 def _check(problem: Any, grid: Any, scheme: Any, method: Any, step: Any, time_limit: Any) -> None:
@@ -129,23 +162,17 @@ def _check(problem: Any, grid: Any, scheme: Any, method: Any, step: Any, time_li
         raise ValueError(
             f"march: {scheme!r} wants equal spacings; leave out Grid.stretch, or use Upwind() or Limited()"
         )
-    if step is not None and not _is_positive(step):
-        raise ValueError(f"march: step = {step!r}; wanted a finite number > 0, in units of time")
-    if time_limit is not None and not (_is_positive(time_limit) or time_limit == math.inf):
-        raise ValueError(f"march: time_limit = {time_limit!r}; wanted seconds > 0")
-
-
-def _is_positive(number: Any) -> bool:
-    plain = isinstance(number, (int, float, np.number)) and not isinstance(number, bool)
-    return plain and math.isfinite(number) and bool(number > 0)
+    if step is not None:
+        arguments.positive(step, "march: step", "in units of time")
+    if time_limit is not None:
+        arguments.positive(time_limit, "march: time_limit", "in seconds", endless=True)
 
 
 def _times(horizon: Any, times: Any) -> tuple[float, np.ndarray]:
     """The horizon and the kept times, checked."""
     if is_traced(horizon, times):
         raise ValueError("march: horizon and times set the number of steps and must be known numbers, not traced ones")
-    if not _is_positive(horizon):
-        raise ValueError(f"march: horizon = {horizon!r}; wanted a finite number > 0, in units of time")
+    arguments.positive(horizon, "march: horizon", "in units of time")
     try:
         kept = np.array((0.0,) if times is None else times, np.float64)
     except (TypeError, ValueError):
@@ -205,14 +232,24 @@ def _prepare(
             _check_step(step, float(limit))
         limit = None if moving else jnp.asarray(limit * method.fraction if step is None else limit, dtype)
     else:
-        evaluation = method.evaluation or _evaluation(problem)
+        evaluation = method.evaluation or _evaluation(problem, grid)
         method = Implicit(evaluation, jnp.asarray(method.tol, dtype), method.max_steps)
-    if step is None:
-        step = horizon / FEWEST if moving or isinstance(method, Implicit) else math.inf
+    checks = _checks(problem, grid, method, dtype)
+    if step is None:  # rates that are found on the way say nothing of the first steps
+        step = horizon / FEWEST if moving or checks[0] or isinstance(method, Implicit) else math.inf
     return March(
         problem, grid, method, None if moving else _rules(problem, grid, dtype), limit, jnp.asarray(step, dtype),
         jnp.asarray(horizon, dtype), _watched(problem, grid, inner, dtype), scheme,
+        *checks,
     )  # fmt: skip
+
+
+def _checks(problem: Problem, grid: Grid, method: Any, dtype: Any) -> tuple[bool, bool]:
+    """Whether steps must look at rates and at correlated noise under the actions that they choose."""
+    how, moving = players.setting(problem, grid.ndim, dtype), problem.time_dependent
+    sampled = not (how.control.fastest_at_ends and how.disturbance.fastest_at_ends)
+    rates = isinstance(method, Explicit) and (sampled or (moving and method.stages != 1))
+    return rates, callable(problem.noise) and (moving or how.steers_noise)
 
 
 def _check_step(step: float | None, limit: float) -> None:
@@ -223,7 +260,11 @@ def _check_step(step: float | None, limit: float) -> None:
         )
 
 
-def _evaluation(problem: Problem) -> Any:
+def _evaluation(problem: Problem, grid: Grid) -> Any:
+    if grid.sides("open"):
+        chosen = choose(problem, grid, traced=False)
+        assert isinstance(chosen, PolicyIteration)
+        return chosen.evaluation
     return Sweeps() if problem.noise is None else Krylov()
 
 
@@ -232,7 +273,7 @@ def _watched(problem: Problem, grid: Grid, share: float | None, dtype: Any) -> A
     if share is None:
         how = players.setting(problem, grid.ndim, dtype).disturbance
         share = 0.5 if isinstance(how.choices, Box) and all(how.curved) else 0.0
-    if not 0 <= share <= 1:
+    if not arguments.is_number(share) or not 0 <= share <= 1:
         raise ValueError(f"march: inner = {share!r}; wanted the share of the box that is watched, from 0 (none) to 1")
     if share == 0:
         return None
@@ -262,7 +303,7 @@ def _march_traced(
     if isinstance(method, Explicit):
         method = Explicit(method.stages or scheme.stages, method.fraction)
     else:
-        method = Implicit(method.evaluation or _evaluation(problem), method.tol, method.max_steps)
+        method = Implicit(method.evaluation or _evaluation(problem, grid), method.tol, method.max_steps)
     problem, grid = cast(problem, kind), cast(grid, kind)
     rules = None if problem.time_dependent else bellman.conditions(problem, grid, kind)
     task = March(problem, grid, method, rules, jnp.inf, step, horizon, None, scheme)

@@ -80,8 +80,8 @@ def advance(
     evaluation: Evaluation,
     tol: Any,
     max_steps: int,
-) -> tuple[jax.Array, jax.Array]:
-    """W at the time t from V = ``value`` at t + Δt, and whether it is known to ``tol`` or to rounding.
+) -> tuple[jax.Array, Greedy, jax.Array]:
+    """W at the time t from V = ``value`` at t + Δt, its policy, and whether it is known to ``tol`` or to rounding.
 
     Args:
       problem, grid, scheme: the chain.
@@ -117,8 +117,8 @@ def advance(
 
     start = rules.impose(value)
     carry = (start, *look(start), jnp.zeros((), jnp.int32))
-    value, _, _, done, _ = jax.lax.while_loop(unfinished, improve, carry)
-    return value, done
+    value, policy, _, done, _ = jax.lax.while_loop(unfinished, improve, carry)
+    return value, policy, done
 
 
 def _evaluated(step: Step, value: jax.Array, policy: Greedy, residual: Any, evaluation: Evaluation) -> jax.Array:

@@ -186,6 +186,29 @@ def _slope_along(grid: Grid, values: Any, axis: int, moment: tuple, nodes: list,
     return (1 - fraction) * first + fraction * last
 
 
+def extended(grid: Grid, values: Any, enumerated: bool) -> Any:
+    """Node values (..., *grid, m) with those of the nearest defined nodes where one of the 3^n around a node has any.
+
+    Axis by axis, the mean of the two neighbours, or of one of them; ``enumerated`` values are not averaged. The rest
+    stays NaN.
+    """
+    xp: Any = jnp if is_traced(values) else np
+    values = xp.asarray(values)
+    first = values.ndim - 1 - grid.ndim
+    for axis in range(grid.ndim):
+        lost = xp.any(xp.isnan(values), axis=-1, keepdims=True)
+        lower, upper = (xp.roll(values, shift, axis=first + axis) for shift in (1, -1))
+        if not grid.periodic[axis]:  # type: ignore[index]
+            place = xp.arange(grid.shape[axis]).reshape(-1, *(1,) * (grid.ndim - axis))
+            lower = xp.where(place == 0, xp.nan, lower)
+            upper = xp.where(place == grid.shape[axis] - 1, xp.nan, upper)
+        no_lower, no_upper = (xp.any(xp.isnan(side), axis=-1, keepdims=True) for side in (lower, upper))
+        both = lower if enumerated else (lower + upper) / 2
+        near = xp.where(no_lower, upper, xp.where(no_upper, lower, both))
+        values = xp.where(lost, near, values)
+    return values
+
+
 def _defined(grid: Grid, values: Any, x: Any, clamp: bool, when: Any) -> Iterator[tuple[Any, Any, Any]]:
     """The nodes around each state: weight, whether the values there are defined and count, and the values."""
     for weight, hidden, there in _corners(grid, values, x, clamp, when):

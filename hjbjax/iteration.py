@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax import bellman, certificates, hamiltonian, players, relaxation
+from hjbjax import arguments, bellman, certificates, chain, players, relaxation, stencil
 from hjbjax.bellman import Conditions, Correction, Greedy
 from hjbjax.certificates import Certificate, Gap
 from hjbjax.grid import Grid
@@ -28,8 +28,11 @@ from hjbjax.schemes import Limited, Scheme
 from hjbjax.status import Status
 
 FULL_STEPS = 10  # corrections of a limited scheme before they are halved, which ends limit cycles of the limiter
+SHIFT = 1.2  # by which the time of a pseudo-step grows; at 2 other solutions of the equation with open ends are found
+SHIFTS = 150  # steps after which there is no shift any more: 1.2¹⁵⁰ is 10¹²
 HISTORY = 256  # steps whose residuals one chunk can record
 GROWTH = 1e6  # a residual that has grown by this factor over its smallest has diverged
+CLIMB = 100_000  # steps of value iteration without progress: without discount V climbs by L Δt a step for long
 PATIENCE = 10  # steps without progress of a residual that is rounding
 ROUNDING = 64  # residuals below this many units in the last place of max|V| are rounding
 
@@ -54,6 +57,10 @@ class PolicyIteration:
     evaluation: Evaluation = Sweeps()
     replies: int = 20
 
+    def __post_init__(self):
+        relaxation.check_evaluation(self.evaluation, "PolicyIteration: evaluation")
+        arguments.count(self.replies, "PolicyIteration: replies")
+
 
 @node(static=("coarsest",))
 class Nested:
@@ -67,14 +74,19 @@ class Nested:
       coarsest: do not go on to grids with fewer nodes than this.
     """
 
-    inner: PolicyIteration = PolicyIteration()
+    inner: PolicyIteration | ValueIteration = PolicyIteration()
     coarsest: int = 2000
+
+    def __post_init__(self):
+        wanted = "hjb.PolicyIteration(...) or hjb.ValueIteration()"
+        arguments.one_of(self.inner, "Nested: inner", (PolicyIteration, ValueIteration), wanted)
+        arguments.count(self.coarsest, "Nested: coarsest")
 
 
 Method = ValueIteration | PolicyIteration | Nested
 
 
-@node(static=("scheme", "certificate"))
+@node(static=("scheme", "certificate", "has_lost"))
 class Task:
     """All that stays the same during a solve.
 
@@ -84,9 +96,11 @@ class Task:
       rules: held nodes and constraints.
       counted: bool (*grid), nodes that have a finite value.
       least_cost: the least running cost at each node, for the multiplicative certificate; else None.
-      pace: max Q + β at each node for value iteration; else None.
+      pace: max Q + β at each node, for value iteration and for open ends; else None.
       tol: certified error to reach, cost units.
       scheme, certificate: static choices.
+      crossing: the time that it takes to cross the box at the largest speeds, where that was asked for; else None.
+      has_lost: whether nodes that do not count may lie beside others, so that no action may lead there.
     """
 
     problem: Problem
@@ -99,6 +113,33 @@ class Task:
     tol: Any
     scheme: Scheme
     certificate: Certificate
+    crossing: Any = None
+    has_lost: bool = False
+
+    @property
+    def constrained(self) -> bool:
+        """Whether the problem has a stopping cost or a running maximum."""
+        return self.problem.stopping_cost is not None or self.problem.running_max is not None
+
+    def impose(self, value: jax.Array) -> jax.Array:
+        """``value`` with what is given put in, and with nodes that are lost far above all others.
+
+        A jump there at a rate that is only rounding beside the others then costs no more than √eps of the value.
+        """
+        value = self.rules.impose(value)
+        if not self.has_lost:
+            return value
+        largest = jnp.max(jnp.where(self.counted, jnp.abs(value), 0))
+        return jnp.where(self.counted, value, largest / jnp.sqrt(jnp.finfo(value.dtype).eps))
+
+    def start(self) -> jax.Array:
+        """Where to start without a guess: zero, or without discount ψ, above all fixed points, or g, below them."""
+        zero = jnp.zeros(self.grid.shape, self.tol.dtype)
+        if not self.constrained or self.certificate is Certificate.ADDITIVE:
+            return zero
+        floor, stop = self.rules.floor, self.rules.stop
+        start = floor if stop is None else stop if floor is None else jnp.maximum(floor, stop)
+        return jnp.asarray(jnp.broadcast_to(start, self.grid.shape), self.tol.dtype)
 
 
 @node()
@@ -135,7 +176,7 @@ def begin(task: Task, guess: Any) -> State:
     gap = Gap(-infinite, infinite, xp.zeros((), dtype), infinite, infinite)
     counter = xp.zeros((), xp.int32)
     code = xp.asarray(int(Status.RUNNING), xp.int32)
-    history = xp.full(HISTORY, xp.nan, dtype)
+    history = xp.full(HISTORY, -1, dtype)  # no NaN, which jax_debug_nans would take for a fault
     return State(value, policy, infinite, gap, counter - 1, xp.stack([infinite] * 2), counter, code, history)
 
 
@@ -161,10 +202,11 @@ def advance(task: Task, state: State, start: Any) -> State:
     delta = jax.lax.cond(state.step < 0, lambda: stay, lambda: _correct(task, state))
     if isinstance(task.scheme, Limited):
         delta = jnp.where(state.step < FULL_STEPS, 1.0, 0.5).astype(delta.dtype) * delta
-    value = task.rules.impose(state.value + delta)
-    policy, fastest, measured = _look(
-        task, value, state.policy, moved=jnp.max(jnp.abs(jnp.where(task.counted, value - state.value, 0)))
-    )
+    value = task.impose(state.value + delta)
+    moved = jnp.max(jnp.abs(jnp.where(task.counted, value - state.value, 0)))
+    if task.certificate is Certificate.OPEN and not isinstance(task.method, ValueIteration):
+        moved = moved * _held_back(task, state)
+    policy, fastest, measured = _look(task, value, state.policy, moved=moved)
     measured = dataclasses.replace(measured, error=jnp.where(_unmeasured(task, state), jnp.inf, measured.error))
     measures = jnp.stack([measured.error, measured.residual])
     since = jnp.where(jnp.any(measures < state.best), 0, state.since_best + 1)
@@ -176,9 +218,37 @@ def advance(task: Task, state: State, start: Any) -> State:
     return jax.tree.map(lambda after, before: jnp.where(code == Status.NONFINITE, before, after), new, old)
 
 
+def broken(task: Task, state: State) -> jax.Array:
+    """Where value or rate are not finite in the step that a NONFINITE state took back, bool (*grid)."""
+    state = dataclasses.replace(state, step=state.step - 1)
+    stay = jnp.zeros_like(state.value)
+    delta = jax.lax.cond(state.step < 0, lambda: stay, lambda: _correct(task, state))
+    value = task.impose(state.value + delta)
+    rate = bellman.greedy(task.problem, task.grid, value, task.rules.held, scheme=task.scheme).rate
+    return task.counted & ~(jnp.isfinite(value) & jnp.isfinite(rate))
+
+
 def _unmeasured(task: Task, state: State) -> Any:
     """Without a certificate a step must have been taken before its size says anything."""
-    return (state.step < 0) & (task.certificate in (Certificate.NONE, Certificate.RESIDUAL))
+    return (state.step < 0) & (task.certificate not in (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE))
+
+
+def _shift(task: Task, state: State) -> Any:
+    """κ, per unit time, by which the discount of a correction is raised: with open ends; it dies geometrically.
+
+    Each correction is then an implicit step in time of length 1/κ. The equation with open ends has several solutions,
+    of which the stable one is wanted, and policies that leave may be worth no finite value.
+    """
+    assert task.pace is not None
+    dying = jnp.asarray(SHIFT, state.value.dtype) ** -jnp.maximum(state.step, 0)
+    return jnp.where(state.step < SHIFTS, jnp.max(task.pace) * dying, 0)
+
+
+def _held_back(task: Task, state: State) -> Any:
+    """By how much longer a step would have been about, if no shift had held it back."""
+    shift, discount = _shift(task, state), jnp.asarray(task.problem.discount, state.value.dtype)
+    safe = jnp.where(discount > 0, discount, 1)
+    return jnp.where(shift == 0, 1, jnp.where(discount > 0, 1 + shift / safe, jnp.inf))
 
 
 def _look(task: Task, value: jax.Array, incumbent: Greedy, moved: jax.Array) -> tuple[Greedy, jax.Array, Gap]:
@@ -196,32 +266,80 @@ def _look(task: Task, value: jax.Array, incumbent: Greedy, moved: jax.Array) -> 
         counted=task.counted,
         moved=moved,
     )
+    if task.has_lost:
+        measured = dataclasses.replace(measured, error=jnp.where(_leaks(task, policy), jnp.inf, measured.error))
     return policy, left.fastest, measured
+
+
+def _leaks(task: Task, policy: Greedy) -> jax.Array:
+    """Whether the policy leads from a node that counts to one that is lost, by more than rounding."""
+    u, d = list(policy.controls), list(policy.disturbances)
+    rates = chain.rates(task.problem, task.grid, u, d, scheme=task.scheme.chain, dtype=policy.rate.dtype)
+    jumps = zip(rates.offsets, rates.values, strict=True)
+    leaking = sum(jnp.where(stencil.neighbour(task.counted, task.grid, offset), 0, c) for offset, c in jumps)
+    limit = ROUNDING * jnp.finfo(policy.rate.dtype).eps * rates.total()
+    return jnp.any(task.counted & ~task.rules.held & (leaking > limit))
 
 
 def _judge(task: Task, value: jax.Array, measured: Gap, best: jax.Array, since: jax.Array) -> jax.Array:
     finite = jnp.isfinite(measured.residual)
     matters = (since >= PATIENCE) | (measured.residual > GROWTH * best[1])  # else it changes no answer below
+    climbs = task.constrained or isinstance(task.method, ValueIteration)
+    to_the_end = climbs and task.certificate in (Certificate.NONE, Certificate.BY_DISCOUNT, Certificate.OPEN)
     size = jax.lax.cond(
-        matters, lambda: jnp.max(jnp.where(task.counted, jnp.abs(value), 0)), lambda: jnp.zeros_like(best[1])
+        matters | to_the_end,
+        lambda: jnp.max(jnp.where(task.counted, jnp.abs(value), 0)),
+        lambda: jnp.zeros_like(best[1]),
     )
-    rounding = ROUNDING * jnp.finfo(value.dtype).eps * size
-    patience = jnp.where(measured.residual <= rounding, PATIENCE, 100 + 4 * sum(task.grid.shape))
+    rounding, tol = ROUNDING * jnp.finfo(value.dtype).eps * size, task.tol
+    longest = CLIMB if isinstance(task.method, ValueIteration) else 100 + 4 * sum(task.grid.shape)
+    if to_the_end:  # a front moves V by a spacing times its slope a step, whatever the tolerance, past every node
+        tol = jnp.where(task.problem.discount > 0, tol, rounding)
+        longest = max(longest, 100 + 4 * task.grid.size)
+    patience = jnp.where(measured.residual <= rounding, PATIENCE, longest)
     code = jnp.where(since >= patience, Status.STALLED, Status.RUNNING)
-    code = jnp.where(measured.residual > GROWTH * jnp.maximum(best[1], rounding), Status.DIVERGED, code)
-    code = jnp.where(measured.error <= task.tol, Status.CONVERGED, code)
+    grew = measured.residual > GROWTH * jnp.maximum(best[1], rounding)
+    bounded = jnp.isfinite(best[0]) & (measured.error <= GROWTH * best[0])
+    grew &= ~bounded  # a better policy may leave more than one that stops at once
+    code = jnp.where(grew, Status.DIVERGED, code)
+    code = jnp.where(measured.error <= tol, Status.CONVERGED, code)
     return jnp.where(finite, code, Status.NONFINITE).astype(jnp.int32)
 
 
 def _correct(task: Task, state: State) -> jax.Array:
     if isinstance(task.method, ValueIteration):
-        assert task.pace is not None
-        return state.policy.rate / task.pace
+        return state.policy.rate / _pace(task, state)
+    if task.pace is None or task.certificate is Certificate.OPEN:
+        return _evaluated(task, state)
+    return jax.lax.cond(  # a tube whose discount is traced: without one its policies have no value of their own
+        jnp.asarray(task.problem.discount > 0),
+        lambda: _evaluated(task, state),
+        lambda: state.policy.rate / _pace(task, state),
+    )
+
+
+def _evaluated(task: Task, state: State) -> jax.Array:
+    """The correction of policy iteration: by the linear equation of the policy, in a game by the inner problem."""
     assert isinstance(task.method, PolicyIteration)
+    if task.certificate is Certificate.OPEN:  # in a game, too: steps in time improve both players at once
+        later = altered(task.problem, discount=task.problem.discount + _shift(task, state))
+        left = equation(dataclasses.replace(task, problem=later), state.value, state.policy)
+        return relaxation.solve(task.method.evaluation, left, task.grid)
     if task.problem.is_game:
         return _hoffman_karp(task, state)
     left = equation(task, state.value, state.policy, state.fastest)
     return relaxation.solve(task.method.evaluation, left, task.grid)
+
+
+def _pace(task: Task, state: State) -> jax.Array:
+    """Q + β for value iteration: of the fastest action, which the policy shows where it is not known beforehand."""
+    assert task.pace is not None
+    how = players.setting(task.problem, task.grid.ndim, state.value.dtype)
+    if how.control.fastest_at_ends and how.disturbance.fastest_at_ends:
+        return task.pace
+    u, d = list(state.policy.controls), list(state.policy.disturbances)
+    chosen = chain.rates(task.problem, task.grid, u, d, scheme=task.scheme.chain, dtype=state.value.dtype).total()
+    return jnp.maximum(task.pace, chosen + task.problem.discount)
 
 
 def equation(task: Task, value: jax.Array, policy: Greedy, fastest: Any = None) -> Correction:
@@ -239,7 +357,7 @@ def _hoffman_karp(task: Task, state: State) -> jax.Array:
 
     def reply(carry):
         value, policy, _, count = carry
-        value = task.rules.impose(value + relaxation.solve(evaluation, equation(task, value, policy), task.grid))
+        value = task.impose(value + relaxation.solve(evaluation, equation(task, value, policy), task.grid))
         policy = bellman.respond(task.problem, task.grid, value, held, policy, scheme=task.scheme)
         left = jnp.max(jnp.where(task.counted, jnp.abs(equation(task, value, policy).source), 0))
         return value, policy, left, count + 1
@@ -249,17 +367,3 @@ def _hoffman_karp(task: Task, state: State) -> jax.Array:
 
     start = (state.value, state.policy, jnp.asarray(jnp.inf, state.value.dtype), jnp.zeros((), jnp.int32))
     return jax.lax.while_loop(unfinished, reply, start)[0] - state.value
-
-
-def rest_nodes(problem: Problem, grid: Grid, *, scheme: Scheme, dtype: Any) -> tuple[jax.Array, jax.Array]:
-    """Where the system can rest at no cost, bool (*grid), and the least running cost at every node.
-
-    Rest is up to rounding, since sin π is not zero in floating point. At V = 0 the Hamiltonian is the cost.
-    """
-    how = players.setting(problem, grid.ndim, dtype)
-    nowhere = hamiltonian.local(problem, grid, jnp.zeros(grid.shape, dtype), scheme=scheme)
-    least = hamiltonian.optimise(nowhere, how)[0]
-    effort = hamiltonian.optimise(hamiltonian.at_rest(problem, grid, scheme=scheme, dtype=dtype), how)[0]
-    size = 1 + sum(grid.hi[axis] - grid.lo[axis] for axis in range(grid.ndim))
-    small = 1e3 * jnp.finfo(dtype).eps * size
-    return (jnp.abs(effort) <= small) & (jnp.abs(least) <= small), least

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.pytree import as_partial, cast, node
+from hjbjax.screen import encodable
 from hjbjax.sets import Ball, Box
 
 CLIMBS = 32  # starts of the local search, for each of the three measures
@@ -58,7 +59,9 @@ class LyapunovReport:
 
     def __str__(self) -> str:
         if not self.positive:
-            return f"violated: V − V(x_e) = {self.lowest:.3g} at {_place(self.lowest_state, self.lowest_time)}"
+            return encodable(
+                f"violated: V − V(x_e) = {self.lowest:.3g} at {_place(self.lowest_state, self.lowest_time)}"
+            )
         if not self.decreasing:
             return f"violated: dV/dt = {self.rate:.3g} at {_place(self.worst_state, self.worst_time)}"
         return f"no violation found at {self.evaluations:,} points; the search proves nothing"

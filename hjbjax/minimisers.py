@@ -5,6 +5,7 @@ returns a pair (value, extra): the value at every node, and whatever is worth ke
 (the opponent's answer). ``sign`` is +1 to minimise and −1 to maximise.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -30,7 +31,9 @@ def pick(condition: Any, first: Any, second: Any) -> Any:
     return jax.tree.map(lambda p, q: jnp.where(condition, p, q), first, second)
 
 
-def enumerate_actions(objective: Objective, points: Any, sign: int, *, weight: int = 1) -> tuple[Any, Action, list]:
+def enumerate_actions(
+    objective: Objective, points: Any, sign: int, *, weight: int = 1, most: int = UNROLL
+) -> tuple[Any, Action, list]:
     """The best of the rows of ``points``, in order; the first of equals wins.
 
     Args:
@@ -38,19 +41,21 @@ def enumerate_actions(objective: Objective, points: Any, sign: int, *, weight: i
       points: shape (K, m).
       sign: +1 to minimise, −1 to maximise.
       weight: how many evaluations one call of ``objective`` stands for.
+      most: evaluations that may be written out.
 
     Returns:
       The best value, the action there, and the extra there.
     """
     count, inputs = np.shape(points)
-    if count * weight <= UNROLL:
+    if count * weight <= most:
         return best_of(objective, [[points[k, j] for j in range(inputs)] for k in range(count)], sign, None)
-    chunk = max(1, CHUNK // weight)
+    chunk = max(1, min(CHUNK, most) // weight)
     padded = -(-count // chunk) * chunk
     rows = jnp.concatenate([points, jnp.broadcast_to(points[-1:], (padded - count, inputs))])
-    first = best_of(objective, [[points[0, j] for j in range(inputs)]], sign, None)
-    shape = first[0].shape
-    best = jax.tree.map(lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, first[0].dtype), shape), first)
+    # shapes alone: evaluated once more in front of the loop, the objective would be compiled once more
+    value, extra = jax.eval_shape(lambda row: objective(list(row)), points[0])
+    everywhere = functools.partial(jnp.full, value.shape, dtype=value.dtype)
+    best = everywhere(sign * jnp.inf), [everywhere(points[0, j]) for j in range(inputs)], [everywhere(0) for _ in extra]
 
     def step(best, block):
         return best_of(objective, [[block[k, j] for j in range(inputs)] for k in range(chunk)], sign, best), None
@@ -72,7 +77,13 @@ def best_of(objective: Objective, actions: Sequence[Action], sign: int, best: An
 
 
 def refine(
-    objective: Objective, best: Any, spacing: Sequence[Any], project: Callable[[Action], Action], sign: int
+    objective: Objective,
+    best: Any,
+    spacing: Sequence[Any],
+    project: Callable[[Action], Action],
+    sign: int,
+    *,
+    weight: int = 1,
 ) -> Any:
     """Pattern search around the best sample: one input at a time, up and down, halving the step.
 
@@ -82,6 +93,8 @@ def refine(
       spacing: distance between neighbouring samples, one number an input.
       project: maps an action to the nearest admissible one.
       sign: +1 to minimise, −1 to maximise.
+      weight: how many evaluations one call of ``objective`` stands for; where it is a search of its own, the moves of
+        a round are made one by one in a loop, since each one written out is compiled apart.
     """
     value, action, extra = best
     dtype, shape = value.dtype, value.shape
@@ -96,4 +109,16 @@ def refine(
                 best = best_of(objective, [project(moved)], sign, best)
         return best
 
-    return jax.lax.fori_loop(0, REFINEMENTS, one_round, best)
+    def one_move(k, best):
+        turn = k // moves
+        length = (1 - 2 * (k % 2)) * jnp.asarray(0.5, dtype) ** (turn + 1)
+        moved = [
+            entry + jnp.where(k % moves // 2 == j, length * width, 0)
+            for j, (entry, width) in enumerate(zip(best[1], spacing, strict=True))
+        ]
+        return best_of(objective, [project(moved)], sign, best)
+
+    moves = 2 * len(action)
+    if weight * moves <= CHUNK:
+        return jax.lax.fori_loop(0, REFINEMENTS, one_round, best)
+    return jax.lax.fori_loop(0, REFINEMENTS * moves, one_move, best)

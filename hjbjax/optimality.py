@@ -8,6 +8,7 @@ import numpy as np
 
 from hjbjax import pointwise
 from hjbjax.pytree import node
+from hjbjax.screen import encodable
 from hjbjax.sets import samples
 from hjbjax.status import Status
 from hjbjax.two_point import TwoPoint
@@ -73,7 +74,7 @@ class Extremal:
         return f"Extremal({self.status}: cost {float(self.cost):.6g} over {float(self.horizon):.6g})"
 
     def __str__(self) -> str:
-        return f"{self.status}: {self.message}"
+        return encodable(f"{self.status}: {self.message}")
 
 
 @jax.jit
@@ -150,4 +151,27 @@ def assemble(ask: TwoPoint, s: np.ndarray, y: np.ndarray, theta: np.ndarray, cod
         optimality_check=check,
         code=int(code),
         message=message,
+    )
+
+
+def unchecked(ask: TwoPoint, s: np.ndarray, y: np.ndarray, lengths: np.ndarray, code: Status) -> Extremal:
+    """A path with its costates as far as a solve came, without controls, which would have to be compiled for."""
+    begins, n = np.cumsum(lengths) - lengths, ask.n
+    z = np.moveaxis(y.reshape(ask.count, -1, len(s)), 1, 2).copy()
+    if ask.shifts is not None:
+        z[..., :n] += np.asarray(ask.shifts)[:, None]
+    inner = np.append(np.tile(np.arange(len(s)) < len(s) - 1, ask.count)[:-1], True)  # at a switch the next arc's
+    times, z = (begins[:, None] + s * lengths[:, None]).ravel()[inner], z.reshape(-1, z.shape[-1])[inner]
+    return Extremal(
+        times=times,
+        states=z[:, :n],
+        controls=np.full((len(times) - 1, np.shape(ask.arcs)[1]), np.nan),
+        costates=z[:, n : 2 * n],
+        values=z[:, -1],
+        switches=np.zeros(0) if ask.seams else begins[1:],
+        cost=float(z[0, -1]),
+        horizon=float(lengths.sum()),
+        optimality_check=Optimality(np.full(len(times), np.nan), np.nan, np.nan, np.nan),
+        code=int(code),
+        message="this is the last iterate, without controls; nothing says how well it meets the conditions",
     )

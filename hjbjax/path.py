@@ -8,6 +8,7 @@ import numpy as np
 
 from hjbjax.grid import Grid
 from hjbjax.pytree import node
+from hjbjax.screen import encodable
 from hjbjax.sets import AdmissibleSet, Ball, Box
 
 
@@ -19,6 +20,8 @@ class PathStatus(enum.IntEnum):
     LEFT_BOX = 2
     MAX_STEPS = 3
     NONFINITE = 4
+    UNDEFINED = 5
+    INTERRUPTED = 6
 
     @property
     def message(self) -> str:
@@ -31,8 +34,18 @@ MESSAGES = {
     PathStatus.TARGET: "reached the target",
     PathStatus.LEFT_BOX: "stopped where it left the box of the grid; enlarge the grid, or go on with clamp=True",
     PathStatus.MAX_STEPS: "stopped after max_steps internal steps; give hold=dt, or more max_steps",
-    PathStatus.NONFINITE: "stopped because the state is no longer finite; look at drift and feedback there",
+    PathStatus.NONFINITE: "stopped before a step to no finite state; drift, cost or feedback are not finite ahead",
+    PathStatus.UNDEFINED: "stopped where the feedback has no control (NaN): the target may be out of reach from there",
+    PathStatus.INTERRUPTED: "was interrupted",
 }
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C during a simulation: ``.path`` is the Path so far."""
+
+    def __init__(self, path: "Path"):
+        super().__init__(f"simulate: the path {path.message}; .path is the path so far")
+        self.path = path
 
 
 @node(host=("message",))
@@ -68,7 +81,34 @@ class Path:
         return PathStatus(int(self.code))
 
     def __str__(self) -> str:
-        return self.message
+        return encodable(self.message)
+
+
+def joined(first: Path, then: Path, discount: float) -> Path:
+    """Two paths in one, the second from where and when the first ends, with the running cost of both.
+
+    Args:
+      first: a path that pays nothing where it ends.
+      then: a path from its last state.
+      discount: β of the problem.
+    """
+    end = first.times[-1]
+    cost, steps = float(first.cost + np.exp(-discount * end) * then.cost), first.steps + then.steps
+    said = (
+        f"{first.status.message} at t = {end:.6g}; from there {then.status.message} at t = {end + then.times[-1]:.6g}"
+    )
+    both = first.disturbances is None or then.disturbances is None
+    return Path(
+        times=np.concatenate([first.times, end + then.times[1:]]),
+        states=np.concatenate([first.states, then.states[1:]]),
+        controls=np.concatenate([first.controls, then.controls]),
+        disturbances=None if both else np.concatenate([first.disturbances, then.disturbances]),
+        cost=cost,
+        reached=None if then.reached is None else end + then.reached,
+        code=then.code,
+        steps=steps,
+        message=f"{said}; cost {cost:.6g}; {steps} internal steps",
+    )
 
 
 def truncated(path: Path, count: int, max_steps: int, grid: Grid | None, controls: Any, noisy: bool) -> Path:
@@ -84,8 +124,11 @@ def truncated(path: Path, count: int, max_steps: int, grid: Grid | None, control
     """
     status, times, states = path.status, path.times[: count + 1], path.states[: count + 1]
     applied = path.controls[:count]
+    where = f"t = {times[-1]:.6g}"
+    if status in (PathStatus.NONFINITE, PathStatus.UNDEFINED):
+        where += f", x = [{', '.join(f'{entry:.4g}' for entry in states[-1])}]"
     said = [
-        f"{status.message} at t = {times[-1]:.6g}",
+        f"{status.message} at {where}",
         f"cost {float(path.cost):.6g}",
         f"{int(path.steps)} internal steps",
     ]
@@ -97,7 +140,7 @@ def truncated(path: Path, count: int, max_steps: int, grid: Grid | None, control
         said.append("the feedback jumps or the loop is stiff: hold=dt is faster")
     if _inadmissible(controls, applied):
         said.append("controls outside the problem's admissible set were applied as they are")
-    if status not in (PathStatus.DURATION, PathStatus.TARGET):
+    if status not in (PathStatus.DURATION, PathStatus.TARGET, PathStatus.INTERRUPTED):  # that is raised
         warnings.warn(f"simulate: the path {said[0]}", UserWarning, stacklevel=3)
     return Path(
         times=times,

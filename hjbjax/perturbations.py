@@ -19,6 +19,7 @@ import numpy as np
 
 from hjbjax import checks
 from hjbjax.canvas import COLOURS, GREY, axes_of, label_axes, logarithmic
+from hjbjax.clock import Clock, noting_interrupts
 from hjbjax.convergence import fitted_order
 from hjbjax.gain import attenuation, saturation
 from hjbjax.grid import Grid
@@ -27,7 +28,7 @@ from hjbjax.problem import Problem
 from hjbjax.reference import mask_of
 from hjbjax.schemes import Limited, Scheme
 from hjbjax.sets import AdmissibleSet, Ball, Box
-from hjbjax.solution import Solution
+from hjbjax.solution import Solution, SolveError
 from hjbjax.solver import check_arguments, solve
 from hjbjax.status import Status
 
@@ -133,6 +134,7 @@ def perturbation_study(
     Raises:
       ValueError: fewer than two noises or levels; a problem that has noise or disturbances already, or no discount; a
         set of disturbances that is felt in the region; and what ``solve`` refuses.
+      SolveError: it was interrupted; ``.solution`` is the study so far, or the unperturbed solution.
 
     Example:
       >>> import hjbjax as hjb
@@ -158,15 +160,23 @@ def perturbation_study(
     def solved(which: Problem, throw: bool = False) -> Solution:
         return solve(which, grid, scheme=scheme, method=method, tol=tol, throw=throw)
 
-    nominal = solved(problem, throw=True)
-    noisy = [solved(dataclasses.replace(problem, noise=epsilon)) for epsilon in levels[0]]
-    robust = [solved(game) for game in games]
-    felt = saturation(dataclasses.replace(robust[-1], disturbance=_within(robust[-1], mask)), games[-1], inner=1.0)
+    clock, found = Clock(), []
+    noisy = [dataclasses.replace(problem, noise=epsilon) for epsilon in levels[0]]
+    with noting_interrupts(clock):
+        nominal = solved(problem, throw=True)
+        for perturbed in (*noisy, *games):
+            if not clock.interrupted:
+                found.append(solved(perturbed))
+    noise = _series("ε", levels[0], found[: len(noisy)], nominal, mask, tol)
+    gain = _series("1/γ", 1 / levels[1][::-1], found[len(noisy) :], nominal, mask, tol)
+    study = Perturbation(nominal, noise, gain, str(scheme), tol)
+    if clock.interrupted:
+        came = f"{len(found)} of {len(noisy) + len(games)} perturbed problems"
+        raise SolveError(f"perturbation_study: interrupted after {came}; .solution is the study so far", study)
+    felt = saturation(dataclasses.replace(found[-1], disturbance=_within(found[-1], mask)), games[-1], inner=1.0)
     if felt.share > 0:
         raise ValueError(f"perturbation_study: at gamma = {levels[1][0]:g} {felt}; widen the set, or raise gamma")
-    noise = _series("ε", levels[0], noisy, nominal, mask, tol)
-    gain = _series("1/γ", 1 / levels[1][::-1], robust, nominal, mask, tol)
-    return Perturbation(nominal, noise, gain, str(scheme), tol)
+    return study
 
 
 def _increasing(name: str, numbers: Any) -> np.ndarray:
@@ -184,11 +194,12 @@ def _within(solution: Solution, mask: np.ndarray) -> np.ndarray:
 def _series(
     name: str, parameters: np.ndarray, solutions: Sequence[Solution], nominal: Solution, mask: np.ndarray, tol: float
 ) -> Series:
+    parameters = parameters[: len(solutions)]  # fewer where the study was interrupted
     values = [np.abs(each.value - nominal.value)[mask] for each in solutions]
     inputs = [np.abs(each.policy - nominal.policy)[mask] for each in solutions]
     errors = np.array([np.max(each) for each in values])
     feedback = np.array([np.max(each, initial=0.0) for each in inputs])
-    converged = np.array([each.status is Status.CONVERGED for each in solutions])
+    converged = np.array([each.status is Status.CONVERGED for each in solutions], bool)
     fitted = converged & np.isfinite(errors) & (errors > tol)
     finest = min(float(nominal.grid.spacing(axis)) for axis in range(nominal.grid.ndim))
     seen = fitted & (feedback > tol / finest)  # a slope of V is known no better than that

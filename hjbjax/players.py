@@ -3,6 +3,8 @@
 The optimum over a player's actions is exact where the drift is affine in them, the cost separable and quadratic, the
 noise free of them, and the inputs of a box fall into groups of one or two that drive components of their own, few
 enough that all their pieces can be tried; in a ball each input drives one component of its own. See ``piecewise``.
+In a game whose players meet in a component, in a cost or in the noise, that holds of the player who answers; the one
+who moves first faces a function with ridges, which is searched.
 """
 
 import dataclasses
@@ -32,6 +34,7 @@ class Player:
       groups: the inputs by what they drive together; the groups drive disjoint sets of components.
       cells: for every group in how many pieces the Hamiltonian may fall.
       curved: for every input whether the cost may hold its square.
+      fastest_at_ends: whether no action moves the chain faster than all those at the ends of the set do.
     """
 
     choices: AdmissibleSet | None
@@ -41,6 +44,7 @@ class Player:
     groups: tuple[tuple[int, ...], ...]
     cells: tuple[int, ...]
     curved: tuple[bool, ...]
+    fastest_at_ends: bool
 
     def derivative(self, problem: Problem, function: Callable, j: int) -> Callable:
         """∂/∂u_j of a function of the problem's arguments, itself one of one state: it varies only as it must."""
@@ -57,6 +61,11 @@ class Player:
             return jax.jvp(moved, (jnp.zeros((), action.dtype),), (jnp.ones((), action.dtype),))[1]
 
         return along
+
+    @property
+    def enumerated(self) -> bool:
+        """Whether all of the player's actions are tried, since they are finitely many or there are none."""
+        return isinstance(self.choices, (Finite, type(None)))
 
     @property
     def weight(self) -> int:
@@ -81,6 +90,8 @@ class Setting:
       separable: whether drift and cost are sums of what each player does, and noise is neither's.
       decoupled: whether they drive different components as well; then the Isaacs condition holds on every grid.
       disturbance_costs: whether the running cost depends on the disturbance.
+      steers_noise: whether the noise depends on an action.
+      isaacs: who moves first, as in ``Problem``; that player's optimum is searched unless the two are decoupled.
     """
 
     control: Player
@@ -88,12 +99,16 @@ class Setting:
     separable: bool
     decoupled: bool
     disturbance_costs: bool
+    steers_noise: bool
+    isaacs: str
 
     @property
     def exact(self) -> bool:
         """Whether min (max) over the sets is exact, which certificates need."""
-        players = (self.control, self.disturbance)
-        return all(player.exact or isinstance(player.choices, (Finite, type(None))) for player in players)
+        first, second = (self.control, self.disturbance) if self.isaacs == "upper" else (self.disturbance, self.control)
+        if second.choices is not None and not self.decoupled:  # the reply is no polynomial of what it replies to
+            return first.enumerated and (second.exact or second.enumerated)
+        return all(player.exact or player.enumerated for player in (first, second))
 
 
 def setting(problem: Problem, n: int, dtype: Any) -> Setting:
@@ -112,12 +127,12 @@ def setting(problem: Problem, n: int, dtype: Any) -> Setting:
     mine = _player(problem.controls, 1, inputs_u, drift, cost, noise, branches)
     theirs = _player(problem.disturbances, -1, inputs_d, drift, cost, noise, branches)
     separate = not set(drift.driven_by(inputs_u)) & set(drift.driven_by(inputs_d))
-    crossed = any(
-        entry is None or any(set(term) & set(inputs_u) and set(term) & set(inputs_d) for term in entry)
-        for entry in (*drift.entries, *cost.entries)
-    )
+    crossed = any(function.crosses(inputs_u, inputs_d) for function in (drift, cost))
     separable = not crossed and noise.is_constant
-    return Setting(mine, theirs, separable, separate and separable, not cost.free_of(inputs_d))
+    return Setting(
+        mine, theirs, separable, separate and separable, not cost.free_of(inputs_d), not noise.is_constant,
+        problem.isaacs,
+    )  # fmt: skip
 
 
 def _player(
@@ -133,13 +148,15 @@ def _player(
     curved = tuple(cost.has_square([j]) for j in inputs)
     groups = _groups(driven)
     cells = tuple(branches ** len(shared(driven, group)) for group in groups)
-    suits = drift.affine_in(inputs) and cost.separable_quadratic_in(inputs) and noise.free_of(inputs)
+    convex = drift.affine_in(inputs) and noise.free_of(inputs)  # so is the rate of leaving a node
+    at_ends = convex or isinstance(choices, (Finite, type(None)))
+    suits = convex and cost.separable_quadratic_in(inputs)
     if isinstance(choices, Box):
         suits &= all(count <= CELLS.get(len(group), 0) for group, count in zip(groups, cells, strict=True))
     elif isinstance(choices, Ball):
         apart = all(len(group) == 1 for group in groups) and all(len(components) <= 1 for components in driven)
         suits &= choices.dim <= 3 and not any(curved) and apart
-    return Player(choices, sign, suits and isinstance(choices, (Box, Ball)), driven, groups, cells, curved)
+    return Player(choices, sign, suits and isinstance(choices, (Box, Ball)), driven, groups, cells, curved, at_ends)
 
 
 def _groups(driven: tuple[tuple[int, ...], ...]) -> tuple[tuple[int, ...], ...]:

@@ -10,7 +10,7 @@ numbers: they get a grey of their own and a line in the legend. A periodic axis 
 """
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -32,7 +32,7 @@ from hjbjax.grid import Grid
 from hjbjax.level_sets import animation, zero_level_set
 from hjbjax.momenta import costates
 from hjbjax.perturbations import perturbation
-from hjbjax.sections import at_time, feedback, folded, lifted, section_of, zeros
+from hjbjax.sections import at_time, feedback, folded, lifted, nodes_in, section_of, zeros
 
 __all__ = [
     "COLOURS",
@@ -61,6 +61,7 @@ def value(
     time: float | None = None,
     levels: int | Sequence[float] = 9,
     colorbar: bool = True,
+    target: Callable | None = None,
 ) -> list[Any]:
     """The value function: a line over one axis, colours with contour lines over two.
 
@@ -73,6 +74,8 @@ def value(
       time: for a marched solution, which stored time to draw (the nearest one; ``None`` is the earliest).
       levels: how many contour lines, or their values; 0 for none.
       colorbar: whether a colour scale is drawn beside two-dimensional pictures.
+      target: a function of the state, ≤ 0 inside, as ``problem.target``: over two axes its nodes are greyed out, since
+        what is held there need not be a value.
 
     Returns:
       The artists: the line or the mesh first.
@@ -91,6 +94,9 @@ def value(
     section = section_of("value", field, solution.grid, fixed, caption)
     ax = axes_of(ax)
     hidden = "V = ∞" if np.all(np.isposinf(section.values.data[section.values.mask])) else "V not finite"
+    if target is not None and len(section.axes) == 2 and np.any(inside := nodes_in(target, solution.grid)):
+        hidden = f"target, or {hidden}" if np.ma.getmaskarray(section.values).any() else "target"
+        section = section_of("value", np.where(inside, np.nan, field), solution.grid, fixed, caption)
     artists = draw(ax, section, solution.grid, "V", hidden, colorbar=colorbar)
     lines = _levels(section.values, levels) if len(section.axes) == 2 else ()
     if len(lines):
@@ -255,7 +261,12 @@ def controls(path: Any, *, ax: Any = None, names: Sequence[str] | None = None) -
 
 
 def closed_loop(
-    solution: Any, path: Any, *, axes: tuple[int, int] = (0, 1), fixed: Mapping[Any, float] | None = None
+    solution: Any,
+    path: Any,
+    *,
+    axes: tuple[int, int] = (0, 1),
+    fixed: Mapping[Any, float] | None = None,
+    target: Callable | None = None,
 ) -> list[Any]:
     """One figure: the path on the value function, and its states and inputs over time.
 
@@ -266,6 +277,7 @@ def closed_loop(
     Keyword Args:
       axes: the two states of the plane on the left; left out for one state.
       fixed: where the other axes are cut, by default at the path's start.
+      target: as for :func:`value`.
 
     Returns:
       The artists: those of the value first.
@@ -280,7 +292,7 @@ def closed_loop(
         start = np.asarray(path.states)[0]
         cut: Mapping[Any, float] = {axis: float(start[axis]) for axis in range(grid.ndim) if axis not in axes}
         ax = styled(figure.add_subplot(columns[:, 0]))
-        artists += value(solution, ax=ax, fixed=cut if fixed is None else fixed)
+        artists += value(solution, ax=ax, fixed=cut if fixed is None else fixed, target=target)
         artists += trajectory(path, ax=ax, axes=axes if axes[0] < axes[1] else axes[::-1], grid=grid)
     upper = styled(figure.add_subplot(columns[0, -1]))
     artists += trajectory(path, ax=upper, axes=None, grid=grid)

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from hjbjax import checks, exits, memory, proper, survey
@@ -27,8 +28,6 @@ from hjbjax.solution import Solution, SolveError
 from hjbjax.solver import as_dtype, check_arguments, solve
 
 TOL = 1e-6
-TOL_OF_STEPS = 1e-9  # value iteration stops by its last step, which is much smaller than what is left
-ROUNDING = 32  # units in the last place of a probability, below which no step is asked for
 
 
 def reach_probability(
@@ -70,7 +69,7 @@ def reach_probability(
       A Solution whose value is the probability, and whose policy attains it.
 
     Raises:
-      ValueError: no target; a feedback without controls; and what ``march`` and ``solve`` refuse.
+      ValueError: no target; open ends; a feedback without controls; and what ``march`` and ``solve`` refuse.
       SolveError: no convergence, with the partial solution.
 
     Example:
@@ -81,12 +80,13 @@ def reach_probability(
       0.6225
     """
     name = "reach_probability"
+    _refuse_open(grid, name)
     problem, inside, hit = _asked(problem, target, obstacle, feedback, horizon, name)
     sign = 1.0 if least else -1.0
     question = exits.ending(problem, inside, hit, 0.0, sign)
     with _quiet(feedback):
         if horizon is None:
-            question, options = _without_end(question, grid, 1.0 if least else 0.0, options)
+            question, options = _without_end(question, grid, least, options)
         return _answer(question, grid, horizon, options, sign)
 
 
@@ -162,8 +162,9 @@ def expected_exit_time(
       A Solution whose value is the time, inf where the target is not reached for certain.
 
     Raises:
-      ValueError: no target; asked for the greatest time, a control that may stay away for ever, in a game also if it
-        needs the disturbance's help, which is not looked for inside ``jit``; and what ``solve`` and ``march`` refuse.
+      ValueError: no target; open ends; asked for the greatest time, a control that may stay away for ever, in a game
+        also if it needs the disturbance's help, which is not looked for inside ``jit``; and what ``solve`` and
+        ``march`` refuse.
       SolveError: no convergence, with the partial solution.
 
     Example:
@@ -175,6 +176,7 @@ def expected_exit_time(
       0.1875
     """
     name = "expected_exit_time"
+    _refuse_open(grid, name)
     problem, inside, _ = _asked(problem, target, None, feedback, horizon, name)
     sign = -1.0 if greatest else 1.0
     question = exits.ending(problem, inside, None, sign, 0.0)
@@ -184,6 +186,14 @@ def expected_exit_time(
             if greatest:
                 _refuse_staying(question, grid, options)
         return _answer(question, grid, horizon, options, sign)
+
+
+def _refuse_open(grid: Any, name: str) -> None:
+    if isinstance(grid, Grid) and grid.sides("open"):
+        raise ValueError(
+            f"{name}: beyond an open end a value is continued from inside, which makes no probability and no time of "
+            "it;\nuse edges='projected' or 'constrained', or a box whose ends lie in the target or in the obstacle"
+        )
 
 
 def _asked(
@@ -214,20 +224,21 @@ def _quiet(feedback: Any) -> Iterator[None]:
         yield
 
 
-def _without_end(question: Problem, grid: Grid, most: float, options: dict) -> tuple[Problem, dict]:
+def _without_end(question: Problem, grid: Grid, least: bool, options: dict) -> tuple[Problem, dict]:
     """The question for all times, with what finds the least of its solutions where one may stay away for ever.
 
-    ``most`` bounds the value from above by itself. Given as a stopping cost it says that there is something to fall
-    back on, so that no node is taken for one without a value.
+    Zero, a bound of the value, is given as a running maximum, or for the greatest probability, which comes with its
+    sign changed, as a stopping cost: so that the iteration starts there, and no node is taken for one without a value.
     """
     options = {"tol": TOL} | options
     if not _may_stay(question, grid, options):
         return question, options
-    question = dataclasses.replace(question, stopping_cost=most)
-    smallest = max(TOL_OF_STEPS, ROUNDING * float(np.finfo(as_dtype(options.get("dtype"))).eps))
-    tol = options["tol"] if is_traced(options["tol"]) else min(options["tol"], smallest)
-    defaults = {"method": ValueIteration(), "guess": np.zeros(grid.shape)}
-    return question, defaults | options | {"tol": tol}
+    bound: dict[str, Any] = {"running_max" if least else "stopping_cost": jax.tree_util.Partial(_zero)}
+    return dataclasses.replace(question, **bound), {"method": ValueIteration()} | options
+
+
+def _zero(*where: Any) -> Any:
+    return jnp.zeros(())
 
 
 def _may_stay(question: Problem, grid: Grid, options: dict) -> int:

@@ -6,6 +6,7 @@
 The control minimises cost, the disturbance maximises it. Everything here is written for one state.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -17,7 +18,7 @@ from hjbjax.pytree import as_partial, is_traced, node, numbers
 from hjbjax.sets import AdmissibleSet, Ball, Box, Finite
 
 
-@node(static=("isaacs", "time_dependent"))
+@node(static=("isaacs", "time_dependent", "discounted"))
 class Problem:
     """An optimal control problem or a two-player zero-sum differential game.
 
@@ -66,6 +67,7 @@ class Problem:
     running_max: Any = None
     isaacs: str = "upper"
     time_dependent: bool = False
+    discounted: bool | None = dataclasses.field(init=False, default=None, repr=False)
 
     def __init__(
         self,
@@ -113,6 +115,7 @@ class Problem:
             "running_max": as_partial(running_max, "Problem.running_max"),
             "isaacs": isaacs,
             "time_dependent": bool(time_dependent),
+            "discounted": None if is_traced(discount) else bool(discount > 0),
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)
@@ -141,9 +144,14 @@ class Problem:
         return jnp.diag(sigma) if sigma.ndim == 1 else sigma
 
 
-def may_be_positive(discount: Any) -> bool:
-    """Whether the discount is positive; a traced one is taken for positive."""
-    return is_traced(discount) or bool(np.asarray(discount) > 0)
+def is_discounted(problem: Problem) -> bool | None:
+    """Whether the discount is positive; None where only a run of the compiled program will tell.
+
+    A problem remembers it in its structure, so that it is known inside ``jit`` also where the number is traced.
+    """
+    if is_traced(problem.discount):
+        return problem.discounted
+    return bool(np.all(np.asarray(problem.discount) > 0))
 
 
 def _is_nonzero(discount: Any) -> bool:

@@ -10,10 +10,10 @@ than two dimensions are drawn on the plane of the first two axes through the sta
 """
 
 import contextlib
+import dataclasses
 import math
 import os
 import shutil
-import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -22,10 +22,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from hjbjax import plotting
+from hjbjax import placement, plotting
 from hjbjax._version import __version__
+from hjbjax.feedback import greedy_feedback
 from hjbjax.path import Path as Trajectory
+from hjbjax.path import joined
 from hjbjax.problem import Problem
+from hjbjax.sets import Ball
 from hjbjax.simulation import simulate
 from hjbjax.solution import Solution, Status
 
@@ -42,6 +45,8 @@ def check_folder(out: Path, force: bool = False) -> None:
     """
     if os.path.lexists(out) and not out.is_dir():
         raise NotADirectoryError(f"{out} is there and is no folder; give another name")
+    for file in FILES:
+        placement.check_place(out / file, force=True)
     old = [file for file in FILES if os.path.lexists(out / file)]
     if old and not force:
         raise FileExistsError(f"{out} holds {', '.join(old)} already; give another --out, or --force to replace them")
@@ -51,6 +56,8 @@ def check_folder(out: Path, force: bool = False) -> None:
 def staging(out: Path) -> Iterator[Path]:
     """A hidden folder on the file system of ``out``, gone at the end; that it can be made shows that one can write.
 
+    A killed command leaves it behind, for the next one to take away.
+
     Raises:
       OSError: ``out`` cannot be written.
     """
@@ -59,12 +66,15 @@ def staging(out: Path) -> Iterator[Path]:
         if os.path.lexists(place):
             raise NotADirectoryError(f"{out} cannot be written: {place} is no folder; give another name")
         place = place.parent
+    placement.sweep(place)
+    folder = place / placement.hidden_name(out.name)
     try:
-        folder = Path(tempfile.mkdtemp(prefix=".hjbjax-", dir=place))
+        folder.mkdir(mode=0o700)
     except OSError as error:
         raise OSError(f"{out} cannot be written: {error.strerror}; give another folder") from error
     try:
-        yield folder
+        with placement.claimed(folder):
+            yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
@@ -80,18 +90,25 @@ def publish(folder: Path, out: Path, made: Sequence[str], force: bool = False) -
     out.mkdir(parents=True, exist_ok=True)
     check_folder(out, force)  # again: the solve may have taken long
     for file in FILES:
-        if file in made:
-            os.replace(folder / file, out / file)
+        if file in made:  # the first is always there: of two commands at once, one is refused before it moves anything
+            placement.place(folder / file, out / file, force)
         else:
             (out / file).unlink(missing_ok=True)
 
 
 def make(
-    problem: Problem, solution: Solution, folder: Path, *, start: Sequence[float], duration: float
+    problem: Problem,
+    solution: Solution,
+    folder: Path,
+    *,
+    start: Sequence[float],
+    duration: float,
+    finish: tuple[Problem, Any] | None = None,
 ) -> Iterator[tuple[str, Trajectory | None]]:
     """Makes the files one by one; yields the name of each and, with the last, the trajectory that it shows.
 
-    An interrupted solve is saved and not drawn; one that did not converge gets no trajectory.
+    An interrupted solve is saved and not drawn; one that did not converge gets no trajectory. ``finish`` is the
+    problem and the feedback by which a trajectory goes on from the target, where that holds the rest of the cost.
 
     Raises:
       OSError: a file cannot be written.
@@ -106,13 +123,15 @@ def make(
         return
     fixed = dict(enumerate(start[2:], 2))
     jumps = is_bang_bang(problem, solution)
-    draw("value.png", _with_curve(plotting.value(solution, fixed=fixed), solution, fixed, jumps))
+    draw("value.png", _with_curve(plotting.value(solution, fixed=fixed, target=problem.target), solution, fixed, jumps))
     yield "value.png", None
     draw("policy.png", _policies(solution, fixed, jumps))
     yield "policy.png", None
-    path = _trajectory(problem, solution, start, duration, jumps) if solution.status == Status.CONVERGED else None
+    path = None
+    if solution.status == Status.CONVERGED:
+        path = _trajectory(problem, solution, start, duration, jumps, finish)
     if path is not None:
-        draw("trajectory.png", plotting.closed_loop(solution, path, fixed=fixed))
+        draw("trajectory.png", plotting.closed_loop(solution, path, fixed=fixed, target=problem.target))
         yield "trajectory.png", path
 
 
@@ -121,21 +140,49 @@ def is_bang_bang(problem: Problem, solution: Solution) -> bool:
     lo, hi = getattr(problem.controls, "lo", None), getattr(problem.controls, "hi", None)
     if solution.discrete or lo is None or hi is None:
         return solution.discrete
-    policy = np.asarray(solution.policy)
-    policy = policy[np.all(np.isfinite(policy), axis=-1)]
-    near = 1e-6 * (hi - lo)
+    policy, near = _known(solution), 1e-6 * (hi - lo)
     return policy.size > 0 and bool(np.mean((policy <= lo + near) | (policy >= hi - near)) > 0.9)
 
 
+def _is_direction(problem: Problem, solution: Solution) -> bool:
+    """Whether the feedback is a direction: nine of ten of its controls lie on the sphere around a ball."""
+    if not isinstance(problem.controls, Ball):
+        return False
+    policy = _known(solution)
+    return policy.size > 0 and bool(np.mean(np.linalg.norm(policy, axis=-1) > problem.controls.radius * 0.999999) > 0.9)
+
+
+def _known(solution: Solution) -> np.ndarray:
+    policy = np.asarray(solution.policy)
+    return policy[np.all(np.isfinite(policy), axis=-1)]
+
+
 def _trajectory(
-    problem: Problem, solution: Solution, start: Sequence[float], duration: float, jumps: bool
+    problem: Problem,
+    solution: Solution,
+    start: Sequence[float],
+    duration: float,
+    jumps: bool,
+    finish: tuple[Problem, Any] | None,
 ) -> Trajectory | None:
-    """The closed loop; a bang-bang feedback is sampled: an adaptive stepper crawls along its switching curve."""
+    """The closed loop, and what follows in the target.
+
+    Where the control jumps or is a direction, the mean of two is optimal for neither: there the Hamiltonian is
+    minimised at the state. One that jumps is sampled: an adaptive stepper crawls along its switching curve.
+    """
     options: dict[str, Any] = {} if problem.noise is None else {"key": 0}
     if jumps:
         options["hold"] = duration / SAMPLES
+    sharp = jumps or _is_direction(problem, solution)
+    feedback = greedy_feedback(problem, solution) if sharp else solution
+    if finish is not None:
+        problem = dataclasses.replace(problem, exit_cost=None)
     try:
-        return simulate(problem, solution, start, duration, **options)
+        path = simulate(problem, feedback, start, duration, **options)
+        if finish is None or path.reached is None:
+            return path
+        rest = simulate(*finish, path.states[-1], duration)
+        return joined(path, rest, float(np.asarray(problem.discount)))
     except ValueError as error:
         warnings.warn(f"no trajectory.png: {error}", UserWarning, stacklevel=2)
         return None

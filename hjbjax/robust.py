@@ -34,10 +34,11 @@ from typing import Any
 
 import numpy as np
 
+from hjbjax.clock import Clock, noting_interrupts
 from hjbjax.gain import Saturation, saturation
 from hjbjax.grid import Grid
 from hjbjax.horizon import march
-from hjbjax.problem import Problem, may_be_positive
+from hjbjax.problem import Problem, is_discounted
 from hjbjax.schemes import Scheme, Weno5
 from hjbjax.sets import Ball, Box
 from hjbjax.solution import Solution, SolveError
@@ -45,6 +46,7 @@ from hjbjax.status import Status
 
 DOUBLINGS = 6  # of the time marched, at most
 SOON = 1e-6  # seconds: a limit that ends a march after its first look
+CUTS = {Status.INTERRUPTED: "interrupted", Status.TIME_LIMIT: "out of time"}
 CLOSE, FALL = 10.0, 1 / 3  # growth so near settle counts as settled if it falls by this factor; at the level it halves
 
 
@@ -55,7 +57,7 @@ class Trial:
     Args:
       gamma: γ.
       feasible: whether the value settled.
-      reason: "settled", "saturated", "growing" or "not finite".
+      reason: "settled", "saturated", "growing" or "not finite"; "interrupted" or "out of time" is no verdict.
       time: the time T that was marched.
       growth: what V grew by over the last doubling of T, over its size, in the inner box.
       value: the largest V there.
@@ -79,28 +81,30 @@ class Level:
 
     Args:
       gamma: γ, the upper end of the bracket.
-      bracket: the largest γ not shown to be feasible, and the least that is.
+      bracket: the largest γ not shown to be feasible, and the least that is; 0 and infinity before there is one.
       trials: everything tried, by γ.
+      status: CONVERGED; of a search that was cut short, INTERRUPTED or TIME_LIMIT.
     """
 
     gamma: float
     bracket: tuple[float, float]
     trials: tuple[Trial, ...]
+    status: Status = Status.CONVERGED
 
     @property
     def solution(self) -> Solution:
-        """The value and the feedbacks at ``gamma``."""
-        return next(trial.solution for trial in self.trials if trial.gamma == self.gamma)
+        """The value and the feedbacks at ``gamma``; without a feasible γ those of the last trial."""
+        return next((trial for trial in self.trials if trial.gamma == self.gamma), self.trials[-1]).solution
 
     def __repr__(self) -> str:
         return f"Level(gamma={self.gamma:.6g}, bracket=({self.bracket[0]:.6g}, {self.bracket[1]:.6g}))"
 
     def __str__(self) -> str:
         lines = [f"least level {self.gamma:.4g}, not shown at {self.bracket[0]:.4g}"]
-        lines.append(f"{'gamma':>9} {'':<10} {'time':>7} {'growth':>8} {'V':>9} {'|d|/bound':>9}")
+        lines.append(f"{'gamma':>9} {'':<11} {'time':>7} {'growth':>8} {'V':>9} {'|d|/bound':>9}")
         for one in self.trials:
             lines.append(
-                f"{one.gamma:>9.4g} {one.reason:<10} {one.time:>7.3g} {one.growth:>8.1e} {one.value:>9.3g} "
+                f"{one.gamma:>9.4g} {one.reason:<11} {one.time:>7.3g} {one.growth:>8.1e} {one.value:>9.3g} "
                 f"{one.saturation.largest:>9.2f}"
             )
         return "\n".join(lines)
@@ -145,7 +149,8 @@ def hinf_level(
       ValueError: not 0 < lo < hi; feasible at lo, infeasible at hi; a problem without disturbances, or with a discount,
         a target or anything else with which V tells no gain.
       TypeError: something that makes no problem.
-      SolveError: a march was interrupted or ran out of time.
+      SolveError: it was interrupted, or a march ran out of time; ``.solution`` is the Level so far, with the bracket
+        and all trials, that of the unfinished march among them.
 
     Example:
       >>> import hjbjax as hjb
@@ -157,12 +162,27 @@ def hinf_level(
       True
     """
     _check_rule(problem_of_gamma, lo, hi, tol, inner, settle, horizon)
+    clock, trials = Clock(), []
 
     def at(gamma: float) -> Trial:
         problem = problem_of_gamma(gamma)
         _check_problem(problem, gamma)
-        return _try(problem, grid, float(gamma), inner, settle, horizon, scheme, time_limit)
+        trial = _try(problem, grid, float(gamma), inner, settle, horizon, scheme, time_limit)
+        trials.append(trial)
+        if trial.reason in CUTS.values():
+            raise SolveError(f"hinf_level: at gamma = {gamma:g}: {trial.solution.message}", _level(trials, trial))
+        return trial
 
+    with noting_interrupts(clock):
+        _bisect(at, lo, hi, tol, settle)
+        if clock.interrupted:
+            whole = dataclasses.replace(_level(trials), status=Status.INTERRUPTED)
+            raise SolveError(f"hinf_level: interrupted after it had come to its end: {whole!r}", whole)
+    return _level(trials)
+
+
+def _bisect(at: Callable[[float], Trial], lo: float, hi: float, tol: float, settle: float) -> None:
+    """Try γ after γ until the bracket is narrow enough."""
     top = at(hi)
     if not top.feasible:
         raise ValueError(f"hinf_level: hi = {hi:g} is not feasible: {_why(top, settle)}")
@@ -172,13 +192,17 @@ def hinf_level(
             f"hinf_level: lo = {lo:g} is feasible: V settles at {bottom.value:.3g} after t = {bottom.time:g}; "
             "give a smaller lo"
         )
-    trials = [bottom, top]
     while top.gamma > bottom.gamma * (1 + tol):
         middle = at(math.sqrt(bottom.gamma * top.gamma))
         bottom, top = (bottom, middle) if middle.feasible else (middle, top)
-        trials.append(middle)
-    trials.sort(key=lambda trial: trial.gamma)
-    return Level(top.gamma, (bottom.gamma, top.gamma), tuple(trials))
+
+
+def _level(trials: list[Trial], cut: Trial | None = None) -> Level:
+    """The level by the trials so far, of which ``cut`` came to no verdict."""
+    top = min((trial.gamma for trial in trials if trial.feasible), default=math.inf)
+    bottom = max((trial.gamma for trial in trials if not trial.feasible and trial is not cut), default=0.0)
+    status = Status.CONVERGED if cut is None else cut.solution.status
+    return Level(top, (bottom, top), tuple(sorted(trials, key=lambda trial: trial.gamma)), status)
 
 
 def _try(
@@ -200,6 +224,8 @@ def _try(
     value, total, span, gains = np.zeros(grid.shape), 0.0, horizon / 2**DOUBLINGS, [math.inf]
     while True:
         solution = march(problem, grid, span, start=value, inner=watch, throw=False, scheme=scheme, time_limit=left)
+        if solution.status in CUTS:
+            return _unfinished(solution, gamma, total + span - float(solution.times[0]), inner)
         after, total = np.asarray(solution.value[0]), total + span - float(solution.times[0])
         size, gain = (float(np.max(np.abs(each[inside]))) for each in (after, after - value))
         bound = saturation(solution, problem, inner=inner)
@@ -208,12 +234,23 @@ def _try(
             break
         value, span, gains = after, total, [*gains, gain]
         left = time_limit and max(time_limit - (perf_counter() - began), SOON)
-    if solution.status in (Status.INTERRUPTED, Status.TIME_LIMIT):
-        raise SolveError(f"hinf_level: at gamma = {gamma:g}: {solution.message}", solution)
-    first = {name: getattr(solution, name)[0] for name in ("value", "policy", "disturbance")}
-    kept = dataclasses.replace(solution, times=None, stats={**solution.stats, "horizon": total}, **first)
+    kept = _stationary(solution, total)
     reason, growth = reason or "growing", gain / size if size else 0.0
     return Trial(gamma, reason == "settled", reason, total, growth, size, bound, kept)
+
+
+def _unfinished(solution: Solution, gamma: float, total: float, inner: float) -> Trial:
+    """A trial without a verdict, from a march that was cut short."""
+    kept = _stationary(solution, total)
+    size = float(np.max(np.abs(kept.value[kept.grid.inner(inner)])))
+    unknown = Saturation(math.nan, math.nan, np.full(kept.grid.ndim, math.nan), inner)
+    return Trial(gamma, False, CUTS[solution.status], total, math.nan, size, unknown, kept)
+
+
+def _stationary(solution: Solution, total: float) -> Solution:
+    """The last slice of a march over the time ``total`` as a stationary solution."""
+    first = {name: getattr(solution, name)[0] for name in ("value", "policy", "disturbance")}
+    return dataclasses.replace(solution, times=None, stats={**solution.stats, "horizon": total}, **first)
 
 
 def _reason(status: Status, bound: Saturation, growth: float, ratio: float, settle: float) -> str:
@@ -272,7 +309,7 @@ def _check_problem(problem: Any, gamma: float) -> None:
     for name in ("noise", "terminal_cost", "stopping_cost", "running_max", "target"):
         if getattr(problem, name) is not None:
             raise ValueError(f"hinf_level: the problem has a {name}, with which V no longer tells a gain; leave it out")
-    if may_be_positive(problem.discount):
+    if is_discounted(problem) is not False:
         raise ValueError(
             f"hinf_level: the problem has discount = {problem.discount}, with which V settles also where the gain is "
             "violated; leave it out"

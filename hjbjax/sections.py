@@ -7,9 +7,10 @@ enumerated controls are cut at the nearest node. Entries that are not finite are
 import difflib
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from hjbjax.grid import Grid
@@ -36,6 +37,14 @@ def at_time(solution: Any, field: Any, time: float | None) -> tuple[np.ndarray, 
     times = np.asarray(times)
     index = int(np.argmin(times if time is None else np.abs(times - time)))
     return field[index], f"t = {times[index]:.4g}"
+
+
+def nodes_in(target: Callable, grid: Grid) -> np.ndarray:
+    """Which nodes lie in a target, a bool (*grid)."""
+    states = grid.nodes().reshape(-1, grid.ndim)
+    with jax.enable_x64(True):
+        level = np.asarray(jax.lax.map(target, states, batch_size=1 << 16))
+    return level.reshape(grid.shape) <= 0
 
 
 def feedback(solution: Any, input: int, fixed: Any, time: float | None) -> tuple[Section, str]:

@@ -7,7 +7,8 @@ The value V of a converged solve satisfies Φ(V, θ) = 0, node by node the activ
 
 ∂Φ/∂θ is taken through the formulas that give the optimal action: where that is stationary they contribute nothing,
 and where it sits at a bound or at a kink of the upwinding, both of which may move with θ, they do. Forward mode
-takes one linear solve and reverse mode one transposed solve, whatever the number of steps that led to V.
+takes one linear solve and reverse mode one transposed solve, whatever the number of steps that led to V. A linear solve
+that does not come to its end makes the derivative NaN; the value stays as it is.
 """
 
 from typing import Any
@@ -21,7 +22,10 @@ from hjbjax.grid import Grid
 from hjbjax.iteration import PolicyIteration, State, Task
 from hjbjax.relaxation import Evaluation, Krylov
 
-STEPS = 200  # refinements of the linear solve; each gains at least a digit with the default evaluations
+STEPS = 200  # refinements of the linear solve in each of its two stages, at most
+SLOW = 0.5  # a refinement that leaves more than this share of the residual hands over to Krylov's
+GOAL = 1e3  # of the rounding unit of the right-hand side
+ROUNDING = 64  # of the rounding unit of the solution: below that no residual can be brought
 
 
 def attach(task: Task, state: State) -> jax.Array:
@@ -42,11 +46,31 @@ def attach(task: Task, state: State) -> jax.Array:
     def matvec(delta):
         return -relaxation.left_over(Correction(jnp.zeros_like(delta), equation.weights), task_kept.grid, delta)
 
-    weights = equation.weights
-    delta = jax.lax.custom_linear_solve(
-        matvec, _residual(task, state, equation), solver(weights), solver(weights.inflow(task_kept.grid))
-    )
-    return value + (delta - jax.lax.stop_gradient(delta))
+    weights, solvers = equation.weights, _exact_solvers(equation, task_kept.grid)
+    if not task_kept.grid.sides("open"):
+        solvers = solver(weights), solver(weights.inflow(task_kept.grid))
+    delta = jax.lax.custom_linear_solve(matvec, _residual(task, state, equation), *solvers)
+    return _with_derivative(value, delta)
+
+
+@jax.custom_jvp
+def _with_derivative(value: jax.Array, delta: jax.Array) -> jax.Array:
+    """``value``, with the derivative of ``delta``; what ``delta`` is itself is never computed."""
+    return value
+
+
+@_with_derivative.defjvp
+def _with_tangent(primals: Any, tangents: Any) -> Any:
+    return primals[0], tangents[1]
+
+
+def _exact_solvers(equation: Correction, grid: Grid) -> tuple[Any, Any]:
+    """The solves of I − W and of its transpose by factorisation; rows of open ends are no jumps to be turned round."""
+
+    def solve(transposed: bool) -> Any:
+        return lambda _, right: relaxation.direct(Correction(right, equation.weights), grid, transposed=transposed)
+
+    return solve(False), solve(True)
 
 
 def _residual(task: Task, state: State, equation: Correction) -> jax.Array:
@@ -61,24 +85,48 @@ def _residual(task: Task, state: State, equation: Correction) -> jax.Array:
     pace = jax.lax.stop_gradient(total + problem.discount)
     phi = rate / jnp.where(pace > 0, pace, 1)
     bound = equation.weights.total() == 0  # rows of the constraints hold no weights
-    if rules.stop is not None:
-        phi = jnp.where(bound & (value >= jax.lax.stop_gradient(rules.stop)), rules.stop - value, phi)
-    if rules.floor is not None:
-        phi = jnp.where(bound & (value <= jax.lax.stop_gradient(rules.floor)), rules.floor - value, phi)
+    for constraint in (rules.stop, rules.floor):
+        if constraint is not None:
+            phi = jnp.where(bound & _same(value, constraint), constraint - value, phi)
     return jnp.where(held, rules.given - value, phi)
 
 
+def _same(value: jax.Array, constraint: jax.Array) -> jax.Array:
+    """Where a value was taken from the constraint, which rounds otherwise whenever it is evaluated anew."""
+    size = jnp.abs(value) + jnp.abs(constraint)
+    return jax.lax.stop_gradient(jnp.abs(value - constraint) <= 64 * jnp.finfo(value.dtype).eps * size)
+
+
 def refined(evaluation: Evaluation, equation: Correction, grid: Grid) -> jax.Array:
-    """Iterative refinement until the residual is a small multiple of rounding or ``STEPS`` corrections are done."""
-    goal = 1e3 * jnp.finfo(equation.source.dtype).eps * jnp.max(jnp.abs(equation.source))
+    """δ by iterative refinement, to a small multiple of rounding; NaN where that is not reached.
 
-    def refine(carry: Any) -> Any:
-        delta, left, count = carry
-        delta = delta + relaxation.solve(evaluation, Correction(left, equation.weights), grid)
-        return delta, relaxation.left_over(equation, grid, delta), count + 1
+    Sweeps hardly gain where little is discounted and the drift goes round in circles: there Krylov takes over.
+    """
+    eps, size = jnp.finfo(equation.source.dtype).eps, jnp.max(jnp.abs(equation.source))
 
-    def unfinished(carry: Any) -> Any:
-        return (jnp.max(jnp.abs(carry[1])) > goal) & (carry[2] < STEPS)
+    def goal(delta: jax.Array) -> jax.Array:
+        return eps * (GOAL * size + ROUNDING * jnp.max(jnp.abs(delta)))
 
-    start = (jnp.zeros_like(equation.source), equation.source, jnp.zeros((), jnp.int32))
-    return jax.lax.while_loop(unfinished, refine, start)[0]
+    def stage(method: Evaluation, delta: jax.Array, slow: Any) -> jax.Array:
+        def refine(carry: Any) -> Any:
+            delta, left, _, count = carry
+            before = jnp.max(jnp.abs(left))
+            delta = delta + relaxation.solve(method, Correction(left, equation.weights), grid)
+            return delta, relaxation.left_over(equation, grid, delta), before, count + 1
+
+        def unfinished(carry: Any) -> Any:
+            delta, left, before, count = carry
+            size = jnp.max(jnp.abs(left))
+            return (size > goal(delta)) & (count < STEPS) & ~(size > slow * before)
+
+        before, none = jnp.full((), jnp.inf, delta.dtype), jnp.zeros((), jnp.int32)
+        start = (delta, relaxation.left_over(equation, grid, delta), before, none)
+        return jax.lax.while_loop(unfinished, refine, start)[0]
+
+    delta = jnp.zeros_like(equation.source)
+    if not isinstance(evaluation, Krylov):
+        delta = stage(evaluation, delta, SLOW)
+        evaluation = Krylov()
+    delta = stage(evaluation, delta, jnp.inf)
+    left = jnp.max(jnp.abs(relaxation.left_over(equation, grid, delta)))
+    return jnp.where(left <= goal(delta), delta, jnp.nan)

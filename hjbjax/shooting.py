@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax import first_guess, seams
-from hjbjax.optimality import Extremal, assemble
+from hjbjax.clock import CUT, Clock, Stopped
+from hjbjax.optimality import Extremal, assemble, unchecked
 from hjbjax.status import Status
 from hjbjax.two_point import Closing, TwoPoint, collocate
 
@@ -34,15 +35,16 @@ ADVICE = {
 
 @dataclasses.dataclass(frozen=True)
 class Limits:
-    """How far a solve goes."""
+    """How far a solve goes, and how long."""
 
     tol: float
     max_nodes: int
+    clock: Clock
 
     @property
     def rough(self) -> "Limits":
         """For problems on the way to the one asked for."""
-        return Limits(max(ROUGH, self.tol), min(COARSE, self.max_nodes))
+        return Limits(max(ROUGH, self.tol), min(COARSE, self.max_nodes), self.clock)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,8 +80,13 @@ class Found:
 
 
 def attempt(ask: TwoPoint, s: Any, y: Any, theta: Any, limits: Limits) -> Found:
-    """One collocation, its ending in our words."""
-    result = collocate(ask, s, y, np.asarray(theta, float), tol=limits.tol, max_nodes=limits.max_nodes)
+    """One collocation, its ending in our words; ``Stopped`` brings along what was found by then."""
+    guess = np.asarray(theta, float)
+    try:
+        result = collocate(ask, s, y, guess, tol=limits.tol, max_nodes=limits.max_nodes, clock=limits.clock)
+    except Stopped as stop:
+        mesh, last, sought = stop.reached
+        raise Stopped(stop.status, Found(ask, mesh, last, sought, stop.status)) from None
     sought = np.zeros(0) if result.p is None else result.p
     code = Status.CONVERGED if result.success else ENDINGS[result.status]
     if not (np.all(np.isfinite(result.y)) and np.all(np.isfinite(sought))):
@@ -93,6 +100,13 @@ def attempt(ask: TwoPoint, s: Any, y: Any, theta: Any, limits: Limits) -> Found:
             found, code=Status.DIVERGED, trouble=f"the final time came out as {found.horizon:.3g}; give a better guess"
         )
     return found
+
+
+def carry_on(found: Found, limits: Limits) -> None:
+    """Look at the clock with something to hand back: between two programs that have to be compiled."""
+    code = limits.clock.over()
+    if code is not None:
+        raise Stopped(code, dataclasses.replace(found, code=code))
 
 
 def smooth(ask: TwoPoint, times: np.ndarray, columns: np.ndarray, limits: Limits, *, trusted: bool) -> Found:
@@ -153,7 +167,7 @@ def _continued(failed: Found, limits: Limits) -> Found:
         if ask.closing is Closing.REST:
             start = ask.rest.state + share * (ask.start - ask.rest.state)
             easier = dataclasses.replace(ask, start=start)
-            times, columns = first_guess.into_rest(easier, start, float(ask.horizon))
+            times, columns = first_guess.into_rest(easier, start, float(ask.horizon), limits.clock)
         else:
             easier = dataclasses.replace(ask, horizon=share * ask.horizon)
             times, columns = first_guess.straight(easier, float(easier.horizon))
@@ -186,7 +200,7 @@ def _settled(found: Found, limits: Limits) -> Found:
         if _near(ask, last) or not found.solved:
             return found
         more = float(ask.horizon) * (LONGER - 1)
-        times, columns = first_guess.into_rest(ask, last, more)
+        times, columns = first_guess.into_rest(ask, last, more, limits.clock)
         longer = dataclasses.replace(ask, horizon=float(ask.horizon) * LONGER)
         t = np.concatenate([found.times, float(ask.horizon) + times[1:]])
         found = attempt(longer, t / t[-1], np.concatenate([found.y, columns[:, 1:]], 1), np.zeros(0), limits)
@@ -195,7 +209,9 @@ def _settled(found: Found, limits: Limits) -> Found:
 
 
 def report(found: Found) -> Extremal:
-    """The extremal, held against the necessary conditions."""
+    """The extremal, held against the necessary conditions; not so the last iterate of a run that was cut short."""
+    if found.code in CUT:
+        return unchecked(found.ask, found.s, found.y, found.lengths, found.code)
     extremal = assemble(found.ask, found.s, found.y, found.theta, found.code, found.trouble)
     check = extremal.optimality_check
     if not found.solved:

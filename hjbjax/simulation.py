@@ -1,6 +1,7 @@
 """Simulation: ``simulate`` at the host, with checks and a report; ``rollout``, the same as a pure function."""
 
 import copy
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -9,13 +10,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.closed_loop import Loop, Stepping, check_kept, integrate
+from hjbjax.clock import Clock, noting_interrupts
+from hjbjax.closed_loop import Loop, Stepping, integrate, some, unbegun
+from hjbjax.driver import CHUNK_SECONDS
+from hjbjax.feedback import check_kept, lookups
 from hjbjax.grid import Grid
-from hjbjax.path import Path, truncated
+from hjbjax.path import Interrupted, Path, PathStatus, truncated
 from hjbjax.problem import Problem
 from hjbjax.pytree import as_partial, cast, is_traced
 
-_compiled = jax.jit(integrate)
+_compiled = jax.jit(some, donate_argnames="so_far")
 
 
 def simulate(
@@ -45,7 +49,8 @@ def simulate(
 
     Args:
       problem: the system and its costs.
-      feedback: a Solution, or a function that returns the control, shape (m,). ``None`` if there is no control.
+      feedback: a Solution, a ``greedy_feedback``, or a function that returns the control, shape (m,). ``None`` if
+        there is no control.
         A marched Solution must have been kept at enough times: at least ten over the duration. Its terminal cost,
         and that of any problem, is paid at the end of a path that lasts as long as the horizon.
       x0: the state at time 0, shape (n,).
@@ -63,7 +68,8 @@ def simulate(
       rtol: relative error of an internal step.
       atol: absolute error of an internal step, in the units of the state and of the cost.
       max_step: the longest internal step. ``None``: one output interval; a tenth of it with noise. A target
-        that the path crosses in less time than this may be missed.
+        that the path crosses in less time than this may be missed; with noise it is met late, as if it began about
+        .58 σ√max_step farther off, which a fourth of the step halves.
       max_steps: no internal step is shorter than 2·duration/max_steps, and no more are made.
 
     Returns:
@@ -72,6 +78,7 @@ def simulate(
     Raises:
       ValueError: an argument that is not admissible, or a function that returns the wrong shape.
       TypeError: a feedback or a disturbance that cannot be called.
+      KeyboardInterrupt: Ctrl-C; its ``.path`` is the Path so far, once that has begun.
 
     Example:
       >>> import jax.numpy as jnp
@@ -96,14 +103,18 @@ def simulate(
         max_steps=_count(max_steps, "max_steps"),
         held=hold is not None,
     )
-    if isinstance(key, (int, np.integer)) and not isinstance(key, bool):
-        key = jax.random.key(key)
+    key = _key(key)
     _check_key(problem, key)
     # Its import adds to JAX's configuration, which is part of the key of every compiled function: once before, or
     # the second call compiles again.
     import diffrax  # noqa: F401
 
-    with jax.enable_x64(True):
+    clock = Clock()
+    with (
+        noting_interrupts(clock),
+        jax.enable_x64(True),
+        jax.debug_nans(False),
+    ):  # after the end of a path its controls are NaN
         loop = cast(loop, np.float64)
         _probe(loop, x0)
         if not loop.margin(x0) > 0:
@@ -112,9 +123,31 @@ def simulate(
                 f"simulate: x0 = {x0.tolist()} lies outside the box from {lo} to {hi}, where the feedback is not "
                 "known; start inside, or give clamp=True"
             )
-        path, active = _compiled(loop, x0, times, key, stepping)
+        path, active = _in_chunks(loop, x0, times, key, stepping, clock)
         path, active, grid, controls = jax.tree.map(np.asarray, (path, active, loop.grid, problem.controls))
-    return truncated(path, int(np.sum(active)), max_steps, grid, controls, problem.noise is not None)
+        path = truncated(path, int(np.sum(active)), max_steps, grid, controls, problem.noise is not None)
+        if clock.interrupted:
+            raise Interrupted(path)
+    return path
+
+
+def _in_chunks(
+    loop: Loop, x0: np.ndarray, times: np.ndarray, key: Any, stepping: Stepping, clock: Clock
+) -> tuple[Path, Any]:
+    """The path, some output intervals at a time, for about half a second each, until it ends or Ctrl-C is noted."""
+    so_far, count, done, chunk = unbegun(loop, x0, times), len(times) - 1, 0, 1
+    if clock.interrupted:
+        raise KeyboardInterrupt("simulate: interrupted before the path began")
+    so_far, answer = _compiled(loop, x0, times, key, stepping, so_far, 0, 0)  # compiles
+    ending = PathStatus.INTERRUPTED  # what a path is called that has intervals left
+    while ending is PathStatus.INTERRUPTED and done < count and not clock.interrupted:
+        began, until = clock.elapsed(), min(done + chunk, count)
+        so_far, answer = _compiled(loop, x0, times, key, stepping, so_far, done, until)
+        ending = PathStatus(int(answer[0].code))
+        pace = max(clock.elapsed() - began, 1e-4) / (until - done)
+        chunk = int(np.clip(CHUNK_SECONDS / pace, 1, 8 * chunk))
+        done = until
+    return answer
 
 
 def rollout(
@@ -187,10 +220,9 @@ def _close(problem: Problem, feedback: Any, disturbance: Any, grid: Any, clamp: 
         if grid is not None and grid is not feedback.grid:
             raise ValueError("simulate: the solution brings its own grid; leave out grid=")
         grid = feedback.grid
-        ask = _from_solution if feedback.times is None else _from_marched
-        control = jax.tree_util.Partial(ask, as_partial(feedback.control_at))
+        control, worst = lookups(feedback)
         if problem.is_game and disturbance is None and feedback.disturbance is not None:
-            opponent = jax.tree_util.Partial(ask, as_partial(feedback.disturbance_at))
+            opponent = worst
     if grid is not None and not isinstance(grid, Grid):
         raise TypeError(f"simulate: grid is {grid!r}, wanted a Grid or None")
     if not isinstance(time_varying, bool):
@@ -216,16 +248,6 @@ def _close(problem: Problem, feedback: Any, disturbance: Any, grid: Any, clamp: 
 def _timeless(function: Callable, t: Any, x: Any) -> Any:
     """A user's function of the state alone."""
     return function(x)
-
-
-def _from_solution(look_up: Callable, t: Any, x: Any) -> Any:
-    """A stationary solution's answer; the state comes clamped, and must not be refused for a rounding."""
-    return look_up(x, clamp=True)
-
-
-def _from_marched(look_up: Callable, t: Any, x: Any) -> Any:
-    """A marched solution's answer, between its kept times."""
-    return look_up(t, x, clamp=True)
 
 
 def _within_horizon(problem: Problem, solution: Any, duration: float) -> Problem:
@@ -279,11 +301,26 @@ def _count(value: Any, name: str) -> int:
     return int(value)
 
 
+def _key(key: Any) -> Any:
+    """The random key of a seed; anything else as it is."""
+    if isinstance(key, bool) or not isinstance(key, (int, np.integer)):
+        return key
+    try:
+        return jax.random.key(int(key))
+    except OverflowError:
+        raise ValueError(f"simulate: key is {key}, wanted a seed that fits 64 bits, or a JAX random key") from None
+
+
 def _check_key(problem: Problem, key: Any) -> None:
     if problem.noise is not None and key is None:
         raise ValueError("simulate: the problem has noise; give key=jax.random.key(0), or any other seed")
     if problem.noise is None and key is not None:
         raise ValueError("simulate: got a key, but problem.noise is None and nothing is random; leave out key")
+    dtype, shape = getattr(key, "dtype", None), np.shape(key)
+    typed = dtype is not None and jax.dtypes.issubdtype(dtype, jax.dtypes.prng_key)
+    if key is not None and not (typed and shape == ()) and not (dtype == np.uint32 and len(shape) == 1):
+        given = f"an array of shape {shape} and type {dtype}" if dtype is not None else repr(key)
+        raise ValueError(f"simulate: key is {given}, wanted one random key: key=jax.random.key(0), or another seed")
 
 
 def _probe(loop: Loop, x0: Any) -> None:
@@ -303,12 +340,26 @@ def _probe(loop: Loop, x0: Any) -> None:
         if function is None:
             continue
         try:
-            found = jax.eval_shape(lambda *a, function=function: jnp.asarray(function(*a)), *arguments)
+            found = jax.eval_shape(functools.partial(_array, function, name), *arguments)
         except jax.errors.JAXTypeError as error:
             raise ValueError(
                 f"simulate: {name} cannot be traced: use jnp.where instead of if, and jnp instead of numpy"
             ) from error
+        if jnp.issubdtype(found.dtype, jnp.complexfloating):
+            raise ValueError(f"simulate: {name} returned complex numbers, expected real ones, shape {wanted}")
         if found.shape != wanted:
             raise ValueError(
                 f"simulate: {name} returned shape {found.shape}, expected {wanted}, for x0 of shape {x0.shape}"
             )
+
+
+def _array(function: Callable, name: str, *arguments: Any) -> jax.Array:
+    """What the function returns, as an array; refuses what is none."""
+    result = function(*arguments)
+    try:
+        return jnp.asarray(result)
+    except jax.errors.JAXTypeError:  # a tracer where NumPy or Python wants a number
+        raise
+    except (TypeError, ValueError):
+        what = "None; is its return missing?" if result is None else f"a {type(result).__name__}"
+        raise ValueError(f"simulate: {name} returned {what}, expected an array of numbers") from None

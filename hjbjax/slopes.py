@@ -13,7 +13,7 @@ p, q, r, s, the slope from below is
 
 c = (.1, .6, .3); the slope from above is its mirror image. At a kink the order is that of the best of three stencils
 of order 3. These slopes are scaled by the range of V over the width of the box, so that ε = 10⁻⁶ has no unit. Beyond
-an end the value is continued quadratically; across it the slope is zero, as in every scheme here. The terms stand
+an end the value is continued quadratically; across a wall the slope is zero, as in every scheme here. The terms stand
 so that XLA makes one loop of them and keeps no array beside the result. Source: G.-S. Jiang and D. Peng, Weighted ENO
 schemes for Hamilton–Jacobi equations, SIAM J. Sci. Comput. 21.
 """
@@ -31,18 +31,18 @@ EPSILON = 1e-6  # of a squared slope over the typical one: what counts as equall
 
 
 def eno2(values: jax.Array, grid: Grid) -> list[tuple[jax.Array, jax.Array]]:
-    """The slopes from above and from below along every axis, each of shape (*grid); zero across an edge."""
+    """The slopes from above and from below along every axis, each of shape (*grid); zero across a wall."""
     result = []
     for axis in range(grid.ndim):
         far_down, down, up, far_up = _differences(values, grid, axis, 2, 1 / grid.spacing(axis))
         bend = up - down
         above, below = up - _smaller(bend, far_up - up) / 2, down + _smaller(bend, down - far_down) / 2
-        result.append(_inside(above, below, grid, axis))
+        result.append(stencil.stopped(above, below, grid, axis))
     return result
 
 
 def weno5(values: jax.Array, grid: Grid) -> list[tuple[jax.Array, jax.Array]]:
-    """The slopes from above and from below along every axis, each of shape (*grid); zero across an edge."""
+    """The slopes from above and from below along every axis, each of shape (*grid); zero across a wall."""
     extent = jax.lax.stop_gradient(jnp.max(values) - jnp.min(values))
     extent = jnp.where(extent > 0, extent, 1)
     result = []
@@ -50,13 +50,8 @@ def weno5(values: jax.Array, grid: Grid) -> list[tuple[jax.Array, jax.Array]]:
         typical = extent / (grid.hi[axis] - grid.lo[axis])
         steps = _differences(values, grid, axis, 3, 1 / (grid.spacing(axis) * typical))
         above, below = typical * _weighted(*steps[:0:-1]), typical * _weighted(*steps[:-1])
-        result.append(_inside(above, below, grid, axis))
+        result.append(stencil.stopped(above, below, grid, axis))
     return result
-
-
-def _inside(above: jax.Array, below: jax.Array, grid: Grid, axis: int) -> tuple[jax.Array, jax.Array]:
-    upper, lower = stencil.on_edge(grid, axis, 1), stencil.on_edge(grid, axis, -1)
-    return jnp.where(upper, 0, above), jnp.where(lower, 0, below)
 
 
 def _smaller(a: jax.Array, b: jax.Array) -> jax.Array:

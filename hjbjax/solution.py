@@ -7,14 +7,13 @@ max(upper − V, V − lower).
 """
 
 import dataclasses
-import math
-import textwrap
+from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax import files
+from hjbjax import files, screen
 from hjbjax.files import Expected, FileError
 from hjbjax.grid import Grid
 from hjbjax.interpolation import between, between_defined, nearest, query, slopes_between
@@ -25,7 +24,6 @@ from hjbjax.stretching import Sinh
 __all__ = ["FileError", "Solution", "SolveError", "Status", "load"]
 
 FORMAT, VERSION = "hjbjax.Solution", 1
-WIDTH = 100  # columns of the printed screen
 KINDS: dict[str, tuple[type, ...]] = {  # what a file's header holds, as JSON has it
     "code": (int,),
     "steps": (int,),
@@ -38,11 +36,14 @@ KINDS: dict[str, tuple[type, ...]] = {  # what a file's header holds, as JSON ha
 
 
 class SolveError(RuntimeError):
-    """A solve that did not converge: the ``message`` says how it ended, ``.solution`` is what there is."""
+    """A solve that did not converge: the ``message`` says how it ended, ``.solution`` is what there is.
 
-    def __init__(self, message: str, solution: Any = None):
+    ``.solutions`` are those of all lanes of a batch, the finished ones among them.
+    """
+
+    def __init__(self, message: str, solution: Any = None, solutions: Sequence[Any] = ()):
         super().__init__(message)
-        self.solution = solution
+        self.solution, self.solutions = solution, tuple(solutions)
 
 
 @node(static=("discrete", "discrete_disturbance"), host=("residuals", "stats", "message"))
@@ -61,6 +62,8 @@ class Solution:
       isaacs_gap: the largest min-max minus max-min over the nodes, in cost units per unit time, in a game.
       reached: the nodes from which the target can be reached, bool (*grid); ``None`` means all.
       times: shape (k,) when marched; value and policy then have a leading axis.
+      cut: at how many nodes of each end of the box the optimal drift is cut off, shape (n, 2), lower and upper; when
+        marched, at each kept time, (k, n, 2). Zero at ends that are not projected; ``None`` where it was not counted.
       discrete: whether the controls are enumerated, so that a mean of two need not be admissible.
       discrete_disturbance: the same of the disturbances.
       residuals: one number a step; host level.
@@ -85,6 +88,7 @@ class Solution:
     isaacs_gap: Any = None
     reached: Any = None
     times: Any = None
+    cut: Any = None
     discrete: bool = False
     discrete_disturbance: bool = False
     residuals: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
@@ -218,6 +222,7 @@ class Solution:
             "grid": {
                 "shape": grid.shape,
                 "periodic": grid.periodic,
+                "edges": grid.edges,
                 "names": grid.names,
                 "stretch": [s and [float(s.strength), float(s.center)] for s in grid.stretch or ()],
             },
@@ -246,7 +251,7 @@ class Solution:
     def __str__(self) -> str:
         if is_traced(self) or np.ndim(self.code):
             return repr(self)
-        return _screen(self)
+        return screen.show(self)
 
 
 def load(path: Any) -> Solution:
@@ -274,6 +279,7 @@ def _plan(header: dict) -> dict[str, Expected]:
         "enclosure": Expected(((2, 2),)),
         "reached": Expected((shape, lead + shape), (np.bool_,)),
         "residuals": Expected((many,)),
+        "cut": Expected(((*lead, len(shape), 2),), (np.int64, np.int32)),
         **({} if marched is None else {"times": Expected((lead,), optional=False)}),
     }
 
@@ -282,8 +288,9 @@ def _rebuild(header: dict, arrays: dict[str, np.ndarray]) -> Solution:
     about = header["grid"]
     stretch = tuple(pair and Sinh(*pair) for pair in about["stretch"])
     grid = Grid(
-        arrays.pop("lo"), arrays.pop("hi"), tuple(about["shape"]), about["periodic"], tuple(about["names"]), stretch
-    )
+        arrays.pop("lo"), arrays.pop("hi"), tuple(about["shape"]), about["periodic"], tuple(about["names"]), stretch,
+        about.get("edges", "projected"),
+    )  # fmt: skip
     for name, kinds in KINDS.items():
         if type(header[name]) not in kinds:
             raise FileError(f"its header has {name} = {header[name]!r:.60}, wanted {kinds[0].__name__}")
@@ -309,58 +316,3 @@ def _check_query(solution: Solution, name: str, values: Any, trailing: int, wher
             f"ask one at a time, as in jax.vmap(lambda solution, x: solution.{name}(x))"
         )
     return (where[0] if marched else None), where[-1]
-
-
-def _screen(solution: Solution) -> str:
-    """The printed screen: at most 14 lines; what is not known is left out."""
-    stats, grid = solution.stats, solution.grid
-    axes = " x ".join(name + " (periodic)" * flag for name, flag in zip(grid.names, grid.periodic or (), strict=True))
-    last = "" if solution.residual is None else f", last residual {solution.residual:.3g}"
-    reached = 1.0 if solution.reached is None else float(np.mean(np.asarray(solution.reached)))
-    compiling = f", and {_number(stats['compile_seconds'])} to check and compile" if "compile_seconds" in stats else ""
-    dtype = stats.get("dtype") or np.asarray(solution.value).dtype
-    rows = {
-        "grid": f"{axes}: {' x '.join(map(str, grid.shape))} = {grid.size:,} nodes",
-        "times": "" if solution.times is None else str(np.size(solution.times)),
-        "method": ", ".join(str(stats[name]) for name in ("method", "scheme") if name in stats),
-        "steps": f"{int(solution.steps)}{last}",
-        "error": _certified(solution),
-        "reached": f"{_percent(reached)} of the nodes" if reached < 1 else "",
-        "isaacs gap": "" if solution.isaacs_gap is None else _number(solution.isaacs_gap),
-        "seconds": f"{_number(stats['seconds'])}{compiling}" if "seconds" in stats else "",
-        "memory": _bytes(stats["bytes"]) if "bytes" in stats else "",
-        "device": f"{stats['device']}, {dtype}" if "device" in stats else str(dtype),
-    }
-    head = textwrap.wrap(f"{solution.status.name}: {solution.message or solution.status.message}", WIDTH)
-    lines = head if len(head) < 4 else [*head[:2], _one_line(" ".join(head[2:]))]
-    return "\n".join(lines + [f"  {name:10}  {_one_line(text)}" for name, text in rows.items() if text])
-
-
-def _certified(solution: Solution) -> str:
-    """The certified error and what certifies it, or why nothing does."""
-    error, tol = solution.error, solution.stats.get("tol")
-    what = "no certificate" if error is None else f"at most {error:.3g}"
-    asked = "" if error is None or tol is None else f" (tol {_number(tol)})"
-    why = solution.stats.get("certificate")
-    return what + asked + (f": {why}" if why else "")
-
-
-def _one_line(text: str) -> str:
-    text = " ".join(text.split())
-    return text if len(text) <= WIDTH else text[: WIDTH - 4] + " ..."
-
-
-def _number(value: Any) -> str:
-    return f"{float(value):.3g}" if np.isreal(value) and np.ndim(value) == 0 else str(value)
-
-
-def _percent(share: float) -> str:
-    """Rounded down to a tenth, so that 100 % is all and nothing else."""
-    return f"{math.floor(1000 * share) / 10:.1f} %"
-
-
-def _bytes(count: Any) -> str:
-    count, unit = float(count), 0
-    while count >= 1000 and unit < 4:
-        count, unit = count / 1000, unit + 1
-    return f"{count:.3g} {('bytes', 'kB', 'MB', 'GB', 'TB')[unit]}"

@@ -6,22 +6,35 @@ same iteration runs with a fixed method and none of that, and its value is diffe
 
 import contextlib
 import dataclasses
-import math
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax import checks, iteration, memory, nested, sensitivity, survey
+from hjbjax import (
+    admissibility,
+    arguments,
+    checks,
+    faults,
+    iteration,
+    memory,
+    nested,
+    resting,
+    sensitivity,
+    survey,
+    transfer,
+)
 from hjbjax.certificates import Certificate
-from hjbjax.driver import Clock, drive
+from hjbjax.clock import Clock, Stopped, noting_interrupts
+from hjbjax.closures import with_settled_functions
+from hjbjax.driver import drive
 from hjbjax.grid import Grid
-from hjbjax.iteration import Method, Nested, PolicyIteration, ValueIteration
-from hjbjax.preparation import choose, judge, prepare, prepare_on_host
-from hjbjax.problem import Problem
+from hjbjax.iteration import Method, Nested, PolicyIteration, State, Task, ValueIteration
+from hjbjax.preparation import choose, is_constrained, prepare_on_host, prepare_traced
+from hjbjax.problem import Problem, is_discounted
 from hjbjax.pytree import altered, is_traced
-from hjbjax.report import assemble, describe, finish
+from hjbjax.report import assemble, closed, describe, finish, unstarted
 from hjbjax.schemes import Limited, Scheme, Upwind
 from hjbjax.solution import Solution, SolveError
 from hjbjax.status import Status
@@ -29,6 +42,7 @@ from hjbjax.status import Status
 TRACED_STEPS = 10_000
 
 
+@with_settled_functions
 def solve(
     problem: Problem,
     grid: Grid,
@@ -54,11 +68,13 @@ def solve(
       method: ``PolicyIteration(...)`` or ``ValueIteration()``; ``None`` picks by the problem.
       scheme: ``Upwind()``, first order and monotone, or ``Limited()``, second order where the value is smooth.
       tol: bound to reach on |V − V_h|, in cost units, V_h the exact solution on the grid. Where no certificate
-        exists the solution says so, and the bound is on the residual and on the last step.
-      guess: node values to start from, shape (*grid).
+        exists the solution says so, and the bound is on the residual and on the last step; a tube without discount
+        goes on until V no longer changes.
+      guess: node values to start from, shape (*grid); not for a tube without discount, which has many fixed points.
       dtype: ``None`` is float64; ``"float32"`` for memory, with a tolerance that float32 can reach.
       max_steps: at most so many steps.
-      time_limit: at most so many seconds.
+      time_limit: at most so many seconds, checks and compilation included; what cannot be cut, as one compilation or
+        one step, is let come to its end.
       throw: raise when the solve does not converge; otherwise the status says it.
       progress: a progress bar; ``None`` shows it on a terminal after one second.
       max_memory: bytes that the solve may take, instead of what is free.
@@ -70,7 +86,7 @@ def solve(
     Raises:
       ValueError: a question without an answer, or a bad argument.
       MemoryError: a grid that does not fit, before anything is compiled.
-      SolveError: no convergence, with the partial solution as ``.solution``.
+      SolveError: no convergence, be it by Ctrl-C, with the partial solution as ``.solution``.
 
     Example:
       >>> import hjbjax as hjb
@@ -79,38 +95,72 @@ def solve(
       >>> solution.status.name, solution.error <= 1e-3
       ('CONVERGED', True)
     """
-    check_arguments(problem, grid, method, scheme, tol, max_steps, time_limit)
+    check_arguments(problem, grid, method, scheme, tol, max_steps, time_limit, guess)
     if is_traced(problem, grid, guess, tol):
         return _solve_traced(problem, grid, method, scheme, tol, guess, dtype, max_steps)
     kind = as_dtype(dtype)
     check_node_values(guess, grid, "solve: the guess")
+    grid.check_spacings(kind)
     method = method or choose(problem, grid, traced=False)
-    clock = Clock(max_steps or 10**9, math.inf if time_limit is None else time_limit, progress)
-    with jax.enable_x64(kind == np.float64):
+    clock = Clock(max_steps or 10**9, time_limit, progress)
+    with noting_interrupts(clock), jax.enable_x64(kind == np.float64):
         needed = memory.require(problem, grid, method, kind, max_memory)
-        checks.shapes(problem, grid, scheme)
-        survey.values(problem, grid, kind)
-        known = None if guess is None else jnp.asarray(guess, kind)
-        start, shapes = nested.start(problem, grid, method, scheme.chain, tol, known, kind, clock)
-        inner = method.inner if isinstance(method, Nested) else method
-        task, verdict, reached = prepare_on_host(problem, grid, method=inner, scheme=scheme.chain, tol=tol, dtype=kind)
-        state, code, residuals = drive(task, nested.warm(task, start, clock), clock)
-        if isinstance(scheme, Limited):
-            monotone = state.value
-            verdict = dataclasses.replace(verdict, certificate=Certificate.RESIDUAL)
-            task = dataclasses.replace(task, certificate=Certificate.RESIDUAL, scheme=scheme)
-            state, code, residuals = drive(task, monotone, clock)
-        solution = finish(task, state, code, reached, residuals, verdict, grid)
-        if isinstance(scheme, Limited):
-            counted = np.asarray(task.counted)
-            apart = np.abs(np.asarray(state.value)[counted] - np.asarray(monotone)[counted])
-            solution.stats["from_monotone"] = float(np.max(apart, initial=0))
+        with faults.explained(clock, needed, lambda kept: _partial(problem, grid, scheme, kind, kept)):
+            solution = closed(_solve_on_host(problem, grid, method, scheme, tol, guess, kind=kind, clock=clock), clock)
+    solution.stats.setdefault("method", describe(method, problem))
     solution.stats.update(
-        method=describe(method, problem), levels=[*shapes, grid.shape], seconds=clock.stepping,
-        compile_seconds=clock.elapsed() - clock.stepping, bytes=needed, tol=tol,
+        seconds=clock.stepping, compile_seconds=clock.elapsed() - clock.stepping,
+        bytes=needed, tol=tol,
     )  # fmt: skip
-    if throw and code is not Status.CONVERGED:
-        raise SolveError(f"{code.name}: {solution.message}", solution)
+    if throw and solution.status is not Status.CONVERGED:
+        raise SolveError(f"{solution.status.name}: {solution.message}", solution)
+    return solution
+
+
+def _partial(problem: Problem, grid: Grid, scheme: Scheme, kind: Any, kept: Any) -> Solution:
+    """The solution of a run that broke, from the value that was kept, maybe on a coarser grid; else zero."""
+    value = np.broadcast_to(np.zeros((), kind), grid.shape) if kept is None else kept[0]  # takes no memory
+    if value.shape != grid.shape:
+        value = transfer.prolong(value, kept[1], grid)
+    return unstarted(problem, grid, np.asarray(value, kind), scheme, Status.INTERRUPTED)
+
+
+def _solve_on_host(
+    problem: Problem, grid: Grid, method: Method, scheme: Scheme, tol: float, guess: Any, *, kind: Any, clock: Clock
+) -> Solution:
+    """Checks, coarser grids, preparation and steps, in this order, as far as the clock lets them come."""
+    start = None if guess is None else np.asarray(guess, kind)
+    inner = method.inner if isinstance(method, Nested) else method
+    try:
+        checks.shapes(problem, grid, scheme)
+        survey.values(problem, grid, kind, clock)
+        admissibility.values(problem, grid, kind)
+        known = None if start is None else jnp.asarray(start)
+        start, shapes = nested.start(problem, grid, method, scheme.chain, tol, known, kind, clock)
+        task, verdict, reached = prepare_on_host(
+            problem, grid, method=inner, scheme=scheme.chain, tol=tol, dtype=kind, clock=clock
+        )
+    except Stopped as stop:
+        value = np.zeros(grid.shape, kind) if start is None else np.array(start)
+        return unstarted(problem, grid, value, scheme, stop.status)
+    task, verdict, reached, state, code, residuals = nested.settle(task, verdict, reached, start, clock)
+    monotone = None
+    if isinstance(scheme, Limited) and clock.over() is None:
+        higher = dataclasses.replace(task, certificate=Certificate.RESIDUAL, scheme=scheme)
+        better, code, more = drive(higher, state.value, clock)
+        if int(better.step) >= 0:  # else it was stopped before its first look, and the monotone answer stands
+            monotone, task, state, residuals = state.value, higher, better, more
+            verdict = dataclasses.replace(verdict, certificate=Certificate.RESIDUAL)
+    elif isinstance(scheme, Limited):
+        code = clock.over() or code
+    solution = finish(task, state, code, reached, residuals, verdict, grid)
+    solution.stats.update(levels=[*shapes, grid.shape])
+    if type(getattr(task.method, "evaluation", None)) is not type(getattr(inner, "evaluation", None)):
+        solution.stats["method"] = describe(task.method, problem)
+    if monotone is not None:
+        counted = np.asarray(task.counted)
+        apart = np.abs(np.asarray(state.value)[counted] - np.asarray(monotone)[counted])
+        solution.stats["from_monotone"] = float(np.max(apart, initial=0))
     return solution
 
 
@@ -121,15 +171,35 @@ def _solve_traced(
     if isinstance(scheme, Limited):
         raise ValueError("solve: Limited() runs at host level only; inside jit, vmap and grad use Upwind()")
     kind = jnp.result_type(float) if dtype is None else jnp.dtype(dtype)
-    verdict = judge(problem, grid, kind)
     method = method or choose(problem, grid, traced=True)
     if isinstance(method, Nested):
         raise ValueError("solve: Nested(...) runs at host level only; inside jit, vmap and grad use its inner method")
-    task = prepare(problem, grid, method=method, scheme=scheme, tol=tol, dtype=kind, verdict=verdict)
-    start = jnp.zeros(grid.shape, kind) if guess is None else jnp.asarray(guess, kind)
-    frozen, start = jax.lax.stop_gradient((task, start))
+    task, verdict = prepare_traced(problem, grid, method=method, scheme=scheme, tol=tol, dtype=kind)
+    frozen = jax.lax.stop_gradient(task)
+    start = frozen.start() if guess is None else jax.lax.stop_gradient(jnp.asarray(guess, kind))
     state = iteration.run(frozen, iteration.begin(frozen, start), max_steps or TRACED_STEPS)
-    return altered(assemble(task, state, verdict), value=sensitivity.attach(task, state))
+    wrong = jnp.zeros((), bool)
+    if verdict.may_rest:
+        state, wrong = _doubted(frozen, state)
+    solution, value = assemble(task, state, verdict), sensitivity.attach(task, state)
+    wrong |= state.code == Status.NONFINITE
+    value = value * jnp.where(wrong, jnp.nan, 1).astype(value.dtype)  # a derivative drops the code, and is NaN, too
+    return altered(solution, value=jnp.where(task.counted, value, jnp.inf) if task.has_lost else value)
+
+
+def _doubted(task: Task, state: State) -> tuple[State, jax.Array]:
+    """The state, stalled and without bounds where leaving a held rest node would pay: the host alone goes on then."""
+    pays = resting.leaving_pays(
+        task.problem, task.grid, task.rules, task.counted, state.value, scheme=task.scheme.chain
+    )
+    wrong = jnp.any(pays) & (state.code == Status.CONVERGED) & (task.problem.discount == 0)
+    gap, infinite = state.gap, jnp.asarray(jnp.inf, state.value.dtype)
+    gap = dataclasses.replace(
+        gap, below=jnp.where(wrong, 0, gap.below), above=jnp.where(wrong, infinite, gap.above),
+        lift=jnp.where(wrong, infinite, gap.lift), error=jnp.where(wrong, infinite, gap.error),
+    )  # fmt: skip
+    code = jnp.where(wrong, Status.STALLED, state.code).astype(state.code.dtype)
+    return dataclasses.replace(state, gap=gap, code=code), wrong
 
 
 def as_dtype(dtype: Any) -> np.dtype:
@@ -142,36 +212,41 @@ def as_dtype(dtype: Any) -> np.dtype:
 
 
 def check_arguments(
-    problem: Any, grid: Any, method: Any, scheme: Any, tol: Any, max_steps: Any, time_limit: Any
+    problem: Any, grid: Any, method: Any, scheme: Any, tol: Any, max_steps: Any, time_limit: Any, guess: Any = None
 ) -> None:
     """Refuse what no solve can start with; needs no values of the problem's functions."""
     if not isinstance(problem, Problem) or not isinstance(grid, Grid):
         raise TypeError(f"solve: got {type(problem).__name__}, {type(grid).__name__}; wanted a Problem and a Grid")
-    if method is not None and not isinstance(method, (ValueIteration, PolicyIteration, Nested)):
-        raise TypeError(f"solve: method is {method!r}; wanted hjb.PolicyIteration(...) or hjb.ValueIteration()")
-    if not isinstance(scheme, (Upwind, Limited)):
-        raise TypeError(f"solve: scheme is {scheme!r}; wanted hjb.Upwind(...) or hjb.Limited()")
-    if not is_traced(tol) and not _is_positive(tol):
-        raise ValueError(f"solve: tol = {tol!r}; wanted a finite number > 0, in the units of the cost")
-    if max_steps is not None and (isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1):
-        raise ValueError(f"solve: max_steps = {max_steps!r}; wanted a positive integer")
-    if time_limit is not None and not (_is_positive(time_limit) or time_limit == math.inf):
-        raise ValueError(f"solve: time_limit = {time_limit!r}; wanted seconds > 0")
+    if method is not None:
+        kinds = (ValueIteration, PolicyIteration, Nested)
+        arguments.one_of(method, "solve: method", kinds, "hjb.PolicyIteration(...) or hjb.ValueIteration()")
+    arguments.one_of(scheme, "solve: scheme", (Upwind, Limited), "hjb.Upwind(...) or hjb.Limited()")
+    arguments.positive(tol, "solve: tol", "in the units of the cost")
+    if max_steps is not None:
+        arguments.count(max_steps, "solve: max_steps")
+    if time_limit is not None:
+        arguments.positive(time_limit, "solve: time_limit", "in seconds", endless=True)
+    if guess is not None and is_constrained(problem) and is_discounted(problem) is False:
+        raise ValueError(
+            "solve: without discount a stopping_cost or a running_max has many fixed points, and the one sought is "
+            "found from the constraint itself;\nleave out guess, and raise max_steps where they ran out"
+        )
     if problem.terminal_cost is not None:
         raise ValueError("solve: a terminal_cost belongs to a finite horizon; a stationary problem has none")
     if problem.time_dependent:
         raise ValueError("solve: a time-dependent problem has no stationary value; it needs a finite horizon")
 
 
-def _is_positive(number: Any) -> bool:
-    return isinstance(number, (int, float, np.number)) and math.isfinite(number) and bool(number > 0)
-
-
 def check_node_values(values: Any, grid: Grid, name: str) -> None:
     """Refuse what cannot be a value at the nodes; None is none."""
     if values is None:
         return
-    array = np.asarray(values)
+    try:
+        array = np.asarray(values)
+    except ValueError:  # rows of different lengths
+        raise ValueError(
+            f"{name} is {arguments.shown(values)}; wanted real node values of shape {grid.shape}"
+        ) from None
     if array.dtype.kind not in "fiu":
         raise ValueError(f"{name} holds {array.dtype}; wanted real node values of shape {grid.shape}")
     if array.shape != grid.shape:

@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax import bellman, hamiltonian, structure
+from hjbjax import bellman, chain, hamiltonian, structure
 from hjbjax.grid import Grid
 from hjbjax.minimisers import Action
 from hjbjax.players import setting
@@ -46,9 +46,20 @@ def fastest_rate(problem: Problem, grid: Grid, *, scheme: Scheme, dtype: Any, t:
     return rates[0] if len(rates) == 1 else rates[0] + rates[1]
 
 
+def rate(problem: Problem, grid: Grid, u: Action, d: Action, *, scheme: Scheme, dtype: Any, t: Any = 0.0) -> jax.Array:
+    """The rate at which value flows out of each node under given actions, (*grid), per unit time."""
+    parts = halves(problem, grid, dtype)
+    players = [(u, d)] if len(parts) == 1 else [(u, []), ([], d)]
+    rates = [
+        chain.rates(part, grid, *actions, scheme=scheme.chain, dtype=dtype, t=t).total()
+        for part, actions in zip(parts, players, strict=True)
+    ]
+    return sum(rates[1:], start=rates[0])
+
+
 def halves(problem: Problem, grid: Grid, dtype: Any) -> list[Problem]:
     """The problems of the two players where they share components and can be told apart; else the problem itself."""
-    if not problem.is_game:
+    if not problem.is_game or grid.sides("constrained"):  # what is admissible depends on both players' sum
         return [problem]
     how = setting(problem, grid.ndim, dtype)
     if how.decoupled or not how.separable:

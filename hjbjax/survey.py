@@ -13,29 +13,34 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax import chain, correlation, fields, sets
+from hjbjax import chain, correlation, fields, sets, subcell
 from hjbjax.checks import OF_ACTION, STATE_COSTS, call
+from hjbjax.clock import Clock
 from hjbjax.grid import Grid
 from hjbjax.problem import Problem
 
 ACTIONS = 33  # at most so many actions of one player are tried, 9 where both play; ends and middle are among them
+LOOK = 10**7  # nodes times actions between two looks at the clock: about a second of a drift with some sines
 
 
-def values(problem: Problem, grid: Grid, dtype: Any) -> None:
+def values(problem: Problem, grid: Grid, dtype: Any, clock: Clock | None = None) -> None:
     """Refuse what the functions return at the nodes: NaN, an empty target, noise that the chain cannot represent.
 
     Args:
       problem: the problem; one that passed ``checks.shapes``.
       grid: the grid.
       dtype: the floating-point type in which the functions are evaluated.
+      clock: where a limit is looked at on the way, between some actions and others; ``Stopped`` leaves then.
 
     Raises:
       ValueError: with the number of nodes, the first of them and its state, and what to do.
     """
+    clock = clock or Clock()
     actions = _actions(problem)
     with jax.enable_x64(True):
-        if _sound(problem, grid, actions, dtype=np.dtype(dtype)):
+        if _all_sound(problem, grid, actions, np.dtype(dtype), clock):
             return
+        clock.look()
         found = jax.device_get(_survey(problem, grid, actions, dtype=np.dtype(dtype)))
     for name in (*OF_ACTION, "target", *STATE_COSTS):
         if name in found and found[name].count:
@@ -75,13 +80,36 @@ def _thinned(choices: sets.AdmissibleSet | None, most: int) -> np.ndarray:
     return points[np.unique(np.linspace(0, len(points) - 1, min(most, len(points))).round().astype(int))]
 
 
+def _all_sound(problem: Problem, grid: Grid, actions: tuple[Any, Any], dtype: Any, clock: Clock) -> bool:
+    """Whether there is nothing that ``values`` refuses, some actions at a time."""
+    count, some = len(actions[0]), max(1, LOOK // grid.size)
+    for first in range(0, count, some):
+        clock.enter(f"the survey of the nodes, {first} of {count} actions")
+        if not _sound(problem, grid, actions, first, min(first + some, count), dtype=dtype):
+            return False
+    return True
+
+
 @functools.partial(jax.jit, static_argnames=("dtype",))
-def _sound(problem: Problem, grid: Grid, actions: tuple[Any, Any], dtype: Any) -> jax.Array:
-    """Whether there is nothing that ``values`` refuses."""
+def _sound(problem: Problem, grid: Grid, actions: tuple[Any, Any], first: Any, last: Any, dtype: Any) -> jax.Array:
+    """Whether nothing is refused of the actions from ``first`` to before ``last``; with the first, of the state."""
+    amiss = jax.lax.cond(first == 0, lambda: _state_amiss(problem, grid, dtype), lambda: jnp.zeros((), bool))
+    x, tried = grid.components(dtype), jax.tree.map(lambda rows: jnp.asarray(rows, dtype), actions)
+
+    def look(k, amiss):
+        here, (u, d) = jax.lax.optimization_barrier((x, jax.tree.map(lambda rows: rows[k], tried)))  # see _survey
+        bad = _of_action(problem, grid, here, list(u), list(d), dtype).values()
+        return amiss | jnp.any(functools.reduce(jnp.logical_or, bad))
+
+    return ~jax.lax.fori_loop(first, last, look, amiss)
+
+
+def _state_amiss(problem: Problem, grid: Grid, dtype: Any) -> jax.Array:
+    """Whether ``values`` refuses what the functions of the state alone return."""
     x = grid.components(dtype)
     amiss, inside = jnp.zeros((), bool), jnp.ones((), bool)
     if problem.target is not None:
-        distance = jnp.broadcast_to(fields.of_state(problem, problem.target, x, 0.0, dtype), grid.shape)
+        distance = subcell.level(problem, grid, dtype)
         inside = distance <= 0
         amiss |= ~jnp.all(jnp.isfinite(distance)) | ~jnp.any(inside) | jnp.all(inside)
     for name in STATE_COSTS:
@@ -89,14 +117,7 @@ def _sound(problem: Problem, grid: Grid, actions: tuple[Any, Any], dtype: Any) -
         if ingredient is not None:
             relevant = inside if name == "exit_cost" else True
             amiss |= jnp.any(relevant & ~jnp.isfinite(fields.of_state(problem, ingredient, x, 0.0, dtype)))
-
-    def look(amiss, action):
-        here, (u, d) = jax.lax.optimization_barrier((x, action))  # or XLA keeps an array of all nodes per invariant
-        bad = _of_action(problem, grid, here, list(u), list(d), dtype).values()
-        return amiss | jnp.any(functools.reduce(jnp.logical_or, bad)), None
-
-    amiss, _ = jax.lax.scan(look, amiss, jax.tree.map(lambda rows: jnp.asarray(rows, dtype), actions))
-    return ~amiss
+    return amiss
 
 
 @functools.partial(jax.jit, static_argnames=("dtype",))
@@ -106,7 +127,7 @@ def _survey(problem: Problem, grid: Grid, actions: tuple[Any, Any], dtype: Any) 
     found: dict[str, Any] = {}
     inside: Any = True
     if problem.target is not None:
-        distance = jnp.broadcast_to(fields.of_state(problem, problem.target, x, 0.0, dtype), grid.shape)
+        distance = subcell.level(problem, grid, dtype)
         inside = distance <= 0
         found["target"] = _count(~jnp.isfinite(distance), grid)
         found["inside"] = jnp.sum(inside)
@@ -151,12 +172,9 @@ def _of_action(problem: Problem, grid: Grid, x: list, u: list, d: list | None, d
         sigma = fields.components(problem.noise, *problem.arguments(x, u, d, 0.0), dtype=dtype)
         if sigma.ndim < 2:
             bad["negative"] = functools.reduce(jnp.logical_or, (jnp.asarray(entry) < 0 for entry in sigma.flat))
-    if any(i != j for i, j in a):
-        slack = 16 * grid.ndim * jnp.finfo(dtype).eps  # rounding of σσᵀ and of the spacings
-        lacking = (
-            chain.along_axis(a, grid, axis) < -slack * jnp.asarray(a[axis, axis], dtype) for axis in range(grid.ndim)
-        )
-        bad["correlation"] = functools.reduce(jnp.logical_or, lacking)
+    lacking = chain.lacking(a, grid, dtype)
+    if lacking is not None:
+        bad["correlation"] = lacking
     return bad
 
 
@@ -226,25 +244,8 @@ def _not_representable(problem: Problem, grid: Grid, finding: _Finding, actions:
     _, x = _place(grid, finding.first)
     u, d = (rows[finding.action] for rows in actions)
     sigma = np.asarray(problem.diffusion(x, u, d, 0.0), dtype=float)
-    a = sigma @ sigma.T
-    h = np.array([grid.spacing(axis) for axis in range(grid.ndim)], dtype=float)
-    head = (
+    raise ValueError(
         f"noise: correlated noise that the chain cannot represent with non-negative probabilities at "
         f"{_where(problem, grid, finding, actions)}.\n"
-        f"Every axis i needs a_ii/h_i ≥ Σ_j |a_ij|/h_j (a = σσᵀ); here diag a = {_numbers(np.diag(a))}, "
-        f"h = {_numbers(h)}.\n"
-    )
-    wanted = correlation.spacings(a, h)
-    if wanted is None:
-        raise ValueError(
-            head + "No spacing of these axes will do: turn the state's axes so that a becomes (nearly) diagonal, "
-            "or weaken the correlation"
-        )
-    shape = correlation.shape(a, grid, wanted)
-    everywhere = "there" if callable(problem.noise) else "everywhere"
-    if shape is not None:
-        raise ValueError(head + f"Use Grid(..., shape={shape}): representable {everywhere}")
-    raise ValueError(
-        head + f"Choose lo, hi and shape so that the spacings are as {_numbers(wanted / wanted[0])} to one another: "
-        f"representable {everywhere}; with this box no shape near {grid.shape} has that ratio"
+        + correlation.advice(sigma @ sigma.T, grid, everywhere=not callable(problem.noise))
     )

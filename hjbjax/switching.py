@@ -16,7 +16,7 @@ import numpy as np
 
 from hjbjax import first_guess
 from hjbjax.optimality import EMPTY
-from hjbjax.shooting import Found, Limits, attempt, report, unknowns
+from hjbjax.shooting import Found, Limits, attempt, carry_on, report, unknowns
 from hjbjax.status import Status
 from hjbjax.two_point import Closing, Law, TwoPoint, conditions
 
@@ -45,7 +45,9 @@ def switching(ask: TwoPoint, times: np.ndarray, columns: np.ndarray, limits: Lim
     known = Found(mixture, times / times[-1], columns, unknowns(ask, times, columns), Status.CONVERGED)
     for blurred in itertools.chain([known] * trusted, _mixtures(mixture, times, columns, limits.rough)):
         least = TRUSTED if blurred is known else 0.0
+        carry_on(blurred, limits)
         found = _sharpened(ask, blurred, limits, least) if blurred.solved else blurred
+        carry_on(found, limits)
         if found.solved and report(found).status is Status.CONVERGED:
             return found
         if failure is None or (blurred.solved and not failure.solved):
@@ -99,6 +101,7 @@ def _sharpened(ask: TwoPoint, blurred: Found, limits: Limits, least: float) -> F
     fine = np.linspace(0, 1, 2001)
     y = np.stack([np.interp(fine, blurred.s, row) for row in blurred.y])
     order, starts = first_guess.sequence(blurred.ask, fine * blurred.horizon, y, least)
+    carry_on(blurred, limits)
     if len(order) > MOST_ARCS:
         trouble = f"{len(order) - 1} switches: the control chatters, or an arc is singular; this is a smoothed extremal"
         return dataclasses.replace(blurred, code=Status.STALLED, trouble=trouble)

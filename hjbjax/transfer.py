@@ -1,8 +1,8 @@
 """From grid to grid: coarser grids, and values carried to a finer one."""
 
 import dataclasses
+from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -27,15 +27,19 @@ def coarser(grid: Grid) -> Grid | None:
     return dataclasses.replace(grid, shape=tuple(shape))
 
 
-def prolong(values: jax.Array, coarse: Grid, fine: Grid) -> jax.Array:
-    """Multilinear interpolation of node values from one grid on a box to another on the same box, (*fine)."""
+def prolong(values: Any, coarse: Grid, fine: Grid) -> Any:
+    """Multilinear interpolation of node values from one grid on a box to another on the same box, (*fine).
+
+    A JAX array for one of JAX, else NumPy's.
+    """
+    xp: Any = np if isinstance(values, np.ndarray) else jnp
     for axis, count in enumerate(fine.shape):
         if coarse.shape[axis] == count:
             continue
         place = np.arange(count) * (coarse.intervals(axis) / fine.intervals(axis))
         cell = np.minimum(place.astype(int), coarse.intervals(axis) - 1)
-        weight = jnp.asarray((place - cell).reshape([-1 if i == axis else 1 for i in range(fine.ndim)]), values.dtype)
-        below = jnp.take(values, cell, axis=axis)
-        above = jnp.take(values, (cell + 1) % coarse.shape[axis], axis=axis)
+        weight = xp.asarray((place - cell).reshape([-1 if i == axis else 1 for i in range(fine.ndim)]), values.dtype)
+        below = xp.take(values, cell, axis=axis)
+        above = xp.take(values, (cell + 1) % coarse.shape[axis], axis=axis)
         values = (1 - weight) * below + weight * above
     return values

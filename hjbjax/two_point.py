@@ -27,6 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax import pointwise
+from hjbjax.clock import Clock, Stopped
 from hjbjax.pointwise import Rule
 from hjbjax.problem import Problem
 from hjbjax.pytree import node
@@ -249,8 +250,10 @@ def _padded(s: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.append(s, np.full(more, s[-1])), np.concatenate([y, np.repeat(y[:, -1:], more, 1)], 1)
 
 
-def collocate(ask: TwoPoint, s: Any, y: Any, theta: Any, *, tol: float, max_nodes: int) -> Any:
+def collocate(ask: TwoPoint, s: Any, y: Any, theta: Any, *, tol: float, max_nodes: int, clock: Clock) -> Any:
     """SciPy's answer from a first guess; float64 has to be on.
+
+    Every call of the right-hand side looks at the clock; ``Stopped`` brings the last iterate along, (s, y, theta).
 
     Args:
       ask: the boundary-value problem.
@@ -259,16 +262,23 @@ def collocate(ask: TwoPoint, s: Any, y: Any, theta: Any, *, tol: float, max_node
       theta: the first guess of what else is sought.
       tol: on the relative residual of the equations and on the conditions.
       max_nodes: of the mesh.
+      clock: whether to go on.
     """
     from scipy.integrate import solve_bvp
 
     arrays = jax.tree.map(jnp.asarray, ask)
     nothing = np.zeros(0)
+    last = (np.asarray(s), np.asarray(y), np.asarray(theta))
 
     def function(s, y, theta=nothing):
+        nonlocal last
+        if s[0] == 0 and s[-1] == 1:  # else between the nodes of the mesh
+            last = (np.array(s), np.array(y), np.array(theta))
+        clock.look()
         return np.asarray(_rates(arrays, *_padded(s, y), theta))[:, : len(s)]
 
     def function_slopes(s, y, theta=nothing):
+        clock.look()
         by_state, by_theta = (np.array(part)[..., : len(s)] for part in _slopes(arrays, *_padded(s, y), theta))
         return (by_state, by_theta) if len(theta) else by_state
 
@@ -279,8 +289,11 @@ def collocate(ask: TwoPoint, s: Any, y: Any, theta: Any, *, tol: float, max_node
         parts = tuple(np.array(part) for part in _condition_slopes(arrays, first, last, theta))
         return parts if len(theta) else parts[:2]
 
-    with np.errstate(all="ignore"):  # what is not finite is looked for in the answer
-        return solve_bvp(
-            function, ends, s, y, p=theta if len(theta) else None, fun_jac=function_slopes, bc_jac=end_slopes,
-            tol=tol, max_nodes=max_nodes,
-        )  # fmt: skip
+    try:
+        with np.errstate(all="ignore"):  # what is not finite is looked for in the answer
+            return solve_bvp(
+                function, ends, s, y, p=theta if len(theta) else None, fun_jac=function_slopes, bc_jac=end_slopes,
+                tol=tol, max_nodes=max_nodes,
+            )  # fmt: skip
+    except Stopped as stop:
+        raise Stopped(stop.status, last) from None

@@ -97,9 +97,14 @@ plt.show()
 #
 # From rest at one the least time is two: full force towards the origin for one unit of time, then full force back. The
 # run stops on the disc where the exact value is held.
+#
+# Between the nodes the solution's control is a mean, and a mean of full forces is no full force. `greedy_feedback`
+# minimises the Hamiltonian at the state instead; a jumping control is sampled, here every hundredth of a unit. Its path
+# costs what the computed value says, with the early braking of Figure 9.
 
 # %%
-path = hjb.simulate(problem, solution, x0=[1.0, 0.0], duration=4.0)
+feedback = hjb.greedy_feedback(problem, solution)
+path = hjb.simulate(problem, feedback, x0=[1.0, 0.0], duration=4.0, hold=0.01)
 arrival = path.times[-1] + float(np.ravel(hjb.zoo.DoubleIntegrator().arrival_time(path.states[-1]))[0])
 print(f"arrives after {arrival:.3f}; the least time is 2")
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from fractions import Fraction
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +16,7 @@ from hjbjax.bellman import Conditions
 from hjbjax.certificates import Certificate
 from hjbjax.grid import Grid
 from hjbjax.problem import Problem
+from hjbjax.pytree import cast
 from hjbjax.schemes import Upwind
 from hjbjax.sets import Finite
 from hjbjax.solution import Solution
@@ -40,51 +42,58 @@ def measured(kind, problem, grid, value, rules, least_cost, counted, moved):
 def bounds_of(kind, problem, grid, value, rules, least_cost=None, counted=None):
     counted = np.ones(grid.shape, bool) if counted is None else counted
     gap, _ = jax.device_get(measured(kind, problem, grid, value, rules, least_cost, counted, np.inf))
-    return gap, Solution(grid, value, None, enclosure=certificates.enclosure(kind, gap)).bounds
+    return gap, Solution(grid, value, None, enclosure=certificates.enclosure(kind, gap, problem.discount)).bounds
 
 
 def exact_solution(problem, grid, rules, start=0.0):
-    """Howard's iteration over actions and over the branches stop, floor and hold, with dense solves."""
+    """Dense solves: Howard's iteration of who pays, inside that of who may lift the value to the floor.
+
+    Newton's method on max(g, min(ψ, T V)) at once, where one maximises and the other minimises, may cycle: so this is
+    the iteration of Hoffman and Karp.
+    """
     size = grid.size
     x = grid.nodes().reshape(size, grid.ndim)
-    held, given = np.ravel(rules.held), np.ravel(rules.given)
     generators = [chain.generator(problem, grid, np.broadcast_to(u, (*grid.shape, 1))).toarray() for u in POINTS]
     costs = [
         np.zeros(size) if problem.cost is None else np.asarray(jax.vmap(lambda x, u=u: problem.cost(x, u))(x))
         for u in POINTS
     ]
-    value = np.where(held, given, np.ravel(start) if rules.stop is None else np.ravel(rules.stop))
-    choice, branch = np.full(size, -1), np.full(size, -1)
+    floored = np.zeros(size, bool)
+    value = np.where(np.ravel(rules.held), np.ravel(rules.given), np.ravel(start if rules.stop is None else rules.stop))
     for _ in range(200):
-        rates = np.array([c + g @ value - problem.discount * value for c, g in zip(costs, generators, strict=True)])
+        value, ahead = _without_floor(np.array(generators), np.array(costs), problem.discount, rules, floored, value)
+        if rules.floor is None:
+            return value.reshape(grid.shape)
+        gain, slack = np.ravel(rules.floor) - value - ahead, 1e-12 * (1 + np.max(np.abs(value)))
+        after = ~np.ravel(rules.held) & np.where(floored, gain >= -slack, gain > slack)
+        if np.array_equal(after, floored):
+            return value.reshape(grid.shape)
+        floored = after
+    raise AssertionError("the oracle does not converge")
+
+
+def _without_floor(generators, costs, discount, rules, floored, value):
+    """Howard's iteration over actions and stopping where the floor is held, and what min(ψ, T V) − V is left."""
+    size, here = len(value), np.arange(len(value))
+    held = np.ravel(rules.held) | floored
+    given = np.where(np.ravel(rules.held), np.ravel(rules.given), 0 if rules.floor is None else np.ravel(rules.floor))
+    stop = np.full(size, np.inf) if rules.stop is None else np.ravel(rules.stop)
+    choice = np.full(size, -1)
+    for _ in range(200):
+        rates = costs + generators @ value - discount * value
         # keep the incumbent unless the gain is real, so that the iteration ends
         new = np.argmin(rates, axis=0)
-        better = rates[new, np.arange(size)] < rates[choice, np.arange(size)] - 1e-11 * (1 + np.max(np.abs(value)))
-        new = np.where((choice < 0) | better, new, choice)
-        pace = np.array([problem.discount - g[np.arange(size), np.arange(size)] for g in generators])[
-            new, np.arange(size)
-        ]
-        step = rates[new, np.arange(size)] / np.where(pace > 0, pace, 1)
-        where = np.where(held, 3, 0)
-        if rules.stop is not None:
-            where = np.where((where == 0) & (np.ravel(rules.stop) - value < step - 1e-12), 1, where)
-        if rules.floor is not None:
-            ahead = np.where(where == 1, np.ravel(rules.stop) - value, step)
-            where = np.where((where != 3) & (np.ravel(rules.floor) - value > ahead + 1e-12), 2, where)
-        matrix, right = np.zeros((size, size)), np.zeros(size)
-        for i in range(size):
-            if where[i] == 0:
-                matrix[i] = -generators[new[i]][i]
-                matrix[i, i] += problem.discount
-                right[i] = costs[new[i]][i]
-            else:
-                matrix[i, i] = 1
-                right[i] = {1: rules.stop, 2: rules.floor, 3: rules.given}[where[i]].ravel()[i]
-        value_new = np.linalg.solve(matrix, right)
-        done = np.max(np.abs(value_new - value)) <= 1e-12 * (1 + np.max(np.abs(value)))
-        value, choice, branch = value_new, new, where
+        better = rates[new, here] < rates[choice, here] - 1e-11 * (1 + np.max(np.abs(value)))
+        choice = np.where((choice < 0) | better, new, choice)
+        pace = discount - generators[choice, here, here]
+        step = rates[choice, here] / np.where(pace > 0, pace, 1)
+        ends = held | (stop - value < step - 1e-12)
+        matrix = np.where(ends[:, None], np.eye(size), discount * np.eye(size) - generators[choice, here])
+        after = np.linalg.solve(matrix, np.where(held, given, np.where(ends, stop, costs[choice, here])))
+        done = np.max(np.abs(after - value)) <= 1e-12 * (1 + np.max(np.abs(value)))
+        value = after
         if done:
-            return value.reshape(grid.shape), branch.reshape(grid.shape)
+            return value, np.minimum(stop - value, step)
     raise AssertionError("the oracle does not converge")
 
 
@@ -106,7 +115,7 @@ def discounted(rng, kind, n, with_rules):
 def test_the_discounted_bound_contains_the_exact_solution(n, kind, with_rules, seed):
     rng = np.random.default_rng(seed)
     problem, grid, rules = discounted(rng, kind, n, with_rules)
-    exact, _ = exact_solution(problem, grid, rules)
+    exact = exact_solution(problem, grid, rules)
     noise = rng.choice([0.0, 1e-6, 1.0]) * rng.normal(size=grid.shape)
     value = np.asarray(rules.impose(exact + noise))
     gap, (lower, upper) = bounds_of(Certificate.ADDITIVE, problem, grid, value, rules)
@@ -147,7 +156,7 @@ def test_the_undiscounted_bound_contains_the_exact_solution(n, kind, seed):
     rules = Conditions(held, np.where(held, rng.uniform(0, 1, grid.shape), 0))
     steps = np.minimum(np.arange(len(held)), np.arange(len(held))[::-1])  # steep: its greedy policy is proper
     start = np.broadcast_to(1e3 * steps.reshape(-1, *[1] * (n - 1)), grid.shape)
-    exact, _ = exact_solution(problem, grid, rules, start)
+    exact = exact_solution(problem, grid, rules, start)
     assert np.all(exact >= 0)
     least = 0.3 + (grid.nodes() - grid.lo) @ slope
     deep = rng.choice([0.0, 5.0])  # exits that pay move the whole value
@@ -211,6 +220,38 @@ def test_no_bound_where_the_theorem_says_nothing():
     free, _ = bounds_of(Certificate.MULTIPLICATIVE, problem, grid, 0.9 * exact, rules, np.array([1.0, 1, 0, 1, 1]))
     assert np.isinf(free.error)
     assert certificates.enclosure(Certificate.NONE, free) is None
+
+
+def test_where_the_value_is_flat_rounding_certifies_nothing():
+    """r = L at a node that no action improves; a least cost that is larger by rounding leaves 1 − ρ = 2e-16."""
+    problem, grid, rules, exact = minimum_time()
+    least = np.full(5, 1 + np.finfo(float).eps)
+    flat, (_, upper) = bounds_of(Certificate.MULTIPLICATIVE, problem, grid, 0 * exact, rules, least)
+    assert np.isinf(flat.above)
+    assert np.isinf(flat.error)
+    assert np.all(np.isinf(upper))
+    single = cast((problem, grid, np.zeros(5), rules, np.full(5, 1 + 1e-6)), np.float32)
+    flat, _ = bounds_of(Certificate.MULTIPLICATIVE, *single)
+    assert flat.above.dtype == np.float32
+    assert np.isinf(flat.error)
+
+
+@given(seed=SEEDS)
+def test_lifted_bounds_are_rounded_outwards(seed):
+    """Beside (V + lift) · factor − lift without rounding, at and near the lowest exit cost −lift."""
+    rng = np.random.default_rng(seed)
+    lift = float(10.0 ** rng.uniform(-9, 9) * rng.choice([0.0, 1.0], p=[0.1, 0.9]))
+    below, above = float(rng.choice([1.0, rng.uniform(0, 1)])), float(10.0 ** rng.choice([0.0, rng.uniform(0, 7.8)]))
+    value = np.append(-lift, -lift * (1 - 10.0 ** rng.uniform(-16, 0, 20)))
+    gap = certificates.Gap(*(np.asarray(number) for number in (below, above, lift, 0.0, 0.0)))
+    enclosure = certificates.enclosure(Certificate.MULTIPLICATIVE, gap)
+    lower, upper = Solution(Grid([0.0], [1.0], (21,)), value, None, enclosure=enclosure).bounds
+    for v, low, high in zip(value, lower, upper, strict=True):
+        raised = Fraction(v) + Fraction(lift)
+        assert Fraction(low) <= raised * Fraction(below) - Fraction(lift) <= Fraction(v)
+        assert Fraction(v) <= raised * Fraction(above) - Fraction(lift) <= Fraction(high)
+    assert np.max(np.abs(lower[0] - value[0])) <= 2e-15 * lift
+    assert np.max(np.abs(upper[0] - value[0])) <= 2e-15 * lift * above
 
 
 @pytest.mark.parametrize("kind", list(Certificate))

@@ -133,7 +133,7 @@ def test_shapes_needs_no_memory():
 
 def test_an_endless_cost_is_refused_with_what_would_end_it():
     with pytest.raises(ValueError, match="no finite solution: discount = 0") as caught:
-        checks.ill_posed(Problem(drift, controls=U), has_rest=False)
+        checks.ill_posed(Problem(drift, controls=U), has_rest=False, grid=GRID)
     message = str(caught.value)
     assert "discount > 0" in message
     assert "target" in message
@@ -149,4 +149,4 @@ def test_an_endless_cost_is_refused_with_what_would_end_it():
     ],
 )
 def test_what_ends_an_endless_cost(ingredients, has_rest):
-    checks.ill_posed(Problem(drift, controls=U, **ingredients), has_rest=has_rest)
+    checks.ill_posed(Problem(drift, controls=U, **ingredients), has_rest=has_rest, grid=GRID)

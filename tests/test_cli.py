@@ -521,6 +521,31 @@ def test_problems_of_every_kind_give_four_files(words):
     assert "CONVERGED" in result.stdout
 
 
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs a disk that is full")
+@pytest.mark.parametrize("words", [["list"], ["--version"]])
+def test_output_that_cannot_be_written(words):
+    with open("/dev/full", "w") as full:
+        result = subprocess.run(
+            [sys.executable, "-m", "hjbjax", *words], stdout=full, stderr=subprocess.PIPE, text=True, timeout=120
+        )
+    assert result.returncode == 5
+    assert result.stderr == "hjbjax: the output could not be written: No space left on device\n"
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs a disk that is full")
+@pytest.mark.parametrize(("words", "code"), [(["list"], 5), (["lst"], 2)])
+def test_nobody_hears_the_refusal(words, code):
+    with open("/dev/full", "w") as full:
+        result = subprocess.run([sys.executable, "-m", "hjbjax", *words], stdout=full, stderr=full, timeout=120)
+    assert result.returncode == code
+
+
+def test_a_reader_that_has_seen_enough():
+    command = f"{sys.executable} -m hjbjax list | head -n 1"
+    result = subprocess.run(command, shell=True, capture_output=True, text=True, timeout=120)
+    assert (result.stdout.count("\n"), result.stderr) == (1, "")
+
+
 def test_a_real_process(folder):
     command = [sys.executable, "-m", "hjbjax", "solve", "stochastic-lq", "--shape", "41", "--json"]
     first = subprocess.run(command, capture_output=True, text=True, env=environment(), timeout=300)

@@ -130,6 +130,18 @@ def test_what_cannot_be_written(tmp_path):
         example().save(tmp_path, force=True)
 
 
+@pytest.mark.parametrize("name", [None, 5, 2.5, ["run.npz"], "a\0b", b"a\0b"])
+def test_what_is_no_name_of_a_file(name):
+    for done, ask in (("written", example().save), ("read", load)):
+        with pytest.raises(FileError, match=f"cannot be {done}: (it is no path|there is a null byte)"):
+            ask(name)
+
+
+def test_bytes_and_paths_are_names(tmp_path):
+    example().save(os.fsencode(tmp_path / "run.npz"))
+    assert_same(load(os.fsencode(tmp_path / "run.npz")), example())
+
+
 @pytest.mark.parametrize("call", ["fsync", "replace"])
 def test_a_full_disk_leaves_the_old_file_and_no_other(tmp_path, monkeypatch, call):
     path = tmp_path / "run.npz"
@@ -157,10 +169,14 @@ def test_ctrl_c_while_writing_leaves_nothing(tmp_path, monkeypatch):
 
 
 def test_bytes_are_on_the_disk_before_the_name_moves(tmp_path, monkeypatch):
-    calls, fsync, replace = [], os.fsync, os.replace
+    calls, fsync, replace, link = [], os.fsync, os.replace, os.link
     monkeypatch.setattr(os, "fsync", lambda handle: (calls.append("fsync"), fsync(handle))[1])
     monkeypatch.setattr(os, "replace", lambda a, b: (calls.append("replace"), replace(a, b))[1])
+    monkeypatch.setattr(os, "link", lambda a, b: (calls.append("link"), link(a, b))[1])
     example().save(tmp_path / "run.npz")
+    assert calls[:2] == ["fsync", "link"]
+    calls.clear()
+    example().save(tmp_path / "run.npz", force=True)
     assert calls[:2] == ["fsync", "replace"]
 
 

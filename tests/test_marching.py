@@ -263,20 +263,53 @@ def test_a_moving_obstacle_by_hand():
     assert errors[-1] < 0.01
 
 
-def test_costs_and_drifts_that_change_in_time():
-    """ẋ = cos t on a circle, L = sin t: V = sin(x + sin T) + 1 − cos T."""
-    problem = hjb.Problem(
-        lambda t, x, u: jnp.cos(t) * jnp.ones(1),
-        lambda t, x, u: jnp.sin(t),
-        terminal_cost=lambda t, x: jnp.sin(x[0]),
-        time_dependent=True,
-    )
-    grid = hjb.Grid([0.0], [2 * np.pi], (60,), (True,))
-    solution = hjb.march(problem, grid, 2.0, scheme=hjb.Weno5(), times=[0.0, 1.0, 2.0])
-    x = np.asarray(grid.axis(0))
+CHANGING = hjb.Problem(  # on a circle V = sin(x + sin T) + 1 − cos T
+    lambda t, x, u: jnp.cos(t) * jnp.ones(1),
+    lambda t, x, u: jnp.sin(t),
+    noise=lambda t, x, u: jnp.sin(t),
+    terminal_cost=lambda t, x: jnp.sin(x[0]),
+    time_dependent=True,
+)
+
+
+CIRCLE = hjb.Grid([0.0], [2 * np.pi], (60,), (True,))
+
+
+def changing(x, t, horizon=2.0):
+    """The wave is carried by ∫ cos and loses exp(−∫ sin²/2)."""
+    lost = np.exp(-(horizon - t - (np.sin(2 * horizon) - np.sin(2 * t)) / 2) / 4)
+    return lost * np.sin(x + np.sin(horizon) - np.sin(t)) + np.cos(t) - np.cos(horizon)
+
+
+def test_costs_drifts_and_noise_that_change_in_time():
+    solution = hjb.march(CHANGING, CIRCLE, 2.0, scheme=hjb.Weno5(), times=[0.0, 1.0, 2.0])
+    x = np.asarray(CIRCLE.axis(0))
     for value, t in zip(solution.value, solution.times, strict=True):
-        exact = np.sin(x + np.sin(2.0) - np.sin(t)) + np.cos(t) - np.cos(2.0)
-        np.testing.assert_allclose(value, exact, rtol=0, atol=2e-5)
+        np.testing.assert_allclose(value, changing(x, t), rtol=0, atol=5e-4)
+
+
+def growth(t):
+    """How fast the chain lets exp(i x) grow, forward in the time that is left: complex, per unit time."""
+    h, f, a = CIRCLE.spacing(0), np.cos(t), np.sin(t) ** 2
+    e = np.maximum(a, h * np.abs(f))  # central differences where they are monotone
+    up, down = (e + h * f) / (2 * h * h), (e - h * f) / (2 * h * h)
+    return up * (np.exp(1j * h) - 1) + down * (np.exp(-1j * h) - 1)
+
+
+def test_implicit_steps_take_what_changes_at_the_time_of_their_result():
+    """Mode by mode by hand, (1 − Δt λ(t)) ŵ = v̂ and + Δt sin t; and order one against endlessly short steps."""
+    x, errors = np.asarray(CIRCLE.axis(0)), []
+    fine = np.linspace(0, 2, 200_001)
+    limit = np.imag(np.exp(np.trapezoid(growth(fine), fine) + 1j * x)) + 1 - np.cos(2.0)
+    for count in (20, 40, 80):
+        wave, paid, dt = 1.0 + 0j, 0.0, 2.0 / count
+        for k in range(count):
+            t = 2.0 - (k + 1) * dt
+            wave, paid = wave / (1 - dt * growth(t)), paid + dt * np.sin(t)
+        value = hjb.march(CHANGING, CIRCLE, 2.0, method=hjb.Implicit(), step=dt).value[0]
+        np.testing.assert_allclose(value, np.imag(wave * np.exp(1j * x)) + paid, rtol=0, atol=2e-6)
+        errors.append(np.max(np.abs(value - limit)))
+    assert order_of(errors) == pytest.approx(1, abs=0.15)
 
 
 # --- laws ---
@@ -298,6 +331,7 @@ def with_waves(problem, k, extra=0.0, floor=None, cost=None):
     )
 
 
+@pytest.mark.filterwarnings("ignore:the optimal drift leaves")  # of random systems some do
 @settings(max_examples=25)
 @given(SEEDS)
 def test_upwind_never_leaves_the_range_of_the_data(seed):

@@ -1,6 +1,10 @@
 """The estimate before a solve, what is free, and the largest grid that fits."""
 
+import functools
+import os
 import re
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -102,6 +106,104 @@ def test_what_is_free_is_known_here():
     free = memory.available()
     assert isinstance(free, int)
     assert free > 10**6
+
+
+def group(folder, **numbers):
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, number in numbers.items():
+        (folder / f"memory.{name}").write_text(f"{number}\n")
+
+
+V1 = ("limit_in_bytes", "usage_in_bytes")
+
+
+@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize("limited", ["own", "above", "mount", "none"])
+def test_what_control_groups_leave(tmp_path, version, limited):
+    """The least of the groups from the process's own up to the mount; read files are given up."""
+    process, mount = tmp_path / "proc", tmp_path / "cgroup"
+    process.mkdir()
+    lines = {1: "9:cpu,cpuacct:/job\n4:memory:/job/step\n0::/\n", 2: "0::/job/step\n"}
+    (process / "cgroup").write_text(lines[version])
+    top = mount / "memory" if version == 1 else mount
+    most, used = V1 if version == 1 else ("max", "current")
+    unlimited = 2**63 - 4096 if version == 1 else "max"
+    folders = {"mount": top, "above": top / "job", "own": top / "job" / "step"}
+    for name, folder in folders.items():
+        group(folder, **{most: 4 * 10**9 if name == limited else unlimited, used: 10**9})
+        (folder / "memory.stat").write_text("anon 5\ninactive_file 250000000\n")
+    left = memory._of_groups(process, mount)
+    if limited == "none":
+        assert left is None or left > 2**62
+    else:
+        assert left == 3 * 10**9 + 250_000_000
+
+
+def test_groups_that_cannot_be_read(tmp_path):
+    assert memory._of_groups(tmp_path / "no", tmp_path) is None
+    (tmp_path / "cgroup").write_text("nonsense\n0::/gone/with/it\n")
+    group(tmp_path, max=10**6)  # without what is used
+    assert memory._of_groups(tmp_path, tmp_path) is None
+
+
+def test_the_least_of_all_counts(monkeypatch):
+    for machine, process, groups, least in ((9, 5, 7, 5), (9, None, 7, 7), (9, None, None, 9), (9, -1, None, 0)):
+        for name, free in (("machine", machine), ("process", process), ("groups", groups)):
+            monkeypatch.setattr(memory, f"_of_{name}", lambda free=free: free)
+        assert memory.available() == least
+    monkeypatch.setattr(memory, "_of_machine", lambda: None)
+    monkeypatch.setattr(memory, "_of_process", lambda: None)
+    assert memory.available() is None
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="limits are POSIX's")
+def test_a_limit_on_the_address_space_refuses_a_grid():
+    program = """
+import resource
+import hjbjax as hjb
+from hjbjax import memory
+used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+memory.available()  # starts JAX
+resource.setrlimit(resource.RLIMIT_AS, (used + 4 * 10**9,) * 2)
+free = memory.available()
+assert 0 <= free <= 4 * 10**9, free
+problem = hjb.Problem(lambda x, u: u[0] - x, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), discount=1.0)
+try:
+    hjb.solve(problem, hjb.Grid([-1.0] * 2, [1.0] * 2, (9000, 9000)))
+except MemoryError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
+    assert "81,000,000 nodes need about" in done.stdout, done.stderr
+
+
+@pytest.mark.parametrize("bad", [0, -5, float("nan"), float("inf"), "lots", True, [10**9], 2**64 * 1j])
+def test_limits_that_are_no_number_of_bytes(bad):
+    problem = hjb.Problem(lambda x, u: u[0] - x, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), discount=1.0)
+    for grid in (hjb.Grid([-1.0], [1.0], (11,)), square(11)):
+        for door, question in ((hjb.solve, problem), (functools.partial(hjb.march, horizon=1.0), problem)):
+            with pytest.raises(ValueError, match=r"max_memory = .*; wanted a finite number > 0, in bytes"):
+                door(question, grid, max_memory=bad)
+        with pytest.raises(ValueError, match=r"max_memory = "):
+            hjb.solve_batch([problem], grid, max_memory=bad)
+
+
+def test_hardly_any_memory():
+    with pytest.raises(MemoryError, match="Not even two points an axis would fit in 2-D"):
+        memory.require(PROBLEM, square(10), METHODS[0], np.float64, 7.5)
+
+
+def test_six_dimensions_are_refused_with_a_way_out():
+    """35^6 nodes: what XLA would take is between 120 and 190 GB, by its own account of the loop on 9^6 nodes."""
+    question = hjb.Problem(lambda x, u: jnp.concatenate([x[1:], u]), cost, hjb.Box([-1.0], [1.0]), discount=1.0)
+    grid = hjb.Grid([-1.0] * 6, [1.0] * 6, (35,) * 6)
+    with pytest.raises(MemoryError) as caught:
+        hjb.solve(question, grid, max_memory=64 * 10**9)
+    message = str(caught.value)
+    assert 120 <= float(re.search(r"about (\d+) GB", message)[1]) <= 190
+    assert len(message.splitlines()) <= 6
+    for word in ("1,838,265,625 nodes", "64 GB are free", "float32", "hjb.pontryagin", "N = ", "max_memory="):
+        assert word in message
 
 
 def test_nobody_says_what_is_free(monkeypatch):

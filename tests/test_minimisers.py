@@ -9,6 +9,8 @@ import pytest
 from hypothesis import given, settings
 from systems import SEEDS
 
+import hjbjax as hjb
+from hjbjax import hamiltonian, players
 from hjbjax.minimisers import UNROLL, enumerate_actions, refine
 
 NODES = 6
@@ -104,3 +106,41 @@ def _refined(centre, tilt, sign):
     best = enumerate_actions(objective, points, sign)
     value, action, _ = refine(objective, best, [0.5, 0.5], lambda action: [jnp.clip(u, -1, 1) for u in action], sign)
     return value, action
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_moves_one_by_one_are_those_of_a_round(sign):
+    """What is compiled once and made many times finds the same action, to the last bit."""
+    points = jnp.asarray(np.stack(np.meshgrid(*[np.linspace(-1, 1, 5)] * 2), -1).reshape(-1, 2))
+    peak = jnp.linspace(-0.9, 0.9, 7)
+
+    def objective(action):
+        return sign * ((action[0] - peak) ** 2 + jnp.abs(action[1] - peak**2) + 0.3 * action[0] * action[1]), []
+
+    def found(weight):
+        best = enumerate_actions(objective, points, sign, weight=weight, most=weight)
+        return refine(objective, best, [0.5, 0.5], lambda a: [jnp.clip(u, -1, 1) for u in a], sign, weight=weight)
+
+    together, apart = found(1), found(100)
+    for one, other in zip(jax.tree.leaves(together), jax.tree.leaves(apart), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_a_search_inside_a_search_is_compiled_in_few_places():
+    """With all samples of the inner player written out at every place of the outer one XLA got 4,958 lines."""
+    problem = hjb.Problem(
+        lambda x, u, d: jnp.maximum(u, 0) + jnp.maximum(d, 0) * jnp.cos(x),
+        lambda x, u, d: x @ x + 0.1 * u @ u,
+        hjb.Box([-1.0], [1.0]),
+        disturbances=hjb.Box([-1.0], [1.0]),
+        discount=1.0,
+    )
+    grid = hjb.Grid([-1.0], [1.0], (11,))
+    how = players.setting(problem, 1, jnp.float32)
+    assert not how.control.exact
+    assert not how.disturbance.exact
+
+    def best(value):
+        return hamiltonian.optimise(hamiltonian.local(problem, grid, value, scheme=hjb.Upwind()), how)
+
+    assert len(jax.jit(best).lower(jnp.zeros(11)).as_text().splitlines()) < 1500

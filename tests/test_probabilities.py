@@ -173,6 +173,7 @@ def test_the_exit_time_from_a_square():
     assert order_of(errors) == pytest.approx(2, abs=0.15)
 
 
+@pytest.mark.filterwarnings("ignore:the optimal drift leaves")
 @given(SEEDS)
 @settings(max_examples=10)
 def test_uncontrolled_chains_are_absorbed_as_linear_algebra_says(seed):
@@ -203,6 +204,7 @@ def test_the_reflection_principle():
     assert order_of(errors) == pytest.approx(2, abs=0.15)
 
 
+@pytest.mark.filterwarnings("ignore:the optimal drift leaves")
 def test_a_target_that_runs_along_with_the_drift():
     """In the frame of dx = dt + dw the target x ≤ t stands still; only the first-order upwind slopes tell."""
     problem = hjb.Problem(lambda t, x, u: jnp.ones(1), noise=1.0, time_dependent=True)

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 import hjbjax as hjb
 from hjbjax import chain, proper
+from hjbjax.clock import Clock
 
 MOVES = np.array([[-1.0], [0.0], [1.0]])
 GRID = hjb.Grid([0.0], [7.0], (8,))
@@ -103,14 +104,33 @@ def test_paths_followed_on_the_device_are_those_of_the_search(monkeypatch, surel
     searched = reached(problem, PLANE, held, surely)
     monkeypatch.setattr(proper, "LARGE", 0)
     monkeypatch.setattr(proper, "LONG", long)
-    proper._spread.clear_cache()
     np.testing.assert_array_equal(reached(problem, PLANE, held, surely), searched)
     with jax.enable_x64(True):
-        jumps = proper._open_jumps(problem, PLANE, None, hjb.Upwind(), np.dtype(np.float64))
-        found, settled = proper._spread(jnp.asarray(held), jumps, PLANE)
-    proper._spread.clear_cache()
-    assert bool(settled) == (long > 0)
-    assert np.array_equal(found, proper._searched(held, jumps, PLANE)) == (long > 0)
+        jumps = proper._open_jumps(problem, PLANE, None, scheme=hjb.Upwind(), dtype=np.dtype(np.float64), clock=Clock())
+        found = proper._spread(held, jumps, PLANE, Clock(), long * sum(PLANE.shape))
+    if long:
+        np.testing.assert_array_equal(found, proper._searched(held, jumps, PLANE))
+    else:
+        assert found is None
+
+
+@pytest.mark.parametrize("surely", [True, False])
+def test_how_often_the_clock_is_looked_at_changes_no_node(monkeypatch, surely):
+    """Some actions, and some jumps of the paths, at a time; where no host could list the jumps, to their very end."""
+    problem = hjb.Problem(turning, None, hjb.Finite(MOVES), noise=[0.5, 0.0], discount=1.0)
+    held = np.zeros(PLANE.shape, bool)
+    held[3, 4] = True
+    searched = reached(problem, PLANE, held, surely)
+    phases, enter = [], Clock.enter
+    monkeypatch.setattr(Clock, "enter", lambda clock, phase: (phases.append(phase), enter(clock, phase)))
+    monkeypatch.setattr(proper, "LARGE", 0)
+    monkeypatch.setattr(proper, "LOOK", 2 * PLANE.size)
+    monkeypatch.setattr(proper, "LONG", 0)
+    monkeypatch.setattr(proper, "SEARCHABLE", 0)
+    monkeypatch.setattr(proper, "_searched", None)
+    np.testing.assert_array_equal(reached(problem, PLANE, held, surely), searched)
+    assert sum("jumps of the chain" in phase for phase in phases) >= len(MOVES) // 2
+    assert sum("paths of" in phase for phase in phases) > 2
 
 
 def test_certain_arrival_is_more_than_possible_arrival():

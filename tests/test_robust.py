@@ -231,8 +231,13 @@ def test_brackets_that_do_not_hold_the_level():
 
 
 def test_a_march_that_runs_out_of_time_is_no_verdict():
-    with pytest.raises(hjb.SolveError, match=r"hinf_level: at gamma = 0.9"):
+    with pytest.raises(hjb.SolveError, match=r"hinf_level: at gamma = 0.9") as caught:
         hjb.hinf_level(LAG.game(), cube(1, 21), 0.6, 0.9, time_limit=1e-9)
+    level = caught.value.solution
+    assert (level.status, level.gamma, level.bracket) == (hjb.Status.TIME_LIMIT, np.inf, (0.0, np.inf))
+    assert [trial.reason for trial in level.trials] == ["out of time"]
+    assert level.solution is level.trials[0].solution
+    assert "out of time" in str(level)
 
 
 def test_the_marches_of_one_gamma_share_its_time(monkeypatch):

@@ -267,9 +267,26 @@ def test_a_key_is_one_brownian_path_whatever_the_steps():
     assert np.all(np.abs(other - ends[0]) > 1e-6)
 
 
+@pytest.mark.parametrize("kind", ["additive", "multiplicative"])
+def test_variance_of_an_ornstein_uhlenbeck_path_over_4000_keys(kind):
+    """dx = −θx dt + σ dw, or σx dw: eight states a path, so that 3 % are four standard deviations of the estimate."""
+    theta, sigma = 0.25, 0.5
+    noise = sigma if kind == "additive" else lambda x, u: sigma * x
+    problem = Problem(lambda x, u: -theta * x, noise=noise)
+    with jax.enable_x64(True):
+        times, keys = jnp.linspace(0.0, 1.0, 6), jax.random.split(jax.random.key(15), 4000)
+        run = jax.jit(jax.vmap(lambda key: rollout(problem, None, jnp.ones(8), times, key=key).states))
+        x = np.asarray(run(keys))[:, 1:]
+        times = np.asarray(times)[1:]
+    decay = np.exp(-2 * theta * times)
+    exact = {"additive": sigma**2 * (1 - decay) / (2 * theta), "multiplicative": decay * np.expm1(sigma**2 * times)}
+    np.testing.assert_allclose(x.var(axis=(0, 2)), exact[kind], rtol=0.03)
+    np.testing.assert_allclose(x.mean(axis=(0, 2)), np.sqrt(decay), rtol=0.02)
+
+
 def test_faults_end_the_path_with_a_status_and_a_warning():
     bang = Problem(lambda x, u: x**2, one)
-    with pytest.warns(UserWarning, match="no longer finite"):
+    with pytest.warns(UserWarning, match="no finite state"):
         path = simulate(bang, None, [1.0], 2.0, steps=20)  # 1/(1 − t)
     assert path.status == PathStatus.NONFINITE
     assert np.all(np.isfinite(path.states))
@@ -313,6 +330,17 @@ BOX2 = Grid([-1.0, -1.0], [1.0, 1.0], (3, 3))
         (PLAIN, toward_zero, [1.0], {"key": 0}, "nothing is random"),
         (PLAIN, toward_zero, [1.0], {"disturbance": toward_zero}, "disturbances is None"),
         (NOISY, toward_zero, [1.0], {}, "give key"),
+        (NOISY, toward_zero, [1.0], {"key": "a"}, r"key is 'a', wanted one random key: key=jax.random.key\(0\)"),
+        (NOISY, toward_zero, [1.0], {"key": True}, "key is True"),
+        (NOISY, toward_zero, [1.0], {"key": 1.5}, "key is 1.5"),
+        (NOISY, toward_zero, [1.0], {"key": 2**70}, "fits 64 bits"),
+        (NOISY, toward_zero, [1.0], {"key": jax.random.split(jax.random.key(0), 3)}, r"shape \(3,\)"),
+        (PLAIN, lambda x: None, [1.0], {}, "feedback returned None; is its return missing"),
+        (PLAIN, lambda x: "left", [1.0], {}, "feedback returned a str"),
+        (PLAIN, lambda x: {"u": x}, [1.0], {}, "feedback returned a dict"),
+        (PLAIN, lambda x: 1j * x, [1.0], {}, "feedback returned complex"),
+        (Problem(integrator, lambda x, u: None, UNIT), toward_zero, [1.0], {}, "cost returned None"),
+        (GAME, toward_zero, [1.0], {"disturbance": lambda x: None}, "disturbance returned None"),
         (GAME, toward_zero, [1.0], {}, "give disturbance="),
         (GAME, toward_zero, [1.0], {"disturbance": lambda x: x[0]}, r"disturbance returned shape \(\)"),
         (PLAIN, lambda x: x[0], [1.0], {}, r"feedback returned shape \(\), expected \(1,\)"),

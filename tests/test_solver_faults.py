@@ -67,6 +67,7 @@ def asked(monkeypatch):
         return run(task, state, until)
 
     monkeypatch.setattr(driver, "run", watched)
+    monkeypatch.setattr(driver, "_run_kept", watched)  # where Python is called on the way
     return steps
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
-from hjbjax import zoo
+from hjbjax import sensitivity, zoo
 from hjbjax.pytree import node
 
 TRACES = []
@@ -201,3 +201,60 @@ def test_the_gradient_is_that_of_the_policy_that_was_found():
         plain = jax.jit(value)
         difference = float(plain(1.0 + step) - plain(1.0 - step)) / (2 * step)
     assert slope == pytest.approx(difference, rel=1e-5)
+
+
+# --- linear solves that sweeps do not bring to their end ---
+
+
+def spun_drift(rate, x, u):
+    return jnp.stack([x[1], -rate * x[0] + 0.01 * u[0]])
+
+
+def spun_cost(x, u):
+    return x @ x
+
+
+def spun_stop(scale, x):
+    return scale * (2 + x[0])
+
+
+def spun_value(numbers):
+    """V of an oscillator that hardly anything damps: paths go round for 1/discount, or until they are stopped."""
+    rate, discount, scale = numbers
+    problem = hjb.Problem(
+        jax.tree_util.Partial(spun_drift, rate), spun_cost, hjb.Box([-1.0], [1.0]), discount=discount,
+        stopping_cost=jax.tree_util.Partial(spun_stop, scale),
+    )  # fmt: skip
+    return hjb.solve(problem, hjb.Grid([-2.0, -2.0], [2.0, 2.0], (9, 9)), tol=1e-9).value[5, 6]
+
+
+@pytest.mark.filterwarnings("ignore:the optimal drift leaves")
+def test_the_gradient_is_right_where_sweeps_gain_little():
+    """Without a stop that counts, and with one: rate, discount and stopping cost move the value."""
+    at = np.array([[1.0, 1e-3, 1e6], [1.3, 1e-4, 200.0]])
+    with jax.enable_x64(True):
+        found = jax.jit(jax.vmap(jax.grad(spun_value)))(at)
+    for row, slopes in zip(at, np.asarray(found), strict=True):
+        for j, slope in enumerate(slopes):
+            step = 1e-4 * row[j] * np.eye(3)[j]
+            rise = spun_value(row + step) - spun_value(row - step)
+            assert slope == pytest.approx(rise / (2 * step[j]), rel=1e-4, abs=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore:the optimal drift leaves")
+def test_a_derivative_that_is_not_found_is_nan_and_the_value_stays(monkeypatch):
+    monkeypatch.setattr(sensitivity, "STEPS", 1)
+    numbers = np.array([1.0, 1e-3, 1e6])
+    with jax.enable_x64(True):
+        value, ahead = jax.jit(lambda at: jax.jvp(spun_value, (at,), (jnp.ones(3),)))(numbers)
+    assert value == pytest.approx(spun_value(numbers), rel=1e-9)
+    assert np.isnan(ahead)
+
+
+def test_a_constraint_that_rounds_otherwise_is_the_same_constraint():
+    psi = jnp.asarray(np.array([0.3, 1e9, -2.0, 0.0]), jnp.float32)
+    one_off = jnp.nextafter(psi, jnp.float32(-1e30))
+    assert np.all(sensitivity._same(psi, one_off)[:3])
+    assert np.all(sensitivity._same(one_off, psi)[:3])
+    assert np.all(sensitivity._same(psi, psi))
+    assert not np.any(sensitivity._same(psi * 1.001 - 1e-3, psi))

@@ -38,7 +38,7 @@ def refusal(kind, *words, question=None, grid=GRID, **options):
 # --- arguments of solve ---
 
 
-@pytest.mark.parametrize("tol", [0.0, -1e-3, float("nan"), float("inf"), [1e-3, 1e-3]])
+@pytest.mark.parametrize("tol", [0.0, -1e-3, float("nan"), float("inf"), [1e-3, 1e-3], True, "1e-3"])
 def test_tolerance(tol):
     refusal(ValueError, "tol", repr(tol), "> 0", tol=tol)
 
@@ -48,7 +48,7 @@ def test_max_steps(count):
     refusal((ValueError, TypeError), "max_steps", repr(count), "positive integer", max_steps=count)
 
 
-@pytest.mark.parametrize("seconds", [0, -1.0, float("nan")])
+@pytest.mark.parametrize("seconds", [0, -1.0, float("nan"), True, "60"])
 def test_time_limit(seconds):
     refusal((ValueError, TypeError), "time_limit", repr(seconds), "> 0", time_limit=seconds)
 
@@ -74,6 +74,8 @@ def test_guess_of_another_shape():
     error = refusal(ValueError, "guess", "(8, 9)", "(8, 10)", guess=np.zeros((8, 9)))
     assert "transposed" not in str(error)
     refusal(ValueError, "guess", "()", guess=1.0)
+    refusal(ValueError, "the guess is [[1], [1, 2]]", "(8, 10)", guess=[[1], [1, 2]])
+    refusal(ValueError, "guess", "(8, 10)", guess=["high"])
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])

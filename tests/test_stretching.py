@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from jax.tree_util import Partial
 
 import hjbjax as hjb
 from hjbjax import zoo
+from hjbjax.pytree import altered
 
 strengths = st.floats(0.1, 8.0)
 centers = st.floats(0.0, 1.0)
@@ -74,6 +76,81 @@ def test_correlated_noise_wants_equal_spacings():
     grid = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (9, 9), stretch=(hjb.Sinh(2.0), None))
     with pytest.raises(ValueError, match="equal spacings"):
         hjb.solve(problem, grid)
+
+
+SHEAR = np.array([[0.5, 0.0], [0.3, 0.4]])
+GATHERED = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (9, 9), stretch=(hjb.Sinh(2.0), None))
+
+
+def calm(x, *rest):
+    return -x
+
+
+def shear(x, *rest):
+    return jnp.asarray(SHEAR)
+
+
+def shear_by_time(t, x, u):
+    return (1 + t) * jnp.asarray(SHEAR)
+
+
+def product(x, *rest):
+    return x[0] * x[1]
+
+
+@pytest.mark.parametrize("noise", [SHEAR, shear], ids=["matrix", "function"])
+@pytest.mark.parametrize("ask", ["solve", "batch", "march", "jit", "generator", "matrix", "arrays", "density"])
+def test_correlated_noise_is_refused_by_the_shape_that_it_returns(ask, noise):
+    problem = hjb.Problem(calm, product, noise=noise, discount=1.0)
+    asked = {
+        "solve": lambda: hjb.solve(problem, GATHERED),
+        "batch": lambda: hjb.solve_batch([problem], GATHERED),
+        "march": lambda: hjb.march(problem, GATHERED, 0.1),
+        "jit": lambda: jax.jit(lambda rate: hjb.solve(altered(problem, discount=rate), GATHERED).value)(1.0),
+        "generator": lambda: hjb.chain.generator(problem, GATHERED),
+        "matrix": lambda: hjb.chain.matrix(problem, GATHERED),
+        "arrays": lambda: hjb.chain.transition_arrays(problem, GATHERED),
+        "density": lambda: hjb.chain.stationary_density(problem, GATHERED),
+    }
+    with pytest.raises(ValueError, match=r"correlated noise.*equal spacings"):
+        asked[ask]()
+
+
+def test_correlated_noise_of_the_time_is_refused_too():
+    problem = hjb.Problem(lambda t, x, u: -x, noise=shear_by_time, terminal_cost=lambda t, x: x[0], time_dependent=True)
+    with pytest.raises(ValueError, match="equal spacings"):
+        hjb.march(problem, GATHERED, 0.1)
+
+
+def test_one_state_has_nothing_to_correlate():
+    """σ of shape (1, 2) on a stretched axis is the noise √(.09 + .16)."""
+    grid = hjb.Grid([-1.0], [1.0], (9,), stretch=(hjb.Sinh(2.0),))
+    values = [
+        hjb.solve(hjb.Problem(calm, lambda x, u: x @ x, noise=noise, discount=1.0), grid, tol=1e-9).value
+        for noise in (np.array([[0.3, 0.4]]), 0.5)
+    ]
+    np.testing.assert_allclose(*values, rtol=1e-12)
+
+
+@settings(max_examples=15)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_no_rate_is_negative_on_stretched_axes(seed):
+    """Where drift and diffusion of the chain cancel, rounding left −3e-17."""
+    rng = np.random.default_rng(seed)
+    grid = hjb.Grid([-1.0, -2.0], [1.3, 0.7], (9, 7), stretch=(hjb.Sinh(rng.uniform(0.5, 3)), hjb.Sinh(1.8)))
+    u = hjb.Finite(rng.normal(size=(3, 2)))
+    matrix = rng.normal(size=(2, 2))
+    for noise in (None, rng.uniform(0, 0.3)):
+        problem = hjb.Problem(Partial(rotated, matrix), product, u, noise=noise, discount=1.0)
+        probabilities = hjb.chain.transition_arrays(problem, grid)[1]
+        assert probabilities.data.min() >= 0
+        policy = np.broadcast_to(u.points[0], (*grid.shape, 2))
+        generator = hjb.chain.generator(problem, grid, policy)
+        assert (generator - np.diag(generator.diagonal())).min() >= 0
+
+
+def rotated(matrix, x, u):
+    return matrix @ x + u
 
 
 def bang_bang_errors(scheme, epsilon, stretch, counts):

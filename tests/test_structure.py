@@ -25,7 +25,25 @@ def verdict(function):
         return "affine"
     if result.separable_quadratic_in([0, 1]):
         return "separable"
-    return "nonlinear" if any(entry is None for entry in result.entries) else "quadratic"
+    return "nonlinear" if any(isinstance(t, frozenset) for entry in result.entries for t in entry) else "quadratic"
+
+
+@jax.custom_jvp
+def own_rule(u):
+    """u, with the derivative zero."""
+    return 1.0 * u
+
+
+own_rule.defjvp(lambda primals, tangents: (own_rule(*primals), 0 * tangents[0]))
+
+
+@jax.custom_vjp
+def own_transpose(u):
+    """u, with the derivative zero in reverse mode."""
+    return 1.0 * u
+
+
+own_transpose.defvjp(lambda u: (own_transpose(u), None), lambda _, bar: (0 * bar,))
 
 
 VERDICTS = {
@@ -63,10 +81,20 @@ VERDICTS = {
     "rounding": (lambda x, u: u.astype(int) * 1.0, "nonlinear"),
     "relu": (lambda x, u: jax.nn.relu(u), "nonlinear"),
     "softplus of a scalar": (lambda x, u: jax.nn.softplus(u[0]), "nonlinear"),
+    "stop_gradient": (lambda x, u: jax.lax.stop_gradient(u), "nonlinear"),
+    "derivative rule of its own": (lambda x, u: own_rule(u), "nonlinear"),
+    "transposed rule of its own": (lambda x, u: own_transpose(u), "nonlinear"),
+    "own rules of the state": (
+        lambda x, u: own_rule(x)[:2] * u + own_transpose(x)[0] + jax.lax.stop_gradient(x[1]) + jax.nn.relu(x[2]),
+        "affine",
+    ),
+    "sixteen bits": (lambda x, u: u.astype(jnp.float16), "nonlinear"),
+    "thirty-two bits": (lambda x, u: u.astype(jnp.float32), "affine"),
     "comparison": (lambda x, u: (u[0] > x[0]) * 1.0, "nonlinear"),
 }
 
 
+@pytest.mark.filterwarnings("ignore:the primitive 'custom_vjp_call'")
 @pytest.mark.parametrize("name", VERDICTS)
 def test_verdict(name):
     function, expected = VERDICTS[name]
@@ -78,7 +106,7 @@ def test_what_has_no_rule_is_constant_only_where_the_control_has_no_part():
     def solved(x, u):
         return jnp.stack([jnp.sort(x)[0] + u[0], jnp.arange(4.0)[u[0].astype(int)]])
 
-    assert dependence(solved).entries == (frozenset({(), (0,)}), None)
+    assert dependence(solved).entries == (frozenset({(), (0,)}), frozenset({frozenset({0})}))
 
 
 @pytest.mark.parametrize("name", [name for name, (_, expected) in VERDICTS.items() if expected == "affine"])
@@ -92,7 +120,7 @@ def test_what_is_called_affine_has_no_curvature(name):
 def test_which_entries_each_input_drives():
     result = dependence(lambda x, u: jnp.stack([x[1], u[0] + x[0], u[1] ** 2, jnp.abs(u[0])]))
     assert result.driven_by([0]) == (1, 3)
-    assert result.driven_by([1]) == (2, 3)  # of what is nonlinear nothing is known
+    assert result.driven_by([1]) == (2,)
     assert not result.free_of([0])
     assert dependence(lambda x, u: x * u[0]).free_of([1])
 
@@ -104,6 +132,19 @@ def test_squares_are_found_input_by_input():
     assert result.affine_in([1])
     assert not result.affine_in([0])
     assert not result.separable_quadratic_in([0, 1])
+
+
+def test_what_is_no_polynomial_is_known_by_its_inputs():
+    result = dependence(lambda x, u: jnp.stack([jnp.abs(u[0]) + u[1] ** 2, jnp.sin(u[0]) * u[1], u[1] + x[0]]))
+    assert not result.affine_in([0])
+    assert not result.affine_in([1])
+    assert result.has_square([1])
+    assert not result.has_square([0])
+    assert result.crosses([0], [1])
+    mixed = dependence(lambda x, u: jnp.abs(u[0]) + u[1])
+    assert mixed.affine_in([1])
+    assert mixed.separable_quadratic_in([1])
+    assert not mixed.crosses([0], [1])
 
 
 def test_inputs_are_numbered_through_both_players():

@@ -14,7 +14,7 @@ all under the names of the command line.
 from hjbjax.zoo.entry import Entry
 from hjbjax.zoo.finance import Merton, merton, merton_exact
 from hjbjax.zoo.geometric import Angle, CarWithTrailers, OneWay, Pomet, Unicycle
-from hjbjax.zoo.landing import Lander, moon_landing, moon_landing_exact
+from hjbjax.zoo.landing import Lander, moon_landing, moon_landing_burn, moon_landing_exact
 from hjbjax.zoo.linear_quadratic import (
     LinearScalar,
     double_integrator_lq,
@@ -72,7 +72,9 @@ _ENTRIES = (
         start=(1.0, 0.0),
         duration=8.0,
     ),
-    Entry("manipulator", "raise a planar arm of n links and hold it upright", manipulator, start=(2.0, 0.0)),
+    Entry(
+        "manipulator", "raise a planar arm of n links and hold it upright", manipulator, start=(2.0, 0.0), duration=6.0
+    ),
     Entry(
         "stochastic-lq",
         "hold a linear system near zero against noise",
@@ -88,7 +90,7 @@ _ENTRIES = (
         brownian_exit,
         brownian_exit_exact,
         start=(0.0,),
-        duration=2.0,
+        duration=4.0,
     ),
     Entry(
         "brownian-ball",
@@ -96,7 +98,7 @@ _ENTRIES = (
         brownian_ball,
         brownian_ball_exact,
         start=(0.0, 0.0),
-        duration=2.0,
+        duration=4.0,
     ),
     Entry(
         "zermelo",
@@ -125,6 +127,7 @@ _ENTRIES = (
         moon_landing_exact,
         start=(1.0, 0.0, 1.0),
         duration=2.0,
+        finish=moon_landing_burn,
     ),
     Entry("smooth", "a smooth nonlinear problem made for a known value", smooth, smooth_exact, start=(0.8, 0.5)),
 )
@@ -172,6 +175,7 @@ __all__ = [
     "merton",
     "merton_exact",
     "moon_landing",
+    "moon_landing_burn",
     "moon_landing_exact",
     "pendulum",
     "pendulum_near_upright",

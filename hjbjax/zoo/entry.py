@@ -18,6 +18,9 @@ class Entry:
         the keywords of ``build`` except ``shape``. ``None`` where no answer is known.
       start: the initial state of the picture of a trajectory.
       duration: its length, in units of time.
+      finish: ``finish(**parameters) -> (problem, feedback)``, with the keywords of ``exact``, where the target holds
+        the cost of what follows: the system with its true end, and the exact feedback until there. ``None`` where
+        nothing is to follow.
 
     Example:
       >>> from hjbjax import zoo
@@ -33,6 +36,7 @@ class Entry:
     exact: Callable[..., Callable] | None = None
     start: tuple[float, ...] = ()
     duration: float = 5.0
+    finish: Callable[..., tuple[Any, Any]] | None = None
 
     @property
     def parameters(self) -> dict[str, Any]:

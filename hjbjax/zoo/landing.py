@@ -96,6 +96,14 @@ class Lander:
         """v − v₁: how much faster it may yet fall; 0 where the burn has to begin, below it crashes."""
         return x[1] - self._begin(self._ratio(x), x[2])[1]
 
+    def sinking(self, x: Any) -> Any:
+        """−v: 0 where the rocket stands still, at the end of the burn."""
+        return -x[1]
+
+    def burn(self, x: Any) -> Any:
+        """Full thrust."""
+        return jnp.full(1, self.thrust, jnp.result_type(x))
+
     def ignition(self, x: Any) -> tuple[Any, Any]:
         """When the engine starts, and how long it burns."""
         x = jnp.asarray(x)
@@ -111,7 +119,8 @@ def moon_landing(
 ) -> tuple[Problem, Grid]:
     """Land on the Moon with the least fuel, on [0, 1.5] × [−2, 0.5] × [0.3, 1]; 0 ≤ u ≤ thrust.
 
-    The value is held where a soft landing takes full thrust or more; the grid has to find the coast. Give
+    The value is held where a soft landing takes full thrust or more; the grid has to find the coast, and a path on it
+    ends where the engine starts: ``moon_landing_burn`` goes on from there to the ground. Give
     ``pontryagin`` the end ``terminal=[0, 0, nan]``, and it finds the burn as well. Close to the ceiling, rising, the
     box is left.
 
@@ -130,6 +139,22 @@ def moon_landing(
         exit_cost=answer(lander.fuel),
     )
     return problem, Grid([0.0, -2.0, 0.3], [1.5, 0.5, 1.0], shape, names=("height", "velocity", "mass"))
+
+
+def moon_landing_burn(*, thrust: Any = 2.0, consumption: Any = 0.3, gravity: Any = 1.0) -> tuple[Problem, Any]:
+    """The burn that follows where the grid's problem ends: full thrust until the rocket stands, on the ground.
+
+    Args:
+      thrust: U.
+      consumption: k.
+      gravity: g.
+
+    Returns:
+      The problem, which ends where v = 0, and the feedback.
+    """
+    lander = Lander(thrust, consumption, gravity)
+    problem = Problem(lander.drift, lander.fuel_rate, Box([0.0], [thrust]), target=lander.sinking)
+    return problem, answer(lander.burn)
 
 
 def moon_landing_exact(*, thrust: Any = 2.0, consumption: Any = 0.3, gravity: Any = 1.0) -> Any:

@@ -1,0 +1,130 @@
+"""What the command says in one line, and the words that it takes: numbers, shapes, names."""
+
+import contextlib
+import difflib
+import math
+import os
+import sys
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import click
+
+
+class Failure(click.ClickException):
+    """A refusal or a fault: one line and an exit code."""
+
+    def __init__(self, message: Any, exit_code: int = 2):
+        super().__init__(" ".join(str(message).split()))
+        self.exit_code = exit_code  # type: ignore[misc]
+
+
+class OneLineGroup(click.Group):
+    """A group whose errors are one line on stderr, without the usage block."""
+
+    def main(
+        self,
+        args: Any = None,
+        prog_name: Any = None,
+        complete_var: Any = None,
+        standalone_mode: bool = True,
+        **extra: Any,
+    ) -> Any:
+        """Runs a command and, unless ``standalone_mode`` is off, ends the process with its exit code."""
+        if not standalone_mode:
+            return super().main(args, prog_name, complete_var, False, **extra)
+        try:
+            code = super().main(args, prog_name, complete_var, False, **extra)
+        except click.ClickException as error:
+            say(" ".join(error.format_message().split()))
+            code = error.exit_code
+        except (click.Abort, KeyboardInterrupt):
+            say("interrupted")
+            code = 130
+        except OSError as error:  # what is not a file of ours is standard output: a full disk, a closed pipe
+            code = 5
+            _let_go_of_output()
+            say(f"the output could not be written: {error.strerror or error}")
+        if code == 130 and sys.stdout is sys.__stdout__:  # a process of our own
+            for stream in filter(None, (sys.stdout, sys.stderr)):
+                with contextlib.suppress(OSError):
+                    stream.flush()
+            os._exit(code)  # JAX may still be at work, which the usual exit waits for, or crashes on
+        sys.exit(code if isinstance(code, int) else 0)
+
+
+def say(line: str) -> None:
+    """One line on standard error; the exit code stands even if nobody can read it."""
+    with contextlib.suppress(OSError):
+        click.echo(f"hjbjax: {line}", err=True)
+
+
+def _let_go_of_output() -> None:
+    """Sends what is left in a buffer of standard output nowhere, or the interpreter fails on it again at its end."""
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
+
+
+class Number(click.ParamType):
+    """A finite number above zero; click's own types let NaN and infinity through."""
+
+    name = "number"
+
+    def __init__(self, kind: type = float):
+        self.kind = kind
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
+        """The number, or a usage error."""
+        number = finite(str(value), self.kind)
+        if number is None or number <= 0:
+            self.fail(f"got {value!r}, wanted a {'whole' if self.kind is int else 'finite'} number > 0", param, ctx)
+        return number
+
+
+class Shape(click.ParamType):
+    """Numbers of nodes with an x between them, as in 200x201."""
+
+    name = "NxN"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> tuple[int, ...]:
+        """One integer an axis, or a usage error."""
+        counts = [finite(part, int) for part in str(value).lower().split("x")]
+        if any(count is None or count < 2 for count in counts):
+            self.fail(f"got {value!r}, wanted whole numbers of at least 2, one an axis, as in 200x201", param, ctx)
+        return tuple(counts)
+
+
+class Name(click.ParamType):
+    """One of some names; an unknown one gets the list and the nearest."""
+
+    name = "name"
+
+    def __init__(self, what: str, allowed: Callable[[], Iterable[str]]):
+        self.what, self.allowed = what, allowed
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> str:
+        """The name, or a usage error."""
+        if value not in (names := list(self.allowed())):
+            self.fail(unknown(self.what, value, names), param, ctx)
+        return value
+
+
+def finite(text: str, kind: type) -> Any:
+    """``text`` as a finite number of a kind; ``None`` if it is none."""
+    try:
+        number = kind(text)
+    except ValueError:
+        return None
+    return number if kind is int or math.isfinite(number) else None
+
+
+def unknown(what: str, got: str, allowed: Iterable[str]) -> str:
+    """A refusal of a name, with those that there are and the nearest of them."""
+    names = list(allowed)
+    near = difflib.get_close_matches(got.lower().replace("_", "-"), names, 1) or difflib.get_close_matches(
+        got, names, 1
+    )
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    return f"unknown {what} {got!r}; there are {', '.join(names)}{hint}"

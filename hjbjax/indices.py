@@ -1,0 +1,203 @@
+"""Indices that lie beyond the array they index, found in the jaxpr of a function.
+
+Where NumPy raises, JAX clamps: x[2] of two states is x[1]. An index that is known when a function is traced stands in
+its jaxpr, behind a few operations on integers ("if negative, add the length"). These alone are carried out here, in
+NumPy; whatever depends on the state is unknown, and unknown indices are let pass.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from jax.extend import core as jex
+
+MOST = 10_000  # entries of an array of indices that is looked at
+TURNS = 64  # of a loop of known length that are followed
+
+KNOWN: dict[str, Callable[..., Any]] = {
+    "lt": lambda a, b: a < b,
+    "le": lambda a, b: a <= b,
+    "gt": lambda a, b: a > b,
+    "ge": lambda a, b: a >= b,
+    "eq": lambda a, b: a == b,
+    "ne": lambda a, b: a != b,
+    "add": lambda a, b: a + b,
+    "sub": lambda a, b: a - b,
+    "mul": lambda a, b: a * b,
+    "neg": lambda a: -a,
+    "max": np.maximum,
+    "min": np.minimum,
+    "copy": lambda a: a,
+    "clamp": lambda low, a, high: np.clip(a, low, high),
+    "select_n": lambda which, *cases: np.choose(np.asarray(which, int), cases),
+    "convert_element_type": lambda a, new_dtype, **_: np.asarray(a, new_dtype),
+    "squeeze": lambda a, dimensions: np.squeeze(a, dimensions),
+    "reshape": lambda a, new_sizes, **_: np.reshape(a, new_sizes),
+    "concatenate": lambda *parts, dimension: np.concatenate(parts, dimension),
+    "iota": lambda dtype, shape, dimension, **_: np.asarray(np.indices(shape)[dimension], dtype),
+    "broadcast_in_dim": lambda a, shape, broadcast_dimensions, **_: np.broadcast_to(
+        np.reshape(a, [shape[axis] if axis in broadcast_dimensions else 1 for axis in range(len(shape))])
+        if np.shape(a) == tuple(shape[axis] for axis in broadcast_dimensions)
+        else np.reshape(a, [1] * len(shape)),
+        shape,
+    ),
+}
+
+
+def beyond(closed: jex.ClosedJaxpr, names: Sequence[str] = ()) -> str | None:
+    """The first index of a jaxpr that lies outside its array, in words; ``None`` where there is none.
+
+    Args:
+      closed: the jaxpr.
+      names: what its inputs are called, as in ("x", "u").
+    """
+    labels: list[str | None] = [*names, *(None,) * (len(closed.jaxpr.invars) - len(names))]
+    return _walk(closed.jaxpr, closed.consts, [None] * len(closed.jaxpr.invars), labels)[1]
+
+
+def calls_back(closed: jex.ClosedJaxpr) -> bool:
+    """Whether a jaxpr calls Python while it runs."""
+    return any("callback" in eqn.primitive.name or any(map(calls_back, _inner(eqn))) for eqn in closed.jaxpr.eqns)
+
+
+def _walk(jaxpr: Any, consts: Sequence[Any], inputs: Sequence[Any], labels: Sequence[Any]) -> tuple[list, str | None]:
+    """Known outputs (``None`` for the others), and what was found first."""
+    values = dict(zip(jaxpr.invars, inputs, strict=True))
+    values |= {var: _index(const) for var, const in zip(jaxpr.constvars, consts, strict=False)}
+    called = dict(zip(jaxpr.invars, labels, strict=True))
+
+    def look(var: Any) -> Any:
+        return _index(var.val) if isinstance(var, jex.Literal) else values.get(var)
+
+    for eqn in jaxpr.eqns:
+        known = [look(var) for var in eqn.invars]
+        first = eqn.invars[0] if eqn.invars else None
+        name = None if first is None or isinstance(first, jex.Literal) else called.get(first)
+        if (found := _outside(eqn, known, name)) is not None:
+            return [], found
+        results: Sequence[Any] = [None] * len(eqn.outvars)
+        passed = [None if isinstance(var, jex.Literal) else called.get(var) for var in eqn.invars]
+        inner = _inner(eqn)
+        if eqn.primitive.name == "scan":
+            inner, (results, found) = [], _turns(eqn, known, passed)
+            if found is not None:
+                return [], found
+        for body in inner:
+            fits = len(body.jaxpr.invars) == len(known)  # else a loop or a branch, whose inputs are others
+            arguments = (known, passed) if fits else ([None] * len(body.jaxpr.invars),) * 2
+            outputs, found = _walk(body.jaxpr, body.consts, *arguments)
+            if found is not None:
+                return [], found
+            if fits and len(inner) == 1 and eqn.primitive.name in ("jit", "pjit", "closed_call"):
+                results = outputs
+        if not inner and eqn.primitive.name != "scan":
+            results = _evaluated(eqn, known)
+        values |= dict(zip(eqn.outvars, results, strict=True))
+    return [look(var) for var in jaxpr.outvars], None
+
+
+def _turns(eqn: Any, known: list[Any], labels: list[Any]) -> tuple[list, str | None]:
+    """Known results of a loop, turn by turn as far as its counters are known, and what was found first."""
+    body, length = eqn.params["jaxpr"], eqn.params["length"]
+    fixed = eqn.params["num_consts"]
+    start = fixed + eqn.params["num_carry"]
+    carry, rows = known[fixed:start], known[start:]
+    turns = range(length)[:: -1 if eqn.params["reverse"] else 1]
+    for turn in turns[:TURNS]:
+        inputs = [*known[:fixed], *carry, *(None if row is None else row[turn] for row in rows)]
+        outputs, found = _walk(body.jaxpr, body.consts, inputs, [*labels[:start], *(None for _ in rows)])
+        if found is not None:
+            return [], found
+        carry = outputs[: len(carry)]
+        if all(each is None for each in (*carry, *rows)):
+            break
+    followed = length <= TURNS and any(each is not None for each in carry)
+    return [*(carry if followed else (None,) * len(carry)), *(None for _ in eqn.outvars[len(carry) :])], None
+
+
+def _inner(eqn: Any) -> list[jex.ClosedJaxpr]:
+    """The jaxprs that an equation calls; not the ones that combine two entries of a scatter."""
+    found = []
+    for name, value in eqn.params.items():
+        for each in value if isinstance(value, (tuple, list)) else (value,):
+            if isinstance(each, jex.ClosedJaxpr):
+                found.append(each)
+            elif isinstance(each, jex.Jaxpr) and name != "update_jaxpr":
+                found.append(jex.ClosedJaxpr(each, ()))
+    return found
+
+
+def _index(value: Any) -> Any:
+    """A concrete array of indices as NumPy; ``None`` for anything else."""
+    kind = getattr(value, "dtype", np.asarray(value).dtype if isinstance(value, (bool, int)) else None)
+    if kind is None or np.dtype(kind).kind not in "iub" or np.size(value) > MOST:
+        return None
+    try:
+        return np.asarray(value)
+    except Exception:  # a tracer: of no known value
+        return None
+
+
+def _evaluated(eqn: Any, known: list[Any]) -> list[Any]:
+    """Results of an operation on known integers; ``None`` where it is another, or they are not known."""
+    rule, shape = KNOWN.get(eqn.primitive.name), eqn.outvars[0].aval.shape if eqn.outvars else ()
+    if rule is None or any(value is None for value in known) or np.prod(shape, dtype=float) > MOST:
+        return [None] * len(eqn.outvars)
+    with np.errstate(all="ignore"):
+        return [_index(rule(*known, **eqn.params))]
+
+
+# --- what an equation indexes ---
+
+
+def _outside(eqn: Any, known: list[Any], name: str | None) -> str | None:
+    """What an equation asks for outside its array, in words."""
+    kind, shape = eqn.primitive.name, getattr(eqn.invars[0].aval, "shape", ()) if eqn.invars else ()
+    if kind == "dynamic_slice":
+        columns = dict(enumerate(known[1 : 1 + len(shape)]))
+        sizes = eqn.params["slice_sizes"]
+    elif kind == "dynamic_update_slice":
+        columns, sizes = dict(enumerate(known[2 : 2 + len(shape)])), eqn.invars[1].aval.shape
+    elif kind == "gather" and not _has_stand_in(eqn.params.get("fill_value")):
+        columns, sizes = _columns(known[1], eqn.params["dimension_numbers"].start_index_map), eqn.params["slice_sizes"]
+    elif kind.startswith("scatter"):
+        numbers = eqn.params["dimension_numbers"]
+        columns = _columns(known[1], numbers.scatter_dims_to_operand_dims)
+        sizes = _window(numbers, shape, eqn.invars[2].aval.shape)
+    else:
+        return None
+    for axis, starts in columns.items():
+        last = shape[axis] - sizes[axis]
+        if starts is None or np.size(starts) == 0 or not (np.min(starts) < 0 or np.max(starts) > last):
+            continue
+        start = next(int(k) for k in np.ravel(starts) if not 0 <= k <= last)
+        return _said(name, shape, axis, start, sizes[axis])
+    return None
+
+
+def _has_stand_in(fill: Any) -> bool:
+    """Whether a gather was given a number for what lies outside; NaN is what JAX takes unasked."""
+    return fill is not None and not np.isnan(fill)
+
+
+def _columns(indices: Any, axes: Sequence[int]) -> dict[int, Any]:
+    """The indices along each axis of the array, from the rows of a gather or a scatter."""
+    return {} if indices is None else {axis: np.asarray(indices)[..., k] for k, axis in enumerate(axes)}
+
+
+def _window(numbers: Any, shape: tuple[int, ...], updates: tuple[int, ...]) -> list[int]:
+    """How much of each axis one update of a scatter covers."""
+    single = {*numbers.inserted_window_dims, *getattr(numbers, "operand_batching_dims", ())}
+    widths = iter(updates[axis] for axis in numbers.update_window_dims)
+    return [1 if axis in single else next(widths) for axis in range(len(shape))]
+
+
+def _said(name: str | None, shape: tuple[int, ...], axis: int, start: int, size: int) -> str:
+    count = shape[axis]
+    entry = f"entry {start}" if start >= 0 else f"entry {start - count} (from the end)"
+    if size > 1:
+        entry = f"entries {start} to {start + size - 1}"
+    array = f"an array of shape {shape}" if name is None else f"{name}, whose shape is {shape}"
+    along = f" along axis {axis}" if len(shape) > 1 else ""
+    wanted = f"0 to {count - 1}" if count else "none"
+    return f"{entry} of {array}{along}; there are {wanted}"

@@ -1,0 +1,143 @@
+"""Tubes without discount: of many fixed points between ψ and g every path takes the right one, and goes to its end."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hjbjax as hjb
+
+U = hjb.Box([-1.0], [1.0])
+GRID = hjb.Grid([-3.0], [3.0], (61,))
+X = GRID.axis(0)
+partial = jax.tree_util.Partial
+
+
+def half_speed(x, u):
+    """Beyond |x| = 2 nothing moves."""
+    return jnp.where(jnp.abs(x) < 2, 0.5 * u, 0.0)
+
+
+def ball(radius, x):
+    return jnp.abs(x[0]) - radius
+
+
+def reach(radius):
+    return hjb.reach(half_speed, U, partial(ball, radius))
+
+
+def pulled(x, u):
+    return -x + 0 * u
+
+
+def near_one(radius, x):
+    return jnp.abs(x[0] - 1.0) - radius
+
+
+def avoid(radius):
+    return hjb.avoid(pulled, U, partial(near_one, radius))
+
+
+def reach_avoid(radius):
+    return hjb.reach_avoid(half_speed, U, partial(ball, radius), partial(near_one, 0.25))
+
+
+def exact_reach(radius):
+    """Inside |x| < 2 the set is reached, where V is the least of l, −radius at 0; outside it is l."""
+    return np.where(np.abs(X) < 2 - 1e-9, -radius, np.abs(X) - radius)
+
+
+def exact_avoid(radius):
+    """The path goes from x to 0 and meets all between: the closest that it comes to 1."""
+    return radius - np.maximum(1 - np.maximum(X, 0), 0)
+
+
+CASES = {"reach": (reach, exact_reach), "avoid": (avoid, exact_avoid), "reach_avoid": (reach_avoid, None)}
+
+
+def traced(make, which):
+    """V for radius ½ by transformations: of a number in the problem, of the whole problem, of a batch of numbers."""
+
+    def value(radius):
+        return hjb.solve(make(radius), GRID, tol=1e-9).value
+
+    with jax.enable_x64(True):
+        if which == "jit":
+            return np.asarray(jax.jit(value)(0.5))
+        if which == "jit of the problem":
+            found = jax.jit(lambda problem: hjb.solve(problem, GRID, tol=1e-9))(make(0.5))
+            assert int(found.code) == hjb.Status.CONVERGED
+            return np.asarray(found.value)
+        return np.asarray(jax.vmap(value)(jnp.array([0.4, 0.5]))[1])
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_every_path_to_a_tube_starts_from_its_constraint(name):
+    make, exact = CASES[name]
+    alone = hjb.solve(make(0.5), GRID, tol=1e-9)
+    assert alone.status is hjb.Status.CONVERGED
+    if exact is not None:
+        assert np.allclose(alone.value, exact(0.5), atol=1e-9)
+    together = hjb.solve_batch([make(0.4), make(0.5)], GRID, tol=1e-9)
+    assert np.allclose(together[1].value, alone.value, atol=1e-12)
+    for which in ("jit", "jit of the problem", "vmap"):
+        assert np.allclose(traced(make, which), alone.value, atol=1e-12), which
+
+
+def test_the_derivative_of_a_tube():
+    """V = l outside where nothing moves, and l at the middle inside: both fall as the ball grows."""
+    with jax.enable_x64(True):
+        slope = jax.jacrev(lambda radius: hjb.solve(reach(radius), GRID, tol=1e-9).value)(0.5)
+    assert np.allclose(slope, -1)
+
+
+def free(x, u):
+    return u
+
+
+@pytest.mark.parametrize(
+    ("scale", "nodes", "half"), [(1, 61, 3.0), (1e-3, 61, 3.0), (1e6, 61, 3.0), (1, 4001, 3.0), (1, 401, 0.1)]
+)
+def test_a_tube_goes_to_its_end_whatever_the_units_and_the_spacing(scale, nodes, half):
+    """All of the box is reached: no default tolerance is small beside spacing times slope."""
+
+    def level(x):
+        return scale * (jnp.abs(x[0]) - half / 6)
+
+    grid = hjb.Grid([-half], [half], (nodes,))
+    solution = hjb.solve(hjb.reach(free, U, level), grid)
+    assert solution.status is hjb.Status.CONVERGED
+    assert np.allclose(solution.value, scale * np.min(np.abs(grid.axis(0)) - half / 6), atol=1e-12 * scale)
+
+
+def test_a_tube_with_noise_and_in_single_precision_is_the_limit_of_marching():
+    """Relatives: noise makes V fall for long by little, and float32 knows fewer numbers."""
+    problem = hjb.reach(lambda x, u: 0.3 * u + 0.5, U, lambda x: jnp.abs(x[0] - 1.0) - 0.4, disturbances=None)
+    solution = hjb.solve(problem, GRID)
+    far = hjb.march(problem, GRID, 60.0)
+    assert np.allclose(solution.value, far.value[0], atol=1e-6)
+    single = hjb.solve(problem, GRID, dtype="float32")
+    assert single.status is hjb.Status.CONVERGED
+    assert np.allclose(single.value, solution.value, atol=1e-4)
+
+
+def winding(x, u):
+    """A rotation: the front comes round many times before it has been everywhere."""
+    return jnp.stack([-x[1], x[0]]) + 0.02 * u
+
+
+def test_a_slow_spiral_is_followed_to_its_end():
+    grid = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (21, 21))
+    problem = hjb.reach(
+        winding, hjb.Box([-1.0, -1.0], [1.0, 1.0]), lambda x: jnp.linalg.norm(x - jnp.array([0.5, 0.0])) - 0.2
+    )
+    solution = hjb.solve(problem, grid)
+    further = hjb.march(problem, grid, 50.0, start=solution.value)
+    assert np.max(np.abs(further.value[0] - solution.value)) <= 1e-9
+
+
+@pytest.mark.parametrize("make", [reach, avoid])
+def test_a_guess_between_the_fixed_points_of_a_tube_is_refused(make):
+    """Zero is itself a fixed point, and would stay."""
+    with pytest.raises(ValueError, match="leave out guess"):
+        hjb.solve(make(0.5), GRID, guess=np.zeros(GRID.shape))

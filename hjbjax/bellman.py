@@ -23,6 +23,8 @@ from hjbjax.problem import Problem
 from hjbjax.pytree import node
 from hjbjax.schemes import Scheme
 
+ROUNDING = 8  # units of eps in (Q + β)|V|, below which one action is no better than another
+
 
 @node()
 class Conditions:
@@ -117,6 +119,23 @@ def greedy(
     how = players.setting(problem, grid.ndim, value.dtype)
     here = _around(problem, grid, value, scheme, t, incumbent)
     return _left_over(problem, grid, value, held, *hamiltonian.optimise(here, how))
+
+
+def kept(
+    problem: Problem, grid: Grid, value: jax.Array, held: jax.Array, new: Greedy, old: Greedy, *, scheme: Scheme
+) -> Greedy:
+    """The new policy where it is better by more than rounding, else the old one; without a disturbance.
+
+    From a policy that ends, one improvement after the other then keeps it so: among actions that are worth the same
+    the first one found leads to where its value came from, and another one may go round.
+    """
+    here, u = _around(problem, grid, value, scheme, 0.0, None), list(old.controls)
+    rates = chain.rates(problem, grid, u, [], scheme=scheme.chain, dtype=value.dtype)
+    rounding = ROUNDING * jnp.finfo(value.dtype).eps * (rates.total() + problem.discount) * jnp.abs(value)
+    rate = here.at(u, []) - problem.discount * value
+    stays = ~held & (rate <= new.rate + rounding)
+    controls = (jnp.where(stays, before, after) for before, after in zip(old.controls, new.controls, strict=True))
+    return Greedy(jnp.where(stays, rate, new.rate), tuple(controls), ())
 
 
 def respond(

@@ -33,6 +33,7 @@ SHIFTS = 150  # steps after which there is no shift any more: 1.2¹⁵⁰ is 10�
 HISTORY = 256  # steps whose residuals one chunk can record
 GROWTH = 1e6  # a residual that has grown by this factor over its smallest has diverged
 CLIMB = 100_000  # steps of value iteration without progress: without discount V climbs by L Δt a step for long
+TO_THE_END = (Certificate.NONE, Certificate.BY_DISCOUNT)  # of tubes: V falls or climbs until nothing moves
 PATIENCE = 10  # steps without progress of a residual that is rounding
 ROUNDING = 64  # residuals below this many units in the last place of max|V| are rounding
 
@@ -254,6 +255,8 @@ def _held_back(task: Task, state: State) -> Any:
 def _look(task: Task, value: jax.Array, incumbent: Greedy, moved: jax.Array) -> tuple[Greedy, jax.Array, Gap]:
     problem, grid, scheme = task.problem, task.grid, task.scheme
     policy = bellman.greedy(problem, grid, value, task.rules.held, scheme=scheme, incumbent=incumbent)
+    if problem.stopping_cost is not None and not problem.is_game and task.certificate in TO_THE_END:
+        policy = bellman.kept(problem, grid, value, task.rules.held, policy, incumbent, scheme=scheme)
     left = equation(task, value, policy)
     measured = certificates.gap(
         task.certificate,
@@ -285,7 +288,7 @@ def _judge(task: Task, value: jax.Array, measured: Gap, best: jax.Array, since: 
     finite = jnp.isfinite(measured.residual)
     matters = (since >= PATIENCE) | (measured.residual > GROWTH * best[1])  # else it changes no answer below
     climbs = task.constrained or isinstance(task.method, ValueIteration)
-    to_the_end = climbs and task.certificate in (Certificate.NONE, Certificate.BY_DISCOUNT, Certificate.OPEN)
+    to_the_end = climbs and task.certificate in (*TO_THE_END, Certificate.OPEN)
     size = jax.lax.cond(
         matters | to_the_end,
         lambda: jnp.max(jnp.where(task.counted, jnp.abs(value), 0)),

@@ -42,7 +42,8 @@ def finish(
     earning = None if stopped else earnings.earned(task, state)
     code = code if earning is None else Status.DIVERGED
     gap = None if stopped else _isaacs_gap(task, state)
-    leaving = None if stopped else _leaving(task, state, grid)
+    unanswered = stopped or code in (Status.DIVERGED, Status.NONFINITE)
+    leaving = None if unanswered else _leaving(task, state, grid)
     state = jax.device_get(state)
     solution = assemble(task, state, verdict)
     lost = ~np.asarray(task.counted)

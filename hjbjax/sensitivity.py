@@ -37,7 +37,7 @@ def attach(task: Task, state: State) -> jax.Array:
     """
     task_kept, state = jax.lax.stop_gradient((task, state))
     value = state.value
-    equation = jax.lax.stop_gradient(iteration.equation(task_kept, value, state.policy))
+    equation = jax.lax.stop_gradient(_ties_to_constraints(task_kept, state))
     evaluation = task.method.evaluation if isinstance(task.method, PolicyIteration) else Krylov()
 
     def solver(weights):
@@ -71,6 +71,20 @@ def _exact_solvers(equation: Correction, grid: Grid) -> tuple[Any, Any]:
         return lambda _, right: relaxation.direct(Correction(right, equation.weights), grid, transposed=transposed)
 
     return solve(False), solve(True)
+
+
+def _ties_to_constraints(task: Task, state: State) -> Correction:
+    """The linear equation of the policy, in which every node whose value is a constraint's belongs to that.
+
+    Where going on is worth as much both branches hold. On a plateau without discount only this one has a derivative:
+    a policy may go round on it for ever.
+    """
+    equation = iteration.equation(task, state.value, state.policy)
+    free = jnp.ones(task.grid.shape, bool)
+    for constraint in (task.rules.stop, task.rules.floor):
+        if constraint is not None:
+            free &= ~_same(state.value, constraint)
+    return Correction(equation.source, equation.weights.scaled(jnp.where(free, 1, 0)), equation.fastest)
 
 
 def _residual(task: Task, state: State, equation: Correction) -> jax.Array:

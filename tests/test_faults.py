@@ -66,10 +66,10 @@ def test_a_callback_that_raises_in_a_solve(trouble, monkeypatch):
     monkeypatch.setattr(driver, "_first_chunk", lambda *a: first(*a) and 1)
     look = driver._ended
 
-    def arm(clock, done, limit):
+    def arm(clock, done, *rest):
         trouble.armed = done >= 2
         seen.append(done)
-        return look(clock, done, limit)
+        return look(clock, done, *rest)
 
     monkeypatch.setattr(driver, "_ended", arm)
     # float32: JAX runs callbacks in a thread of its own, which knows nothing of float64 inside a ``with``

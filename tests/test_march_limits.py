@@ -58,6 +58,7 @@ def test_a_slow_run_of_samples_is_not_slowed_down():
     assert found.steps == np.ceil(0.5 / (0.9 * LINE.spacing(0)))
 
 
+@pytest.mark.filterwarnings("ignore:the optimal drift leaves")
 @pytest.mark.parametrize(("scheme", "stages"), [(hjb.Upwind(), 2), (hjb.Limited(), None), (hjb.Upwind(), 3)])
 def test_a_drift_that_switches_on_within_a_step_is_not_outrun(scheme, stages):
     """At rest the limit is endless and a step a hundredth of the horizon; within one the rate becomes 800."""

@@ -114,10 +114,14 @@ def greedy(
     scheme: Scheme,
     t: Any = 0.0,
     incumbent: Greedy | None = None,
+    lost: jax.Array | None = None,
 ) -> Greedy:
-    """The optimal actions at ``value`` and the rate r that is left; an incumbent policy is among the candidates."""
+    """The optimal actions at ``value`` and the rate r that is left; an incumbent policy is among the candidates.
+
+    To the nodes that are ``lost``, bool (*grid), no drift leads that is only rounding.
+    """
     how = players.setting(problem, grid.ndim, value.dtype)
-    here = _around(problem, grid, value, scheme, t, incumbent)
+    here = _around(problem, grid, value, scheme, t, incumbent, lost)
     return _left_over(problem, grid, value, held, *hamiltonian.optimise(here, how))
 
 
@@ -139,11 +143,19 @@ def kept(
 
 
 def respond(
-    problem: Problem, grid: Grid, value: jax.Array, held: jax.Array, current: Greedy, *, scheme: Scheme, t: Any = 0.0
+    problem: Problem,
+    grid: Grid,
+    value: jax.Array,
+    held: jax.Array,
+    current: Greedy,
+    *,
+    scheme: Scheme,
+    t: Any = 0.0,
+    lost: jax.Array | None = None,
 ) -> Greedy:
     """The inner player's best answer to the outer player's current policy, in a game."""
     how = players.setting(problem, grid.ndim, value.dtype)
-    here = _around(problem, grid, value, scheme, t, current)
+    here = _around(problem, grid, value, scheme, t, current, lost)
     u, d = list(current.controls), list(current.disturbances)
     if problem.isaacs == "upper":
         best, d = hamiltonian.best_response(here, how.disturbance, lambda d: (u, d))
@@ -152,8 +164,10 @@ def respond(
     return _left_over(problem, grid, value, held, best, u, d)
 
 
-def _around(problem: Problem, grid: Grid, value: Any, scheme: Scheme, t: Any, policy: Greedy | None) -> Any:
-    here = hamiltonian.local(problem, grid, value, scheme=scheme, t=t)
+def _around(
+    problem: Problem, grid: Grid, value: Any, scheme: Scheme, t: Any, policy: Greedy | None, lost: Any = None
+) -> Any:
+    here = hamiltonian.local(problem, grid, value, scheme=scheme, t=t, lost=lost)
     if policy is None:
         return here
     return dataclasses.replace(here, tried=(list(policy.controls), list(policy.disturbances)))

@@ -74,6 +74,19 @@ def barred(f: Any, grid: Grid, axis: int, rounding: Rounding, coarser: Any = 1) 
     return None if not found else found[0] if len(found) == 1 else found[0] | found[1]
 
 
+def beside(lost: jax.Array, grid: Grid) -> tuple[tuple[jax.Array, jax.Array], ...]:
+    """For every axis whether the next node up, and the next one down, is among the ``lost`` ones, bool (*grid)."""
+    up, down = ([stencil.unit(grid, axis, step) for axis in range(grid.ndim)] for step in (1, -1))
+    pairs = zip(up, down, strict=True)
+    return tuple((stencil.neighbour(lost, grid, p), stencil.neighbour(lost, grid, q)) for p, q in pairs)
+
+
+def strays(f: Any, beside: tuple[Any, Any], rounding: Rounding) -> Any:
+    """Where a drift component that is only rounding points to a lost node beside."""
+    up, down = beside
+    return ((up & (f > 0)) | (down & (f < 0))) & (jnp.abs(f) <= rounding.of(f))
+
+
 def inadmissible(
     problem: Problem, grid: Grid, u: list, d: list | None, t: Any, dtype: Any, *, eps: Any = None
 ) -> jax.Array:

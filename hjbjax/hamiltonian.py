@@ -45,7 +45,8 @@ class Local:
       bends: D⁺ − D⁻ along every axis, which noise sees.
       tried: an action of each player that is a candidate beside the samples; with the actions of the last step
         among them a sampled policy never gets worse.
-      slack: for every axis what is rounding of the drift; None without constrained ends.
+      slack: for every axis what is rounding of the drift; None without constrained ends and lost nodes.
+      lost: for every axis whether the next node up and the next node down are lost; None where none is.
     """
 
     problem: Problem
@@ -61,12 +62,17 @@ class Local:
     links: tuple[stencil.Links, ...]
     tried: tuple[Action, Action] | None = None
     slack: tuple[Any, ...] | None = None
+    lost: tuple[tuple[Any, Any], ...] | None = None
 
     def gain(self, axis: int, f: Any, a: Any) -> Any:
         """[(e + h⁻ f) D⁺ − (e − h⁺ f) D⁻]/(h⁺ + h⁻), or with other slopes; infinite where f leaves a constrained end.
 
-        So every candidate for an optimum is judged by what it may do: the kink at f = 0 is among them.
+        So every candidate for an optimum is judged by what it may do: the kink at f = 0 is among them. A drift that is
+        rounding leads to no lost node, whose value is far above all others.
         """
+        if self.lost is not None:
+            assert self.slack is not None
+            f = jnp.where(edges.strays(f, self.lost[axis], self.slack[axis]), 0, f)
         gain = self._free_gain(axis, f, a)
         out = None if self.slack is None else edges.barred(f, self.grid, axis, self.slack[axis])
         return gain if out is None else jnp.where(out, jnp.inf, gain)
@@ -121,7 +127,9 @@ def at_rest(problem: Problem, grid: Grid, slopes: jax.Array, *, scheme: Scheme) 
     return dataclasses.replace(here, up=ups, down=downs, bends=bends)
 
 
-def local(problem: Problem, grid: Grid, value: jax.Array, *, scheme: Scheme, t: Any = 0.0) -> Local:
+def local(
+    problem: Problem, grid: Grid, value: jax.Array, *, scheme: Scheme, t: Any = 0.0, lost: jax.Array | None = None
+) -> Local:
     """Coordinates and differences around ``value``, tied together so that no loop hoists tables out of itself."""
     x, value = jax.lax.optimization_barrier((grid.components(value.dtype), value))
     links = tuple(subcell.links(problem, grid, subcell=scheme.subcell, dtype=value.dtype, t=t))
@@ -134,8 +142,10 @@ def local(problem: Problem, grid: Grid, value: jax.Array, *, scheme: Scheme, t: 
     elif isinstance(scheme, Limited):
         differences = _limited(problem, grid, x, differences, links, t)
     up, down = zip(*differences, strict=True)
-    slack = tuple(edges.slack(problem, grid, t, value.dtype)) if grid.sides("constrained") else None
-    return Local(problem, grid, scheme, value.dtype, t, x, value, up, down, bends, links, slack=slack)
+    careful = lost is not None or grid.sides("constrained")
+    slack = tuple(edges.slack(problem, grid, t, value.dtype)) if careful else None
+    beside = None if lost is None else edges.beside(lost, grid)
+    return Local(problem, grid, scheme, value.dtype, t, x, value, up, down, bends, links, slack=slack, lost=beside)
 
 
 def _limited(problem: Problem, grid: Grid, x: list, differences: list, links: tuple, t: Any) -> list:

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax import arguments, bellman, certificates, chain, players, relaxation, stencil
+from hjbjax import arguments, bellman, certificates, chain, edges, players, relaxation, stencil
 from hjbjax.bellman import Conditions, Correction, Greedy
 from hjbjax.certificates import Certificate, Gap
 from hjbjax.grid import Grid
@@ -118,15 +118,17 @@ class Task:
     has_lost: bool = False
 
     @property
+    def lost(self) -> jax.Array | None:
+        """The nodes to which no action may lead, bool (*grid), or None."""
+        return ~self.counted if self.has_lost else None
+
+    @property
     def constrained(self) -> bool:
         """Whether the problem has a stopping cost or a running maximum."""
         return self.problem.stopping_cost is not None or self.problem.running_max is not None
 
     def impose(self, value: jax.Array) -> jax.Array:
-        """``value`` with what is given put in, and with nodes that are lost far above all others.
-
-        A jump there at a rate that is only rounding beside the others then costs no more than √eps of the value.
-        """
+        """``value`` with what is given put in, and with nodes that are lost far above all others."""
         value = self.rules.impose(value)
         if not self.has_lost:
             return value
@@ -225,7 +227,7 @@ def broken(task: Task, state: State) -> jax.Array:
     stay = jnp.zeros_like(state.value)
     delta = jax.lax.cond(state.step < 0, lambda: stay, lambda: _correct(task, state))
     value = task.impose(state.value + delta)
-    rate = bellman.greedy(task.problem, task.grid, value, task.rules.held, scheme=task.scheme).rate
+    rate = bellman.greedy(task.problem, task.grid, value, task.rules.held, scheme=task.scheme, lost=task.lost).rate
     return task.counted & ~(jnp.isfinite(value) & jnp.isfinite(rate))
 
 
@@ -254,7 +256,7 @@ def _held_back(task: Task, state: State) -> Any:
 
 def _look(task: Task, value: jax.Array, incumbent: Greedy, moved: jax.Array) -> tuple[Greedy, jax.Array, Gap]:
     problem, grid, scheme = task.problem, task.grid, task.scheme
-    policy = bellman.greedy(problem, grid, value, task.rules.held, scheme=scheme, incumbent=incumbent)
+    policy = bellman.greedy(problem, grid, value, task.rules.held, scheme=scheme, incumbent=incumbent, lost=task.lost)
     if problem.stopping_cost is not None and not problem.is_game and task.certificate in TO_THE_END:
         policy = bellman.kept(problem, grid, value, task.rules.held, policy, incumbent, scheme=scheme)
     left = equation(task, value, policy)
@@ -276,11 +278,20 @@ def _look(task: Task, value: jax.Array, incumbent: Greedy, moved: jax.Array) -> 
 
 def _leaks(task: Task, policy: Greedy) -> jax.Array:
     """Whether the policy leads from a node that counts to one that is lost, by more than rounding."""
+    problem, grid, dtype = task.problem, task.grid, policy.rate.dtype
     u, d = list(policy.controls), list(policy.disturbances)
-    rates = chain.rates(task.problem, task.grid, u, d, scheme=task.scheme.chain, dtype=policy.rate.dtype)
-    jumps = zip(rates.offsets, rates.values, strict=True)
-    leaking = sum(jnp.where(stencil.neighbour(task.counted, task.grid, offset), 0, c) for offset, c in jumps)
-    limit = ROUNDING * jnp.finfo(policy.rate.dtype).eps * rates.total()
+    rates = chain.rates(problem, grid, u, d, scheme=task.scheme.chain, dtype=dtype)
+    beside, slack = edges.beside(~task.counted, grid), edges.slack(problem, grid, 0.0, dtype)
+    f = chain.drift(problem, grid.components(dtype), u, d, 0.0, dtype)
+    strays = [edges.strays(*each) for each in zip(f, beside, slack, strict=True)]
+    leaking = jnp.zeros(grid.shape, dtype)
+    for offset, c in zip(rates.offsets, rates.values, strict=True):
+        leak = jnp.where(stencil.neighbour(task.counted, grid, offset), 0, c)
+        if problem.noise is None:  # jumps go along one axis
+            axis = next(axis for axis, step in enumerate(offset) if step)
+            leak = jnp.where(strays[axis], 0, leak)
+        leaking = leaking + leak
+    limit = ROUNDING * jnp.finfo(dtype).eps * rates.total()
     return jnp.any(task.counted & ~task.rules.held & (leaking > limit))
 
 
@@ -361,7 +372,7 @@ def _hoffman_karp(task: Task, state: State) -> jax.Array:
     def reply(carry):
         value, policy, _, count = carry
         value = task.impose(value + relaxation.solve(evaluation, equation(task, value, policy), task.grid))
-        policy = bellman.respond(task.problem, task.grid, value, held, policy, scheme=task.scheme)
+        policy = bellman.respond(task.problem, task.grid, value, held, policy, scheme=task.scheme, lost=task.lost)
         left = jnp.max(jnp.where(task.counted, jnp.abs(equation(task, value, policy).source), 0))
         return value, policy, left, count + 1
 

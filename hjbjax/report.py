@@ -220,7 +220,7 @@ def warn_of_gap(gap: float, matter: float, isaacs: str) -> None:
 
 @jax.jit
 def _gap_at(task: Task, value: jax.Array) -> tuple[jax.Array, jax.Array]:
-    here = hamiltonian.local(task.problem, task.grid, value, scheme=task.scheme)
+    here = hamiltonian.local(task.problem, task.grid, value, scheme=task.scheme, lost=task.lost)
     return isaacs_gap(here, task.counted & ~task.rules.held)
 
 

@@ -93,7 +93,8 @@ def _residual(task: Task, state: State, equation: Correction) -> jax.Array:
     rules = bellman.conditions(problem, grid, value.dtype)
     u, d = list(policy.controls), list(policy.disturbances)
     held = jax.lax.stop_gradient(task.rules.held)
-    rate = bellman.greedy(problem, grid, value, held, scheme=task.scheme, incumbent=policy).rate
+    lost = jax.lax.stop_gradient(task.lost)
+    rate = bellman.greedy(problem, grid, value, held, scheme=task.scheme, incumbent=policy, lost=lost).rate
     scheme = task.scheme.chain
     total = chain.rates(problem, grid, u, d, scheme=scheme, dtype=value.dtype).total()
     pace = jax.lax.stop_gradient(total + problem.discount)

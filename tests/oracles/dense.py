@@ -99,8 +99,13 @@ def _supports(chain):
     """Actions (K, S, m) that between them make every set of jumps that some action makes."""
     tried = candidates(chain, np.zeros(chain.size), chain.model.controls, chain.model.G, chain.model.l,
                        chain.model.s, chain.model.b)  # fmt: skip
-    if chain.model.controls.kind in ("none", "finite"):
+    choices, gain = chain.model.controls, chain.model.G
+    if choices.kind in ("none", "finite"):
         return tried
+    if choices.kind == "ball":  # the part of a disc that a line cuts off may hold no other candidate
+        length = np.linalg.norm(gain, axis=-1, keepdims=True)
+        outmost = np.moveaxis(choices.radius * gain / np.where(length > 0, length, 1), 1, 0)
+        tried = np.concatenate([tried, outmost, -outmost])
     if tried.shape[-1] == 1:
         ordered = np.sort(tried, axis=0)
         return np.concatenate([tried, (ordered[1:] + ordered[:-1]) / 2])

@@ -126,18 +126,18 @@ def greedy(
 
 
 def kept(
-    problem: Problem, grid: Grid, value: jax.Array, held: jax.Array, new: Greedy, old: Greedy, *, scheme: Scheme
+    problem: Problem, grid: Grid, value: jax.Array, fixed: jax.Array, new: Greedy, old: Greedy, *, scheme: Scheme
 ) -> Greedy:
-    """The new policy where it is better by more than rounding, else the old one; without a disturbance.
+    """The new policy where it is better by more than rounding or where nodes are ``fixed``, else the old one.
 
     From a policy that ends, one improvement after the other then keeps it so: among actions that are worth the same
-    the first one found leads to where its value came from, and another one may go round.
+    the first one found leads to where its value came from, and another one may go round. There is no disturbance.
     """
     here, u = _around(problem, grid, value, scheme, 0.0, None), list(old.controls)
     rates = chain.rates(problem, grid, u, [], scheme=scheme.chain, dtype=value.dtype)
     rounding = ROUNDING * jnp.finfo(value.dtype).eps * (rates.total() + problem.discount) * jnp.abs(value)
     rate = here.at(u, []) - problem.discount * value
-    stays = ~held & (rate <= new.rate + rounding)
+    stays = ~fixed & (rate <= new.rate + rounding)
     controls = (jnp.where(stays, before, after) for before, after in zip(old.controls, new.controls, strict=True))
     return Greedy(jnp.where(stays, rate, new.rate), tuple(controls), ())
 

@@ -209,7 +209,7 @@ def advance(task: Task, state: State, start: Any) -> State:
     moved = jnp.max(jnp.abs(jnp.where(task.counted, value - state.value, 0)))
     if task.certificate is Certificate.OPEN and not isinstance(task.method, ValueIteration):
         moved = moved * _held_back(task, state)
-    policy, fastest, measured = _look(task, value, state.policy, moved=moved)
+    policy, fastest, measured = _look(task, value, state.policy, moved=moved, first=state.step < 0)
     measured = dataclasses.replace(measured, error=jnp.where(_unmeasured(task, state), jnp.inf, measured.error))
     measures = jnp.stack([measured.error, measured.residual])
     since = jnp.where(jnp.any(measures < state.best), 0, state.since_best + 1)
@@ -254,11 +254,14 @@ def _held_back(task: Task, state: State) -> Any:
     return jnp.where(shift == 0, 1, jnp.where(discount > 0, 1 + shift / safe, jnp.inf))
 
 
-def _look(task: Task, value: jax.Array, incumbent: Greedy, moved: jax.Array) -> tuple[Greedy, jax.Array, Gap]:
+def _look(
+    task: Task, value: jax.Array, incumbent: Greedy, *, moved: jax.Array, first: jax.Array
+) -> tuple[Greedy, jax.Array, Gap]:
     problem, grid, scheme = task.problem, task.grid, task.scheme
     policy = bellman.greedy(problem, grid, value, task.rules.held, scheme=scheme, incumbent=incumbent, lost=task.lost)
     if problem.stopping_cost is not None and not problem.is_game and task.certificate in TO_THE_END:
-        policy = bellman.kept(problem, grid, value, task.rules.held, policy, incumbent, scheme=scheme)
+        fixed = task.rules.held | first  # nobody has chosen the actions before the first look
+        policy = bellman.kept(problem, grid, value, fixed, policy, incumbent, scheme=scheme)
     left = equation(task, value, policy)
     measured = certificates.gap(
         task.certificate,

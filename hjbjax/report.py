@@ -20,6 +20,7 @@ from hjbjax.solution import Solution
 from hjbjax.status import Status
 
 GAP = 0.05  # of what the actions matter; where Isaacs' condition holds, upwinding left up to .019 on 21 nodes
+MOST = 2 / 3  # of an end's nodes: whatever has a velocity leaves by half of those where its position ends
 
 
 def finish(
@@ -125,7 +126,7 @@ def assemble(task: Task, state: State, verdict: Verdict) -> Solution:
 
 
 def _leaving(task: Task, state: State, grid: Grid) -> np.ndarray:
-    """At how many nodes of each end the optimal drift is cut off, with a warning where that is at most of them."""
+    """At how many nodes of each end the optimal drift is cut off, with a warning where those are most of them."""
     value, policy, rules, counted = jax.device_get((state.value, state.policy, task.rules, task.counted))
     u, d = (list(players) for players in (policy.controls, policy.disturbances))
     cut, ends = edges.cut(task.problem, task.grid, value, u, d, counted & rules.acting(value))
@@ -134,10 +135,10 @@ def _leaving(task: Task, state: State, grid: Grid) -> np.ndarray:
 
 
 def warn_of_cuts(cut: np.ndarray, ends: np.ndarray, grid: Grid) -> None:
-    """Warn of ends at most nodes of which the optimal drift is cut off; both shape (n, 2)."""
+    """Warn of ends at more than ``MOST`` of whose nodes the optimal drift is cut off; both shape (n, 2)."""
     most = [
         f"the {('lower', 'upper')[side]} end of {grid.names[axis]} ({cut[axis, side]} of {ends[axis, side]} nodes)"
-        for axis, side in np.argwhere(2 * cut > ends)
+        for axis, side in np.argwhere(cut > MOST * ends)
     ]
     if most:
         warn(

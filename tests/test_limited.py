@@ -112,6 +112,7 @@ def test_smooth_nonlinear_problem_is_second_order():
     assert fitted_order(errors) >= 1.8
 
 
+@pytest.mark.filterwarnings("ignore:the optimal drift leaves")
 @pytest.mark.slow
 def test_manufactured_problem_on_a_line_is_second_order():
     errors = [largest_error(on_a_line(n), Line().value, inside(0.5)) for n in (41, 81, 161)]

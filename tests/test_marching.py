@@ -345,6 +345,7 @@ def test_upwind_never_leaves_the_range_of_the_data(seed):
     assert value[0].max() <= value[1].max()
 
 
+@pytest.mark.filterwarnings("ignore:the optimal drift leaves")
 @pytest.mark.slow
 @settings(max_examples=25)
 @given(SEEDS)

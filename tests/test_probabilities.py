@@ -324,6 +324,7 @@ def test_where_a_solution_has_no_action_the_state_stays():
     assert found.value[-1] == 1
 
 
+@pytest.mark.filterwarnings("ignore:the optimal drift leaves")
 @pytest.mark.slow
 @given(SEEDS)
 @settings(max_examples=10)

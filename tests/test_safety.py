@@ -123,6 +123,7 @@ def box(x):
     return jnp.maximum(jnp.abs(x[0]), jnp.abs(x[1])) - 0.5
 
 
+@pytest.mark.filterwarnings("ignore:the optimal drift leaves")
 @pytest.mark.slow
 def test_straight_ahead_left_or_right_is_safe_and_their_mean_is_not():
     """Carried towards a square: unsafe is |y| < ½ − (time until it is there), where the two ways round meet."""
@@ -147,6 +148,7 @@ def moving_wall(t, x):
 MOVING = hjb.avoid(lambda t, x, u: braking(x, u), UNIT, moving_wall, time_dependent=True)
 
 
+@pytest.mark.filterwarnings("ignore:the optimal drift leaves")
 @pytest.mark.slow
 def test_a_wall_that_comes_nearer():
     """y = x − 1 + t/2 and w = v + ½ see a wall at rest: V = y + ½w² as long as there is time to brake."""

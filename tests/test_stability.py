@@ -69,6 +69,7 @@ def distance(x):
     return jnp.sqrt(x @ x + 1e-12)
 
 
+@pytest.mark.filterwarnings("ignore:the optimal drift leaves")
 @pytest.mark.parametrize("speed", [1.0, -1.0])
 @pytest.mark.slow
 def test_the_tubes_of_example_41(speed):

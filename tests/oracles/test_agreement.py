@@ -62,7 +62,8 @@ def square(x, u):
 
 
 def contested(x, u, d):
-    return u + 0.5 * d - 0.3 * jnp.sin(x)
+    """Each player drives a component of its own: there both fronts upwind alike."""
+    return jnp.stack([u[0] - 0.3 * jnp.sin(2 * x[1]), 0.5 * d[0] - 0.4 * x[0]])
 
 
 def toll(x, u, d):
@@ -96,7 +97,7 @@ QUESTIONS = {
         lambda r: hjb.Problem(steered, square, U, discount=0.5, target=Partial(ball, r), exit_cost=Partial(fee, r))
     ),
     "noise": Question(lambda r: hjb.Problem(steered, square, U, discount=0.5, noise=r)),
-    "game": Question(lambda r: hjb.Problem(contested, toll, U, disturbances=hjb.Box([-r], [r]), discount=0.5)),
+    "game": Question(lambda r: hjb.Problem(contested, toll, U, disturbances=hjb.Box([-r], [r]), discount=0.5), PLANE),
     "periodic": Question(
         lambda r: hjb.Problem(steered, lambda x, u: r * jnp.cos(x[0]) + 0.1 * u @ u, U, discount=0.5),
         hjb.Grid([-np.pi], [np.pi], (20,), (True,)),
@@ -110,7 +111,7 @@ QUESTIONS = {
     ),
     "plane, uncontrolled exit": Question(
         lambda r: hjb.Problem(
-            lambda x, u: -x, lambda x, u: 1.0, noise=np.array([[0.3, 0.0], [0.1, 0.3]]),
+            lambda x, u: -x, lambda x, u: 1.0, noise=np.array([[0.9, 0.0], [0.3, 0.9]]),
             target=lambda x: 0.9 - jnp.max(jnp.abs(x)), exit_cost=Partial(fee, r),
         ), PLANE,
     ),

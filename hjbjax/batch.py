@@ -15,9 +15,9 @@ import numpy as np
 
 from hjbjax import admissibility, checks, faults, iteration, memory, nested, survey
 from hjbjax.arguments import shown
-from hjbjax.clock import CUT, Clock, Stopped, noting_interrupts
+from hjbjax.clock import CHUNK_SECONDS, CUT, Clock, Stopped, noting_interrupts
 from hjbjax.closures import with_settled_functions
-from hjbjax.driver import CHUNK_SECONDS, FIRST_NODES, imposed
+from hjbjax.driver import FIRST_NODES, imposed
 from hjbjax.grid import Grid
 from hjbjax.iteration import Method, Nested, State, Task
 from hjbjax.preparation import choose, prepare_on_host

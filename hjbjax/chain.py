@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax import correlation, edges, export, fields, recurrence, stencil
+from hjbjax import checks, edges, export, fields, recurrence, stencil
 from hjbjax.grid import Grid
 from hjbjax.problem import Problem
 from hjbjax.pytree import cast, node
@@ -105,7 +105,7 @@ def along_axis(a: dict[tuple[int, int], Any], grid: Grid, axis: int) -> Any:
         return None
     for (i, j), entry in a.items():
         if i != j:
-            correlation.refuse_stretched(grid)
+            checks.refuse_stretched(grid)
         if i != j and axis in (i, j):
             other = j if axis == i else i
             left = left - jnp.abs(entry) * (grid.spacing(axis) / grid.spacing(other))

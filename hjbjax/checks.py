@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax import correlation, indices, sets
+from hjbjax import indices, sets
 from hjbjax.grid import Grid
 from hjbjax.problem import Problem
 from hjbjax.pytree import remembered
@@ -53,7 +53,16 @@ def shapes(problem: Problem, grid: Grid, scheme: Any) -> None:
     if problem.noise is not None:
         with jax.enable_x64(True):
             if len(_returned(problem, "noise", n)) == 2:
-                correlation.refuse_stretched(grid)
+                refuse_stretched(grid)
+
+
+def refuse_stretched(grid: Grid) -> None:
+    """Refuse correlated noise, σ of shape (n, k), on a stretched grid: its diagonal jumps want equal spacings."""
+    if grid.ndim > 1 and any(each is not None for each in grid.stretch or ()):
+        raise ValueError(
+            "noise: correlated noise, σ of shape (n, k), wants equal spacings: leave out Grid.stretch, or give noise "
+            "by axis, (n,)"
+        )
 
 
 def of_one_state(problem: Problem, n: int, meaning: str) -> None:

@@ -17,6 +17,7 @@ from typing import Any
 from hjbjax.status import Status
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+CHUNK_SECONDS = 0.5  # between two looks at the clock, where steps are short
 CUT = (Status.INTERRUPTED, Status.TIME_LIMIT)
 
 

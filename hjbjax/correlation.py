@@ -16,15 +16,6 @@ import numpy as np
 from hjbjax.grid import Grid
 
 
-def refuse_stretched(grid: Grid) -> None:
-    """Refuse correlated noise, σ of shape (n, k), on a stretched grid: its diagonal jumps want equal spacings."""
-    if grid.ndim > 1 and any(each is not None for each in grid.stretch or ()):
-        raise ValueError(
-            "noise: correlated noise, σ of shape (n, k), wants equal spacings: leave out Grid.stretch, or give noise "
-            "by axis, (n,)"
-        )
-
-
 def spacings(a: Any, now: Any) -> np.ndarray | None:
     """Spacings h close to the given ones with a_ii/h_i ≥ Σ_j |a_ij|/h_j on every axis, if there are any.
 

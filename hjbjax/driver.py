@@ -15,12 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax import checks, faults, iteration
-from hjbjax.clock import CUT, Clock
+from hjbjax.clock import CHUNK_SECONDS, CUT, Clock
 from hjbjax.iteration import HISTORY, State, Task
 from hjbjax.relaxation import Direct, Krylov
 from hjbjax.status import Status
 
-CHUNK_SECONDS = 0.5
 FIRST_NODES = 20_000  # a first chunk steps over about so many nodes
 MANY_NODES = 2_000_000  # beyond which the look at the guess is a chunk of its own: a step may take many times as long
 

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax import correlation, edges, hamiltonian, marching, players
-from hjbjax.clock import CUT, Clock
-from hjbjax.driver import CHUNK_SECONDS, ticker
+from hjbjax.clock import CHUNK_SECONDS, CUT, Clock
+from hjbjax.driver import ticker
 from hjbjax.grid import Grid
 from hjbjax.marching import Explicit, Front, Implicit, March
 from hjbjax.report import isaacs_gap, warn_of_cuts, warn_of_gap

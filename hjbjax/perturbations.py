@@ -18,7 +18,6 @@ import jax
 import numpy as np
 
 from hjbjax import checks
-from hjbjax.canvas import COLOURS, GREY, axes_of, label_axes, logarithmic
 from hjbjax.clock import Clock, noting_interrupts
 from hjbjax.convergence import fitted_order
 from hjbjax.gain import attenuation, saturation
@@ -204,44 +203,3 @@ def _series(
     finest = min(float(nominal.grid.spacing(axis)) for axis in range(nominal.grid.ndim))
     seen = fitted & (feedback > tol / finest)  # a slope of V is known no better than that
     return Series(name, parameters, errors, feedback, tuple(solutions), fitted, seen)
-
-
-def perturbation(study: Perturbation, *, ax: Any = None) -> list[Any]:
-    """The changes of value and feedback over ε and over 1/γ in one picture, with the fitted orders.
-
-    Full marks are values, rings feedbacks; the thin grey line beside the full marks has the fitted slope.
-
-    Args:
-      study: what ``perturbation_study`` returned.
-
-    Keyword Args:
-      ax: matplotlib axes to draw on; ``None`` makes a figure.
-
-    Returns:
-      The artists: the line of the values over ε first.
-
-    Raises:
-      ValueError: no change is positive and finite.
-    """
-    artists = []
-    ax = axes_of(ax)
-    for series, color in ((study.noise, COLOURS[0]), (study.gain, COLOURS[1])):
-        if not np.any((series.errors > 0) & np.isfinite(series.errors)):
-            raise ValueError(f"perturbation: the changes over {series.name} are {series.errors}; none has a logarithm")
-        for what, y, order, fill in (
-            ("V", series.errors, series.order, color),
-            ("u", series.feedback_errors, series.feedback_order, "white"),
-        ):
-            shown = np.ma.masked_where(~(np.isfinite(y) & (y > 0)), y)
-            label = f"{what} over {series.name}" + (f", order {order:.2f}" if np.isfinite(order) else "")
-            style = {"color": color, "markerfacecolor": fill, "linewidth": 1.2, "markersize": 5}
-            artists += ax.plot(series.parameters, shown, marker="o", label=label, **style)
-        if np.isfinite(series.order):
-            x, y = series.parameters[series.fitted], series.errors[series.fitted]
-            middle = np.exp(np.mean(np.log(y)) - series.order * np.mean(np.log(x)))
-            artists += ax.plot(x, middle * x**series.order, color=GREY, linewidth=3, zorder=0)
-    logarithmic(ax)
-    label_axes(ax, "ε, 1/γ", "largest change")
-    # lines that rise leave this corner free
-    artists.append(ax.legend(loc="upper left", fontsize=8, frameon=False, borderaxespad=0.2, handlelength=1.4))
-    return artists

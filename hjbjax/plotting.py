@@ -24,15 +24,13 @@ from hjbjax.canvas import (
     frame,
     label_axes,
     legend,
-    logarithmic,
-    pair_of_axes,
     styled,
 )
 from hjbjax.grid import Grid
 from hjbjax.level_sets import animation, zero_level_set
 from hjbjax.momenta import costates
-from hjbjax.perturbations import perturbation
 from hjbjax.sections import at_time, feedback, folded, lifted, nodes_in, section_of, zeros
+from hjbjax.studies import convergence, perturbation
 
 __all__ = [
     "COLOURS",
@@ -331,50 +329,6 @@ def residuals(solution: Any, *, ax: Any = None, label: str | None = None) -> lis
     artists += bands(ax, steps, ~np.isfinite(history), "not finite")
     label_axes(ax, "step", "residual")
     if label or len(artists) > 1:
-        legend(ax)
-    return artists
-
-
-def convergence(study: Any, *, ax: Any = None) -> list[Any]:
-    """The errors of a convergence study over the spacing and over the seconds, with the fitted orders.
-
-    Full marks are the largest errors, rings the mean ones; the thin line beside the full marks has the fitted
-    slope. Errors of zero have no logarithm and are left out; an estimate is called one in the label of the axis.
-
-    Args:
-      study: what ``convergence_study`` returned.
-
-    Keyword Args:
-      ax: matplotlib axes to draw on: one for the errors over the spacing, or two, the second for the seconds;
-        ``None`` makes a figure with both.
-
-    Returns:
-      The artists: the line of the largest errors over the spacing first.
-
-    Raises:
-      ValueError: no error is positive and finite.
-    """
-    if not np.any((study.errors > 0) & np.isfinite(study.errors)):
-        raise ValueError(f"convergence: the errors are {study.errors}; there is none with a logarithm to draw")
-    axes = pair_of_axes() if ax is None else list(np.ravel(ax))
-    quality = "estimated error" if study.estimated else "error"
-    own = ax is None
-    artists = []
-    for ax, x, name in zip(axes, (study.h, study.seconds), ("h", "seconds"), strict=False):
-        for y, order, kind, fill in (
-            (study.errors, study.order, "largest", COLOURS[0]),
-            (study.mean_errors, study.mean_order, "mean", "white"),
-        ):
-            label = f"{kind}, order {order:.2f}" if np.isfinite(order) and name == "h" else kind
-            shown = np.ma.masked_where(~(np.isfinite(y) & (y > 0)), y)
-            style = {"color": COLOURS[0], "markerfacecolor": fill, "linewidth": 1.2, "markersize": 5}
-            artists += ax.plot(x, shown, marker="o", label=label, **style)
-        fitted = study.fitted & np.isfinite(study.errors) & (study.errors > 0)
-        if name == "h" and np.isfinite(study.order) and fitted.any():
-            middle = np.exp(np.mean(np.log(study.errors[fitted])) - study.order * np.mean(np.log(x[fitted])))
-            artists += ax.plot(x[fitted], middle * x[fitted] ** study.order, color=GREY, linewidth=3, zorder=0)
-        logarithmic(ax, study.h if name == "h" else None)
-        label_axes(ax, name, "" if own and name == "seconds" else quality)
         legend(ax)
     return artists
 

@@ -10,9 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.clock import Clock, noting_interrupts
+from hjbjax.clock import CHUNK_SECONDS, Clock, noting_interrupts
 from hjbjax.closed_loop import Loop, Stepping, integrate, some, unbegun
-from hjbjax.driver import CHUNK_SECONDS
 from hjbjax.feedback import check_kept, lookups
 from hjbjax.grid import Grid
 from hjbjax.path import Interrupted, Path, PathStatus, truncated

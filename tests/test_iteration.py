@@ -29,7 +29,9 @@ def expected(residual, error, best, nearest, since, tol):
     code = Status.RUNNING
     if since >= (10 if residual <= ROUNDING else 100 + 4 * 11):
         code = Status.STALLED
-    bounded = np.isfinite(nearest) and error <= 1e6 * nearest  # a better policy may leave more than one that stops at once
+    bounded = (
+        np.isfinite(nearest) and error <= 1e6 * nearest
+    )  # a better policy may leave more than one that stops at once
     if residual > 1e6 * max(best, ROUNDING) and not bounded:
         code = Status.DIVERGED
     if error <= tol:

@@ -63,7 +63,7 @@ def _refused(case):
 
 
 def _judged(solution, answer, finite, rounding, tol, *, lower):
-    """The best of a sample of the outer player's actions is no better for it than its best: one bound then still holds."""
+    """Where the outer player's actions are sampled only the bound on its side is asked: no sample beats the best."""
     value = np.asarray(solution.value, float).ravel()
     complaints = []
     if np.any(np.isnan(value)):

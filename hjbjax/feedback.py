@@ -178,8 +178,8 @@ def greedy_feedback(problem: Problem, solution: Solution) -> Greedy:
       >>> import hjbjax as hjb
       >>> problem, grid = hjb.zoo.eikonal(shape=(21, 21))
       >>> feedback = hjb.greedy_feedback(problem, hjb.solve(problem, grid))
-      >>> feedback(np.array([0.6, 0.0])).round(3).tolist(), feedback(np.array([[0.0, 0.6], [0.5, 0.5]])).shape
-      ([-1.0, 0.0], (2, 2))
+      >>> round(float(feedback(np.array([0.6, 0.0]))[0]), 3), feedback(np.array([[0.0, 0.6], [0.5, 0.5]])).shape
+      (-1.0, (2, 2))
     """
     if not isinstance(problem, Problem):
         raise TypeError(f"greedy_feedback: got {type(problem).__name__}, wanted a Problem")

@@ -15,8 +15,8 @@ import numpy as np
 import hjbjax as hjb
 from benchmarks import marching
 from benchmarks.report import RESULTS, attempt, publish, table
-from hjbjax.convergence import fitted_order
-from hjbjax.reference import at_nodes_of, distance, mask_of, mean_spacing
+from hjbjax.applications.convergence import fitted_order
+from hjbjax.applications.reference import at_nodes_of, distance, mask_of, mean_spacing
 from hjbjax.zoo import catalogue
 
 COLUMNS = ("problem", "scheme", "shape", "h", "error", "mean_error", "order", "seconds", "compile_seconds", "status")

@@ -22,8 +22,8 @@ from benchmarks import questions
 from benchmarks.accuracy import inner
 from benchmarks.report import RESULTS, attempt, picture, stamped, table, write_json
 from benchmarks.timing import interleaved
-from hjbjax.convergence import fitted_order
-from hjbjax.reference import at_nodes_of, mask_of
+from hjbjax.applications.convergence import fitted_order
+from hjbjax.applications.reference import at_nodes_of, mask_of
 
 COLUMNS = (
     "part", "minimum", "shape", "controls", "steps", "seconds", "compile_seconds", "error", "exponent", "bound",

@@ -6,9 +6,10 @@ import jax
 import numpy as np
 
 import hjbjax as hjb
-from hjbjax import driver, iteration
-from hjbjax.preparation import choose, judge, prepare
-from hjbjax.pytree import cast
+from hjbjax.iteration import iteration
+from hjbjax.problem.pytree import cast
+from hjbjax.solvers import driver
+from hjbjax.solvers.preparation import choose, judge, prepare
 
 
 def bytes_of(lowered: Any) -> int:

@@ -23,7 +23,7 @@ import hjbjax as hjb
 from benchmarks import floors, footprint, questions
 from benchmarks.report import RESULTS, attempt, publish, table
 from benchmarks.timing import interleaved, timed
-from hjbjax.convergence import fitted_order
+from hjbjax.applications.convergence import fitted_order
 
 COLUMNS = (
     "problem", "shape", "nodes", "steps", "seconds", "compile_seconds", "microseconds_per_node", "exponent",

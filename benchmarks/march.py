@@ -17,7 +17,8 @@ import numpy as np
 
 import hjbjax as hjb
 from benchmarks.report import RESULTS, attempt, publish, table
-from hjbjax import epochs, horizon, marching
+from hjbjax.iteration import marching
+from hjbjax.solvers import epochs, horizon
 
 COLUMNS = ("problem", "scheme", "who", "shape", "ms_per_step", "times", "bytes_per_node", "compile_seconds", "differs")
 SCHEMES = {"low": hjb.Upwind(), "medium": hjb.Eno2(), "very_high": hjb.Weno5()}

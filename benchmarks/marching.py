@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.sets import Ball, Box
+from hjbjax.problem.sets import Ball, Box
 
 PERIOD = 1.0  # the value is looked at once in so much of the problem's time
 

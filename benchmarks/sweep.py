@@ -24,9 +24,10 @@ from benchmarks import floors, questions
 from benchmarks.footprint import bytes_of
 from benchmarks.report import RESULTS, attempt, publish, table, without
 from benchmarks.timing import interleaved
-from hjbjax import bellman, driver, iteration, memory
-from hjbjax.preparation import prepare_on_host
-from hjbjax.pytree import cast
+from hjbjax.iteration import bellman, iteration
+from hjbjax.problem.pytree import cast
+from hjbjax.solvers import driver, memory
+from hjbjax.solvers.preparation import prepare_on_host
 
 COLUMNS = (
     "problem", "kernel", "shape", "controls", "seconds", "compile_seconds", "node_controls_per_second",

@@ -1,35 +1,37 @@
 """hjbjax: Hamilton–Jacobi–Bellman and Isaacs equations on grids, with JAX."""
 
-from hjbjax import chain, geometry, plotting, stability, zoo
+from hjbjax import geometry, plotting, zoo
 from hjbjax._version import __version__
-from hjbjax.batch import solve_batch
-from hjbjax.convergence import convergence_study
-from hjbjax.dissipation import dissipation
-from hjbjax.extremals import FreeTime, pontryagin
-from hjbjax.feedback import greedy_feedback
-from hjbjax.fields import FallbackWarning
-from hjbjax.files import FileError
-from hjbjax.gain import attenuation, saturation
-from hjbjax.grid import Grid
-from hjbjax.horizon import march
-from hjbjax.iteration import Nested, PolicyIteration, ValueIteration
-from hjbjax.lyapunov import lyapunov_check
-from hjbjax.marching import Explicit, Implicit
-from hjbjax.perturbations import perturbation_study
-from hjbjax.preparation import SolveWarning
-from hjbjax.probabilities import expected_exit_time, reach_probability, stay_probability
-from hjbjax.problem import Problem
-from hjbjax.reachability import avoid, reach, reach_avoid
-from hjbjax.relaxation import Direct, Krylov, Sweeps
-from hjbjax.robust import hinf_level
-from hjbjax.safety import least_restrictive
-from hjbjax.schemes import Eno2, Limited, Upwind, Weno5
-from hjbjax.sets import Ball, Box, Finite
-from hjbjax.simulation import simulate
-from hjbjax.solution import Solution, SolveError, load
-from hjbjax.solver import solve
-from hjbjax.status import Status
-from hjbjax.stretching import Sinh
+from hjbjax.applications.convergence import convergence_study
+from hjbjax.applications.gain import attenuation, saturation
+from hjbjax.applications.perturbations import perturbation_study
+from hjbjax.applications.probabilities import expected_exit_time, reach_probability, stay_probability
+from hjbjax.applications.reachability import avoid, reach, reach_avoid
+from hjbjax.applications.robust import hinf_level
+from hjbjax.discretisation import chain
+from hjbjax.discretisation.schemes import Eno2, Limited, Upwind, Weno5
+from hjbjax.extremals.extremals import FreeTime, pontryagin
+from hjbjax.feedback.dissipation import dissipation
+from hjbjax.feedback.feedback import greedy_feedback
+from hjbjax.feedback.safety import least_restrictive
+from hjbjax.feedback.simulation import simulate
+from hjbjax.geometry import stability
+from hjbjax.geometry.lyapunov import lyapunov_check
+from hjbjax.iteration.iteration import Nested, PolicyIteration, ValueIteration
+from hjbjax.iteration.marching import Explicit, Implicit
+from hjbjax.iteration.relaxation import Direct, Krylov, Sweeps
+from hjbjax.problem.fields import FallbackWarning
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.sets import Ball, Box, Finite
+from hjbjax.problem.stretching import Sinh
+from hjbjax.solution.files import FileError
+from hjbjax.solution.solution import Solution, SolveError, load
+from hjbjax.solution.status import Status
+from hjbjax.solvers.batch import solve_batch
+from hjbjax.solvers.horizon import march
+from hjbjax.solvers.preparation import SolveWarning
+from hjbjax.solvers.solver import solve
 
 __all__ = [
     "Ball",

@@ -1,6 +1,6 @@
 """``python -m hjbjax``: the command without its script."""
 
-from hjbjax.cli import main
+from hjbjax.cli.main import main
 
 if __name__ == "__main__":
     main(prog_name="hjbjax")

@@ -5,10 +5,10 @@ import itertools
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax import stencil
-from hjbjax.bellman import Correction
-from hjbjax.chain import Rates
-from hjbjax.grid import Grid
+from hjbjax.discretisation import stencil
+from hjbjax.discretisation.chain import Rates
+from hjbjax.iteration.bellman import Correction
+from hjbjax.problem.grid import Grid
 
 SHAPES = {1: (9,), 2: (6, 5), 3: (4, 3, 5), 4: (3, 4, 2, 3)}
 LAYOUTS = [(n, flags) for n in (1, 2) for flags in itertools.product((False, True), repeat=n)]

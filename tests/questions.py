@@ -3,8 +3,10 @@
 import jax.numpy as jnp
 import pytest
 
-from hjbjax import Box, Grid, Problem, checks, survey
-from hjbjax.schemes import Upwind
+from hjbjax import Box, Grid, Problem
+from hjbjax.discretisation.schemes import Upwind
+from hjbjax.finiteness import survey
+from hjbjax.problem import checks
 
 GRID = Grid([-1.0, -2.0], [1.0, 2.0], (5, 9))
 U = Box([-1.0], [1.0])

@@ -4,10 +4,10 @@ import jax.numpy as jnp
 import numpy as np
 from hypothesis import strategies as st
 
-from hjbjax.grid import Grid
-from hjbjax.problem import Problem
-from hjbjax.pytree import node
-from hjbjax.sets import Box
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import node
+from hjbjax.problem.sets import Box
 
 SHAPES = {1: (7,), 2: (5, 4), 3: (4, 3, 3), 4: (3, 4, 2, 3)}
 PERIODIC = {1: (False,), 2: (True, False), 3: (False, True, False), 4: (False, True, False, True)}

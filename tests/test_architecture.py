@@ -3,7 +3,6 @@
 import ast
 import enum
 import inspect
-import itertools
 import re
 import subprocess
 import sys
@@ -17,26 +16,32 @@ import hjbjax as hjb
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "hjbjax"
 
-# The README's architecture table, top to bottom and left to right: a file imports only from files before it.
+# The README's architecture table: a folder imports only from folders before it, and inside it a file from files before.
 TABLE = (ROOT / "README.md").read_text(encoding="utf-8").split("## Architecture")[1].split("\n## ")[0]
-ROWS = [re.findall(r"`(\w+)`", row.split("|")[2]) for row in TABLE.splitlines() if row.startswith("| ")]
-*PIPELINE, COMMAND = ROWS  # the command alone may see the package as its users do
-ORDER = ["_version", *itertools.chain.from_iterable(PIPELINE), "__init__", *COMMAND, "__main__"]
-SOURCES = sorted(PACKAGE.rglob("*.py"))
+ROWS = [[re.findall(r"`(\w+)`", cell) for cell in row.split("|")[1:3]] for row in TABLE.splitlines()]
+FOLDERS = {folder[0]: files for folder, files in (row for row in ROWS if len(row) == 2) if folder}
+ORDER = [f"{folder}.{file}" for folder, files in FOLDERS.items() for file in files if file != "zoo"]
+SOURCES = sorted(path for path in PACKAGE.rglob("*.py") if path.parent != PACKAGE)
+LOOSE = {"__init__.py", "__main__.py", "_version.py", "py.typed"}
 
 
-def module_of(path):
-    """The name in ORDER: a package such as zoo counts as one file."""
-    return path.relative_to(PACKAGE).with_suffix("").parts[0]
+def name_of(path):
+    """As in ORDER: "folder.file", or the folder alone for its ``__init__`` and for all of the zoo."""
+    folder, file = path.relative_to(PACKAGE).with_suffix("").parts
+    return folder if folder == "zoo" or file == "__init__" else f"{folder}.{file}"
 
 
-def test_the_table_names_each_file_once():
+def test_the_folders_are_those_of_the_table_and_hold_the_files_that_it_names():
+    entries = {path.name for path in PACKAGE.iterdir()} - LOOSE - {"__pycache__"}
+    assert entries == set(FOLDERS)
+    assert len(entries) <= 16
     assert len(set(ORDER)) == len(ORDER)
-    assert COMMAND[-1] == "cli"
+    names = {name_of(path) for path in SOURCES}
+    assert {name for name in names if "." in name} == set(ORDER)
 
 
 def imports_of(path):
-    """The names in ORDER that a file imports, inside functions too; a name of the package's own is its __init__."""
+    """What a file imports of the package, inside functions too, as "folder.file", "folder" or "" for the whole."""
     found = set()
     for statement in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(statement, ast.ImportFrom):
@@ -46,20 +51,26 @@ def imports_of(path):
             names = [alias.name for alias in statement.names] if isinstance(statement, ast.Import) else []
         for package, *rest in (name.split(".") for name in names):
             if package == "hjbjax":
-                found.add(rest[0] if rest and rest[0] in ORDER else "__init__")
+                known = ".".join(rest[:2]) in ORDER
+                found.add(
+                    ".".join(rest[:2]) if known else rest[0] if rest and rest[0] in (*FOLDERS, "_version") else ""
+                )
     return found
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_a_file_imports_only_from_above(path):
-    name = module_of(path)
-    assert name in ORDER, f"{path.name} has no place in the README's architecture table"
-    above = set(ORDER[: ORDER.index(name)])
-    if name == "solver":
-        above -= {"files"}  # a Solution reads and writes itself; solving touches no file
-    if name == "zoo":
-        above = {"pytree", "sets", "grid", "problem", "zoo"}  # problems know nothing of how they are solved
-    assert imports_of(path) <= above
+    folder, _, file = name_of(path).partition(".")
+    folders = list(FOLDERS)
+    inside = FOLDERS[folder][: FOLDERS[folder].index(file)] if file else FOLDERS[folder]
+    allowed = {"_version", *(f"{folder}.{each}" for each in inside)} | ({"zoo"} if folder == "zoo" else set())
+    earlier = folders[: folders.index(folder)]
+    if folder == "zoo":
+        earlier = ["problem"]  # problems know nothing of how they are solved
+    allowed |= {name for name in ORDER if name.partition(".")[0] in earlier}
+    if folder == "cli":  # the command alone may see the package as its users do
+        allowed |= {"", "zoo", "plotting"}
+    assert imports_of(path) <= allowed
 
 
 def test_importing_brings_nothing_heavy():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
-from hjbjax import arguments
+from hjbjax.problem import arguments
 
 NO_NUMBERS = [0, 0.0, -1, -1e-300, float("nan"), float("inf"), True, np.True_, None, "1", [1.0], np.ones(1), 10**400]
 NO_COUNTS = [0, -1, 2.0, float("nan"), float("inf"), True, np.True_, None, "7", [3], np.float64(3)]

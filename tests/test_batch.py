@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
-from hjbjax.pytree import node
+from hjbjax.problem.pytree import node
 
 GRID = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (13, 11))
 MANY = np.linspace(-1.0, 1.0, 41)  # more than the checks try: they pass over the fourth

@@ -9,13 +9,15 @@ import pytest
 from hypothesis import given, settings
 from systems import SEEDS, random_game, random_grid, random_problem
 
-from hjbjax import bellman, chain, hamiltonian
-from hjbjax.bellman import Conditions
-from hjbjax.grid import Grid
-from hjbjax.problem import Problem
-from hjbjax.pytree import node
-from hjbjax.schemes import Upwind
-from hjbjax.sets import Ball, Box, Finite
+from hjbjax.discretisation import chain
+from hjbjax.discretisation.schemes import Upwind
+from hjbjax.hamiltonian import hamiltonian
+from hjbjax.iteration import bellman
+from hjbjax.iteration.bellman import Conditions
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import node
+from hjbjax.problem.sets import Ball, Box, Finite
 
 UNIT = Box([-1.0], [1.0])
 NOISES = ["none", "diagonal", "matrix"]

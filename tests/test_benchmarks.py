@@ -14,7 +14,7 @@ from click.testing import CliRunner
 import hjbjax as hjb
 from benchmarks import batch, controls, floors, footprint, growth, peers, questions, scaling, startup, sweep, timing
 from benchmarks.__main__ import NAMES
-from hjbjax.pytree import cast
+from hjbjax.problem.pytree import cast
 
 COMPLETE = {"benchmark", "device", "dtype", "versions", "date", "cores", "status"}
 

@@ -11,15 +11,16 @@ import pytest
 from hypothesis import given, settings
 from systems import SEEDS, random_grid, random_problem
 
-from hjbjax import bellman, certificates, chain
-from hjbjax.bellman import Conditions
-from hjbjax.certificates import Certificate
-from hjbjax.grid import Grid
-from hjbjax.problem import Problem
-from hjbjax.pytree import cast
-from hjbjax.schemes import Upwind
-from hjbjax.sets import Finite
-from hjbjax.solution import Solution
+from hjbjax.discretisation import chain
+from hjbjax.discretisation.schemes import Upwind
+from hjbjax.iteration import bellman, certificates
+from hjbjax.iteration.bellman import Conditions
+from hjbjax.iteration.certificates import Certificate
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import cast
+from hjbjax.problem.sets import Finite
+from hjbjax.solution.solution import Solution
 
 POINTS = np.array([[-1.0], [0.0], [0.4], [1.0]])
 laws = settings(max_examples=10)

@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given, settings
 from systems import SEEDS, SHAPES, random_grid, random_problem
 
-from hjbjax import chain
-from hjbjax.grid import Grid
-from hjbjax.problem import Problem
-from hjbjax.schemes import Upwind
-from hjbjax.sets import Ball, Box, Finite
+from hjbjax.discretisation import chain
+from hjbjax.discretisation.schemes import Upwind
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.sets import Ball, Box, Finite
 
 PLAIN = Upwind(central=False)
 CASES = [(n, kind) for n in (1, 2, 3, 4) for kind in ("none", "scalar", "diagonal", "matrix")] + [(2, "function")]
@@ -188,7 +188,7 @@ def test_generator_and_adjoint_are_dual(n, seed):
 
 @jax.jit
 def _apply_both(problem, grid, u, value, density):
-    from hjbjax import stencil
+    from hjbjax.discretisation import stencil
 
     rates = chain.rates(problem, grid, u, scheme=Upwind(), dtype=value.dtype)
     arriving = rates.inflow(grid)
@@ -320,7 +320,7 @@ SLOW = [
 def test_quantecon_finds_our_value(n, kind, with_target):
     from quantecon.markov import DiscreteDP
 
-    from hjbjax.solver import solve
+    from hjbjax.solvers.solver import solve
 
     rng = np.random.default_rng(n)
     ending = {"target": lambda x: abs(x[0]) - 0.5, "exit_cost": lambda x: x[0] - 1} if with_target else {}

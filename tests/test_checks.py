@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from questions import GRID, U, accepted, drift, in_disc, refused
 
-from hjbjax import Grid, Problem, checks
-from hjbjax.pytree import node
-from hjbjax.schemes import Upwind
+from hjbjax import Grid, Problem
+from hjbjax.discretisation.schemes import Upwind
+from hjbjax.problem import checks
+from hjbjax.problem.pytree import node
 
 # --- shapes ---
 

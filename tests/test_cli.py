@@ -12,10 +12,11 @@ import pytest
 from click.testing import CliRunner
 
 import hjbjax
-from hjbjax import results, zoo
-from hjbjax.cli import main
-from hjbjax.path import Path, PathStatus
-from hjbjax.solution import Solution, Status, load
+from hjbjax import zoo
+from hjbjax.cli import results
+from hjbjax.cli.main import main
+from hjbjax.feedback.path import Path, PathStatus
+from hjbjax.solution.solution import Solution, Status, load
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -464,7 +465,7 @@ def test_help_and_version():
 
 
 def test_help_loads_nothing_heavy():
-    code = "import sys, hjbjax.cli; print(*sys.modules)"
+    code = "import sys, hjbjax.cli.main; print(*sys.modules)"
     answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment())
     assert not {"matplotlib", "diffrax", "scipy", "optax", "tqdm"} & set(answer.stdout.split())
 

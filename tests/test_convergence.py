@@ -14,11 +14,11 @@ from matplotlib.figure import Figure
 
 import hjbjax as hjb
 from hjbjax import plotting, zoo
-from hjbjax.canvas import few
-from hjbjax.convergence import Study, fitted_order
-from hjbjax.reference import distance, mask_of, richardson
-from hjbjax.solution import Solution
-from hjbjax.status import Status
+from hjbjax.applications.convergence import Study, fitted_order
+from hjbjax.applications.reference import distance, mask_of, richardson
+from hjbjax.plotting.canvas import few
+from hjbjax.solution.solution import Solution
+from hjbjax.solution.status import Status
 
 ROOT = Path(__file__).parents[1]
 PROBLEM, _ = zoo.bang_bang()
@@ -181,7 +181,7 @@ FINE = Solution(line(81)[0], np.zeros(81), None, code=Status.CONVERGED)
     ],
 )
 def test_refusals_come_before_anything_is_solved(monkeypatch, grids, reference, options, message):
-    monkeypatch.setattr("hjbjax.convergence.solve", lambda *_, **__: pytest.fail("solved"))
+    monkeypatch.setattr("hjbjax.applications.convergence.solve", lambda *_, **__: pytest.fail("solved"))
     with pytest.raises(ValueError, match=message):
         hjb.convergence_study(PROBLEM, grids, reference, **options)
 

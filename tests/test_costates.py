@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hjbjax.grid import Grid
-from hjbjax.solution import Solution
-from hjbjax.stretching import Sinh
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.stretching import Sinh
+from hjbjax.solution.solution import Solution
 
 BOX = ([-1.0, 0.0], [1.0, 3.0])
 PLAIN = Grid(*BOX, (6, 5))

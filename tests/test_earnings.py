@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
-from hjbjax import report
-from hjbjax.certificates import Certificate
-from hjbjax.status import Status
+from hjbjax.iteration.certificates import Certificate
+from hjbjax.solution.status import Status
+from hjbjax.solvers import report
 
 P = jax.tree_util.Partial
 U = hjb.Box([-1.0], [1.0])

@@ -12,7 +12,8 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import solve_continuous_are
 
 import hjbjax as hjb
-from hjbjax import pointwise, zoo
+from hjbjax import zoo
+from hjbjax.hamiltonian import pointwise
 
 RIDER = hjb.Problem(lambda x, u: u, lambda x, u: x @ x + u @ u, hjb.Box([-9.0], [9.0]))
 

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
-from hjbjax import checks, driver, epochs
-from hjbjax.status import Status
+from hjbjax.problem import checks
+from hjbjax.solution.status import Status
+from hjbjax.solvers import driver, epochs
 
 U = hjb.Box([-1.0], [1.0])
 GRID = hjb.Grid([-1.0], [1.0], (9,))
@@ -148,7 +149,7 @@ def test_memory_that_runs_out_on_a_coarser_grid(monkeypatch):
 
 
 def test_memory_that_runs_out_in_a_batch(monkeypatch):
-    from hjbjax import batch
+    from hjbjax.solvers import batch
 
     monkeypatch.setattr(batch, "_run", out_of_memory)
     with pytest.raises(MemoryError, match="memory ran out"):

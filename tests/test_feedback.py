@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from hjbjax import zoo
-from hjbjax.feedback import greedy_feedback
-from hjbjax.grid import Grid
-from hjbjax.problem import Problem
-from hjbjax.sets import Box, Finite
-from hjbjax.simulation import simulate
-from hjbjax.solution import Solution
-from hjbjax.solver import solve
+from hjbjax.feedback.feedback import greedy_feedback
+from hjbjax.feedback.simulation import simulate
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.sets import Box, Finite
+from hjbjax.solution.solution import Solution
+from hjbjax.solvers.solver import solve
 
 
 def exact_at_nodes(grid, exact, policy):

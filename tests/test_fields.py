@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hjbjax import Grid, fields
+from hjbjax import Grid
+from hjbjax.problem import fields
 
 RISE = np.arange(16.0).reshape(4, 4) / 7
 TABLE = np.linspace(-1.5, 1.5, 9)
@@ -155,7 +156,7 @@ def test_what_has_no_rule_falls_back_and_says_so_once(name):
         np.testing.assert_array_equal(got, again)
 
 
-@pytest.mark.filterwarnings("ignore::hjbjax.fields.FallbackWarning")
+@pytest.mark.filterwarnings("ignore::hjbjax.FallbackWarning")
 @pytest.mark.parametrize("name", DIFFERENTIATED)
 def test_derivatives_by_a_parameter_are_those_of_vmap(name):
     with jax.enable_x64(True):
@@ -180,7 +181,7 @@ def test_forward_mode_keeps_the_functions_own_derivative(function):
         np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-14)
 
 
-@pytest.mark.filterwarnings("ignore::hjbjax.fields.FallbackWarning")
+@pytest.mark.filterwarnings("ignore::hjbjax.FallbackWarning")
 @pytest.mark.parametrize(
     "name", ["stack", "matmul", "set", "add", "cond", "custom_jvp of a vector", "grad inside", "solve"]
 )

@@ -16,10 +16,10 @@ import zipfile
 import numpy as np
 import pytest
 
-from hjbjax import files
-from hjbjax.files import FileError
-from hjbjax.grid import Grid
-from hjbjax.solution import FORMAT, VERSION, Solution, Status, load
+from hjbjax.problem.grid import Grid
+from hjbjax.solution import files
+from hjbjax.solution.files import FileError
+from hjbjax.solution.solution import FORMAT, VERSION, Solution, Status, load
 
 
 def example(seed=0, **changes):
@@ -185,7 +185,7 @@ def test_kill_minus_nine_while_writing_leaves_a_whole_file(tmp_path):
     path = tmp_path / "run.npz"
     program = f"""
         import numpy as np
-        from hjbjax import files
+        from hjbjax.solution import files
         for number in range(10**9):
             array = np.full(300_000, number * 1.0)
             files.write({str(path)!r}, {{"format": "test", "version": 1}}, {{"a": array}}, force=True)

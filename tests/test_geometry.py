@@ -24,7 +24,7 @@ from systems import SEEDS
 
 import hjbjax as hjb
 from hjbjax import geometry, zoo
-from hjbjax.pytree import node
+from hjbjax.problem.pytree import node
 
 
 @pytest.fixture(autouse=True)

@@ -9,12 +9,13 @@ import pytest
 from hypothesis import given, settings
 from systems import SEEDS, random_game, random_grid, random_problem, random_sigma
 
-from hjbjax import chain, hamiltonian, players
-from hjbjax.grid import Grid
-from hjbjax.problem import Problem
-from hjbjax.pytree import node
-from hjbjax.schemes import Upwind
-from hjbjax.sets import Ball, Box, Finite, samples
+from hjbjax.discretisation import chain
+from hjbjax.discretisation.schemes import Upwind
+from hjbjax.hamiltonian import hamiltonian, players
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import node
+from hjbjax.problem.sets import Ball, Box, Finite, samples
 
 CASES = [(1, "diagonal"), (2, "none"), (2, "matrix"), (2, "function"), (3, "diagonal"), (3, "matrix"), (4, "matrix")]
 SCHEMES = [Upwind(central=False), Upwind(central=True)]

@@ -7,7 +7,8 @@ import pytest
 from questions import U, drift, refused
 
 import hjbjax as hjb
-from hjbjax import checks, indices, zoo
+from hjbjax import zoo
+from hjbjax.problem import checks, indices
 
 ALONG = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (5, 5))
 TABLE = np.array([1.0, 2.0, 3.0])

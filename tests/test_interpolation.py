@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hjbjax.grid import Grid
-from hjbjax.solution import Solution
+from hjbjax.problem.grid import Grid
+from hjbjax.solution.solution import Solution
 
 GRID = Grid([-1.0, 0.0], [1.0, 3.0], (5, 4))
 RING = Grid([0.0, -1.0], [2 * np.pi, 1.0], (8, 3), (True, False), ("angle", "speed"))

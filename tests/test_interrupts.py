@@ -25,7 +25,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the backgro
 seed, count = int(sys.argv[1]), int(sys.argv[2])
 import jax, jax.numpy as jnp, numpy as np
 import hjbjax as hjb
-from hjbjax import clock
+from hjbjax.solution import clock
 warnings.simplefilter("ignore")
 
 compiled = []  # when each compilation ended, and its seconds

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
-from hjbjax import iteration
-from hjbjax.certificates import Gap
-from hjbjax.preparation import prepare_on_host
-from hjbjax.status import Status
+from hjbjax.iteration import iteration
+from hjbjax.iteration.certificates import Gap
+from hjbjax.solution.status import Status
+from hjbjax.solvers.preparation import prepare_on_host
 
 GRID = hjb.Grid([-1.0], [1.0], (11,))
 LARGE = 1e6  # the size of the value, whose rounding is 64 eps of it

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hjbjax import plotting
-from hjbjax.grid import Grid
+from hjbjax.problem.grid import Grid
 
 BALL = Grid([-1.0] * 3, [1.0] * 3, (21,) * 3, names=("x", "y", "z"))
 

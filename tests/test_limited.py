@@ -9,7 +9,7 @@ import pytest
 
 import hjbjax as hjb
 from hjbjax import zoo
-from hjbjax.pytree import node
+from hjbjax.problem.pytree import node
 
 PLAIN = hjb.Upwind(central=False)
 NOISE = 0.5**0.5

@@ -14,21 +14,13 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
-from hjbjax import (
-    batch,
-    convergence,
-    driver,
-    epochs,
-    perturbations,
-    rests,
-    robust,
-    shooting,
-    simulation,
-    survey,
-    two_point,
-)
-from hjbjax.clock import Clock, Stopped, noting_interrupts
-from hjbjax.pytree import node
+from hjbjax.applications import convergence, perturbations, robust
+from hjbjax.extremals import rests, shooting, two_point
+from hjbjax.feedback import simulation
+from hjbjax.finiteness import survey
+from hjbjax.problem.pytree import node
+from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
+from hjbjax.solvers import batch, driver, epochs
 
 U = hjb.Box([-1.0], [1.0])
 GRID = hjb.Grid([-1.0], [1.0], (25,))

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
-from hjbjax import epochs
-from hjbjax.sets import Box
+from hjbjax.problem.sets import Box
+from hjbjax.solvers import epochs
 
 GRID = hjb.Grid([-2.0], [2.0], (41,))
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
-from hjbjax import marching, splitting
+from hjbjax.iteration import marching, splitting
 
 UNIT = hjb.Box([-1.0], [1.0])
 LINE = hjb.Grid([-1.0], [1.0], (41,))

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from systems import SEEDS, random_grid, random_problem
 
 import hjbjax as hjb
-from hjbjax import simulation
-from hjbjax.sets import Box
+from hjbjax.feedback import simulation
+from hjbjax.problem.sets import Box
 
 
 def order_of(errors, ratio=2.0):

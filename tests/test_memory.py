@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
-from hjbjax import driver, iteration, memory
-from hjbjax.preparation import judge, prepare
-from hjbjax.pytree import cast
+from hjbjax.iteration import iteration
+from hjbjax.problem.pytree import cast
+from hjbjax.solvers import driver, memory
+from hjbjax.solvers.preparation import judge, prepare
 
 METHODS = [
     hjb.ValueIteration(),
@@ -161,7 +162,7 @@ def test_a_limit_on_the_address_space_refuses_a_grid():
     program = """
 import resource
 import hjbjax as hjb
-from hjbjax import memory
+from hjbjax.solvers import memory
 used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
 memory.available()  # starts JAX
 resource.setrlimit(resource.RLIMIT_AS, (used + 4 * 10**9,) * 2)
@@ -217,7 +218,8 @@ def test_the_estimate_is_near_what_the_compiler_reports(method):
     """Between half and four times the peak of the compiled step."""
     import jax
 
-    from hjbjax import iteration, preparation
+    from hjbjax.iteration import iteration
+    from hjbjax.solvers import preparation
 
     grid = square(64)
     with jax.enable_x64(True):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
-from hjbjax.status import Status
+from hjbjax.solution.status import Status
 
 U = hjb.Box([-1.0], [1.0])
 GRID = hjb.Grid([-1.0], [1.0], (21,))

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from systems import SEEDS
 
 import hjbjax as hjb
-from hjbjax import hamiltonian, players
-from hjbjax.minimisers import UNROLL, enumerate_actions, refine
+from hjbjax.hamiltonian import hamiltonian, players
+from hjbjax.hamiltonian.minimisers import UNROLL, enumerate_actions, refine
 
 NODES = 6
 laws = settings(max_examples=30)

@@ -5,15 +5,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hjbjax.grid import Grid
-from hjbjax.interpolation import extended
-from hjbjax.path import PathStatus
-from hjbjax.problem import Problem
-from hjbjax.pytree import node
-from hjbjax.sets import Ball, Box, Finite
-from hjbjax.simulation import simulate
-from hjbjax.solution import Solution
-from hjbjax.stretching import Sinh
+from hjbjax.feedback.path import PathStatus
+from hjbjax.feedback.simulation import simulate
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import node
+from hjbjax.problem.sets import Ball, Box, Finite
+from hjbjax.problem.stretching import Sinh
+from hjbjax.solution.interpolation import extended
+from hjbjax.solution.solution import Solution
 
 GRID = Grid([-1.5, -1.5], [1.5, 1.5], (31, 31))
 

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
-from hjbjax import perturbations, plotting, zoo
-from hjbjax.perturbations import Series
-from hjbjax.sets import Box, Finite
+from hjbjax import plotting, zoo
+from hjbjax.applications import perturbations
+from hjbjax.applications.perturbations import Series
+from hjbjax.problem.sets import Box, Finite
 
 PLANT = hjb.Problem(lambda x, u: u, lambda x, u: 0.5 * (x @ x + u @ u), Box([-4.0], [4.0]), discount=1.0)
 GRID = hjb.Grid([-2.0], [2.0], (41,))

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from systems import SEEDS
 
-from hjbjax.piecewise import Kinked, kinked_ball, piecewise_input, piecewise_pair
+from hjbjax.hamiltonian.piecewise import Kinked, kinked_ball, piecewise_input, piecewise_pair
 
 NODES = 6
 

@@ -13,8 +13,9 @@ import sys
 import numpy as np
 import pytest
 
-from hjbjax import files, placement, results
-from hjbjax.placement import FileError
+from hjbjax.cli import results
+from hjbjax.solution import files, placement
+from hjbjax.solution.placement import FileError
 
 RACES = 60
 posix = pytest.mark.skipif(os.name != "posix", reason="pipes, devices and locks are POSIX's")
@@ -220,7 +221,7 @@ def test_what_another_machine_is_writing_stays(tmp_path):
     path.write_bytes(b"half")
     program = f"""
 import time
-from hjbjax import placement
+from hjbjax.solution import placement
 with placement.claimed({str(path)!r}):
     print("claimed", flush=True)
     time.sleep(60)
@@ -239,7 +240,7 @@ def test_kill_minus_nine_leaves_nothing_for_long(tmp_path):
     program = f"""
 import os, signal
 import numpy as np
-from hjbjax import files
+from hjbjax.solution import files
 os.fsync = lambda handle: os.kill(os.getpid(), signal.SIGKILL)
 files.write({str(tmp_path / "run.npz")!r}, {{"format": "test", "version": 1}}, {{"a": np.ones(3)}})
 """

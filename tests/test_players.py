@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
-from hjbjax import players
-from hjbjax.preparation import judge
+from hjbjax.hamiltonian import players
+from hjbjax.solvers.preparation import judge
 
 LINE = hjb.Grid([-2.0], [2.0], (21,))
 UNIT = hjb.Box([-1.0], [1.0])

@@ -11,8 +11,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from hjbjax import plotting
-from hjbjax.grid import Grid
-from hjbjax.solution import Solution
+from hjbjax.problem.grid import Grid
+from hjbjax.solution.solution import Solution
 
 
 def made(grid, value, policy=None, **more):

@@ -10,8 +10,10 @@ from scipy.stats import norm
 from systems import SEEDS, random_grid, random_problem
 
 import hjbjax as hjb
-from hjbjax import chain, exits, marching, probabilities
-from hjbjax.pytree import node
+from hjbjax.applications import exits, probabilities
+from hjbjax.discretisation import chain
+from hjbjax.iteration import marching
+from hjbjax.problem.pytree import node
 
 UNIT = hjb.Box([-1.0], [1.0])
 SIGMA = 0.7

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hjbjax import Ball, Box, Problem
-from hjbjax.pytree import node
+from hjbjax.problem.pytree import node
 
 U, D = Box([-1.0], [1.0]), Ball(1.0, 1)
 

@@ -8,8 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import hjbjax as hjb
-from hjbjax import chain, proper
-from hjbjax.clock import Clock
+from hjbjax.discretisation import chain
+from hjbjax.finiteness import proper
+from hjbjax.solution.clock import Clock
 
 MOVES = np.array([[-1.0], [0.0], [1.0]])
 GRID = hjb.Grid([0.0], [7.0], (8,))

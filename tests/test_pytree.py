@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hjbjax import Ball, Box, Finite, Grid, Problem
-from hjbjax.pytree import REMEMBERED, altered, as_partial, cast, is_traced, node, numbers, remembered
+from hjbjax.problem.pytree import REMEMBERED, altered, as_partial, cast, is_traced, node, numbers, remembered
 
 
 @node(static=("kind",), host=("history", "note"))

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
-from hjbjax.sets import Box
+from hjbjax.problem.sets import Box
 
 UNIT = Box([-1.0], [1.0])
 

@@ -6,12 +6,12 @@ import pytest
 from hypothesis import given, settings
 from systems import SEEDS, random_grid, random_problem
 
-from hjbjax import chain, recurrence
-from hjbjax.grid import Grid
-from hjbjax.problem import Problem
-from hjbjax.schemes import Upwind
-from hjbjax.sets import Box
-from hjbjax.stretching import Sinh
+from hjbjax.discretisation import chain, recurrence
+from hjbjax.discretisation.schemes import Upwind
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.sets import Box
+from hjbjax.problem.stretching import Sinh
 
 COUNTS = (65, 129, 257)
 
@@ -118,7 +118,7 @@ def test_a_damped_oscillator_under_noise():
 
 def test_a_density_under_the_policy_that_was_found():
     """LQ: u = −p x makes a Gauss of variance σ²/2p."""
-    from hjbjax.solver import solve
+    from hjbjax.solvers.solver import solve
 
     problem = Problem(lambda x, u: u, lambda x, u: x @ x + u @ u, Box([-9.0], [9.0]), noise=1.0, discount=1.0)
     grid = Grid([-5.0], [5.0], (201,))

@@ -10,10 +10,10 @@ from equations import LAYOUTS, ids, make_grid, random_equation
 from hypothesis import given, settings
 from systems import SEEDS
 
-from hjbjax import relaxation
-from hjbjax.bellman import Correction
-from hjbjax.chain import Rates
-from hjbjax.relaxation import Direct, Krylov, Sweeps
+from hjbjax.discretisation.chain import Rates
+from hjbjax.iteration import relaxation
+from hjbjax.iteration.bellman import Correction
+from hjbjax.iteration.relaxation import Direct, Krylov, Sweeps
 
 
 @pytest.fixture(autouse=True, scope="module")

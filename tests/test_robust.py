@@ -10,11 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import hjbjax as hjb
-from hjbjax import robust, zoo
-from hjbjax.path import PathStatus
-from hjbjax.pytree import node
-from hjbjax.robust import Trial
-from hjbjax.sets import Ball, Box, Finite
+from hjbjax import zoo
+from hjbjax.applications import robust
+from hjbjax.applications.robust import Trial
+from hjbjax.feedback.path import PathStatus
+from hjbjax.problem.pytree import node
+from hjbjax.problem.sets import Ball, Box, Finite
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

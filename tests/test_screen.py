@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
-from hjbjax import screen
-from hjbjax.grid import Grid
-from hjbjax.path import Path
-from hjbjax.solution import Solution, Status
+from hjbjax.feedback.path import Path
+from hjbjax.problem.grid import Grid
+from hjbjax.solution import screen
+from hjbjax.solution.solution import Solution, Status
 
 GRID = Grid([0.0], [1.0], (3,))
 NASTY = "\x1b[2J\x1b]0;title\x07 \u202ereversed \x00 \x9b31m \ud800"
@@ -124,7 +124,7 @@ def test_what_could_not_be_read_again_is_not_written(tmp_path):
 
 
 def test_a_refused_file_is_quoted_in_one_short_line(tmp_path):
-    from hjbjax import files
+    from hjbjax.solution import files
 
     path = tmp_path / "run.npz"
     for header in ({"format": "test", "version": NASTY * 10**4}, {"format": "test", "version": 1}):

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from hjbjax.grid import Grid
-from hjbjax.path import PathStatus
-from hjbjax.problem import Problem
-from hjbjax.pytree import node
-from hjbjax.sets import Box
-from hjbjax.simulation import rollout, simulate
+from hjbjax.feedback.path import PathStatus
+from hjbjax.feedback.simulation import rollout, simulate
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import node
+from hjbjax.problem.sets import Box
 
 ROOT3 = math.sqrt(3.0)
 A, B = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])

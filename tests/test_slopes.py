@@ -8,8 +8,8 @@ from hypothesis import given
 from numpy.polynomial import Polynomial
 from systems import SEEDS
 
-from hjbjax import slopes
-from hjbjax.grid import Grid
+from hjbjax.discretisation import slopes
+from hjbjax.problem.grid import Grid
 
 SHAPE = (9, 7)
 GRID = Grid([0.0, -1.0], [2.0, 3.0], SHAPE, (True, False))

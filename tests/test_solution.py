@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hjbjax.grid import Grid
-from hjbjax.solution import Solution, SolveError, Status
+from hjbjax.problem.grid import Grid
+from hjbjax.solution.solution import Solution, SolveError, Status
 
 GRID = Grid([-1.0, 0.0], [1.0, 3.0], (5, 4))
 RING = Grid([0.0, -1.0], [2 * np.pi, 1.0], (8, 3), (True, False), ("angle", "speed"))

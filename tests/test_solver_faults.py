@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
-from hjbjax import driver
-from hjbjax.preparation import prepare_on_host
-from hjbjax.pytree import node
+from hjbjax.problem.pytree import node
+from hjbjax.solvers import driver
+from hjbjax.solvers.preparation import prepare_on_host
 
 GRID = hjb.Grid([-1.0, -2.0], [1.0, 2.0], (17, 18))
 SLOW = hjb.ValueIteration()

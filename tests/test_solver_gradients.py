@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
-from hjbjax import sensitivity, zoo
-from hjbjax.pytree import node
+from hjbjax import zoo
+from hjbjax.iteration import sensitivity
+from hjbjax.problem.pytree import node
 
 TRACES = []
 

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
-from hjbjax import chain, zoo
+from hjbjax import zoo
+from hjbjax.discretisation import chain
 
 TOL = 1e-5
 METHODS = [

@@ -9,7 +9,7 @@ from test_solver_refusals import GRID, problem, refusal
 
 import hjbjax as hjb
 from hjbjax import zoo
-from hjbjax.pytree import node
+from hjbjax.problem.pytree import node
 
 
 @pytest.mark.parametrize("tol", ["1e-3", None])

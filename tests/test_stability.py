@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import hjbjax as hjb
-from hjbjax import geometry, stability, zoo
-from hjbjax.pytree import node
+from hjbjax import geometry, zoo
+from hjbjax.geometry import stability
+from hjbjax.problem.pytree import node
 
 
 @pytest.fixture(autouse=True)

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hjbjax import stencil
-from hjbjax.grid import Grid
-from hjbjax.stretching import Sinh
+from hjbjax.discretisation import stencil
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.stretching import Sinh
 
 GRIDS = [
     Grid([0.0], [1.0], (5,)),

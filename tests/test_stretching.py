@@ -10,7 +10,7 @@ from jax.tree_util import Partial
 
 import hjbjax as hjb
 from hjbjax import zoo
-from hjbjax.pytree import altered
+from hjbjax.problem.pytree import altered
 
 strengths = st.floats(0.1, 8.0)
 centers = st.floats(0.0, 1.0)

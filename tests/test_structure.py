@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hjbjax import structure
-from hjbjax.pytree import as_partial, node
+from hjbjax.problem import structure
+from hjbjax.problem.pytree import as_partial, node
 
 MATRIX = np.array([[1.0, 2.0], [0.5, -1.0]])
 ARGUMENTS = ((3, False), (2, True))  # a state of three entries, a control of two
@@ -101,7 +101,7 @@ def test_verdict(name):
     assert verdict(function) == expected
 
 
-@pytest.mark.filterwarnings("ignore::hjbjax.fields.FallbackWarning")
+@pytest.mark.filterwarnings("ignore::hjbjax.FallbackWarning")
 def test_what_has_no_rule_is_constant_only_where_the_control_has_no_part():
     def solved(x, u):
         return jnp.stack([jnp.sort(x)[0] + u[0], jnp.arange(4.0)[u[0].astype(int)]])

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import hjbjax as hjb
-from hjbjax.pytree import node
+from hjbjax.problem.pytree import node
 
 
 @node()

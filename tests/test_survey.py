@@ -7,8 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from questions import GRID, U, accepted, in_disc, refused
 
-from hjbjax import Box, Finite, Grid, Problem, chain, correlation, survey
-from hjbjax.pytree import node
+from hjbjax import Box, Finite, Grid, Problem
+from hjbjax.discretisation import chain, correlation
+from hjbjax.finiteness import survey
+from hjbjax.problem.pytree import node
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from equations import LAYOUTS, SHAPES, ids, make_grid, random_equation
 from hypothesis import given, settings
 from systems import SEEDS
 
-from hjbjax import wavefront
+from hjbjax.iteration import wavefront
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -12,7 +12,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.pytree import node
+from hjbjax.problem.pytree import node
 from hjbjax.zoo.ingredients import positive
 
 

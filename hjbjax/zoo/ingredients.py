@@ -10,7 +10,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.pytree import as_partial, is_traced, node
+from hjbjax.problem.pytree import as_partial, is_traced, node
 
 
 def unit_cost(x: Any, u: Any) -> Any:

@@ -22,10 +22,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.grid import Grid
-from hjbjax.problem import Problem
-from hjbjax.pytree import as_partial, node
-from hjbjax.sets import Box
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import as_partial, node
+from hjbjax.problem.sets import Box
 from hjbjax.zoo.ingredients import QuadraticCost, positive
 
 

@@ -10,10 +10,10 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from hjbjax.grid import Grid
-from hjbjax.problem import Problem
-from hjbjax.pytree import node
-from hjbjax.sets import Box
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import node
+from hjbjax.problem.sets import Box
 from hjbjax.zoo.ingredients import answer
 
 

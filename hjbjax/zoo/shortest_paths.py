@@ -12,10 +12,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.grid import Grid
-from hjbjax.problem import Problem
-from hjbjax.pytree import node
-from hjbjax.sets import Ball, Box, Finite
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import node
+from hjbjax.problem.sets import Ball, Box, Finite
 from hjbjax.zoo.ingredients import Arrival, Disc, answer, positive, unit_cost
 
 

@@ -11,10 +11,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.grid import Grid
-from hjbjax.problem import Problem
-from hjbjax.pytree import node
-from hjbjax.sets import Box
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import node
+from hjbjax.problem.sets import Box
 from hjbjax.zoo.ingredients import OutsideBall, OutsideCube, answer, noise_or_none, positive, unit_cost
 
 TERMS = 200  # of the series for the square, whose tail falls like k⁻³ at the worst place: 1e-6 there, 1e-15 inside

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hjbjax import zoo
-from hjbjax.sets import Ball, Finite
+from hjbjax.problem.sets import Ball, Finite
 
 WITH_ANSWER = [entry for entry in zoo.catalogue.values() if entry.exact is not None]
 

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hjbjax import fields, zoo
-from hjbjax.sets import Ball, Finite
+from hjbjax import zoo
+from hjbjax.problem import fields
+from hjbjax.problem.sets import Ball, Finite
 
 ENTRIES = list(zoo.catalogue.values())
 WITH_ANSWER = [entry for entry in ENTRIES if entry.exact is not None]

@@ -4,8 +4,9 @@ import jax
 import numpy as np
 import pytest
 
-from hjbjax import Grid, Problem, Solution, Status, plotting, results, simulate, zoo
-from hjbjax.path import PathStatus, joined
+from hjbjax import Grid, Problem, Solution, Status, plotting, simulate, zoo
+from hjbjax.cli import results
+from hjbjax.feedback.path import PathStatus, joined
 
 
 def exact_solution(entry, **parameters):

@@ -1,0 +1,144 @@
+"""Questions about where and when paths end, as problems: who reaches a set, and how long it takes.
+
+    P(x) = opt E 1{x(τ) in the target, not in the obstacle},      T(x) = opt E τ,       τ = first time in either
+
+are the problem's own equation without running cost (or with cost 1) and with an exit cost of one on the target and zero
+on the obstacle. The control minimises and the disturbance maximises, as everywhere: a greatest probability or time is
+that of minus the cost. A feedback that is given closes the loop: what is left has no control.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.feedback.feedback import check_kept
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import as_partial, is_traced, node
+
+
+@node(static=("marched", "timed"))
+class Closed:
+    """A problem's drift and noise under a feedback; where the feedback is NaN, the state stays where it is.
+
+    Args:
+      problem: the problem.
+      control: a pytree that is called with (x), or with (t, x) if ``marched``, or if a function of the time.
+      marched: whether the control takes the time.
+      timed: whether the closed loop depends on the time.
+    """
+
+    problem: Problem
+    control: Any
+    marched: bool
+    timed: bool
+
+    def drift(self, *arguments: Any) -> jax.Array:
+        """f(x, control(x), d), shape (n,)."""
+        t, x, u, d, acts = self._given(arguments)
+        return jnp.where(acts, jnp.asarray(self.problem.drift(*self.problem.arguments(x, u, d, t))), 0)
+
+    def noise(self, *arguments: Any) -> jax.Array:
+        """σ there, in the shape in which the problem gives it."""
+        t, x, u, d, acts = self._given(arguments)
+        sigma = self.problem.noise
+        return jnp.where(acts, jnp.asarray(sigma(*self.problem.arguments(x, u, d, t)) if callable(sigma) else sigma), 0)
+
+    def _given(self, arguments: tuple) -> tuple[Any, Any, Any, Any, Any]:
+        """The time, the state, the control, the disturbance, and whether there is a control."""
+        t, rest = (arguments[0], arguments[1:]) if self.timed else (0.0, arguments)
+        x, d = rest[0], rest[2] if self.problem.is_game else None
+        u = jnp.asarray(self.control(t, x) if self.marched else self.control(x))
+        acts = ~jnp.any(jnp.isnan(u))
+        return t, x, jnp.where(acts, u, 0), d, acts
+
+
+def closed(problem: Problem, feedback: Any, horizon: Any, name: str) -> Problem:
+    """The problem with its control replaced by a feedback, and with none of its costs.
+
+    Args:
+      problem: the problem, with controls.
+      feedback: a Solution, or a function of x (of t and x if the problem depends on the time).
+      horizon: how long it is to act; a marched one must be kept at times that are dense enough up to there.
+      name: who asks, for refusals.
+
+    Raises:
+      ValueError: there is no control to replace; a marched feedback that is not known up to the horizon.
+      TypeError: the feedback cannot be called.
+    """
+    if problem.controls is None:
+        raise ValueError(f"{name}: got a feedback, but problem.controls is None; leave out feedback")
+    solved = hasattr(feedback, "control_at")
+    if not solved and not callable(feedback):
+        signature = "(t, x)" if problem.time_dependent else "(x)"
+        raise TypeError(f"{name}: feedback is {feedback!r}, wanted a Solution or a function {signature}")
+    marched = feedback.times is not None if solved else problem.time_dependent
+    if solved and marched and isinstance(horizon, (int, float, np.number)) and not is_traced(feedback.times):
+        check_kept(feedback, float(horizon), f"{name}: horizon")
+    look = jax.tree_util.Partial(_inside, as_partial(feedback.control_at)) if solved else as_partial(feedback)
+    loop = Closed(problem, look, marched, marched or problem.time_dependent)
+    still = solved or callable(problem.noise)  # a function always has a control, and leaves a number what it is
+    return Problem(
+        loop.drift, None, None, disturbances=problem.disturbances,
+        noise=loop.noise if still and problem.noise is not None else problem.noise,
+        isaacs=problem.isaacs,
+        time_dependent=loop.timed,
+    )  # fmt: skip
+
+
+def ending(problem: Problem, target: Any, obstacle: Any, cost: float, exit_cost: float) -> Problem:
+    """The problem that pays ``cost`` per unit time and ``exit_cost`` on the target where that is no obstacle.
+
+    Args:
+      problem: whose drift, noise and players count.
+      target: a function ≤ 0 inside.
+      obstacle: likewise, or None; it ends the path as well, and wins where the two overlap.
+      cost: per unit time; 0 for none.
+      exit_cost: on the target; 0 for none.
+    """
+    sets = (target,) if obstacle is None else (target, obstacle)
+    paid = jax.tree_util.Partial(_paid, exit_cost, sets) if exit_cost else None
+    return Problem(
+        problem.drift, jax.tree_util.Partial(_constant, cost) if cost else None, problem.controls,
+        disturbances=problem.disturbances, noise=problem.noise, target=jax.tree_util.Partial(_nearest, sets),
+        exit_cost=paid, isaacs=problem.isaacs, time_dependent=problem.time_dependent,
+    )  # fmt: skip
+
+
+def outside(region: Callable, *where: Any) -> Any:
+    """The complement of a set given by a function ≤ 0 inside."""
+    return -region(*where)
+
+
+def timed(function: Any, needed: bool) -> Any:
+    """A function of the state as one of time and state."""
+    return jax.tree_util.Partial(_timeless, function) if needed and function is not None else function
+
+
+def _timeless(function: Callable, t: Any, *arguments: Any) -> Any:
+    return function(*arguments)
+
+
+def _inside(look_up: Callable, *where: Any) -> Any:
+    """A solution's control; a node on the edge must not be refused for a rounding."""
+    return look_up(*where, clamp=True)
+
+
+def _constant(value: Any, *arguments: Any) -> Any:
+    return jnp.asarray(value, jnp.result_type(float))
+
+
+def _nearest(sets: tuple, *where: Any) -> Any:
+    """≤ 0 in one of the sets."""
+    distances = [jnp.asarray(each(*where)) for each in sets]
+    return distances[0] if len(sets) == 1 else jnp.minimum(*distances)
+
+
+def _paid(amount: Any, sets: tuple, *where: Any) -> Any:
+    """The amount where the path ends in the target; on a boundary between nodes the nearer set is the one it met."""
+    if len(sets) == 1:
+        return jnp.asarray(amount, jnp.result_type(float))
+    inside, hit = (jnp.asarray(each(*where)) for each in sets)
+    return jnp.where((hit <= 0) | (hit <= inside), 0.0, amount)

@@ -1,0 +1,205 @@
+"""How noise that vanishes, and disturbances that become expensive, change a value: both by second order.
+
+    ε: dx = f dt + ε dw, the equation with ½ε² Δ V;      γ: dx = (f + E d) dt, cost L − ½γ²|d|²
+
+    |V^ε − V| = O(ε²),   |V^γ − V| = O(γ⁻²),   and the same of the feedbacks, where V is smooth;
+
+to first order ε² times the integral of ½ΔV, and γ⁻² times that of ½|E'DV|², along the optimal path. At a kink of V the
+change is of lower order: choose the region without one. All problems are solved on one grid by one scheme, so that the
+grid's own error cancels but for its product with the change; with ``Limited()`` no numerical diffusion hides ε. The
+orders are slopes of log error over log ε and log 1/γ by least squares, of errors that rise above the tolerance.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from hjbjax.applications.convergence import fitted_order
+from hjbjax.applications.gain import attenuation, saturation
+from hjbjax.applications.reference import mask_of
+from hjbjax.discretisation.schemes import Limited, Scheme
+from hjbjax.iteration.iteration import Method
+from hjbjax.problem import checks
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.sets import AdmissibleSet, Ball, Box
+from hjbjax.solution.clock import Clock, noting_interrupts
+from hjbjax.solution.solution import Solution, SolveError
+from hjbjax.solution.status import Status
+from hjbjax.solvers.solver import check_arguments, solve
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Series:
+    """One way to perturb a problem, entry by entry of a parameter that goes to zero.
+
+    Args:
+      name: "ε" or "1/γ".
+      parameters: the values of it, increasing.
+      errors: the largest |V' − V| over the nodes of the region.
+      feedback_errors: the largest |u' − u| there.
+      solutions: the perturbed solutions.
+      fitted: which entries count for the order of V: converged, and with a change that rises above the tolerance.
+      feedback_fitted: which count for that of u: of these, where |u' − u| rises above the tolerance over the spacing.
+    """
+
+    name: str
+    parameters: np.ndarray
+    errors: np.ndarray
+    feedback_errors: np.ndarray
+    solutions: tuple[Solution, ...]
+    fitted: np.ndarray
+    feedback_fitted: np.ndarray
+
+    @property
+    def order(self) -> float:
+        """The fitted slope of the value; NaN with fewer than two entries to fit."""
+        return fitted_order(self.parameters[self.fitted], self.errors[self.fitted])
+
+    @property
+    def feedback_order(self) -> float:
+        """The fitted slope of the feedback, likewise."""
+        return fitted_order(self.parameters[self.feedback_fitted], self.feedback_errors[self.feedback_fitted])
+
+    def __str__(self) -> str:
+        lines = [f"{self.name:>9} {'value':>10} {'feedback':>10}  status"]
+        rows = zip(self.parameters, self.errors, self.feedback_errors, self.fitted, self.solutions, strict=True)
+        for parameter, value, feedback, counts, solution in rows:
+            mark = " " if counts else "*"
+            lines.append(f"{parameter:>9.4g} {value:>10.3e}{mark}{feedback:>10.3e}  {solution.status.name}")
+        lines.append(f"{'order':>9} {self.order:>10.2f} {self.feedback_order:>10.2f}")
+        return "\n".join(lines)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Perturbation:
+    """A value beside those with noise and with disturbances; ``print`` shows the tables.
+
+    Args:
+      nominal: the solution without either.
+      noise: what the noises ε did.
+      gain: what the disturbances at the levels γ did, over 1/γ.
+      scheme: the scheme's text.
+      tol: the tolerance of every solve.
+    """
+
+    nominal: Solution
+    noise: Series
+    gain: Series
+    scheme: str
+    tol: float
+
+    def __str__(self) -> str:
+        head = f"{self.scheme}, tol {self.tol:g}; largest changes in the region"
+        lines = [head, *(str(each) for each in (self.noise, self.gain))]
+        if not (self.noise.fitted.all() and self.gain.fitted.all()):
+            lines.append("* not fitted: the solve did not converge, or the change does not rise above the tolerance")
+        return "\n".join(lines)
+
+
+def perturbation_study(
+    problem: Problem,
+    grid: Grid,
+    *,
+    noises: Sequence[float],
+    gammas: Sequence[float],
+    disturbances: AdmissibleSet,
+    enters: Any = None,
+    region: Any = 0.25,
+    scheme: Scheme = Limited(),
+    method: Method | None = None,
+    tol: float = 1e-6,
+) -> Perturbation:
+    """Solve a problem with noises that vanish and with disturbances that become expensive, and fit the orders.
+
+    Args:
+      problem: the question, without noise or disturbances; without discount noise would cost without end.
+      grid: the nodes, the same for all.
+      noises: ε, at least two numbers > 0.
+      gammas: γ, at least two feasible levels.
+      disturbances: the set of d, not saturated in the region.
+      enters: E, as for ``attenuation``.
+      region: where changes are measured, without a kink of V: a function of one state, or a share of the box.
+      scheme: as for ``solve``.
+      method: as for ``solve``.
+      tol: as for ``solve``, and small beside the smallest change.
+
+    Returns:
+      The study; ``hjb.plotting.perturbation(study)`` draws both lines in one picture.
+
+    Raises:
+      ValueError: fewer than two noises or levels; a problem that has noise or disturbances already, or no discount; a
+        set of disturbances that is felt in the region; and what ``solve`` refuses.
+      SolveError: it was interrupted; ``.solution`` is the study so far, or the unperturbed solution.
+
+    Example:
+      >>> import hjbjax as hjb
+      >>> plant = hjb.Problem(lambda x, u: u, lambda x, u: 0.5 * (x @ x + u @ u), hjb.Box([-4.0], [4.0]), discount=1.0)
+      >>> study = hjb.perturbation_study(plant, hjb.Grid([-2.0], [2.0], (21,)), noises=[0.05, 0.1], gammas=[5.0, 10.0],
+      ...     disturbances=hjb.Box([-1.0], [1.0]), scheme=hjb.Upwind(central=False))
+      >>> round(study.noise.order, 1), round(study.gain.order, 1)
+      (2.0, 2.0)
+    """
+    check_arguments(problem, grid, method, scheme, tol, None, None)
+    levels = _increasing("noises", noises), _increasing("gammas", gammas)
+    if problem.is_game or problem.noise is not None:
+        raise ValueError("perturbation_study: the problem has noise or disturbances already; leave them out")
+    if not np.asarray(problem.discount) > 0:
+        raise ValueError("perturbation_study: with noise and no discount the cost has no end; give a discount > 0")
+    mask = mask_of(region, grid, "perturbation_study")
+    games = [attenuation(problem, gamma, disturbances, enters=enters) for gamma in levels[1][::-1]]
+    if not isinstance(disturbances, (Box, Ball)):
+        raise ValueError(f"perturbation_study: the disturbances are {disturbances!r:.60}; wanted a Box or a Ball")
+    with jax.enable_x64(True):
+        checks.shapes(games[0], grid, scheme)
+
+    def solved(which: Problem, throw: bool = False) -> Solution:
+        return solve(which, grid, scheme=scheme, method=method, tol=tol, throw=throw)
+
+    clock, found = Clock(), []
+    noisy = [dataclasses.replace(problem, noise=epsilon) for epsilon in levels[0]]
+    with noting_interrupts(clock):
+        nominal = solved(problem, throw=True)
+        for perturbed in (*noisy, *games):
+            if not clock.interrupted:
+                found.append(solved(perturbed))
+    noise = _series("ε", levels[0], found[: len(noisy)], nominal, mask, tol)
+    gain = _series("1/γ", 1 / levels[1][::-1], found[len(noisy) :], nominal, mask, tol)
+    study = Perturbation(nominal, noise, gain, str(scheme), tol)
+    if clock.interrupted:
+        came = f"{len(found)} of {len(noisy) + len(games)} perturbed problems"
+        raise SolveError(f"perturbation_study: interrupted after {came}; .solution is the study so far", study)
+    felt = saturation(dataclasses.replace(found[-1], disturbance=_within(found[-1], mask)), games[-1], inner=1.0)
+    if felt.share > 0:
+        raise ValueError(f"perturbation_study: at gamma = {levels[1][0]:g} {felt}; widen the set, or raise gamma")
+    return study
+
+
+def _increasing(name: str, numbers: Any) -> np.ndarray:
+    values = np.unique(np.asarray(numbers, np.float64))
+    if values.size < 2 or not np.all(np.isfinite(values) & (values > 0)):
+        raise ValueError(f"perturbation_study: got {name} = {numbers!r}, wanted at least two finite numbers > 0")
+    return values
+
+
+def _within(solution: Solution, mask: np.ndarray) -> np.ndarray:
+    """The disturbance in the region, NaN outside."""
+    return np.where(mask[..., None], solution.disturbance, np.nan)
+
+
+def _series(
+    name: str, parameters: np.ndarray, solutions: Sequence[Solution], nominal: Solution, mask: np.ndarray, tol: float
+) -> Series:
+    parameters = parameters[: len(solutions)]  # fewer where the study was interrupted
+    values = [np.abs(each.value - nominal.value)[mask] for each in solutions]
+    inputs = [np.abs(each.policy - nominal.policy)[mask] for each in solutions]
+    errors = np.array([np.max(each) for each in values])
+    feedback = np.array([np.max(each, initial=0.0) for each in inputs])
+    converged = np.array([each.status is Status.CONVERGED for each in solutions], bool)
+    fitted = converged & np.isfinite(errors) & (errors > tol)
+    finest = min(float(nominal.grid.spacing(axis)) for axis in range(nominal.grid.ndim))
+    seen = fitted & (feedback > tol / finest)  # a slope of V is known no better than that
+    return Series(name, parameters, errors, feedback, tuple(solutions), fitted, seen)

@@ -1,0 +1,293 @@
+"""Front doors of probabilities and exit times: ``reach_probability``, ``stay_probability``, ``expected_exit_time``.
+
+The equations are those of ``solve`` and ``march`` with the exit costs of ``exits``; nothing is solved here. For all
+times without discount a chain that may stay away for ever has more than one solution: there value iteration from zero
+finds the least one, which is the probability; where every pair of actions must end, any method does. The chain
+tells at host level; inside jit, vmap and grad it is taken for granted that every pair must end.
+"""
+
+import contextlib
+import dataclasses
+import warnings
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.applications import exits
+from hjbjax.discretisation.schemes import Upwind
+from hjbjax.finiteness import proper, survey
+from hjbjax.iteration.iteration import ValueIteration
+from hjbjax.problem import checks
+from hjbjax.problem.fields import FallbackWarning
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import as_partial, is_traced
+from hjbjax.solution.solution import Solution, SolveError
+from hjbjax.solvers import memory
+from hjbjax.solvers.horizon import march
+from hjbjax.solvers.solver import as_dtype, check_arguments, solve
+
+TOL = 1e-6
+
+
+def reach_probability(
+    problem: Problem,
+    grid: Grid,
+    target: Callable | None = None,
+    *,
+    obstacle: Callable | None = None,
+    horizon: float | None = None,
+    least: bool = False,
+    feedback: Any = None,
+    **options: Any,
+) -> Solution:
+    """The greatest probability with which the control can bring the state into the target.
+
+    V(x) = sup_u inf_d P(x(τ) in the target, τ ≤ horizon), τ the first time in the target or in the obstacle, from
+    min max (V_t + f·DV + ½ tr σσᵀD²V) = 0 with V = 1 on the target and 0 on the obstacle. Order and cost are those
+    of ``march``, and of ``solve`` without a horizon. There is no certificate. Where for all times the state may stay
+    away from both, value iteration from zero finds the probability among several solutions, which is slower. It stops
+    at a step of at most 1e-9 (4e-6 in float32), which bounds nothing: where steps shrink slowly more is left.
+
+    Inside ``jit``, ``vmap`` and ``grad`` it is not looked for whether the state may stay away for ever: where it may,
+    the answer there may be wrong.
+
+    Args:
+      problem: the system; its costs and its discount play no part.
+      grid: the nodes.
+      target: a function ≤ 0 inside; ``None`` is the problem's own target.
+      obstacle: likewise: a path that comes there first has failed, also where the two overlap.
+      horizon: until when, in units of time; ``None`` is for all times.
+      least: the least probability instead: the control keeps away.
+      feedback: a Solution or a function of the state that acts in place of the control; then nothing is optimised.
+        Where a Solution has no action the state stays for ever. A marched one must have been kept at times that
+        are dense enough up to the horizon.
+      options: anything else that ``march`` takes, or ``solve`` without a horizon: times, scheme, method, ...; tol is
+        that of ``solve``, 1e-6 by default: a bound on the residual and the last step.
+
+    Returns:
+      A Solution whose value is the probability, and whose policy attains it.
+
+    Raises:
+      ValueError: no target; open ends; a feedback without controls; and what ``march`` and ``solve`` refuse.
+      SolveError: no convergence, with the partial solution.
+
+    Example:
+      >>> import hjbjax as hjb
+      >>> gambler, grid = hjb.Problem(lambda x, u: 0.5 + 0 * x, noise=1.0), hjb.Grid([0.0], [1.0], (101,))
+      >>> chance = hjb.reach_probability(gambler, grid, lambda x: 1 - x[0], obstacle=lambda x: x[0])
+      >>> round(float(chance.value_at([0.5])), 4)  # (1 − e^{−2·½·½})/(1 − e^{−2·½})
+      0.6225
+    """
+    name = "reach_probability"
+    _refuse_open(grid, name)
+    problem, inside, hit = _asked(problem, target, obstacle, feedback, horizon, name)
+    sign = 1.0 if least else -1.0
+    question = exits.ending(problem, inside, hit, 0.0, sign)
+    with _quiet(feedback):
+        if horizon is None:
+            question, options = _without_end(question, grid, least, options)
+        return _answer(question, grid, horizon, options, sign)
+
+
+def stay_probability(
+    problem: Problem,
+    grid: Grid,
+    region: Callable,
+    *,
+    horizon: float | None = None,
+    least: bool = False,
+    feedback: Any = None,
+    **options: Any,
+) -> Solution:
+    """The greatest probability with which the control can keep the state in a region.
+
+    V(x) = sup_u inf_d P(x(s) in the region for all s ≤ horizon), one minus the least probability of leaving it.
+
+    Args:
+      problem: the system; its costs, its discount and its target play no part.
+      grid: the nodes; the region must not cover all of them, since at the edge of the box noise reflects.
+      region: a function ≤ 0 inside; its boundary counts as outside.
+      horizon: as in ``reach_probability``.
+      least: the least probability instead: the control wants to get out.
+      feedback: as in ``reach_probability``.
+      options: as in ``reach_probability``.
+
+    Returns:
+      A Solution whose value is the probability, and whose policy attains it.
+
+    Raises:
+      ValueError: as ``reach_probability``.
+      SolveError: no convergence, with the partial solution.
+
+    Example:
+      >>> import jax.numpy as jnp
+      >>> import hjbjax as hjb
+      >>> walk, grid = hjb.Problem(lambda x, u: 0 * x, noise=1.0), hjb.Grid([-1.0], [1.0], (41,))
+      >>> kept = hjb.stay_probability(walk, grid, lambda x: jnp.abs(x[0]) - 1, horizon=1.0)
+      >>> round(float(kept.value_at(0.0, [0.0])), 2)  # (4/π) e^{−π²/8} − ...
+      0.37
+    """
+    leaving = jax.tree_util.Partial(exits.outside, as_partial(region, "stay_probability: region"))
+    with _scaled_errors(1.0, -1.0):
+        left = reach_probability(problem, grid, leaving, horizon=horizon, least=not least, feedback=feedback, **options)
+    return _scaled(left, 1.0, -1.0)
+
+
+def expected_exit_time(
+    problem: Problem,
+    grid: Grid,
+    target: Callable | None = None,
+    *,
+    horizon: float | None = None,
+    greatest: bool = False,
+    feedback: Any = None,
+    **options: Any,
+) -> Solution:
+    """The least expected time in which the control can bring the state into the target.
+
+    V(x) = inf_u sup_d E τ, τ the first time in the target: min max (1 + f·DV + ½ tr σσᵀD²V) = 0, V = 0 there. The
+    bound on |V − V_h| is certified, except for the greatest time.
+
+    Args:
+      problem: the system; its costs and its discount play no part.
+      grid: the nodes.
+      target: a function ≤ 0 inside; ``None`` is the problem's own. To leave a region r ≤ 0 give −r.
+      horizon: E min(τ, horizon) instead, by ``march``.
+      greatest: the greatest expected time instead: the control stays as long as it can.
+      feedback: as in ``reach_probability``.
+      options: anything else that ``solve`` takes, or ``march`` with a horizon.
+
+    Returns:
+      A Solution whose value is the time, inf where the target is not reached for certain.
+
+    Raises:
+      ValueError: no target; open ends; asked for the greatest time, a control that may stay away for ever, in a game
+        also if it needs the disturbance's help, which is not looked for inside ``jit``; and what ``solve`` and
+        ``march`` refuse.
+      SolveError: no convergence, with the partial solution.
+
+    Example:
+      >>> import jax.numpy as jnp
+      >>> import hjbjax as hjb
+      >>> walk, grid = hjb.Problem(lambda x, u: 0 * x, noise=2.0), hjb.Grid([-1.0], [1.0], (41,))
+      >>> time = hjb.expected_exit_time(walk, grid, lambda x: 1 - jnp.abs(x[0]))
+      >>> round(float(time.value_at([0.5])), 6)  # (1 − x²)/σ²
+      0.1875
+    """
+    name = "expected_exit_time"
+    _refuse_open(grid, name)
+    problem, inside, _ = _asked(problem, target, None, feedback, horizon, name)
+    sign = -1.0 if greatest else 1.0
+    question = exits.ending(problem, inside, None, sign, 0.0)
+    with _quiet(feedback):
+        if horizon is None:
+            options = {"tol": TOL} | options
+            if greatest:
+                _refuse_staying(question, grid, options)
+        return _answer(question, grid, horizon, options, sign)
+
+
+def _refuse_open(grid: Any, name: str) -> None:
+    if isinstance(grid, Grid) and grid.sides("open"):
+        raise ValueError(
+            f"{name}: beyond an open end a value is continued from inside, which makes no probability and no time of "
+            "it;\nuse edges='projected' or 'constrained', or a box whose ends lie in the target or in the obstacle"
+        )
+
+
+def _asked(
+    problem: Any, target: Any, obstacle: Any, feedback: Any, horizon: Any, name: str
+) -> tuple[Problem, Any, Any]:
+    """The system that runs, with its loop closed if there is a feedback, its target and its obstacle."""
+    if not isinstance(problem, Problem):
+        raise TypeError(f"{name}: got {type(problem).__name__}, wanted a Problem")
+    inside = problem.target if target is None else as_partial(target, f"{name}: target")
+    if inside is None:
+        raise ValueError(f"{name}: there is nothing to reach: give target=, a function ≤ 0 inside, or problem.target")
+    hit = as_partial(obstacle, f"{name}: obstacle")
+    if feedback is None:
+        return problem, inside, hit
+    loop = exits.closed(problem, feedback, horizon, name)
+    needs_time = loop.time_dependent and not problem.time_dependent
+    return loop, exits.timed(inside, needs_time), exits.timed(hit, needs_time)
+
+
+@contextlib.contextmanager
+def _quiet(feedback: Any) -> Iterator[None]:
+    """A feedback that is a Solution is looked up node by node; that is no fault of the user's functions."""
+    if not hasattr(feedback, "control_at"):
+        yield
+        return
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FallbackWarning)
+        yield
+
+
+def _without_end(question: Problem, grid: Grid, least: bool, options: dict) -> tuple[Problem, dict]:
+    """The question for all times, with what finds the least of its solutions where one may stay away for ever.
+
+    Zero, a bound of the value, is given as a running maximum, or for the greatest probability, which comes with its
+    sign changed, as a stopping cost: so that the iteration starts there, and no node is taken for one without a value.
+    """
+    options = {"tol": TOL} | options
+    if not _may_stay(question, grid, options):
+        return question, options
+    bound: dict[str, Any] = {"running_max" if least else "stopping_cost": jax.tree_util.Partial(_zero)}
+    return dataclasses.replace(question, **bound), {"method": ValueIteration()} | options
+
+
+def _zero(*where: Any) -> Any:
+    return jnp.zeros(())
+
+
+def _may_stay(question: Problem, grid: Grid, options: dict) -> int:
+    """The number of nodes at which some actions keep the state away from every end for ever; 0 while traced."""
+    scheme, kind = options.get("scheme", Upwind()), as_dtype(options.get("dtype"))
+    check_arguments(question, grid, options.get("method"), scheme, options["tol"], None, None)
+    if is_traced(question, grid):
+        return 0
+    method = options.get("method") or ValueIteration()  # needs the least; solve asks again for what it takes
+    with jax.enable_x64(kind == np.float64):
+        memory.require(question, grid, method, kind, options.get("max_memory"))
+        checks.shapes(question, grid, scheme)
+        survey.values(question, grid, kind)
+        return int(np.sum(np.asarray(proper.refuge(question, grid, scheme=scheme.chain, dtype=kind))))
+
+
+def _refuse_staying(question: Problem, grid: Grid, options: dict) -> None:
+    count = _may_stay(question, grid, options)
+    if count:
+        how, who = ("may be", "actions of both players keep") if question.is_game else ("is", "action keeps")
+        raise ValueError(
+            f"expected_exit_time: the greatest time {how} infinite: at {count} of {grid.size} nodes some {who} the "
+            "state away from the target for ever;\ngive horizon= for E min(τ, horizon), or noise that drives it out"
+        )
+
+
+def _answer(question: Problem, grid: Grid, horizon: float | None, options: dict, sign: float) -> Solution:
+    """sign · V of the question, also for a partial solution."""
+    with _scaled_errors(0.0, sign):
+        found = solve(question, grid, **options) if horizon is None else march(question, grid, horizon, **options)
+    return _scaled(found, 0.0, sign)
+
+
+@contextlib.contextmanager
+def _scaled_errors(offset: float, sign: float) -> Iterator[None]:
+    """An error's partial solution is scaled as the whole one is."""
+    try:
+        yield
+    except SolveError as error:
+        if error.solution is not None:
+            error.solution = _scaled(error.solution, offset, sign)
+        raise
+
+
+def _scaled(solution: Solution, offset: float, sign: float) -> Solution:
+    """The solution with offset + sign · V for V; no certificate holds for a cost that is negative."""
+    if sign > 0:
+        return dataclasses.replace(solution, value=offset + solution.value)
+    return dataclasses.replace(solution, value=offset - solution.value, enclosure=None)

@@ -1,0 +1,154 @@
+"""Reachable sets and tubes, as problems whose cost is a signed distance l (≤ 0 inside).
+
+    reach:        V = min_u max_d min_s l(x(s)),                      the controller gets there from {V ≤ 0}
+    avoid:        V = min_u max_d max_s −l(x(s)),                     the disturbance gets it there from {V ≥ 0}
+    reach-avoid:  V = min_u max_d min_s max{l(x(s)), max_{r ≤ s} −o(x(r))},  there and never in the obstacle: {V ≤ 0}
+
+with s over [0, T] for a tube and s = T for a set. The control minimises and the disturbance maximises, as everywhere;
+these constructors alone know the vocabulary. Where an obstacle covers a part of the target, that part is no success.
+The value inherits the range of l, and its zero level does not depend on how l is scaled. ``march`` solves them over a
+horizon, ``solve`` for all times (tubes). Source: I. M. Mitchell, A. M. Bayen and C. J. Tomlin, A time-dependent
+Hamilton–Jacobi formulation of reachable sets for continuous dynamic games, IEEE Trans. Automat. Contr. 50.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import as_partial
+from hjbjax.problem.sets import AdmissibleSet
+
+
+def reach(
+    drift: Callable,
+    controls: AdmissibleSet | None,
+    target: Callable,
+    *,
+    disturbances: AdmissibleSet | None = None,
+    tube: bool = True,
+    forward: bool = False,
+    isaacs: str = "upper",
+    time_dependent: bool = False,
+) -> Problem:
+    """From where the control can bring the state into the target, whatever the disturbance: {V ≤ 0}.
+
+    Args:
+      drift: f, as in ``Problem``.
+      controls: the admissible set of u, which wants to get there.
+      target: the signed distance l(x), ≤ 0 inside; l(t, x) where the problem depends on the time.
+      disturbances: the admissible set of d, which wants to keep the state out.
+      tube: at some time within the horizon; otherwise exactly at its end.
+      forward: where the system can be when it starts in the target: the drift runs backwards.
+      isaacs: as in ``Problem``.
+      time_dependent: as in ``Problem``; not with ``forward``.
+
+    Returns:
+      The problem; V is in the units of l.
+
+    Example:
+      >>> import hjbjax as hjb
+      >>> problem = hjb.reach(lambda x, u: u, hjb.Box([-1.0], [1.0]), lambda x: jnp.abs(x[0]) - 0.5)
+      >>> solution = hjb.march(problem, hjb.Grid([-3.0], [3.0], (61,)), 1.0)
+      >>> bool(solution.value_at(0.0, [1.45]) <= 0), bool(solution.value_at(0.0, [1.55]) <= 0)
+      (True, False)
+    """
+    inside = as_partial(target, "reach: target")
+    stop, end = (inside, None) if tube else (None, inside)
+    return Problem(
+        _running(drift, forward, time_dependent), None, controls, disturbances=disturbances, stopping_cost=stop,
+        terminal_cost=end, isaacs=isaacs, time_dependent=time_dependent,
+    )  # fmt: skip
+
+
+def avoid(
+    drift: Callable,
+    controls: AdmissibleSet | None,
+    obstacle: Callable,
+    *,
+    disturbances: AdmissibleSet | None = None,
+    tube: bool = True,
+    forward: bool = False,
+    isaacs: str = "upper",
+    time_dependent: bool = False,
+) -> Problem:
+    """From where the control cannot keep the state out of the obstacle, for some disturbance: {V ≥ 0}.
+
+    Args:
+      drift: f, as in ``Problem``.
+      controls: the admissible set of u, which keeps away.
+      obstacle: the signed distance l(x), ≤ 0 inside; l(t, x) where the problem depends on the time.
+      disturbances: the admissible set of d, which pursues.
+      tube: at no time within the horizon; otherwise not at its end.
+      forward: as in ``reach``.
+      isaacs: as in ``Problem``.
+      time_dependent: as in ``Problem``; not with ``forward``.
+
+    Returns:
+      The problem; −V is the least distance that the control can guarantee.
+    """
+    depth = jax.tree_util.Partial(_negative, as_partial(obstacle, "avoid: obstacle"))
+    most, end = (depth, None) if tube else (None, depth)
+    return Problem(
+        _running(drift, forward, time_dependent), None, controls, disturbances=disturbances, running_max=most,
+        terminal_cost=end, isaacs=isaacs, time_dependent=time_dependent,
+    )  # fmt: skip
+
+
+def reach_avoid(
+    drift: Callable,
+    controls: AdmissibleSet | None,
+    target: Callable,
+    obstacle: Callable,
+    *,
+    disturbances: AdmissibleSet | None = None,
+    tube: bool = True,
+    forward: bool = False,
+    isaacs: str = "upper",
+    time_dependent: bool = False,
+) -> Problem:
+    """From where the control can bring the state into the target without ever touching the obstacle: {V ≤ 0}.
+
+    Args:
+      drift: f, as in ``Problem``.
+      controls: the admissible set of u.
+      target: the signed distance of the target, ≤ 0 inside.
+      obstacle: the signed distance of the obstacle, ≤ 0 inside; it wins where the two overlap.
+      disturbances: the admissible set of d, which wants the opposite.
+      tube: at some time within the horizon; otherwise exactly at its end.
+      forward: as in ``reach``.
+      isaacs: as in ``Problem``.
+      time_dependent: as in ``Problem``; not with ``forward``.
+
+    Returns:
+      The problem; V is in the units of the distances.
+    """
+    inside, hit = as_partial(target, "reach_avoid: target"), as_partial(obstacle, "reach_avoid: obstacle")
+    depth = jax.tree_util.Partial(_negative, hit)
+    stop, end = (inside, None) if tube else (None, inside)
+    return Problem(
+        _running(drift, forward, time_dependent), None, controls, disturbances=disturbances, stopping_cost=stop,
+        terminal_cost=end, running_max=depth, isaacs=isaacs, time_dependent=time_dependent,
+    )  # fmt: skip
+
+
+def _running(drift: Callable, forward: bool, time_dependent: bool) -> Callable:
+    """The drift, backwards for a forward set."""
+    if not forward:
+        return drift
+    if time_dependent:
+        raise ValueError(
+            "forward=True turns the time round, which it cannot do for functions of the time; write drift(T - t, x, u) "
+            "and the distances of T - t yourself, with forward=False and the drift's sign changed"
+        )
+    return jax.tree_util.Partial(_backwards, as_partial(drift, "drift"))
+
+
+def _backwards(drift: Callable, *arguments: Any) -> Any:
+    return -jnp.asarray(drift(*arguments))
+
+
+def _negative(distance: Callable, *arguments: Any) -> Any:
+    return -distance(*arguments)

@@ -1,0 +1,271 @@
+"""The command ``hjbjax``: solve a ready problem, list them, look at the machine.
+
+``solve`` writes ``solution.npz``, ``value.png``, ``policy.png`` and ``trajectory.png`` into a folder and prints
+one screen. What can be refused is refused in one line before anything is compiled. Files are made in a hidden
+folder beside the old ones and moved over them when they are whole.
+
+Exit codes: 0 done, 1 a check of ``doctor`` failed, 2 usage, 3 not converged, 4 diverged or not finite, 5 file,
+6 memory, 130 interrupted (Ctrl-C or SIGTERM).
+"""
+
+import contextlib
+import json
+import signal
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+
+from hjbjax._version import __version__
+from hjbjax.cli.command_line import Failure, Name, Number, OneLineGroup, Shape, finite, say, unknown
+
+FILES = ("solution.npz", "value.png", "policy.png", "trajectory.png")
+CODES = {"CONVERGED": 0, "DIVERGED": 4, "NONFINITE": 4, "INTERRUPTED": 130}  # any other status: 3, not converged
+METHODS = {"value-iteration": "ValueIteration", "policy-iteration": "PolicyIteration"}
+SCHEMES = {"upwind": "Upwind", "limited": "Limited", "eno2": "Eno2", "weno5": "Weno5"}
+PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "diffrax", "optax", "matplotlib", "tqdm", "click")
+
+
+def _systems() -> Iterable[str]:
+    from hjbjax import zoo
+
+    return zoo.catalogue
+
+
+def _offered(table: dict[str, str]) -> Callable[[], Iterable[str]]:
+    """The names in a table of choices that this version has."""
+
+    def names() -> Iterable[str]:
+        import hjbjax
+
+        return [name for name, choice in table.items() if hasattr(hjbjax, choice)]
+
+    return names
+
+
+@click.group(cls=OneLineGroup, invoke_without_command=True, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="hjbjax")
+@click.pass_context
+def main(context: click.Context) -> None:
+    """Hamilton-Jacobi-Bellman and Isaacs equations on grids."""
+    if context.invoked_subcommand is None:
+        click.echo(context.get_help())
+
+
+@main.command("list")
+@click.argument("name", required=False, type=Name("problem", _systems))
+def list_problems(name: str | None) -> None:
+    """List the ready problems; of one NAME, its parameters."""
+    from hjbjax import zoo
+
+    if name is None:
+        width = max(map(len, zoo.catalogue))
+        for entry in zoo.catalogue.values():
+            click.echo(f"{entry.name:<{width}}  {entry.summary}")
+        return
+    entry = zoo.catalogue[name]
+    click.echo(f"{entry.name}: {entry.summary}")
+    for key, default in entry.parameters.items():
+        if key != "shape":
+            click.echo(f"  --set {key}={_written(default)}")
+
+
+@main.command()
+@click.argument("name", type=Name("problem", _systems))
+@click.option("--shape", type=Shape(), help="Nodes along each axis, as in 200x201.")
+@click.option("--set", "settings", multiple=True, metavar="NAME=VALUE", help="A parameter; may be given several times.")
+@click.option("--method", type=Name("method", _offered(METHODS)), help=f"{' or '.join(METHODS)}; chosen if not given.")
+@click.option("--scheme", type=Name("scheme", _offered(SCHEMES)), help="The discretisation; upwind if not given.")
+@click.option("--tol", type=Number(), help="Certified bound on the algebraic error, in cost units.")
+@click.option("--max-steps", type=Number(int), help="Stop after so many steps.")
+@click.option("--time-limit", type=Number(), help="Stop after so many seconds.")
+@click.option("--out", type=click.Path(path_type=Path), help="Folder of the results; the problem's name if not given.")
+@click.option("--force", is_flag=True, help="Replace results that are there already.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of the screen.")
+def solve(
+    name: str, shape: Any, settings: tuple[str, ...], out: Path | None, force: bool, as_json: bool, **options: Any
+) -> None:
+    """Solve the ready problem NAME; write solution.npz, value.png, policy.png and trajectory.png."""
+    from hjbjax import zoo
+    from hjbjax.cli import results
+
+    entry = zoo.catalogue[name]
+    parameters = _parameters(entry, settings)
+    out = Path(name) if out is None else out
+    with _failing(OSError, 2, "--out: "):
+        results.check_folder(out, force)
+    problem, grid = _build(entry, parameters, shape)
+    path, made = None, []
+    with contextlib.ExitStack() as stack:
+        with _failing(OSError, 2, "--out: "):
+            staging = stack.enter_context(results.staging(out))
+        stack.enter_context(_one_line_warnings())
+        stack.enter_context(_interruptible())
+        solution = _solve(problem, grid, options)
+        with _failing(OSError, 5, "the results could not be written: "):
+            try:
+                start = entry.initial_state(grid.ndim)
+                finish = None if entry.finish is None else entry.finish(**parameters)
+                pictures = results.make(problem, solution, staging, start=start, duration=entry.duration, finish=finish)
+                for file, drawn in pictures:
+                    made.append(file)
+                    path = drawn
+            finally:  # what is whole is kept
+                results.publish(staging, out, made, force)
+    files = [out / file for file in made]
+    off = None
+    with contextlib.suppress(ValueError):  # no answer is known for these parameters
+        off = None if entry.exact is None else results.difference(entry.exact(**parameters), solution)
+    if as_json:
+        about = {"problem": name, "parameters": parameters, "exact_difference": off}
+        click.echo(json.dumps(results.report(solution, path, files, **about)))
+    else:
+        click.echo(str(solution))
+        if off is not None:
+            click.echo(f"off the exact answer by at most {off:.3g} on the inner half of the box")
+        if path is not None:
+            click.echo(f"path: {path}")
+        click.echo(f"wrote {', '.join(map(str, files))}")
+    if code := CODES.get(solution.status.name, 3):
+        raise Failure(f"{solution.status.name}: {solution.message or solution.status.message}", code)
+
+
+@contextlib.contextmanager
+def _failing(kind: type[Exception], exit_code: int, prefix: str = "") -> Iterator[None]:
+    """An error of a kind as one line and an exit code."""
+    try:
+        yield
+    except kind as error:
+        raise Failure(f"{prefix}{error}", exit_code) from error
+
+
+# ------------------------------------------------------------------------------------- before the solve
+
+
+def _parameters(entry: Any, settings: tuple[str, ...]) -> dict[str, Any]:
+    """The values of --set, each of the kind of its default."""
+    defaults = {key: value for key, value in entry.parameters.items() if key != "shape"}
+    chosen: dict[str, Any] = {}
+    for setting in settings:
+        key, equals, text = (part.strip() for part in setting.partition("="))
+        if not equals or not key or not text:
+            raise Failure(f"--set: got {setting!r}, wanted NAME=VALUE, as in --set {next(iter(defaults))}=2")
+        if key == "shape":
+            raise Failure("--set: the shape has an option of its own: --shape 200x201")
+        if key not in defaults:
+            raise Failure("--set: " + unknown(f"parameter of {entry.name}", key, defaults))
+        if key in chosen:
+            raise Failure(f"--set: {key} is given twice")
+        chosen[key] = _value_of(key, text, defaults[key])
+    return chosen
+
+
+def _value_of(key: str, text: str, default: Any) -> Any:
+    if isinstance(default, bool):
+        if text.lower() not in ("true", "false"):
+            raise Failure(f"--set: got {key}={text}, wanted true or false")
+        return text.lower() == "true"
+    parts = text.split(",")
+    kind = int if isinstance(default, int) else float
+    numbers = tuple(finite(part, kind) for part in parts)
+    if default is None and len(parts) == 1 and (whole := finite(text, int)) is not None:
+        numbers = (whole,)  # what has no default may be a count
+    if None in numbers or (isinstance(default, tuple) and len(parts) != len(default)):
+        wanted = "a whole number" if kind is int else "a finite number"
+        if isinstance(default, tuple):
+            wanted = f"{len(default)} finite numbers with commas between them"
+        raise Failure(f"--set: got {key}={text}, wanted {wanted}")
+    if len(parts) > 1 and isinstance(default, (int, float)):
+        raise Failure(f"--set: got {key}={text}, wanted one number")
+    return numbers if len(parts) > 1 else numbers[0]
+
+
+def _written(value: Any) -> str:
+    """A parameter's value as --set takes it."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return "..." if value is None else ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
+
+
+def _build(entry: Any, parameters: dict[str, Any], shape: tuple[int, ...] | None) -> tuple[Any, Any]:
+    try:
+        problem, grid = entry.build(**parameters)
+        if shape is None:
+            return problem, grid
+        if len(shape) != grid.ndim:
+            example = "x".join(map(str, grid.shape))
+            raise ValueError(
+                f"--shape: got {len(shape)} sizes, but {entry.name} has {grid.ndim} axes "
+                f"({', '.join(grid.names)}); give one size an axis, as in {example}"
+            )
+        return entry.build(**parameters, shape=shape)
+    except (ValueError, TypeError) as error:
+        raise Failure(error) from error
+    except MemoryError as error:
+        raise Failure(error, 6) from error
+
+
+@contextlib.contextmanager
+def _interruptible() -> Iterator[None]:
+    """Ctrl-C and SIGTERM alike: the solver keeps what it has for either.
+
+    A shell starts background jobs with SIGINT ignored, so SIGTERM must not go by way of SIGINT. While it runs the
+    solver notes what has the usual handler of Ctrl-C, and takes either for one.
+    """
+    try:
+        old = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    except ValueError:  # not the main thread: signals are another's business
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, old)
+
+
+@contextlib.contextmanager
+def _one_line_warnings() -> Iterator[None]:
+    def show(message: Any, *_: Any, **__: Any) -> None:
+        say(f"warning: {' '.join(str(message).split())}")
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", UserWarning)
+        warnings.showwarning = show
+        yield
+
+
+# ------------------------------------------------------------------------------------- solve and write
+
+
+def _solve(problem: Any, grid: Any, options: dict[str, Any]) -> Any:
+    import jax
+
+    import hjbjax as hjb
+
+    given = {key: value for key, value in options.items() if value is not None}
+    for key, table in (("method", METHODS), ("scheme", SCHEMES)):
+        if key in given:
+            given[key] = getattr(hjb, table[given[key]])()
+    try:
+        return hjb.solve(problem, grid, throw=False, **given)
+    except (ValueError, TypeError) as error:
+        raise Failure(error) from error
+    except MemoryError as error:
+        raise Failure(error, 6) from error
+    except jax.errors.JaxRuntimeError as error:
+        raise Failure(error, 6 if "RESOURCE_EXHAUSTED" in str(error) else 4) from error
+
+
+@main.command()
+def doctor() -> None:
+    """Check versions, devices, float64, a tiny solve, memory, pictures and the current folder."""
+    from hjbjax.cli.doctor import examine
+
+    failed = 0
+    for name, well, found in examine():
+        click.echo(f"{'ok  ' if well else 'FAIL'}  {name:<10}  {found}")
+        failed += not well
+    if failed:
+        raise Failure(f"{failed} of the checks failed", 1)

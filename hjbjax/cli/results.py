@@ -1,0 +1,274 @@
+"""The files of a solved problem, and its report for programs.
+
+    solution.npz    the Solution
+    value.png       the value; with the switching curve where the feedback is bang-bang
+    policy.png      every input of the feedback
+    trajectory.png  a closed loop on the value, and over time
+
+Files are made in a hidden folder beside the old ones and moved over them when they are whole. States of more
+than two dimensions are drawn on the plane of the first two axes through the start of the trajectory.
+"""
+
+import contextlib
+import dataclasses
+import math
+import os
+import shutil
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from hjbjax import plotting
+from hjbjax._version import __version__
+from hjbjax.feedback.feedback import greedy_feedback
+from hjbjax.feedback.path import Path as Trajectory
+from hjbjax.feedback.path import joined
+from hjbjax.feedback.simulation import simulate
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.sets import Ball
+from hjbjax.solution import placement
+from hjbjax.solution.solution import Solution, Status
+
+FILES = ("solution.npz", "value.png", "policy.png", "trajectory.png")
+SAMPLES = 400  # of a bang-bang feedback along its trajectory
+DPI = 160
+
+
+def check_folder(out: Path, force: bool = False) -> None:
+    """Refuses a folder that holds results, unless by ``force``, and what is no folder.
+
+    Raises:
+      OSError: with a line on what to do.
+    """
+    if os.path.lexists(out) and not out.is_dir():
+        raise NotADirectoryError(f"{out} is there and is no folder; give another name")
+    for file in FILES:
+        placement.check_place(out / file, force=True)
+    old = [file for file in FILES if os.path.lexists(out / file)]
+    if old and not force:
+        raise FileExistsError(f"{out} holds {', '.join(old)} already; give another --out, or --force to replace them")
+
+
+@contextlib.contextmanager
+def staging(out: Path) -> Iterator[Path]:
+    """A hidden folder on the file system of ``out``, gone at the end; that it can be made shows that one can write.
+
+    A killed command leaves it behind, for the next one to take away.
+
+    Raises:
+      OSError: ``out`` cannot be written.
+    """
+    place = out.absolute()
+    while not place.is_dir():
+        if os.path.lexists(place):
+            raise NotADirectoryError(f"{out} cannot be written: {place} is no folder; give another name")
+        place = place.parent
+    placement.sweep(place)
+    folder = place / placement.hidden_name(out.name)
+    try:
+        folder.mkdir(mode=0o700)
+    except OSError as error:
+        raise OSError(f"{out} cannot be written: {error.strerror}; give another folder") from error
+    try:
+        with placement.claimed(folder):
+            yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def publish(folder: Path, out: Path, made: Sequence[str], force: bool = False) -> None:
+    """Moves whole files into ``out``; an older file that has no successor goes with the result it belonged to.
+
+    Raises:
+      OSError: ``out`` cannot be written, or holds results by now.
+    """
+    if not made:
+        return
+    out.mkdir(parents=True, exist_ok=True)
+    check_folder(out, force)  # again: the solve may have taken long
+    for file in FILES:
+        if file in made:  # the first is always there: of two commands at once, one is refused before it moves anything
+            placement.place(folder / file, out / file, force)
+        else:
+            (out / file).unlink(missing_ok=True)
+
+
+def make(
+    problem: Problem,
+    solution: Solution,
+    folder: Path,
+    *,
+    start: Sequence[float],
+    duration: float,
+    finish: tuple[Problem, Any] | None = None,
+) -> Iterator[tuple[str, Trajectory | None]]:
+    """Makes the files one by one; yields the name of each and, with the last, the trajectory that it shows.
+
+    An interrupted solve is saved and not drawn; one that did not converge gets no trajectory. ``finish`` is the
+    problem and the feedback by which a trajectory goes on from the target, where that holds the rest of the cost.
+
+    Raises:
+      OSError: a file cannot be written.
+    """
+
+    def draw(name: str, artists: list[Any]) -> None:
+        artists[0].get_figure().savefig(folder / name, dpi=DPI)
+
+    solution.save(folder / "solution.npz")
+    yield "solution.npz", None
+    if solution.status == Status.INTERRUPTED:
+        return
+    fixed = dict(enumerate(start[2:], 2))
+    jumps = is_bang_bang(problem, solution)
+    draw("value.png", _with_curve(plotting.value(solution, fixed=fixed, target=problem.target), solution, fixed, jumps))
+    yield "value.png", None
+    draw("policy.png", _policies(solution, fixed, jumps))
+    yield "policy.png", None
+    path = None
+    if solution.status == Status.CONVERGED:
+        path = _trajectory(problem, solution, start, duration, jumps, finish)
+    if path is not None:
+        draw("trajectory.png", plotting.closed_loop(solution, path, fixed=fixed, target=problem.target))
+        yield "trajectory.png", path
+
+
+def is_bang_bang(problem: Problem, solution: Solution) -> bool:
+    """Whether the feedback jumps: it is enumerated, or nine of ten of its entries lie on a bound."""
+    lo, hi = getattr(problem.controls, "lo", None), getattr(problem.controls, "hi", None)
+    if solution.discrete or lo is None or hi is None:
+        return solution.discrete
+    policy, near = _known(solution), 1e-6 * (hi - lo)
+    return policy.size > 0 and bool(np.mean((policy <= lo + near) | (policy >= hi - near)) > 0.9)
+
+
+def _is_direction(problem: Problem, solution: Solution) -> bool:
+    """Whether the feedback is a direction: nine of ten of its controls lie on the sphere around a ball."""
+    if not isinstance(problem.controls, Ball):
+        return False
+    policy = _known(solution)
+    return policy.size > 0 and bool(np.mean(np.linalg.norm(policy, axis=-1) > problem.controls.radius * 0.999999) > 0.9)
+
+
+def _known(solution: Solution) -> np.ndarray:
+    policy = np.asarray(solution.policy)
+    return policy[np.all(np.isfinite(policy), axis=-1)]
+
+
+def _trajectory(
+    problem: Problem,
+    solution: Solution,
+    start: Sequence[float],
+    duration: float,
+    jumps: bool,
+    finish: tuple[Problem, Any] | None,
+) -> Trajectory | None:
+    """The closed loop, and what follows in the target.
+
+    Where the control jumps or is a direction, the mean of two is optimal for neither: there the Hamiltonian is
+    minimised at the state. One that jumps is sampled: an adaptive stepper crawls along its switching curve.
+    """
+    options: dict[str, Any] = {} if problem.noise is None else {"key": 0}
+    if jumps:
+        options["hold"] = duration / SAMPLES
+    sharp = jumps or _is_direction(problem, solution)
+    feedback = greedy_feedback(problem, solution) if sharp else solution
+    if finish is not None:
+        problem = dataclasses.replace(problem, exit_cost=None)
+    try:
+        path = simulate(problem, feedback, start, duration, **options)
+        if finish is None or path.reached is None:
+            return path
+        rest = simulate(*finish, path.states[-1], duration)
+        return joined(path, rest, float(np.asarray(problem.discount)))
+    except ValueError as error:
+        warnings.warn(f"no trajectory.png: {error}", UserWarning, stacklevel=2)
+        return None
+
+
+def _policies(solution: Solution, fixed: dict[int, float], jumps: bool) -> list[Any]:
+    """One picture an input, side by side."""
+    from matplotlib.figure import Figure
+
+    count = solution.policy.shape[-1]
+    figure = Figure(figsize=(5.4 * max(1, count), 4.2), layout="constrained")
+    if count == 0:
+        return [figure.text(0.5, 0.5, "this problem has no control", ha="center", va="center", color="0.4")]
+    artists: list[Any] = []
+    for input, ax in enumerate(figure.subplots(1, count, squeeze=False)[0]):
+        drawn = plotting.policy(solution, input=input, fixed=fixed, ax=plotting.styled(ax))
+        artists += _with_curve(drawn, solution, fixed, jumps, input)
+    return artists
+
+
+def _with_curve(
+    artists: list[Any], solution: Solution, fixed: dict[int, float], jumps: bool, input: int = 0
+) -> list[Any]:
+    """A picture with the switching curve, where there is one."""
+    if jumps and not solution.discrete and solution.grid.ndim > 1:
+        with contextlib.suppress(ValueError):  # the control keeps its sign
+            artists += plotting.switching_curve(solution, input=input, fixed=fixed, ax=artists[0].axes)
+    return artists
+
+
+def difference(exact: Callable, solution: Solution) -> float | None:
+    """The largest |V − exact| on the inner half of the box, where its edge is not felt.
+
+    Args:
+      exact: the value as a function of one state.
+      solution: what ``solve`` returned.
+
+    Returns:
+      The difference in cost units; ``None`` if nothing there is finite.
+    """
+    grid = solution.grid
+    index = []
+    for axis in range(grid.ndim):
+        lo, hi, nodes = grid.lo[axis], grid.hi[axis], np.asarray(grid.axis(axis))
+        inner = np.abs(nodes - (lo + hi) / 2) <= (hi - lo) / 4
+        index.append(np.arange(len(nodes)) if grid.periodic[axis] else np.flatnonzero(inner))  # type: ignore[index]
+    corner = np.ix_(*index)
+    states = grid.nodes()[corner]
+    with jax.enable_x64(True):
+        wanted = np.asarray(jax.lax.map(exact, states.reshape(-1, grid.ndim), batch_size=1 << 16))
+    off = np.abs(np.asarray(solution.value)[corner] - wanted.reshape(states.shape[:-1]))
+    off = off[np.isfinite(off)]
+    return float(off.max()) if off.size else None
+
+
+def report(solution: Solution, path: Trajectory | None, files: Sequence[Path], **about: Any) -> dict[str, Any]:
+    """The answer as JSON has it: without arrays of nodes, and null for infinity and NaN, which JSON lacks."""
+    names = ("start", "end", "duration", "cost", "status", "message")
+    answer = {
+        **about,
+        "shape": solution.grid.shape,
+        "status": solution.status.name,
+        "message": solution.message or solution.status.message,
+        **{name: getattr(solution, name) for name in ("steps", "residual", "error", "isaacs_gap", "stats")},
+        "trajectory": path
+        and dict(
+            zip(
+                names,
+                (path.states[0], path.states[-1], path.times[-1], path.cost, path.status.name, path.message),
+                strict=True,
+            )
+        ),
+        "files": [str(file) for file in files],
+        "version": __version__,
+    }
+    return _plain(answer)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, np.ndarray | np.generic) or hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if value is None or isinstance(value, bool | int | str) else str(value)

@@ -1,0 +1,103 @@
+"""Correlated noise and the spacings of a grid.
+
+The diagonal jumps of the chain take Σ_j |a_ij| h_i/h_j from a_ii, and what is left must not be negative:
+
+    a_ii/h_i ≥ Σ_{j≠i} |a_ij|/h_j        (a = σσᵀ, scaled diagonal dominance)
+
+With D = diag a there are such spacings exactly where the spectral radius of B = D^(−1/2) |a − D| D^(−1/2) is at
+most one; then 1/h = D^(−1/2) v with (I − B) v = 1, or at one with the Perron vector v of B, block by block. In 2-D
+there always are: h₁/h₂ = √(a₁₁/a₂₂).
+"""
+
+from typing import Any
+
+import numpy as np
+
+from hjbjax.problem.grid import Grid
+
+
+def spacings(a: Any, now: Any) -> np.ndarray | None:
+    """Spacings h close to the given ones with a_ii/h_i ≥ Σ_j |a_ij|/h_j on every axis, if there are any.
+
+    Args:
+      a: the diffusion matrix at one node, shape (n, n).
+      now: the spacings now, shape (n,); each block keeps their geometric mean.
+
+    Returns:
+      Spacings, shape (n,), or None.
+
+    Example:
+      >>> spacings([[1.0, 2.0], [2.0, 4.0]], [0.5, 0.5]).round(6).tolist()
+      [0.353553, 0.707107]
+    """
+    a, result = np.asarray(a, dtype=float), np.array(now, dtype=float)
+    root = np.sqrt(np.diag(a))
+    scale = np.where(root > 0, root, 1.0)
+    b = np.abs(a - np.diag(np.diag(a))) / np.outer(scale, scale)
+    linked = np.linalg.matrix_power(np.eye(len(a)) + (b > 0), len(a)) > 0
+    for block in {tuple(np.flatnonzero(row)) for row in linked}:
+        if len(block) == 1:
+            continue
+        axes = np.array(block)
+        inner = b[np.ix_(axes, axes)]
+        radii, vectors = np.linalg.eigh(inner)
+        if radii[-1] > 1 + 1e-12:
+            return None
+        if radii[-1] < 1 - 1e-9:  # (I − B) v = 1 has room on every axis, and v ≥ 1 where blocks hardly touch
+            v = np.linalg.solve(np.eye(len(axes)) - inner, np.ones(len(axes)))
+        else:
+            v = np.maximum(np.abs(vectors[:, -1]), 1e-9)
+        new = scale[axes] / v
+        result[axes] = new * np.exp(np.mean(np.log(result[axes] / new)))
+    return result
+
+
+def shape(a: Any, grid: Grid, wanted: Any) -> tuple[int, ...] | None:
+    """Numbers of nodes for which the chain represents ``a`` on the same box, if there are any near the present ones.
+
+    Args:
+      a: the diffusion matrix at one node, shape (n, n).
+      grid: the grid.
+      wanted: spacings that represent it, shape (n,).
+    """
+    a, lengths = np.asarray(a, dtype=float), np.asarray(grid.hi) - np.asarray(grid.lo)
+    ends = 1 - np.array(grid.periodic, dtype=int)
+    off = np.abs(a - np.diag(np.diag(a)))
+    for factor in sorted(np.geomspace(0.5, 2.0, 2001), key=lambda factor: abs(np.log(factor))):
+        intervals = np.maximum(np.round(lengths / wanted * factor), 1)
+        density = intervals / lengths
+        if np.all(np.diag(a) * density * (1 + 1e-15) >= off @ density) and np.all(intervals + ends >= 2):
+            return tuple(int(count) for count in intervals + ends)
+    return None
+
+
+def advice(a: Any, grid: Grid, *, everywhere: bool) -> str:
+    """What the chain needs to represent ``a``, and the shape or the spacings that would do, in two sentences.
+
+    Args:
+      a: the diffusion matrix at one node, shape (n, n).
+      grid: the grid.
+      everywhere: whether it is the matrix of all nodes.
+    """
+    h = np.array([grid.spacing(axis) for axis in range(grid.ndim)], dtype=float)
+    head = (
+        "Every axis i needs a_ii/h_i ≥ Σ_j |a_ij|/h_j (a = σσᵀ); here diag a = "
+        f"{_numbers(np.diag(a))}, h = {_numbers(h)}.\n"
+    )
+    wanted = spacings(a, h)
+    if wanted is None:
+        return head + (
+            "No spacing of these axes will do: turn the state's axes so that a becomes (nearly) diagonal, "
+            "or weaken the correlation"
+        )
+    fitting, where = shape(a, grid, wanted), "everywhere" if everywhere else "there"
+    if fitting is not None:
+        return head + f"Use Grid(..., shape={fitting}): representable {where}"
+    return head + (
+        f"Choose lo, hi and shape so that the spacings are as {_numbers(wanted / wanted[0])} to one another: "
+        f"representable {where}; with this box no shape near {grid.shape} has that ratio"
+    )
+
+
+def _numbers(entries: Any) -> str:
+    return "[" + ", ".join(f"{entry:.6g}" for entry in np.asarray(entries, dtype=float)) + "]"

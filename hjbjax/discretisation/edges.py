@@ -1,0 +1,162 @@
+"""The ends of the box: which drift leaves, and what that means for each kind of end.
+
+At a projected end the component of the drift that leaves is cut off, while the control keeps what it costs and earns.
+At a constrained end an action whose drift leaves costs infinitely much: for the control it is inadmissible, and a
+disturbance that can push the state out must be kept from it by the control. Noise reflects at both. At an open end
+nothing is stopped; see ``stencil`` for how the value goes on.
+
+A drift that vanishes at an end does so up to rounding: of the parts that an action makes cancel at that node, and of
+the node's coordinates. What counts as leaving is held against these, so that it has no unit and knows no other place.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.discretisation import stencil
+from hjbjax.problem import fields, structure
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+
+PLANES = 5  # coordinates of an axis at which the size of the drift is looked at, for the count of what is cut
+ROUNDINGS = 256  # units of eps in parts of a drift: what its formula may leave where they cancel
+COORDINATES = 8  # units of eps by which a coordinate may be off
+
+
+@dataclasses.dataclass(frozen=True)
+class Rounding:
+    """What rounding may leave of a drift component that vanishes at a node; both entries broadcast.
+
+    Attributes:
+      idle: the component without actions: what the actions have to cancel.
+      shift: what a shift of the node by the rounding of its coordinates makes of that.
+    """
+
+    idle: Any
+    shift: Any
+
+    def of(self, f: Any) -> Any:
+        """The size of ``f`` below which it is rounding."""
+        eps = jnp.finfo(jnp.result_type(f)).eps
+        return ROUNDINGS * eps * (jnp.abs(self.idle) + jnp.abs(f - self.idle)) + self.shift
+
+
+def slack(problem: Problem, grid: Grid, t: Any, dtype: Any) -> list[Rounding]:
+    """What is rounding of the drift along every axis, node by node."""
+    m, k = (0 if choices is None else choices.dim for choices in (problem.controls, problem.disturbances))
+    nothing = ([jnp.zeros((), dtype)] * m, [jnp.zeros((), dtype)] * k)
+    f = fields.components(problem.drift, *problem.arguments(grid.components(dtype), *nothing, t), dtype=dtype)
+    found = []
+    for entry in f:
+        idle = jnp.broadcast_to(jnp.where(jnp.isfinite(entry), entry, 0), grid.shape)
+        shift = jnp.zeros((), dtype)
+        for axis in range(grid.ndim):
+            up, down = (jnp.abs(slope) for slope in stencil.one_sided(idle, grid, axis))
+            end = stencil.on_edge(grid, axis, 1) | stencil.on_edge(grid, axis, -1)
+            farthest = jnp.maximum(jnp.abs(grid.lo[axis]), jnp.abs(grid.hi[axis]))
+            slope = jnp.where(end, jnp.maximum(up, down), jnp.minimum(up, down))  # the lesser: not across a jump
+            shift = shift + COORDINATES * jnp.finfo(dtype).eps * farthest * slope
+        found.append(Rounding(idle, shift))
+    return found
+
+
+def leaves(f: Any, grid: Grid, axis: int, step: int, rounding: Rounding, coarser: Any = 1) -> Any:
+    """Where a drift component leaves across one end of its axis by more than rounding; broadcasts."""
+    return stencil.on_edge(grid, axis, step) & (step * f > coarser * rounding.of(f))
+
+
+def barred(f: Any, grid: Grid, axis: int, rounding: Rounding, coarser: Any = 1) -> Any:
+    """Where a drift component leaves across a constrained end of its axis; None if the axis has none."""
+    steps = [step for which, step in grid.sides("constrained") if which == axis]
+    found = [leaves(f, grid, axis, step, rounding, coarser) for step in steps]
+    return None if not found else found[0] if len(found) == 1 else found[0] | found[1]
+
+
+def beside(lost: jax.Array, grid: Grid) -> tuple[tuple[jax.Array, jax.Array], ...]:
+    """For every axis whether the next node up, and the next one down, is among the ``lost`` ones, bool (*grid)."""
+    up, down = ([stencil.unit(grid, axis, step) for axis in range(grid.ndim)] for step in (1, -1))
+    pairs = zip(up, down, strict=True)
+    return tuple((stencil.neighbour(lost, grid, p), stencil.neighbour(lost, grid, q)) for p, q in pairs)
+
+
+def strays(f: Any, beside: tuple[Any, Any], rounding: Rounding) -> Any:
+    """Where a drift component that is only rounding points to a lost node beside."""
+    up, down = beside
+    return ((up & (f > 0)) | (down & (f < 0))) & (jnp.abs(f) <= rounding.of(f))
+
+
+def inadmissible(
+    problem: Problem, grid: Grid, u: list, d: list | None, t: Any, dtype: Any, *, eps: Any = None
+) -> jax.Array:
+    """The nodes at which these actions lead out across a constrained end, bool (*grid); ``eps`` is their rounding."""
+    bad = jnp.zeros(grid.shape, bool)
+    if not grid.sides("constrained"):
+        return bad
+    f = fields.components(problem.drift, *problem.arguments(grid.components(dtype), u, d, t), dtype=dtype)
+    coarser = 1 if eps is None else eps / jnp.finfo(dtype).eps
+    for axis, rounding in enumerate(slack(problem, grid, t, dtype)):
+        out = barred(f[axis], grid, axis, rounding, coarser)
+        bad = bad if out is None else bad | out
+    return bad
+
+
+def cut(
+    problem: Problem, grid: Grid, value: np.ndarray, u: list, d: list, acting: np.ndarray, t: Any = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """At how many nodes of each projected end the drift under these actions is cut off, and how many there are.
+
+    Where the value does not change towards the end, next to its range over the box, and nobody's actions cost or earn
+    anything, the cut takes nothing away. Host level: one small program for the drift at the ends and on a coarse
+    sample, whose size tells what counts as leaving; counting is NumPy's, since reductions take long to compile.
+
+    Args:
+      problem, grid: the question.
+      value: V, shape (*grid).
+      u, d: the actions, each component (*grid).
+      acting: bool (*grid), the nodes that are looked at.
+      t: the time.
+
+    Returns:
+      Two arrays of integers of shape (n, 2), lower and upper ends; zeros where an end is not projected.
+    """
+    counts, totals = np.zeros((2, grid.ndim, 2), int)
+    acting, earning = np.broadcast_to(acting, grid.shape), _actions_cost(problem, grid.ndim, value.dtype)
+    number = np.arange(grid.size).reshape(grid.shape)
+    coarse = number[np.ix_(*(np.linspace(0, count - 1, min(count, PLANES)).astype(int) for count in grid.shape))]
+    sides = grid.sides("projected")
+    faces = [np.take(number, grid.shape[axis] - 1 if step > 0 else 0, axis).ravel() for axis, step in sides]
+    places = np.unravel_index(np.concatenate([coarse.ravel(), *faces]), grid.shape)
+    x = [np.asarray(grid.axis(axis), value.dtype)[index] for axis, index in enumerate(places)]
+    actions = ([np.broadcast_to(entry, grid.shape)[places] for entry in each] for each in (u, d))
+    f = np.asarray(_drift(problem, x, *actions, t))
+    least = ROUNDINGS * np.finfo(value.dtype).eps * np.max(np.abs(f[:, : coarse.size]), axis=1)
+    extent = np.ptp(value[acting]) if acting.any() else 0.0
+    first = coarse.size
+    for (axis, step), face in zip(sides, faces, strict=True):
+        inner = face - step * number.strides[axis] // number.itemsize
+        change = np.abs(value.ravel()[face] - value.ravel()[inner]) * (grid.shape[axis] - 1)
+        leaves_there = step * f[axis, first : first + face.size] > least[axis]
+        matters = earning | (change > np.sqrt(np.finfo(value.dtype).eps) * extent)
+        side, first = (step + 1) // 2, first + face.size
+        counts[axis, side] = np.sum(acting.ravel()[face] & leaves_there & matters)
+        totals[axis, side] = np.sum(acting.ravel()[face])
+    return counts, totals
+
+
+@jax.jit
+def _drift(problem: Problem, x: list, u: list, d: list, t: Any) -> jax.Array:
+    """The drift at states (K,) an entry, shape (n, K)."""
+    f = fields.components(problem.drift, *problem.arguments(x, u, d, t), dtype=x[0].dtype)
+    return jnp.stack([jnp.broadcast_to(entry, x[0].shape) for entry in f])
+
+
+def _actions_cost(problem: Problem, n: int, dtype: Any) -> bool:
+    """Whether the running cost depends on what a player does."""
+    if problem.cost is None:
+        return False
+    m, k = (0 if choices is None else choices.dim for choices in (problem.controls, problem.disturbances))
+    time, game = ((None, False),) * problem.time_dependent, ((k, True),) * problem.is_game
+    return not structure.dependence(problem.cost, *time, (n, False), (m, True), *game, dtype=dtype).is_constant

@@ -1,0 +1,179 @@
+"""A chain in the forms that other people's solvers read: SciPy's sparse matrices, QuantEcon's pairs.
+
+Host level, float64, nodes in C order. What depends on how rates are made is ``chain``'s; here is what the exports
+ask of a problem and a policy, and how their arrays are laid out.
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from hjbjax.discretisation import recurrence, stencil, subcell
+from hjbjax.problem import fields
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.sets import AdmissibleSet, Finite
+
+Offsets = tuple[tuple[int, ...], ...]
+Table = tuple[Offsets, Sequence[Any], Any, np.ndarray]
+
+
+def time_step(leaving: np.ndarray) -> float:
+    """Δt = 1/max Q; 1 where nothing moves."""
+    fastest = float(np.max(leaving))
+    return 1 / fastest if fastest > 0 else 1.0
+
+
+def refuse(what: str, where: np.ndarray, grid: Grid) -> None:
+    """Raise a ValueError that says ``what``, at how many nodes and at which first, if it is true of any."""
+    if np.any(where):
+        first = tuple(int(i) for i in np.argwhere(where)[0])
+        state = np.array2string(grid.state(first), separator=", ")
+        raise ValueError(f"chain: {what} at {int(np.sum(where))} nodes, the first {first} with state {state}")
+
+
+def single_law(classes: list[np.ndarray], generator: Any, grid: Grid) -> np.ndarray:
+    """The stationary probabilities of a chain with one recurrent class, shape (S,).
+
+    Raises:
+      ValueError: more than one class, or one that rounding may take for several.
+    """
+    why = "where the chain is found after a long time depends on where it starts"
+    fix = "connect them by noise, or look at a part of the box by itself"
+    if len(classes) > 1:
+        first = [np.array2string(grid.state(np.unravel_index(c[0], grid.shape)), separator=", ") for c in classes[:2]]
+        raise ValueError(
+            f"stationary_density: got {len(classes)} recurrent classes, wanted one: {why};\nthe first two hold the "
+            f"states {first[0]} and {first[1]}, {len(classes[0])} and {len(classes[1])} nodes; {fix}"
+        )
+    probabilities, error = recurrence.law(generator, classes[0])
+    if error > recurrence.LARGEST_ERROR:
+        raise ValueError(
+            f"stationary_density: parts of the box exchange so little that rounding alone may move {error:.2g} of the "
+            f"probability between them, wanted at most {recurrence.LARGEST_ERROR:g}:\n{why}; {fix}"
+        )
+    return probabilities
+
+
+def target(problem: Problem, grid: Grid, t: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Which nodes lie on the target, and the exit cost; both (*grid)."""
+    with jax.enable_x64(True):
+        paid = fields.of_state(problem, problem.exit_cost, grid.components(np.float64), t, np.float64)
+        inside = np.zeros(grid.shape, bool)
+        if problem.target is not None:
+            inside = np.asarray(subcell.level(problem, grid, np.float64, t) <= 0)
+    return inside, np.broadcast_to(paid, grid.shape)
+
+
+def policies(problem: Problem, grid: Grid, policy: Any, disturbance: Any) -> tuple[list, list, np.ndarray]:
+    """The components of both players' policies, each (*grid), and the nodes where no entry is NaN."""
+    u = _entries(policy, problem.controls, grid, "policy")
+    d = _entries(disturbance, problem.disturbances, grid, "disturbance")
+    active = ~np.any(np.isnan(np.concatenate([u, d], axis=-1)), axis=-1)
+    return *(list(np.moveaxis(np.where(active[..., None], action, 0), -1, 0)) for action in (u, d)), active
+
+
+def _entries(action: Any, choices: AdmissibleSet | None, grid: Grid, name: str) -> np.ndarray:
+    wanted = (*grid.shape, 0 if choices is None else choices.dim)
+    entries = np.zeros(wanted) if action is None and choices is None else np.asarray(action, np.float64)
+    if entries.shape != wanted:
+        raise ValueError(f"chain: got a {name} of shape {entries.shape}, wanted {wanted}: one action a node")
+    if np.any(np.isinf(entries)):
+        raise ValueError(f"chain: the {name} is infinite at some node; wanted numbers, or NaN where there is no action")
+    return entries
+
+
+def actions(problem: Problem) -> np.ndarray:
+    """The K actions of a discounted decision problem, shape (K, m); refuses what is none.
+
+    Raises:
+      ValueError: a game, no discount, constraints, time, or controls that are not finitely many.
+    """
+    if problem.is_game:
+        raise ValueError("transition_arrays: got a game; a decision problem has one player. Leave out disturbances")
+    if not problem.discount > 0:
+        raise ValueError(
+            "transition_arrays: got discount = 0, wanted > 0: the factor would be 1, and stationary decision problems "
+            "need one below (QuantEcon's methods refuse 1)"
+        )
+    if problem.stopping_cost is not None or problem.running_max is not None:
+        raise ValueError("transition_arrays: got a stopping_cost or running_max, which a decision problem cannot hold")
+    if problem.time_dependent:
+        raise ValueError("transition_arrays: got time_dependent=True, wanted a stationary problem")
+    if problem.controls is None:
+        return np.zeros((1, 0))
+    if not isinstance(problem.controls, Finite):
+        kind = type(problem.controls).__name__
+        raise ValueError(f"transition_arrays: got controls in a {kind}, wanted Finite: sample it, as by Box.grid(num)")
+    return np.asarray(problem.controls.points, np.float64)
+
+
+def surcharge(links: Sequence[stencil.Links], given: np.ndarray, grid: Grid) -> dict[tuple[int, ...], np.ndarray]:
+    """For each jump what it costs more to end on the boundary of the target than on the node beyond it, (*grid)."""
+    extra = {}
+    for axis, link in enumerate(links):
+        for step, meets in ((1, link.meets_up), (-1, link.meets_down)):
+            if meets is not None:
+                offset = stencil.unit(grid, axis, step)
+                beyond = np.asarray(stencil.neighbour(jax.numpy.asarray(given), grid, offset))
+                crosses, there = (np.asarray(entry) for entry in meets)
+                extra[offset] = np.where(crosses, there - beyond, 0)
+    return extra
+
+
+def paid(jumps: Any, extra: dict[tuple[int, ...], np.ndarray]) -> Any:
+    """The surcharges per unit time: Σ_o c_o extra_o."""
+    return sum(c * extra.get(offset, 0.0) for offset, c in zip(jumps.offsets, jumps.values, strict=True))
+
+
+def decision_problem(
+    tables: Iterable[Table], grid: Grid, count: int, held: np.ndarray, given: np.ndarray, discount: float
+) -> tuple[np.ndarray, Any, np.ndarray, np.ndarray, float]:
+    """Costs, probabilities, indices and factor over pairs of state and action; see ``chain.transition_arrays``.
+
+    Args:
+      tables: for each action the offsets, the rates, the running cost and where it is admissible; one action in
+        memory at a time.
+      grid: the grid.
+      count: the number K of actions.
+      held: the nodes of the target, where the tables are zero.
+      given: the exit cost there.
+      discount: β.
+    """
+    from scipy.sparse import csr_array
+
+    costs, entries = np.empty((grid.size, count)), np.empty((grid.size, count, 0))
+    offsets: Offsets = ()
+    admissible = np.ones((grid.size, count), bool)
+    for k, (offsets, values, cost, allowed) in enumerate(tables):
+        if k == 0:  # the last entry of a row is its diagonal
+            entries = np.empty((grid.size, count, len(offsets) + 1))
+        costs[:, k], admissible[:, k] = cost.ravel(), allowed.ravel()
+        for column, c in enumerate(values):
+            entries[:, k, column] = c.ravel()
+    leaving = entries[..., :-1].sum(axis=-1)
+    dt = time_step(leaving)
+    entries[..., :-1] *= dt
+    entries[..., -1] = np.maximum(1 - leaving * dt, 0)
+    factor = 1 / (1 + discount * dt)
+    paid = np.where(held.reshape(-1, 1), (1 - factor) * given.reshape(-1, 1), factor * dt * costs)
+    number = np.arange(grid.size, dtype=np.int32 if entries.size < 2**31 else np.int64).reshape(grid.shape)
+    ends = [np.roll(number, [-step for step in offset], axis=range(grid.ndim)) for offset in offsets]
+    columns = np.stack([end.ravel() for end in (*ends, number)], axis=-1)[:, None, :]
+    starts = np.arange(0, entries.size + 1, entries.shape[-1], dtype=number.dtype)
+    layout = (entries.ravel(), np.repeat(columns, count, axis=1).ravel(), starts)
+    probabilities = csr_array(layout, shape=(costs.size, grid.size))
+    probabilities.sum_duplicates()  # a jump over the seam of an axis with two nodes; sorts the columns as well
+    probabilities.eliminate_zeros()
+    refuse(
+        "no action is admissible: all lead out across a constrained end",
+        np.logical_not(np.any(admissible, axis=1)).reshape(grid.shape),
+        grid,
+    )
+    pairs = np.flatnonzero(admissible)
+    state, action = np.divmod(pairs, count)
+    if pairs.size < costs.size:
+        probabilities = probabilities[pairs]
+    return paid.ravel()[pairs], probabilities, state, action, factor

@@ -1,0 +1,229 @@
+"""Neighbours and one-sided differences on a grid, with ghost cells.
+
+Beyond an edge that is not periodic stands a copy of the edge node: a one-sided difference across the edge is
+zero, which projects outward drift back onto the box and reflects noise. Beyond an open end the value goes on as the
+parabola through its last three nodes, V_{N+1} = 3V_N − 3V_{N−1} + V_{N−2} where they are equally spaced.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.problem.grid import Grid
+
+LONGER = 4  # axes up to which neighbours along the last one are slices of a longer array
+
+
+def on_edge(grid: Grid, axis: int, step: int) -> np.ndarray:
+    """Which nodes have no neighbour in direction ``step`` along ``axis``; broadcasts against the node axes."""
+    mask = np.zeros(grid.shape[axis], dtype=bool)
+    mask[-1 if step > 0 else 0] = not grid.periodic[axis]  # type: ignore[index]
+    return mask.reshape([-1 if i == axis else 1 for i in range(grid.ndim)])
+
+
+def wall(grid: Grid, axis: int, step: int) -> np.ndarray:
+    """The nodes at which drift and noise in direction ``step`` along ``axis`` are stopped: edges that are not open."""
+    edge = on_edge(grid, axis, step)
+    return np.zeros_like(edge) if (axis, step) in grid.sides("open") else edge
+
+
+def walls(grid: Grid, axis: int) -> np.ndarray:
+    """The nodes with a wall on either side along ``axis``."""
+    return wall(grid, axis, 1) | wall(grid, axis, -1)
+
+
+def stopped(up: jax.Array, down: jax.Array, grid: Grid, axis: int) -> tuple[jax.Array, jax.Array]:
+    """Slopes of a scheme from above and from below along one axis, with those across walls made zero."""
+    return jnp.where(wall(grid, axis, 1), 0, up), jnp.where(wall(grid, axis, -1), 0, down)
+
+
+def parabola(grid: Grid, axis: int, step: int) -> tuple[Any, Any, Any]:
+    """The weights of the last node and of the two before it in the value beyond an end; their sum is one.
+
+    The next gap is taken as long as the last one.
+    """
+    if grid.stretch[axis] is None:  # type: ignore[index]
+        return 3.0, -3.0, 1.0
+    gaps = jnp.diff(jnp.asarray(grid.axis(axis)))
+    last, before = (gaps[-1], gaps[-2]) if step > 0 else (gaps[0], gaps[1])
+    ratio, bend = last / before, 2 * last / (last + before)
+    return 2 + bend, -(1 + bend + bend * ratio), bend * ratio
+
+
+def continued(values: jax.Array, grid: Grid, offset: tuple[int, ...]) -> jax.Array:
+    """V at x + offset for every node x, shape (*grid), as ``neighbour`` has it, and extrapolated beyond open ends."""
+    if not grid.sides("open"):
+        return neighbour(values, grid, offset)
+    for axis, step in enumerate(offset):
+        moved = neighbour(values, grid, unit(grid, axis, step))
+        if step and (axis, step) in grid.sides("open"):
+            moved = jnp.where(on_edge(grid, axis, step), _beyond(values, grid, axis, step), moved)
+        values = moved
+    return values
+
+
+def inward(
+    offsets: Sequence[tuple[int, ...]], values: Sequence[Any], grid: Grid
+) -> tuple[list[tuple[int, ...]], list[Any]]:
+    """Offsets and entries of the same operator without any beyond an open end: they go to the parabola's nodes."""
+    pairs = list(zip(offsets, values, strict=True))
+    for axis in range(grid.ndim):
+        kept = []
+        for offset, value in pairs:
+            step = offset[axis]
+            if step == 0 or (axis, step) not in grid.sides("open"):
+                kept.append((offset, value))
+                continue
+            outside = on_edge(grid, axis, step)
+            kept.append((offset, jnp.where(outside, 0, value)))
+            for k, weight in enumerate(parabola(grid, axis, step)):
+                place = (*offset[:axis], -k * step, *offset[axis + 1 :])
+                kept.append((place, jnp.where(outside, jnp.asarray(weight, value.dtype) * value, 0)))
+        pairs = kept
+    return [offset for offset, _ in pairs], [value for _, value in pairs]
+
+
+def _beyond(values: jax.Array, grid: Grid, axis: int, step: int) -> jax.Array:
+    """What stands beyond the end of an ordinary axis, one slice: a copy of the end, or the parabola's continuation."""
+    last = grid.shape[axis] - 1 if step > 0 else 0
+    if (axis, step) not in grid.sides("open"):
+        return jax.lax.slice_in_dim(values, last, last + 1, axis=axis)
+    nodes = [jax.lax.slice_in_dim(values, k, k + 1, axis=axis) for k in (last, last - step, last - 2 * step)]
+    weights = [jnp.asarray(weight, values.dtype) for weight in parabola(grid, axis, step)]
+    return sum((w * v for w, v in zip(weights[1:], nodes[1:], strict=True)), start=weights[0] * nodes[0])
+
+
+def neighbour(values: jax.Array, grid: Grid, offset: tuple[int, ...], *, ghost: bool = True) -> jax.Array:
+    """The values at x + offset for every node x, shape (*grid).
+
+    Args:
+      values: node values, shape (*grid).
+      grid: the grid they live on.
+      offset: steps along the axes, each −1, 0 or 1.
+      ghost: beyond an edge take the edge node's own value; otherwise zero.
+    """
+    for axis, step in enumerate(offset):
+        if step == 0:
+            continue
+        last = grid.shape[axis] - 1
+        end = last if (step > 0) != bool(grid.periodic[axis]) else 0  # type: ignore[index]
+        beyond = jax.lax.slice_in_dim(values, end, end + 1, axis=axis)
+        if not ghost and not grid.periodic[axis]:  # type: ignore[index]
+            beyond = jnp.zeros_like(beyond)
+        if step > 0:
+            parts = [jax.lax.slice_in_dim(values, 1, last + 1, axis=axis), beyond]
+        else:
+            parts = [beyond, jax.lax.slice_in_dim(values, 0, last, axis=axis)]
+        values = jnp.concatenate(parts, axis=axis)  # fused, where a pad would fill an array
+    return values
+
+
+def unit(grid: Grid, axis: int, step: int) -> tuple[int, ...]:
+    """The offset of one step along one axis."""
+    return tuple(step if i == axis else 0 for i in range(grid.ndim))
+
+
+@dataclasses.dataclass(frozen=True)
+class Links:
+    """How every node hangs together with its two neighbours along one axis; all entries broadcast.
+
+    Attributes:
+      up, down: the distances.
+      meets_up, meets_down: where the link ends on the boundary of a target before it comes to the next node, and
+        the value there; None where no link does.
+    """
+
+    up: Any
+    down: Any
+    meets_up: tuple[Any, Any] | None = None
+    meets_down: tuple[Any, Any] | None = None
+
+
+def links(grid: Grid, axis: int) -> Links:
+    """The links of the grid itself along one axis; on a stretched one an end repeats its only distance."""
+    if grid.stretch[axis] is None:  # type: ignore[index]
+        return Links(grid.spacing(axis), grid.spacing(axis))
+    gaps = jnp.diff(jnp.asarray(grid.axis(axis)))
+    along = [-1 if i == axis else 1 for i in range(grid.ndim)]
+    return Links(jnp.append(gaps, gaps[-1:]).reshape(along), jnp.append(gaps[:1], gaps).reshape(along))
+
+
+def one_sided(values: jax.Array, grid: Grid, axis: int, link: Links | None = None) -> tuple[jax.Array, jax.Array]:
+    """The differences D⁺ = (V(x+h⁺) − V(x))/h⁺ and D⁻ = (V(x) − V(x−h⁻))/h⁻ along one axis; zero across a wall."""
+    link = link or links(grid, axis)
+    up, down = _neighbours(values, grid, axis)
+    if link.meets_up is not None:
+        up = jnp.where(*link.meets_up, up)
+    if link.meets_down is not None:
+        down = jnp.where(*link.meets_down, down)
+    return (up - values) / link.up, (values - down) / link.down
+
+
+def _neighbours(values: jax.Array, grid: Grid, axis: int) -> tuple[jax.Array, jax.Array]:
+    """The values one step up and one step down along an axis.
+
+    XLA fuses a concatenation into the loop over the nodes, except one along the last axis. There two slices of a
+    longer array are fused: one array is filled in place of two. In many dimensions, where memory rules, none is.
+    """
+    if axis < grid.ndim - 1 or grid.ndim > LONGER:
+        return continued(values, grid, unit(grid, axis, 1)), continued(values, grid, unit(grid, axis, -1))
+    count = grid.shape[axis]
+    first, last = (_beyond(values, grid, axis, step) for step in (-1, 1))
+    if grid.periodic[axis]:  # type: ignore[index]
+        first, last = last, first
+    wide = jax.lax.optimization_barrier(jnp.concatenate([first, values, last], axis=axis))
+    return jax.lax.slice_in_dim(wide, 2, count + 2, axis=axis), jax.lax.slice_in_dim(wide, 0, count, axis=axis)
+
+
+def limited(up: jax.Array, down: jax.Array, grid: Grid, axis: int, link: Links) -> tuple[jax.Array, jax.Array]:
+    """Second-order one-sided slopes from the differences D⁺, D⁻ along one axis; zero across a wall as they are.
+
+    Next to an edge, and to the boundary of a target, the second difference is continued as a constant.
+    """
+    upper, lower = on_edge(grid, axis, 1), on_edge(grid, axis, -1)
+    bend = 2 * (up - down) / (link.up + link.down)
+    bend = jnp.where(upper, neighbour(bend, grid, unit(grid, axis, -1)), bend)
+    bend = jnp.where(lower, neighbour(bend, grid, unit(grid, axis, 1)), bend)
+    above, below = (neighbour(bend, grid, unit(grid, axis, step)) for step in (1, -1))
+    if link.meets_up is not None:
+        above = jnp.where(link.meets_up[0], bend, above)
+    if link.meets_down is not None:
+        below = jnp.where(link.meets_down[0], bend, below)
+    up, down = up - link.up / 2 * _van_albada(bend, above), down + link.down / 2 * _van_albada(bend, below)
+    return stopped(up, down, grid, axis)
+
+
+def _van_albada(a: jax.Array, b: jax.Array) -> jax.Array:
+    agree = a * b > 0
+    return jnp.where(agree, a * b * (a + b) / jnp.where(agree, a * a + b * b, 1), 0)
+
+
+def numbers(grid: Grid, offset: Sequence[int]) -> np.ndarray:
+    """The number in C order of the node x + offset for every node x, shape (*grid), round all axes; host level."""
+    number = np.arange(grid.size).reshape(grid.shape)
+    return np.roll(number, [-step for step in offset], axis=range(grid.ndim))
+
+
+def sparse(offsets: Sequence[tuple[int, ...]], values: Sequence[np.ndarray], diagonal: np.ndarray, grid: Grid) -> Any:
+    """The matrix with ``diagonal`` and, for every offset o, entry values_o(x) in row x and column x + o.
+
+    Host level. Nodes are numbered in C order. Entries whose column lies outside the box must be zero.
+
+    Returns:
+      A SciPy CSR array of shape (nodes, nodes) without explicit zeros off the diagonal.
+    """
+    from scipy.sparse import coo_array
+
+    number = np.arange(grid.size)
+    rows, columns, entries = [number], [number], [np.asarray(diagonal, np.float64).ravel()]
+    for offset, value in zip(offsets, values, strict=True):
+        nonzero = np.asarray(value).ravel() != 0
+        rows.append(number[nonzero])
+        columns.append(numbers(grid, offset).ravel()[nonzero])
+        entries.append(np.asarray(value, np.float64).ravel()[nonzero])
+    index = (np.concatenate(rows), np.concatenate(columns))
+    return coo_array((np.concatenate(entries), index), shape=(grid.size, grid.size)).tocsr()

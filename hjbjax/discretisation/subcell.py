@@ -1,0 +1,73 @@
+"""Targets on a grid: which nodes lie in one, and boundaries that run between the nodes.
+
+A node lies in the target {l ≤ 0} if a shift of it by the rounding of its coordinates brings it there, so that a node
+on the boundary is inside in every program, however that rounds l. Between the nodes the boundary crosses the link
+from a free node x to a held node y at the fraction θ = l(x)/(l(x) − l(y)) of the way, exactly so for a signed distance
+that is linear there. The link is cut to θh and ends on the boundary, where the exit cost is paid. The chain stays a
+chain: it jumps to the boundary at rates for the distance θh.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from hjbjax.discretisation import stencil
+from hjbjax.discretisation.stencil import Links
+from hjbjax.problem import fields
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+
+SHORTEST = 1e-2  # of a spacing: a shorter link would only make the rates large
+ROUNDINGS = 8  # units of eps of the largest coordinate: a distance made of a few operations
+
+
+def level(problem: Problem, grid: Grid, dtype: Any, t: Any = 0.0) -> jax.Array:
+    """l at every node, shape (*grid), with an exact zero where it is zero up to rounding: ≤ 0 in the target.
+
+    What rounding does to l is taken from its slopes, so that neither its units nor values far away matter; from the
+    lesser of two, since one may lead across a jump.
+    """
+    found = jnp.broadcast_to(fields.of_state(problem, problem.target, grid.components(dtype), t, dtype), grid.shape)
+    slack = jnp.zeros((), dtype)
+    for axis in range(grid.ndim):
+        up, down = stencil.one_sided(found, grid, axis)
+        farthest = jnp.maximum(jnp.abs(grid.lo[axis]), jnp.abs(grid.hi[axis]))
+        up, down = jnp.abs(up), jnp.abs(down)
+        end = stencil.on_edge(grid, axis, 1) | stencil.on_edge(grid, axis, -1)  # where one of them is none
+        slope = jnp.where(end, jnp.maximum(up, down), jnp.minimum(up, down))
+        slack = slack + ROUNDINGS * jnp.finfo(dtype).eps * farthest * slope
+    return jnp.where(jnp.abs(found) <= slack, 0, found)
+
+
+def links(problem: Problem, grid: Grid, *, subcell: bool, dtype: Any, t: Any = 0.0) -> list[Links]:
+    """The links along every axis, cut at the target's boundary where the scheme wants that."""
+    plain = [stencil.links(grid, axis) for axis in range(grid.ndim)]
+    if not subcell or problem.target is None:
+        return plain
+    x, here = grid.components(dtype), level(problem, grid, dtype, t)
+
+    def cut(axis: int, step: int, length: Any) -> tuple[Any, tuple[Any, Any]]:
+        """The length of every link in one direction, and where it meets the target with the exit cost there."""
+        beyond = stencil.neighbour(here, grid, stencil.unit(grid, axis, step))
+        meets = (here > 0) & (beyond <= 0)
+        theta = jnp.where(meets, jnp.maximum(here / jnp.where(meets, here - beyond, 1), SHORTEST), 1)
+        crossing = _wrapped(x[axis] + step * theta * length, grid, axis)
+        boundary = [crossing if i == axis else entry for i, entry in enumerate(x)]
+        paid = fields.of_state(problem, problem.exit_cost, boundary, t, dtype)
+        return theta * length, (meets, jnp.broadcast_to(paid, grid.shape))
+
+    result = []
+    for axis, link in enumerate(plain):
+        (up, meets_up), (down, meets_down) = cut(axis, 1, link.up), cut(axis, -1, link.down)
+        result.append(Links(up, down, meets_up, meets_down))
+    return result
+
+
+def _wrapped(coordinate: Any, grid: Grid, axis: int) -> Any:
+    """A coordinate at most one spacing beyond the seam of a periodic axis, back in [lo, hi)."""
+    if not grid.periodic[axis]:  # type: ignore[index]
+        return coordinate
+    lo, hi = grid.lo[axis], grid.hi[axis]
+    inside = jnp.where(coordinate >= hi, coordinate - (hi - lo), coordinate)
+    return jnp.where(inside < lo, inside + (hi - lo), inside)

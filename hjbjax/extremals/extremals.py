@@ -1,0 +1,283 @@
+"""Extremals: paths that meet Pontryagin's necessary conditions, by ``pontryagin``.
+
+The boundary-value problem and what closes it are in ``two_point``, the pointwise minimum in ``pointwise``, the rest of
+an infinite horizon in ``rests``. SciPy's ``solve_bvp`` solves it by collocation of order 4 on a mesh of its own, to a
+relative residual below ``tol``. An extremal is a candidate: its path is admissible, so its cost bounds the value from
+above, and the value is that of the best one.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+import numpy as np
+
+from hjbjax.extremals import first_guess, rests, shooting, switching
+from hjbjax.extremals.optimality import Extremal
+from hjbjax.extremals.two_point import Closing, Law, TwoPoint
+from hjbjax.hamiltonian.pointwise import rule_of
+from hjbjax.problem import checks
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import as_partial, is_traced, node
+from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
+from hjbjax.solution.solution import SolveError
+from hjbjax.solution.status import Status
+
+SETTLED = 12.0  # time constants of the loop near a rest that an infinite horizon is followed: what is left is e⁻¹²
+LONGEST = 20.0  # units of time that the loop of a solution is followed to a target without a guess of the time
+
+
+@node()
+class FreeTime:
+    """A final time that is sought.
+
+    Args:
+      guess: where the search starts, in units of time.
+
+    Raises:
+      ValueError: the guess is not a positive number.
+    """
+
+    guess: Any = 1.0
+
+    def __post_init__(self):
+        if np.ndim(self.guess) or not (np.isfinite(self.guess) and self.guess > 0):
+            raise ValueError(f"FreeTime: got guess = {self.guess!r}, wanted a finite number > 0")
+
+
+def pontryagin(
+    problem: Problem,
+    x0: Any,
+    *,
+    horizon: Any = None,
+    terminal: Any = None,
+    guess: Any = None,
+    rest: Any = None,
+    grid: Grid | None = None,
+    tol: float = 1e-8,
+    max_nodes: int = 5000,
+    throw: bool = True,
+) -> Extremal:
+    """The extremal from ``x0`` near a first guess, in float64.
+
+        ẋ = f(t, x, u),  ṗ = βp − H_x(t, x, p, u),  u = argmin of H = L + f·p over the admissible set
+
+    Collocation of order 4. Where H is affine in an input of a box, or the controls are enumerated, u jumps: the order
+    of its values is found with smoothed jumps, and the switching times then like any other unknown.
+
+    Args:
+      problem: deterministic, with one player, and neither ``stopping_cost`` nor ``running_max``.
+      x0: the state at time 0, shape (n,).
+
+    Keyword Args:
+      horizon: the final time; ``FreeTime(guess)`` where it is sought. ``None``: free if the problem has a target or
+        ``terminal`` gives states, otherwise infinite, closed by the Riccati costate of a rest.
+      terminal: how the path ends: an array (n,) of end states, NaN for those that are free; or a function ψ, paid at
+        the end in place of ``terminal_cost``. ``None``: without a horizon on the target, with ``exit_cost``.
+      guess: a Solution, whose closed loop and DV are the first guess, or another extremal. ``None``: a line to the end
+        states, or the loop under the Riccati costate.
+      rest: a state near the rest of an infinite horizon; ``None``: the least node of a Solution, else the origin.
+      grid: its periodic axes are wrapped before the problem sees a state; a Solution brings its own.
+      tol: on the relative residual of the differential equations, and on the conditions at the ends.
+      max_nodes: of the mesh; each iteration of the solver costs as much as it has.
+      throw: whether a failure raises.
+
+    Returns:
+      An Extremal; with ``throw=False`` its ``status`` and ``message`` tell how a failed solve ended.
+
+    Raises:
+      SolveError: the boundary-value problem was not solved; ``.solution`` is the Extremal so far. After Ctrl-C that
+        is the last iterate, without controls; None, whatever ``throw`` says, on the way to a first guess.
+      ValueError: an argument that is not admissible.
+      TypeError: a guess, a horizon or a terminal condition of another kind.
+
+    Example:
+      >>> import jax.numpy as jnp
+      >>> from hjbjax import Box, Problem
+      >>> problem = Problem(lambda x, u: u, lambda x, u: x @ x + u @ u, Box([-9.0], [9.0]))
+      >>> extremal = pontryagin(problem, [1.0])
+      >>> round(extremal.cost, 8), extremal.costates[0].round(6).tolist()
+      (1.0, [2.0])
+    """
+    if is_traced(problem, x0, guess, terminal):
+        raise ValueError("pontryagin: got traced values; it runs at the host: call it outside of jit, vmap and grad")
+    _check(problem, tol, max_nodes)
+    start = _numbers(x0, "x0")
+    paid = dataclasses.replace(problem, terminal_cost=terminal) if callable(terminal) else problem
+    checks.of_one_state(paid, len(start), "the length of x0")
+    _check_guess(guess, len(start), horizon)
+    _check_grid(grid, len(start))
+    clock = Clock()
+    limits = shooting.Limits(tol, max_nodes, clock)
+    with noting_interrupts(clock), jax.enable_x64(True):
+        try:
+            ask = _question(problem, start, horizon, terminal, getattr(guess, "grid", grid))
+            if ask.closing is Closing.REST:
+                ask, times, columns = _to_rest(ask, guess, rest, clock)
+            else:
+                times, columns = _guess(ask, guess, horizon)
+                if not ask.free:
+                    times = times * (float(ask.horizon) / times[-1])
+            solve = switching.switching if ask.rule.jumps else shooting.smooth
+            found = solve(ask, times, columns, limits, trusted=guess is not None)
+            if clock.interrupted:
+                raise Stopped(Status.INTERRUPTED, dataclasses.replace(found, code=Status.INTERRUPTED))
+            extremal = shooting.report(found)
+            if clock.interrupted:
+                extremal = dataclasses.replace(extremal, code=int(Status.INTERRUPTED))
+        except Stopped as stop:
+            if stop.reached is None:
+                raise SolveError(f"pontryagin: {stop.status}: on the way to a first guess; there is no path") from None
+            extremal = shooting.report(stop.reached)
+    if throw and extremal.status is not Status.CONVERGED:
+        raise SolveError(f"pontryagin: {extremal.status}: {extremal.message}", extremal)
+    return extremal
+
+
+def _check(problem: Any, tol: Any, max_nodes: Any) -> None:
+    if not isinstance(problem, Problem):
+        raise TypeError(f"pontryagin: got problem = {problem!r}, wanted a Problem")
+    for name, why in (
+        ("noise", "the principle here is the deterministic one; solve it on a grid"),
+        ("disturbances", "a game has a saddle, not a minimum; solve it on a grid"),
+        ("stopping_cost", "stopping is no end condition of (8.7); solve it on a grid"),
+        ("running_max", "a running maximum is no integral; solve it on a grid"),
+    ):
+        if getattr(problem, name) is not None:
+            raise ValueError(f"pontryagin: got a problem with {name}, wanted one without: {why}")
+    if problem.controls is None:
+        raise ValueError("pontryagin: got a problem without controls, wanted a Box, a Ball or a Finite to choose from")
+    if not (np.ndim(tol) == 0 and 0 < tol < 1):
+        raise ValueError(f"pontryagin: got tol = {tol!r}, wanted a number between 0 and 1")
+    if isinstance(max_nodes, bool) or not isinstance(max_nodes, (int, np.integer)) or max_nodes < 1:
+        raise ValueError(f"pontryagin: got max_nodes = {max_nodes!r}, wanted a positive integer")
+
+
+def _check_guess(guess: Any, n: int, horizon: Any) -> None:
+    if guess is not None and not (hasattr(guess, "costate_at") or isinstance(guess, Extremal)):
+        raise TypeError(f"pontryagin: got guess = {guess!r}, wanted a Solution, an Extremal or None")
+    if not hasattr(guess, "costate_at"):
+        return
+    if guess.grid.ndim != n:
+        raise ValueError(
+            f"pontryagin: got a guess on a grid of {guess.grid.ndim} axes, wanted {n}, the length of x0; "
+            "give the Solution of this problem, or no guess"
+        )
+    if guess.times is not None and horizon is None:
+        raise ValueError(
+            "pontryagin: got a marched Solution as the guess, and no horizon: its feedback is known up to "
+            f"t = {float(guess.times[-1]):g} only;\ngive horizon=, or FreeTime() to seek it, or a Solution of solve"
+        )
+
+
+def _check_grid(grid: Any, n: int) -> None:
+    if grid is None:
+        return
+    if not isinstance(grid, Grid):
+        raise TypeError(f"pontryagin: got grid = {grid!r}, wanted a Grid or None")
+    if grid.ndim != n:
+        raise ValueError(
+            f"pontryagin: got a grid of {grid.ndim} axes, wanted {n}, the length of x0; give one axis a state"
+        )
+
+
+def _question(problem: Problem, start: np.ndarray, horizon: Any, terminal: Any, grid: Grid | None) -> TwoPoint:
+    """The boundary-value problem, all but its rest."""
+    n = len(start)
+    rule = rule_of(problem, n)
+    held, ends, final = _ends(terminal, n)
+    closing = Closing.STATE if any(held) else Closing.COST
+    if horizon is None and terminal is None:
+        closing = Closing.REST if problem.target is None else Closing.TARGET
+    free = isinstance(horizon, FreeTime) or (horizon is None and closing is not Closing.REST)
+    if free and horizon is None and closing is Closing.COST:
+        raise ValueError(
+            "pontryagin: got a terminal cost and no horizon; give horizon=T, or FreeTime(guess) to seek it"
+        )
+    if isinstance(horizon, FreeTime) and terminal is None and problem.target is not None:
+        closing = Closing.TARGET
+    if final is None:
+        final = problem.exit_cost if closing is Closing.TARGET else problem.terminal_cost
+    if closing is Closing.REST and (problem.time_dependent or rule.jumps):
+        why = "depends on time" if problem.time_dependent else "has controls that jump, without a Riccati equation"
+        raise ValueError(f"pontryagin: got no horizon, and the problem {why}; give horizon=, or terminal= end states")
+    controls: Any = problem.controls
+    return TwoPoint(
+        problem=problem,
+        grid=grid if grid is not None and any(grid.periodic or ()) else None,
+        start=start,
+        horizon=0.0 if free or horizon is None else _positive(horizon),
+        final=final,
+        ends=ends,
+        rest=None,
+        arcs=np.full((1, controls.dim), np.nan),
+        epsilon=1.0,
+        rule=rule,
+        law=Law.MINIMUM,
+        closing=closing,
+        held=held,
+        free=free,
+    )
+
+
+def _numbers(value: Any, name: str) -> np.ndarray:
+    try:
+        array = np.asarray(value, np.float64)
+    except (TypeError, ValueError):
+        raise TypeError(f"pontryagin: got {name} = {value!r}, wanted one number a state") from None
+    if array.ndim != 1 or array.size == 0 or (name != "terminal" and not np.all(np.isfinite(array))):
+        raise ValueError(f"pontryagin: got {name} = {value!r}, wanted shape (n,): one finite number a state")
+    return array
+
+
+def _ends(terminal: Any, n: int) -> tuple[tuple[bool, ...], np.ndarray, Any]:
+    """Which end states are given, their values, and the terminal cost."""
+    if terminal is None or callable(terminal):
+        return (False,) * n, np.zeros(n), None if terminal is None else as_partial(terminal)
+    ends = _numbers(terminal, "terminal")
+    if len(ends) != n or np.any(np.isinf(ends)) or np.all(np.isnan(ends)):
+        raise ValueError(
+            f"pontryagin: got terminal = {ends.tolist()}, wanted {n} numbers, NaN for a state that is free at the end, "
+            "and at least one that is not"
+        )
+    return tuple(bool(given) for given in ~np.isnan(ends)), np.nan_to_num(ends), None
+
+
+def _positive(horizon: Any) -> float:
+    if isinstance(horizon, (bool, str)) or np.ndim(horizon) or not (np.isfinite(horizon) and horizon > 0):
+        raise ValueError(f"pontryagin: got horizon = {horizon!r}, wanted a finite number > 0, FreeTime() or None")
+    return float(horizon)
+
+
+def _guess(ask: TwoPoint, guess: Any, horizon: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Times and columns where the solver starts, for a horizon that ends."""
+    if isinstance(guess, Extremal):
+        return first_guess.earlier(ask, guess)
+    long = float(horizon.guess) if isinstance(horizon, FreeTime) else float(ask.horizon)
+    if guess is not None:
+        return first_guess.along_loop(ask, guess, long or LONGEST)
+    return first_guess.straight(ask, long or 1.0)
+
+
+def _to_rest(ask: TwoPoint, guess: Any, rest: Any, clock: Clock) -> tuple[TwoPoint, np.ndarray, np.ndarray]:
+    """The boundary-value problem with its rest, and where the solver starts."""
+    n, solution = ask.n, guess if hasattr(guess, "costate_at") else None
+    near = np.zeros(n) if rest is None else _numbers(rest, "rest")
+    if len(near) != n:
+        raise ValueError(f"pontryagin: got rest = {near.tolist()}, wanted shape ({n},), like x0: a state near the rest")
+    if solution is not None and rest is None:
+        near = solution.grid.state(np.unravel_index(np.nanargmin(solution.value), solution.grid.shape))
+    if isinstance(guess, Extremal) and rest is None:
+        near = guess.states[-1]
+    found, slowest = rests.find(ask, near, np.zeros(n))
+    clock.look()
+    ask = dataclasses.replace(ask, rest=found, horizon=SETTLED / slowest)
+    if solution is None and guess is None:
+        return ask, *first_guess.into_rest(ask, ask.start, float(ask.horizon), clock)
+    if solution is None:
+        times, columns = first_guess.earlier(ask, guess)
+    else:
+        times, columns = first_guess.along_loop(ask, solution, 2 * float(ask.horizon))
+        found, _ = rests.find(ask, columns[:n, -1], found.costate)  # a periodic state may come to rest a period away
+    return dataclasses.replace(ask, rest=found, horizon=float(times[-1])), times, columns

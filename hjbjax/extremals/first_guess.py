@@ -1,0 +1,162 @@
+"""First guesses of extremals: where a boundary-value solver starts decides whether and where it arrives.
+
+From a solution on a grid: its closed loop, with the interpolated DV as the costate. Into a rest: the loop under the
+Riccati costate, whose control is clipped where it has to be. Otherwise a line between the ends.
+"""
+
+import warnings
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.extremals.two_point import TwoPoint
+from hjbjax.feedback.simulation import simulate
+from hjbjax.hamiltonian import pointwise
+from hjbjax.solution.clock import Clock, Stopped
+from hjbjax.solution.status import Status
+
+COLUMNS = 101  # of a guess; the solver adds nodes where it wants them
+SAMPLES = 400  # intervals in which the control of a simulated guess is held: a feedback may jump
+FAR = 1e3  # times 1 + |x₀|: a loop that gets there has left for good
+
+
+@jax.jit
+def _rest_loop(ask: TwoPoint, x: Any) -> Any:
+    """ẋ under the costate p̄ + P(x − x̄)."""
+    p = ask.rest.costate + ask.rest.matrix @ (x - ask.rest.state)
+    return ask.flow(0.0, jnp.concatenate([x, p, jnp.zeros(1, x.dtype)]), ask.arcs[0])[: ask.n]
+
+
+def into_rest(ask: TwoPoint, start: np.ndarray, duration: float, clock: Clock) -> tuple[np.ndarray, np.ndarray]:
+    """Times and columns (x, p, w) under the Riccati costate; a line to the rest where that loop runs away."""
+    from scipy.integrate import solve_ivp
+
+    arrays, rest = jax.tree.map(jnp.asarray, ask), ask.rest
+    times, far = np.linspace(0, duration, COLUMNS), FAR * (1 + np.linalg.norm(start))
+
+    def away(t, x):
+        return np.linalg.norm(x) - far
+
+    def flow(t, x):
+        clock.look()
+        return np.asarray(_rest_loop(arrays, x))
+
+    away.terminal = True  # type: ignore[attr-defined]
+    with np.errstate(all="ignore"):
+        path = solve_ivp(flow, (0, duration), start, t_eval=times, events=away, rtol=1e-5)
+    states = path.y
+    if states.shape[1] < len(times) or not np.all(np.isfinite(states)):
+        decay = np.exp(-5 * times / duration)
+        states = rest.state[:, None] + (start - rest.state)[:, None] * decay
+    off = states - rest.state[:, None]
+    bent = rest.matrix @ off
+    value = rest.value + rest.costate @ off + 0.5 * np.sum(off * bent, axis=0)
+    return times, np.concatenate([states, rest.costate[:, None] + bent, value[None]])
+
+
+def along_loop(ask: TwoPoint, solution: Any, duration: float) -> tuple[np.ndarray, np.ndarray]:
+    """Times and columns (x, p, w) of the closed loop of a solution, as far as it gets; a line where it gets nowhere."""
+    grid, marched = solution.grid, solution.times is not None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # where a guess ends is seen from its times
+        try:
+            path = simulate(ask.problem, solution, ask.start, duration, hold=duration / SAMPLES, clamp=True)
+        except KeyboardInterrupt:
+            raise Stopped(Status.INTERRUPTED) from None
+    times, states = path.times, path.states
+    if not ask.problem.target and ask.free and any(ask.held):
+        nearest = int(np.argmin(np.linalg.norm((states - ask.ends)[:, np.array(ask.held)], axis=1)))
+        if nearest:  # else it starts where it ends, though only in the states that are given there
+            times, states = times[: nearest + 1], states[: nearest + 1]
+    if len(times) == 1:  # in the target from the first
+        return straight(ask, duration)
+    kept = np.unique(np.linspace(0, len(times) - 1, 2 * COLUMNS).astype(int))
+    times, states = times[kept], states[kept]
+    inside = np.asarray(grid.wrap(states))
+    where = (times, inside) if marched else (inside,)
+    costates, values = solution.costate_at(*where, clamp=True), solution.value_at(*where, clamp=True)
+    return times, np.nan_to_num(np.concatenate([states, costates, values[:, None]], axis=1).T, posinf=0.0, neginf=0.0)
+
+
+def straight(ask: TwoPoint, duration: float) -> tuple[np.ndarray, np.ndarray]:
+    """Times and columns (x, p, w) along a line to the given end states; at rest in x₀ without any."""
+    times = np.linspace(0, duration, COLUMNS)
+    held = np.array(ask.held)
+    gap = np.where(held, ask.start - np.where(held, ask.ends, 0), 0) if held.any() else np.zeros(ask.n)
+    length = np.linalg.norm(gap)
+    states = ask.start[:, None] - gap[:, None] * times / duration
+    if held.any():
+        costate = gap * duration / length**2 if length else gap
+    else:
+        costate = np.asarray(jax.grad(ask.psi, 1)(jnp.asarray(duration), jnp.asarray(ask.start)))
+    costates = np.repeat(np.nan_to_num(costate)[:, None], len(times), 1)
+    return times, np.concatenate([states, costates, np.zeros((1, len(times)))])
+
+
+def earlier(ask: TwoPoint, extremal: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Times and columns (x, p, w) of another extremal, its start moved to x₀."""
+    if np.shape(extremal.states)[1] != ask.n:
+        raise ValueError(f"pontryagin: the guess has {np.shape(extremal.states)[1]} states, wanted {ask.n}")
+    times, kept = np.unique(extremal.times, return_index=True)
+    states, costates, values = (part[kept].T for part in (extremal.states, extremal.costates, extremal.values[:, None]))
+    moved = (ask.start - states[:, 0])[:, None] * (1 - times / times[-1]) if times[-1] > 0 else 0.0
+    return times, np.concatenate([states + moved, costates, values])
+
+
+def sequence(ask: TwoPoint, times: np.ndarray, columns: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
+    """The values of the jumping inputs in the order met, shape (k, m), and when each sets in, shape (k,).
+
+    Args:
+      ask: of a mixture.
+      times: increasing.
+      columns: (x, p, w) at these times.
+      least: the share of the time that an arc must last; the one before goes on in place of a shorter one.
+    """
+    which = np.asarray(_best(ask, times, columns))
+    begins = np.flatnonzero(np.append(True, which[1:] != which[:-1]))
+    lasting = np.diff(np.append(times[begins], times[-1])) >= least * (times[-1] - times[0])
+    begins = begins[lasting]
+    begins = begins[np.append(True, which[begins[1:]] != which[begins[:-1]])] if len(begins) else np.zeros(1, int)
+    starts = np.append(times[0], 0.5 * (times[begins[1:]] + times[begins[1:] - 1]))
+    return values(ask)[which[begins]], starts
+
+
+def values(ask: TwoPoint) -> np.ndarray:
+    """The values between which the control jumps, shape (K, m)."""
+    return np.asarray(_corners(ask))
+
+
+@jax.jit
+def _corners(ask: TwoPoint) -> Any:
+    return pointwise.corners(ask.problem, ask.rule)
+
+
+@jax.jit
+def _best(ask: TwoPoint, times: Any, columns: Any) -> Any:
+    """The index of the value with the largest weight at every time."""
+
+    def one(t, z):
+        x, p, _ = ask.split(z)
+        return jnp.argmax(ask.weighted(t, x, p, ask.arcs[0])[1])
+
+    return jax.vmap(one, (0, 1))(times, columns)
+
+
+def size(ask: TwoPoint, times: np.ndarray, columns: np.ndarray) -> float:
+    """The typical size of the Hamiltonian's terms along a guess, where a smoothing starts."""
+    return float(np.mean(_sizes(ask, times, columns))) or 1.0
+
+
+@jax.jit
+def _sizes(ask: TwoPoint, times: Any, columns: Any) -> Any:
+    def one(t, z):
+        x, p, _ = ask.split(z)
+        values = pointwise.corners(ask.problem, ask.rule)
+        energies = jax.vmap(
+            lambda value: ask.hamiltonian(t, x, p, pointwise.at_corner(ask.problem, ask.rule, t, ask.wrap(x), p, value))
+        )(values)
+        return jnp.maximum(jnp.max(energies) - jnp.min(energies), jnp.mean(jnp.abs(energies)))
+
+    return jax.vmap(one, (0, 1))(times, columns)

@@ -1,0 +1,177 @@
+"""The answer of ``pontryagin``: the extremal, how its solve ended, and how well it meets the necessary conditions."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.extremals.two_point import TwoPoint
+from hjbjax.hamiltonian import pointwise
+from hjbjax.problem.pytree import node
+from hjbjax.problem.sets import samples
+from hjbjax.solution.screen import encodable
+from hjbjax.solution.status import Status
+
+EMPTY = 1e-9  # share of the time below which an arc is left out of the path
+BUDGET = 200  # controls with which the minimiser is compared
+
+
+@node()
+class Optimality:
+    """How well an extremal meets the necessary conditions, in cost units per unit time.
+
+    Args:
+      hamiltonian: e^{−βt}(H − βw) less what ∂H/∂t makes of it, at every time, shape (k+1,): a constant, which is
+        zero for an infinite horizon, and for a free final time unless the end itself, ψ or the target, depends on time.
+      drift: how much it varies, largest less least.
+      gap: the largest excess of H(u) over the least H among many admissible controls, over all times.
+      scale: the largest size of the terms of H, which both are to be compared with.
+    """
+
+    hamiltonian: Any
+    drift: Any
+    gap: Any
+    scale: Any
+
+
+@node(host=("message",))
+class Extremal:
+    """A path with its costates that meets Pontryagin's conditions; ``plotting`` draws it like any path.
+
+    Args:
+      times: shape (k+1,), increasing, as close as the solver wanted them.
+      states: shape (k+1, n), periodic states unwound.
+      controls: shape (k, m), at the start of each interval.
+      costates: p, shape (k+1, n): current-value, to be compared with DV along the path.
+      values: the cost to go along the path, discounted to each time, shape (k+1,).
+      switches: the times at which the control jumps.
+      cost: of the path from x₀, with what is paid at the end or after it.
+      horizon: the final time; where an infinite horizon was cut, that time.
+      optimality_check: an ``Optimality``.
+      code: a ``Status`` number.
+      message: how the solve ended, in a sentence; host level.
+    """
+
+    times: Any
+    states: Any
+    controls: Any
+    costates: Any
+    values: Any
+    switches: Any
+    cost: Any
+    horizon: Any
+    optimality_check: Optimality
+    code: Any
+    message: str = ""
+
+    @property
+    def status(self) -> Status:
+        """How the solve ended."""
+        return Status(int(self.code))
+
+    def __repr__(self) -> str:
+        return f"Extremal({self.status}: cost {float(self.cost):.6g} over {float(self.horizon):.6g})"
+
+    def __str__(self) -> str:
+        return encodable(f"{self.status}: {self.message}")
+
+
+@jax.jit
+def measure(ask: TwoPoint, t: Any, z: Any, corner: Any) -> dict[str, Any]:
+    """What the check needs at all times of one arc; ``z`` has shape (2n+1, k+1)."""
+    controls: Any = ask.problem.controls
+    tried = jnp.asarray(samples(controls, BUDGET), z.dtype)
+
+    def one(t, z):
+        x, p, w = ask.split(z)
+        at, weights = ask.weighted(t, x, p, corner)
+        u = weights @ at
+        energy = weights @ jax.vmap(lambda u: ask.hamiltonian(t, x, p, u))(at)
+        least = jnp.min(jax.vmap(lambda u: ask.hamiltonian(t, x, p, u))(tried))
+        least = jnp.minimum(
+            least, ask.hamiltonian(t, x, p, pointwise.minimiser(ask.problem, ask.rule, t, ask.wrap(x), p))
+        )
+        terms = ask.problem.drift(*ask.problem.arguments(ask.wrap(x), u, t=t)) * p
+        cost = pointwise.running_cost(ask.problem, t, ask.wrap(x), u)
+        now = jnp.exp(-ask.problem.discount * t)
+        moving = now * jax.grad(ask.hamiltonian, 0)(t, x, p, u) if ask.problem.time_dependent else 0.0 * t
+        size = jnp.maximum(jnp.max(jnp.abs(terms)), jnp.abs(cost))
+        constant = now * (energy - ask.problem.discount * w)
+        return {"u": u, "constant": constant, "moving": moving, "gap": energy - least, "size": size}
+
+    return jax.vmap(one, (0, 1))(t, z)
+
+
+def assemble(ask: TwoPoint, s: np.ndarray, y: np.ndarray, theta: np.ndarray, code: Status, message: str) -> Extremal:
+    """The extremal from the functions on [0, 1] that solve ``ask``; float64 has to be on."""
+    from scipy.integrate import cumulative_simpson
+
+    arrays = jax.tree.map(jnp.asarray, ask)
+    lengths = np.asarray(ask.durations(jnp.asarray(theta)))
+    begins, stacked = np.cumsum(lengths) - lengths, y.reshape(ask.count, -1, len(s))
+    parts, moved = [], 0.0
+    for number, (begin, length, z, corner) in enumerate(
+        zip(begins, lengths, stacked, np.asarray(ask.arcs), strict=True)
+    ):
+        t = begin + s * length
+        part = {name: np.asarray(each) for name, each in measure(arrays, t, z, corner).items()}
+        gone = np.full(len(s), moved)
+        if ask.problem.time_dependent:  # a mesh that crowds may repeat a node
+            once, back = np.unique(s, return_index=True, return_inverse=True)[1:]
+            gone += length * cumulative_simpson(part["moving"][once], x=s[once], initial=0.0)[back]
+        part["constant"], moved = part["constant"] - gone, gone[-1]
+        if code is Status.CONVERGED and length <= EMPTY * lengths.sum():  # an arc that begins where it ends
+            continue
+        states = z[: ask.n].T + (0.0 if ask.shifts is None else ask.shifts[number])
+        parts.append({**part, "t": t, "z": np.concatenate([states, z[ask.n :].T], 1)})
+
+    def joined(name, last=True):
+        """Over all arcs; at a switch the next arc's."""
+        rows = [part[name][:-1] for part in parts]
+        return np.concatenate([*rows, parts[-1][name][-1:]] if last else rows)
+
+    n, z = ask.n, joined("z")
+    every = np.concatenate([part["constant"] for part in parts])
+    check = Optimality(
+        hamiltonian=joined("constant"),
+        drift=float(np.max(every) - np.min(every)),
+        gap=float(max(np.max(part["gap"]) for part in parts)),
+        scale=float(max(np.max(part["size"]) for part in parts)),
+    )
+    return Extremal(
+        times=joined("t"),
+        states=z[:, :n],
+        controls=joined("u", last=False),
+        costates=z[:, n : 2 * n],
+        values=z[:, -1],
+        switches=np.array([part["t"][0] for part in parts[1:] if not ask.seams]),
+        cost=float(z[0, -1]),
+        horizon=float(lengths.sum()),
+        optimality_check=check,
+        code=int(code),
+        message=message,
+    )
+
+
+def unchecked(ask: TwoPoint, s: np.ndarray, y: np.ndarray, lengths: np.ndarray, code: Status) -> Extremal:
+    """A path with its costates as far as a solve came, without controls, which would have to be compiled for."""
+    begins, n = np.cumsum(lengths) - lengths, ask.n
+    z = np.moveaxis(y.reshape(ask.count, -1, len(s)), 1, 2).copy()
+    if ask.shifts is not None:
+        z[..., :n] += np.asarray(ask.shifts)[:, None]
+    inner = np.append(np.tile(np.arange(len(s)) < len(s) - 1, ask.count)[:-1], True)  # at a switch the next arc's
+    times, z = (begins[:, None] + s * lengths[:, None]).ravel()[inner], z.reshape(-1, z.shape[-1])[inner]
+    return Extremal(
+        times=times,
+        states=z[:, :n],
+        controls=np.full((len(times) - 1, np.shape(ask.arcs)[1]), np.nan),
+        costates=z[:, n : 2 * n],
+        values=z[:, -1],
+        switches=np.zeros(0) if ask.seams else begins[1:],
+        cost=float(z[0, -1]),
+        horizon=float(lengths.sum()),
+        optimality_check=Optimality(np.full(len(times), np.nan), np.nan, np.nan, np.nan),
+        code=int(code),
+        message="this is the last iterate, without controls; nothing says how well it meets the conditions",
+    )

@@ -1,0 +1,125 @@
+"""The rest at which an infinite horizon ends, and the value near it by the Riccati equation.
+
+At a rest of the Hamiltonian flow f(x̄, ū) = 0 and βp̄ = H_x, with ū the minimiser. To second order the value there is
+w̄ + p̄·y + ½ y'Py with y = x − x̄ and, for A = f_x, B = f_u over the inputs that are not at a bound,
+
+    P(A − ½βI) + (A − ½βI)'P + H_xx − (PB + H_xu) H_uu⁻¹ (B'P + H_ux) = 0,        w̄ = L(x̄, ū)/β
+
+so the closed loop is ẏ = (A − B H_uu⁻¹(B'P + H_ux)) y, and a path that has come near may be cut off.
+"""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.extremals.two_point import Rest, TwoPoint
+from hjbjax.hamiltonian import pointwise
+from hjbjax.problem.sets import Ball
+
+NEAR = 1e-8  # what counts as at rest, relative to 1 + |x̄| + |p̄|
+FREE = 1e-9  # an input this close to an end of its range, relative to its width, is at a bound
+
+
+@jax.jit
+def _rest_rates(ask: TwoPoint, y: Any) -> Any:
+    """(ẋ, ṗ) at time 0."""
+    return ask.flow(0.0, jnp.append(y, 0.0), ask.arcs[0])[:-1]
+
+
+_rest_slopes = jax.jit(jax.jacfwd(_rest_rates, 1))
+
+
+@jax.jit
+def _expansion(ask: TwoPoint, x: Any, p: Any) -> dict[str, Any]:
+    """The minimiser at one state and costate, and H there to second order."""
+    problem = ask.problem
+    u = pointwise.minimiser(problem, ask.rule, 0.0, ask.wrap(x), p)
+
+    def energy(x, u):
+        return ask.hamiltonian(0.0, x, p, u)
+
+    def drift(x, u):
+        return jnp.asarray(problem.drift(*problem.arguments(ask.wrap(x), u)), p.dtype)
+
+    (xx, xu), (_, uu) = jax.hessian(energy, (0, 1))(x, u)
+    by_state, by_control = jax.jacfwd(drift, (0, 1))(x, u)
+    cost = pointwise.running_cost(problem, 0.0, ask.wrap(x), u)
+    return {"u": u, "a": by_state, "b": by_control, "xx": xx, "xu": xu, "uu": uu, "cost": cost}
+
+
+def find(ask: TwoPoint, near: np.ndarray, costate: np.ndarray) -> tuple[Rest, float]:
+    """The rest near a state, and the slowest rate of the closed loop there, per unit time.
+
+    Raises:
+      ValueError: no rest is found, it costs, or the Riccati equation has no stabilising solution.
+    """
+    from scipy.linalg import LinAlgError, solve_continuous_are
+    from scipy.optimize import root
+
+    n = len(near)
+    with np.errstate(all="ignore"):
+        found = root(
+            functools.partial(_on_host, _rest_rates, ask), np.append(near, costate),
+            jac=functools.partial(_on_host, _rest_slopes, ask), tol=1e-13,
+        )  # fmt: skip
+    left = np.max(np.abs(_on_host(_rest_rates, ask, found.x)))
+    if not left < NEAR * (1 + np.linalg.norm(found.x)):
+        raise ValueError(
+            f"pontryagin: no rest of the Hamiltonian flow near x = {near.tolist()} (what is left is {left:.2g}); an "
+            "infinite horizon ends at one: give rest=, or a horizon"
+        )
+    x, p = found.x[:n], found.x[n:]
+    at = {name: np.asarray(part) for name, part in _expansion(ask, x, p).items()}
+    beta = float(ask.problem.discount)
+    if beta == 0 and abs(at["cost"]) > NEAR:
+        raise ValueError(
+            f"pontryagin: the rest x = {x.tolist()} costs {at['cost']:.3g} per unit time, without discount; the cost "
+            "of an infinite horizon is infinite: shift the cost, or give a discount or a horizon"
+        )
+    free = _free(ask, at["u"])
+    shifted = at["a"] - beta / 2 * np.eye(n)
+    try:
+        matrix = solve_continuous_are(
+            shifted, at["b"][:, free], at["xx"], at["uu"][np.ix_(free, free)], s=at["xu"][:, free]
+        )
+    except (LinAlgError, ValueError) as error:
+        raise ValueError(
+            f"pontryagin: the Riccati equation at the rest x = {x.tolist()} has no stabilising solution ({error}); "
+            "give a horizon, or terminal="
+        ) from None
+    gain = np.linalg.solve(at["uu"][np.ix_(free, free)], at["b"][:, free].T @ matrix + at["xu"][:, free].T)
+    slowest = -float(np.max(np.linalg.eigvals(at["a"] - at["b"][:, free] @ gain).real))
+    if not slowest > 0:
+        raise ValueError(
+            f"pontryagin: under the discount {beta:g} the best loop does not return to the rest x = {x.tolist()} (its "
+            f"slowest rate is {slowest:.3g}); give a horizon"
+        )
+    value = at["cost"] / beta if beta else 0.0
+    return Rest(x, p, np.asarray(value), matrix), slowest
+
+
+def _on_host(function: Any, ask: TwoPoint, y: Any) -> np.ndarray:
+    return np.asarray(function(ask, y))
+
+
+def _free(ask: TwoPoint, u: np.ndarray) -> np.ndarray:
+    """The inputs that are not at a bound, as indices.
+
+    Raises:
+      ValueError: there is none, so nothing steers near the rest.
+    """
+    choices: Any = ask.problem.controls
+    if isinstance(choices, Ball):
+        inside = np.full(len(u), np.linalg.norm(u) < choices.radius * (1 - FREE))
+    else:
+        room = FREE * (np.asarray(choices.hi) - np.asarray(choices.lo))
+        inside = (u > choices.lo + room) & (u < choices.hi - room)
+    if not inside.any():
+        raise ValueError(
+            f"pontryagin: at the rest the control {u.tolist()} is at its bound, and the Riccati equation needs room; "
+            "give a horizon"
+        )
+    return np.flatnonzero(inside)

@@ -1,0 +1,61 @@
+"""Extremals that cross the seam of a periodic axis: one arc on every side of it.
+
+A cost such as θ² on [−π, π) is continuous at the seam, and so are the costate and H, but ṗ jumps there; a collocation
+across it crowds its mesh at that place and comes no further. With an arc for every turn, each in the coordinates of the
+box, and the times of crossing sought (x_i = its end of the axis), everything is smooth on an arc again.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from hjbjax.extremals.two_point import TwoPoint
+
+FINE = 4001  # samples in which a guess is looked through for crossings
+NODES = 33  # of an arc's first mesh
+
+
+def split(
+    ask: TwoPoint, times: np.ndarray, columns: np.ndarray
+) -> tuple[TwoPoint, np.ndarray, np.ndarray, np.ndarray] | None:
+    """The boundary-value problem in arcs, their mesh, the guess on it, and their durations; None without a crossing.
+
+    Args:
+      ask: with one arc, and a grid where it has periodic axes.
+      times: increasing from 0.
+      columns: the guess (x, p, w) at these times.
+    """
+    if ask.grid is None:
+        return None
+    cyclic, fine = np.array(ask.grid.periodic), np.linspace(0, times[-1], FINE)
+    lo, period = np.asarray(ask.grid.lo), np.asarray(ask.grid.hi) - np.asarray(ask.grid.lo)
+    states = np.stack([np.interp(fine, times, row) for row in columns[: ask.n]], axis=-1)
+    turns = np.where(cyclic, np.floor((states - lo) / period), 0)
+    at = 1 + np.flatnonzero(np.any(np.diff(turns, axis=0) != 0, axis=1))
+    steps = turns[at] - turns[at - 1]
+    if not len(at) or np.any(np.sum(np.abs(steps), axis=1) != 1):
+        return None
+    axes = np.argmax(np.abs(steps), axis=1)
+    shifts = turns[np.append(0, at)] * period
+    upward = steps[np.arange(len(at)), axes] > 0
+    starts = np.append(0.0, fine[at])
+    lengths, s = np.diff(np.append(starts, times[-1])), np.linspace(0, 1, NODES)
+    pieces = [
+        np.stack([np.interp(begin + s * length, times, row) for row in columns])
+        for begin, length in zip(starts, lengths, strict=True)
+    ]
+    for piece, shift in zip(pieces, shifts, strict=True):
+        piece[: ask.n] -= shift[:, None]
+    rest = ask.rest and dataclasses.replace(ask.rest, state=ask.rest.state - shifts[-1])
+    apart = dataclasses.replace(
+        ask,
+        grid=None,
+        start=ask.start - shifts[0],
+        ends=ask.ends - np.where(ask.held, shifts[-1], 0),
+        rest=rest,
+        arcs=np.repeat(ask.arcs, len(starts), 0),
+        shifts=shifts,
+        places=np.where(upward, lo[axes] + period[axes], lo[axes]),
+        seams=tuple(int(axis) for axis in axes),
+    )
+    return apart, s, np.concatenate(pieces), lengths

@@ -1,0 +1,233 @@
+"""Solving the boundary-value problem of an extremal whose control is continuous: at once, or by continuation.
+
+The collocation starts from the guess; if that fails, from easier problems on the way: starts nearer to the rest of an
+infinite horizon, or shorter horizons. An infinite horizon is lengthened until the path has settled. What comes back is
+held against the necessary conditions before it counts as converged.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.extremals import first_guess, seams
+from hjbjax.extremals.optimality import Extremal, assemble, unchecked
+from hjbjax.extremals.two_point import Closing, TwoPoint, collocate
+from hjbjax.solution.clock import CUT, Clock, Stopped
+from hjbjax.solution.status import Status
+
+SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)  # of the way, in a continuation
+ROUGH, COARSE = 1e-3, 1000  # tolerance and nodes on the way
+HUGE = 1e6  # times the guess: what grows so much has no limit
+SETTLED = 1e-3  # how far from a rest its quadratic value is trusted, relative to 1 + |x̄|; what is left is its cube
+LONGER, EXTENSIONS = 1.5, 6  # factor, and how often, an infinite horizon is lengthened
+GAP = 1e-6  # by how much the Hamiltonian may miss its minimum, relative to its terms
+ENDINGS = {1: Status.MAX_STEPS, 2: Status.DIVERGED, 3: Status.STALLED}
+ADVICE = {
+    Status.MAX_STEPS: "the mesh reached max_nodes; raise max_nodes, loosen tol, or give a better guess",
+    Status.DIVERGED: "its Jacobian became singular: no extremal near the guess, or none that meets the end conditions",
+    Status.STALLED: "the end conditions cannot be met to tol; give another guess",
+    Status.NONFINITE: "NaN or infinity on the way; look at drift, cost and terminal there, or give a better guess",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Limits:
+    """How far a solve goes, and how long."""
+
+    tol: float
+    max_nodes: int
+    clock: Clock
+
+    @property
+    def rough(self) -> "Limits":
+        """For problems on the way to the one asked for."""
+        return Limits(max(ROUGH, self.tol), min(COARSE, self.max_nodes), self.clock)
+
+
+@dataclasses.dataclass(frozen=True)
+class Found:
+    """What came of a boundary-value problem; ``trouble`` is empty where it is solved."""
+
+    ask: TwoPoint
+    s: np.ndarray
+    y: np.ndarray
+    theta: np.ndarray
+    code: Status
+    trouble: str = ""
+
+    @property
+    def solved(self) -> bool:
+        """Whether it may go on."""
+        return self.code is Status.CONVERGED
+
+    @property
+    def times(self) -> np.ndarray:
+        """The mesh in units of time, of one arc."""
+        return self.s * self.horizon
+
+    @property
+    def lengths(self) -> np.ndarray:
+        """The durations of the arcs."""
+        return np.asarray(self.ask.durations(np.asarray(self.theta)))
+
+    @property
+    def horizon(self) -> float:
+        """The final time."""
+        return float(np.sum(self.lengths))
+
+
+def attempt(ask: TwoPoint, s: Any, y: Any, theta: Any, limits: Limits) -> Found:
+    """One collocation, its ending in our words; ``Stopped`` brings along what was found by then."""
+    guess = np.asarray(theta, float)
+    try:
+        result = collocate(ask, s, y, guess, tol=limits.tol, max_nodes=limits.max_nodes, clock=limits.clock)
+    except Stopped as stop:
+        mesh, last, sought = stop.reached
+        raise Stopped(stop.status, Found(ask, mesh, last, sought, stop.status)) from None
+    sought = np.zeros(0) if result.p is None else result.p
+    code = Status.CONVERGED if result.success else ENDINGS[result.status]
+    if not (np.all(np.isfinite(result.y)) and np.all(np.isfinite(sought))):
+        code = Status.NONFINITE
+    elif np.max(np.abs(result.y)) > HUGE * (1 + np.max(np.abs(y))):
+        code = Status.DIVERGED  # a jump sharper than the mesh can look like a solution
+    trouble = "" if code is Status.CONVERGED else f"the boundary-value problem was not solved: {ADVICE[code]}"
+    found = Found(ask, result.x, result.y, sought, code, trouble)
+    if found.solved and not found.horizon > 0:
+        return dataclasses.replace(
+            found, code=Status.DIVERGED, trouble=f"the final time came out as {found.horizon:.3g}; give a better guess"
+        )
+    return found
+
+
+def carry_on(found: Found, limits: Limits) -> None:
+    """Look at the clock with something to hand back: between two programs that have to be compiled."""
+    code = limits.clock.over()
+    if code is not None:
+        raise Stopped(code, dataclasses.replace(found, code=code))
+
+
+def smooth(ask: TwoPoint, times: np.ndarray, columns: np.ndarray, limits: Limits, *, trusted: bool) -> Found:
+    """The extremal of a Hamiltonian whose minimiser is continuous.
+
+    Args:
+      ask: the boundary-value problem.
+      times: increasing from 0.
+      columns: the guess at these times, shape (2n+1, len(times)).
+      limits: how far to go.
+      trusted: whether the guess is of the very problem, so that easier ones would lead away from it.
+    """
+    apart = seams.split(ask, times, columns)
+    if apart is not None:
+        multiplier = unknowns(ask, times, columns)[int(ask.timed) :]
+        return _arrived(attempt(*apart[:3], np.append(apart[3], multiplier), limits))
+    found = attempt(ask, times / times[-1], columns, unknowns(ask, times, columns), limits)
+    if not found.solved and not trusted:
+        found = _continued(found, limits)
+    if ask.closing is Closing.REST:
+        found = _settled(found, limits)
+    return found
+
+
+def unknowns(ask: TwoPoint, times: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """First guesses of the final time and of ν, whatever the guess makes of p(T) = ψ_x + ν l_x."""
+    theta = [times[-1]] * ask.timed
+    if ask.closing is Closing.TARGET:
+        theta.append(float(_multiplier(ask, times[-1], columns[:, -1])))
+    return np.array(theta)
+
+
+@jax.jit
+def _multiplier(ask: TwoPoint, t: Any, z: Any) -> Any:
+    x, p, _ = ask.split(z)
+    slope, normal = jax.grad(ask.psi, 1)(t, x), jax.grad(ask.level, 1)(t, x)
+    return jnp.nan_to_num((p - slope) @ normal / jnp.maximum(normal @ normal, 1e-300))
+
+
+@jax.jit
+def _levels(ask: TwoPoint, s: Any, y: Any, theta: Any) -> Any:
+    """The target's function along every arc, each in its own coordinates: the target knows no unwound angles."""
+    lengths = ask.durations(theta)
+    begins = jnp.cumsum(lengths) - lengths
+    states = y.reshape(ask.count, -1, len(s))[:, : ask.n]
+    along = jax.vmap(ask.level, (0, 1))
+    return jax.vmap(lambda begin, length, x: along(begin + s * length, x))(begins, lengths, states)
+
+
+def _continued(failed: Found, limits: Limits) -> Found:
+    """The same from easier problems; the failure itself where there are none, or they fail, too."""
+    ask = failed.ask
+    if ask.closing not in (Closing.REST, Closing.COST) or ask.free:
+        return failed
+    found = None
+    for share in SHARES:
+        last = share == 1
+        if ask.closing is Closing.REST:
+            start = ask.rest.state + share * (ask.start - ask.rest.state)
+            easier = dataclasses.replace(ask, start=start)
+            times, columns = first_guess.into_rest(easier, start, float(ask.horizon), limits.clock)
+        else:
+            easier = dataclasses.replace(ask, horizon=share * ask.horizon)
+            times, columns = first_guess.straight(easier, float(easier.horizon))
+        s, y = (times / times[-1], columns) if found is None else (found.s, found.y)
+        found = attempt(easier, s, y, np.zeros(0), limits if last else limits.rough)
+        if not found.solved:
+            return failed
+    return found or failed
+
+
+def _arrived(found: Found) -> Found:
+    """A path over an infinite horizon, unless it has not come near its rest."""
+    ask = found.ask
+    last = found.y.reshape(ask.count, -1, len(found.s))[-1, : ask.n, -1]
+    if ask.closing is not Closing.REST or not found.solved or _near(ask, last):
+        return found
+    trouble = f"the path has not settled at its rest by t = {found.horizon:.3g}; give another guess"
+    return dataclasses.replace(found, code=Status.STALLED, trouble=trouble)
+
+
+def _near(ask: TwoPoint, last: np.ndarray) -> bool:
+    return bool(np.linalg.norm(last - ask.rest.state) <= SETTLED * (1 + np.linalg.norm(ask.rest.state)))
+
+
+def _settled(found: Found, limits: Limits) -> Found:
+    """An infinite horizon cut where the path is near enough to its rest."""
+    for _ in range(EXTENSIONS):
+        ask = found.ask
+        last = found.y[: ask.n, -1]
+        if _near(ask, last) or not found.solved:
+            return found
+        more = float(ask.horizon) * (LONGER - 1)
+        times, columns = first_guess.into_rest(ask, last, more, limits.clock)
+        longer = dataclasses.replace(ask, horizon=float(ask.horizon) * LONGER)
+        t = np.concatenate([found.times, float(ask.horizon) + times[1:]])
+        found = attempt(longer, t / t[-1], np.concatenate([found.y, columns[:, 1:]], 1), np.zeros(0), limits)
+    trouble = f"the path has not settled at its rest by t = {found.horizon:.3g}; give horizon, or rest="
+    return found if not found.solved else dataclasses.replace(found, code=Status.STALLED, trouble=trouble)
+
+
+def report(found: Found) -> Extremal:
+    """The extremal, held against the necessary conditions; not so the last iterate of a run that was cut short."""
+    if found.code in CUT:
+        return unchecked(found.ask, found.s, found.y, found.lengths, found.code)
+    extremal = assemble(found.ask, found.s, found.y, found.theta, found.code, found.trouble)
+    check = extremal.optimality_check
+    if not found.solved:
+        return extremal
+    if np.min(found.lengths) < -GAP * found.horizon:
+        missed = "an arc came out with a negative duration; give another guess"
+        return dataclasses.replace(extremal, code=int(Status.STALLED), message=missed)
+    if found.ask.closing is Closing.TARGET:
+        inside = np.asarray(_levels(found.ask, found.s, found.y, found.theta))
+        if np.min(inside) < -GAP * (1 + np.max(np.abs(inside))):
+            missed = "the path crosses the target before its end, where it would have stopped; give another guess"
+            return dataclasses.replace(extremal, code=int(Status.STALLED), message=missed)
+    if not check.gap <= GAP * (1 + check.scale):
+        missed = f"the Hamiltonian misses its minimum by {check.gap:.3g}: no extremal; give another guess"
+        return dataclasses.replace(extremal, code=int(Status.STALLED), message=missed)
+    count = len(extremal.switches)
+    jumps = f", {count} switch{'es' * (count != 1)}" if found.ask.rule.jumps else ""
+    said = f"an extremal of cost {extremal.cost:.6g} over {extremal.horizon:.6g}{jumps}, {len(found.s)} nodes"
+    return dataclasses.replace(extremal, message=said)

@@ -1,0 +1,371 @@
+"""Closed loops and their integration: what a feedback does to the system, and what that costs.
+
+    dx = f(x, u, d) dt + σ(x, u, d) dw,  u = control(x),  d = opponent(x)
+    cost = ∫ e^{−βt} L(x, u, d) dt  (+ e^{−βτ} exit cost, where the target is reached at τ; else e^{−βT} terminal cost)
+
+The running cost is one more state of the integrator, so it has the accuracy of the path.
+
+Without noise: Tsit5 with adaptive steps, no longer than the distance of two output times. A feedback that jumps
+(bang-bang) makes any adaptive stepper crawl along its switching curve, so no step is shorter than
+2·duration/max_steps: there the path chatters within f·(that step) of the curve, as a fast sampler would. For such
+a feedback a zero-order hold is faster, and is what hardware does.
+With noise: fixed steps in Itô's sense on a virtual Brownian tree. Noise that is a number or a matrix: SRA1 (strong
+order 1.5 in a smooth closed loop); noise that is a function: Euler–Maruyama (strong order ½, weak order 1).
+Rejecting steps would bias the law of the path, so ``rtol`` and ``atol`` have no say here.
+
+The target, the edge of the box and the end of what the players know are looked for at the end of every internal
+step, and located by bisection of that step's interpolant; the path ends on their far side, by rounding. Inside the
+target a Solution has no control, and a step that ends there still wants one at its stages: it is that of the last
+place on the straight way there where the players had an answer.
+With noise a target is met late, since what happens between two steps is not seen: by about .58 σ√dt in space.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.feedback.path import Path, PathStatus
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import node
+
+HALVINGS = 30  # of the way back to where the players have an answer: a billionth of an interval
+
+
+@node(static=("clamp",))
+class Loop:
+    """The closed loop as functions of (t, x).
+
+    Args:
+      problem: the system and its costs.
+      control: a pytree that is called with (t, x); None where there is no control.
+      opponent: likewise, for the disturbance.
+      grid: the Grid in whose box the players are known; None where that is everywhere.
+      clamp: outside the box, whether to go on with what the players say at its nearest point.
+    """
+
+    problem: Problem
+    control: Any
+    opponent: Any
+    grid: Any
+    clamp: bool
+
+    def wrap(self, x):
+        """The state with its periodic entries in the box."""
+        return x if self.grid is None else self.grid.wrap(x)
+
+    def players(self, t, x):
+        """The control, shape (m,), and the disturbance, shape (l,), or None; NaN where they have no answer."""
+        u = jnp.zeros(0, x.dtype) if self.control is None else self._ask(self.control, t, x)
+        return u, None if self.opponent is None else self._ask(self.opponent, t, x)
+
+    def actions(self, t, x, since):
+        """The players at (t, x); where they have none, as in the target, those of the last place that has.
+
+        Args:
+          t: the time.
+          x: the state, which a stage of a step may put into the target.
+          since: a time and a state before, where the players have an answer.
+        """
+        now = self.players(t, x)
+        if not self.guarded:
+            return now
+
+        def halve(_, way):
+            known, lost = way
+            middle = (known + lost) / 2
+            there = self._between(since, (t, x), middle)
+            good = (self.target(*there) > 0) & defined(self.players(*there))
+            return jnp.where(good, middle, known), jnp.where(good, lost, middle)
+
+        def before():
+            ends = jnp.zeros((), x.dtype), jnp.ones((), x.dtype)
+            known, _ = jax.lax.fori_loop(0, HALVINGS, halve, ends)
+            return self.players(*self._between(since, (t, x), known))
+
+        return jax.lax.cond((self.target(t, x) > 0) & defined(now), lambda: now, before)
+
+    def _between(self, since, now, share):
+        return tuple(a + share * (b - a) for a, b in zip(since, now, strict=True))
+
+    @property
+    def guarded(self):
+        """Whether there is a place where the players need not have an answer: inside a target, or on a grid."""
+        return (self.control is not None or self.opponent is not None) and (
+            self.problem.target is not None or self.grid is not None
+        )
+
+    def _ask(self, player, t, x):
+        """A player sees the state in the box."""
+        if self.grid is not None:
+            x, (lo, hi) = self.grid.wrap(x), self._corners(x)
+            x = jnp.where(np.array(self.grid.periodic), x, jnp.clip(x, lo, hi))
+        return jnp.asarray(player(t, x), x.dtype)
+
+    def _corners(self, x):
+        return jnp.asarray(self.grid.lo, x.dtype), jnp.asarray(self.grid.hi, x.dtype)
+
+    def discount(self, elapsed):
+        """e^{−βt} after the time ``elapsed``."""
+        return jnp.exp(-jnp.asarray(self.problem.discount, elapsed.dtype) * elapsed)
+
+    def rate(self, t, x, u, d, discount):
+        """Drift, and running cost times ``discount``, as one array of shape (n+1,)."""
+        arguments = self.problem.arguments(self.wrap(x), u, d, t)
+        cost = 0.0 if self.problem.cost is None else self.problem.cost(*arguments)
+        drift = jnp.asarray(self.problem.drift(*arguments), x.dtype)
+        return jnp.append(drift, jnp.asarray(discount * cost, x.dtype))
+
+    def noise(self, t, x, u, d):
+        """σ with a zero row for the cost, shape (n+1, k)."""
+        sigma = self.problem.diffusion(self.wrap(x), u, d, t).astype(x.dtype)
+        return jnp.pad(sigma, ((0, 1), (0, 0)))
+
+    def target(self, t, x):
+        """≤ 0 inside the target; inf where there is none."""
+        return self.number(jnp.inf if self.problem.target is None else self.problem.target, t, x)
+
+    def margin(self, x):
+        """The distance to the edge of the box over its width, ≤ 0 outside; inf where the path may go anywhere."""
+        if self.grid is None or self.clamp:
+            return jnp.asarray(jnp.inf, x.dtype)
+        lo, hi = self._corners(x)
+        inside = jnp.minimum(x - lo, hi - x) / (hi - lo)
+        # A path may rest on the edge, where rounding must not push it out.
+        slack = 64 * jnp.finfo(x.dtype).eps
+        return jnp.min(jnp.where(np.array(self.grid.periodic), jnp.inf, inside)) + slack
+
+    def number(self, value, t, x):
+        """A number (None is zero) or a function of the state, as a number."""
+        if callable(value):
+            value = value(*self.problem.state_arguments(self.wrap(x), t))
+        return jnp.asarray(0.0 if value is None else value, x.dtype)
+
+
+def defined(actions: Any) -> Any:
+    """Whether every entry of the players' actions is finite."""
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(each)) for each in jax.tree.leaves(actions)]))
+
+
+@node(static=("max_steps", "held"))
+class Stepping:
+    """How the integrator steps.
+
+    Args:
+      rtol: relative error of an internal step.
+      atol: absolute error of an internal step, in the units of the state and of the cost.
+      max_step: the longest internal step, may be inf.
+      max_steps: the most internal steps.
+      held: whether the control is held from one output time to the next.
+    """
+
+    rtol: Any
+    atol: Any
+    max_step: Any
+    max_steps: int
+    held: bool
+
+
+def integrate(loop: Loop, x0: Any, times: Any, key: Any, stepping: Stepping) -> tuple[Path, Any]:
+    """The path of full length, and for each interval whether the path runs through it, shape (k,).
+
+    One diffrax solve an output interval, all in one scan; a path that has ended gets intervals of length zero.
+    """
+    interval, first = _intervals(loop, x0, times, key, stepping)
+    last, rows = jax.lax.scan(interval, first, times[1:])
+    return _path(loop, x0, times[0], last, rows)
+
+
+def unbegun(loop: Loop, x0: np.ndarray, times: np.ndarray) -> tuple[tuple, tuple]:
+    """The state before the first interval, but for its code, and room for what all intervals show; NumPy."""
+    count, players = len(times) - 1, (loop.problem.controls, loop.problem.disturbances)
+    inputs = [0 if choices is None else choices.dim for choices in players]
+    controls, disturbances = (np.zeros((count, size), x0.dtype) for size in inputs)
+    state = times[0], np.append(x0, 0.0), np.int32(0), np.int32(0)
+    shown = controls, None if loop.opponent is None else disturbances
+    return state, (np.zeros(count, x0.dtype), np.zeros((count, len(x0)), x0.dtype), *shown, np.zeros(count, bool))
+
+
+def some(
+    loop: Loop, x0: Any, times: Any, key: Any, stepping: Stepping, so_far: tuple, done: Any, until: Any
+) -> tuple[tuple, tuple[Path, Any]]:
+    """``integrate`` from the interval ``done`` to before ``until``: the state and all shown, and the path so far.
+
+    Args:
+      loop, x0, times, key, stepping: of the whole path.
+      so_far: the state and what the intervals before have shown; at first as ``unbegun`` makes them.
+      done: the first interval.
+      until: the interval after the last one.
+    """
+    interval, first = _intervals(loop, x0, times, key, stepping)
+    state, rows = so_far
+    state = jax.tree.map(lambda old, new: jnp.where(done == 0, new, old), state, first)
+
+    def one(k, carry):
+        state, row = interval(carry[0], times[k + 1])
+        return state, jax.tree.map(lambda array, entry: array.at[k].set(entry), carry[1], row)
+
+    state, rows = jax.lax.fori_loop(done, until, one, (state, rows))
+    t, y, code, count = state
+    came = jnp.arange(len(times) - 1) < until
+    later, states, controls, disturbances, active = rows
+    cut = (code == PathStatus.DURATION) & (until < len(times) - 1)
+    last = t, y, jnp.where(cut, PathStatus.INTERRUPTED, code).astype(code.dtype), count
+    shown = jnp.where(came, later, t), jnp.where(came[:, None], states, y[:-1]), controls, disturbances, active & came
+    return (state, rows), _path(loop, x0, times[0], last, shown)
+
+
+def _intervals(loop: Loop, x0: Any, times: Any, key: Any, stepping: Stepping) -> tuple[Callable, tuple]:
+    """One output interval as a step of a scan, and the state (t, y, code, steps) before the first."""
+    start = times[0]
+    solve = _solver(loop, x0, times, key, stepping)
+
+    def interval(state, end):
+        t, y, code, count = state
+        u, d = loop.players(t, y[:-1])
+        code = jnp.where((code == PathStatus.DURATION) & ~defined((u, d)), PathStatus.UNDEFINED, code)
+        active = code == PathStatus.DURATION
+        later, moved, result, made = _advance(loop, solve, t, jnp.where(active, end, t), y, u, stepping)
+        count = count + made
+        code = jnp.where(active, result, code)
+        code = jnp.where((code == PathStatus.DURATION) & (count >= stepping.max_steps), PathStatus.MAX_STEPS, code)
+        active &= jnp.all(jnp.isfinite(moved))  # if not, the path ends at the last output time before
+        t, y = jnp.where(active, later, t), jnp.where(active, moved, y)
+        shown = jax.tree.map(lambda a: jnp.where(active, a, jnp.nan), (u, d))
+        return (t, y, code.astype(jnp.int32), count), (t, y[:-1], *shown, active)
+
+    code = jnp.where(loop.margin(x0) > 0, PathStatus.DURATION, PathStatus.LEFT_BOX)
+    code = jnp.where(loop.target(start, x0) <= 0, PathStatus.TARGET, code).astype(jnp.int32)
+    return interval, (start, jnp.append(x0, 0.0), code, jnp.zeros((), jnp.int32))
+
+
+def _path(loop: Loop, x0: Any, start: Any, last: tuple, shown: tuple) -> tuple[Path, Any]:
+    """The path of full length from its last state and what its intervals have shown, and which it runs through."""
+    (t, y, code, count), (later, states, controls, disturbances, active) = last, shown
+    hit = code == PathStatus.TARGET
+    times, states = jnp.append(start, later), jnp.concatenate([x0[None], states])
+    ended = code == PathStatus.DURATION
+    if loop.problem.running_max is None:
+        exit_cost, final = (loop.number(c, t, y[:-1]) for c in (loop.problem.exit_cost, loop.problem.terminal_cost))
+        due = jnp.where(hit, exit_cost, jnp.where(ended, final, 0))
+        cost = y[-1] + loop.discount(t - start) * due
+    else:
+        cost = jnp.max(jax.vmap(lambda t, x: loop.number(loop.problem.running_max, t, x))(times, states))
+        if loop.problem.terminal_cost is not None:
+            final = loop.number(loop.problem.terminal_cost, t, y[:-1])
+            cost = jnp.where(ended, jnp.maximum(cost, final), cost)
+    return Path(times, states, controls, disturbances, cost, jnp.where(hit, t, jnp.inf), code, count), active
+
+
+def _advance(loop, solve, t, end, y, u, stepping):
+    """From ``t`` to ``end``, or to the target or the edge if they come first: (time, y, code, steps)."""
+    import diffrax
+
+    width = jnp.where(end > t, end - t, 1)  # of an ended path: any positive number
+    if loop.problem.noise is None:
+        step = jnp.minimum(width, stepping.max_step)
+    else:
+        step = width / jnp.ceil(jnp.maximum(width / stepping.max_step, 10) - 1e-6)
+    solved = solve(t0=t, t1=end, dt0=step, y0=y, args=(u, t, y[:-1]))
+    later, y = solved.ts[0], solved.ys[0]
+    target, margin = loop.target(later, y[:-1]), loop.margin(y[:-1])
+    code = jnp.where(target <= margin, PathStatus.TARGET, PathStatus.LEFT_BOX)
+    if loop.guarded and not stepping.held:
+        inside = (target > 0) & (margin > 0)
+        code = jnp.where(inside & ~defined(loop.players(later, y[:-1])), PathStatus.UNDEFINED, code)
+    code = jnp.where(diffrax.is_event(solved.result), code, PathStatus.DURATION)
+    code = jnp.where(jnp.all(jnp.isfinite(y)), code, PathStatus.NONFINITE)
+    # diffrax hands back infinity where it ran out of steps, and the state need not have been
+    code = jnp.where(diffrax.is_okay(solved.result), code, PathStatus.MAX_STEPS)
+    return later, y, code, solved.stats["num_steps"].astype(jnp.int32)
+
+
+def _solver(loop, x0, times, key, stepping) -> Callable:
+    """diffrax's solve with all that stays; its ``args``: control, time and state at the beginning of an interval."""
+    import diffrax
+
+    start, duration = times[0], times[-1] - times[0]
+
+    def act(t, y, begun):
+        u, d = loop.actions(t, y[:-1], begun[1:])
+        return (begun[0] if stepping.held else u), d
+
+    def rate(t, y, begun):
+        return loop.rate(t, y[:-1], *act(t, y, begun), loop.discount(t - start))
+
+    def noise(t, y, begun):
+        return loop.noise(t, y[:-1], *act(t, y, begun))
+
+    def margin(t, y, args, **kwargs):
+        inside = jnp.minimum(loop.target(t, y[:-1]), loop.margin(y[:-1]))
+        if not loop.guarded or stepping.held:  # under a hold the players are asked at its samples only
+            return inside
+        return jnp.where(defined(loop.players(t, y[:-1])), inside, jnp.minimum(inside, -1))
+
+    terms: Any = diffrax.ODETerm(rate)
+    solver: Any
+    controller: Any
+    if loop.problem.noise is None:
+        solver = diffrax.Tsit5()
+        controller = diffrax.PIDController(
+            rtol=stepping.rtol, atol=stepping.atol, dtmin=2 * duration / stepping.max_steps, dtmax=stepping.max_step,
+            force_dtmin=True, norm=_size,
+        )  # fmt: skip
+    else:
+        additive = not callable(loop.problem.noise)
+        brownian = _brownian(loop, x0, times, key, stepping.max_step, additive)
+        terms = diffrax.MultiTerm(terms, diffrax.ControlTerm(noise, brownian))
+        solver, controller = diffrax.SRA1() if additive else diffrax.Euler(), diffrax.ConstantStepSize()
+    event = None
+    if (
+        loop.guarded or loop.problem.target is not None or (loop.grid is not None and not loop.clamp)
+    ):  # it doubles the compile time
+        close = 4 * jnp.finfo(x0.dtype).eps
+        # flip=True: the function falls through zero. "detect" would put a host callback into the compiled run.
+        event = diffrax.Event(margin, _bisection()(close, close, flip=True), direction=False)
+    return functools.partial(
+        diffrax.diffeqsolve, terms, solver, stepsize_controller=controller, event=event,
+        saveat=diffrax.SaveAt(t1=True), adjoint=diffrax.ForwardMode(), max_steps=stepping.max_steps, throw=False,
+    )  # fmt: skip
+
+
+def _brownian(loop, x0, times, key, max_step, additive):
+    """The Brownian path of a key, the same whatever the steps."""
+    import diffrax
+
+    start, duration = times[0], times[-1] - times[0]
+    # Below its tolerance the tree interpolates, which is not Brownian: keep that far below a step (of 1/10 interval
+    # or less), but one for the whole run, so that neighbouring intervals agree on w, and at most 30 levels deep.
+    fine = jnp.maximum(jnp.minimum(jnp.min(jnp.diff(times)) / 10, max_step) / 64, duration / 2**30)
+    area = diffrax.SpaceTimeLevyArea if additive else diffrax.BrownianIncrement
+    sources = jax.eval_shape(lambda x: loop.noise(start, x, *loop.players(start, x)), x0).shape[1]
+    shape = jax.ShapeDtypeStruct((sources,), x0.dtype)
+    return diffrax.VirtualBrownianTree(start, start + duration, fine, shape, key, levy_area=area)
+
+
+def _size(error: Any) -> Any:
+    """The root mean square of a scaled error; infinite for NaN, from which diffrax would make a step of NaN."""
+    size = jnp.sqrt(jnp.mean(jnp.square(error)))
+    return jnp.where(jnp.isnan(size), jnp.inf, size)
+
+
+@functools.cache
+def _bisection() -> Any:
+    """optimistix's bisection, stopped by the width of its bracket alone: a target function may be steep, or jump.
+
+    The answer is the late end of the bracket, where the function has fallen to zero or below.
+    """
+    import optimistix
+
+    class Bisection(optimistix.Bisection):
+        def terminate(self, fn, y, args, options, state, tags):
+            narrow = jnp.abs(state.lower - state.upper) < self.atol + self.rtol * jnp.abs(y)
+            return narrow, optimistix.RESULTS.successful
+
+        def postprocess(self, fn, y, aux, args, options, state, tags, result):
+            return state.upper, aux, {}
+
+    return Bisection

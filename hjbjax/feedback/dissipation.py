@@ -1,0 +1,237 @@
+"""The dissipation inequality of a robust feedback, checked along simulated paths.
+
+    ∫ L(x, u, 0) dt ≤ ∫ [L(x, u, 0) − L(x, u, d)] dt + V(x₀)    for every d, with u the feedback of the solution.
+
+For the cost ½|z|² − ½γ²|d|² of an L₂ gain this is half of ∫|z|² ≤ γ²∫|d|² + β₀(x₀) with β₀ = 2V: the left side is the
+energy of the output, the integral on the right what the disturbance supplies, V what is stored at the start. It holds
+up to any time, since V ≥ 0 is left at its end. The worst disturbance takes it to equality as time goes on, a random one
+leaves a margin. V and u are those of a grid: the margin of the worst case may be below zero by their error, and where
+the set of disturbances was felt (see ``saturation``) nothing is claimed of wider ones.
+
+Both integrals are made by the integrator of ``simulate``, with its accuracy. Random disturbances run linearly between
+independent points at equally spaced times; those are uniform in the set times a strength, which goes from .01 to 1, so
+that they are neither all weak nor all so strong that the inequality says nothing. A box without 0 is scaled about its
+point nearest to 0, so that they stay in it.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.feedback.path import PathStatus
+from hjbjax.feedback.simulation import rollout
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import as_partial, cast, is_traced
+from hjbjax.problem.sets import Box, Finite
+from hjbjax.solution.solution import Solution
+
+POINTS = 33  # of a random disturbance
+STEPS = 64  # output intervals of a path
+WEAKEST = 0.01  # random disturbance over the set
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Dissipation:
+    """Energies along paths, one entry a path, in cost units (halves of squares where the cost is ½|z|² − ½γ²|d|²).
+
+    Args:
+      starts: x₀, shape (p, n).
+      disturbances: "worst case", "random" or "given", p words.
+      output: the energy of the output, ∫ L(x, u, 0) dt, shape (p,).
+      supplied: what the disturbance supplies, ∫ [L(x, u, 0) − L(x, u, d)] dt, shape (p,).
+      stored: V(x₀), shape (p,).
+      ends: the state at the end, shape (p, n).
+      statuses: why each path ends.
+    """
+
+    starts: np.ndarray
+    disturbances: tuple[str, ...]
+    output: np.ndarray
+    supplied: np.ndarray
+    stored: np.ndarray
+    ends: np.ndarray
+    statuses: tuple[PathStatus, ...]
+
+    @property
+    def margin(self) -> np.ndarray:
+        """stored + supplied − output, shape (p,): ≥ 0 where the inequality holds; NaN where a path broke off."""
+        return self.stored + self.supplied - self.output
+
+    @property
+    def worst(self) -> float:
+        """The smallest margin; NaN if one is."""
+        return float(np.min(self.margin))
+
+    def __str__(self) -> str:
+        lines = [f"{len(self.output)} paths, smallest margin {self.worst:.3g}"]
+        lines.append(f"{'disturbance':<12} {'paths':>5} {'output':>9} {'supplied':>9} {'stored':>9} {'margin':>9}")
+        for kind in dict.fromkeys(self.disturbances):
+            rows = np.flatnonzero(np.array(self.disturbances) == kind)
+            tight = rows[np.argmin(self.margin[rows])]
+            numbers = (self.output[tight], self.supplied[tight], self.stored[tight], self.margin[tight])
+            lines.append(f"{kind:<12} {len(rows):>5} " + " ".join(f"{number:>9.3g}" for number in numbers))
+        return "\n".join(lines)
+
+
+def dissipation(
+    problem: Problem,
+    solution: Solution,
+    x0s: Any,
+    duration: float,
+    *,
+    disturbances: Sequence[Callable] = (),
+    random: int = 8,
+    key: Any = 0,
+    rtol: float = 1e-6,
+) -> Dissipation:
+    """Check ∫|z|² ≤ γ²∫|d|² + β₀(x₀) along paths with the worst, with random and with given disturbances.
+
+    Args:
+      problem: the game, with cost ½|z|² − ½γ²|d|² or like it.
+      solution: its stationary solution, such as ``hinf_level(...).solution``, which brings V, feedback and worst case.
+      x0s: where paths start, shape (k, n), or (n,) for one; in the grid.
+      duration: how long each runs, in units of time, unless it leaves the grid before.
+      disturbances: more signals, functions (t, x) -> (l,).
+      random: how many random disturbances from each start; 0 for those of a finite set.
+      key: a JAX random key or an integer.
+      rtol: relative error of an internal step.
+
+    Returns:
+      The energies of k (1 + random + given) paths and their margins; ``print`` shows the tightest of each kind.
+
+    Raises:
+      ValueError: no disturbances, random ones of a finite set, noise, a marched solution, or starts outside the grid.
+      TypeError: a signal that cannot be called.
+
+    Example:
+      >>> import hjbjax as hjb
+      >>> problem, grid = hjb.zoo.lq_game(shape=(41,))
+      >>> x, p = grid.nodes(), 2 / 3**0.5  # V = px², u = −px, d = px/γ² with γ = 2, as ``solve`` finds them
+      >>> solution = hjb.Solution(grid, p * x[..., 0] ** 2, -p * x, p * x / 4)
+      >>> bool(hjb.dissipation(problem, solution, [[0.5]], 3.0, random=3).worst > -1e-3)
+      True
+    """
+    starts = _check(problem, solution, x0s, duration, disturbances, random)
+    if isinstance(key, (int, np.integer)) and not isinstance(key, bool):
+        key = jax.random.key(key)
+    import diffrax  # noqa: F401  # before anything is compiled, see simulate
+
+    with jax.enable_x64(True):
+        problem, solution = cast(problem, np.float64), cast(solution, np.float64)
+        times = np.linspace(0.0, float(duration), STEPS + 1)
+        lanes, kinds = _lanes(problem, starts, random, key)
+        found = [_paths(problem, solution, *lanes, times, rtol)]
+        for signal in disturbances:
+            found.append(_given(problem, solution, as_partial(signal), starts, times, rtol))
+        output, total, ends, codes = (np.concatenate(each) for each in zip(*jax.device_get(found), strict=True))
+        stored = np.asarray(solution.value_at(starts))
+    count = len(output) // len(starts)
+    statuses = tuple(PathStatus(int(code)) for code in codes)
+    output = np.where([status is PathStatus.NONFINITE for status in statuses], np.nan, output)
+    return Dissipation(
+        np.tile(starts, (count, 1)),
+        tuple(kinds) + ("given",) * (len(output) - len(kinds)),
+        output,
+        output - total,
+        np.tile(stored, count),
+        ends,
+        statuses,
+    )
+
+
+def _lanes(problem: Problem, starts: np.ndarray, random: int, key: Any) -> tuple[tuple, list[str]]:
+    """Starts, the weight of the worst case and the points of a signal, one row a path; and what they are called."""
+    choices, count = problem.disturbances, random * len(starts)
+    assert choices is not None
+    strength = np.geomspace(WEAKEST, 1.0, random) if random > 1 else np.ones(random)
+    least = np.clip(0.0, choices.lo, choices.hi) if isinstance(choices, Box) else np.zeros(choices.dim)
+    away = np.asarray(_uniform(choices, key, (count, POINTS))) - least if count else np.zeros((0, POINTS, choices.dim))
+    points = least + np.repeat(strength, len(starts))[:, None, None] * away
+    still = np.zeros((len(starts), POINTS, choices.dim))
+    weight = np.repeat([1.0, 0.0], [len(starts), count])
+    lanes = np.tile(starts, (1 + random, 1)), weight, np.concatenate([still, points])
+    return lanes, ["worst case"] * len(starts) + ["random"] * count
+
+
+def _uniform(choices: Any, key: Any, shape: tuple[int, ...]) -> jax.Array:
+    """Points of a set, shape (*shape, l)."""
+    if isinstance(choices, Box):
+        return jax.random.uniform(key, (*shape, choices.dim), minval=choices.lo, maxval=choices.hi)
+    return choices.radius * jax.random.ball(key, choices.dim, shape=shape)
+
+
+def _mixed(look: Callable, weight: Any, points: Any, duration: Any, t: Any, x: Any) -> Any:
+    """The worst case times ``weight``, and beside it a signal that is linear between its points."""
+    place = jnp.clip(t / duration, 0, 1) * (POINTS - 1)
+    cell = jnp.clip(jnp.floor(place).astype(int), 0, POINTS - 2)
+    signal = points[cell] + (place - cell) * (points[cell + 1] - points[cell])
+    return weight * jnp.nan_to_num(look(x, clamp=True)) + signal
+
+
+def _energy(cost: Callable, share: Any, *arguments: Any) -> Any:
+    """L(x, u, d) for share = 1, L(x, u, 0) for share = 0."""
+    *seen, d = arguments
+    still = cost(*seen, jnp.zeros_like(d))
+    return still + share * (cost(*arguments) - still)
+
+
+@jax.jit
+def _paths(problem, solution, starts, weights, points, times, rtol):
+    """The energy of the output, the whole cost, the last state and the code, for every lane."""
+
+    def lane(start, weight, signal):
+        opponent = jax.tree_util.Partial(_mixed, as_partial(solution.disturbance_at), weight, signal, times[-1])
+        return _both(problem, solution, opponent, start, times, rtol)
+
+    return jax.vmap(lane)(starts, weights, points)
+
+
+@jax.jit
+def _given(problem, solution, signal, starts, times, rtol):
+    """The same for one signal of the user's."""
+    return jax.vmap(lambda start: _both(problem, solution, signal, start, times, rtol))(starts)
+
+
+def _both(problem, solution, opponent, start, times, rtol):
+    """One path with both costs."""
+
+    def run(share):
+        measured = dataclasses.replace(problem, cost=jax.tree_util.Partial(_energy, problem.cost, share))
+        return rollout(measured, solution, start, times, disturbance=opponent, time_varying=True, rtol=rtol)
+
+    path = jax.vmap(run)(jnp.arange(2.0))
+    return path.cost[0], path.cost[1], path.states[0, -1], path.code[0]
+
+
+def _check(problem: Any, solution: Any, x0s: Any, duration: Any, signals: Any, random: Any) -> np.ndarray:
+    """Refuse what has no inequality; the starts, shape (k, n)."""
+    if is_traced(problem, solution, x0s):
+        raise ValueError("dissipation: it runs at host level only, outside of jit, vmap and grad")
+    if problem.disturbances is None or solution.disturbance is None or problem.cost is None:
+        raise ValueError("dissipation: wanted a game with a cost, as hjb.attenuation(plant, gamma, hjb.Box(...))")
+    if problem.noise is not None:
+        raise ValueError("dissipation: with noise the inequality holds in the mean only; leave out the noise")
+    if solution.times is not None or problem.time_dependent:
+        raise ValueError("dissipation: wanted a stationary problem and solution, of hjb.solve or hjb.hinf_level")
+    if isinstance(duration, bool) or not isinstance(duration, (int, float)) or not 0 < duration < np.inf:
+        raise ValueError(f"dissipation: duration is {duration!r}, wanted a finite number > 0")
+    if isinstance(random, bool) or not isinstance(random, int) or random < 0:
+        raise ValueError(f"dissipation: random is {random!r}, wanted how many, an integer ≥ 0")
+    if random and isinstance(problem.disturbances, Finite):
+        raise ValueError(
+            f"dissipation: the disturbances are {len(problem.disturbances.points)} points, between which random ones "
+            "would run; wanted a Box or a Ball, or random=0"
+        )
+    for signal in signals:
+        if not callable(signal):
+            raise TypeError(f"dissipation: got {signal!r} among the disturbances, wanted functions (t, x) -> (l,)")
+    starts = np.atleast_2d(np.asarray(x0s, np.float64))
+    if starts.ndim != 2 or starts.shape[1] != solution.grid.ndim:
+        raise ValueError(f"dissipation: x0s has shape {np.shape(x0s)}, wanted (k, {solution.grid.ndim})")
+    if not np.all(np.isfinite(solution.value_at(starts))):
+        raise ValueError("dissipation: a start lies outside the grid, or where the value is not finite; start inside")
+    return starts

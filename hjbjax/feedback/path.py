@@ -1,0 +1,163 @@
+"""The answer of a simulation: a path, why it ends, and the line that says so."""
+
+import enum
+import warnings
+from typing import Any
+
+import numpy as np
+
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.pytree import node
+from hjbjax.problem.sets import AdmissibleSet, Ball, Box
+from hjbjax.solution.screen import encodable
+
+
+class PathStatus(enum.IntEnum):
+    """Why a path ends."""
+
+    DURATION = 0
+    TARGET = 1
+    LEFT_BOX = 2
+    MAX_STEPS = 3
+    NONFINITE = 4
+    UNDEFINED = 5
+    INTERRUPTED = 6
+
+    @property
+    def message(self) -> str:
+        """What happened and what to do, as said of a path."""
+        return MESSAGES[self]
+
+
+MESSAGES = {
+    PathStatus.DURATION: "ran for the whole duration",
+    PathStatus.TARGET: "reached the target",
+    PathStatus.LEFT_BOX: "stopped where it left the box of the grid; enlarge the grid, or go on with clamp=True",
+    PathStatus.MAX_STEPS: "stopped after max_steps internal steps; give hold=dt, or more max_steps",
+    PathStatus.NONFINITE: "stopped before a step to no finite state; drift, cost or feedback are not finite ahead",
+    PathStatus.UNDEFINED: "stopped where the feedback has no control (NaN): the target may be out of reach from there",
+    PathStatus.INTERRUPTED: "was interrupted",
+}
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C during a simulation: ``.path`` is the Path so far."""
+
+    def __init__(self, path: "Path"):
+        super().__init__(f"simulate: the path {path.message}; .path is the path so far")
+        self.path = path
+
+
+@node(host=("message",))
+class Path:
+    """A closed loop's history, truncated where it ends.
+
+    Args:
+      times: shape (k+1,), from 0; the last is where the path ends.
+      states: shape (k+1, n), periodic states unwound (``grid.wrap`` brings them into the grid).
+      controls: shape (k, m), the control at the start of each interval; under ``hold`` all through it.
+      disturbances: shape (k, l), likewise, or None where there is no opponent.
+      cost: discounted running cost, plus the discounted exit cost if the target was reached; with
+        ``running_max`` the maximum of that function over the output times instead.
+      reached: the time at which the target was reached, or None.
+      code: a PathStatus number.
+      steps: internal steps of the integrator, rejected ones included.
+      message: one line on how the path ended.
+    """
+
+    times: Any
+    states: Any
+    controls: Any
+    disturbances: Any
+    cost: Any
+    reached: Any
+    code: Any
+    steps: Any
+    message: str = ""
+
+    @property
+    def status(self) -> PathStatus:
+        """Why the path ends."""
+        return PathStatus(int(self.code))
+
+    def __str__(self) -> str:
+        return encodable(self.message)
+
+
+def joined(first: Path, then: Path, discount: float) -> Path:
+    """Two paths in one, the second from where and when the first ends, with the running cost of both.
+
+    Args:
+      first: a path that pays nothing where it ends.
+      then: a path from its last state.
+      discount: β of the problem.
+    """
+    end = first.times[-1]
+    cost, steps = float(first.cost + np.exp(-discount * end) * then.cost), first.steps + then.steps
+    said = (
+        f"{first.status.message} at t = {end:.6g}; from there {then.status.message} at t = {end + then.times[-1]:.6g}"
+    )
+    both = first.disturbances is None or then.disturbances is None
+    return Path(
+        times=np.concatenate([first.times, end + then.times[1:]]),
+        states=np.concatenate([first.states, then.states[1:]]),
+        controls=np.concatenate([first.controls, then.controls]),
+        disturbances=None if both else np.concatenate([first.disturbances, then.disturbances]),
+        cost=cost,
+        reached=None if then.reached is None else end + then.reached,
+        code=then.code,
+        steps=steps,
+        message=f"{said}; cost {cost:.6g}; {steps} internal steps",
+    )
+
+
+def truncated(path: Path, count: int, max_steps: int, grid: Grid | None, controls: Any, noisy: bool) -> Path:
+    """A path of full length cut where it ends, with its line; one that ends early outside the target warns.
+
+    Args:
+      path: NumPy arrays over all output times.
+      count: the number k of intervals before the end.
+      max_steps: the most internal steps that it could make.
+      grid: the box that the feedback is known in, if there is one.
+      controls: the admissible set of the problem, or None.
+      noisy: whether the steps were fixed in advance, so that their number says nothing of the loop.
+    """
+    status, times, states = path.status, path.times[: count + 1], path.states[: count + 1]
+    applied = path.controls[:count]
+    where = f"t = {times[-1]:.6g}"
+    if status in (PathStatus.NONFINITE, PathStatus.UNDEFINED):
+        where += f", x = [{', '.join(f'{entry:.4g}' for entry in states[-1])}]"
+    said = [
+        f"{status.message} at {where}",
+        f"cost {float(path.cost):.6g}",
+        f"{int(path.steps)} internal steps",
+    ]
+    if grid is not None and status != PathStatus.LEFT_BOX:
+        outside = np.any(((states < grid.lo) | (states > grid.hi)) & ~np.array(grid.periodic), axis=-1)
+        if outside.any():
+            said.append(f"left the box at t = {times[np.argmax(outside)]:.6g}: controls there are the nearest point's")
+    if not noisy and path.steps > max(1000, max_steps / 8):
+        said.append("the feedback jumps or the loop is stiff: hold=dt is faster")
+    if _inadmissible(controls, applied):
+        said.append("controls outside the problem's admissible set were applied as they are")
+    if status not in (PathStatus.DURATION, PathStatus.TARGET, PathStatus.INTERRUPTED):  # that is raised
+        warnings.warn(f"simulate: the path {said[0]}", UserWarning, stacklevel=3)
+    return Path(
+        times=times,
+        states=states,
+        controls=applied,
+        disturbances=None if path.disturbances is None else path.disturbances[:count],
+        cost=float(path.cost),
+        reached=float(path.reached) if status == PathStatus.TARGET else None,
+        code=int(path.code),
+        steps=int(path.steps),
+        message="; ".join(said),
+    )
+
+
+def _inadmissible(controls: AdmissibleSet | None, applied: np.ndarray) -> bool:
+    """Whether a control lies outside a box or a ball by more than rounding."""
+    if isinstance(controls, Box):
+        slack = 1e-9 * (1 + np.abs(controls.lo) + np.abs(controls.hi))
+        return bool(np.any((applied < controls.lo - slack) | (applied > controls.hi + slack)))
+    return isinstance(controls, Ball) and bool(np.any(np.linalg.norm(applied, axis=-1) > controls.radius * (1 + 1e-9)))

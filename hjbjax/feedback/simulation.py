@@ -1,0 +1,364 @@
+"""Simulation: ``simulate`` at the host, with checks and a report; ``rollout``, the same as a pure function."""
+
+import copy
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.feedback.closed_loop import Loop, Stepping, integrate, some, unbegun
+from hjbjax.feedback.feedback import check_kept, lookups
+from hjbjax.feedback.path import Interrupted, Path, PathStatus, truncated
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import as_partial, cast, is_traced
+from hjbjax.solution.clock import CHUNK_SECONDS, Clock, noting_interrupts
+
+_compiled = jax.jit(some, donate_argnames="so_far")
+
+
+def simulate(
+    problem: Problem,
+    feedback: Any,
+    x0: Any,
+    duration: float,
+    *,
+    steps: int | None = None,
+    disturbance: Callable | None = None,
+    time_varying: bool = False,
+    key: Any = None,
+    hold: Any = False,
+    grid: Grid | None = None,
+    clamp: bool = False,
+    rtol: float = 1e-6,
+    atol: float = 1e-8,
+    max_step: float | None = None,
+    max_steps: int = 100_000,
+) -> Path:
+    """The path of the closed loop from ``x0``, in float64.
+
+    Callables take ``(x)``; they take ``(t, x)`` exactly when ``problem.time_dependent``, and feedback and disturbance
+    also when ``time_varying``. Periodic states are
+    wrapped into the grid before anything sees them. Called again with the same functions and shapes, it does
+    not compile again, whatever the numbers.
+
+    Args:
+      problem: the system and its costs.
+      feedback: a Solution, a ``greedy_feedback``, or a function that returns the control, shape (m,). ``None`` if
+        there is no control.
+        A marched Solution must have been kept at enough times: at least ten over the duration. Its terminal cost,
+        and that of any problem, is paid at the end of a path that lasts as long as the horizon.
+      x0: the state at time 0, shape (n,).
+      duration: how long to run unless the target is reached before, in units of time.
+
+    Keyword Args:
+      steps: number of output intervals; ``None`` is 200, or the sampling intervals under ``hold``.
+      disturbance: a function that returns the opponent's d, shape (l,). ``None``: the Solution's own worst case.
+      time_varying: whether feedback and disturbance take ``(t, x)`` though the problem does not depend on time.
+      key: a JAX random key or an integer; wanted exactly when the problem has noise.
+      hold: the sampling interval of a zero-order hold of the control, in units of time; ``False`` for none.
+      grid: the box to stay in, for a feedback that is a function; a Solution brings its own.
+      clamp: outside the box, ``False`` ends the path at the edge; ``True`` goes on with what the feedback says at
+        the nearest point of the box.
+      rtol: relative error of an internal step.
+      atol: absolute error of an internal step, in the units of the state and of the cost.
+      max_step: the longest internal step. ``None``: one output interval; a tenth of it with noise. A target
+        that the path crosses in less time than this may be missed; with noise it is met late, as if it began about
+        .58 σ√max_step farther off, which a fourth of the step halves.
+      max_steps: no internal step is shorter than 2·duration/max_steps, and no more are made.
+
+    Returns:
+      A Path. One that ends early, except in the target, warns and says so in its ``status`` and ``message``.
+
+    Raises:
+      ValueError: an argument that is not admissible, or a function that returns the wrong shape.
+      TypeError: a feedback or a disturbance that cannot be called.
+      KeyboardInterrupt: Ctrl-C; its ``.path`` is the Path so far, once that has begun.
+
+    Example:
+      >>> import jax.numpy as jnp
+      >>> from hjbjax import Box, Problem
+      >>> problem = Problem(lambda x, u: u, lambda x, u: x @ x + u @ u, Box([-9.0], [9.0]))
+      >>> path = simulate(problem, lambda x: -x, [1.0], 20.0)
+      >>> round(float(path.cost), 6), path.status.name
+      (1.0, 'DURATION')
+    """
+    if is_traced(problem, feedback, x0, duration, key, grid):
+        raise ValueError("simulate: got traced values; inside jit, vmap or grad use hjbjax.feedback.simulation.rollout")
+    if getattr(feedback, "times", None) is not None:
+        problem = _within_horizon(problem, feedback, _positive(duration, "duration"))
+    loop = _close(problem, feedback, disturbance, grid, clamp, time_varying)
+    x0 = _initial(x0, loop.grid)
+    hold = None if hold is False else hold
+    times = _times(_positive(duration, "duration"), steps, hold)
+    stepping = Stepping(
+        rtol=_positive(rtol, "rtol"),
+        atol=_positive(atol, "atol"),
+        max_step=np.inf if max_step is None else _positive(max_step, "max_step"),
+        max_steps=_count(max_steps, "max_steps"),
+        held=hold is not None,
+    )
+    key = _key(key)
+    _check_key(problem, key)
+    # Its import adds to JAX's configuration, which is part of the key of every compiled function: once before, or
+    # the second call compiles again.
+    import diffrax  # noqa: F401
+
+    clock = Clock()
+    with (
+        noting_interrupts(clock),
+        jax.enable_x64(True),
+        jax.debug_nans(False),
+    ):  # after the end of a path its controls are NaN
+        loop = cast(loop, np.float64)
+        _probe(loop, x0)
+        if not loop.margin(x0) > 0:
+            lo, hi = np.asarray(loop.grid.lo).tolist(), np.asarray(loop.grid.hi).tolist()
+            raise ValueError(
+                f"simulate: x0 = {x0.tolist()} lies outside the box from {lo} to {hi}, where the feedback is not "
+                "known; start inside, or give clamp=True"
+            )
+        path, active = _in_chunks(loop, x0, times, key, stepping, clock)
+        path, active, grid, controls = jax.tree.map(np.asarray, (path, active, loop.grid, problem.controls))
+        path = truncated(path, int(np.sum(active)), max_steps, grid, controls, problem.noise is not None)
+        if clock.interrupted:
+            raise Interrupted(path)
+    return path
+
+
+def _in_chunks(
+    loop: Loop, x0: np.ndarray, times: np.ndarray, key: Any, stepping: Stepping, clock: Clock
+) -> tuple[Path, Any]:
+    """The path, some output intervals at a time, for about half a second each, until it ends or Ctrl-C is noted."""
+    so_far, count, done, chunk = unbegun(loop, x0, times), len(times) - 1, 0, 1
+    if clock.interrupted:
+        raise KeyboardInterrupt("simulate: interrupted before the path began")
+    so_far, answer = _compiled(loop, x0, times, key, stepping, so_far, 0, 0)  # compiles
+    ending = PathStatus.INTERRUPTED  # what a path is called that has intervals left
+    while ending is PathStatus.INTERRUPTED and done < count and not clock.interrupted:
+        began, until = clock.elapsed(), min(done + chunk, count)
+        so_far, answer = _compiled(loop, x0, times, key, stepping, so_far, done, until)
+        ending = PathStatus(int(answer[0].code))
+        pace = max(clock.elapsed() - began, 1e-4) / (until - done)
+        chunk = int(np.clip(CHUNK_SECONDS / pace, 1, 8 * chunk))
+        done = until
+    return answer
+
+
+def rollout(
+    problem: Problem,
+    feedback: Any,
+    x0: Any,
+    times: Any,
+    *,
+    disturbance: Callable | None = None,
+    time_varying: bool = False,
+    key: Any = None,
+    hold: bool = False,
+    grid: Grid | None = None,
+    clamp: bool = False,
+    rtol: float = 1e-6,
+    atol: float = 1e-8,
+    max_step: Any = None,
+    max_steps: int = 100_000,
+) -> Path:
+    """``simulate`` as a pure function, for ``jit``, ``vmap`` (over keys, starts, parameters) and forward derivatives.
+
+    Follows the dtype of ``x0`` and checks no values. The arrays have full length: after the end of the path
+    times and states repeat the last one, controls are NaN, and ``reached`` is inf if the target was not.
+
+    Args:
+      problem: the system and its costs.
+      feedback: as in ``simulate``.
+      x0: the state at the first time, shape (n,), floating point.
+      times: output times, shape (k+1,), increasing; the first is where discounting starts.
+
+    Keyword Args:
+      disturbance: as in ``simulate``, like ``time_varying``.
+      key: a JAX random key; wanted exactly when the problem has noise.
+      hold: whether the control is held from one output time to the next.
+      grid: as in ``simulate``, like ``clamp``, ``rtol``, ``atol``, ``max_step`` and ``max_steps``.
+
+    Returns:
+      A Path of JAX arrays without a message.
+
+    Raises:
+      ValueError: a state of integers, or a function that returns the wrong shape.
+      TypeError: a feedback or a disturbance that cannot be called.
+
+    Example:
+      >>> import jax
+      >>> from hjbjax import Problem
+      >>> walk = Problem(lambda x, u: 0 * x, noise=1.0)
+      >>> keys = jax.random.split(jax.random.key(0), 4)
+      >>> jax.vmap(lambda key: rollout(walk, None, jnp.zeros(1), jnp.linspace(0, 1, 3), key=key))(keys).states.shape
+      (4, 3, 1)
+    """
+    x0 = jnp.asarray(x0)
+    if not jnp.issubdtype(x0.dtype, jnp.floating):
+        raise ValueError(f"rollout: x0 has dtype {x0.dtype}, wanted floating point: the path follows it")
+    _check_key(problem, key)
+    loop = _close(problem, feedback, disturbance, grid, clamp, time_varying)
+    _probe(loop, x0)
+    stepping = Stepping(rtol, atol, np.inf if max_step is None else max_step, max_steps, hold)
+    return integrate(loop, x0, jnp.asarray(times, x0.dtype), key, stepping)[0]
+
+
+def _close(problem: Problem, feedback: Any, disturbance: Any, grid: Any, clamp: bool, time_varying: Any) -> Loop:
+    """The loop through a Solution, which brings its grid and its worst case, or through functions."""
+    if disturbance is not None and not problem.is_game:
+        raise ValueError(
+            "simulate: got a disturbance, but problem.disturbances is None; give the problem an admissible set"
+        )
+    control, opponent = feedback, disturbance
+    if hasattr(feedback, "control_at"):
+        if grid is not None and grid is not feedback.grid:
+            raise ValueError("simulate: the solution brings its own grid; leave out grid=")
+        grid = feedback.grid
+        control, worst = lookups(feedback)
+        if problem.is_game and disturbance is None and feedback.disturbance is not None:
+            opponent = worst
+    if grid is not None and not isinstance(grid, Grid):
+        raise TypeError(f"simulate: grid is {grid!r}, wanted a Grid or None")
+    if not isinstance(time_varying, bool):
+        raise TypeError(f"simulate: time_varying is {time_varying!r}, wanted True or False")
+    signature = "(t, x)" if problem.time_dependent or time_varying else "(x)"
+    if problem.disturbances is not None and opponent is None:
+        raise ValueError(
+            "simulate: the problem has disturbances, and only a Solution of it knows the worst case; "
+            f"give disturbance=, a function {signature} that returns shape ({problem.disturbances.dim},)"
+        )
+    for name, function, optional in (("feedback", control, problem.controls is None), ("disturbance", opponent, True)):
+        if not callable(function) and not (function is None and optional):
+            raise TypeError(f"simulate: {name} is {function!r}, wanted a Solution or a function {signature}")
+    if not (problem.time_dependent or time_varying):
+        control, opponent = (
+            jax.tree_util.Partial(_timeless, as_partial(player)) if player is not None and player is given else player
+            for player, given in ((control, feedback), (opponent, disturbance))
+        )
+    control = None if problem.controls is None else as_partial(control)
+    return Loop(problem, control, as_partial(opponent), grid, bool(clamp))
+
+
+def _timeless(function: Callable, t: Any, x: Any) -> Any:
+    """A user's function of the state alone."""
+    return function(x)
+
+
+def _within_horizon(problem: Problem, solution: Any, duration: float) -> Problem:
+    """Refuse a marched feedback that is not known well enough; without the terminal cost if the path ends before."""
+    horizon = check_kept(solution, duration, "simulate: duration")
+    if duration < horizon * (1 - 1e-9) and problem.terminal_cost is not None:
+        problem = copy.copy(problem)
+        object.__setattr__(problem, "terminal_cost", None)
+    return problem
+
+
+def _initial(x0: Any, grid: Grid | None) -> np.ndarray:
+    try:
+        state = np.asarray(x0, np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"simulate: x0 is {x0!r}, wanted one number a state") from None
+    if state.ndim != 1 or state.size == 0 or (grid is not None and state.size != grid.ndim):
+        wanted = "(n,)" if grid is None else f"({grid.ndim},)"
+        raise ValueError(f"simulate: x0 has shape {state.shape}, wanted {wanted}: one number a state")
+    if not np.all(np.isfinite(state)):
+        raise ValueError(f"simulate: x0 is {state.tolist()}, wanted finite numbers")
+    return state
+
+
+def _times(duration: float, steps: Any, hold: Any) -> np.ndarray:
+    """The output times; under a hold, the sampling instants."""
+    if hold is None:
+        return np.linspace(0.0, duration, 1 + (200 if steps is None else _count(steps, "steps")))
+    if isinstance(hold, bool):
+        raise ValueError("simulate: hold is True, wanted the sampling interval, as in hold=0.05")
+    hold = _positive(hold, "hold")
+    if steps is not None:
+        raise ValueError(f"simulate: got steps = {steps} and hold = {hold}; leave out steps: the output is every hold")
+    count = max(1, duration / hold - 1e-9)
+    if count > 10**7:
+        raise ValueError(
+            f"simulate: hold = {hold} makes {count:.3g} intervals of duration {duration:g}, wanted at most 1e7"
+        )
+    return np.append(np.arange(math.ceil(count)) * hold, duration)
+
+
+def _positive(value: Any, name: str) -> float:
+    if isinstance(value, (bool, str)) or np.ndim(value) or not (np.isfinite(value) and value > 0):
+        raise ValueError(f"simulate: {name} is {value!r}, wanted a finite number > 0")
+    return float(value)
+
+
+def _count(value: Any, name: str) -> int:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+        raise ValueError(f"simulate: {name} is {value!r}, wanted a positive integer")
+    return int(value)
+
+
+def _key(key: Any) -> Any:
+    """The random key of a seed; anything else as it is."""
+    if isinstance(key, bool) or not isinstance(key, (int, np.integer)):
+        return key
+    try:
+        return jax.random.key(int(key))
+    except OverflowError:
+        raise ValueError(f"simulate: key is {key}, wanted a seed that fits 64 bits, or a JAX random key") from None
+
+
+def _check_key(problem: Problem, key: Any) -> None:
+    if problem.noise is not None and key is None:
+        raise ValueError("simulate: the problem has noise; give key=jax.random.key(0), or any other seed")
+    if problem.noise is None and key is not None:
+        raise ValueError("simulate: got a key, but problem.noise is None and nothing is random; leave out key")
+    dtype, shape = getattr(key, "dtype", None), np.shape(key)
+    typed = dtype is not None and jax.dtypes.issubdtype(dtype, jax.dtypes.prng_key)
+    if key is not None and not (typed and shape == ()) and not (dtype == np.uint32 and len(shape) == 1):
+        given = f"an array of shape {shape} and type {dtype}" if dtype is not None else repr(key)
+        raise ValueError(f"simulate: key is {given}, wanted one random key: key=jax.random.key(0), or another seed")
+
+
+def _probe(loop: Loop, x0: Any) -> None:
+    """Trace every function of the loop once, abstractly, and compare the shapes it returns with those wanted."""
+    problem, n = loop.problem, x0.shape[0]
+    m = 0 if problem.controls is None else problem.controls.dim
+    opponents = 0 if problem.disturbances is None else problem.disturbances.dim
+    u, d = jnp.zeros(m, x0.dtype), jnp.zeros(opponents, x0.dtype)
+    players, state = (x0[0], x0), problem.arguments(x0, u, d, x0[0])
+    for name, function, arguments, wanted in (
+        ("feedback", loop.control, players, (m,)),
+        ("disturbance", loop.opponent, players, (opponents,)),
+        ("drift", problem.drift, state, (n,)),
+        ("cost", problem.cost, state, ()),
+        ("target", problem.target, problem.state_arguments(x0, x0[0]), ()),
+    ):
+        if function is None:
+            continue
+        try:
+            found = jax.eval_shape(functools.partial(_array, function, name), *arguments)
+        except jax.errors.JAXTypeError as error:
+            raise ValueError(
+                f"simulate: {name} cannot be traced: use jnp.where instead of if, and jnp instead of numpy"
+            ) from error
+        if jnp.issubdtype(found.dtype, jnp.complexfloating):
+            raise ValueError(f"simulate: {name} returned complex numbers, expected real ones, shape {wanted}")
+        if found.shape != wanted:
+            raise ValueError(
+                f"simulate: {name} returned shape {found.shape}, expected {wanted}, for x0 of shape {x0.shape}"
+            )
+
+
+def _array(function: Callable, name: str, *arguments: Any) -> jax.Array:
+    """What the function returns, as an array; refuses what is none."""
+    result = function(*arguments)
+    try:
+        return jnp.asarray(result)
+    except jax.errors.JAXTypeError:  # a tracer where NumPy or Python wants a number
+        raise
+    except (TypeError, ValueError):
+        what = "None; is its return missing?" if result is None else f"a {type(result).__name__}"
+        raise ValueError(f"simulate: {name} returned {what}, expected an array of numbers") from None

@@ -1,0 +1,62 @@
+"""Whether every node of a grid with constrained ends has an action that keeps the state in the box; host level.
+
+Without costs and at V = 0 the Hamiltonian is zero where there is one, and infinite elsewhere.
+"""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.discretisation.schemes import Upwind
+from hjbjax.hamiltonian import hamiltonian, players
+from hjbjax.iteration import bellman
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import altered
+
+
+def values(problem: Problem, grid: Grid, dtype: Any, t: float = 0.0) -> None:
+    """Refuse a problem that at some node forces the state out across a constrained end.
+
+    Args:
+      problem: the problem; one that passed ``checks.shapes``.
+      grid: the grid.
+      dtype: the floating-point type in which the drift is evaluated.
+      t: the time, if the problem depends on it.
+
+    Raises:
+      ValueError: with the number of nodes, the first of them and its state, and what to do.
+    """
+    if not grid.sides("constrained"):
+        return
+    with jax.enable_x64(True):
+        stuck = np.asarray(_stuck(problem, grid, t, dtype=np.dtype(dtype)))
+    if not stuck.any():
+        return
+    index = tuple(int(i) for i in np.argwhere(stuck)[0])
+    ends = [
+        f"the {'upper' if step > 0 else 'lower'} end of {grid.names[axis]}"
+        for axis, step in grid.sides("constrained")
+        if index[axis] == (grid.shape[axis] - 1 if step > 0 else 0)
+    ]
+    exact = players.setting(altered(problem, cost=None), grid.ndim, np.float64).exact
+    found = "no action is admissible" if exact else "none of the sampled actions is admissible"
+    raise ValueError(
+        f"Grid.edges: {found} at {int(stuck.sum())} of {grid.size} nodes, first at node {index}, "
+        f"x = {np.array2string(grid.state(index), separator=', ', precision=6)}"
+        + (f", t = {t:g}" if problem.time_dependent else "")
+        + f":\nevery drift leaves the box across {' or '.join(ends)}, which is constrained. Give controls that can "
+        "keep the state in,\nmove that end to where they can, or make it 'projected' or 'open'"
+    )
+
+
+@functools.partial(jax.jit, static_argnames="dtype")
+def _stuck(problem: Problem, grid: Grid, t: Any, dtype: Any) -> jax.Array:
+    """The nodes off the target without an admissible action, bool (*grid)."""
+    free = altered(problem, cost=None)
+    here = hamiltonian.local(free, grid, jnp.zeros(grid.shape, dtype), scheme=Upwind(), t=t)
+    least = hamiltonian.optimise(here, players.setting(free, grid.ndim, dtype))[0]
+    return ~jnp.isfinite(least) & ~bellman.conditions(problem, grid, dtype, t).held

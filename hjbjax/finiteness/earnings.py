@@ -1,0 +1,73 @@
+"""Costs that are earned for ever: what makes an undiscounted value −∞.
+
+A policy under which the chain, once in a class of nodes, never leaves it pays there the mean of the running cost under
+the stationary law of the class, per unit time. If that is negative the value is −∞ at every node of the class: no
+iteration that is stopped by the size of its steps can say so, since V falls by the same amount in each of them.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.discretisation import chain, recurrence, stencil
+from hjbjax.iteration.certificates import Certificate
+from hjbjax.iteration.iteration import State, Task
+
+LARGEST = 200_000  # nodes of a class whose stationary law is solved for; of a larger one every node must earn
+
+
+class Earning(NamedTuple):
+    """A class of nodes in which a policy can stay and earn.
+
+    Attributes:
+      mean: the mean running cost, < 0, per unit time.
+      node: the index of one of its nodes.
+    """
+
+    mean: float
+    node: tuple[int, ...]
+
+
+def earned(task: Task, state: State) -> Earning | None:
+    """The first class of nodes in which the greedy policy earns for ever; ``None`` if it has none.
+
+    Host level, for one player; a game's answer to it would be another policy.
+    """
+    problem = task.problem
+    bounded = task.certificate is not Certificate.NONE or problem.discount != 0
+    if bounded or problem.is_game or problem.cost is None or int(state.step) < 0:
+        return None
+    jumps, cost = jax.device_get(_at(task, state.policy.controls))
+    going = np.asarray(task.counted) & ~np.asarray(task.rules.held)
+    if not np.all(np.isfinite(cost[going])) or not np.any(cost[going] < 0):
+        return None
+    values = [np.where(going, rate, 0) for rate in jumps.values]
+    generator = stencil.sparse(jumps.offsets, values, -np.sum(values, axis=0), task.grid)
+    for states in recurrence.classes(generator):
+        if not going.flat[states[0]]:
+            continue
+        paid = cost.flat[states]
+        mean = float(np.max(paid)) if np.all(paid < 0) else _mean(generator, states, cost)
+        if mean < 0:
+            return Earning(mean, tuple(int(i) for i in np.unravel_index(states[0], task.grid.shape)))
+    return None
+
+
+@jax.jit
+def _at(task: Task, controls: tuple) -> Any:
+    """Rates and running cost under a policy."""
+    problem, grid, dtype = task.problem, task.grid, task.tol.dtype
+    jumps = chain.rates(problem, grid, list(controls), None, scheme=task.scheme.chain, dtype=dtype)
+    cost = chain.running_cost(problem, grid.components(dtype), list(controls), None, 0.0, dtype)
+    return jumps, jnp.broadcast_to(cost, grid.shape)
+
+
+def _mean(generator: Any, states: np.ndarray, cost: np.ndarray) -> float:
+    """An upper bound on the mean cost of a class: with what rounding may do to its stationary law."""
+    if len(states) > LARGEST or not np.any(cost.flat[states] < 0):
+        return np.inf
+    probabilities, error = recurrence.law(generator, states)
+    paid = cost.flat[states]
+    return float(probabilities[states] @ paid + error * np.max(np.abs(paid))) if np.isfinite(error) else np.inf

@@ -1,0 +1,340 @@
+"""Which nodes can be brought to the target for certain, read off the graph of the chain.
+
+Without discount the value is finite exactly where some policy reaches the held nodes with probability one (a
+proper policy). The largest such set R is a fixed point: take away the nodes from which no path of jumps leads
+to the target by actions that keep every jump inside R, until nothing changes. Jumps under sampled actions are
+found on the device, paths by a breadth-first search on the host, or on large grids on the device as well.
+"""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.discretisation import chain, edges, stencil, subcell
+from hjbjax.discretisation.chain import Rates
+from hjbjax.discretisation.schemes import Upwind
+from hjbjax.hamiltonian import players
+from hjbjax.hamiltonian.players import Player
+from hjbjax.problem import fields, sets
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.sets import Ball
+from hjbjax.solution.clock import Clock
+
+COMBINATIONS = 32  # of kinks of all inputs that are tried with one action
+SAMPLES = 33  # actions of a continuum that are tried
+FEW = 9  # of each player in a game, where all pairs are
+LARGE = 200_000  # nodes beyond which paths are first followed on the device, all at once
+LONG = 4  # times the nodes of all axes together: jumps of a path that are followed there
+SEARCHABLE = 5 * 10**7  # jumps that a search on the host can list: some 60 bytes each
+LOOK = 10**7  # nodes times actions, or times jumps of a path, between two looks at the clock: about a second
+
+
+def _open_jumps(problem: Problem, grid: Grid, inside: jax.Array | None, clock: Clock, **options: Any) -> Rates:
+    """For every jump whether some action makes it while all jumps of that action stay ``inside``; None is the box."""
+    points = _points(problem)
+    count, some, known = len(points), max(1, LOOK // grid.size), None
+    for first in range(0, count, some):
+        clock.enter(f"the jumps of the chain, {first} of {count} actions")
+        last = min(first + some, count)
+        known = _also_open(problem, grid, inside, known, points, first, last, **options)
+    assert known is not None
+    return known
+
+
+def _points(problem: Problem) -> Any:
+    return np.zeros((1, 0)) if problem.controls is None else sets.samples(problem.controls, SAMPLES)
+
+
+@functools.partial(jax.jit, static_argnames=("scheme", "dtype", "kinks"))
+def _also_open(
+    problem: Problem,
+    grid: Grid,
+    inside: Any,
+    known: Any,
+    points: Any,
+    first: Any,
+    last: Any,
+    *,
+    scheme: Upwind,
+    dtype: Any,
+    least: Any = 0.0,
+    kinks: bool = False,
+) -> Rates:
+    """The jumps that are known to be open and those of the actions from ``first`` to before ``last``."""
+    points, mine = jnp.asarray(points, dtype), players.setting(problem, grid.ndim, dtype).control
+    if known is None:
+        start = chain.rates(problem, grid, list(points[0]), None, scheme=scheme, dtype=dtype)
+        known = Rates(start.offsets, tuple(jnp.zeros(grid.shape, bool) for _ in start.offsets))
+
+    def also(k, opened):
+        action = list(points[k])
+        for each in _with_kinks(problem, grid, mine, action, dtype) if kinks else [action]:
+            rates = chain.rates(problem, grid, each, None, scheme=scheme, dtype=dtype)
+            stays = ~edges.inadmissible(problem, grid, each, None, 0.0, dtype)
+            if inside is not None:
+                stays &= _stays(rates, grid, inside, least)
+            opened = tuple(p | ((c > least) & stays) for p, c in zip(opened, rates.values, strict=True))
+        return opened
+
+    return Rates(known.offsets, jax.lax.fori_loop(first, last, also, known.values))
+
+
+def _with_kinks(problem: Problem, grid: Grid, player: Player, action: list, dtype: Any) -> list[list]:
+    """An action, and those with some inputs where one component of the drift vanishes: (x), each input on the nodes.
+
+    Only there may a jump stay away that all samples make. Where the drift is not affine in the inputs there are none.
+    """
+    found = [action]
+    if not player.exact or problem.is_game:
+        return found
+    x = grid.components(dtype)
+    for j, driven in enumerate(player.driven):
+        if len(found) * (1 + len(driven)) > COMBINATIONS:
+            break
+        for base in tuple(found):
+            at_zero = [jnp.zeros((), dtype) if k == j else entry for k, entry in enumerate(base)]
+            offset = chain.drift(problem, x, at_zero, None, 0.0, dtype)
+            arguments = problem.arguments(x, at_zero, None, 0.0)
+            slope = fields.components(player.derivative(problem, problem.drift, j), *arguments, dtype=dtype)
+            for i in driven:
+                kink = jnp.where(slope[i] != 0, -offset[i] / jnp.where(slope[i] != 0, slope[i], 1), base[j])
+                moved = [kink if k == j else entry for k, entry in enumerate(base)]
+                admissible = _contains(player.choices, moved)
+                found.append([jnp.where(admissible, new, old) for new, old in zip(moved, base, strict=True)])
+    return found
+
+
+def _contains(choices: Any, action: list) -> Any:
+    """Where an action with an entry a node lies in a box or a ball."""
+    if isinstance(choices, Ball):
+        return sum(u * u for u in action) <= choices.radius**2
+    return functools.reduce(
+        jnp.logical_and, ((u >= choices.lo[j]) & (u <= choices.hi[j]) for j, u in enumerate(action))
+    )
+
+
+def _stays(rates: Rates, grid: Grid, inside: jax.Array, least: Any) -> jax.Array:
+    """Where all jumps at rates above ``least`` lead ``inside``, bool (*grid)."""
+    stays = jnp.ones(grid.shape, bool)
+    for offset, c in zip(rates.offsets, rates.values, strict=True):
+        stays &= (c <= least) | stencil.neighbour(inside, grid, offset)
+    return stays
+
+
+def reached(
+    problem: Problem,
+    grid: Grid,
+    held: np.ndarray,
+    *,
+    scheme: Upwind,
+    dtype: Any,
+    surely: bool,
+    least: Any = 0.0,
+    clock: Clock | None = None,
+) -> np.ndarray:
+    """The nodes from which the held nodes can be reached; host level, for problems with one player.
+
+    Args:
+      problem, grid, scheme, dtype: the chain.
+      held: bool (*grid), the nodes to reach.
+      surely: with probability one rather than with some probability.
+      least: a rate per unit time; up to it jumps are rounding.
+      clock: where a limit is looked at on the way; ``Stopped`` leaves then.
+
+    Returns:
+      bool (*grid).
+    """
+    grid = grid.walled  # what goes on beyond an open end is not known to come back
+    clock, found = clock or Clock(), np.zeros(grid.shape, bool)
+    for kinks in (False, True):  # what samples do not reach may be reached by the one action that keeps to a way
+        found |= _by_some_actions(
+            problem, grid, held, surely, clock, scheme=scheme, dtype=dtype, least=least, kinks=kinks
+        )
+        if found.all():
+            break
+    return found
+
+
+def _by_some_actions(
+    problem: Problem, grid: Grid, held: np.ndarray, surely: bool, clock: Clock, **options: Any
+) -> np.ndarray:
+    def staying(inside: jax.Array | None) -> np.ndarray:
+        return _leads_to(held, _open_jumps(problem, grid, inside, clock, **options), grid, clock)
+
+    found, inside = staying(None), np.ones(grid.shape, bool)
+    while surely and not np.array_equal(found, inside):
+        inside = found
+        found = inside & staying(jnp.asarray(inside))
+    return found
+
+
+def surely_reached(
+    problem: Problem, grid: Grid, held: jax.Array, *, scheme: Upwind, dtype: Any, least: Any = 0.0
+) -> jax.Array:
+    """The nodes from which the held ones are reached with probability one, bool (*grid); inside a transformation."""
+    points, grid = _points(problem), grid.walled
+
+    def shrink(carry):
+        inside, _ = carry
+        jumps = _also_open(
+            problem, grid, inside, None, points, 0, len(points), scheme=scheme, dtype=dtype, least=least, kinks=True
+        )
+        found = inside & _further(held, jumps, grid, grid.size)[0]
+        return found, jnp.any(found != inside)
+
+    return jax.lax.while_loop(lambda carry: carry[1], shrink, (jnp.ones(grid.shape, bool), jnp.ones((), bool)))[0]
+
+
+def forced(
+    problem: Problem, grid: Grid, held: np.ndarray, *, scheme: Upwind, dtype: Any, least: Any, clock: Clock
+) -> np.ndarray:
+    """The nodes of a game from which the control reaches the held ones for certain, whatever the disturbance does.
+
+    The largest set R in which some control keeps all jumps inside under every disturbance, and leads on to a nearer
+    node; in a lower game, some control for every disturbance. Of a continuum few actions are tried. Arguments are those
+    of ``reached``. Costs a step a cell of the longest way, each of all pairs of actions: for games that fail.
+    """
+    found, grid = np.ones(grid.shape, bool), grid.walled
+    while True:
+        inside, nearer, more = found, jnp.asarray(held), True
+        while more:
+            clock.enter("the search for nodes from which the target can be forced")
+            nearer, more = _forced_further(problem, grid, inside, nearer, least, scheme=scheme, dtype=dtype)
+        found = np.asarray(nearer)
+        if np.array_equal(found, inside):
+            return found
+
+
+@functools.partial(jax.jit, static_argnames=("scheme", "dtype"))
+def _forced_further(
+    problem: Problem, grid: Grid, inside: jax.Array, found: jax.Array, least: Any, *, scheme: Upwind, dtype: Any
+) -> tuple[jax.Array, jax.Array]:
+    """The nodes one jump further from which the control leads to ``found`` and stays ``inside``; if there are more."""
+    us, ds = (
+        jnp.asarray(np.zeros((1, 0)) if choices is None else sets.samples(choices, FEW), dtype)
+        for choices in (problem.controls, problem.disturbances)
+    )
+    upper = problem.isaacs == "upper"
+    outer, inner = (us, ds) if upper else (ds, us)
+
+    def answered(first):
+        def also(ok, second):
+            u, d = (first, second) if upper else (second, first)
+            rates = chain.rates(problem, grid, list(u), list(d), scheme=scheme, dtype=dtype)
+            jumps = zip(rates.offsets, rates.values, strict=True)
+            leads = functools.reduce(
+                jnp.logical_or, ((c > least) & stencil.neighbour(found, grid, offset) for offset, c in jumps)
+            )
+            allowed = ~edges.inadmissible(problem, grid, list(u), list(d), 0.0, dtype)
+            good = leads & allowed & _stays(rates, grid, inside, least)
+            return (ok & good if upper else ok | good), None
+
+        return jax.lax.scan(also, jnp.full(grid.shape, upper), inner)[0]
+
+    def over(ok, first):
+        return (ok | answered(first) if upper else ok & answered(first)), None
+
+    new = found | (inside & jax.lax.scan(over, jnp.full(grid.shape, not upper), outer)[0])
+    return new, jnp.any(new != found)
+
+
+@functools.partial(jax.jit, static_argnames=("scheme", "dtype"))
+def refuge(
+    problem: Problem, grid: Grid, inside: Any = None, dearest: Any = None, *, scheme: Upwind, dtype: Any
+) -> jax.Array:
+    """The nodes from which some actions of both players keep the state off the target for ever, bool (*grid).
+
+    The largest set in which every node has an action whose jumps all stay in it: nodes without one are taken away until
+    nothing changes. Empty means that under every policy the target is reached with probability one.
+
+    Args:
+      problem, grid, scheme, dtype: the chain.
+      inside: the nodes among which it is sought, bool (*grid); ``None`` is all off the target.
+      dearest: actions of a higher running cost do not count; ``None`` for all.
+    """
+    u, d = (
+        jnp.asarray(np.zeros((1, 0)) if choices is None else sets.samples(choices, SAMPLES), dtype)
+        for choices in (problem.controls, problem.disturbances)
+    )
+    mine, x = players.setting(problem, grid.ndim, dtype).control, grid.components(dtype)
+    start = subcell.level(problem, grid, dtype) > 0 if inside is None else inside
+
+    def shrink(carry):
+        inside, _ = carry
+
+        def also(found, pair):
+            for action in _with_kinks(problem, grid, mine, list(u[pair[0]]), dtype):
+                rates = chain.rates(problem, grid, action, list(d[pair[1]]), scheme=scheme, dtype=dtype)
+                allowed = ~edges.inadmissible(problem, grid, action, list(d[pair[1]]), 0.0, dtype)
+                if dearest is not None:
+                    allowed &= chain.running_cost(problem, x, action, list(d[pair[1]]), 0.0, dtype) <= dearest
+                found |= allowed & _stays(rates, grid, inside, 0.0)
+            return found, None
+
+        pairs = jnp.stack(jnp.meshgrid(jnp.arange(len(u)), jnp.arange(len(d)), indexing="ij"), -1).reshape(-1, 2)
+        found = inside & jax.lax.scan(also, jnp.zeros(grid.shape, bool), pairs)[0]
+        return found, jnp.any(found != inside)
+
+    return jax.lax.while_loop(lambda carry: carry[1], shrink, (start, jnp.ones((), bool)))[0]
+
+
+def _leads_to(held: np.ndarray, jumps: Rates, grid: Grid, clock: Clock) -> np.ndarray:
+    """Nodes with a path of jumps to a held node."""
+    if grid.size > LARGE:
+        listed = grid.size * len(jumps.offsets) <= SEARCHABLE
+        found = _spread(held, jumps, grid, clock, LONG * sum(grid.shape) if listed else grid.size)
+        if found is not None:
+            return found
+    clock.enter("the search for nodes that reach the target")
+    return _searched(held, jumps, grid)
+
+
+def _spread(held: np.ndarray, jumps: Rates, grid: Grid, clock: Clock, most: int) -> np.ndarray | None:
+    """Nodes that lead to a held one, all at once on the device; None if their paths have more than ``most`` jumps."""
+    found, more, some = jnp.asarray(held), True, max(1, LOOK // grid.size)
+    for step in range(0, most, some):
+        clock.enter(f"the search for nodes that reach the target, paths of {step} jumps")
+        found, more = _further(found, jumps, grid, min(some, most - step))
+        if not more:
+            return np.asarray(found)
+    return None
+
+
+@jax.jit
+def _further(found: jax.Array, jumps: Rates, grid: Grid, most: Any) -> tuple[jax.Array, jax.Array]:
+    """The nodes one jump further from the target, ``most`` times over; and whether there may be more."""
+
+    def step(carry):
+        found, _, count = carry
+        more = found
+        for offset, jump in zip(jumps.offsets, jumps.values, strict=True):
+            more |= jump & stencil.neighbour(more, grid, offset)
+        return more, jnp.any(more != found), count + 1
+
+    def goes_on(carry):
+        return carry[1] & (carry[2] < most)
+
+    found, more, _ = jax.lax.while_loop(goes_on, step, (found, jnp.ones((), bool), 0))
+    return found, more
+
+
+def _searched(held: np.ndarray, jumps: Rates, grid: Grid) -> np.ndarray:
+    """The same by a breadth-first search, however long the paths are."""
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import breadth_first_order
+
+    starts = [np.flatnonzero(held)]
+    ends = [np.full_like(starts[0], grid.size)]  # one more node leads to all held ones
+    for offset, jump in zip(jumps.offsets, jumps.values, strict=True):
+        leaves = ~held & np.asarray(jump)
+        starts.append(np.flatnonzero(leaves))
+        ends.append(stencil.numbers(grid, offset)[leaves])
+    backward = np.concatenate(ends), np.concatenate(starts)
+    graph = csr_array((np.ones(len(backward[0])), backward), shape=(grid.size + 1, grid.size + 1))
+    found = np.zeros(grid.size + 1, bool)
+    found[breadth_first_order(graph, grid.size, directed=True, return_predecessors=False)] = True
+    return found[:-1].reshape(grid.shape)

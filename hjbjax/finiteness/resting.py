@@ -1,0 +1,116 @@
+"""Nodes where the system can rest at no cost, which close an undiscounted problem, and whether leaving them pays.
+
+At a node where some action has f = 0, L = 0 and no noise the run may stay for ever and pay nothing: V ≤ 0 there.
+Where no path can earn anything V = 0, and the node is held at it like a target. Where some can (a negative exit cost,
+a negative running cost elsewhere), leaving may be better: whether it is, the answer with held rest nodes tells.
+
+"No cost" and "no motion" mean: less than rounding beside the largest cost and beside the largest speed on the grid,
+each in its own unit.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from hjbjax.discretisation import chain
+from hjbjax.discretisation.schemes import Scheme, Upwind
+from hjbjax.hamiltonian import hamiltonian, players
+from hjbjax.iteration import bellman
+from hjbjax.iteration.bellman import Conditions
+from hjbjax.problem import sets
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+
+ROUNDINGS = 8  # units of eps: sin π, in float32 as well, times what it is multiplied with
+GAIN = 64  # units of eps of Q max|V|: a smaller gain of leaving is rounding
+
+
+class Standstill(NamedTuple):
+    """Where the system can rest, and the scales of cost and time that tell it.
+
+    Attributes:
+      rests: bool (*grid).
+      least: the least running cost at every node, (*grid).
+      crossing: the time that the fastest motion takes from end to end of the box, all axes after one another; a number.
+    """
+
+    rests: jax.Array
+    least: jax.Array
+    crossing: jax.Array
+
+
+def standstill(problem: Problem, grid: Grid, *, scheme: Scheme, dtype: Any) -> Standstill:
+    """Where the system can rest at no cost, up to rounding: sin π is not zero in floating point.
+
+    With slopes ±s, s_i = max L/max|f_i|, the Hamiltonian is L + Σ s_i |f_i|: its minimum vanishes at rest alone.
+    """
+    how = players.setting(problem, grid.ndim, dtype)
+    nowhere = hamiltonian.local(problem, grid, jnp.zeros(grid.shape, dtype), scheme=scheme)
+    least = hamiltonian.optimise(nowhere, how)[0]
+    speeds, dearest = _scales(problem, grid, dtype)
+    cost = jnp.max(jnp.where(jnp.isfinite(least), jnp.abs(least), 0))  # infinite where a constrained end leaves none
+    cost = jnp.where(cost > 0, cost, jnp.where(dearest > 0, dearest, 1))
+    speeds = jnp.where(speeds > 0, speeds, 1)
+    at_rest = hamiltonian.at_rest(problem, grid, cost / speeds, scheme=scheme)
+    effort, u, d = hamiltonian.optimise(at_rest, how)
+    small = ROUNDINGS * jnp.finfo(dtype).eps
+    rests = (jnp.abs(effort) <= small * cost) & (jnp.abs(least) <= small * cost)
+    for axis, speed in enumerate(_spread(problem, grid, u, d, dtype)):
+        rests &= speed <= small * speeds[axis]
+    extents = jnp.stack([jnp.asarray(grid.hi[axis] - grid.lo[axis], dtype) for axis in range(grid.ndim)])
+    return Standstill(rests, least, jnp.sum(extents / speeds))
+
+
+def _spread(problem: Problem, grid: Grid, u: list, d: list, dtype: Any) -> list[Any]:
+    """a_ii/h_i along every axis: the speed at which noise leaves a node, correlated noise included."""
+    a = chain.diffusion(problem, grid.components(dtype), u, d, 0.0, dtype)
+    return [a.get((axis, axis), jnp.zeros((), dtype)) / grid.spacing(axis) for axis in range(grid.ndim)]
+
+
+def _scales(problem: Problem, grid: Grid, dtype: Any) -> tuple[jax.Array, jax.Array]:
+    """The largest speed along every axis, drift or noise, shape (n,), and the largest |L|, over nodes and actions."""
+
+    def rows(choices: Any) -> jax.Array:
+        return jnp.stack(
+            [jnp.stack(action) if action else jnp.zeros(0, dtype) for action in sets.probes(choices, dtype)]
+        )
+
+    us, ds = rows(problem.controls), rows(problem.disturbances)
+    pairs = jnp.stack(jnp.meshgrid(jnp.arange(len(us)), jnp.arange(len(ds)), indexing="ij"), -1).reshape(-1, 2)
+
+    def largest(entry: Any) -> jax.Array:
+        return jnp.max(jnp.abs(jnp.broadcast_to(jnp.asarray(entry, dtype), grid.shape)))
+
+    def look(found: tuple, pair: jax.Array) -> tuple:
+        x, (u, d) = jax.lax.optimization_barrier((grid.components(dtype), (list(us[pair[0]]), list(ds[pair[1]]))))
+        f, spread = chain.drift(problem, x, u, d, 0.0, dtype), _spread(problem, grid, u, d, dtype)
+        speeds = jnp.stack([largest(jnp.abs(drift) + noise) for drift, noise in zip(f, spread, strict=True)])
+        cost = largest(chain.running_cost(problem, x, u, d, 0.0, dtype))
+        return (jnp.maximum(found[0], speeds), jnp.maximum(found[1], cost)), None
+
+    start = (jnp.zeros(grid.ndim, dtype), jnp.zeros((), dtype))
+    return jax.lax.scan(look, start, pairs)[0]
+
+
+def leaving_pays(
+    problem: Problem, grid: Grid, rules: Conditions, counted: Any, value: jax.Array, *, scheme: Upwind
+) -> jax.Array:
+    """The held rest nodes at which some action has L + Σ_o c_o (V(x + o) − V(x)) < 0, bool (*grid).
+
+    With none of them the value with held rest nodes solves the problem in which they may be left, too.
+    """
+    rests = rules.held & counted & ~jnp.asarray(rules.ended)
+    policy = bellman.greedy(problem, grid, value, rules.held & ~rests, scheme=scheme)
+    u, d = list(policy.controls), list(policy.disturbances)
+    leaving = chain.rates(problem, grid, u, d, scheme=scheme, dtype=value.dtype).total()
+    cost = jnp.max(jnp.abs(chain.running_cost(problem, grid.components(value.dtype), u, d, 0.0, value.dtype)))
+    size = jnp.max(jnp.where(counted, jnp.abs(value), 0))
+    return rests & (policy.rate < -GAIN * jnp.finfo(value.dtype).eps * (leaving * size + cost))
+
+
+def released(rules: Conditions, pays: jax.Array) -> Conditions:
+    """The conditions with the nodes ``pays`` no longer held: there the run may rest, V ≤ 0, or leave."""
+    stop = jnp.where(pays, 0, jnp.inf)
+    stop = stop if rules.stop is None else jnp.minimum(stop, rules.stop)
+    return bellman.Conditions(rules.held & ~pays, rules.given, stop, rules.floor, rules.ended)

@@ -1,0 +1,252 @@
+"""What a problem must satisfy at every node before a solve starts; host level, never under a tracer.
+
+All functions are evaluated at all nodes for representative actions. A first pass finds out whether anything is amiss,
+which compiles fast; a second one, where it is needed, reduces on the fly to counts and first nodes, so that what is
+refused can be named.
+"""
+
+import functools
+import itertools
+from typing import Any, NamedTuple, NoReturn
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.discretisation import chain, correlation, subcell
+from hjbjax.problem import fields, sets
+from hjbjax.problem.checks import OF_ACTION, STATE_COSTS, call
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.solution.clock import Clock
+
+ACTIONS = 33  # at most so many actions of one player are tried, 9 where both play; ends and middle are among them
+LOOK = 10**7  # nodes times actions between two looks at the clock: about a second of a drift with some sines
+
+
+def values(problem: Problem, grid: Grid, dtype: Any, clock: Clock | None = None) -> None:
+    """Refuse what the functions return at the nodes: NaN, an empty target, noise that the chain cannot represent.
+
+    Args:
+      problem: the problem; one that passed ``checks.shapes``.
+      grid: the grid.
+      dtype: the floating-point type in which the functions are evaluated.
+      clock: where a limit is looked at on the way, between some actions and others; ``Stopped`` leaves then.
+
+    Raises:
+      ValueError: with the number of nodes, the first of them and its state, and what to do.
+    """
+    clock = clock or Clock()
+    actions = _actions(problem)
+    with jax.enable_x64(True):
+        if _all_sound(problem, grid, actions, np.dtype(dtype), clock):
+            return
+        clock.look()
+        found = jax.device_get(_survey(problem, grid, actions, dtype=np.dtype(dtype)))
+    for name in (*OF_ACTION, "target", *STATE_COSTS):
+        if name in found and found[name].count:
+            _not_finite(problem, grid, name, found[name], actions)
+    if "negative" in found and found["negative"].count:
+        where = _where(problem, grid, found["negative"], actions)
+        raise ValueError(
+            f"{call(problem, 'noise')} is negative at {where}.\nWanted numbers ≥ 0: it is σ in dx = f dt + σ dw; "
+            "only an (n, k) matrix may hold negative entries"
+        )
+    if "correlation" in found and found["correlation"].count:
+        _not_representable(problem, grid, found["correlation"], actions)
+    if problem.target is not None:
+        _target(problem, grid, found["inside"], found["nearest"])
+
+
+class _Finding(NamedTuple):
+    """How many nodes, the first of them (flat), and for which action."""
+
+    count: Any
+    first: Any
+    action: Any
+
+
+def _actions(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
+    """Representative pairs of control and disturbance, shapes (K, m) and (K, l)."""
+    most = 9 if problem.is_game else ACTIONS
+    mine, theirs = (_thinned(choices, most) for choices in (problem.controls, problem.disturbances))
+    pairs = list(itertools.product(mine, theirs))
+    return np.array([u for u, _ in pairs]), np.array([d for _, d in pairs])
+
+
+def _thinned(choices: sets.AdmissibleSet | None, most: int) -> np.ndarray:
+    if choices is None:
+        return np.zeros((1, 0))
+    points = np.asarray(sets.samples(choices, 9))
+    return points[np.unique(np.linspace(0, len(points) - 1, min(most, len(points))).round().astype(int))]
+
+
+def _all_sound(problem: Problem, grid: Grid, actions: tuple[Any, Any], dtype: Any, clock: Clock) -> bool:
+    """Whether there is nothing that ``values`` refuses, some actions at a time."""
+    count, some = len(actions[0]), max(1, LOOK // grid.size)
+    for first in range(0, count, some):
+        clock.enter(f"the survey of the nodes, {first} of {count} actions")
+        if not _sound(problem, grid, actions, first, min(first + some, count), dtype=dtype):
+            return False
+    return True
+
+
+@functools.partial(jax.jit, static_argnames=("dtype",))
+def _sound(problem: Problem, grid: Grid, actions: tuple[Any, Any], first: Any, last: Any, dtype: Any) -> jax.Array:
+    """Whether nothing is refused of the actions from ``first`` to before ``last``; with the first, of the state."""
+    amiss = jax.lax.cond(first == 0, lambda: _state_amiss(problem, grid, dtype), lambda: jnp.zeros((), bool))
+    x, tried = grid.components(dtype), jax.tree.map(lambda rows: jnp.asarray(rows, dtype), actions)
+
+    def look(k, amiss):
+        here, (u, d) = jax.lax.optimization_barrier((x, jax.tree.map(lambda rows: rows[k], tried)))  # see _survey
+        bad = _of_action(problem, grid, here, list(u), list(d), dtype).values()
+        return amiss | jnp.any(functools.reduce(jnp.logical_or, bad))
+
+    return ~jax.lax.fori_loop(first, last, look, amiss)
+
+
+def _state_amiss(problem: Problem, grid: Grid, dtype: Any) -> jax.Array:
+    """Whether ``values`` refuses what the functions of the state alone return."""
+    x = grid.components(dtype)
+    amiss, inside = jnp.zeros((), bool), jnp.ones((), bool)
+    if problem.target is not None:
+        distance = subcell.level(problem, grid, dtype)
+        inside = distance <= 0
+        amiss |= ~jnp.all(jnp.isfinite(distance)) | ~jnp.any(inside) | jnp.all(inside)
+    for name in STATE_COSTS:
+        ingredient = getattr(problem, name)
+        if ingredient is not None:
+            relevant = inside if name == "exit_cost" else True
+            amiss |= jnp.any(relevant & ~jnp.isfinite(fields.of_state(problem, ingredient, x, 0.0, dtype)))
+    return amiss
+
+
+@functools.partial(jax.jit, static_argnames=("dtype",))
+def _survey(problem: Problem, grid: Grid, actions: tuple[Any, Any], dtype: Any) -> dict[str, Any]:
+    """Counts and first nodes of everything that ``values`` refuses."""
+    x = grid.components(dtype)
+    found: dict[str, Any] = {}
+    inside: Any = True
+    if problem.target is not None:
+        distance = subcell.level(problem, grid, dtype)
+        inside = distance <= 0
+        found["target"] = _count(~jnp.isfinite(distance), grid)
+        found["inside"] = jnp.sum(inside)
+        found["nearest"] = (jnp.min(distance), jnp.argmin(distance))
+    for name in STATE_COSTS:
+        ingredient = getattr(problem, name)
+        if ingredient is not None:
+            relevant = inside if name == "exit_cost" else True
+            found[name] = _count(relevant & ~jnp.isfinite(fields.of_state(problem, ingredient, x, 0.0, dtype)), grid)
+
+    def body(carry, index_and_action):
+        index, u, d = index_and_action
+        here, u, d = jax.lax.optimization_barrier((x, u, d))  # or XLA keeps an array of all nodes per invariant
+        new = _of_action(problem, grid, here, list(u), list(d), dtype)
+        new = {name: _count(bad, grid, index) for name, bad in new.items()}
+        kept = {
+            name: jax.tree.map(functools.partial(jnp.where, carry[name].count > 0), carry[name], new[name])
+            for name in new
+        }
+        return kept, None
+
+    us, ds = (jnp.asarray(action, dtype) for action in actions)
+    nothing = _Finding(*(jnp.zeros((), jnp.int64),) * 3)
+    names = jax.eval_shape(lambda: _of_action(problem, grid, x, list(us[0]), list(ds[0]), dtype))
+    carry, _ = jax.lax.scan(body, dict.fromkeys(names, nothing), (jnp.arange(len(us)), us, ds))
+    return found | carry
+
+
+def _of_action(problem: Problem, grid: Grid, x: list, u: list, d: list | None, dtype: Any) -> dict[str, Any]:
+    """Where drift, cost and noise are what they must not be, for one action."""
+
+    def faulty(entries):
+        return functools.reduce(jnp.logical_or, (~jnp.isfinite(jnp.asarray(entry, dtype)) for entry in entries))
+
+    bad = {"drift": faulty(chain.drift(problem, x, u, d, 0.0, dtype))}
+    if problem.cost is not None:
+        bad["cost"] = faulty([chain.running_cost(problem, x, u, d, 0.0, dtype)])
+    a = chain.diffusion(problem, x, u, d, 0.0, dtype)
+    if a:
+        bad["noise"] = faulty(a.values())
+    if callable(problem.noise):
+        sigma = fields.components(problem.noise, *problem.arguments(x, u, d, 0.0), dtype=dtype)
+        if sigma.ndim < 2:
+            bad["negative"] = functools.reduce(jnp.logical_or, (jnp.asarray(entry) < 0 for entry in sigma.flat))
+    lacking = chain.lacking(a, grid, dtype)
+    if lacking is not None:
+        bad["correlation"] = lacking
+    return bad
+
+
+def _count(bad: Any, grid: Grid, action: Any = 0) -> _Finding:
+    bad = jnp.broadcast_to(bad, grid.shape)
+    # counting and argmax are slow on a CPU: they run where there is something to find
+    count, first = jax.lax.cond(
+        jnp.any(bad),
+        lambda: (jnp.sum(bad, dtype=jnp.int64), jnp.argmax(bad).astype(jnp.int64)),
+        lambda: (jnp.zeros((), jnp.int64),) * 2,
+    )
+    return _Finding(count, first, jnp.asarray(action, jnp.int64))
+
+
+# --- what is said ---
+
+
+def _numbers(entries: Any) -> str:
+    return "[" + ", ".join(f"{entry:.6g}" for entry in np.asarray(entries, dtype=float)) + "]"
+
+
+def _place(grid: Grid, flat: Any) -> tuple[tuple[int, ...], np.ndarray]:
+    index = tuple(int(i) for i in np.unravel_index(int(flat), grid.shape))
+    return index, grid.state(index)
+
+
+def _where(problem: Problem, grid: Grid, finding: _Finding, actions: tuple | None) -> str:
+    """ "3 of 100 nodes, first at node (0, 1), x = [...], with u = [...]"."""
+    index, x = _place(grid, finding.first)
+    text = f"{int(finding.count)} of {grid.size} nodes, first at node {index}, x = {_numbers(x)}"
+    if actions is not None:
+        given = zip("ud", actions, strict=True)
+        played = [f"{letter} = {_numbers(rows[finding.action])}" for letter, rows in given if rows.shape[1]]
+        text += ", with " + " and ".join(played) if played else ""
+    return text
+
+
+def _not_finite(problem: Problem, grid: Grid, name: str, finding: _Finding, actions: tuple) -> NoReturn:
+    ingredient = getattr(problem, name)
+    if not callable(ingredient):
+        raise ValueError(f"Problem.{name}: got {np.asarray(ingredient)}, wanted finite numbers")
+    where = _where(problem, grid, finding, actions if name in OF_ACTION else None)
+    raise ValueError(
+        f"{call(problem, name)} is NaN or infinite at {where}.\n"
+        "Keep the singularity out of the box (lo, hi) or between nodes (shape), or define the function there:\n"
+        "jnp.where(bad, finite, f(jnp.where(bad, safe_x, x)))"
+    )
+
+
+def _target(problem: Problem, grid: Grid, inside: Any, nearest: tuple[Any, Any]) -> None:
+    if 0 < inside < grid.size:
+        return
+    if inside:
+        raise ValueError(
+            f"target: all {grid.size} nodes lie in the target ({call(problem, 'target')} ≤ 0 inside), so nothing is "
+            "left to solve: enlarge the box or make the target smaller; check its sign"
+        )
+    index, x = _place(grid, nearest[1])
+    raise ValueError(
+        f"target: no node lies in the target: {call(problem, 'target')} ≤ 0 inside, but its least value is "
+        f"{float(nearest[0]):.6g}, at node {index}, x = {_numbers(x)}: refine the grid or enlarge the target"
+    )
+
+
+def _not_representable(problem: Problem, grid: Grid, finding: _Finding, actions: tuple) -> NoReturn:
+    """Refuse correlated noise, with spacings for which its diagonal jumps leave no negative probability."""
+    _, x = _place(grid, finding.first)
+    u, d = (rows[finding.action] for rows in actions)
+    sigma = np.asarray(problem.diffusion(x, u, d, 0.0), dtype=float)
+    raise ValueError(
+        f"noise: correlated noise that the chain cannot represent with non-negative probabilities at "
+        f"{_where(problem, grid, finding, actions)}.\n"
+        + correlation.advice(sigma @ sigma.T, grid, everywhere=not callable(problem.noise))
+    )

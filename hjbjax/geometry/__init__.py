@@ -1,0 +1,26 @@
+"""Vector fields of control systems: brackets, what they span, linearisation by feedback, stability.
+
+Read ``brackets`` and ``distributions`` first, then ``linearisation`` and ``linearisability``; ``lyapunov`` searches
+against Lyapunov functions, and ``stability`` has Brockett's condition.
+"""
+
+from hjbjax.geometry.brackets import ad, affine_fields, lie_bracket, lie_derivative
+from hjbjax.geometry.distributions import Distribution, observability_codistribution, reachability_distribution
+from hjbjax.geometry.linearisability import Linearisability, is_feedback_linearisable
+from hjbjax.geometry.linearisation import Linearisation, RelativeDegree, linearising_feedback, relative_degree
+
+__all__ = [
+    "Distribution",
+    "Linearisability",
+    "Linearisation",
+    "RelativeDegree",
+    "ad",
+    "affine_fields",
+    "is_feedback_linearisable",
+    "lie_bracket",
+    "lie_derivative",
+    "linearising_feedback",
+    "observability_codistribution",
+    "reachability_distribution",
+    "relative_degree",
+]

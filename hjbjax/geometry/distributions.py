@@ -1,0 +1,189 @@
+"""Distributions: what vector fields and their brackets, or outputs and their derivatives, span at a state.
+
+    reachability       span of the fields and their brackets [X_k, [… [X_2, X_1]]]           (4.5)
+    observability      span of d(L_{X_1} … L_{X_k} h_j)                                      (4.11)
+
+with X_i out of f, g_1, …, g_m. Right-nested brackets are enough: they span the whole Lie algebra. A rank is decided by
+singular values: those above ``tolerance`` times the largest count, and the tolerance is √eps of the dtype (1.5e-8 in
+float64) unless given. It is the rank at one state.
+
+Cost: the program of depth k holds 2^k derivatives, and the number of brackets grows like (number of fields)^k.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from hjbjax.geometry.brackets import Field, along, as_fields, check_count, decide, floating, stacked
+from hjbjax.problem.pytree import as_partial, is_traced, node
+
+
+@node()
+class Distribution:
+    """The span of vectors at one point, and how clear its rank is.
+
+    Args:
+      vectors: what spans it, shape (p, n).
+      directions: orthonormal, the left singular vectors in the order of ``singular_values``, shape (n, min(n, p)).
+      singular_values: of ``vectors``, falling, shape (min(n, p),).
+      tolerance: what counts, as a part of the largest singular value.
+    """
+
+    vectors: Any
+    directions: Any
+    singular_values: Any
+    tolerance: Any
+
+    @property
+    def counted(self) -> Any:
+        """Which singular values count towards the rank, shape (min(n, p),)."""
+        return self.singular_values > self.tolerance * self.singular_values[0]
+
+    @property
+    def rank(self) -> Any:
+        """How many singular values count; an int outside of a trace."""
+        rank = self.counted.sum()
+        return rank if is_traced(rank) else int(rank)
+
+    @property
+    def basis(self) -> Any:
+        """An orthonormal basis in columns, shape (n, rank); under a tracer all directions, with zeros past the rank."""
+        if is_traced(self.singular_values):
+            return self.directions * self.counted
+        return self.directions[:, : self.rank]
+
+    @property
+    def margin(self) -> Any:
+        """The smallest singular value that counts over the largest; compare with ``tolerance``."""
+        return self._largest_ratio(jnp.where(self.counted, self.singular_values, jnp.inf).min())
+
+    @property
+    def residue(self) -> Any:
+        """The largest singular value that does not count over the largest; compare with ``tolerance``."""
+        return self._largest_ratio(jnp.where(self.counted, 0.0, self.singular_values).max())
+
+    def _largest_ratio(self, value: Any) -> Any:
+        largest = self.singular_values[0]
+        ratio = jnp.where((largest > 0) & jnp.isfinite(value), value / jnp.where(largest > 0, largest, 1.0), 0.0)
+        return ratio if is_traced(ratio) else float(ratio)
+
+
+def reachability_distribution(
+    f: Field | None, gs: Field | Sequence[Field], x: Any, depth: int, *, tolerance: Any = None
+) -> Distribution:
+    """What f, the g_j and their brackets span at a state (4.5).
+
+    The first generation holds the brackets of two fields, generation k those of a field with one of generation
+    k − 1. Rank n says that the states reachable from x in any time fill an open set (accessibility), and without
+    drift that x is locally controllable. It never falls with the depth.
+
+    Args:
+      f: the drift; ``None`` for a system without drift.
+      gs: the input fields, a sequence of functions or one function.
+      x: the state, shape (n,).
+      depth: generations of brackets, 0 for the fields alone.
+
+    Keyword Args:
+      tolerance: which part of the largest singular value counts; ``None`` is √eps.
+
+    Returns:
+      A Distribution, with ``rank``, ``basis``, ``margin`` and ``residue``.
+
+    Raises:
+      ValueError: a depth that is no integer ≥ 0, a field of the wrong shape, or a number that is not finite.
+
+    Example:
+      >>> parabola = lambda x: jnp.stack([0.0, x[0] ** 2])      # with the input field below: Example 4.1
+      >>> push = lambda x: jnp.array([1.0, 0.0])
+      >>> [reachability_distribution(parabola, push, [0.0, 5.0], depth).rank for depth in (0, 1, 2)]
+      [1, 1, 2]
+    """
+    check_count("reachability_distribution", "depth", depth)
+    fields = tuple(as_partial(field) for field in [*([] if f is None else [f]), *as_fields(gs)])
+    return decide(_reach, fields, x, tolerance, depth=int(depth))
+
+
+def observability_codistribution(
+    f: Field | None, gs: Field | Sequence[Field], h: Callable, x: Any, depth: int, *, tolerance: Any = None
+) -> Distribution:
+    """What the differentials of the outputs and of their Lie derivatives span at a state (4.11).
+
+    Rank n says that states near x are told apart by their outputs under suitable inputs (local observability);
+    it says nothing of states far from each other.
+
+    Args:
+      f: the drift; ``None`` for a system without drift.
+      gs: the input fields, a sequence of functions or one function; empty without inputs.
+      h: the output, a function of one state that returns one number or shape (outputs,).
+      x: the state, shape (n,).
+      depth: how many Lie derivatives, 0 for the outputs alone; n − 1 is enough for a rank that is constant near x.
+
+    Keyword Args:
+      tolerance: which part of the largest singular value counts; ``None`` is √eps.
+
+    Returns:
+      A Distribution of covectors.
+
+    Raises:
+      ValueError: a depth that is no integer ≥ 0, a field of the wrong shape, or a number that is not finite.
+
+    Example:
+      >>> swing = lambda x: jnp.stack([x[1], jnp.sin(x[0])])
+      >>> observability_codistribution(swing, [], lambda x: x[0], [0.3, 0.0], 1).rank
+      2
+    """
+    check_count("observability_codistribution", "depth", depth)
+    fields = tuple(as_partial(field) for field in [*([] if f is None else [f]), *as_fields(gs)])
+    return decide(_observe, (fields, as_partial(h)), x, tolerance, depth=int(depth))
+
+
+def _reach(fields, x, tolerance, *, depth):
+    field = stacked(fields)
+
+    def generations(state):
+        return (field(state),)
+
+    for _ in range(depth):
+        generations = _with_brackets(field, generations)
+    return span(jnp.concatenate(generations(x)), tolerance)
+
+
+def _with_brackets(fields, generations):
+    """The generations and one more: the brackets of every field with every member of the last one."""
+
+    def longer(x):
+        found, changes = along(generations, x, fields(x))
+        _, bends = along(fields, x, found[-1])  # (members, fields, n)
+        brackets = changes[-1] - bends.swapaxes(0, 1)
+        return (*found, brackets.reshape(-1, x.shape[0]))
+
+    return longer
+
+
+def _observe(functions, x, tolerance, *, depth):
+    fields, h = functions
+
+    def generations(state):
+        return (jnp.atleast_1d(floating(h)(state)),)
+
+    for _ in range(depth if fields else 0):
+        generations = _with_derivatives(stacked(fields), generations)
+    return span(jnp.concatenate(jax.jacfwd(generations)(x)), tolerance)
+
+
+def _with_derivatives(fields, generations):
+    """The generations and one more: the derivatives of the last one along every field."""
+
+    def longer(x):
+        found, changes = along(generations, x, fields(x))
+        return (*found, changes[-1].reshape(-1))
+
+    return longer
+
+
+def span(vectors: Any, tolerance: Any) -> Distribution:
+    """The Distribution of row vectors, shape (p, n)."""
+    directions, values, _ = jnp.linalg.svd(vectors.T, full_matrices=False)
+    return Distribution(vectors, directions, values, jnp.asarray(tolerance, vectors.dtype))

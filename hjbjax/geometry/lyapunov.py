@@ -1,0 +1,282 @@
+"""A search for what contradicts a Lyapunov function.
+
+A function V proves that ẋ = f(t, x) is stable at x_e in a region when there
+
+    V(t, x) > V(t, x_e) for x ≠ x_e,      dV/dt = ∂V/∂t + (∂V/∂x) f ≤ 0
+
+``lyapunov_check`` evaluates both at points spread evenly over the region and its corners, and climbs from the worst of
+them along the gradient. A violation that it returns is one, up to rounding. That it finds none is evidence, no proof:
+a violation much narrower than the distance of the points can be missed.
+"""
+
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.problem.pytree import as_partial, cast, node
+from hjbjax.problem.sets import Ball, Box
+from hjbjax.solution.screen import encodable
+
+CLIMBS = 32  # starts of the local search, for each of the three measures
+STEPS = 80  # its steps; a step that does not climb is halved
+NEAR = 0.01  # closer to the equilibrium than this part of the region's size, V is not compared with zero
+
+
+@node()
+class LyapunovReport:
+    """What a search for a violation found.
+
+    Args:
+      positive: whether V > V(x_e) at every point looked at, but x_e itself.
+      decreasing: whether dV/dt ≤ 0 at every point looked at, up to rounding.
+      worst_state: where dV/dt is largest; where it is never positive, where it is largest relative to its terms.
+      worst_time: the time of that, ``None`` without times.
+      rate: dV/dt there.
+      lowest_state: where V − V(x_e) is smallest relative to |x − x_e|².
+      lowest_time: the time of that, ``None`` without times.
+      lowest: V − V(x_e) there.
+      evaluations: how many points were looked at.
+    """
+
+    positive: bool
+    decreasing: bool
+    worst_state: Any
+    worst_time: Any
+    rate: float
+    lowest_state: Any
+    lowest_time: Any
+    lowest: float
+    evaluations: int
+
+    @property
+    def holds(self) -> bool:
+        """Whether no violation was found."""
+        return self.positive and self.decreasing
+
+    def __str__(self) -> str:
+        if not self.positive:
+            return encodable(
+                f"violated: V − V(x_e) = {self.lowest:.3g} at {_place(self.lowest_state, self.lowest_time)}"
+            )
+        if not self.decreasing:
+            return f"violated: dV/dt = {self.rate:.3g} at {_place(self.worst_state, self.worst_time)}"
+        return f"no violation found at {self.evaluations:,} points; the search proves nothing"
+
+
+def lyapunov_derivative(V: Callable, f: Callable, *, time_varying: bool = False) -> Callable:
+    """dV/dt along ẋ = f, a function of ``(x)``, or of ``(t, x)`` as V and f then are.
+
+    Args:
+      V: a function that returns one number.
+      f: the closed loop, returns shape (n,).
+
+    Keyword Args:
+      time_varying: whether V and f take ``(t, x)``.
+
+    Example:
+      >>> decay = lyapunov_derivative(lambda x: x @ x, lambda x: -x)
+      >>> float(decay(jnp.array([1.0, 2.0])))
+      -10.0
+    """
+    if time_varying:
+        return lambda t, x: jax.jvp(V, (t, x), (jnp.ones_like(t), f(t, x)))[1]
+    return lambda x: jax.jvp(V, (x,), (f(x),))[1]
+
+
+def lyapunov_check(
+    V: Callable,
+    f: Callable,
+    region: Box | Ball,
+    times: Any = None,
+    *,
+    equilibrium: Any = None,
+    samples: int = 4096,
+    tolerance: float = 1e-9,
+) -> LyapunovReport:
+    """Search a region for a point that contradicts V as a Lyapunov function of ẋ = f, and return the worst.
+
+    Args:
+      V: a function that returns one number.
+      f: the closed loop, returns shape (n,).
+      region: the states to search, a Box or a Ball around the origin.
+      times: the interval of times to search, two numbers; V and f then take ``(t, x)``. ``None``: they take ``(x)``.
+
+    Keyword Args:
+      equilibrium: x_e, shape (n,); ``None`` is the origin.
+      samples: how many points the search starts with.
+      tolerance: how much of the terms of dV/dt, or of V elsewhere at the same distance from x_e, counts as zero.
+
+    Returns:
+      A LyapunovReport, with ``holds``, ``worst_state`` and ``rate``.
+
+    Raises:
+      TypeError: a region that is neither Box nor Ball.
+      ValueError: a number that is not admissible, or V or f not finite at a point of the region.
+
+    Example:
+      >>> oscillator = lambda x: jnp.stack([x[1], -x[0] - (1 - x[0] ** 2) * x[1]])      # unstable beyond |x| = 1
+      >>> energy = lambda x: 0.5 * (x @ x)
+      >>> lyapunov_check(energy, oscillator, Box([-0.9, -0.9], [0.9, 0.9])).holds
+      True
+      >>> report = lyapunov_check(energy, oscillator, Box([-2.0, -2.0], [2.0, 2.0]))
+      >>> report.holds, np.abs(report.worst_state).tolist(), report.rate
+      (False, [2.0, 2.0], 12.0)
+    """
+    if not isinstance(region, (Box, Ball)):
+        raise TypeError(f"lyapunov_check: region is {region!r}, wanted a Box or a Ball of states")
+    if isinstance(samples, bool) or not isinstance(samples, (int, np.integer)) or samples < 1:
+        raise ValueError(f"lyapunov_check: samples is {samples!r}, wanted a positive integer")
+    if not 0 < tolerance < 1:
+        raise ValueError(f"lyapunov_check: tolerance is {tolerance!r}, wanted a number between 0 and 1")
+    span_of_times = _times(times)
+    rest = np.zeros(region.dim) if equilibrium is None else np.asarray(equilibrium, np.float64)
+    if rest.shape != (region.dim,):
+        raise ValueError(f"lyapunov_check: equilibrium has shape {rest.shape}, wanted ({region.dim},)")
+    with jax.enable_x64(True):
+        place = cast((region, rest, span_of_times), np.float64)
+        starts = _starts(region.dim + (times is not None), int(samples))
+        functions = cast((as_partial(V), as_partial(f)), np.float64)
+        found = jax.tree.map(np.asarray, _search(functions, place, starts, tolerance))
+    if not found.pop("finite"):
+        raise ValueError(
+            "lyapunov_check: V or f is not finite at a point of the region; choose a region where both are"
+        )
+    numbers = {name: found[name].item() for name in ("positive", "decreasing", "rate", "lowest")}
+    found |= numbers
+    if times is None:
+        found |= {"worst_time": None, "lowest_time": None}
+    return LyapunovReport(**found, evaluations=len(starts) + 3 * min(CLIMBS, len(starts)) * STEPS)
+
+
+def _times(times: Any) -> Any:
+    if times is None:
+        return None
+    ends = np.asarray(times, np.float64)
+    if ends.shape != (2,) or not np.all(np.isfinite(ends)) or ends[0] > ends[1]:
+        raise ValueError(f"lyapunov_check: times is {times!r}, wanted two numbers, the first and the last time")
+    return ends
+
+
+def _place(state: Any, time: Any) -> str:
+    where = "x = [" + ", ".join(f"{number:.4g}" for number in np.asarray(state)) + "]"
+    return where if time is None else f"t = {float(time):.4g}, {where}"
+
+
+def _starts(dim: int, samples: int) -> np.ndarray:
+    """Points of the unit cube, shape (about samples, dim): a sequence that fills it evenly, and its corners."""
+    # Multiples of the powers of 1/φ, φ^(dim + 1) = φ + 1: the golden ratio's sequence, in dim dimensions.
+    root = 2.0
+    for _ in range(60):
+        root = (1 + root) ** (1 / (dim + 1))
+    steps = root ** -np.arange(1.0, dim + 1)
+    inner = (0.5 + np.arange(1, samples + 1)[:, None] * steps) % 1
+    return np.concatenate([inner, np.array(list(itertools.product((0.0, 1.0), repeat=dim)))]) if dim <= 10 else inner
+
+
+@jax.jit
+def _search(functions, place, starts, tolerance):
+    region, rest, times = place
+    size = _size(region)
+
+    def at(z):
+        return _state_of(region, times, z)
+
+    def value(z):
+        return _lift(functions[0], times, z, at(z)[1])
+
+    def rates(z):
+        return _terms(functions, times, z, at(z)[1])
+
+    def relative(z):  # dV/dt over the size of its terms
+        rate, terms = rates(z)
+        return rate / jnp.where(terms > 0, terms, 1)
+
+    def low(z):
+        x = at(z)[1]
+        square = jnp.sum((x - rest) ** 2)
+        above = value(z) - _lift(functions[0], times, z, rest)
+        return jnp.where(square > (NEAR * size) ** 2, -above / jnp.where(square > 0, square, 1), -jnp.inf)
+
+    highest, nearest, lowest = (_best(f, starts) for f in (lambda z: rates(z)[0], relative, low))
+    rate, terms = rates(highest)
+    decreasing = rate <= tolerance * terms
+    # A violation may be small where dV/dt is largest in units of V: near the equilibrium everything is.
+    decreasing &= relative(nearest) <= tolerance
+    worst = jnp.where((rate > tolerance * terms), highest, nearest)
+    above, around = _compare(functions[0], place, lowest, at(lowest)[1])
+    everywhere = jax.vmap(lambda z: value(z) + rates(z)[0])(starts)
+    (worst_time, worst_state), (lowest_time, lowest_state) = at(worst), at(lowest)
+    return {
+        "finite": jnp.all(jnp.isfinite(everywhere)), "positive": above > tolerance * around, "decreasing": decreasing,
+        "worst_state": worst_state, "worst_time": worst_time, "rate": rates(worst)[0],
+        "lowest_state": lowest_state, "lowest_time": lowest_time, "lowest": above,
+    }  # fmt: skip
+
+
+def _size(region):
+    return region.radius if isinstance(region, Ball) else jnp.max(region.hi - region.lo) / 2
+
+
+def _state_of(region, times, z):
+    """The time, or None, and the state that a point of the unit cube stands for."""
+    t = None if times is None else times[0] + z[-1] * (times[1] - times[0])
+    z = z if times is None else z[:-1]
+    if isinstance(region, Box):
+        return t, region.lo + z * (region.hi - region.lo)
+    x = region.radius * (2 * z - 1)
+    square = jnp.sum(x * x)
+    outside = square > region.radius**2
+    return t, jnp.where(outside, x * region.radius / jnp.sqrt(jnp.where(outside, square, 1)), x)
+
+
+def _lift(V, times, z, x):
+    return jnp.asarray(V(x) if times is None else V(times[0] + z[-1] * (times[1] - times[0]), x), x.dtype)
+
+
+def _terms(functions, times, z, x):
+    """dV/dt, and the sum of the sizes of what it is made of."""
+    V, f = functions
+    if times is None:
+        parts = jax.grad(lambda x: jnp.asarray(V(x), x.dtype))(x) * jnp.asarray(f(x), x.dtype)
+        return jnp.sum(parts), jnp.sum(jnp.abs(parts))
+    t = times[0] + z[-1] * (times[1] - times[0])
+    slope, slopes = jax.grad(lambda t, x: jnp.asarray(V(t, x), x.dtype), argnums=(0, 1))(t, x)
+    parts = slopes * jnp.asarray(f(t, x), x.dtype)
+    return slope + jnp.sum(parts), jnp.abs(slope) + jnp.sum(jnp.abs(parts))
+
+
+def _best(measure, starts):
+    """The point of the unit cube where a measure is largest, by climbing from the best starts."""
+    values = jax.vmap(measure)(starts)
+    _, order = jax.lax.top_k(jnp.where(jnp.isnan(values), -jnp.inf, values), min(CLIMBS, starts.shape[0]))
+
+    def climb(carry, _):
+        z, best, step = carry
+        slope = jax.grad(measure)(z)
+        length = jnp.sqrt(jnp.sum(slope * slope))
+        moved = jnp.clip(z + step * slope / jnp.where(length > 0, length, 1), 0.0, 1.0)
+        there = measure(moved)
+        better = there > best
+        return (jnp.where(better, moved, z), jnp.where(better, there, best), jnp.where(better, step, step / 2)), None
+
+    def run(z):
+        first = (z, measure(z), jnp.asarray(0.1, z.dtype))
+        (z, best, _), _ = jax.lax.scan(climb, first, length=STEPS)
+        return z, best
+
+    points, heights = jax.vmap(run)(starts[order])
+    return points[jnp.argmax(heights)]
+
+
+def _compare(V, place, z, x):
+    """V − V(x_e) at a point, and the largest at states as far from x_e."""
+    region, rest, times = place
+    axes = np.concatenate([np.eye(region.dim), -np.eye(region.dim)])
+    base = _lift(V, times, z, rest)
+    ring = jnp.concatenate([rest + jnp.sqrt(jnp.sum((x - rest) ** 2)) * axes, x[None]])
+    around = jax.vmap(lambda y: jnp.abs(_lift(V, times, z, y) - base))(ring)
+    return _lift(V, times, z, x) - base, jnp.max(jnp.where(jnp.isfinite(around), around, 0))

@@ -1,0 +1,100 @@
+"""Stability: Lyapunov functions, and Brockett's necessary condition.
+
+``lyapunov_check`` searches a region for what contradicts a Lyapunov function; it is defined in ``lyapunov``.
+
+Brockett's condition: if a continuous feedback of the state makes x_e asymptotically stable, then the image of
+(x, u) ↦ f(x, u) holds a neighbourhood of zero. A system without drift whose m < n fields are independent at x_e fails
+it: in coordinates in which the first m rows of the fields are invertible, (0, ε) is not in the image. Source: M. D.
+Kvalheim and D. E. Koditschek, Necessary conditions for feedback stabilization and safety, arXiv:2106.00215, which
+states Brockett's theorem of 1983.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.geometry.brackets import Field, as_fields, decide, stacked
+from hjbjax.geometry.distributions import span
+from hjbjax.geometry.lyapunov import LyapunovReport, lyapunov_check, lyapunov_derivative
+from hjbjax.problem.pytree import as_partial, node
+
+__all__ = ["BrockettVerdict", "LyapunovReport", "brockett_check", "lyapunov_check", "lyapunov_derivative"]
+
+
+@node(static=("message",))
+class BrockettVerdict:
+    """Whether a system meets Brockett's necessary condition for a continuous stabilising feedback of the state.
+
+    Args:
+      satisfied: ``False`` rules such a feedback out, ``True`` does not promise one; ``None`` is undecided.
+      rank: of (∂f/∂x, ∂f/∂u) at the state.
+      margin: the smallest singular value that counts towards the rank, over the largest.
+      message: the reason in words.
+    """
+
+    satisfied: bool | None
+    rank: int
+    margin: float
+    message: str
+
+
+def brockett_check(f: Field | None, gs: Field | Sequence[Field], x: Any, *, tolerance: Any = None) -> BrockettVerdict:
+    """Brockett's necessary condition for a continuous feedback u(x) that makes a rest point asymptotically stable.
+
+    Decided where it can be from first derivatives at x: without drift by the fields themselves, with drift by
+    the rank of the linearisation (∂f/∂x, ∂f/∂u), which satisfies it where it is n.
+
+    Args:
+      f: the drift; ``None`` for a system without drift.
+      gs: the input fields, a sequence of functions or one function.
+      x: the state to be stabilised, shape (n,), where some input keeps the system at rest.
+
+    Keyword Args:
+      tolerance: which part of the largest singular value counts; ``None`` is √eps.
+
+    Returns:
+      A BrockettVerdict, with ``satisfied`` and a ``message``.
+
+    Raises:
+      ValueError: no input keeps the system at rest at x, or a field is of the wrong shape or not finite there.
+
+    Example:
+      >>> drive = lambda x: jnp.stack([jnp.cos(x[2]), jnp.sin(x[2]), 0.0])
+      >>> turn = lambda x: jnp.array([0.0, 0.0, 1.0])
+      >>> print(brockett_check(None, [drive, turn], jnp.zeros(3)).message)
+      violated: 2 independent fields move 3 states without drift; no continuous u(x) makes this state stable
+    """
+    inputs = as_fields(gs)
+    fields = tuple(as_partial(field) for field in [*([] if f is None else [f]), *inputs])
+    linear, unbalanced = decide(_linearisation, fields, x, tolerance, drift=f is not None)
+    n, m, rank = linear.vectors.shape[1], len(inputs), linear.rank
+    if unbalanced > 1e-8:
+        raise ValueError(
+            f"brockett_check: no input keeps the system at rest at x = {np.asarray(x).tolist()}: "
+            f"the drift there leaves the span of the fields by {unbalanced:.2g} of its size"
+        )
+    satisfied: bool | None
+    if rank == n:
+        satisfied, reason = True, "satisfied: the linearisation moves the state in every direction"
+    elif f is None and rank == m:
+        fields_and_states = f"{m} independent fields move {n} states without drift"
+        satisfied, reason = False, f"violated: {fields_and_states}; no continuous u(x) makes this state stable"
+    else:
+        satisfied, reason = None, f"undecided: the linearisation has rank {rank} of {n}, and higher orders decide"
+    return BrockettVerdict(satisfied, rank, linear.margin, reason)
+
+
+def _linearisation(fields, x, tolerance, *, drift):
+    """(∂f/∂x, ∂f/∂u) at x and the input that balances the drift best, and what of the drift that leaves."""
+    vectors = stacked(fields)(x)
+    if not drift:
+        return span(vectors, tolerance), jnp.zeros((), x.dtype)
+    gs = vectors[1:].T
+    u, *_ = jnp.linalg.lstsq(gs, -vectors[0])
+    size = jnp.sqrt(jnp.sum(vectors[0] ** 2))
+    left = jnp.sqrt(jnp.sum((vectors[0] + gs @ u) ** 2))
+    slopes = jnp.einsum("k,kij->ij", jnp.append(1.0, u).astype(x.dtype), jax.jacfwd(stacked(fields))(x))
+    return span(jnp.concatenate([slopes.T, vectors[1:]]), tolerance), left / jnp.where(size > 0, size, 1)

@@ -1,0 +1,323 @@
+"""The discrete Hamiltonian and its optimum over the admissible sets.
+
+At a node, for one action of each player,
+
+    H(u, d) = L(x, u, d) + Σ_o c_o(x, u, d) (V(x + o) − V(x)),
+
+written with one-sided differences, so that nothing but the value is read from memory: with D⁺, D⁻ along an
+axis the gain of a drift component f is [(e + h⁻ f) D⁺ − (e − h⁺ f) D⁻]/(h⁺ + h⁻). As a function of u it has
+kinks where f changes sign (and at |f| = a/h under central differences): minimising it is piecewise.
+
+Exact where the drift is affine in u, the cost separable and quadratic, the noise free of u, and the inputs fall into
+groups of one or two that drive components of their own, not too many (read from the jaxpr, see ``players``): all
+ends, kinks and stationary points are tried. Otherwise samples and a pattern search, and certificates hold for the
+refined sample.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from hjbjax.discretisation import chain, edges, slopes, stencil, subcell
+from hjbjax.discretisation.schemes import Eno2, Limited, Scheme, Upwind, Weno5
+from hjbjax.hamiltonian import players
+from hjbjax.hamiltonian.minimisers import UNROLL, Action, best_of, enumerate_actions, refine
+from hjbjax.hamiltonian.piecewise import Kinked, inverse_root, kinked_ball, piecewise_input, piecewise_pair
+from hjbjax.hamiltonian.players import SAMPLES, Player, Setting, shared
+from hjbjax.problem import fields, sets
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import altered
+from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite
+
+INNER = 8  # evaluations written out of a search inside a search: with all 33 XLA gets up to five times the lines
+
+
+@dataclasses.dataclass(frozen=True)
+class Local:
+    """The Hamiltonian around one value function: coordinates, slopes, and how to evaluate H(u, d).
+
+    Attributes:
+      up, down: the slopes that drift sees; D⁺ and D⁻, or those of a scheme of higher order.
+      links: the distances to the neighbours along every axis.
+      bends: D⁺ − D⁻ along every axis, which noise sees.
+      tried: an action of each player that is a candidate beside the samples; with the actions of the last step
+        among them a sampled policy never gets worse.
+      slack: for every axis what is rounding of the drift; None without constrained ends and lost nodes.
+      lost: for every axis whether the next node up and the next node down are lost; None where none is.
+    """
+
+    problem: Problem
+    grid: Grid
+    scheme: Scheme
+    dtype: Any
+    t: Any
+    x: list
+    value: jax.Array
+    up: tuple[jax.Array, ...]
+    down: tuple[jax.Array, ...]
+    bends: tuple[jax.Array, ...]
+    links: tuple[stencil.Links, ...]
+    tried: tuple[Action, Action] | None = None
+    slack: tuple[Any, ...] | None = None
+    lost: tuple[tuple[Any, Any], ...] | None = None
+
+    def gain(self, axis: int, f: Any, a: Any) -> Any:
+        """[(e + h⁻ f) D⁺ − (e − h⁺ f) D⁻]/(h⁺ + h⁻), or with other slopes; infinite where f leaves a constrained end.
+
+        So every candidate for an optimum is judged by what it may do: the kink at f = 0 is among them. A drift that is
+        rounding leads to no lost node, whose value is far above all others.
+        """
+        if self.lost is not None:
+            assert self.slack is not None
+            f = jnp.where(edges.strays(f, self.lost[axis], self.slack[axis]), 0, f)
+        gain = self._free_gain(axis, f, a)
+        out = None if self.slack is None else edges.barred(f, self.grid, axis, self.slack[axis])
+        return gain if out is None else jnp.where(out, jnp.inf, gain)
+
+    def _free_gain(self, axis: int, f: Any, a: Any) -> Any:
+        """What ``gain`` is away from constrained ends; with other slopes f⁺ P⁺ + f⁻ P⁻ + a (D⁺ − D⁻)/(h⁺ + h⁻)."""
+        upwind = jnp.maximum(f, 0) * self.up[axis] + jnp.minimum(f, 0) * self.down[axis]
+        if a is None:
+            return upwind
+        link = self.links[axis]
+        h_up, h_down = link.up, link.down
+        if not isinstance(self.scheme, Upwind):
+            return upwind + jnp.maximum(a, 0) * self.bends[axis] / (h_up + h_down)
+        e = chain.excess(f, a, self.grid, axis, self.scheme, link)
+        upward, downward = (e + h_down * f) / (h_up + h_down), (e - h_up * f) / (h_up + h_down)
+        return upward * self.up[axis] - downward * self.down[axis]
+
+    def at(self, u: Action, d: Action) -> Any:
+        """H(u, d) at every node, in cost per unit time."""
+        f = chain.drift(self.problem, self.x, u, d, self.t, self.dtype)
+        a = chain.diffusion(self.problem, self.x, u, d, self.t, self.dtype)
+        total = chain.running_cost(self.problem, self.x, u, d, self.t, self.dtype)
+        for axis in range(self.grid.ndim):
+            total = total + self.gain(axis, f[axis], chain.along_axis(a, self.grid, axis))
+        for (i, j), entry in a.items():
+            if i != j:
+                total = total + self._diagonal(i, j, entry)
+        return jnp.broadcast_to(total, self.grid.shape)
+
+    def _diagonal(self, i: int, j: int, entry: Any) -> Any:
+        ends = {
+            (p, q): stencil.continued(
+                self.value, self.grid, tuple(p * (k == i) + q * (k == j) for k in range(self.grid.ndim))
+            )
+            for p, q in itertools.product((1, -1), repeat=2)
+        }
+        same, opposite = ends[1, 1] + ends[-1, -1], ends[1, -1] + ends[-1, 1]
+        scale = 2 * self.grid.spacing(i) * self.grid.spacing(j)
+        return (
+            jnp.maximum(entry, 0) * (same - 2 * self.value) + jnp.maximum(-entry, 0) * (opposite - 2 * self.value)
+        ) / scale
+
+
+def at_rest(problem: Problem, grid: Grid, slopes: jax.Array, *, scheme: Scheme) -> Local:
+    """A Hamiltonian with slopes D⁺ = s_i and D⁻ = −s_i everywhere: H = L + Σ s_i |f_i| and what noise adds.
+
+    With s > 0, shape (n,), its minimum is zero exactly where an action rests at no cost, if the cost is not negative.
+    """
+    here = local(problem, grid, jnp.zeros(grid.shape, slopes.dtype), scheme=scheme)
+    one = jnp.ones(grid.shape, slopes.dtype)
+    ups, downs, bends = (tuple(sign * slope * one for slope in slopes) for sign in (1, -1, 2))
+    return dataclasses.replace(here, up=ups, down=downs, bends=bends)
+
+
+def local(
+    problem: Problem, grid: Grid, value: jax.Array, *, scheme: Scheme, t: Any = 0.0, lost: jax.Array | None = None
+) -> Local:
+    """Coordinates and differences around ``value``, tied together so that no loop hoists tables out of itself."""
+    x, value = jax.lax.optimization_barrier((grid.components(value.dtype), value))
+    links = tuple(subcell.links(problem, grid, subcell=scheme.subcell, dtype=value.dtype, t=t))
+    differences = [stencil.one_sided(value, grid, axis, link) for axis, link in enumerate(links)]
+    bends = tuple(up - down for up, down in differences)
+    if isinstance(scheme, Weno5):
+        differences = slopes.weno5(value, grid)
+    elif isinstance(scheme, Eno2):
+        differences = slopes.eno2(value, grid)
+    elif isinstance(scheme, Limited):
+        differences = _limited(problem, grid, x, differences, links, t)
+    up, down = zip(*differences, strict=True)
+    careful = lost is not None or grid.sides("constrained")
+    slack = tuple(edges.slack(problem, grid, t, value.dtype)) if careful else None
+    beside = None if lost is None else edges.beside(lost, grid)
+    return Local(problem, grid, scheme, value.dtype, t, x, value, up, down, bends, links, slack=slack, lost=beside)
+
+
+def _limited(problem: Problem, grid: Grid, x: list, differences: list, links: tuple, t: Any) -> list:
+    """Limited slopes; central ones where noise keeps those monotone, a_ii ≥ h |f_i| for all actions."""
+    found = [stencil.limited(up, down, grid, axis, links[axis]) for axis, (up, down) in enumerate(differences)]
+    if problem.noise is None:
+        return found
+    dtype = differences[0][0].dtype
+    calm: list = [True] * grid.ndim
+    for u, d in itertools.product(sets.probes(problem.controls, dtype), sets.probes(problem.disturbances, dtype)):
+        f = chain.drift(problem, x, u, d, t, dtype)
+        a = chain.diffusion(problem, x, u, d, t, dtype)
+        for axis, link in enumerate(links):
+            left = chain.along_axis(a, grid, axis)
+            calm[axis] &= left >= jnp.maximum(link.up, link.down) * jnp.abs(f[axis])
+    for axis, ((up, down), link) in enumerate(zip(differences, links, strict=True)):
+        inner = calm[axis] & ~stencil.walls(grid, axis)
+        middle = (link.down * up + link.up * down) / (link.up + link.down)
+        found[axis] = (jnp.where(inner, middle, found[axis][0]), jnp.where(inner, middle, found[axis][1]))
+    return found
+
+
+def optimise(here: Local, how: Setting, isaacs: str | None = None) -> tuple[jax.Array, Action, Action]:
+    """min max of H, or max min, as the problem or ``isaacs`` says: the value, the control and the disturbance."""
+    if how.disturbance.choices is None:
+        value, u = best_response(here, how.control, lambda u: (u, []))
+        return value, u, []
+    if how.decoupled:
+        start = _any_action(how.disturbance.choices)
+        _, u = best_response(here, how.control, lambda u: (u, start))
+        value, d = best_response(here, how.disturbance, lambda d: (u, d))
+        return value, u, d
+    if (isaacs or here.problem.isaacs) == "upper":
+        return _nested(here, how.control, how.disturbance, lambda u, d: (u, d))
+    value, d, u = _nested(here, how.disturbance, how.control, lambda d, u: (u, d))
+    return value, u, d
+
+
+def best_response(here: Local, player: Player, join: Callable, most: int = UNROLL) -> tuple[jax.Array, Action]:
+    """One player's optimum against a given action of the other; ``join(mine)`` makes the pair (u, d).
+
+    ``most`` is how many evaluations may be written out, where it samples.
+    """
+    if player.choices is None:
+        return here.at(*join([])), []
+    if player.exact:
+        action = _exact(here, player, join)
+    else:
+        start = _admissible(here, player, join)
+        _, action, _ = _sampled(
+            here, player, lambda action: (here.at(*join(action)), []), weight=1, most=most, start=start
+        )
+    action = jax.lax.optimization_barrier(action)  # or the search is done twice, for the action and for the value
+    return here.at(*join(action)), action
+
+
+def _nested(here: Local, outer: Player, inner: Player, join: Callable) -> tuple[jax.Array, Action, Action]:
+    def objective(action):
+        return best_response(here, inner, lambda reply: join(action, reply), most=INNER)
+
+    if outer.choices is None:
+        value, answer = objective([])
+        return value, [], answer
+    return _sampled(here, outer, objective, weight=inner.weight)
+
+
+def _admissible(here: Local, player: Player, join: Callable) -> Action | None:
+    """At constrained ends an action of a sampled control that does not leave, where that can be found exactly."""
+    if here.slack is None or player.sign < 0:
+        return None
+    free = altered(here.problem, cost=None)
+    alone = players.setting(free, here.grid.ndim, here.dtype).control
+    return _exact(dataclasses.replace(here, problem=free), alone, join) if alone.exact else None
+
+
+def _sampled(
+    here: Local, player: Player, objective: Callable, weight: int, most: int = UNROLL, start: Action | None = None
+) -> Any:
+    assert player.choices is not None
+    points = jnp.asarray(sets.samples(player.choices, SAMPLES), here.dtype)
+    best = enumerate_actions(objective, points, player.sign, weight=weight, most=most)
+    if isinstance(player.choices, Finite):
+        return best
+    project = _projection(player.choices)
+    if start is not None:
+        best = best_of(objective, [start], player.sign, best)
+    if here.tried is not None:
+        best = best_of(objective, [project(here.tried[0 if player.sign > 0 else 1])], player.sign, best)
+    return refine(objective, best, sets.spacing(player.choices, SAMPLES), project, player.sign, weight=weight)
+
+
+def _projection(choices: Box | Ball) -> Callable[[Action], Action]:
+    if isinstance(choices, Box):
+        return lambda action: [jnp.clip(u, choices.lo[j], choices.hi[j]) for j, u in enumerate(action)]
+
+    def onto_ball(action):
+        shrink = jnp.minimum(1, choices.radius * inverse_root(sum(u * u for u in action)))
+        return [shrink * u for u in action]
+
+    return onto_ball
+
+
+def _any_action(choices: AdmissibleSet) -> Action:
+    if isinstance(choices, Ball):
+        return [jnp.zeros(())] * choices.dim
+    first = choices.lo if isinstance(choices, Box) else choices.points[0]
+    return [first[j] for j in range(choices.dim)]
+
+
+def _exact(here: Local, player: Player, join: Callable) -> Action:
+    """The exact optimum over a box or a ball; see ``piecewise`` for why the candidates suffice."""
+    choices = player.choices
+    assert isinstance(choices, (Box, Ball))
+    zero = [jnp.zeros((), here.dtype)] * choices.dim
+    u, d = join(zero)
+    arguments = here.problem.arguments(here.x, u, d, here.t)
+    offsets = chain.drift(here.problem, here.x, u, d, here.t, here.dtype)
+    slopes = [
+        fields.components(player.derivative(here.problem, here.problem.drift, j), *arguments, dtype=here.dtype)
+        for j in range(choices.dim)
+    ]
+    linear, square = zip(*(_cost_coefficients(here, player, arguments, j) for j in range(choices.dim)), strict=True)
+
+    def piece(i: int, group: Sequence[int]) -> Kinked:
+        slope = [slopes[j][i] for j in group]
+        return _kinked(here, (u, d), i, offsets[i], slope[0] if len(group) == 1 else slope)
+
+    if isinstance(choices, Ball):
+        single = [[piece(i, [j]) for i in player.driven[j]] for j in range(choices.dim)]
+        return kinked_ball(player.sign, choices.radius, linear, [p[0] if p else None for p in single])
+    action = list(zero)
+    for group in player.groups:
+        pieces = [piece(i, group) for i in shared(player.driven, group)]
+        lo, hi, slope, bend = ([each[j] for j in group] for each in (choices.lo, choices.hi, linear, square))
+        curved = any(player.curved[j] for j in group)
+        if len(group) == 1:
+            found = [piecewise_input(player.sign, lo[0], hi[0], slope[0], bend[0], pieces, curved=curved)]
+        else:
+            found = piecewise_pair(player.sign, lo, hi, slope, bend, pieces, curved=curved)
+        for j, u in zip(group, found, strict=True):
+            action[j] = u
+    return action
+
+
+def _cost_coefficients(here: Local, player: Player, arguments: tuple, j: int) -> tuple[Any, Any]:
+    """l_j and q_j of a cost l_j u + q_j u² + ... by differentiation at zero."""
+    cost, none = here.problem.cost, jnp.zeros((), here.dtype)
+    if cost is None:
+        return none, none
+    slope = player.derivative(here.problem, cost, j)
+    linear = fields.scalar(slope, *arguments, dtype=here.dtype)
+    if not player.curved[j]:
+        return linear, none
+    return linear, fields.scalar(player.derivative(here.problem, slope, j), *arguments, dtype=here.dtype) / 2
+
+
+def _kinked(here: Local, base: tuple[Action, Action], axis: int, offset: Any, slope: Any) -> Kinked:
+    u, d = base
+    a = chain.diffusion(here.problem, here.x, u, d, here.t, here.dtype)
+    left = chain.along_axis(a, here.grid, axis)
+    up, down = here.up[axis], here.down[axis]
+
+    def gain(f):
+        return here.gain(axis, f, left)
+
+    if left is None or not isinstance(here.scheme, Upwind) or not here.scheme.central:
+        return Kinked(gain, offset, slope, (0.0,), (down, up))
+    h_up, h_down = here.links[axis].up, here.links[axis].down
+    edge = stencil.walls(here.grid, axis)
+    width = jnp.maximum(left, 0)
+    middle = (h_down * up + h_up * down) / (h_up + h_down)
+    kinks = (jnp.where(edge, 0, -width / h_down), 0.0, jnp.where(edge, 0, width / h_up))
+    return Kinked(gain, offset, slope, kinks, (down, jnp.where(edge, down, middle), jnp.where(edge, up, middle), up))

@@ -1,0 +1,174 @@
+"""The two players: what each may do, and how the Hamiltonian depends on it, read from the problem's functions.
+
+The optimum over a player's actions is exact where the drift is affine in them, the cost separable and quadratic, the
+noise free of them, and the inputs of a box fall into groups of one or two that drive components of their own, few
+enough that all their pieces can be tried; in a ball each input drives one component of its own. See ``piecewise``.
+In a game whose players meet in a component, in a cost or in the noise, that holds of the player who answers; the one
+who moves first faces a function with ridges, which is searched.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from hjbjax.problem import structure
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite
+
+SAMPLES = 33  # points of a continuum before refinement
+CELLS = {1: 64, 2: 16}  # by the inputs of a group: combinations of pieces that are tried at most
+
+
+@dataclasses.dataclass(frozen=True)
+class Player:
+    """What one player may do and how the Hamiltonian depends on it; static, known from the jaxpr.
+
+    Attributes:
+      choices: the admissible set, or None.
+      sign: +1 minimises, −1 maximises.
+      exact: whether the optimum is found exactly rather than by samples.
+      driven: for every input the drift components that it drives.
+      groups: the inputs by what they drive together; the groups drive disjoint sets of components.
+      cells: for every group in how many pieces the Hamiltonian may fall.
+      curved: for every input whether the cost may hold its square.
+      fastest_at_ends: whether no action moves the chain faster than all those at the ends of the set do.
+    """
+
+    choices: AdmissibleSet | None
+    sign: int
+    exact: bool
+    driven: tuple[tuple[int, ...], ...]
+    groups: tuple[tuple[int, ...], ...]
+    cells: tuple[int, ...]
+    curved: tuple[bool, ...]
+    fastest_at_ends: bool
+
+    def derivative(self, problem: Problem, function: Callable, j: int) -> Callable:
+        """∂/∂u_j of a function of the problem's arguments, itself one of one state: it varies only as it must."""
+        position = problem.time_dependent + (1 if self.sign > 0 else 2)
+
+        def along(*arguments: Any) -> Any:
+            action = jnp.asarray(arguments[position])
+            unit = jnp.zeros_like(action).at[j].set(1)
+
+            def moved(s: Any) -> Any:
+                result = function(*arguments[:position], action + s * unit, *arguments[position + 1 :])
+                return jnp.asarray(result, action.dtype)
+
+            return jax.jvp(moved, (jnp.zeros((), action.dtype),), (jnp.ones((), action.dtype),))[1]
+
+        return along
+
+    @property
+    def enumerated(self) -> bool:
+        """Whether all of the player's actions are tried, since they are finitely many or there are none."""
+        return isinstance(self.choices, (Finite, type(None)))
+
+    @property
+    def weight(self) -> int:
+        """About how many evaluations of H one optimisation takes."""
+        if self.choices is None:
+            return 1
+        if isinstance(self.choices, Finite):
+            return len(self.choices.points)
+        if not self.exact:
+            return SAMPLES
+        return sum(
+            3 + cells if len(group) == 1 else 10 * cells for group, cells in zip(self.groups, self.cells, strict=True)
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    """Both players and how they meet.
+
+    Attributes:
+      control, disturbance: the players.
+      separable: whether drift and cost are sums of what each player does, and noise is neither's.
+      decoupled: whether they drive different components as well; then the Isaacs condition holds on every grid.
+      disturbance_costs: whether the running cost depends on the disturbance.
+      steers_noise: whether the noise depends on an action.
+      isaacs: who moves first, as in ``Problem``; that player's optimum is searched unless the two are decoupled.
+    """
+
+    control: Player
+    disturbance: Player
+    separable: bool
+    decoupled: bool
+    disturbance_costs: bool
+    steers_noise: bool
+    isaacs: str
+
+    @property
+    def exact(self) -> bool:
+        """Whether min (max) over the sets is exact, which certificates need."""
+        first, second = (self.control, self.disturbance) if self.isaacs == "upper" else (self.disturbance, self.control)
+        if second.choices is not None and not self.decoupled:  # the reply is no polynomial of what it replies to
+            return first.enumerated and (second.exact or second.enumerated)
+        return all(player.exact or player.enumerated for player in (first, second))
+
+
+def setting(problem: Problem, n: int, dtype: Any) -> Setting:
+    """Read from the problem's functions how the Hamiltonian depends on each player."""
+    m = 0 if problem.controls is None else problem.controls.dim
+    k = 0 if problem.disturbances is None else problem.disturbances.dim
+    time = ((None, False),) * problem.time_dependent
+    game = ((k, True),) * problem.is_game
+    arguments = (*time, (n, False), (m, True), *game)
+    drift = structure.dependence(problem.drift, *arguments, dtype=dtype)
+    constant = structure.Dependence((structure.CONSTANT,))
+    cost = constant if problem.cost is None else structure.dependence(problem.cost, *arguments, dtype=dtype)
+    noise = structure.dependence(problem.noise, *arguments, dtype=dtype) if callable(problem.noise) else constant
+    inputs_u, inputs_d = range(m), range(m, m + k)
+    branches = 2 if problem.noise is None else 4  # central differences have three kinks a component
+    mine = _player(problem.controls, 1, inputs_u, drift, cost, noise, branches)
+    theirs = _player(problem.disturbances, -1, inputs_d, drift, cost, noise, branches)
+    separate = not set(drift.driven_by(inputs_u)) & set(drift.driven_by(inputs_d))
+    crossed = any(function.crosses(inputs_u, inputs_d) for function in (drift, cost))
+    separable = not crossed and noise.is_constant
+    return Setting(
+        mine, theirs, separable, separate and separable, not cost.free_of(inputs_d), not noise.is_constant,
+        problem.isaacs,
+    )  # fmt: skip
+
+
+def _player(
+    choices: AdmissibleSet | None,
+    sign: int,
+    inputs: range,
+    drift: structure.Dependence,
+    cost: structure.Dependence,
+    noise: structure.Dependence,
+    branches: int,
+) -> Player:
+    driven = tuple(drift.driven_by([j]) for j in inputs)
+    curved = tuple(cost.has_square([j]) for j in inputs)
+    groups = _groups(driven)
+    cells = tuple(branches ** len(shared(driven, group)) for group in groups)
+    convex = drift.affine_in(inputs) and noise.free_of(inputs)  # so is the rate of leaving a node
+    at_ends = convex or isinstance(choices, (Finite, type(None)))
+    suits = convex and cost.separable_quadratic_in(inputs)
+    if isinstance(choices, Box):
+        suits &= all(count <= CELLS.get(len(group), 0) for group, count in zip(groups, cells, strict=True))
+    elif isinstance(choices, Ball):
+        apart = all(len(group) == 1 for group in groups) and all(len(components) <= 1 for components in driven)
+        suits &= choices.dim <= 3 and not any(curved) and apart
+    return Player(choices, sign, suits and isinstance(choices, (Box, Ball)), driven, groups, cells, curved, at_ends)
+
+
+def _groups(driven: tuple[tuple[int, ...], ...]) -> tuple[tuple[int, ...], ...]:
+    """The inputs in groups that drive no component together."""
+    groups: list[list[int]] = []
+    for j, components in enumerate(driven):
+        meets = [group for group in groups if set(shared(driven, group)) & set(components)]
+        joined = [*(k for group in meets for k in group), j]
+        groups = [group for group in groups if group not in meets] + [joined]
+    return tuple(tuple(sorted(group)) for group in sorted(groups))
+
+
+def shared(driven: tuple[tuple[int, ...], ...], group: Sequence[int]) -> tuple[int, ...]:
+    """The components that a group of inputs drives."""
+    return tuple(sorted({i for j in group for i in driven[j]}))

@@ -1,0 +1,183 @@
+"""The Hamiltonian at one state and costate, and the control that minimises it.
+
+    H(t, x, p, u) = L(t, x, u) + f(t, x, u)·p,      u*(t, x, p) = argmin of H over the admissible set
+
+Unlike on a grid there is no upwinding, so H has no kinks in u. How it depends on u is read from the jaxpr
+(``structure``), and the minimum is found accordingly:
+
+    Finite                            enumerated
+    Box, separable quadratic in u     the stationary point clipped, input by input; an end where H is affine or concave
+    Ball, separable convex quadratic  −(2C + μ)⁻¹b with the multiplier μ ≥ 0 of the radius, by Newton's method
+    anything else                     samples, a pattern search, and Newton steps in the inputs that are not at a bound
+
+Where H is affine in an input of a box, u* jumps between the ends: that input is ``jumping``. Between enumerated
+controls it jumps, too. Everything else is a differentiable function of (x, p) away from a change of the bounds met.
+"""
+
+import dataclasses
+import itertools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.hamiltonian.minimisers import enumerate_actions, refine
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.sets import Ball, Box, Finite, samples, spacing
+from hjbjax.problem.structure import dependence
+
+BUDGET = 64  # samples that start a search
+NEWTON = 24  # steps for the multiplier of a ball, monotone and at last quadratic; an affine H needs none
+
+
+@dataclasses.dataclass(frozen=True)
+class Rule:
+    """How H is minimised, read from the jaxpr; hashable, so that it may be a static argument.
+
+    Attributes:
+      exact: whether the formulas above hold, or a search has to do.
+      jumping: the inputs of a box in which H is affine.
+      finite: whether the controls are enumerated.
+    """
+
+    exact: bool
+    jumping: tuple[int, ...] = ()
+    finite: bool = False
+
+    @property
+    def jumps(self) -> bool:
+        """Whether u* is no continuous function of the costate."""
+        return self.finite or bool(self.jumping)
+
+
+def rule_of(problem: Problem, n: int) -> Rule:
+    """Read from the functions themselves how H depends on the control."""
+    if isinstance(problem.controls, Finite):
+        return Rule(exact=True, finite=True)
+    assert problem.controls is not None
+    inputs = tuple(range(problem.controls.dim))
+    lengths = [(None, False)] * problem.time_dependent + [(n, False), (len(inputs), True)]
+    functions = [problem.drift] if problem.cost is None else [problem.drift, problem.cost]
+    found = [dependence(function, *lengths, dtype=jnp.result_type(float)) for function in functions]
+    if not all(each.separable_quadratic_in(inputs) for each in found):
+        return Rule(exact=False)
+    straight = tuple(j for j in inputs if not any(each.has_square((j,)) for each in found))
+    return Rule(exact=True, jumping=straight if isinstance(problem.controls, Box) else ())
+
+
+def hamiltonian(problem: Problem, t: Any, x: Any, p: Any, u: Any) -> Any:
+    """H(t, x, p, u) in cost units per unit time; ``x`` as the problem's functions want it."""
+    arguments = problem.arguments(x, u, t=t)
+    return running_cost(problem, t, x, u) + jnp.asarray(problem.drift(*arguments), p.dtype) @ p
+
+
+def running_cost(problem: Problem, t: Any, x: Any, u: Any) -> Any:
+    """L, zero without one."""
+    return jnp.asarray(0.0 if problem.cost is None else problem.cost(*problem.arguments(x, u, t=t)), x.dtype)
+
+
+def corners(problem: Problem, rule: Rule) -> Any:
+    """The values between which u* jumps, shape (K, m); NaN in inputs of a box that do not jump."""
+    if isinstance(problem.controls, Finite):
+        return jnp.asarray(problem.controls.points)
+    assert isinstance(problem.controls, Box)
+    ends = [(problem.controls.lo[j], problem.controls.hi[j]) for j in rule.jumping]
+    rows = []
+    for choice in itertools.product(*ends):
+        at = dict(zip(rule.jumping, choice, strict=True))
+        rows.append(jnp.stack([jnp.asarray(at.get(j, jnp.nan), float) for j in range(problem.controls.dim)]))
+    return jnp.stack(rows)
+
+
+def at_corner(problem: Problem, rule: Rule, t: Any, x: Any, p: Any, corner: Any) -> Any:
+    """The control with its jumping inputs as in ``corner``, and the others at their minimum."""
+    if rule.finite or len(rule.jumping) == np.shape(corner)[-1]:
+        return corner
+    chosen = jnp.array([j in rule.jumping for j in range(np.shape(corner)[-1])])
+    return jnp.where(chosen, corner, minimiser(problem, rule, t, x, p))
+
+
+def minimiser(problem: Problem, rule: Rule, t: Any, x: Any, p: Any) -> Any:
+    """u*, shape (m,)."""
+    choices = problem.controls
+
+    def energy(u):
+        return hamiltonian(problem, t, x, p, u)
+
+    if isinstance(choices, Finite):
+        points = jnp.asarray(choices.points, p.dtype)
+        return points[jnp.argmin(jax.vmap(energy)(points))]
+    if not rule.exact:
+        return _searched(choices, energy, p.dtype)
+    assert choices is not None
+    zero = jnp.zeros(choices.dim, p.dtype)
+    slope, square = jax.grad(energy)(zero), jnp.diagonal(jax.hessian(energy)(zero)) / 2
+    if isinstance(choices, Box):
+        return _in_box(jnp.asarray(choices.lo, p.dtype), jnp.asarray(choices.hi, p.dtype), slope, square)
+    return _in_ball(jnp.asarray(choices.radius, p.dtype), slope, square)
+
+
+def _in_box(lo: Any, hi: Any, slope: Any, square: Any) -> Any:
+    """The minimum of b·u + Σ c_j u_j², input by input."""
+    convex = square > 0
+    inner = jnp.clip(-slope / jnp.where(convex, 2 * square, 1), lo, hi)
+    end = jnp.where(slope * lo + square * lo * lo <= slope * hi + square * hi * hi, lo, hi)
+    return jnp.where(convex, inner, end)
+
+
+def _in_ball(radius: Any, slope: Any, square: Any) -> Any:
+    """The minimum of b·u + Σ c_j u_j², c ≥ 0, over |u| ≤ r: u = −b/(2c + μ); the centre where b = 0.
+
+    1/|u| − 1/r is concave and increasing in μ, so Newton's method from the left rises to the root. Where c is one
+    number it is linear, and the first μ is the root.
+    """
+    curvature = jnp.maximum(2 * square, 0)
+    size = jnp.sqrt(jnp.maximum(slope @ slope, jnp.finfo(slope.dtype).tiny))
+    inner = -slope / jnp.where(curvature > 0, curvature, 1)
+    inside = jnp.all((curvature > 0) | (slope == 0)) & (inner @ inner <= radius * radius)
+    mu = jnp.maximum(size / radius - jnp.max(curvature), 0)
+
+    def newton(_, mu):
+        parts = jnp.where(curvature + mu > 0, curvature + mu, 1)
+        u = slope / parts
+        norm = jnp.sqrt(jnp.maximum(u @ u, jnp.finfo(slope.dtype).tiny))
+        rise = jnp.maximum((u / parts) @ u, jnp.finfo(slope.dtype).tiny)  # −½ d|u|²/dμ
+        return jnp.maximum(mu + (norm / radius - 1) * norm * norm / rise, 0)
+
+    mu = jax.lax.fori_loop(0, NEWTON, newton, mu)
+    bound = -slope / jnp.where(curvature + mu > 0, curvature + mu, 1)
+    return jnp.where(inside, inner, bound)
+
+
+def _searched(choices: Any, energy: Any, dtype: Any) -> Any:
+    """Samples, a pattern search, and Newton's method in the free inputs.
+
+    The last Newton step carries the derivative of the implicit function, which the search has not.
+    """
+    count = choices.dim
+
+    def project(action):
+        u = jnp.stack(action)
+        if isinstance(choices, Ball):
+            return list(u * jnp.minimum(1, choices.radius / jnp.maximum(jnp.linalg.norm(u), 1e-300)))
+        return list(jnp.clip(u, choices.lo, choices.hi))
+
+    def objective(action):
+        return energy(jnp.stack([jnp.asarray(entry, dtype) for entry in action])), []
+
+    best = enumerate_actions(objective, jnp.asarray(samples(choices, BUDGET), dtype), 1)
+    u = jnp.stack(refine(objective, best, spacing(choices, BUDGET), project, 1)[1])
+    for _ in range(3):
+        u = jax.lax.stop_gradient(u)
+        gradient, bend = jax.grad(energy)(u), jax.hessian(energy)(u)
+        if isinstance(choices, Ball):
+            free = jnp.full(count, jnp.linalg.norm(u) < choices.radius * (1 - 1e-6))
+        else:
+            room = 1e-6 * (choices.hi - choices.lo)
+            free = (u > choices.lo + room) & (u < choices.hi - room)
+        matrix = jnp.where(free[:, None] & free[None, :], bend, jnp.eye(count, dtype=dtype))
+        convex = jnp.all(jnp.linalg.eigvalsh(jax.lax.stop_gradient(matrix)) > 0)
+        step = jnp.linalg.solve(matrix, jnp.where(free, gradient, 0))
+        u = jnp.where(convex, jnp.stack(project(list(u - step))), u)
+    return u

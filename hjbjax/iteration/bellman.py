@@ -1,0 +1,232 @@
+"""One step: the residual of the variational inequality, the greedy policy, and the linear equation it leaves.
+
+At a node that is not held, with r = min_u max_d H(u, d) − β V in cost per unit time and s = r/(Q + β) its
+size in cost units (the Bellman operator of the chain is T V = V + s at the greedy action),
+
+    residual = max(min(s, ψ − V), g − V),      V ← V + residual  is  V ← max(g, min(ψ, T V)).
+
+Nodes on the target, and rest points of an undiscounted problem, are held at given values. For one policy the
+equation is linear: δ = s + Σ_o w_o δ(x + o) with weights w_o = c_o/(Q + β), and s, w = ψ − V, 0 (or g − V, 0)
+where the constraint is the active branch. That correction is what every method solves, exactly or roughly.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from hjbjax.discretisation import chain, stencil, subcell
+from hjbjax.discretisation.chain import Rates
+from hjbjax.discretisation.schemes import Scheme
+from hjbjax.hamiltonian import hamiltonian, players
+from hjbjax.problem import fields, sets
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import node
+
+ROUNDING = 8  # units of eps in (Q + β)|V|, below which one action is no better than another
+
+
+@node()
+class Conditions:
+    """What the value obeys beside the equation itself, at every node.
+
+    Args:
+      held: bool (*grid), where the value is given.
+      given: the value there, (*grid) or a number.
+      stop: ψ at the nodes, or None.
+      floor: g at the nodes, or None.
+      ended: bool (*grid), the held nodes that are targets, where no action is taken any more.
+      least_exit: the least exit cost on boundaries between the nodes, a number; zero if none is negative.
+    """
+
+    held: Any
+    given: Any
+    stop: Any = None
+    floor: Any = None
+    ended: Any = False
+    least_exit: Any = 0.0
+
+    def impose(self, value: jax.Array) -> jax.Array:
+        """``value`` with the given values put in and the constraints respected: max(g, min(ψ, V))."""
+        if self.stop is not None:
+            value = jnp.minimum(value, self.stop)
+        if self.floor is not None:
+            value = jnp.maximum(value, self.floor)
+        return jnp.where(self.held, self.given, value)
+
+    def acting(self, value: jax.Array) -> Any:
+        """The nodes at which actions matter, bool (*grid): not held, and no constraint is the active branch."""
+        acts = ~self.held
+        if self.stop is not None:
+            acts &= value < self.stop
+        return acts if self.floor is None else acts & (value > self.floor)
+
+
+@node()
+class Greedy:
+    """The greedy policy of a value function and what it leaves unsolved.
+
+    Args:
+      rate: r = min max H − β V, (*grid), cost per unit time; zero where held.
+      controls: the m components of u, each (*grid).
+      disturbances: the components of d, each (*grid).
+    """
+
+    rate: jax.Array
+    controls: tuple[jax.Array, ...]
+    disturbances: tuple[jax.Array, ...]
+
+
+@node()
+class Correction:
+    """The linear equation δ = source + Σ_o weights_o δ(x + o) for a correction δ of the value, in cost units.
+
+    ``fastest`` is the largest Q + β of the policy that it belongs to, per unit time, or what ``correction`` was told.
+    """
+
+    source: jax.Array
+    weights: Rates
+    fastest: Any = None
+
+
+def conditions(problem: Problem, grid: Grid, dtype: Any, t: Any = 0.0) -> Conditions:
+    """Target, stopping cost and running maximum at the nodes."""
+    exit_cost, stop, floor = (
+        None if ingredient is None else at_nodes(problem, grid, ingredient, dtype, t)
+        for ingredient in (problem.exit_cost, problem.stopping_cost, problem.running_max)
+    )
+    held = jnp.zeros(grid.shape, bool) if problem.target is None else subcell.level(problem, grid, dtype, t) <= 0
+    given = jnp.zeros((), dtype) if exit_cost is None else jnp.where(held, exit_cost, 0)
+    return Conditions(held, given, stop, floor, ended=held)
+
+
+def at_nodes(problem: Problem, grid: Grid, ingredient: Any, dtype: Any, t: Any = 0.0) -> jax.Array:
+    """A function of the state alone, or a number, at every node, shape (*grid); None is zero."""
+    return jnp.broadcast_to(fields.of_state(problem, ingredient, grid.components(dtype), t, dtype), grid.shape)
+
+
+def greedy(
+    problem: Problem,
+    grid: Grid,
+    value: jax.Array,
+    held: jax.Array,
+    *,
+    scheme: Scheme,
+    t: Any = 0.0,
+    incumbent: Greedy | None = None,
+    lost: jax.Array | None = None,
+) -> Greedy:
+    """The optimal actions at ``value`` and the rate r that is left; an incumbent policy is among the candidates.
+
+    To the nodes that are ``lost``, bool (*grid), no drift leads that is only rounding.
+    """
+    how = players.setting(problem, grid.ndim, value.dtype)
+    here = _around(problem, grid, value, scheme, t, incumbent, lost)
+    return _left_over(problem, grid, value, held, *hamiltonian.optimise(here, how))
+
+
+def kept(
+    problem: Problem, grid: Grid, value: jax.Array, fixed: jax.Array, new: Greedy, old: Greedy, *, scheme: Scheme
+) -> Greedy:
+    """The new policy where it is better by more than rounding or where nodes are ``fixed``, else the old one.
+
+    From a policy that ends, one improvement after the other then keeps it so: among actions that are worth the same
+    the first one found leads to where its value came from, and another one may go round. There is no disturbance.
+    """
+    here, u = _around(problem, grid, value, scheme, 0.0, None), list(old.controls)
+    rates = chain.rates(problem, grid, u, [], scheme=scheme.chain, dtype=value.dtype)
+    rounding = ROUNDING * jnp.finfo(value.dtype).eps * (rates.total() + problem.discount) * jnp.abs(value)
+    rate = here.at(u, []) - problem.discount * value
+    stays = ~fixed & (rate <= new.rate + rounding)
+    controls = (jnp.where(stays, before, after) for before, after in zip(old.controls, new.controls, strict=True))
+    return Greedy(jnp.where(stays, rate, new.rate), tuple(controls), ())
+
+
+def respond(
+    problem: Problem,
+    grid: Grid,
+    value: jax.Array,
+    held: jax.Array,
+    current: Greedy,
+    *,
+    scheme: Scheme,
+    t: Any = 0.0,
+    lost: jax.Array | None = None,
+) -> Greedy:
+    """The inner player's best answer to the outer player's current policy, in a game."""
+    how = players.setting(problem, grid.ndim, value.dtype)
+    here = _around(problem, grid, value, scheme, t, current, lost)
+    u, d = list(current.controls), list(current.disturbances)
+    if problem.isaacs == "upper":
+        best, d = hamiltonian.best_response(here, how.disturbance, lambda d: (u, d))
+    else:
+        best, u = hamiltonian.best_response(here, how.control, lambda u: (u, d))
+    return _left_over(problem, grid, value, held, best, u, d)
+
+
+def _around(
+    problem: Problem, grid: Grid, value: Any, scheme: Scheme, t: Any, policy: Greedy | None, lost: Any = None
+) -> Any:
+    here = hamiltonian.local(problem, grid, value, scheme=scheme, t=t, lost=lost)
+    if policy is None:
+        return here
+    return dataclasses.replace(here, tried=(list(policy.controls), list(policy.disturbances)))
+
+
+def _left_over(problem: Problem, grid: Grid, value: Any, held: Any, best: Any, u: list, d: list) -> Greedy:
+    rate = jnp.where(held, 0, best - problem.discount * value)
+    full = [tuple(jnp.broadcast_to(jnp.asarray(c, value.dtype), grid.shape) for c in action) for action in (u, d)]
+    return Greedy(rate, *full)
+
+
+def correction(
+    problem: Problem,
+    grid: Grid,
+    value: jax.Array,
+    policy: Greedy,
+    rules: Conditions,
+    *,
+    scheme: Scheme,
+    t: Any = 0.0,
+    fastest: Any = None,
+) -> Correction:
+    """The linear equation for δ under one policy; the active branch of the constraints is chosen node by node.
+
+    ``fastest``, where it is known of the same policy and time, spares a pass over the nodes. Zero spares it, too: then
+    every rate counts, however small it is beside the others.
+    """
+    u, d = list(policy.controls), list(policy.disturbances)
+    rates = chain.rates(problem, grid, u, d, scheme=scheme.chain, dtype=value.dtype, t=t)
+    leaving = rates.total() + problem.discount
+    fastest = jnp.max(leaving) if fastest is None else fastest
+    moves = leaving > 8 * jnp.finfo(value.dtype).eps * fastest  # a drift that cancels leaves rounding
+    pace = jnp.where(moves, leaving, jnp.where(fastest > 0, fastest, 1))  # where nothing moves the cost piles up
+    source, free = policy.rate / pace, ~rules.held
+    if rules.stop is not None:
+        stops = free & (rules.stop - value < source)
+        source, free = jnp.where(stops, rules.stop - value, source), free & ~stops
+    if rules.floor is not None:
+        floored = ~rules.held & (rules.floor - value > source)
+        source, free = jnp.where(floored, rules.floor - value, source), free & ~floored
+    weights = rates.scaled(jnp.where(free, 1 / pace, 0))
+    if scheme.subcell:  # what leads to a held node ends on the target's boundary, where nothing is to be corrected
+        loose = ~rules.held
+        jumps = zip(weights.offsets, weights.values, strict=True)
+        cut = tuple(jnp.where(stencil.neighbour(loose, grid, offset), w, 0) for offset, w in jumps)
+        weights = dataclasses.replace(weights, values=cut)
+    return Correction(source, weights, fastest)
+
+
+def fastest_rate(problem: Problem, grid: Grid, *, scheme: Scheme, dtype: Any, t: Any = 0.0) -> jax.Array:
+    """max over the actions of Q at every node, (*grid): with Δt = 1/(Q + β) value iteration is monotone.
+
+    Q is convex in u for a drift affine in u, so that corners of the sets suffice; samples are added for others.
+    """
+    result = jnp.zeros(grid.shape, dtype)
+    for u in sets.probes(problem.controls, dtype):
+        for d in sets.probes(problem.disturbances, dtype):
+            rates = chain.rates(problem, grid, u, d, scheme=scheme.chain, dtype=dtype, t=t)
+            result = jnp.maximum(result, rates.total())
+    return result

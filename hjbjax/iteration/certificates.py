@@ -1,0 +1,159 @@
+"""Bounds on the distance from a value function to the exact solution of the discrete equation.
+
+Discounted: with ρ = max(min(r/β, ψ − V), g − V) at every node (zero where held)
+
+    V + min ρ ≤ V_h ≤ V + max ρ.
+
+Undiscounted with running cost L > 0, exit cost ≥ 0 and V ≥ 0: with L the least running cost at a node,
+
+    V/(1 + η) ≤ V_h ≤ V/(1 − ρ),    ρ = max(r/L)⁺ < 1,   η = max((−r)⁺/L),
+
+because scaling a super- or subsolution scales its generator part and not its cost. Minimum time is L = 1. A
+constant may be added to an undiscounted V: where an exit cost is negative all of it is lifted to zero first. A stopping
+cost ψ changes little: V ≤ ψ is imposed and where V = ψ nothing bounds V_h from above but ψ itself, so that such nodes
+count for η alone.
+A factor 1/(1 − ρ) beyond ε^{-1/2}, ε the unit of rounding, is no bound: its 1 − ρ may be rounding of r and L alone,
+and it says nothing anyway. Both follow from the comparison principle of a monotone scheme; they bound the algebraic
+error and not the error of the grid, hold where the minimum over the actions is exact, and want float64.
+"""
+
+import enum
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.iteration.bellman import Conditions, Correction, Greedy
+from hjbjax.problem.pytree import is_traced, node
+
+LOST = 4  # roundings of numbers of the size lift · max(factor, 1) in factor · V + shift
+
+
+class Certificate(enum.Enum):
+    """Which bound a problem admits; the value says so in words."""
+
+    ADDITIVE = "from the discount, V + min r/β ≤ V_h ≤ V + max r/β"
+    MULTIPLICATIVE = "from the running cost, V/(1 + η) ≤ V_h ≤ V/(1 − ρ)"
+    BY_DISCOUNT = "from the discount where that is positive, else from the running cost"
+    RESIDUAL = "the second-order equation, whose residual this is, has no comparison principle"
+    OPEN = "open ends continue the value from inside, and have no comparison principle"
+    NONE = "without discount and positive running cost the residual bounds nothing"
+
+
+@node()
+class Gap:
+    """How far the bounds are from the value.
+
+    Args:
+      below, above: what bounds V_h: V + shift where additive, (V + lift) · factor − lift where multiplicative.
+      lift: what makes every exit cost non-negative.
+      error: the largest |bound − V| over the nodes that count, cost units; without a certificate the size of the
+        last correction or of the residual.
+      residual: the largest |residual| in cost units.
+    """
+
+    below: jax.Array
+    above: jax.Array
+    lift: jax.Array
+    error: jax.Array
+    residual: jax.Array
+
+
+def gap(
+    kind: Certificate,
+    value: jax.Array,
+    policy: Greedy,
+    equation: Correction,
+    rules: Conditions,
+    *,
+    discount: Any,
+    least_cost: Any,
+    counted: Any,
+    moved: Any,
+) -> Gap:
+    """The certificate of ``value``.
+
+    Args:
+      kind: which bound applies.
+      value: V.
+      policy: the greedy policy at V with its rate r, zero where held.
+      equation: the correction equation there, whose source is the residual.
+      rules: held nodes and constraints.
+      discount: β.
+      least_cost: L at every node, for the multiplicative bound.
+      counted: bool (*grid), the nodes whose error counts (those that reach the target).
+      moved: the size of the last correction, the fallback measure.
+    """
+    residual = jnp.max(jnp.where(counted, jnp.abs(equation.source), 0))
+    free = counted & ~rules.held
+    zero = jnp.zeros_like(residual)
+    if kind is Certificate.BY_DISCOUNT:
+        other = Certificate.NONE if least_cost is None else Certificate.MULTIPLICATIVE
+        known = {"least_cost": least_cost, "counted": counted, "moved": moved}
+        rate = jnp.where(discount > 0, discount, 1)
+        with_it, without = (
+            gap(each, value, policy, equation, rules, discount=rate, **known) for each in (Certificate.ADDITIVE, other)
+        )
+        if other is Certificate.NONE:  # bounds that say nothing
+            without = Gap(zero, zero + jnp.inf, zero + jnp.inf, without.error, residual)
+        return jax.tree.map(lambda mine, theirs: jnp.where(discount > 0, mine, theirs), with_it, without)
+    if kind is Certificate.ADDITIVE:
+        if rules.stop is None and rules.floor is None:
+            below, above = jnp.min(policy.rate) / discount, jnp.max(policy.rate) / discount
+        else:
+            shift = policy.rate / discount
+            if rules.stop is not None:
+                shift = jnp.minimum(shift, rules.stop - value)
+            if rules.floor is not None:
+                shift = jnp.maximum(shift, rules.floor - value)
+            shift = jnp.where(rules.held, 0, shift)
+            below, above = jnp.min(shift), jnp.max(shift)
+        return Gap(below, above, zero, jnp.maximum(jnp.abs(below), jnp.abs(above)), residual)
+    if kind is Certificate.MULTIPLICATIVE:
+        safe = jnp.where(free & (least_cost > 0), least_cost, 1)
+        relative = jnp.where(free, jnp.where(least_cost > 0, policy.rate / safe, jnp.sign(policy.rate) * jnp.inf), 0)
+        rising = relative if rules.stop is None else jnp.where(value < rules.stop, relative, 0)
+        rho, eta = jnp.maximum(jnp.max(rising), 0), jnp.maximum(jnp.max(-relative), 0)
+        priced = jnp.all(~free | (least_cost > 0))
+        sound = priced & (1 - rho > jnp.sqrt(jnp.finfo(rho.dtype).eps))  # a V flat somewhere has r = L up to rounding
+        below, above = 1 / (1 + eta), jnp.where(sound, 1 / jnp.where(sound, 1 - rho, 1), jnp.inf)
+        lift = jnp.maximum(-lowest_end(rules, counted), 0)
+        lifted = jnp.where(counted, value + lift, 0)
+        apart = jnp.where(jnp.isinf(above), 0, jnp.maximum(above - 1, 1 - below))  # no 0 · inf
+        error = jnp.where(jnp.isinf(above), jnp.inf, jnp.max(lifted) * apart)
+        error = jnp.where(jnp.all(lifted >= 0), error, jnp.inf) + 0 * residual  # a NaN stays one
+        return Gap(below, above, jnp.where(priced, lift, jnp.inf), error, residual)
+    return Gap(zero, zero, zero, jnp.maximum(residual, moved), residual)
+
+
+def lowest_end(rules: Conditions, counted: Any) -> jax.Array:
+    """The least of zero and of what may be paid at the end of a run: exit costs, between nodes as well, and ψ."""
+    lowest = jnp.minimum(jnp.min(jnp.where(counted & rules.held, rules.given, 0)), rules.least_exit)
+    return lowest if rules.stop is None else jnp.minimum(lowest, jnp.min(jnp.where(counted, rules.stop, 0)))
+
+
+def enclosure(kind: Certificate, measured: Gap, discount: Any = None) -> Any:
+    """Both bounds as affine functions of V: rows lower and upper, columns factor and shift, shape (2, 2).
+
+    (V + lift) · factor − lift cancels where V is near −lift, as on a target with a negative exit cost; the shift is
+    rounded outwards by what that costs. ``None`` without a certificate.
+    """
+    if kind is Certificate.BY_DISCOUNT:
+        with_it, without = (enclosure(each, measured) for each in (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE))
+        return jnp.where(discount > 0, with_it, without)
+    if kind not in (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE):
+        return None
+    xp: Any = jnp if is_traced(measured) else np
+    below, above, lift = (xp.asarray(number) for number in (measured.below, measured.above, measured.lift))
+
+    def line(side: Any, outwards: int) -> Any:
+        one = xp.ones_like(side)
+        if kind is Certificate.ADDITIVE:
+            return xp.stack([one, side])
+        endless = xp.isinf(side) | xp.isinf(lift)
+        factor, lifted = xp.where(endless, one, side), xp.where(endless, 0 * one, lift)  # no 0 · inf
+        lost = LOST * xp.finfo(side.dtype).eps * lifted * xp.maximum(factor, 1) * (factor != 1)
+        return xp.stack([factor, xp.where(endless, outwards * xp.inf, lifted * (factor - 1) + outwards * lost)])
+
+    return xp.stack([line(below, -1), line(above, 1)])

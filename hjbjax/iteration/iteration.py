@@ -1,0 +1,389 @@
+"""Many steps: value iteration and policy iteration as one loop.
+
+Every method repeats the same step. At V the greedy policy leaves a residual; the linear equation of that
+policy gives a correction δ; V + δ is the next value. What differs is how well the equation is solved: value
+iteration takes its diagonal with the largest rate (monotone, a contraction), modified policy iteration a few
+Gauss–Seidel sweeps, policy iteration (Howard; semismooth Newton) solves it. In a game the outer player's policy
+is kept while the inner player's problem is improved (Hoffman–Karp); improving both at once may cycle.
+
+The loop stops by the certificate of the value it returns, not by the size of a step, and tests finiteness: a
+NaN residual is never taken for convergence.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.discretisation import chain, edges, stencil
+from hjbjax.discretisation.schemes import Limited, Scheme
+from hjbjax.hamiltonian import players
+from hjbjax.iteration import bellman, certificates, relaxation
+from hjbjax.iteration.bellman import Conditions, Correction, Greedy
+from hjbjax.iteration.certificates import Certificate, Gap
+from hjbjax.iteration.relaxation import Evaluation, Sweeps
+from hjbjax.problem import arguments
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import altered, is_traced, node
+from hjbjax.solution.status import Status
+
+FULL_STEPS = 10  # corrections of a limited scheme before they are halved, which ends limit cycles of the limiter
+SHIFT = 1.2  # by which the time of a pseudo-step grows; at 2 other solutions of the equation with open ends are found
+SHIFTS = 150  # steps after which there is no shift any more: 1.2¹⁵⁰ is 10¹²
+HISTORY = 256  # steps whose residuals one chunk can record
+GROWTH = 1e6  # a residual that has grown by this factor over its smallest has diverged
+CLIMB = 100_000  # steps of value iteration without progress: without discount V climbs by L Δt a step for long
+TO_THE_END = (Certificate.NONE, Certificate.BY_DISCOUNT)  # of tubes: V falls or climbs until nothing moves
+PATIENCE = 10  # steps without progress of a residual that is rounding
+ROUNDING = 64  # residuals below this many units in the last place of max|V| are rounding
+
+
+@node()
+class ValueIteration:
+    """V ← max(g, min(ψ, V + (min max H − β V)/(max_u Q + β))): monotone, converges from every guess.
+
+    The error falls by 1/(1 + βΔt) a step: many cheap steps. For reference, for games, and where memory rules.
+    """
+
+
+@node(static=("replies",))
+class PolicyIteration:
+    """Improve the policy, evaluate it, repeat; the evaluation is what distinguishes the methods of this family.
+
+    Args:
+      evaluation: ``Sweeps(count)`` is modified policy iteration; ``Krylov()`` and ``Direct()`` are Howard's.
+      replies: in a game, the inner player's improvements for each of the outer player's, at most.
+    """
+
+    evaluation: Evaluation = Sweeps()
+    replies: int = 20
+
+    def __post_init__(self):
+        relaxation.check_evaluation(self.evaluation, "PolicyIteration: evaluation")
+        arguments.count(self.replies, "PolicyIteration: replies")
+
+
+@node(static=("coarsest",))
+class Nested:
+    """Solve on coarser grids first, and start each finer one from the interpolated answer.
+
+    From a cold start the count of policy improvements grows with N, one cell of good policy an improvement; from
+    the coarser grid's answer it stays at a few. Host level only: every level is compiled on its own.
+
+    Args:
+      inner: what runs on each level.
+      coarsest: do not go on to grids with fewer nodes than this.
+    """
+
+    inner: PolicyIteration | ValueIteration = PolicyIteration()
+    coarsest: int = 2000
+
+    def __post_init__(self):
+        wanted = "hjb.PolicyIteration(...) or hjb.ValueIteration()"
+        arguments.one_of(self.inner, "Nested: inner", (PolicyIteration, ValueIteration), wanted)
+        arguments.count(self.coarsest, "Nested: coarsest")
+
+
+Method = ValueIteration | PolicyIteration | Nested
+
+
+@node(static=("scheme", "certificate", "has_lost"))
+class Task:
+    """All that stays the same during a solve.
+
+    Args:
+      problem, grid: the question.
+      method: how the correction is made.
+      rules: held nodes and constraints.
+      counted: bool (*grid), nodes that have a finite value.
+      least_cost: the least running cost at each node, for the multiplicative certificate; else None.
+      pace: max Q + β at each node, for value iteration and for open ends; else None.
+      tol: certified error to reach, cost units.
+      scheme, certificate: static choices.
+      crossing: the time that it takes to cross the box at the largest speeds, where that was asked for; else None.
+      has_lost: whether nodes that do not count may lie beside others, so that no action may lead there.
+    """
+
+    problem: Problem
+    grid: Grid
+    method: Method
+    rules: Conditions
+    counted: jax.Array
+    least_cost: jax.Array | None
+    pace: jax.Array | None
+    tol: Any
+    scheme: Scheme
+    certificate: Certificate
+    crossing: Any = None
+    has_lost: bool = False
+
+    @property
+    def lost(self) -> jax.Array | None:
+        """The nodes to which no action may lead, bool (*grid), or None."""
+        return ~self.counted if self.has_lost else None
+
+    @property
+    def constrained(self) -> bool:
+        """Whether the problem has a stopping cost or a running maximum."""
+        return self.problem.stopping_cost is not None or self.problem.running_max is not None
+
+    def impose(self, value: jax.Array) -> jax.Array:
+        """``value`` with what is given put in, and with nodes that are lost far above all others."""
+        value = self.rules.impose(value)
+        if not self.has_lost:
+            return value
+        largest = jnp.max(jnp.where(self.counted, jnp.abs(value), 0))
+        return jnp.where(self.counted, value, largest / jnp.sqrt(jnp.finfo(value.dtype).eps))
+
+    def start(self) -> jax.Array:
+        """Where to start without a guess: zero, or without discount ψ, above all fixed points, or g, below them."""
+        zero = jnp.zeros(self.grid.shape, self.tol.dtype)
+        if not self.constrained or self.certificate is Certificate.ADDITIVE:
+            return zero
+        floor, stop = self.rules.floor, self.rules.stop
+        start = floor if stop is None else stop if floor is None else jnp.maximum(floor, stop)
+        return jnp.asarray(jnp.broadcast_to(start, self.grid.shape), self.tol.dtype)
+
+
+@node()
+class State:
+    """Where the iteration stands: a value, its greedy policy, its certificate, and the loop's book-keeping.
+
+    ``fastest`` is the policy's largest Q + β, zero where every rate counts (under a discount), infinite before the look
+    at a guess.
+    """
+
+    value: jax.Array
+    policy: Greedy
+    fastest: jax.Array
+    gap: Gap
+    step: jax.Array
+    best: jax.Array
+    since_best: jax.Array
+    code: jax.Array
+    history: jax.Array
+
+
+def begin(task: Task, guess: Any) -> State:
+    """The state before the first look at a guess; step −1 of ``run`` is that look, so that all is one program.
+
+    The guess is copied, since states are donated. At host level there is nothing to compile.
+    """
+    traced = is_traced(task, guess)
+    xp: Any = jnp if traced else np
+    value = jnp.array(guess) if traced else jax.device_put(guess, may_alias=False)
+    dtype, shape = guess.dtype, task.grid.shape
+    inputs = [0 if choices is None else choices.dim for choices in (task.problem.controls, task.problem.disturbances)]
+    policy = Greedy(xp.zeros(shape, dtype), *(tuple(xp.zeros(shape, dtype) for _ in range(m)) for m in inputs))
+    infinite = xp.asarray(xp.inf, dtype)
+    gap = Gap(-infinite, infinite, xp.zeros((), dtype), infinite, infinite)
+    counter = xp.zeros((), xp.int32)
+    code = xp.asarray(int(Status.RUNNING), xp.int32)
+    history = xp.full(HISTORY, -1, dtype)  # no NaN, which jax_debug_nans would take for a fault
+    return State(value, policy, infinite, gap, counter - 1, xp.stack([infinite] * 2), counter, code, history)
+
+
+def run(task: Task, state: State, until: Any) -> State:
+    """Steps until the state is no longer running or ``until`` steps are done; at most ``HISTORY`` at a time."""
+    start = state.step
+
+    def goes_on(state):
+        return (state.code == Status.RUNNING) & (state.step < until)
+
+    def step(state):
+        # loop variant, or XLA compiles a kernel for every scalar of every action that it can hoist
+        controls, grid, count = jax.lax.optimization_barrier((task.problem.controls, task.grid, state.step))
+        here = dataclasses.replace(task, problem=altered(task.problem, controls=controls), grid=grid)
+        return advance(here, dataclasses.replace(state, step=count), start)
+
+    return jax.lax.while_loop(goes_on, step, state)
+
+
+def advance(task: Task, state: State, start: Any) -> State:
+    """One step; a step that ends in numbers that are not finite is taken back."""
+    stay = jnp.zeros_like(state.value)
+    delta = jax.lax.cond(state.step < 0, lambda: stay, lambda: _correct(task, state))
+    if isinstance(task.scheme, Limited):
+        delta = jnp.where(state.step < FULL_STEPS, 1.0, 0.5).astype(delta.dtype) * delta
+    value = task.impose(state.value + delta)
+    moved = jnp.max(jnp.abs(jnp.where(task.counted, value - state.value, 0)))
+    if task.certificate is Certificate.OPEN and not isinstance(task.method, ValueIteration):
+        moved = moved * _held_back(task, state)
+    policy, fastest, measured = _look(task, value, state.policy, moved=moved, first=state.step < 0)
+    measured = dataclasses.replace(measured, error=jnp.where(_unmeasured(task, state), jnp.inf, measured.error))
+    measures = jnp.stack([measured.error, measured.residual])
+    since = jnp.where(jnp.any(measures < state.best), 0, state.since_best + 1)
+    code = _judge(task, value, measured, state.best, since)
+    history = state.history.at[state.step - start].set(measured.residual)
+    best = jnp.fmin(state.best, measures)
+    new = State(value, policy, fastest, measured, state.step + 1, best, since, code, history)
+    old = dataclasses.replace(state, step=new.step, since_best=since, code=code, history=history)
+    return jax.tree.map(lambda after, before: jnp.where(code == Status.NONFINITE, before, after), new, old)
+
+
+def broken(task: Task, state: State) -> jax.Array:
+    """Where value or rate are not finite in the step that a NONFINITE state took back, bool (*grid)."""
+    state = dataclasses.replace(state, step=state.step - 1)
+    stay = jnp.zeros_like(state.value)
+    delta = jax.lax.cond(state.step < 0, lambda: stay, lambda: _correct(task, state))
+    value = task.impose(state.value + delta)
+    rate = bellman.greedy(task.problem, task.grid, value, task.rules.held, scheme=task.scheme, lost=task.lost).rate
+    return task.counted & ~(jnp.isfinite(value) & jnp.isfinite(rate))
+
+
+def _unmeasured(task: Task, state: State) -> Any:
+    """Without a certificate a step must have been taken before its size says anything."""
+    return (state.step < 0) & (task.certificate not in (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE))
+
+
+def _shift(task: Task, state: State) -> Any:
+    """κ, per unit time, by which the discount of a correction is raised: with open ends; it dies geometrically.
+
+    Each correction is then an implicit step in time of length 1/κ. The equation with open ends has several solutions,
+    of which the stable one is wanted, and policies that leave may be worth no finite value.
+    """
+    assert task.pace is not None
+    dying = jnp.asarray(SHIFT, state.value.dtype) ** -jnp.maximum(state.step, 0)
+    return jnp.where(state.step < SHIFTS, jnp.max(task.pace) * dying, 0)
+
+
+def _held_back(task: Task, state: State) -> Any:
+    """By how much longer a step would have been about, if no shift had held it back."""
+    shift, discount = _shift(task, state), jnp.asarray(task.problem.discount, state.value.dtype)
+    safe = jnp.where(discount > 0, discount, 1)
+    return jnp.where(shift == 0, 1, jnp.where(discount > 0, 1 + shift / safe, jnp.inf))
+
+
+def _look(
+    task: Task, value: jax.Array, incumbent: Greedy, *, moved: jax.Array, first: jax.Array
+) -> tuple[Greedy, jax.Array, Gap]:
+    problem, grid, scheme = task.problem, task.grid, task.scheme
+    policy = bellman.greedy(problem, grid, value, task.rules.held, scheme=scheme, incumbent=incumbent, lost=task.lost)
+    if problem.stopping_cost is not None and not problem.is_game and task.certificate in TO_THE_END:
+        fixed = task.rules.held | first  # nobody has chosen the actions before the first look
+        policy = bellman.kept(problem, grid, value, fixed, policy, incumbent, scheme=scheme)
+    left = equation(task, value, policy)
+    measured = certificates.gap(
+        task.certificate,
+        value,
+        policy,
+        left,
+        task.rules,
+        discount=problem.discount,
+        least_cost=task.least_cost,
+        counted=task.counted,
+        moved=moved,
+    )
+    if task.has_lost:
+        measured = dataclasses.replace(measured, error=jnp.where(_leaks(task, policy), jnp.inf, measured.error))
+    return policy, left.fastest, measured
+
+
+def _leaks(task: Task, policy: Greedy) -> jax.Array:
+    """Whether the policy leads from a node that counts to one that is lost, by more than rounding."""
+    problem, grid, dtype = task.problem, task.grid, policy.rate.dtype
+    u, d = list(policy.controls), list(policy.disturbances)
+    rates = chain.rates(problem, grid, u, d, scheme=task.scheme.chain, dtype=dtype)
+    beside, slack = edges.beside(~task.counted, grid), edges.slack(problem, grid, 0.0, dtype)
+    f = chain.drift(problem, grid.components(dtype), u, d, 0.0, dtype)
+    strays = [edges.strays(*each) for each in zip(f, beside, slack, strict=True)]
+    leaking = jnp.zeros(grid.shape, dtype)
+    for offset, c in zip(rates.offsets, rates.values, strict=True):
+        leak = jnp.where(stencil.neighbour(task.counted, grid, offset), 0, c)
+        if problem.noise is None:  # jumps go along one axis
+            axis = next(axis for axis, step in enumerate(offset) if step)
+            leak = jnp.where(strays[axis], 0, leak)
+        leaking = leaking + leak
+    limit = ROUNDING * jnp.finfo(dtype).eps * rates.total()
+    return jnp.any(task.counted & ~task.rules.held & (leaking > limit))
+
+
+def _judge(task: Task, value: jax.Array, measured: Gap, best: jax.Array, since: jax.Array) -> jax.Array:
+    finite = jnp.isfinite(measured.residual)
+    matters = (since >= PATIENCE) | (measured.residual > GROWTH * best[1])  # else it changes no answer below
+    climbs = task.constrained or isinstance(task.method, ValueIteration)
+    to_the_end = climbs and task.certificate in (*TO_THE_END, Certificate.OPEN)
+    size = jax.lax.cond(
+        matters | to_the_end,
+        lambda: jnp.max(jnp.where(task.counted, jnp.abs(value), 0)),
+        lambda: jnp.zeros_like(best[1]),
+    )
+    rounding, tol = ROUNDING * jnp.finfo(value.dtype).eps * size, task.tol
+    longest = CLIMB if isinstance(task.method, ValueIteration) else 100 + 4 * sum(task.grid.shape)
+    if to_the_end:  # a front moves V by a spacing times its slope a step, whatever the tolerance, past every node
+        tol = jnp.where(task.problem.discount > 0, tol, rounding)
+        longest = max(longest, 100 + 4 * task.grid.size)
+    patience = jnp.where(measured.residual <= rounding, PATIENCE, longest)
+    code = jnp.where(since >= patience, Status.STALLED, Status.RUNNING)
+    grew = measured.residual > GROWTH * jnp.maximum(best[1], rounding)
+    bounded = jnp.isfinite(best[0]) & (measured.error <= GROWTH * best[0])
+    grew &= ~bounded  # a better policy may leave more than one that stops at once
+    code = jnp.where(grew, Status.DIVERGED, code)
+    code = jnp.where(measured.error <= tol, Status.CONVERGED, code)
+    return jnp.where(finite, code, Status.NONFINITE).astype(jnp.int32)
+
+
+def _correct(task: Task, state: State) -> jax.Array:
+    if isinstance(task.method, ValueIteration):
+        return state.policy.rate / _pace(task, state)
+    if task.pace is None or task.certificate is Certificate.OPEN:
+        return _evaluated(task, state)
+    return jax.lax.cond(  # a tube whose discount is traced: without one its policies have no value of their own
+        jnp.asarray(task.problem.discount > 0),
+        lambda: _evaluated(task, state),
+        lambda: state.policy.rate / _pace(task, state),
+    )
+
+
+def _evaluated(task: Task, state: State) -> jax.Array:
+    """The correction of policy iteration: by the linear equation of the policy, in a game by the inner problem."""
+    assert isinstance(task.method, PolicyIteration)
+    if task.certificate is Certificate.OPEN:  # in a game, too: steps in time improve both players at once
+        later = altered(task.problem, discount=task.problem.discount + _shift(task, state))
+        left = equation(dataclasses.replace(task, problem=later), state.value, state.policy)
+        return relaxation.solve(task.method.evaluation, left, task.grid)
+    if task.problem.is_game:
+        return _hoffman_karp(task, state)
+    left = equation(task, state.value, state.policy, state.fastest)
+    return relaxation.solve(task.method.evaluation, left, task.grid)
+
+
+def _pace(task: Task, state: State) -> jax.Array:
+    """Q + β for value iteration: of the fastest action, which the policy shows where it is not known beforehand."""
+    assert task.pace is not None
+    how = players.setting(task.problem, task.grid.ndim, state.value.dtype)
+    if how.control.fastest_at_ends and how.disturbance.fastest_at_ends:
+        return task.pace
+    u, d = list(state.policy.controls), list(state.policy.disturbances)
+    chosen = chain.rates(task.problem, task.grid, u, d, scheme=task.scheme.chain, dtype=state.value.dtype).total()
+    return jnp.maximum(task.pace, chosen + task.problem.discount)
+
+
+def equation(task: Task, value: jax.Array, policy: Greedy, fastest: Any = None) -> Correction:
+    """The linear equation of a policy; ``fastest``, its largest Q + β, spares a pass where it is known and wanted."""
+    if task.certificate is Certificate.ADDITIVE:  # no rate is only rounding: there is a discount
+        fastest = jnp.zeros((), value.dtype)
+    return bellman.correction(task.problem, task.grid, value, policy, task.rules, scheme=task.scheme, fastest=fastest)
+
+
+def _hoffman_karp(task: Task, state: State) -> jax.Array:
+    """The inner player's problem against the outer player's frozen policy, to a tenth of the outer residual."""
+    assert isinstance(task.method, PolicyIteration)
+    evaluation, replies, held = task.method.evaluation, task.method.replies, task.rules.held
+    target = 0.1 * state.gap.residual
+
+    def reply(carry):
+        value, policy, _, count = carry
+        value = task.impose(value + relaxation.solve(evaluation, equation(task, value, policy), task.grid))
+        policy = bellman.respond(task.problem, task.grid, value, held, policy, scheme=task.scheme, lost=task.lost)
+        left = jnp.max(jnp.where(task.counted, jnp.abs(equation(task, value, policy).source), 0))
+        return value, policy, left, count + 1
+
+    def unfinished(carry):
+        return (carry[2] > target) & (carry[3] < replies)
+
+    start = (state.value, state.policy, jnp.asarray(jnp.inf, state.value.dtype), jnp.zeros((), jnp.int32))
+    return jax.lax.while_loop(unfinished, reply, start)[0] - state.value

@@ -1,0 +1,343 @@
+"""Many steps in time: V_t + min max H − β V = 0 from the horizon back to 0, with targets and constraints.
+
+Explicit: strong-stability-preserving Runge–Kutta methods of Shu and Osher, with F = min max H − β V,
+
+    W ← a_k V + (1 − a_k) (W + Δt F(W)),    a = (0), (0, ½) or (0, ¾, ⅓),
+
+each stage a mean of Euler steps, so that what one Euler step keeps, they keep: V ← max(g, min(ψ, ·)) and the given
+values after every stage, and for the monotone chain the order of two values and the range of the data, as long as
+Δt (max Q + β) ≤ 1 with Q the rate at which the chain leaves a node. Order 1, 2, 3 in time. Where the fastest action is
+not at an end of its set, or Q changes within a step, Q is looked at under the actions that every stage chose, and a
+step that was too long for it is done again in shorter ones.
+
+Implicit (Euler): min{ max{ (β + 1/Δt) W − V/Δt − min max H(W), W − ψ }, W − g } = 0, a discounted stationary problem
+for W by policy iteration, any Δt, order 1. Against the other player's own solved problem, as in ``iteration``.
+
+Steps end on the kept times exactly: those that are left are of equal length.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from hjbjax.discretisation import chain
+from hjbjax.discretisation.schemes import Scheme
+from hjbjax.iteration import bellman, implicit, relaxation, splitting
+from hjbjax.iteration.bellman import Conditions
+from hjbjax.iteration.relaxation import Evaluation
+from hjbjax.problem import arguments
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import node
+from hjbjax.problem.sets import Box
+from hjbjax.solution.status import Status
+
+MEANS = {1: (0.0,), 2: (0.0, 1 / 2), 3: (0.0, 3 / 4, 1 / 3)}  # a_k: the share of V in a stage
+STARTS = {1: (0.0,), 2: (0.0, 1.0), 3: (0.0, 1.0, 0.5)}  # where a stage evaluates F, in steps
+ENDS = {1: (1.0,), 2: (1.0, 1.0), 3: (1.0, 0.5, 1.0)}  # the time of its result
+TRIES = 30  # of a step that is shortened, at most; what its first stage sees does not depend on its length
+NEAR = 1e-3  # of a bound's distance: a disturbance so near its bound sits on it
+
+
+@node(static=("stages",))
+class Explicit:
+    """Explicit steps: the SSP Runge–Kutta method with ``stages`` stages, which is also its order in time.
+
+    Args:
+      stages: 1 (Euler), 2 or 3; ``None`` takes what goes with the scheme: 1 for ``Upwind``, 3 for ``Weno5``, else 2.
+      fraction: the length of a step over the stability limit 1/(max Q + β), at most 1.
+    """
+
+    stages: int | None = None
+    fraction: Any = 0.9
+
+    def __post_init__(self):
+        if isinstance(self.stages, bool) or self.stages not in (None, *MEANS):
+            raise ValueError(f"Explicit: got stages = {self.stages!r}, wanted 1, 2, 3 or None")
+        arguments.positive(self.fraction, "Explicit: fraction", most=1)
+
+
+@node(static=("max_steps",))
+class Implicit:
+    """Implicit Euler steps, each by policy iteration: any length, first order in time.
+
+    Args:
+      evaluation: how a policy is evaluated; ``None`` is ``Krylov()`` with noise and ``Sweeps()`` without.
+      tol: bound on what the policy iterations leave over the whole march, in cost units.
+      max_steps: policy improvements in one step, at most.
+    """
+
+    evaluation: Evaluation | None = None
+    tol: Any = 1e-6
+    max_steps: int = 100
+
+    def __post_init__(self):
+        if self.evaluation is not None:
+            relaxation.check_evaluation(self.evaluation, "Implicit: evaluation")
+        arguments.positive(self.tol, "Implicit: tol", "in the units of the cost")
+        arguments.count(self.max_steps, "Implicit: max_steps")
+
+
+@node(static=("scheme", "checks_rates", "checks_noise"))
+class March:
+    """All that stays the same during a march.
+
+    Args:
+      problem, grid: the question.
+      method: ``Explicit`` with its stages, or ``Implicit`` with its evaluation.
+      rules: held nodes and constraints; ``None`` where they depend on the time.
+      limit: the longest stable step of an explicit method; ``None`` where it depends on the time, and if implicit.
+      step: the longest step wanted; inf where the limit alone counts.
+      horizon: the time at which the terminal cost is paid.
+      watched: bool (*grid), nodes where a disturbance at its bound means that the value blows up; or ``None``.
+      scheme: the slopes.
+      checks_rates: whether explicit steps look at Q under the actions that they chose.
+      checks_noise: whether steps look for correlated noise that the chain cannot represent.
+    """
+
+    problem: Problem
+    grid: Grid
+    method: Any
+    rules: Conditions | None
+    limit: Any
+    step: Any
+    horizon: Any
+    watched: Any
+    scheme: Scheme
+    checks_rates: bool = False
+    checks_noise: bool = False
+
+    def rules_at(self, t: Any, dtype: Any) -> Conditions:
+        """Held nodes and constraints at the time t."""
+        return bellman.conditions(self.problem, self.grid, dtype, t) if self.rules is None else self.rules
+
+    def longest(self, t: Any, dtype: Any) -> Any:
+        """The longest step that may start at the time t."""
+        if isinstance(self.method, Implicit):
+            return self.step
+        limit = self.limit
+        if limit is None:
+            limit = self.method.fraction * stable(self.problem, self.grid, self.scheme, t, dtype)
+        return jnp.minimum(self.step, limit)
+
+
+@node()
+class Front:
+    """Where a march stands: V at the time t, the steps so far, how it is going, and what the last step saw."""
+
+    value: jax.Array
+    t: jax.Array
+    steps: jax.Array
+    code: jax.Array
+    seen: "Seen"
+
+
+@node()
+class Seen:
+    """What is found out on the way; nothing where nothing is looked for.
+
+    Args:
+      fastest: the largest Q + β under the actions that were chosen, per unit time.
+      lacking: the first node, counted flat, where noise is correlated more than the spacings allow, or −1.
+      t: the time of that.
+    """
+
+    fastest: jax.Array
+    lacking: jax.Array
+    t: jax.Array
+
+    def joined(self, other: "Seen") -> "Seen":
+        """What was seen in both of two looks, the first fault of the noise first."""
+        first = self.lacking >= 0
+        return Seen(
+            jnp.maximum(self.fastest, other.fastest),
+            jnp.where(first, self.lacking, other.lacking),
+            jnp.where(first, self.t, other.t),
+        )
+
+
+def stable(problem: Problem, grid: Grid, scheme: Scheme, t: Any, dtype: Any) -> jax.Array:
+    """The longest step for which explicit Euler is monotone, 1/(max Q + β); inf where nothing moves."""
+    rate = jnp.max(splitting.fastest_rate(problem, grid, scheme=scheme, dtype=dtype, t=t)) + problem.discount
+    return jnp.where(rate > 0, 1 / jnp.where(rate > 0, rate, 1), jnp.inf)
+
+
+def terminal(problem: Problem, grid: Grid, horizon: Any, dtype: Any, start: Any = None) -> jax.Array:
+    """V at the horizon: ``start`` or the terminal cost, with given values and constraints put in.
+
+    Without either a stopping cost is paid at the latest then, and a running maximum is g itself; else nothing is paid.
+    """
+    rules = bellman.conditions(problem, grid, dtype, horizon)
+    if start is not None:
+        return rules.impose(jnp.asarray(start, dtype))
+    cost = problem.terminal_cost
+    if cost is None:
+        cost = problem.running_max if problem.stopping_cost is None else problem.stopping_cost
+    return rules.impose(bellman.at_nodes(problem, grid, cost, dtype, horizon))
+
+
+def begin(march: March, value: jax.Array) -> Front:
+    """The front at the horizon."""
+    zero = jnp.zeros((), jnp.int32)
+    return Front(
+        value, jnp.asarray(march.horizon, value.dtype), zero, zero + int(Status.RUNNING), _nothing(value.dtype)
+    )
+
+
+def _nothing(dtype: Any) -> Seen:
+    return Seen(jnp.zeros((), dtype), jnp.full((), -1, jnp.int32), jnp.zeros((), dtype))
+
+
+def run(march: March, front: Front, until: Any, most: Any) -> Front:
+    """At most ``most`` steps towards the time ``until``, as long as the values are finite."""
+
+    def goes_on(carry):
+        front, left = carry
+        return (front.code == Status.RUNNING) & (front.t > until) & (left > 0)
+
+    def step(carry):
+        front, left = carry
+        return advance(march, front, until), left - 1
+
+    return jax.lax.while_loop(goes_on, step, (front, jnp.asarray(most, jnp.int32)))[0]
+
+
+def advance(march: March, front: Front, until: Any) -> Front:
+    """One step towards ``until``; what is left is cut into equal steps."""
+    dtype = front.value.dtype
+    until, left = jnp.asarray(until, dtype), front.t - until
+    longest, ok = march.longest(front.t, dtype), jnp.ones((), bool)
+    if march.checks_rates:  # a step like the last one rather than one that is done again
+        longest = jnp.minimum(longest, march.method.fraction / front.seen.fastest)
+    count = jnp.maximum(jnp.ceil(left / longest - 1e-4), 1)
+    t = until + left * ((count - 1) / count)
+    if isinstance(march.method, Implicit):
+        value, ok, seen = _implicit(march, front.value, t, front.t - t)
+    elif march.checks_rates:
+        value, t, ok, seen = _short_enough(march, front, until, count)
+    else:
+        value, seen = _explicit(march, front.value, front.t, front.t - t)
+    low, high = jnp.min(value), jnp.max(value)
+    code = jnp.where(ok, Status.RUNNING, Status.STALLED)
+    if march.watched is not None:
+        code = jnp.where(_saturates(march, value, t), Status.DIVERGED, code)
+    code = jnp.where(jnp.isfinite(high - low), code, Status.NONFINITE)
+    if march.checks_noise:  # such a step is not taken
+        taken = seen.lacking < 0
+        value, t = jnp.where(taken, value, front.value), jnp.where(taken, t, front.t)
+        code = jnp.where(taken, code, Status.STALLED)
+    return Front(value, t, front.steps + 1, code.astype(jnp.int32), seen)
+
+
+def _short_enough(march: March, front: Front, until: Any, count: Any) -> tuple[jax.Array, jax.Array, jax.Array, Seen]:
+    """V after one of ``count`` or more equal steps, its time, whether Δt (Q + β) ≤ 1 held in every stage, and Q."""
+    left = front.t - until
+
+    def end(count):
+        return until + left * ((count - 1) / count)
+
+    def too_long(carry):
+        count, tries, _, seen = carry
+        return (seen.fastest * (front.t - end(count)) > 1 + 1e-6) & (tries < TRIES)
+
+    def attempt(carry):
+        count, tries, _, seen = carry
+        more = jnp.maximum(jnp.ceil(left * seen.fastest / march.method.fraction - 1e-4), count + 1)
+        count = jnp.where(tries > 0, more, count)
+        return count, tries + 1, *_explicit(march, front.value, front.t, front.t - end(count))
+
+    nothing = _nothing(front.value.dtype)
+    endless = dataclasses.replace(nothing, fastest=jnp.full_like(nothing.fastest, jnp.inf))
+    start = (count, jnp.zeros((), jnp.int32), front.value, endless)
+    carry = jax.lax.while_loop(too_long, attempt, start)
+    return carry[2], end(carry[0]), ~too_long((carry[0], 0, *carry[2:])), carry[3]
+
+
+def repeat(march: March, value: jax.Array, start: float, end: float, count: int) -> jax.Array:
+    """``count`` equal steps from the time ``start`` to ``end``, with known numbers: differentiable both ways."""
+    dt = (start - end) / max(count, 1)
+
+    def step(value, k):
+        t = jnp.asarray(start, value.dtype) - k * dt
+        if isinstance(march.method, Implicit):
+            return _implicit(march, value, t - dt, jnp.asarray(dt, value.dtype))[0], None
+        return explicit(march, value, t, dt), None
+
+    return jax.lax.scan(step, value, jnp.arange(count).astype(value.dtype))[0]
+
+
+def explicit(march: March, value: jax.Array, t: Any, dt: Any) -> jax.Array:
+    """V at t − Δt from V at t."""
+    return _explicit(march, value, t, dt)[0]
+
+
+def _explicit(march: March, value: jax.Array, t: Any, dt: Any) -> tuple[jax.Array, Seen]:
+    """V at t − Δt, and what the stages saw."""
+    dtype, stages = value.dtype, march.method.stages
+    if stages == 1:
+        rate, seen = _rate(march, value, t)
+        return march.rules_at(t - dt, dtype).impose(value + dt * rate), seen
+    means, starts, ends = (jnp.asarray(table[stages], dtype) for table in (MEANS, STARTS, ENDS))
+
+    def stage(k, carry):
+        w, seen = carry
+        rate, now = _rate(march, w, t - starts[k] * dt)
+        moved = means[k] * value + (1 - means[k]) * (w + dt * rate)
+        return march.rules_at(t - ends[k] * dt, dtype).impose(moved), seen.joined(now)
+
+    return jax.lax.fori_loop(0, stages, stage, (value, _nothing(dtype)))
+
+
+def _implicit(march: March, value: jax.Array, t: Any, dt: Any) -> tuple[jax.Array, jax.Array, Seen]:
+    """V at t from V at t + Δt, whether the policy iteration came to its end, and what its last policy saw."""
+    method, rules = march.method, march.rules_at(t, value.dtype)
+    value, policy, ok = implicit.advance(
+        march.problem, march.grid, rules, value, t, dt, scheme=march.scheme, evaluation=method.evaluation,
+        tol=method.tol * dt / march.horizon, max_steps=method.max_steps,
+    )  # fmt: skip
+    return value, ok, _look(march, list(policy.controls), list(policy.disturbances), t, value.dtype)
+
+
+def _rate(march: March, value: jax.Array, t: Any) -> tuple[jax.Array, Seen]:
+    """F = min max H − β V, cost per unit time, and what the optimal actions show."""
+    best, u, d = splitting.optimise(march.problem, march.grid, value, scheme=march.scheme, t=t)
+    return best - march.problem.discount * value, _look(march, u, d, t, value.dtype)
+
+
+def _look(march: March, u: list, d: list, t: Any, dtype: Any) -> Seen:
+    """How fast the chain leaves a node under these actions, and where it cannot represent the noise."""
+    seen, problem, grid = _nothing(dtype), march.problem, march.grid
+    if march.checks_rates:
+        rate = splitting.rate(problem, grid, u, d, scheme=march.scheme, dtype=dtype, t=t)
+        seen = dataclasses.replace(seen, fastest=jnp.max(rate) + jnp.asarray(problem.discount, dtype))
+    if march.checks_noise:
+        lacking = chain.lacking(chain.diffusion(problem, grid.components(dtype), u, d, t, dtype), grid, dtype)
+        if lacking is None:
+            return seen
+        lacking = jnp.broadcast_to(lacking, grid.shape) & ~march.rules_at(t, dtype).held
+        first = jnp.where(jnp.any(lacking), jnp.argmax(lacking), -1).astype(jnp.int32)
+        seen = dataclasses.replace(seen, lacking=first, t=jnp.asarray(t, dtype))
+    return seen
+
+
+def greedy(march: March, value: jax.Array, t: Any) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, ...]]:
+    """The control and the disturbance at the time t, each component of shape (*grid)."""
+    _, u, d = splitting.optimise(march.problem, march.grid, value, scheme=march.scheme, t=t)
+
+    def full(action):
+        return tuple(jnp.broadcast_to(jnp.asarray(entry, value.dtype), march.grid.shape) for entry in action)
+
+    return full(u), full(d)
+
+
+def _saturates(march: March, value: jax.Array, t: Any) -> jax.Array:
+    """Whether the worst disturbance sits on its bound at a watched node."""
+    choices = march.problem.disturbances
+    assert isinstance(choices, Box)
+    on_bound: Any = False
+    for j, entry in enumerate(greedy(march, value, t)[1]):
+        slack = NEAR * (choices.hi[j] - choices.lo[j])
+        on_bound |= (entry <= choices.lo[j] + slack) | (entry >= choices.hi[j] - slack)
+    return jnp.any(on_bound & march.watched & ~march.rules_at(t, value.dtype).held)

@@ -1,0 +1,148 @@
+"""The derivative of a solution with respect to the numbers in the problem and in the grid.
+
+The value V of a converged solve satisfies Φ(V, θ) = 0, node by node the active one of (H(u, d) − β V)/(Q + β),
+ψ − V, g − V and given − V. With W the weights of the optimal policy ∂Φ/∂V = −(I − W), so that
+
+    dV = (I − W)⁻¹ ∂Φ/∂θ dθ.
+
+∂Φ/∂θ is taken through the formulas that give the optimal action: where that is stationary they contribute nothing,
+and where it sits at a bound or at a kink of the upwinding, both of which may move with θ, they do. Forward mode
+takes one linear solve and reverse mode one transposed solve, whatever the number of steps that led to V. A linear solve
+that does not come to its end makes the derivative NaN; the value stays as it is.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from hjbjax.discretisation import chain
+from hjbjax.iteration import bellman, iteration, relaxation
+from hjbjax.iteration.bellman import Correction
+from hjbjax.iteration.iteration import PolicyIteration, State, Task
+from hjbjax.iteration.relaxation import Evaluation, Krylov
+from hjbjax.problem.grid import Grid
+
+STEPS = 200  # refinements of the linear solve in each of its two stages, at most
+SLOW = 0.5  # a refinement that leaves more than this share of the residual hands over to Krylov's
+GOAL = 1e3  # of the rounding unit of the right-hand side
+ROUNDING = 64  # of the rounding unit of the solution: below that no residual can be brought
+
+
+def attach(task: Task, state: State) -> jax.Array:
+    """The value of ``state``, unchanged, as a differentiable function of the problem and of the grid in ``task``.
+
+    Args:
+      task: the task as the user gave it, with its tracers.
+      state: a converged state of the same task, found without derivatives.
+    """
+    task_kept, state = jax.lax.stop_gradient((task, state))
+    value = state.value
+    equation = jax.lax.stop_gradient(_ties_to_constraints(task_kept, state))
+    evaluation = task.method.evaluation if isinstance(task.method, PolicyIteration) else Krylov()
+
+    def solver(weights):
+        return lambda _, right: refined(evaluation, Correction(right, weights), task_kept.grid)
+
+    def matvec(delta):
+        return -relaxation.left_over(Correction(jnp.zeros_like(delta), equation.weights), task_kept.grid, delta)
+
+    weights, solvers = equation.weights, _exact_solvers(equation, task_kept.grid)
+    if not task_kept.grid.sides("open"):
+        solvers = solver(weights), solver(weights.inflow(task_kept.grid))
+    delta = jax.lax.custom_linear_solve(matvec, _residual(task, state, equation), *solvers)
+    return _with_derivative(value, delta)
+
+
+@jax.custom_jvp
+def _with_derivative(value: jax.Array, delta: jax.Array) -> jax.Array:
+    """``value``, with the derivative of ``delta``; what ``delta`` is itself is never computed."""
+    return value
+
+
+@_with_derivative.defjvp
+def _with_tangent(primals: Any, tangents: Any) -> Any:
+    return primals[0], tangents[1]
+
+
+def _exact_solvers(equation: Correction, grid: Grid) -> tuple[Any, Any]:
+    """The solves of I − W and of its transpose by factorisation; rows of open ends are no jumps to be turned round."""
+
+    def solve(transposed: bool) -> Any:
+        return lambda _, right: relaxation.direct(Correction(right, equation.weights), grid, transposed=transposed)
+
+    return solve(False), solve(True)
+
+
+def _ties_to_constraints(task: Task, state: State) -> Correction:
+    """The linear equation of the policy, in which every node whose value is a constraint's belongs to that.
+
+    Where going on is worth as much both branches hold. On a plateau without discount only this one has a derivative:
+    a policy may go round on it for ever.
+    """
+    equation = iteration.equation(task, state.value, state.policy)
+    free = jnp.ones(task.grid.shape, bool)
+    for constraint in (task.rules.stop, task.rules.floor):
+        if constraint is not None:
+            free &= ~_same(state.value, constraint)
+    return Correction(equation.source, equation.weights.scaled(jnp.where(free, 1, 0)), equation.fastest)
+
+
+def _residual(task: Task, state: State, equation: Correction) -> jax.Array:
+    """Φ at the frozen value and branches, as a function of the problem and of the grid."""
+    problem, grid, value, policy = task.problem, task.grid, state.value, state.policy
+    rules = bellman.conditions(problem, grid, value.dtype)
+    u, d = list(policy.controls), list(policy.disturbances)
+    held = jax.lax.stop_gradient(task.rules.held)
+    lost = jax.lax.stop_gradient(task.lost)
+    rate = bellman.greedy(problem, grid, value, held, scheme=task.scheme, incumbent=policy, lost=lost).rate
+    scheme = task.scheme.chain
+    total = chain.rates(problem, grid, u, d, scheme=scheme, dtype=value.dtype).total()
+    pace = jax.lax.stop_gradient(total + problem.discount)
+    phi = rate / jnp.where(pace > 0, pace, 1)
+    bound = equation.weights.total() == 0  # rows of the constraints hold no weights
+    for constraint in (rules.stop, rules.floor):
+        if constraint is not None:
+            phi = jnp.where(bound & _same(value, constraint), constraint - value, phi)
+    return jnp.where(held, rules.given - value, phi)
+
+
+def _same(value: jax.Array, constraint: jax.Array) -> jax.Array:
+    """Where a value was taken from the constraint, which rounds otherwise whenever it is evaluated anew."""
+    size = jnp.abs(value) + jnp.abs(constraint)
+    return jax.lax.stop_gradient(jnp.abs(value - constraint) <= 64 * jnp.finfo(value.dtype).eps * size)
+
+
+def refined(evaluation: Evaluation, equation: Correction, grid: Grid) -> jax.Array:
+    """δ by iterative refinement, to a small multiple of rounding; NaN where that is not reached.
+
+    Sweeps hardly gain where little is discounted and the drift goes round in circles: there Krylov takes over.
+    """
+    eps, size = jnp.finfo(equation.source.dtype).eps, jnp.max(jnp.abs(equation.source))
+
+    def goal(delta: jax.Array) -> jax.Array:
+        return eps * (GOAL * size + ROUNDING * jnp.max(jnp.abs(delta)))
+
+    def stage(method: Evaluation, delta: jax.Array, slow: Any) -> jax.Array:
+        def refine(carry: Any) -> Any:
+            delta, left, _, count = carry
+            before = jnp.max(jnp.abs(left))
+            delta = delta + relaxation.solve(method, Correction(left, equation.weights), grid)
+            return delta, relaxation.left_over(equation, grid, delta), before, count + 1
+
+        def unfinished(carry: Any) -> Any:
+            delta, left, before, count = carry
+            size = jnp.max(jnp.abs(left))
+            return (size > goal(delta)) & (count < STEPS) & ~(size > slow * before)
+
+        before, none = jnp.full((), jnp.inf, delta.dtype), jnp.zeros((), jnp.int32)
+        start = (delta, relaxation.left_over(equation, grid, delta), before, none)
+        return jax.lax.while_loop(unfinished, refine, start)[0]
+
+    delta = jnp.zeros_like(equation.source)
+    if not isinstance(evaluation, Krylov):
+        delta = stage(evaluation, delta, SLOW)
+        evaluation = Krylov()
+    delta = stage(evaluation, delta, jnp.inf)
+    left = jnp.max(jnp.abs(relaxation.left_over(equation, grid, delta)))
+    return jnp.where(left <= goal(delta), delta, jnp.nan)

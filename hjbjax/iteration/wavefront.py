@@ -1,0 +1,185 @@
+"""Gauss–Seidel as a wavefront: δ(x) ← s(x) + Σ_o w_o(x) δ(x + o), node after node, a plane of nodes at a time.
+
+Under the star stencil the nodes on a hyperplane i₀ + i₁ + … = const do not depend on each other. The arrays are
+sheared cyclically along the first axis,
+
+    S[d, j] = X[(d − Σ_k j_k) mod n₀, j],
+
+so that such a hyperplane is one slice S[d] (several, folded); its neighbours stand in S[d − 1] and S[d + 1], one
+entry to the side for the axes beyond the first. A forward sweep goes through the slices upwards, a backward one
+downwards, and flipping axes beyond the first before shearing gives all 2ⁿ orders. What comes across the fold, or
+across the seam of a periodic axis, is as old as the last sweep.
+
+Where the arrays outgrow a processor's cache, slabs of slices take the place of single sweeps through all of them.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from hjbjax.discretisation import stencil
+from hjbjax.iteration.bellman import Correction
+from hjbjax.problem.grid import Grid
+
+Weights = list[tuple[jax.Array, ...]]  # for each axis, as ``_towards`` gives them
+
+CACHE = 2**25  # bytes that a processor keeps near by
+SLAB = 64  # slices
+FOLDS = 4  # up to so many comparisons take the place of a division, which XLA would not fuse
+
+
+def gauss_seidel(equation: Correction, grid: Grid, rounds: int) -> jax.Array:
+    """Sweeps from zero, in every order ``rounds`` times forward and backward; for jumps along the axes alone.
+
+    The orders are one loop, so that one program serves them all and its operands are arrays in memory: a fused
+    gather would compute each of their entries on its own.
+    """
+
+    def order(index: jax.Array, delta: jax.Array) -> jax.Array:
+        flips = [(index >> axis) & 1 for axis in range(grid.ndim - 1)]
+        source = _sheared(equation.source, flips)
+        weights = [_towards(equation, grid, axis, flips) for axis in range(grid.ndim)]
+
+        def whole(planes: jax.Array) -> jax.Array:
+            return _in_turns(source, weights, planes, grid, rounds)
+
+        def in_slabs(planes: jax.Array) -> jax.Array:
+            return _in_slabs(source, weights, planes, grid, rounds)
+
+        planes = jnp.pad(_sheared(delta, flips), 1)
+        if _outgrows_the_cache(source, weights):
+            planes = jax.lax.platform_dependent(planes, cpu=in_slabs, default=whole)
+        else:
+            planes = whole(planes)
+        return _sheared(planes[(slice(1, -1),) * grid.ndim], flips, back=True)
+
+    return jax.lax.fori_loop(0, 2 ** (grid.ndim - 1), order, jnp.zeros_like(equation.source))
+
+
+def _outgrows_the_cache(source: jax.Array, weights: Weights) -> bool:
+    """Whether all slices do, and a slab of them does not."""
+    arrays = 2 + sum(map(len, weights))
+    size = arrays * source.size * source.dtype.itemsize
+    return size > CACHE and SLAB * size / len(source) < CACHE / 2
+
+
+def _in_turns(source: jax.Array, weights: Weights, planes: jax.Array, grid: Grid, rounds: int) -> jax.Array:
+    """All slices upwards and downwards, ``rounds`` times."""
+
+    def pair(_: Any, planes: jax.Array) -> jax.Array:
+        for up in (True, False):
+            planes = _sweep(source, weights, _wrapped(planes, grid), 0, len(source), up=up)
+        return planes
+
+    return jax.lax.fori_loop(0, rounds, pair, planes)
+
+
+def _in_slabs(source: jax.Array, weights: Weights, planes: jax.Array, grid: Grid, rounds: int) -> jax.Array:
+    """Slab after slab upwards and once more downwards; each to and fro while it is in the cache.
+
+    What lies beyond the cache is read twice instead of 2 ``rounds`` times, and a slab is swept 2 ``rounds`` - 1 times
+    while it is at hand, three at least.
+    """
+    count = len(source)
+    slabs = -(-count // SLAB)
+    for up in (True, False):
+
+        def slab(index: jax.Array, planes: jax.Array, up: bool = up) -> jax.Array:
+            first = SLAB * (index if up else slabs - 1 - index)
+            last = jnp.minimum(first + SLAB, count)
+
+            def sweep(k: jax.Array, planes: jax.Array) -> jax.Array:
+                return _sweep(source, weights, planes, first, last, up=up == (k % 2 == 0))
+
+            return jax.lax.fori_loop(0, max(2 * rounds - 1, 3), sweep, planes)
+
+        planes = jax.lax.fori_loop(0, slabs, slab, _wrapped(planes, grid))
+    return planes
+
+
+def _towards(equation: Correction, grid: Grid, axis: int, flips: list[jax.Array]) -> tuple[jax.Array, ...]:
+    """The sheared weights (up, down) along an axis, or (up − down,) where at most one of the two is positive."""
+    table = dict(zip(equation.weights.offsets, equation.weights.values, strict=True))
+    up, down = (table[stencil.unit(grid, axis, step)] for step in (1, -1))
+    flipped = flips[axis - 1] == 1 if axis else False
+    if equation.weights.one_way:
+        return (_sheared((up - down) * jnp.where(flipped, -1, 1).astype(up.dtype), flips),)
+    return _sheared(jnp.where(flipped, down, up), flips), _sheared(jnp.where(flipped, up, down), flips)
+
+
+def _wrapped(planes: jax.Array, grid: Grid) -> jax.Array:
+    """The margin filled with what lies across the fold of the shear and across the seams of periodic axes."""
+    for axis in range(1, grid.ndim):
+        if grid.periodic[axis]:  # type: ignore[index]
+            planes = _with_margins(planes, axis)
+    return _with_margins(planes, 0)
+
+
+def _with_margins(planes: jax.Array, axis: int) -> jax.Array:
+    """Both margins of an axis filled from its other end; across a seam a hyperplane goes on in another slice.
+
+    In a loop an update is made in place; out of one XLA copies all planes to keep the old ones.
+    """
+    count = planes.shape[axis] - 2
+
+    def fill(side: jax.Array, planes: jax.Array) -> jax.Array:
+        above = side == 0
+        inner = jax.lax.dynamic_slice_in_dim(planes, jnp.where(above, 1, count), 1, axis)
+        start: list[Any] = [0] * planes.ndim
+        if axis > 0:
+            inner = jnp.roll(inner[1:-1], jnp.where(above, count, -count), axis=0)
+            start[0] = 1
+        start[axis] = jnp.where(above, count + 1, 0)
+        return jax.lax.dynamic_update_slice(planes, inner, start)
+
+    return jax.lax.fori_loop(0, 2, fill, planes)
+
+
+def _sweep(source: jax.Array, weights: Weights, planes: jax.Array, first: Any, last: Any, *, up: Any) -> jax.Array:
+    """One pass over the slices from ``first`` to ``last``; ``planes`` has a margin of one entry on every side."""
+
+    def row(values: jax.Array, d: Any) -> jax.Array:
+        return jax.lax.dynamic_slice_in_dim(values, d, 1, allow_negative_indices=False)
+
+    def core(slab: jax.Array, axis: int, step: int) -> jax.Array:
+        """A slice without its margin, moved by ``step`` along an axis of the grid beyond the first."""
+        starts = [1 + step * (k == axis) for k in range(1, source.ndim)]
+        cut = (slice(start, start + size) for start, size in zip(starts, source.shape[1:], strict=True))
+        return slab[(slice(None), *cut)]
+
+    def relax(k: jax.Array, planes: jax.Array) -> jax.Array:
+        d = jnp.where(up, k, first + last - 1 - k)
+        below, above, new = row(planes, d), row(planes, d + 2), row(source, d)
+        for axis, pair in enumerate(weights):
+            rows, up_there, down_there = [row(w, d) for w in pair], core(above, axis, 1), core(below, axis, -1)
+            if len(rows) == 2:
+                new = new + rows[0] * up_there + rows[1] * down_there
+            else:
+                new = new + rows[0] * jnp.where(rows[0] > 0, up_there, -down_there)
+        start: tuple[Any, ...] = (d + 1, *(1 for _ in source.shape[1:]))
+        return jax.lax.dynamic_update_slice(planes, new, start, allow_negative_indices=False)
+
+    return jax.lax.fori_loop(first, last, relax, planes)
+
+
+def _sheared(values: jax.Array, flips: list[jax.Array], *, back: bool = False) -> jax.Array:
+    """S[d, j] = X[(d − Σ_k j_k) mod n₀, j] of the flipped array; or ``back`` from S to X."""
+    zero, *flips = jax.lax.optimization_barrier((jnp.int32(0), *flips))  # or the loop over the orders keeps indices
+    count, *counts = values.shape
+    row, *columns = (jax.lax.broadcasted_iota(jnp.int32, values.shape, axis) + zero for axis in range(values.ndim))
+    flipped = [
+        jnp.where(flip == 1, size - 1 - column, column)
+        for column, size, flip in zip(columns, counts, flips, strict=True)
+    ]
+    place = row + sum(flipped) if back else row - sum(columns)
+    folds = -(-(sum(counts) - len(counts)) // count)
+    step = -count if back else count
+    if folds > FOLDS:
+        place = place % count
+    else:
+        for _ in range(folds):
+            place = jnp.where(place >= count if back else place < 0, place + step, place)
+    for column, size in zip(flipped, counts, strict=True):
+        place = place * size + column
+    return values.reshape(-1).at[place].get(mode="promise_in_bounds")

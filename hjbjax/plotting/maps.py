@@ -1,0 +1,302 @@
+"""Pictures over one or two axes of a value, a feedback, its switching curve; of paths and of residuals."""
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from hjbjax.plotting.canvas import COLOURS, axes_of, bands, draw, frame, label_axes, legend, styled
+from hjbjax.plotting.sections import at_time, feedback, folded, lifted, nodes_in, section_of, zeros
+from hjbjax.problem.grid import Grid
+
+
+def value(
+    solution: Any,
+    *,
+    ax: Any = None,
+    fixed: Mapping[Any, float] | None = None,
+    time: float | None = None,
+    levels: int | Sequence[float] = 9,
+    colorbar: bool = True,
+    target: Callable | None = None,
+) -> list[Any]:
+    """The value function: a line over one axis, colours with contour lines over two.
+
+    Args:
+      solution: what ``solve`` or ``march`` returned.
+
+    Keyword Args:
+      ax: matplotlib axes to draw on; ``None`` makes a figure.
+      fixed: coordinates of the axes to cut at, by number or name, until at most two are free.
+      time: for a marched solution, which stored time to draw (the nearest one; ``None`` is the earliest).
+      levels: how many contour lines, or their values; 0 for none.
+      colorbar: whether a colour scale is drawn beside two-dimensional pictures.
+      target: a function of the state, ≤ 0 inside, as ``problem.target``: over two axes its nodes are greyed out, since
+        what is held there need not be a value.
+
+    Returns:
+      The artists: the line or the mesh first.
+
+    Raises:
+      ValueError: more than two axes are free, or ``fixed`` names an axis or a place that does not exist.
+
+    Example:
+      >>> from types import SimpleNamespace
+      >>> grid = Grid(lo=[-1.0], hi=[1.0], shape=(3,), names=("position",))
+      >>> artists = value(SimpleNamespace(grid=grid, value=np.array([1.0, 0.0, 1.0]), times=None))
+      >>> artists[0].axes.get_xlabel(), artists[0].get_ydata().tolist()
+      ('position', [1.0, 0.0, 1.0])
+    """
+    field, caption = at_time(solution, solution.value, time)
+    section = section_of("value", field, solution.grid, fixed, caption)
+    ax = axes_of(ax)
+    hidden = "V = ∞" if np.all(np.isposinf(section.values.data[section.values.mask])) else "V not finite"
+    if target is not None and len(section.axes) == 2 and np.any(inside := nodes_in(target, solution.grid)):
+        hidden = f"target, or {hidden}" if np.ma.getmaskarray(section.values).any() else "target"
+        section = section_of("value", np.where(inside, np.nan, field), solution.grid, fixed, caption)
+    artists = draw(ax, section, solution.grid, "V", hidden, colorbar=colorbar)
+    lines = _levels(section.values, levels) if len(section.axes) == 2 else ()
+    if len(lines):
+        x, y = section.coordinates
+        artists.append(ax.contour(x, y, section.values.T, levels=lines, colors="white", linewidths=0.6, alpha=0.65))
+    return artists
+
+
+def policy(
+    solution: Any,
+    *,
+    input: int = 0,
+    ax: Any = None,
+    fixed: Mapping[Any, float] | None = None,
+    time: float | None = None,
+    colorbar: bool = True,
+) -> list[Any]:
+    """One input of the feedback u(x): a line over one axis, diverging colours centred at zero over two.
+
+    Nodes where no control is defined or the value is not finite are greyed out.
+
+    Args:
+      solution: what ``solve`` or ``march`` returned.
+
+    Keyword Args:
+      input: which of the m inputs, from 0.
+      ax, fixed, time, colorbar: as for :func:`value`, with its result and its refusals.
+    """
+    section, label = feedback(solution, input, fixed, time)
+    return draw(axes_of(ax), section, solution.grid, label, "no control defined", colorbar=colorbar, diverging=True)
+
+
+def switching_curve(
+    solution: Any,
+    *,
+    input: int = 0,
+    ax: Any = None,
+    fixed: Mapping[Any, float] | None = None,
+    time: float | None = None,
+    color: str = "black",
+    label: str | None = "switching curve",
+) -> list[Any]:
+    """Where one input changes sign: the zero level of the feedback, linear between nodes.
+
+    A bang-bang feedback jumps between two nodes, so its curve is known to half a cell, as it is drawn. Over
+    one axis the places are vertical lines.
+
+    Args:
+      solution: what ``solve`` or ``march`` returned.
+
+    Keyword Args:
+      input, ax, fixed, time: as for :func:`policy`.
+      color: of the curve.
+      label: of the curve in the legend; ``None`` leaves it out.
+
+    Raises:
+      ValueError: the input keeps its sign, or as for :func:`value`.
+    """
+    section, name = feedback(solution, input, fixed, time)
+    known = section.values.compressed()
+    if known.size == 0 or known.min() >= 0 or known.max() <= 0:
+        between = f"{known.min():g} and {known.max():g}" if known.size else "no finite values"
+        raise ValueError(f"switching_curve: {name} stays between {between}; there is no change of sign to draw")
+    ax = axes_of(ax)
+    style = {"color": color, "linewidth": 1.6}
+    if len(section.axes) == 1:
+        artists = [ax.axvline(x, **style) for x in zeros(section.coordinates[0], section.values)]
+    else:
+        x, y = section.coordinates
+        artists = [ax.contour(x, y, section.values.T, levels=[0.0], colors=color, linewidths=1.6)]
+    frame(ax, section, solution.grid)
+    if label:
+        artists += ax.plot([], [], label=label, **style)
+        legend(ax)
+    return artists
+
+
+def trajectory(
+    path: Any,
+    *,
+    ax: Any = None,
+    axes: tuple[int, int] | None = (0, 1),
+    grid: Grid | None = None,
+    names: Sequence[str] | None = None,
+    color: str | None = None,
+    label: str | None = None,
+) -> list[Any]:
+    """A path in the plane of two states, or its states over time.
+
+    Works on top of :func:`value` or :func:`policy`: pass their ``ax``. A ring marks the start, a dot the end.
+
+    Args:
+      path: what ``simulate`` returned: ``times`` (k+1,) and ``states`` (k+1, n).
+
+    Keyword Args:
+      ax: matplotlib axes to draw on; ``None`` makes a figure.
+      axes: the two states of the plane; ``None``, or a path with one state, draws all states over time.
+      grid: gives the names, and where periodic states are wrapped: the line is broken at the seam.
+      names: names of the states, in place of the grid's.
+      color: of the line, ``None`` chooses.
+      label: of the line in the legend.
+
+    Returns:
+      The artists: the line first, or one line a state.
+
+    Raises:
+      ValueError: ``axes`` asks for states that the path does not have.
+    """
+    from matplotlib.patheffects import Normal, Stroke
+
+    times, states = np.asarray(path.times), np.asarray(path.states)
+    count = states.shape[1]
+    names = tuple(names or (grid.names if grid is not None else (f"x{i + 1}" for i in range(count))))
+    states = lifted(states, grid)
+    if axes is None or count == 1:
+        ax = axes_of(ax, wide=True)
+        colours = itertools.cycle((color,) if color else COLOURS)
+        artists = [ax.plot(times, states[:, i], color=next(colours), label=names[i])[0] for i in range(count)]
+        label_axes(ax, "t", names[0] if count == 1 else "state")
+        return artists if count == 1 else [*artists, legend(ax)]
+    if len(axes) != 2 or not all(0 <= i < count for i in axes):
+        raise ValueError(f"trajectory: got axes={axes!r}; the path has {count} states, wanted two of 0 to {count - 1}")
+    ax = axes_of(ax)
+    first, last = folded(states[:1], axes, grid)[0], folded(states[-1:], axes, grid)[0]
+    plane = folded(states, axes, grid)
+    color = color or COLOURS[1]
+    casing = [Stroke(linewidth=3.4, foreground="white"), Normal()]  # a white edge: it reads on any colour
+    artists = ax.plot(*plane.T, color=color, linewidth=1.8, label=label, path_effects=casing, zorder=4)
+    marks = {"linestyle": "none", "marker": "o", "markeredgecolor": color, "markersize": 6, "zorder": 5}
+    artists += ax.plot(*first, markerfacecolor="white", markeredgewidth=1.6, **marks)
+    artists += ax.plot(*last, markerfacecolor=color, path_effects=casing, **marks)
+    label_axes(ax, names[axes[0]], names[axes[1]])
+    if label:
+        legend(ax)
+    return artists
+
+
+def controls(path: Any, *, ax: Any = None, names: Sequence[str] | None = None) -> list[Any]:
+    """The inputs of a path over time, each constant over its step; ``path.controls`` has shape (k, m).
+
+    Args:
+      path: what ``simulate`` returned.
+
+    Keyword Args:
+      ax: matplotlib axes to draw on; ``None`` makes a figure.
+      names: of the inputs.
+
+    Returns:
+      The artists: one step line an input.
+    """
+    times, inputs = np.asarray(path.times), np.asarray(path.controls)
+    count = inputs.shape[1]
+    names = tuple(names or (("u",) if count == 1 else (f"u{i + 1}" for i in range(count))))
+    ax = axes_of(ax, wide=True)
+    colours = itertools.cycle(COLOURS)
+    artists = [
+        ax.stairs(inputs[:, i], times, baseline=None, color=next(colours), linewidth=1.4, label=names[i])
+        for i in range(count)
+    ]
+    label_axes(ax, "t", names[0] if count == 1 else "control")
+    return artists if count < 2 else [*artists, legend(ax)]
+
+
+def closed_loop(
+    solution: Any,
+    path: Any,
+    *,
+    axes: tuple[int, int] = (0, 1),
+    fixed: Mapping[Any, float] | None = None,
+    target: Callable | None = None,
+) -> list[Any]:
+    """One figure: the path on the value function, and its states and inputs over time.
+
+    Args:
+      solution: what ``solve`` returned.
+      path: what ``simulate`` returned for it.
+
+    Keyword Args:
+      axes: the two states of the plane on the left; left out for one state.
+      fixed: where the other axes are cut, by default at the path's start.
+      target: as for :func:`value`.
+
+    Returns:
+      The artists: those of the value first.
+    """
+    from matplotlib.figure import Figure
+
+    grid, artists = solution.grid, []
+    plane, driven = grid.ndim > 1, np.shape(path.controls)[1] > 0
+    figure = Figure(figsize=(9.6 if plane else 5.4, 4.2), layout="constrained")
+    columns = figure.add_gridspec(1 + driven, 1 + plane, width_ratios=(1.25, 1.0)[: 1 + plane])
+    if plane:
+        start = np.asarray(path.states)[0]
+        cut: Mapping[Any, float] = {axis: float(start[axis]) for axis in range(grid.ndim) if axis not in axes}
+        ax = styled(figure.add_subplot(columns[:, 0]))
+        artists += value(solution, ax=ax, fixed=cut if fixed is None else fixed, target=target)
+        artists += trajectory(path, ax=ax, axes=axes if axes[0] < axes[1] else axes[::-1], grid=grid)
+    upper = styled(figure.add_subplot(columns[0, -1]))
+    artists += trajectory(path, ax=upper, axes=None, grid=grid)
+    if driven:
+        upper.set_xlabel("")
+        artists += controls(path, ax=styled(figure.add_subplot(columns[1, -1], sharex=upper)))
+        upper.tick_params(labelbottom=False)
+    return artists
+
+
+def residuals(solution: Any, *, ax: Any = None, label: str | None = None) -> list[Any]:
+    """The residual after each step on a logarithmic scale; steps where it is not finite are marked grey.
+
+    Args:
+      solution: what ``solve`` returned; its history lives on the host and is kept by neither ``jit`` nor ``vmap``.
+
+    Keyword Args:
+      ax: matplotlib axes to draw on; ``None`` makes a figure.
+      label: of the line in the legend, to compare several.
+
+    Raises:
+      ValueError: the solution carries no history.
+    """
+    history = np.asarray(solution.residuals if solution.residuals is not None else (), dtype=float).ravel()
+    if history.size == 0:
+        raise ValueError(
+            "residuals: the solution carries no history; it stays behind under jit and vmap: use solve directly"
+        )
+    ax = axes_of(ax, wide=True)
+    steps = np.arange(1, history.size + 1)
+    drawable = np.isfinite(history) & (history > 0)  # an exact zero has no logarithm
+    artists = ax.plot(steps, np.ma.masked_where(~drawable, history), color=None if label else COLOURS[0], label=label)
+    if history.size < 60:
+        artists[0].set(marker="o", markersize=3)
+    ax.set_yscale("log")
+    artists += bands(ax, steps, ~np.isfinite(history), "not finite")
+    label_axes(ax, "step", "residual")
+    if label or len(artists) > 1:
+        legend(ax)
+    return artists
+
+
+def _levels(values: np.ma.MaskedArray, levels: int | Sequence[float]) -> np.ndarray:
+    """Contour levels strictly between the extremes, so that none is empty."""
+    known = values.compressed()
+    if known.size == 0:
+        return known
+    places = np.linspace(known.min(), known.max(), levels + 2) if isinstance(levels, int) else np.sort(levels)
+    return places[(places > known.min()) & (places < known.max())]

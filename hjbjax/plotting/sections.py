@@ -1,0 +1,196 @@
+"""What a picture draws, as plain arrays: fields cut to one or two axes, and paths folded at periodic seams.
+
+Nothing here knows about matplotlib. Cuts are linear between nodes, as ``Solution.value_at`` is; fields of
+enumerated controls are cut at the nearest node. Entries that are not finite are masked.
+"""
+
+import difflib
+import itertools
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from hjbjax.problem.grid import Grid
+
+COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight")
+
+
+class Section(NamedTuple):
+    """A field cut down to one or two axes: the axes, their coordinates, masked values, and where it was cut."""
+
+    axes: tuple[int, ...]
+    coordinates: tuple[np.ndarray, ...]
+    values: np.ma.MaskedArray
+    caption: str
+
+
+def at_time(solution: Any, field: Any, time: float | None) -> tuple[np.ndarray, str]:
+    """The field at one stored time, and how to say so."""
+    field, times = np.asarray(field), getattr(solution, "times", None)
+    if times is None:
+        if time is not None:
+            raise ValueError(f"time: got {time!r}, but the solution is stationary; leave time out")
+        return field, ""
+    times = np.asarray(times)
+    index = int(np.argmin(times if time is None else np.abs(times - time)))
+    return field[index], f"t = {times[index]:.4g}"
+
+
+def nodes_in(target: Callable, grid: Grid) -> np.ndarray:
+    """Which nodes lie in a target, a bool (*grid)."""
+    states = grid.nodes().reshape(-1, grid.ndim)
+    with jax.enable_x64(True):
+        level = np.asarray(jax.lax.map(target, states, batch_size=1 << 16))
+    return level.reshape(grid.shape) <= 0
+
+
+def feedback(solution: Any, input: int, fixed: Any, time: float | None) -> tuple[Section, str]:
+    """One input's section, masked where no control is defined or the value is not finite, and its name."""
+    if solution.policy is None:
+        raise ValueError("policy: this solution has no policy")
+    inputs, caption = at_time(solution, solution.policy, time)
+    count = inputs.shape[-1]
+    if isinstance(input, bool) or not isinstance(input, (int, np.integer)) or not 0 <= input < count:
+        allowed = f"0 to {count - 1}" if count else "none: the problem has no control"
+        raise ValueError(f"policy: got input={input!r}, wanted one of {allowed}")
+    known = np.isfinite(at_time(solution, solution.value, time)[0])
+    field = np.where(known, inputs[..., input], np.nan)
+    nearest = getattr(solution, "discrete", False)  # the mean of two enumerated controls need not be admissible
+    return section_of("policy", field, solution.grid, fixed, caption, nearest), "u" if count == 1 else f"u{input + 1}"
+
+
+def section_of(
+    what: str,
+    field: np.ndarray,
+    grid: Grid,
+    fixed: Mapping[Any, float] | None,
+    caption: str,
+    nearest: bool = False,
+) -> Section:
+    """Cuts the field at the fixed coordinates, closes periodic axes and masks what is not finite."""
+    if field.shape != grid.shape:
+        raise ValueError(
+            f"{what}: got a field of shape {field.shape} on a grid of shape {grid.shape}; draw one lane at a time"
+        )
+    cuts: dict[int, float] = {}
+    for key, place in dict(fixed or {}).items():
+        axis = axis_number(key, grid)
+        if axis in cuts:
+            raise ValueError(f"{what}: fixed gives axis {axis} ({grid.names[axis]}) twice; give each axis once")
+        if not np.ndim(place) == 0 or not np.isreal(place):
+            raise ValueError(f"{what}: got {grid.names[axis]} = {place!r}, wanted one coordinate")
+        cuts[axis] = float(place)
+    free = tuple(axis for axis in range(grid.ndim) if axis not in cuts)
+    if not 1 <= len(free) <= 2:
+        raise ValueError(f"{what}: {_how_many(grid, free)}")
+    for axis in sorted(cuts, reverse=True):
+        field = _cut(what, field, grid, axis, cuts[axis], nearest)
+    for position, axis in enumerate(free):
+        if grid.periodic[axis]:  # type: ignore[index]
+            field = np.concatenate([field, np.take(field, [0], position)], position)
+    coordinates = tuple(_closed_axis(grid, axis) for axis in free)
+    places = [caption] * bool(caption) + [f"{grid.names[axis]} = {cuts[axis]:.4g}" for axis in sorted(cuts)]
+    return Section(free, coordinates, np.ma.masked_invalid(field), ", ".join(places))
+
+
+def _how_many(grid: Grid, free: tuple[int, ...]) -> str:
+    if not free:
+        return "every axis is fixed; leave one or two of them free"
+    rest = grid.ndim - 2
+    number = COUNTS[rest] if rest < len(COUNTS) else str(rest)
+    example = ", ".join(f"{grid.names[axis]!r}: ..." for axis in range(2, grid.ndim))
+    return (
+        f"a picture has two axes and {len(free)} are free ({', '.join(grid.names[axis] for axis in free)}); "
+        f"choose two axes and fix the other {number}, as in fixed={{{example}}}"
+    )
+
+
+def axis_number(key: Any, grid: Grid) -> int:
+    """The axis that a number or a name means."""
+    if isinstance(key, str) and key in grid.names:
+        return grid.names.index(key)
+    if isinstance(key, (int, np.integer)) and not isinstance(key, bool) and 0 <= key < grid.ndim:
+        return int(key)
+    near = difflib.get_close_matches(str(key), grid.names, 1)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    raise ValueError(f"fixed: got axis {key!r}, wanted one of {', '.join(grid.names)} or 0 to {grid.ndim - 1}{hint}")
+
+
+def _cut(what: str, field: np.ndarray, grid: Grid, axis: int, place: float, nearest: bool) -> np.ndarray:
+    """Linear interpolation along one axis; a neighbour of weight zero, infinite or not, does not count."""
+    lo, hi, last = float(grid.lo[axis]), float(grid.hi[axis]), grid.intervals(axis)
+    if grid.periodic[axis] and math.isfinite(place):  # type: ignore[index]
+        place = lo + (place - lo) % (hi - lo)
+    position = (place - lo) / (hi - lo) * last
+    if not -1e-9 <= position <= last + 1e-9:
+        raise ValueError(f"{what}: got {grid.names[axis]} = {place:g}, which is outside the grid, [{lo:g}, {hi:g}]")
+    if nearest or abs(position - round(position)) < 1e-9:  # on a node but for rounding
+        return np.take(field, round(position) % grid.shape[axis], axis)
+    cell = math.floor(position)
+    left, right = np.take(field, cell, axis), np.take(field, (cell + 1) % grid.shape[axis], axis)
+    with np.errstate(invalid="ignore"):  # ∞ − ∞ is NaN, and masked
+        return (cell + 1 - position) * left + (position - cell) * right
+
+
+def _closed_axis(grid: Grid, axis: int) -> np.ndarray:
+    """The coordinates of an axis; a periodic one gets its upper end as well."""
+    nodes = np.asarray(grid.axis(axis))
+    return np.append(nodes, grid.hi[axis]) if grid.periodic[axis] else nodes  # type: ignore[index]
+
+
+def zeros(x: np.ndarray, values: np.ma.MaskedArray) -> list[float]:
+    """Where a sampled function changes sign, linear between nodes; at the middle of nodes where it is zero."""
+    samples = values.filled(np.nan)
+    signed = np.flatnonzero(samples != 0).tolist()
+    crossings = []
+    for left, right in itertools.pairwise(signed):
+        if samples[left] * samples[right] >= 0 or np.isnan(samples[left] * samples[right]):
+            continue
+        share = samples[left] / (samples[left] - samples[right])
+        place = x[left] + share * (x[right] - x[left]) if right == left + 1 else np.mean(x[left + 1 : right])
+        crossings.append(float(place))
+    return crossings
+
+
+def lifted(states: np.ndarray, grid: Grid | None) -> np.ndarray:
+    """Periodic states made continuous in time."""
+    states = np.array(states, dtype=float)
+    for axis in range(0 if grid is None else grid.ndim):
+        if grid.periodic[axis]:  # type: ignore[union-attr, index]
+            states[:, axis] = np.unwrap(states[:, axis], period=float(grid.hi[axis] - grid.lo[axis]))  # type: ignore[union-attr]
+    return states
+
+
+def folded(states: np.ndarray, axes: tuple[int, int], grid: Grid | None) -> np.ndarray:
+    """Two columns with periodic states brought into the box, the line cut (a row of NaN) where it crosses a seam."""
+    points = states[:, list(axes)]
+    lo, period = np.zeros(2), np.full(2, np.inf)
+    for column, axis in enumerate(axes):
+        if grid is not None and grid.periodic[axis]:  # type: ignore[index]
+            lo[column], period[column] = grid.lo[axis], grid.hi[axis] - grid.lo[axis]
+
+    def turns(point):
+        return np.where(np.isinf(period), 0.0, np.floor((point - lo) / period))
+
+    def shift(count):
+        return np.where(np.isinf(period), 0.0, count * np.where(np.isinf(period), 0.0, period))
+
+    here = turns(points[0])
+    rows = [points[0] - shift(here)]
+    for start, end in itertools.pairwise(points):
+        cuts: set[float] = {0.0, 1.0}
+        for column in np.flatnonzero(turns(start) != turns(end)).tolist():
+            low, high = sorted((turns(start)[column], turns(end)[column]))
+            edges = lo[column] + np.arange(low + 1, high + 1) * period[column]
+            shares = (edges - start[column]) / (end[column] - start[column])
+            cuts.update(np.round(shares, 12).tolist())  # rounded, so that a corner is one cut
+        for a, b in itertools.pairwise(sorted(cuts)):
+            piece = turns(start + (a + b) / 2 * (end - start))
+            if np.any(piece != here):
+                rows += [np.full(2, np.nan), start + a * (end - start) - shift(piece)]
+                here = piece
+            rows.append((end if b == 1 else start + b * (end - start)) - shift(here))
+    return np.array(rows)

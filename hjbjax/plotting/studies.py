@@ -1,0 +1,92 @@
+"""Pictures of studies: errors over spacings, and changes over noise and disturbances, with the fitted orders."""
+
+from typing import Any
+
+import numpy as np
+
+from hjbjax.plotting.canvas import COLOURS, GREY, axes_of, label_axes, legend, logarithmic, pair_of_axes
+
+
+def convergence(study: Any, *, ax: Any = None) -> list[Any]:
+    """The errors of a convergence study over the spacing and over the seconds, with the fitted orders.
+
+    Full marks are the largest errors, rings the mean ones; the thin line beside the full marks has the fitted
+    slope. Errors of zero have no logarithm and are left out; an estimate is called one in the label of the axis.
+
+    Args:
+      study: what ``convergence_study`` returned.
+
+    Keyword Args:
+      ax: matplotlib axes to draw on: one for the errors over the spacing, or two, the second for the seconds;
+        ``None`` makes a figure with both.
+
+    Returns:
+      The artists: the line of the largest errors over the spacing first.
+
+    Raises:
+      ValueError: no error is positive and finite.
+    """
+    if not np.any((study.errors > 0) & np.isfinite(study.errors)):
+        raise ValueError(f"convergence: the errors are {study.errors}; there is none with a logarithm to draw")
+    axes = pair_of_axes() if ax is None else list(np.ravel(ax))
+    quality = "estimated error" if study.estimated else "error"
+    own = ax is None
+    artists = []
+    for ax, x, name in zip(axes, (study.h, study.seconds), ("h", "seconds"), strict=False):
+        for y, order, kind, fill in (
+            (study.errors, study.order, "largest", COLOURS[0]),
+            (study.mean_errors, study.mean_order, "mean", "white"),
+        ):
+            label = f"{kind}, order {order:.2f}" if np.isfinite(order) and name == "h" else kind
+            shown = np.ma.masked_where(~(np.isfinite(y) & (y > 0)), y)
+            style = {"color": COLOURS[0], "markerfacecolor": fill, "linewidth": 1.2, "markersize": 5}
+            artists += ax.plot(x, shown, marker="o", label=label, **style)
+        fitted = study.fitted & np.isfinite(study.errors) & (study.errors > 0)
+        if name == "h" and np.isfinite(study.order) and fitted.any():
+            middle = np.exp(np.mean(np.log(study.errors[fitted])) - study.order * np.mean(np.log(x[fitted])))
+            artists += ax.plot(x[fitted], middle * x[fitted] ** study.order, color=GREY, linewidth=3, zorder=0)
+        logarithmic(ax, study.h if name == "h" else None)
+        label_axes(ax, name, "" if own and name == "seconds" else quality)
+        legend(ax)
+    return artists
+
+
+def perturbation(study: Any, *, ax: Any = None) -> list[Any]:
+    """The changes of value and feedback over ε and over 1/γ in one picture, with the fitted orders.
+
+    Full marks are values, rings feedbacks; the thin grey line beside the full marks has the fitted slope.
+
+    Args:
+      study: what ``perturbation_study`` returned.
+
+    Keyword Args:
+      ax: matplotlib axes to draw on; ``None`` makes a figure.
+
+    Returns:
+      The artists: the line of the values over ε first.
+
+    Raises:
+      ValueError: no change is positive and finite.
+    """
+    artists = []
+    ax = axes_of(ax)
+    for series, color in ((study.noise, COLOURS[0]), (study.gain, COLOURS[1])):
+        if not np.any((series.errors > 0) & np.isfinite(series.errors)):
+            raise ValueError(f"perturbation: the changes over {series.name} are {series.errors}; none has a logarithm")
+        for what, y, order, fill in (
+            ("V", series.errors, series.order, color),
+            ("u", series.feedback_errors, series.feedback_order, "white"),
+        ):
+            shown = np.ma.masked_where(~(np.isfinite(y) & (y > 0)), y)
+            label = f"{what} over {series.name}" + (f", order {order:.2f}" if np.isfinite(order) else "")
+            style = {"color": color, "markerfacecolor": fill, "linewidth": 1.2, "markersize": 5}
+            artists += ax.plot(series.parameters, shown, marker="o", label=label, **style)
+        if np.isfinite(series.order):
+            x, y = series.parameters[series.fitted], series.errors[series.fitted]
+            middle = np.exp(np.mean(np.log(y)) - series.order * np.mean(np.log(x)))
+            artists += ax.plot(x, middle * x**series.order, color=GREY, linewidth=3, zorder=0)
+    logarithmic(ax)
+    label_axes(ax, "ε, 1/γ", "largest change")
+    # lines that rise leave this corner free
+    artists.append(ax.legend(loc="upper left", fontsize=8, frameon=False, borderaxespad=0.2, handlelength=1.4))
+    return artists

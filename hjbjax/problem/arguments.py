@@ -1,0 +1,75 @@
+"""Checks of arguments, said once: numbers, counts, kinds of choices.
+
+Each takes the name of the argument as the user knows it, as in ``"solve: tol"``, and refuses with that name, the value
+and what is wanted. Tracers pass: inside a JAX transformation no value can be looked at.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from hjbjax.problem.pytree import is_traced
+
+SHOWN = 80  # characters of a refused value that are quoted
+
+
+def positive(value: Any, name: str, unit: str = "", *, most: float = math.inf, endless: bool = False) -> None:
+    """Refuse what is not one finite number above zero.
+
+    Args:
+      value: what was given.
+      name: the argument.
+      unit: what the number counts, as in "in units of time".
+      most: the largest number that is admissible.
+      endless: whether infinity is admissible, too.
+
+    Raises:
+      ValueError: zero, negative, NaN, infinite, a truth value, an array, no number at all.
+    """
+    if is_traced(value) or (endless and is_number(value) and value == math.inf):
+        return
+    if not (is_number(value) and math.isfinite(value) and 0 < value <= most):
+        wanted = "a finite number > 0" if most == math.inf else f"a number > 0 and at most {most:g}"
+        raise ValueError(f"{name} = {shown(value)}; wanted {wanted}{unit and ', ' + unit}")
+
+
+def count(value: Any, name: str, least: int = 1) -> None:
+    """Refuse what is not an integer of at least ``least``.
+
+    Raises:
+      ValueError: too small, a float, a truth value, no number at all.
+    """
+    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    if not whole or value < least:
+        wanted = "a positive integer" if least == 1 else f"an integer of at least {least}"
+        raise ValueError(f"{name} = {shown(value)}; wanted {wanted}")
+
+
+def one_of(value: Any, name: str, kinds: tuple[type, ...], wanted: str) -> None:
+    """Refuse a choice of another kind.
+
+    Raises:
+      TypeError: ``value`` is an instance of none of the ``kinds``, which ``wanted`` spells out.
+    """
+    if not isinstance(value, kinds):
+        raise TypeError(f"{name} is {shown(value)}; wanted {wanted}")
+
+
+def is_number(value: Any) -> bool:
+    """Whether ``value`` is one real number; truth values and text that looks like one are none."""
+    if isinstance(value, (bool, str, bytes)) or value is None:
+        return False
+    if isinstance(value, int):  # of any size that a float has
+        return value.bit_length() < 1024
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError):  # a ragged list, an object that fails on its way to an array
+        return False
+    return array.ndim == 0 and array.dtype.kind in "fiu"
+
+
+def shown(value: Any) -> str:
+    """How a value is quoted in a refusal: its ``repr``, one line, not too long."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= SHOWN else text[: SHOWN - 4] + " ..."

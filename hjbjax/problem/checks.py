@@ -1,0 +1,253 @@
+"""What a problem must satisfy before a solve starts, seen on one state; host level, never under a tracer.
+
+Every function is traced once and nothing is allocated. What is refused is named, with the way out.
+"""
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.problem import indices, sets
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import remembered
+
+OF_ACTION = ("drift", "cost", "noise")
+STATE_COSTS = ("exit_cost", "terminal_cost", "stopping_cost", "running_max")
+
+_TRACED = (  # most special first
+    (
+        (jax.errors.TracerBoolConversionError, jax.errors.NonConcreteBooleanIndexError),
+        "decides by Python `if`, `and`, `min`, `max` or a mask on a traced value: use jnp.where (jnp.minimum, ...)",
+    ),
+    (jax.errors.TracerArrayConversionError, "hands a traced value to NumPy: use jnp in place of np"),
+    (jax.errors.TracerIntegerConversionError, "indexes by a traced value: use jnp.asarray(table)[i]"),
+    (
+        jax.errors.ConcretizationTypeError,
+        "needs a traced value as a number: use jnp in place of np, math, float() and int(), and jnp.where for `if`",
+    ),
+)
+
+
+def shapes(problem: Problem, grid: Grid, scheme: Any) -> None:
+    """Refuse functions that cannot be traced on one state or return something else than they should.
+
+    Args:
+      problem: the problem.
+      grid: the grid; only its number of axes and their points matter.
+      scheme: the scheme; one with a number ``points`` needs as many points an axis.
+
+    Raises:
+      ValueError: a result of the wrong shape or kind, a wrong number of arguments, code that JAX cannot trace.
+    """
+    needed = getattr(scheme, "points", 2)
+    for axis, count in enumerate(grid.shape):
+        if count < needed:
+            raise ValueError(f"axis {axis} has {count} points; {type(scheme).__name__} needs at least {needed}")
+    n = grid.ndim
+    of_one_state(problem, n, "the number of axes of the grid")
+    if problem.noise is not None:
+        with jax.enable_x64(True):
+            if len(_returned(problem, "noise", n)) == 2:
+                refuse_stretched(grid)
+
+
+def refuse_stretched(grid: Grid) -> None:
+    """Refuse correlated noise, σ of shape (n, k), on a stretched grid: its diagonal jumps want equal spacings."""
+    if grid.ndim > 1 and any(each is not None for each in grid.stretch or ()):
+        raise ValueError(
+            "noise: correlated noise, σ of shape (n, k), wants equal spacings: leave out Grid.stretch, or give noise "
+            "by axis, (n,)"
+        )
+
+
+def of_one_state(problem: Problem, n: int, meaning: str) -> None:
+    """The same without a grid, for a state of ``n`` numbers.
+
+    Args:
+      problem: the problem.
+      n: the number of states.
+      meaning: what n is, for refusals.
+
+    Raises:
+      ValueError: as ``shapes``.
+    """
+
+    def expect(name: str, wanted: str, fits: Callable[[tuple], bool]) -> None:
+        _expect(problem, name, n, wanted, fits, "a scalar" if wanted == "()" else f"n = {n} is {meaning}")
+
+    with jax.enable_x64(True):
+        expect("drift", f"({n},)", lambda shape: shape == (n,))
+        expect("noise", f"(), ({n},) or ({n}, k)", lambda shape: shape[:1] in ((), (n,)) and len(shape) <= 2)
+        for name in ("cost", "target", *STATE_COSTS):
+            expect(name, "()", lambda shape: shape == ())
+
+
+def ill_posed(problem: Problem, has_rest: bool, grid: Grid) -> None:
+    """Refuse an endless sum of costs: no discount, and nothing that ends the path or lets it rest at no cost.
+
+    Args:
+      problem: the problem.
+      has_rest: whether there is a node where the system can rest at no cost.
+      grid: the nodes; where none stands in the middle of the box, the refusal says which shape puts one there.
+
+    Raises:
+      ValueError: there is no finite solution; with what would give one.
+    """
+    ends = (problem.target, problem.stopping_cost, problem.running_max)
+    if problem.discount > 0 or has_rest or any(end is not None for end in ends):
+        return
+    raise ValueError(
+        "Problem: there is no finite solution: discount = 0, and the cost is paid for ever, since there is no target,\n"
+        "no stopping_cost, no running_max and no node where the system can rest at no cost.\n"
+        "Give discount > 0, or a target, or put a rest point (drift 0 and cost 0 for some control) on a node,\n"
+        "or march over a finite horizon" + _middle(grid)
+    )
+
+
+def _middle(grid: Grid) -> str:
+    """Which shape puts a node in the middle of the box: an even number on a periodic axis, an odd one on another."""
+    shape = tuple(
+        count - (count % 2 if cyclic else 1 - count % 2)
+        for count, cyclic in zip(grid.shape, grid.periodic or (), strict=True)
+    )
+    if shape == grid.shape or min(shape) < 2:
+        return ""
+    return f".\nNo node stands in the middle of the box, as in 0 on [-1, 1]; shape={shape} puts one there"
+
+
+# --- on one state ---
+
+
+def call(problem: Problem, name: str) -> str:
+    """How the problem calls one of its functions, as in ``drift(x, u)``."""
+    if not callable(getattr(problem, name)):
+        return name
+    return f"{name}({', '.join(_names(problem, name))})"
+
+
+def _names(problem: Problem, name: str) -> tuple[str, ...]:
+    if name in OF_ACTION:
+        return problem.arguments("x", "u", "d", "t")
+    return problem.state_arguments("x", "t")
+
+
+def _expect(problem: Problem, name: str, n: int, wanted: str, fits: Callable[[tuple], bool], why: str) -> None:
+    """Refuse an ingredient of the wrong kind or shape."""
+    ingredient = getattr(problem, name)
+    if ingredient is None:
+        return
+    verdict = _returned(problem, name, n)
+    if isinstance(verdict, str):
+        hint = ""
+        if verdict.startswith(("a list", "a tuple")) and wanted != "()":
+            hint = ": use jnp.stack([...])"
+        if name == "target" and "bool" in verdict:
+            hint = ": a distance ≤ 0 inside, as jnp.linalg.norm(x) - 0.1"
+        raise ValueError(
+            f"{call(problem, name)} returned {verdict}, expected floating-point numbers of shape {wanted}{hint}"
+        )
+    if not fits(verdict):
+        raise ValueError(f"{call(problem, name)} returned shape {verdict}, expected {wanted}: {why}")
+
+
+def _returned(problem: Problem, name: str, n: int) -> tuple[int, ...] | str:
+    """The shape of what an ingredient is or returns; of anything but floating-point numbers a description."""
+    ingredient = getattr(problem, name)
+    return _probe(problem, name, n) if callable(ingredient) else _verdict(ingredient)
+
+
+def _verdict(result: Any) -> tuple[int, ...] | str:
+    """The shape of floating-point numbers; of anything else a description."""
+    if result is None or isinstance(result, str):
+        return repr(result)
+    if isinstance(result, (list, tuple, dict)):
+        return f"a {type(result).__name__} of {len(result)}"
+    try:
+        dtype, shape = jnp.result_type(result), jnp.shape(result)
+    except TypeError:
+        return f"an object of type {type(result).__name__}"
+    if jnp.issubdtype(dtype, jnp.floating):
+        return shape
+    plain = isinstance(result, int) or getattr(result, "weak_type", False)  # `cost=lambda x, u: 1` is a number
+    if jnp.issubdtype(dtype, jnp.integer) and plain:
+        return shape
+    return f"{dtype} numbers"
+
+
+def _probe(problem: Problem, name: str, n: int) -> tuple[int, ...] | str:
+    """What a function returns on one state, found by tracing it."""
+    function, names, said_call = getattr(problem, name), _names(problem, name), call(problem, name)
+    lengths = _lengths(problem, n)
+    _check_arity(problem, name)
+    try:
+        verdict, outside, _ = _traced(function, names, tuple(lengths[letter] for letter in names))
+    except Exception as error:
+        fed = ", ".join(f"{letter} of shape {lengths[letter]}" for letter in names)
+        for kind, advice in _TRACED:
+            if isinstance(error, kind):
+                raise ValueError(f"{said_call} {advice}.\nIt is traced once on one state, with {fed}") from error
+        if isinstance(error, (TypeError, ValueError, IndexError)):
+            said = (str(error).strip() or type(error).__name__).splitlines()[0]
+            raise ValueError(f"{said_call} failed on one state, with {fed}:\n{said[:400]}") from error
+        error.add_note(f"raised by {said_call}, traced on one state, with {fed}")
+        raise
+    if outside is not None:
+        raise ValueError(f"{said_call} asks for {outside}.\nJAX would take the nearest one, or none, without a word")
+    return verdict
+
+
+def _lengths(problem: Problem, n: int) -> dict[str, tuple[int, ...]]:
+    """The shapes of the arguments of one state."""
+    return {"x": (n,), "u": (_dim(problem.controls),), "d": (_dim(problem.disturbances),), "t": ()}
+
+
+def calls_back(problem: Problem, n: int) -> bool:
+    """Whether a function of a problem calls Python while it runs, where anything may happen."""
+    lengths = _lengths(problem, n)
+    with jax.enable_x64(True):
+        for name in (*OF_ACTION, "target", *STATE_COSTS):
+            function, names = getattr(problem, name), _names(problem, name)
+            if callable(function) and _traced(function, names, tuple(lengths[letter] for letter in names))[2]:
+                return True
+    return False
+
+
+@remembered
+def _traced(
+    function: Callable, names: tuple[str, ...], lengths: tuple[tuple[int, ...], ...]
+) -> tuple[tuple[int, ...] | str, str | None, bool]:
+    """What a function returns for arguments of these shapes, what it asks for outside an array, if it calls Python."""
+    verdicts = []
+
+    def probe(*arguments):
+        result = function(*arguments)
+        verdicts.append(_verdict(result))
+        return () if isinstance(verdicts[0], str) else result
+
+    closed = jax.make_jaxpr(probe)(*(jax.ShapeDtypeStruct(shape, np.float64) for shape in lengths))
+    return verdicts[0], indices.beyond(closed, names), indices.calls_back(closed)
+
+
+def _dim(choices: sets.AdmissibleSet | None) -> int:
+    return 0 if choices is None else choices.dim
+
+
+def _check_arity(problem: Problem, name: str) -> None:
+    try:
+        signature = inspect.signature(getattr(problem, name))
+    except (TypeError, ValueError):  # a builtin says nothing about its arguments
+        return
+    try:
+        signature.bind(*_names(problem, name))
+    except TypeError as error:
+        time = "t first because time_dependent=True" if problem.time_dependent else "t only with time_dependent=True"
+        players = "d because disturbances are given" if problem.is_game else "d only with disturbances"
+        why = f"x and u always; {players}; {time}" if name in OF_ACTION else f"x always; {time}"
+        raise ValueError(
+            f"{name} does not take the arguments that the problem passes, {call(problem, name)}: {error}.\nWhy: {why}"
+        ) from error

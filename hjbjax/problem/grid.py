@@ -1,0 +1,359 @@
+"""The box of nodes on which a value function lives.
+
+Node-centred: both ends of an ordinary axis are nodes; a periodic axis omits its upper end. Coordinates are
+x_i = (lo·(M − i) + hi·i)/M with M = N − 1 (M = N on a periodic axis), so that a node at zero is exactly zero.
+They are computed once, in NumPy, one table an axis that travels with the grid: a compiled division rounds otherwise,
+and whether a node on the boundary of a target belongs to it must not depend on the program that asks.
+"""
+
+import dataclasses
+import difflib
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.problem.pytree import altered, is_traced, node, numbers
+from hjbjax.problem.stretching import Sinh, Stretching
+
+ROUNDINGS = 16  # units of eps of the largest coordinate by which the formula may miss its table
+EDGES = ("projected", "constrained", "open")  # names, as they carry no numbers: static, hashable, saved as they are
+Ends = tuple[str, str] | None  # of an axis: the kinds of its lower and its upper end; none where it is periodic
+
+
+COINCIDING = 16  # units in the last place of a coordinate, of which a spacing must be more
+TABLED = 2**24  # points of an axis whose coordinates are kept; a grid that is refused must not allocate them before
+
+
+@node(static=("shape", "periodic", "names", "edges"))
+class Grid:
+    """A grid of nodes on a box in R^n, uniform along every axis that is not stretched.
+
+    Args:
+      lo: lower corner, shape (n,), in the units of each state.
+      hi: upper corner, shape (n,); on a periodic axis the point that is the same as ``lo``.
+      shape: number of nodes an axis, n integers of at least 2.
+      periodic: one bool an axis; ``None`` means none.
+      names: one name an axis, used by pictures and printed tables.
+      stretch: one ``Sinh(strength, center)`` or ``None`` an axis; ``None`` means uniform. Not on a periodic axis.
+      edges: what happens to drift that points out of the box: a name for every end, or one entry an axis, a name or
+        a pair (lower end, upper end); ``None`` on a periodic axis, which has no ends.
+        "projected": the component that leaves is cut off, while the control keeps what it costs and earns.
+        "constrained": actions whose drift leaves are not admissible: the state-constrained problem.
+        "open": paths may leave; the value goes on beyond the end as the parabola through its last three nodes.
+        Noise reflects at a projected and at a constrained end, and goes on at an open one.
+
+    Raises:
+      ValueError: bounds that are not finite or not increasing, lengths that differ, or an unknown kind of end.
+      TypeError: sizes that are not integers, periodicities that are not booleans.
+
+    Example:
+      >>> grid = Grid(lo=[-1.0, 0.0], hi=[1.0, 1.0], shape=(5, 4), periodic=(False, True))
+      >>> grid.axis(0).tolist(), grid.axis(1).tolist()
+      ([-1.0, -0.5, 0.0, 0.5, 1.0], [0.0, 0.25, 0.5, 0.75])
+    """
+
+    lo: Any
+    hi: Any
+    shape: tuple[int, ...]
+    periodic: tuple[bool, ...] | None = None
+    names: tuple[str, ...] = ()
+    stretch: tuple[Stretching | None, ...] | None = None
+    edges: Any = "projected"
+    coordinates: tuple[Any, ...] = dataclasses.field(init=False, repr=False)
+
+    def __post_init__(self):
+        lo, hi = _corner(self.lo, "lo"), _corner(self.hi, "hi")
+        shape = _sizes(self.shape)
+        periodic = _flags(self.periodic, len(shape))
+        names = tuple(str(name) for name in self.names) or tuple(f"x{axis + 1}" for axis in range(len(shape)))
+        stretch = (None,) * len(shape) if self.stretch is None else tuple(self.stretch)
+        lengths = (len(lo), len(hi), len(shape), len(periodic), len(names), len(stretch))
+        if len(set(lengths)) != 1:
+            raise ValueError(
+                "Grid: got lo, hi, shape, periodic, names and stretch of lengths {}, {}, {}, {}, {} and {}; "
+                "wanted one entry an axis in each".format(*lengths)
+            )
+        _check_stretch(stretch, periodic)
+        if isinstance(lo, np.ndarray) and isinstance(hi, np.ndarray):
+            for axis, (low, high) in enumerate(zip(lo, hi, strict=True)):
+                if not (math.isfinite(low) and math.isfinite(high) and low < high):
+                    raise ValueError(f"Grid: axis {axis} runs from {low:g} to {high:g}; wanted finite lo < hi")
+        edges = _edges(self.edges, periodic, shape)
+        checked = {
+            "lo": lo, "hi": hi, "shape": shape, "periodic": periodic, "names": names, "stretch": stretch, "edges": edges
+        }  # fmt: skip
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
+        tables = (self._computed(axis) if count <= TABLED else None for axis, count in enumerate(shape))
+        object.__setattr__(self, "coordinates", tuple(tables))
+        self.check_spacings(np.float64)
+
+    def check_spacings(self, dtype: Any) -> None:
+        """Refuse nodes that coincide up to rounding in ``dtype``: differences of values would be rounding as well.
+
+        Raises:
+          ValueError: with the axis and its ends.
+        """
+        for axis, nodes in enumerate(self.coordinates):
+            if not isinstance(nodes, np.ndarray):
+                continue
+            largest = max(abs(nodes[0]), abs(nodes[-1]))
+            if np.min(np.diff(nodes)) <= COINCIDING * np.finfo(dtype).eps * largest:
+                lo, hi = float(nodes[0]), float(nodes[-1])
+                raise ValueError(
+                    f"Grid: axis {axis} has {len(nodes)} points between {lo:.17g} and {hi:.17g}: spacings that are "
+                    f"rounding of its coordinates in {np.dtype(dtype)}; take fewer points, or measure the state from a "
+                    "point in the box"
+                )
+
+    @property
+    def ndim(self) -> int:
+        """The number of states n."""
+        return len(self.shape)
+
+    @property
+    def size(self) -> int:
+        """The number of nodes, a Python integer of any size."""
+        return math.prod(self.shape)
+
+    def sides(self, kind: str) -> list[tuple[int, int]]:
+        """The sides of the box with ends of this kind: pairs of an axis and a step, −1 lower and 1 upper."""
+        ends = ((axis, pair) for axis, pair in enumerate(self.edges) if pair is not None)
+        return [(axis, step) for axis, pair in ends for step, name in zip((-1, 1), pair, strict=True) if name == kind]
+
+    @property
+    def walled(self) -> "Grid":
+        """The grid with its open ends made projected ones."""
+        pairs = (pair and tuple("projected" if name == "open" else name for name in pair) for pair in self.edges)
+        return altered(self, edges=tuple(pairs))
+
+    def intervals(self, axis: int) -> int:
+        """The number M of intervals between ``lo`` and ``hi``."""
+        return self.shape[axis] if self.periodic[axis] else self.shape[axis] - 1  # type: ignore[index]
+
+    def spacing(self, axis: int) -> Any:
+        """The distance h between neighbours along ``axis``; their mean on a stretched one."""
+        return (self.hi[axis] - self.lo[axis]) / self.intervals(axis)
+
+    def axis(self, axis: int, dtype: Any = None) -> Any:
+        """The coordinates of the nodes along one axis, shape (N,); the same numbers in every program."""
+        computed, table = self._computed(axis), self.coordinates[axis]
+        table = computed if table is None else table
+        if is_traced(computed, table):
+            return _tabled(*(jnp.asarray(each, dtype or jnp.result_type(float)) for each in (computed, table)))
+        return np.asarray(table, dtype or np.float64)
+
+    def _computed(self, axis: int) -> Any:
+        """The coordinates by the formula, in NumPy where the corners are known numbers."""
+        index, last = np.arange(self.shape[axis], dtype=np.float64), self.intervals(axis)
+        stretching = self.stretch[axis]  # type: ignore[index]
+        if stretching is not None:
+            index = last * stretching.place(index / last)
+        return (self.lo[axis] * (last - index) + self.hi[axis] * index) / last
+
+    def components(self, dtype: Any) -> list[jax.Array]:
+        """The coordinates as n arrays, the i-th of which varies along axis i alone and broadcasts."""
+        columns = []
+        for axis, count in enumerate(self.shape):
+            along = [1] * self.ndim
+            along[axis] = count
+            columns.append(jnp.asarray(self.axis(axis, np.dtype(dtype)), dtype).reshape(along))
+        return columns
+
+    def state(self, index: Sequence[int]) -> np.ndarray:
+        """The state at a node, shape (n,); host level."""
+        return np.array([np.asarray(self.axis(axis))[i] for axis, i in enumerate(index)])
+
+    def nodes(self) -> np.ndarray:
+        """All states, shape (*grid, n), at host level: a table for tests and pictures, not for solvers."""
+        return np.stack(np.meshgrid(*(np.asarray(self.axis(i)) for i in range(self.ndim)), indexing="ij"), axis=-1)
+
+    def inner(self, share: float) -> np.ndarray:
+        """The nodes in the middle ``share`` of every axis that is not periodic, bool (*grid); host level."""
+        inside = np.ones(self.shape, bool)
+        for axis in range(self.ndim):
+            if not self.periodic[axis]:  # type: ignore[index]
+                nodes, lo, hi = np.asarray(self.axis(axis)), float(self.lo[axis]), float(self.hi[axis])
+                near = np.abs(nodes - (lo + hi) / 2) <= share * (hi - lo) / 2 * (1 + 1e-9)
+                inside &= near.reshape([-1 if i == axis else 1 for i in range(self.ndim)])
+        return inside
+
+    def volumes(self) -> np.ndarray:
+        """The part of the box that belongs to each node, shape (*grid), host level: half cells at ends that are nodes.
+
+        Their sum is the volume of the box, and sums of node values weighted by them are trapezoidal integrals.
+        """
+        total = np.ones(())
+        for axis, count in enumerate(self.shape):
+            gaps = np.diff(np.append(np.asarray(self.axis(axis)), self.hi[axis] if self.periodic[axis] else []))  # type: ignore[index]
+            share = np.zeros(count)
+            share[: len(gaps)] += gaps / 2
+            share[-len(gaps) :] += gaps / 2
+            total = np.multiply.outer(total, share)
+        return total
+
+    def wrap(self, x: Any) -> Any:
+        """States with their periodic entries brought into [lo, hi); the others as they are."""
+        x = _states(x)
+        lo, hi = jnp.asarray(self.lo, x.dtype), jnp.asarray(self.hi, x.dtype)
+        moved = lo + jnp.mod(x - lo, hi - lo)
+        moved = jnp.where(moved >= hi, lo, moved)  # just below lo, the remainder rounds up to a whole period
+        return jnp.where(np.array(self.periodic) & ~((x >= lo) & (x < hi)), moved, x)
+
+    def interpolate(self, values: Any, x: Any, *, clamp: bool = False) -> jax.Array:
+        """Multilinear interpolation of node values, second order; jit- and vmap-able.
+
+        Args:
+          values: shape (*grid, ...).
+          x: states, shape (..., n).
+          clamp: outside the box take the nearest point of the box; otherwise the answer there is NaN.
+
+        Returns:
+          Shape ``x.shape[:-1] + values.shape[n:]``.
+        """
+        values, x = jnp.asarray(values), _states(x)
+        if x.ndim == 0 or x.shape[-1] != self.ndim:
+            raise ValueError(f"Grid: got states of shape {x.shape}, wanted (..., {self.ndim}): one entry an axis")
+        if values.shape[: self.ndim] != self.shape:
+            raise ValueError(f"Grid: got values of shape {values.shape}, wanted {self.shape} first: one a node")
+        x = self.wrap(x)
+        cells, fractions, inside = zip(*(self._locate(axis, x[..., axis]) for axis in range(self.ndim)), strict=True)
+        trailing = (1,) * (values.ndim - self.ndim)
+        total = jnp.zeros((), x.dtype)
+        for corner in np.ndindex(*(2,) * self.ndim):
+            weight = jnp.ones((), x.dtype)
+            for fraction, bit in zip(fractions, corner, strict=True):
+                weight = weight * (fraction if bit else 1 - fraction)
+            index = tuple((cell + bit) % count for cell, bit, count in zip(cells, corner, self.shape, strict=True))
+            weight, at_corner = weight.reshape(weight.shape + trailing), values[index]
+            # A corner of no weight may be infinite (0 · inf); where it is finite it still carries the derivative.
+            total = total + weight * jnp.where((weight == 0) & ~jnp.isfinite(at_corner), 0, at_corner)
+        hidden = jnp.any(jnp.isnan(x), axis=-1) | ((not clamp) & ~jnp.all(jnp.stack(inside), axis=0))
+        return jnp.where(hidden.reshape(hidden.shape + trailing), jnp.nan, total)
+
+    def _locate(self, axis: int, x: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """The node below ``x``, the fraction of the way to the next, and whether ``x`` lies in the box."""
+        lo, hi, last = jnp.asarray(self.lo[axis], x.dtype), jnp.asarray(self.hi[axis], x.dtype), self.intervals(axis)
+        place = (x - lo) / (hi - lo)
+        if self.stretch[axis] is not None:  # type: ignore[index]
+            return self._locate_stretched(axis, x, place)
+        place = place * last
+        # What rounding of coordinates of the size of the ends can do to a place, in cells, with room to spare.
+        slack = 8 * last * jnp.finfo(x.dtype).eps * jnp.maximum(1, jnp.maximum(abs(lo), abs(hi)) / (hi - lo))
+        inside = (place >= -slack) & (place <= last + slack)  # NaN counts as outside
+        place = jnp.clip(jnp.nan_to_num(place), 0, last)
+        # A node is met exactly, so that an infinite neighbour stays out of it; the derivative is untouched.
+        to_node = jax.lax.stop_gradient(jnp.round(place) - place)
+        place = place + jnp.where(abs(to_node) <= slack, to_node, 0)
+        cell = jnp.minimum(jnp.floor(jax.lax.stop_gradient(place)), last - 1).astype(int)
+        return cell, place - cell, inside
+
+    def _locate_stretched(self, axis: int, x: jax.Array, place: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """The same on a stretched axis: the cell by the inverse map, the fraction by the coordinates of its ends."""
+        slack = 64 * jnp.finfo(x.dtype).eps
+        inside = (place >= -slack) & (place <= 1 + slack)
+        nodes, last = jnp.asarray(self.axis(axis), x.dtype), self.intervals(axis)
+        guess = last * self.stretch[axis].fraction(jnp.clip(jnp.nan_to_num(place), 0, 1))  # type: ignore[index, union-attr]
+        cell = jnp.clip(jnp.floor(jax.lax.stop_gradient(guess)).astype(int), 0, last - 1)
+        cell = jnp.clip(cell + (x >= nodes[cell + 1]) - (x < nodes[cell]), 0, last - 1)  # rounding of the inverse map
+        fraction = (x - nodes[cell]) / (nodes[cell + 1] - nodes[cell])
+        fraction = jnp.nan_to_num(fraction)  # a clip would halve the derivative on a node, where it is 0 or 1
+        return cell, jnp.where((fraction >= 0) & (fraction <= 1), fraction, jnp.clip(fraction, 0, 1)), inside
+
+
+@jax.custom_jvp
+def _tabled(computed: jax.Array, table: jax.Array) -> jax.Array:
+    """The table, with the derivative of the formula; the formula where the corners were changed alone."""
+    slack = ROUNDINGS * jnp.finfo(table.dtype).eps * jnp.max(jnp.abs(computed))
+    return jnp.where(jnp.abs(computed - table) <= slack, table, computed)
+
+
+@_tabled.defjvp
+def _derivative_of_the_formula(primals: tuple, tangents: tuple) -> tuple:
+    return _tabled(*primals), tangents[0]
+
+
+def _states(x: Any) -> jax.Array:
+    x = jnp.asarray(x)
+    return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(float)
+
+
+def _check_stretch(stretch: tuple, periodic: tuple[bool, ...]) -> None:
+    for axis, (stretching, cyclic) in enumerate(zip(stretch, periodic, strict=True)):
+        if stretching is not None and not isinstance(stretching, Sinh):
+            raise TypeError(f"Grid.stretch: entry {axis} is {stretching!r}; wanted Sinh(strength, center) or None")
+        if stretching is not None and cyclic:
+            raise ValueError(f"Grid.stretch: axis {axis} is periodic; only an axis with ends can be stretched")
+
+
+def _edges(edges: Any, periodic: tuple[bool, ...], shape: tuple[int, ...]) -> tuple[Ends, ...]:
+    """The kinds of both ends of every axis, checked."""
+    if edges is None or isinstance(edges, str):
+        _kind(edges, "every end")
+        edges = [None if cyclic else edges for cyclic in periodic]
+    if not isinstance(edges, Sequence) or len(edges) != len(periodic):
+        pair = '(("open", "constrained"),)' if len(periodic) == 1 else '("open", ("projected", "constrained"))'
+        raise ValueError(
+            f"Grid.edges: got {edges!r} for {len(periodic)} axes; wanted a name for all, or one entry an axis: a name "
+            f"or a pair (lower end, upper end), as in {pair}"
+        )
+    return tuple(_ends(entry, axis, periodic[axis], shape[axis]) for axis, entry in enumerate(edges))
+
+
+def _ends(entry: Any, axis: int, cyclic: bool, count: int) -> Ends:
+    """The kinds of the two ends of one axis."""
+    if cyclic and entry is not None:
+        raise ValueError(f"Grid.edges: axis {axis} is periodic and has no ends; got {entry!r} there, wanted None")
+    if cyclic:
+        return None
+    pair = (entry, entry) if entry is None or isinstance(entry, str) else entry
+    if not isinstance(pair, Sequence) or len(pair) != 2:
+        raise ValueError(f"Grid.edges: axis {axis} has {entry!r}; wanted a name or a pair (lower end, upper end)")
+    lower, upper = (_kind(name, f"axis {axis}") for name in pair)
+    if "open" in (lower, upper) and count < 3:
+        raise ValueError(f"Grid.edges: axis {axis} has {count} points; an open end continues the last three")
+    return lower, upper
+
+
+def _kind(name: Any, where: str) -> str:
+    if name is None:
+        return "projected"
+    if name not in EDGES:
+        near = difflib.get_close_matches(str(name), EDGES, 1, 0.4)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise ValueError(f"Grid.edges: got {name!r} for {where}; wanted one of {', '.join(map(repr, EDGES))}{hint}")
+    return name
+
+
+def _corner(value: Any, name: str) -> Any:
+    corner = numbers(value, f"Grid.{name}")
+    if np.ndim(corner) != 1 or np.size(corner) == 0:
+        raise ValueError(f"Grid.{name}: got {value!r}, wanted a list of numbers, one an axis")
+    return corner
+
+
+def _sizes(shape: Any) -> tuple[int, ...]:
+    if isinstance(shape, str) or not isinstance(shape, (Sequence, np.ndarray)):
+        raise TypeError(f"Grid.shape: got {shape!r}, wanted a tuple of integers, one an axis")
+    for axis, count in enumerate(shape):
+        if isinstance(count, (bool, np.bool_)) or not isinstance(count, (int, np.integer)):
+            raise TypeError(f"Grid.shape: axis {axis} has {count!r} points; wanted an integer")
+        if count < 2:
+            raise ValueError(f"Grid.shape: axis {axis} has {count} points; wanted at least 2")
+    return tuple(int(count) for count in shape)
+
+
+def _flags(periodic: Any, n: int) -> tuple[bool, ...]:
+    if periodic is None:
+        return (False,) * n
+    wanted = f"wanted one bool an axis (not axis numbers), as in {(True,) + (False,) * (n - 1)}"
+    if isinstance(periodic, (str, bool)) or not isinstance(periodic, (Sequence, np.ndarray)):
+        raise TypeError(f"Grid.periodic: got {periodic!r}, {wanted}")
+    for axis, flag in enumerate(periodic):
+        if not isinstance(flag, (bool, np.bool_)):
+            raise ValueError(f"Grid.periodic: entry {axis} is {flag!r}; {wanted}")
+    return tuple(bool(flag) for flag in periodic)

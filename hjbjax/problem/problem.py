@@ -1,0 +1,199 @@
+"""The question: one variational inequality, every ingredient optional.
+
+    min{ max{ β V − V_t − H(x, DV, D²V),  V − ψ },  V − g } = 0
+    H = min_u max_d [ L(x,u,d) + f(x,u,d)·DV + ½ tr(σσᵀ(x,u,d) D²V) ]
+
+The control minimises cost, the disturbance maximises it. Everything here is written for one state.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.problem.pytree import as_partial, is_traced, node, numbers
+from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite
+
+
+@node(static=("isaacs", "time_dependent", "discounted"))
+class Problem:
+    """An optimal control problem or a two-player zero-sum differential game.
+
+    Functions act on one state. ``drift``, ``cost`` and a callable ``noise`` take ``(x, u)``; they take
+    ``(x, u, d)`` exactly when ``disturbances`` is given. ``target``, ``exit_cost``, ``terminal_cost``,
+    ``stopping_cost`` and ``running_max`` take ``(x)``. With ``time_dependent=True`` the time goes first in all.
+
+    Args:
+      drift: f, returns shape (n,): the rate of change of the state.
+      cost: L, returns a scalar: cost per unit time. ``None`` is zero.
+      controls: the admissible set of u, shape (m,). ``None``: there is no control and u has shape (0,).
+
+    Keyword Args:
+      disturbances: the admissible set of the opponent's d.
+      noise: σ in dx = f dt + σ dw: a scalar ε (σ = ε I), an (n,) diagonal, an (n, k) matrix, or a function
+        with the arguments of ``drift`` that returns one of these.
+      discount: β ≥ 0, per unit time.
+      target: a function that is ≤ 0 inside the target, where the run ends.
+      exit_cost: paid on the target; a number or a function. ``None`` is zero.
+      terminal_cost: V at the horizon, for ``march``.
+      stopping_cost: ψ, the controller may stop and pay it: V ≤ ψ.
+      running_max: g, the cost is the running maximum of g: V ≥ g. Needs zero running cost and no discount.
+      isaacs: ``"upper"`` is min over u of max over d (the disturbance sees u), ``"lower"`` is max min.
+      time_dependent: whether the functions take the time as their first argument.
+
+    Raises:
+      ValueError: an ingredient that contradicts another, or a number that is not admissible.
+      TypeError: something that is not callable where a function is wanted.
+
+    Example:
+      >>> import jax.numpy as jnp
+      >>> Problem(lambda x, u: u, lambda x, u: x @ x + u @ u, Box([-1.0], [1.0]), discount=1.0).controls.dim
+      1
+    """
+
+    drift: Any
+    cost: Any = None
+    controls: AdmissibleSet | None = None
+    disturbances: AdmissibleSet | None = None
+    noise: Any = None
+    discount: Any = 0.0
+    target: Any = None
+    exit_cost: Any = None
+    terminal_cost: Any = None
+    stopping_cost: Any = None
+    running_max: Any = None
+    isaacs: str = "upper"
+    time_dependent: bool = False
+    discounted: bool | None = dataclasses.field(init=False, default=None, repr=False)
+
+    def __init__(
+        self,
+        drift: Callable,
+        cost: Callable | None = None,
+        controls: AdmissibleSet | None = None,
+        *,
+        disturbances: AdmissibleSet | None = None,
+        noise: Any = None,
+        discount: Any = 0.0,
+        target: Callable | None = None,
+        exit_cost: Any = None,
+        terminal_cost: Any = None,
+        stopping_cost: Any = None,
+        running_max: Callable | None = None,
+        isaacs: str = "upper",
+        time_dependent: bool = False,
+    ):
+        if not callable(drift):
+            raise TypeError(f"Problem.drift: got {drift!r}, wanted a function (x, u) -> (n,)")
+        _check_sets(controls, disturbances)
+        if isaacs not in ("upper", "lower"):
+            raise ValueError(f"Problem.isaacs: got {isaacs!r}, wanted 'upper' (min max) or 'lower' (max min)")
+        discount = _rate(discount)
+        if not isinstance(time_dependent, (bool, np.bool_)):
+            raise TypeError(f"Problem.time_dependent: got {time_dependent!r}, wanted True or False")
+        if running_max is not None and (cost is not None or _is_nonzero(discount)):
+            raise ValueError(
+                "Problem.running_max: the cost is the running maximum alone; "
+                "leave out cost and discount, or put the running cost into a stopping_cost"
+            )
+        if exit_cost is not None and target is None:
+            raise ValueError("Problem.exit_cost: there is no target to pay it on; give target as well")
+        fields = {
+            "drift": as_partial(drift, "Problem.drift"),
+            "cost": as_partial(cost, "Problem.cost"),
+            "controls": controls,
+            "disturbances": disturbances,
+            "noise": _noise(noise),
+            "discount": discount,
+            "target": as_partial(target, "Problem.target"),
+            "exit_cost": _function_or_number(exit_cost, "Problem.exit_cost"),
+            "terminal_cost": _function_or_number(terminal_cost, "Problem.terminal_cost"),
+            "stopping_cost": _function_or_number(stopping_cost, "Problem.stopping_cost"),
+            "running_max": as_partial(running_max, "Problem.running_max"),
+            "isaacs": isaacs,
+            "time_dependent": bool(time_dependent),
+            "discounted": None if is_traced(discount) else bool(discount > 0),
+        }
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def is_game(self) -> bool:
+        """Whether there is an opponent."""
+        return self.disturbances is not None
+
+    def arguments(self, x: Any, u: Any, d: Any = None, t: Any = 0.0) -> tuple:
+        """The arguments of ``drift``, ``cost`` and ``noise`` in their order."""
+        return (t,) * self.time_dependent + (x, u) + (d,) * self.is_game
+
+    def state_arguments(self, x: Any, t: Any = 0.0) -> tuple:
+        """The arguments of the functions of the state alone."""
+        return (t,) * self.time_dependent + (x,)
+
+    def diffusion(self, x: Any, u: Any, d: Any = None, t: Any = 0.0) -> jax.Array:
+        """σ at one state as a matrix, shape (n, k); (n, 0) without noise."""
+        n = jnp.shape(x)[-1]
+        if self.noise is None:
+            return jnp.zeros((n, 0))
+        sigma = jnp.asarray(self.noise(*self.arguments(x, u, d, t)) if callable(self.noise) else self.noise)
+        if sigma.ndim == 0:
+            return sigma * jnp.eye(n, dtype=sigma.dtype)
+        return jnp.diag(sigma) if sigma.ndim == 1 else sigma
+
+
+def is_discounted(problem: Problem) -> bool | None:
+    """Whether the discount is positive; None where only a run of the compiled program will tell.
+
+    A problem remembers it in its structure, so that it is known inside ``jit`` also where the number is traced.
+    """
+    if is_traced(problem.discount):
+        return problem.discounted
+    return bool(np.all(np.asarray(problem.discount) > 0))
+
+
+def _is_nonzero(discount: Any) -> bool:
+    return is_traced(discount) or bool(discount != 0)
+
+
+def _check_sets(controls: Any, disturbances: Any) -> None:
+    for name, choices in (("controls", controls), ("disturbances", disturbances)):
+        if choices is not None and not isinstance(choices, (Box, Ball, Finite)):
+            raise TypeError(f"Problem.{name}: got {choices!r}, wanted a Box, a Ball, a Finite or None")
+
+
+def _rate(discount: Any) -> Any:
+    """The discount as a float, or the tracer that stands for it."""
+    rate = numbers(discount, "Problem.discount")
+    if np.ndim(rate) != 0 or (isinstance(rate, np.ndarray) and not 0 <= rate < np.inf):
+        raise ValueError(f"Problem.discount: got {discount!r}, wanted a finite number ≥ 0")
+    return float(rate) if isinstance(rate, np.ndarray) else rate
+
+
+def _noise(noise: Any) -> Any:
+    """σ as a function, a number or an array; with its shape and its numbers checked where they are known."""
+    sigma = _function_or_number(noise, "Problem.noise", largest=2)
+    if sigma is None or callable(sigma) or is_traced(sigma):
+        return sigma
+    if not np.all(np.isfinite(sigma)):
+        raise ValueError(f"Problem.noise: got {noise!r}, wanted finite numbers")
+    if np.ndim(sigma) < 2 and np.any(np.asarray(sigma) < 0):
+        raise ValueError(f"Problem.noise: got {noise!r}, wanted numbers ≥ 0: it is σ in dx = f dt + σ dw")
+    return sigma
+
+
+def _function_or_number(value: Any, name: str, largest: int = 0) -> Any:
+    """A function as a pytree, or numbers in an array of at most ``largest`` dimensions."""
+    if value is None or callable(value):
+        return as_partial(value, name)
+    array = numbers(value, name)
+    if np.ndim(array) > largest:
+        wanted = "a number, (n,) or (n, k)" if largest else "one number"
+        raise ValueError(f"{name}: got shape {np.shape(array)}, wanted {wanted}")
+    if not isinstance(array, np.ndarray):
+        return array
+    if np.any(np.isnan(array)):
+        raise ValueError(f"{name}: got {value!r}, which is not a number")
+    return array if array.ndim else float(array)

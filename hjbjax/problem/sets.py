@@ -1,0 +1,185 @@
+"""Admissible sets of controls and disturbances.
+
+``Box`` and ``Ball`` are continua and are minimised as continua; ``Finite`` is enumerated. The numbers in a
+set are leaves: a wider box is no recompile.
+"""
+
+import itertools
+from collections.abc import Sequence
+from typing import Any, TypeAlias
+
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.problem.pytree import node, numbers
+
+
+def _bounded(value: Any, name: str) -> Any:
+    array = numbers(value, name)
+    if isinstance(array, np.ndarray) and not np.all(np.isfinite(array)):
+        raise ValueError(f"{name}: got {value!r}, wanted finite numbers: bound the set")
+    return array
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and int(value) >= 1
+
+
+@node()
+class Box:
+    """The box lo ≤ u ≤ hi.
+
+    Args:
+      lo: lower bounds, shape (m,), in the units of each input.
+      hi: upper bounds, shape (m,).
+
+    Raises:
+      ValueError: the bounds differ in length, are not finite, or leave no admissible control.
+
+    Example:
+      >>> Box([-1.0], [1.0]).grid(3).points.tolist()
+      [[-1.0], [0.0], [1.0]]
+    """
+
+    lo: Any
+    hi: Any
+
+    def __post_init__(self):
+        lo, hi = _bounded(self.lo, "Box.lo"), _bounded(self.hi, "Box.hi")
+        if np.ndim(lo) != 1 or np.shape(lo) != np.shape(hi) or np.size(lo) == 0:
+            raise ValueError(f"Box: got lo of shape {np.shape(lo)} and hi of shape {np.shape(hi)}, wanted (m,) twice")
+        if isinstance(lo, np.ndarray) and isinstance(hi, np.ndarray) and np.any(lo > hi):
+            axis = int(np.argmax(lo > hi))
+            raise ValueError(f"Box: no admissible control: input {axis} has lo = {lo[axis]:g} > hi = {hi[axis]:g}")
+        object.__setattr__(self, "lo", lo)
+        object.__setattr__(self, "hi", hi)
+
+    @property
+    def dim(self) -> int:
+        """The number of inputs m."""
+        return np.shape(self.lo)[-1]
+
+    def grid(self, num: int | Sequence[int]) -> "Finite":
+        """The box sampled with ``num`` equally spaced values an input, ends included, as a finite set.
+
+        Values are (lo·(M−k) + hi·k)/M, so that an odd number on a symmetric box holds an exact zero.
+        """
+        counts = tuple(num) if isinstance(num, (Sequence, np.ndarray)) else (num,) * self.dim
+        if len(counts) != self.dim or not all(_is_count(n) for n in counts):
+            raise ValueError(f"Box.grid: got {num!r}, wanted a positive integer or {self.dim} of them")
+        rows = np.array(list(itertools.product(*(range(int(n)) for n in counts))), dtype=np.float64)
+        last = np.maximum(np.asarray(counts, dtype=np.float64) - 1, 1)
+        return Finite((self.lo * (last - rows) + self.hi * rows) / last)
+
+
+@node(static=("dim",))
+class Ball:
+    """The Euclidean ball |u| ≤ radius in R^dim.
+
+    Args:
+      radius: in the units of the inputs, which are the same for all; at least 0.
+      dim: the number of inputs m.
+
+    Raises:
+      ValueError: the radius is negative or not finite, or the dimension is not a positive integer.
+    """
+
+    radius: Any
+    dim: int
+
+    def __post_init__(self):
+        radius = _bounded(self.radius, "Ball.radius")
+        if not _is_count(self.dim):
+            raise ValueError(f"Ball: got dim = {self.dim!r}, wanted a positive integer")
+        if np.ndim(radius) != 0:
+            raise ValueError(f"Ball: got a radius of shape {np.shape(radius)}, wanted one number")
+        if isinstance(radius, np.ndarray) and radius < 0:
+            raise ValueError(f"Ball: no admissible control: radius = {float(radius):g} < 0")
+        object.__setattr__(self, "radius", radius)
+        object.__setattr__(self, "dim", int(self.dim))
+
+
+@node()
+class Finite:
+    """A finite set; enumerated, in order, the first of equals wins.
+
+    Args:
+      points: the K admissible values, shape (K, m).
+
+    Raises:
+      ValueError: the set is empty or the points are not rows of numbers.
+    """
+
+    points: Any
+
+    def __post_init__(self):
+        points = _bounded(self.points, "Finite.points")
+        if np.ndim(points) == 1 and np.size(points) > 0:
+            raise ValueError(f"Finite: got points of shape {np.shape(points)}, wanted (K, m): one row a control")
+        if np.ndim(points) != 2 or 0 in np.shape(points):
+            raise ValueError(f"Finite: no admissible control: got points of shape {np.shape(points)}, wanted (K, m)")
+        object.__setattr__(self, "points", points)
+
+    @property
+    def dim(self) -> int:
+        """The number of inputs m."""
+        return np.shape(self.points)[-1]
+
+
+AdmissibleSet: TypeAlias = Box | Ball | Finite
+
+
+def samples(choices: AdmissibleSet, budget: int) -> Any:
+    """Representative points of a set, shape (K, m) with K about ``budget``; all points of a finite one.
+
+    A box gets an odd number of values an input, so that its ends and its middle are among them; a ball its
+    centre and directions on spheres, spread by the golden angle in the plane and by axes and diagonals beyond.
+    """
+    if isinstance(choices, Finite):
+        return choices.points
+    if isinstance(choices, Box):
+        per_input = max(3, round(budget ** (1 / choices.dim)) // 2 * 2 + 1)
+        return choices.grid(per_input).points
+    unit = _unit_ball(choices.dim, budget)
+    return choices.radius * unit
+
+
+def _unit_ball(dim: int, budget: int) -> np.ndarray:
+    if dim == 1:
+        return np.linspace(-1.0, 1.0, budget // 2 * 2 + 1)[:, None]
+    if dim == 2:
+        angles = np.arange(max(8, budget // 8 * 4)) * (2 * np.pi / max(8, budget // 8 * 4))
+        sphere = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    else:
+        signs = np.array(list(itertools.product((-1.0, 0.0, 1.0), repeat=dim)))
+        signs = signs[np.any(signs != 0, axis=1)]
+        sphere = signs / np.linalg.norm(signs, axis=1, keepdims=True)
+    return np.concatenate([np.zeros((1, dim)), 0.5 * sphere, sphere])
+
+
+def extremes(choices: AdmissibleSet) -> Any:
+    """Points whose convex hull holds the set, shape (K, m): where a convex function of u is at its largest."""
+    if isinstance(choices, Finite):
+        return choices.points
+    if isinstance(choices, Box):
+        return choices.grid(2).points
+    return choices.radius * np.array(list(itertools.product((-1.0, 1.0), repeat=choices.dim)))
+
+
+def probes(choices: AdmissibleSet | None, dtype: Any) -> list[list]:
+    """Actions among which a convex function of u takes its largest value, and a few more for others."""
+    if choices is None:
+        return [[]]
+    points = jnp.asarray(extremes(choices), dtype)
+    if not isinstance(choices, Finite):
+        points = jnp.concatenate([points, jnp.asarray(samples(choices, 9), dtype)])
+    return [[points[k, j] for j in range(points.shape[1])] for k in range(points.shape[0])]
+
+
+def spacing(choices: AdmissibleSet, budget: int) -> list[Any]:
+    """The distance between neighbouring ``samples``, one number an input."""
+    if isinstance(choices, Ball):
+        return [choices.radius / 2] * choices.dim
+    assert isinstance(choices, Box)
+    per_input = max(3, round(budget ** (1 / choices.dim)) // 2 * 2 + 1)
+    return [(choices.hi[j] - choices.lo[j]) / (per_input - 1) for j in range(choices.dim)]

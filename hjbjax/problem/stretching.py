@@ -1,0 +1,61 @@
+"""Where the nodes of an axis stand: maps of [0, 1] onto itself."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.problem.pytree import is_traced, node
+
+
+@node()
+class Sinh:
+    """Nodes gathered around one place, ever sparser away from it: smooth, so that schemes keep their order.
+
+    φ(ξ) = (sinh κ(ξ − ξ₀) + sinh κξ₀)/(sinh κ(1 − ξ₀) + sinh κξ₀) with ξ₀ such that φ(ξ₀) is the centre. Spacings at
+    the centre are about κ/sinh κ of the uniform ones when it is at one end, κ/(2 sinh κ/2) when in the middle.
+
+    Args:
+      strength: κ > 0; the larger, the denser.
+      center: the place, as a fraction of the way from ``lo`` to ``hi``. A node stands on it when it is ½ and the
+        number of intervals is even.
+
+    Raises:
+      ValueError: a strength that is not positive, or a centre outside [0, 1].
+
+    Example:
+      >>> np.round(Sinh(4.0).place(np.linspace(0, 1, 5)), 3).tolist()
+      [0.0, 0.338, 0.5, 0.662, 1.0]
+    """
+
+    strength: Any
+    center: Any = 0.5
+
+    def __post_init__(self):
+        if is_traced(self.strength, self.center):
+            return
+        if not (np.isfinite(self.strength) and self.strength > 0):
+            raise ValueError(f"Sinh: got strength = {self.strength!r}, wanted a finite number > 0")
+        if not 0 <= self.center <= 1:
+            raise ValueError(f"Sinh: got center = {self.center!r}, wanted a fraction between 0 and 1")
+
+    def _frame(self, xp: Any) -> tuple[Any, Any, Any]:
+        k, c = self.strength, self.center
+        middle = xp.arctanh(c * xp.sinh(k) / (1 - c + c * xp.cosh(k))) / k
+        middle = xp.where(c == 0.5, 0.5, middle)  # to the last bit, so that a node stands exactly there
+        below, above = xp.sinh(k * middle), xp.sinh(k * (1 - middle))
+        return middle, below, above
+
+    def place(self, fraction: Any) -> Any:
+        """φ: where the node stands that uniform spacing would put at ``fraction``."""
+        xp: Any = jnp if is_traced(self, fraction) else np
+        middle, below, above = self._frame(xp)
+        return (xp.sinh(self.strength * (fraction - middle)) + below) / (above + below)
+
+    def fraction(self, place: Any) -> Any:
+        """φ⁻¹; JAX arrays."""
+        middle, below, above = self._frame(jnp)
+        return middle + jnp.arcsinh(place * (above + below) - below) / self.strength
+
+
+Stretching = Sinh

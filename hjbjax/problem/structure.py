@@ -1,0 +1,177 @@
+"""How the drift and the cost depend on the control: read from the jaxpr, not from a flag or from samples.
+
+The jaxpr of a function is evaluated with polynomials in u instead of numbers. A polynomial is known only by
+the set of its terms: ``()`` is what does not depend on u, ``(0,)`` is u₀, ``(0, 1)`` is u₀u₁. A term of degree above
+two, or one that is no polynomial, is known only by the set of the inputs that enter it: ``frozenset({0})`` is some
+function of u₀. The answer is a proof: a function that is called affine is affine at every state.
+
+The slopes of an affine function are taken by JAX's derivative rules, so that a function with a rule of its own
+(``stop_gradient``, ``custom_jvp``, ``custom_vjp``) of the control counts as any other that is no polynomial.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+
+from hjbjax.problem import fields
+from hjbjax.problem.pytree import remembered
+
+Term = tuple[int, ...] | frozenset[int]  # a product of at most two inputs, or some function of these inputs
+Terms = frozenset
+CONSTANT: Terms = frozenset({()})
+
+_LINEAR = frozenset({"neg", "convert_element_type", "copy", "copy_p", "real"})
+
+
+@dataclass(frozen=True)
+class Dependence:
+    """Which terms in the control each entry of a function's result holds.
+
+    Attributes:
+      entries: one set of terms an entry.
+    """
+
+    entries: tuple[Terms, ...]
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether no entry depends on the control."""
+        return not any(term for entry in self.entries for term in entry)
+
+    def affine_in(self, inputs: Sequence[int]) -> bool:
+        """Whether every entry is affine in these inputs together, whatever the others are."""
+        wanted = set(inputs)
+
+        def fits(term: Term) -> bool:
+            return sum(j in wanted for j in term) <= (1 if isinstance(term, tuple) else 0)
+
+        return all(fits(term) for entry in self.entries for term in entry)
+
+    def separable_quadratic_in(self, inputs: Sequence[int]) -> bool:
+        """Whether every entry is a sum of quadratic polynomials of one of these inputs each."""
+        wanted = set(inputs)
+
+        def fits(term: Term) -> bool:
+            return len(wanted & set(term)) <= (1 if isinstance(term, tuple) else 0)
+
+        return all(fits(term) for entry in self.entries for term in entry)
+
+    def free_of(self, inputs: Sequence[int]) -> bool:
+        """Whether no entry depends on these inputs."""
+        return not self.driven_by(inputs)
+
+    def driven_by(self, inputs: Sequence[int]) -> tuple[int, ...]:
+        """The entries that depend on one of ``inputs``."""
+        wanted = set(inputs)
+        return tuple(i for i, entry in enumerate(self.entries) if any(wanted & set(term) for term in entry))
+
+    def crosses(self, first: Sequence[int], second: Sequence[int]) -> bool:
+        """Whether some term holds inputs of both, so that the function is no sum of a part each."""
+        return any(set(term) & set(first) and set(term) & set(second) for entry in self.entries for term in entry)
+
+    def has_square(self, inputs: Sequence[int]) -> bool:
+        """Whether some entry holds a second power of one of ``inputs``."""
+        return any((j, j) in entry for entry in self.entries for j in inputs)
+
+
+@remembered
+def dependence(function: Callable, *arguments: tuple[int | None, bool], dtype: Any) -> Dependence:
+    """The dependence of ``function`` on those of its arguments that are controls.
+
+    Args:
+      function: a function of one state, as a problem holds it: a pytree.
+      *arguments: for every argument (length, counts): its length (``None`` for a scalar), and whether its
+        entries are inputs; inputs are numbered through all counted arguments.
+      dtype: the floating-point type in which it is traced.
+    """
+    shapes = [jax.ShapeDtypeStruct(() if length is None else (length,), dtype) for length, _ in arguments]
+    closed = jax.make_jaxpr(function)(*shapes)
+    packed, number = [], 0
+    for (_, counts), shape in zip(arguments, shapes, strict=True):
+        entries = np.empty(shape.shape, dtype=object)
+        for index in np.ndindex(*shape.shape):
+            entries[index] = frozenset({(number,)}) if counts else CONSTANT
+            number += counts
+        packed.append(entries)
+    (result,) = fields.evaluate(closed, packed, _POLYNOMIALS)
+    if not (isinstance(result, np.ndarray) and result.dtype == object):
+        return Dependence((CONSTANT,) * int(np.size(result)))
+    return Dependence(tuple(result.reshape(-1)))
+
+
+def _some_function(operands: Iterable[Terms]) -> Terms:
+    """What is known of a function of these operands that is no quadratic polynomial: on which inputs it depends."""
+    inputs = frozenset(j for terms in operands for term in terms for j in term)
+    return frozenset({inputs}) if inputs else CONSTANT
+
+
+def _product(left: Terms, right: Terms) -> Terms:
+    return frozenset(_times(p, q) for p in left for q in right)
+
+
+def _times(left: Term, right: Term) -> Term:
+    if not left or not right:
+        return left or right
+    if isinstance(left, tuple) and isinstance(right, tuple) and len(left) + len(right) <= 2:
+        return tuple(sorted(left + right))
+    return frozenset(left) | frozenset(right)
+
+
+class _Polynomials:
+    """Scalars that are sets of terms."""
+
+    def constant(self, value: Any, index: tuple[int, ...]) -> Terms:
+        return CONSTANT
+
+    def entrywise(self, primitive: Any, params: dict, operands: list[Any], dtypes: list[Any]) -> Terms:
+        name = primitive.name
+        if all(value == CONSTANT for value in operands):
+            return CONSTANT
+        if name == "convert_element_type" and _rounds(params["new_dtype"]):
+            return _some_function(operands)
+        if name in _LINEAR:
+            return operands[0]
+        if name in ("add", "add_any", "sub"):
+            return operands[0] | operands[1]
+        if name == "mul":
+            return _product(*operands)
+        if name == "div" and operands[1] == CONSTANT:
+            return operands[0]
+        if name == "square" or (name == "integer_pow" and params["y"] == 2):
+            return _product(operands[0], operands[0])
+        if name == "integer_pow" and params["y"] == 1:
+            return operands[0]
+        if name == "select_n" and operands[0] == CONSTANT:
+            return frozenset().union(*operands[1:])
+        return _some_function(operands)
+
+    def combine(self, operation: Callable, dtype: Any, left: Terms, right: Terms) -> Terms:
+        if operation is jax.lax.add:
+            return left | right
+        if operation is jax.lax.mul:
+            return _product(left, right)
+        return _some_function([left, right])
+
+    def custom_jvp(self, eqn: Any, inner: Any, operands: list[Any]) -> list[Any]:
+        return self.nodewise(eqn, operands)
+
+    def nodewise(self, eqn: Any, operands: list[Any]) -> list[Any]:
+        varying = [v for v in operands if isinstance(v, np.ndarray) and v.dtype == object]
+        known = _some_function(entry for value in varying for entry in value.flat)
+        results = []
+        for var in eqn.outvars:
+            entries = np.empty(var.aval.shape, dtype=object)
+            entries.fill(known)
+            results.append(entries)
+        return results
+
+
+def _rounds(dtype: Any) -> bool:
+    """Whether numbers become coarse steps in this type: integers, and floating point of 16 bits or fewer."""
+    return not np.issubdtype(dtype, np.inexact) or np.finfo(dtype).bits < 32
+
+
+_POLYNOMIALS = _Polynomials()

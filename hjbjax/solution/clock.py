@@ -1,0 +1,114 @@
+"""The limits of a long run: its seconds, its steps, and Ctrl-C; and how far it came.
+
+All that runs long does so in phases (checks, a survey of the nodes, preparation, grids, chunks of steps) and looks at
+its clock between two of them. Ctrl-C leaves a note on the clock instead of an exception: an exception may be thrown
+into a callback of the runtime and be swallowed there, and would take along what was done so far. What cannot be cut,
+a compilation or one step, is seen to its end, and nothing follows it.
+"""
+
+import contextlib
+import math
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+from hjbjax.solution.status import Status
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+CHUNK_SECONDS = 0.5  # between two looks at the clock, where steps are short
+CUT = (Status.INTERRUPTED, Status.TIME_LIMIT)
+
+
+class Stopped(Exception):
+    """A run is over between two of its phases: ``status`` says why, ``reached`` is what it came to, if anything.
+
+    Caught where there is something to hand back.
+    """
+
+    def __init__(self, status: Status, reached: Any = None):
+        super().__init__(status.message)
+        self.status, self.reached = status, reached
+
+
+class Clock:
+    """The limits of a run, the time it has taken, that of its steps apart, and whether it was interrupted.
+
+    ``phase`` says how far it came, as in "the survey of the nodes". ``per_node`` is the seconds that a step took at a
+    node in the last chunk, from grid to grid; None before the first.
+    """
+
+    def __init__(self, max_steps: int = 10**9, seconds: float | None = None, progress: bool | None = None):
+        self.max_steps, self.progress = max_steps, progress
+        self.seconds = math.inf if seconds is None else seconds
+        self.began, self.stepping, self.interrupted = time.perf_counter(), 0.0, False
+        self.per_node: float | None = None
+        self.phase = "the checks"
+
+    def elapsed(self) -> float:
+        """Seconds since the run began."""
+        return time.perf_counter() - self.began
+
+    def over(self) -> Status | None:
+        """INTERRUPTED or TIME_LIMIT; ``None`` to go on."""
+        if self.interrupted:
+            return Status.INTERRUPTED
+        return Status.TIME_LIMIT if self.elapsed() >= self.seconds else None
+
+    def look(self) -> None:
+        """Go on, or raise ``Stopped``."""
+        code = self.over()
+        if code is not None:
+            raise Stopped(code)
+
+    def enter(self, phase: str) -> None:
+        """Go on to the next phase, or raise ``Stopped``; the clock then keeps the phase before."""
+        self.look()
+        self.phase = phase
+
+    def count(self, seconds: float, steps: int, nodes: int) -> None:
+        """Take note of a chunk of steps."""
+        self.stepping += seconds
+        self.per_node = max(seconds, 1e-4) / (steps * nodes)
+
+    def steps_in(self, seconds: float, nodes: int) -> float:
+        """How many steps take so long, by the last chunk."""
+        assert self.per_node is not None
+        return seconds / (self.per_node * nodes)
+
+
+_running: list[Clock] = []  # of the main thread, the outermost run first
+
+
+@contextlib.contextmanager
+def noting_interrupts(clock: Clock) -> Iterator[None]:
+    """Ctrl-C leaves a note on the clock, and on those of the runs around this one.
+
+    A second Ctrl-C is the usual exception. Only in the main thread, and not over a handler of the user's own. SIGTERM
+    likewise where it was made to do what Ctrl-C does: ``signal.signal(signal.SIGTERM, signal.default_int_handler)``.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    usual = signal.default_int_handler
+    noted = [] if _running else [number for number in SIGNALS if signal.getsignal(number) is usual]
+
+    def give_back() -> None:
+        for number in noted:
+            signal.signal(number, usual)
+
+    def note(number: int, frame: Any) -> None:
+        for each in _running:
+            each.interrupted = True
+        give_back()
+
+    clock.interrupted |= any(each.interrupted for each in _running)
+    _running.append(clock)
+    try:
+        for number in noted:
+            signal.signal(number, note)
+        yield
+    finally:
+        give_back()
+        _running.remove(clock)

@@ -1,0 +1,261 @@
+"""Result files: npz archives written whole or not at all, and read with suspicion.
+
+A file is an uncompressed zip of npy arrays, one of which, ``header``, is JSON in UTF-8. Writing goes to a
+temporary file in the same folder, then flush, fsync and ``os.replace``: after a crash at any time the file is
+the old one or the new one. Without leave to replace it ends in ``os.link``, which fails where another writer was
+faster. What a killed writer left behind is taken away by the next one in that folder. Reading never unpickles,
+and believes no declared size that the file's own size does not bear out, so that a claim of 8 TB costs nothing.
+Every failure is one ``FileError``.
+"""
+
+import json
+import math
+import os
+import re
+import stat
+import struct
+import zipfile
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+
+from hjbjax.solution import screen
+from hjbjax.solution.placement import FileError, check_place, claimed, hidden_name, path_of, place, sweep
+
+T = TypeVar("T")
+
+REASON = 400  # characters of a refusal, which may quote the file
+MAX_HEADER = 1 << 24  # bytes; the header holds settings and timings, never data
+
+# The only text that numpy writes before an array of numbers. Matched, and not evaluated as numpy does: before
+# the checksum has been compared these may be any bytes.
+DECLARATION = re.compile(rb"\{'descr': '([<>|]\w\d)', 'fortran_order': False, 'shape': \(([0-9, ]{0,999})\), \} *\n")
+
+
+class Expected(NamedTuple):
+    """What an array must look like: any of the shapes (``None`` matches every length), any of the dtypes."""
+
+    shapes: tuple[tuple[int | None, ...], ...]
+    dtypes: tuple[Any, ...] = (np.float64, np.float32)
+    optional: bool = True
+
+    def complaint(self, shape: tuple[int, ...], code: str) -> str | None:
+        """Why an array with this shape and dtype code, as in '<f8', is refused; ``None`` where it is not."""
+        allowed = [np.dtype(dtype).str for dtype in self.dtypes]
+        if code not in allowed:
+            return f"has dtype {code!r}, wanted {' or '.join(allowed)}"
+        if not any(_matches(shape, wanted) for wanted in self.shapes):
+            return f"has shape {shape}, wanted {' or '.join(_shape_text(wanted) for wanted in self.shapes)}"
+        return None
+
+
+def _matches(shape: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
+    return len(shape) == len(wanted) and all(n is None or n == m for m, n in zip(shape, wanted, strict=True))
+
+
+def _shape_text(wanted: tuple[int | None, ...]) -> str:
+    return f"({', '.join('any' if n is None else str(n) for n in wanted)}{',' * (len(wanted) == 1)})"
+
+
+def write(path: Any, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], *, force: bool = False) -> None:
+    """Write a header and arrays atomically.
+
+    Args:
+      path: where to; nothing is appended to the name.
+      header: JSON values; NumPy scalars and arrays in it become numbers and lists, anything else its text.
+      arrays: numbers or booleans by name.
+      force: whether an existing file may be replaced.
+
+    Raises:
+      FileExistsError: the file exists and ``force`` is false; or another process made it meanwhile.
+      FileError: the folder is missing or cannot be written, the disk is full, or a folder, a device or a pipe has that
+        name; no half file is left.
+    """
+    path = os.path.realpath(path_of(path, "written"))
+    check_place(path, force)
+    # A damaged table of contents may hide whole entries, and no checksum covers it: so the header has the list.
+    text = json.dumps({**header, "arrays": sorted(arrays)}, default=_plain).encode()
+    if len(text) > MAX_HEADER - 1000:  # of which the entry's own header takes some
+        raise FileError(f"{path}: cannot be written: message and statistics take {len(text):,} bytes of {MAX_HEADER:,}")
+    members = {"header": np.frombuffer(text, np.uint8), **arrays}
+    folder, name = os.path.split(path)
+    sweep(folder)
+    temporary = os.path.join(folder, hidden_name(name))
+    try:
+        open(temporary, "xb").close()
+        with claimed(temporary):
+            with open(temporary, "r+b") as file:
+                _write_members(file, members)
+                file.flush()
+                os.fsync(file.fileno())
+            place(temporary, path, force)
+    except FileExistsError:
+        raise
+    except OSError as error:
+        raise FileError(f"{path}: cannot be written: {error.strerror or error}") from error
+    finally:
+        if os.path.lexists(temporary):
+            os.unlink(temporary)
+    _sync_folder(folder)
+
+
+def _write_members(file: Any, members: Mapping[str, np.ndarray]) -> None:
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+        for name, array in members.items():
+            info = zipfile.ZipInfo(name + ".npy")  # dated 1980: equal solutions make equal files
+            with archive.open(info, "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.asarray(array, order="C"), allow_pickle=False)
+
+
+def _sync_folder(folder: str) -> None:
+    """Make the new name survive a power cut, where the system can: the file itself is whole either way."""
+    try:
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError:
+        return
+    try:
+        os.fsync(handle)
+    except OSError:
+        pass
+    finally:
+        os.close(handle)
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if isinstance(value, (np.generic, np.ndarray)) else str(value)
+
+
+def read(
+    path: Any,
+    form: str,
+    version: int,
+    plan: Callable[[dict], Mapping[str, Expected]],
+    rebuild: Callable[[dict, dict[str, np.ndarray]], T],
+) -> T:
+    """Read what ``write`` wrote.
+
+    Args:
+      path: the file.
+      form: what ``header["format"]`` must say.
+      version: the newest ``header["version"]`` that the caller understands.
+      plan: from the header to what each array must look like.
+      rebuild: from the header and the arrays by name, less the optional ones that the file lacks, to the object.
+
+    Returns:
+      What ``rebuild`` returns.
+
+    Raises:
+      FileError: for every kind of bad file, before anything of the size that it claims is allocated.
+    """
+    path = path_of(path, "read")
+    try:
+        status = os.stat(path)
+        if stat.S_ISDIR(status.st_mode):
+            raise FileError("it is a folder; give a file in it")
+        if not stat.S_ISREG(status.st_mode):  # opening a pipe would wait for ever
+            raise FileError("it is not an ordinary file")
+        with open(path, "rb") as file:
+            return rebuild(*_read_archive(file, status.st_size, form, version, plan))
+    except FileError as error:
+        reason, cause = str(error), error.__cause__ or error
+    except OSError as error:
+        reason, cause = error.strerror or str(error), error
+    except zipfile.BadZipFile as error:
+        reason, cause = f"it is damaged: {error}", error
+    except Exception as error:  # zipfile, json and numpy raise a dozen kinds on damaged bytes
+        reason, cause = f"damaged or foreign ({type(error).__name__}: {' '.join(str(error).split())[:200]})", error
+    raise FileError(f"{path}: cannot be read: {screen.one_line(reason, REASON)}") from cause
+
+
+def _read_archive(file: Any, size: int, form: str, version: int, plan: Callable) -> tuple[dict, dict]:
+    if size == 0:
+        raise FileError("it is empty")
+    start = file.read(4)
+    if start != b"PK\3\4":
+        what = "a pickle, which may run code and is never opened" if start[:1] == b"\x80" else "no npz file"
+        raise FileError(f"it is {what}; wanted a file written by save()")
+    try:
+        archive = zipfile.ZipFile(file)
+    except (zipfile.BadZipFile, struct.error, EOFError) as error:
+        raise FileError("it is truncated or damaged: its table of contents is missing") from error
+    with archive:
+        members = _members(archive, size)
+        if "header" not in members or members["header"].file_size > MAX_HEADER:
+            raise FileError("it has no header: not a file written by save()")
+        header = _read_header(archive, members["header"], form, version)
+        expected = plan(header)
+        if wrong := set(members) ^ {"header", *header["arrays"]}:
+            raise FileError(f"it does not hold the arrays that its header lists: {', '.join(sorted(wrong))}")
+        for name, wanted in expected.items():
+            if name in members:
+                _check_member(archive, members[name], wanted)
+            elif not wanted.optional:
+                raise FileError(f"the array {name!r} is missing")
+        if unknown := set(members) - {"header"} - set(expected):
+            raise FileError(f"unknown entry {min(unknown)!r}: not a file written by save()")
+        present = [name for name in expected if name in members]
+        return header, {name: _read_member(archive, members[name]) for name in present}
+
+
+def _members(archive: zipfile.ZipFile, size: int) -> dict[str, zipfile.ZipInfo]:
+    members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+    if len(members) != len(archive.infolist()):
+        raise FileError("an entry is there twice")
+    for name, info in members.items():
+        if info.compress_type != zipfile.ZIP_STORED or info.flag_bits & 1:
+            raise FileError(f"entry {name!r} is compressed or encrypted: not a file written by save()")
+        if info.file_size != info.compress_size:
+            raise FileError(f"entry {name!r} declares two sizes: it is damaged")
+    total, memory = sum(info.file_size for info in members.values()), _memory()
+    if total > size:
+        raise FileError(f"it claims {total:,} bytes of arrays and is {size:,} bytes long")
+    if total > memory:
+        raise FileError(f"it holds {total:,} bytes of arrays; this machine has {memory:,} bytes of memory")
+    return members
+
+
+def _memory() -> float:
+    """The physical memory in bytes; infinite where the system does not say."""
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, OSError, ValueError):
+        return math.inf
+
+
+def _read_header(archive: zipfile.ZipFile, info: zipfile.ZipInfo, form: str, version: int) -> dict:
+    _check_member(archive, info, Expected(((None,),), (np.uint8,)))
+    header = json.loads(_read_member(archive, info).tobytes())
+    if not isinstance(header, dict) or header.get("format") != form:
+        raise FileError(f"its header does not say {form!r}: another program wrote it")
+    found = header.get("version")
+    if isinstance(found, bool) or not isinstance(found, int) or found < 1:
+        raise FileError(f"its format version is {found!r}, wanted an integer from 1 to {version}")
+    if found > version:
+        raise FileError(f"its format is version {found}, newer than the {version} known here: update hjbjax")
+    return header
+
+
+def _check_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, wanted: Expected) -> None:
+    """Compare what the npy header declares with what is wanted and with the bytes that are there."""
+    name = info.filename.removesuffix(".npy")
+    with archive.open(info) as member:
+        start = member.read(10)
+        text = member.read(int.from_bytes(start[8:], "little"))
+    declared = DECLARATION.fullmatch(text)
+    if start[:8] != b"\x93NUMPY\1\0" or declared is None:
+        raise FileError(f"the array {name!r} is damaged or holds something other than numbers")
+    code, shape = declared[1].decode(), tuple(int(count) for count in declared[2].split(b",") if count.strip())
+    if complaint := wanted.complaint(shape, code):
+        raise FileError(f"the array {name!r} {complaint}")
+    if info.file_size != 10 + len(text) + np.dtype(code).itemsize * math.prod(shape):
+        raise FileError(
+            f"the array {name!r} declares shape {shape} of {code!r}; its entry has {info.file_size:,} bytes"
+        )
+
+
+def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
+    with archive.open(info) as member:
+        array = np.lib.format.read_array(member, allow_pickle=False)
+        member.read()  # to the end, where the checksum is compared
+    return array

@@ -1,0 +1,239 @@
+"""Values between the nodes: multilinear, with gaps, or of the nearest node.
+
+With the cell's corners c and fractions s_i of the way along each axis, w_c = Π_i (s_i or 1 − s_i) and
+V(x) = Σ_c w_c V_c: second order, exact for multilinear V, and never beyond the range of the corners.
+
+The slopes DV are found at the nodes and interpolated likewise: second order where V is smooth, exact for quadratic V.
+"""
+
+import functools
+import itertools
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.pytree import cast, is_traced
+
+
+def query(
+    look: Callable, grid: Grid, values: Any, x: Any, *, clamp: bool, name: str, times: Any = None, t: Any = None
+) -> Any:
+    """``look`` at node values between the nodes: float64 NumPy from concrete data, else as the tracer is.
+
+    Args:
+      look: ``between``, ``between_defined`` or ``nearest``.
+      grid: the nodes.
+      values: shape (*grid, ...); (k, *grid, ...) with ``times``.
+      x: states, shape (..., n).
+      clamp: outside the grid take the nearest point of its box; otherwise the answer there is NaN.
+      name: who asks, for refusals.
+      times: shape (k,), of a marched solution; between them the answer is linear, or that of the nearest.
+      t: when, broadcasts against ``x.shape[:-1]``; outside ``times`` as outside the grid.
+
+    Returns:
+      Shape ``x.shape[:-1] + values.shape[n:]``.
+
+    Raises:
+      TypeError: states that are not real numbers.
+      ValueError: states of another length.
+    """
+    traced = [leaf for leaf in jax.tree.leaves((values, x, times, t)) if isinstance(leaf, jax.core.Tracer)]
+    if not traced and not is_traced(grid):
+        # Inside somebody's jit a constant must come out, and float64 must not be switched on in the middle of it.
+        with jax.ensure_compile_time_eval(), jax.enable_x64(True):
+            when = None if times is None else _moment(times, t, np.float64, name)
+            # JAX keeps what it made of a NumPy array in float32, outside of here, and would hand it in for float64.
+            grid, values = cast((grid, values), np.float64)
+            return np.array(look(grid, values, _states(grid, x, np.float64, name), clamp, when))[()]
+    dtype = jnp.result_type(*traced) if traced else jnp.result_type(float)
+    if not jnp.issubdtype(dtype, jnp.floating):
+        dtype = jnp.result_type(float)
+    when = None if times is None else _moment(times, t, dtype, name)
+    return look(grid, values, _states(grid, x, dtype, name), clamp, when).astype(dtype)
+
+
+def _moment(times: Any, t: Any, dtype: Any, name: str) -> tuple[Any, Any, Any]:
+    """The kept time before t, the share of the one after it, and whether t lies between the first and the last."""
+    try:
+        t = jnp.asarray(t if is_traced(t) else np.asarray(t, np.float64), dtype)
+    except (TypeError, ValueError):
+        raise TypeError(f"{name}: got t = {t!r}, wanted a time") from None
+    times = jnp.asarray(times, dtype)
+    slack = 8 * jnp.finfo(dtype).eps * jnp.max(jnp.abs(times))
+    inside = (t >= times[0] - slack) & (t <= times[-1] + slack)
+    if len(times) == 1:
+        return jnp.zeros(t.shape, int), jnp.zeros(t.shape, dtype), inside
+    before = jnp.clip(jnp.searchsorted(times, t, side="right") - 1, 0, len(times) - 2)
+    share = (t - times[before]) / (times[before + 1] - times[before])
+    return before, jnp.clip(share, 0, 1), inside & ~jnp.isnan(t)
+
+
+def _states(grid: Grid, x: Any, dtype: Any, name: str) -> Any:
+    """The states in ``dtype``; an infinite entry on a periodic axis is no place and becomes NaN."""
+    try:
+        x = jnp.asarray(x) if is_traced(x) else np.asarray(x)
+    except (TypeError, ValueError):
+        x = np.asarray(None)
+    if not jnp.issubdtype(x.dtype, jnp.floating) and not jnp.issubdtype(x.dtype, jnp.integer):
+        raise TypeError(f"{name}: got states of type {x.dtype}, wanted real numbers, shape (..., {grid.ndim})")
+    if x.ndim == 0 or x.shape[-1] != grid.ndim:
+        raise ValueError(f"{name}: got states of shape {x.shape}, wanted (..., {grid.ndim}): one entry an axis")
+    x = jnp.asarray(x, dtype)
+    return jnp.where(np.array(grid.periodic) & jnp.isinf(x), jnp.nan, x)
+
+
+@functools.partial(jax.jit, static_argnames="clamp")
+def between(grid: Grid, values: Any, x: Any, clamp: bool, when: Any = None) -> jax.Array:
+    """The multilinear interpolant, with NaN and infinity wherever a node that counts has them."""
+    if when is None:
+        return grid.interpolate(values, x, clamp=clamp)
+    total: Any = 0.0
+    for weight, hidden, there in _corners(grid, values, x, clamp, when):
+        total = total + jnp.where(hidden, jnp.nan, weight * jnp.where((weight == 0) & ~jnp.isfinite(there), 0, there))
+    return total
+
+
+@functools.partial(jax.jit, static_argnames="clamp")
+def between_defined(grid: Grid, values: Any, x: Any, clamp: bool, when: Any = None) -> jax.Array:
+    """The mean over those nodes of the cell where no entry is NaN."""
+    total: Any = 0.0
+    sum_of_weights: Any = 0.0
+    for weight, defined, there in _defined(grid, values, x, clamp, when):
+        weight = jnp.where(defined, weight, 0)[..., None]
+        total, sum_of_weights = total + weight * jnp.where(defined[..., None], there, 0), sum_of_weights + weight
+    some = sum_of_weights > 0
+    return jnp.where(some, total / jnp.where(some, sum_of_weights, 1), jnp.nan)
+
+
+@functools.partial(jax.jit, static_argnames="clamp")
+def nearest(grid: Grid, values: Any, x: Any, clamp: bool, when: Any = None) -> jax.Array:
+    """The values at the nearest node of the cell where no entry is NaN; of equally near ones the lower."""
+    answer: Any = jnp.nan
+    largest: Any = 0.0
+    for weight, defined, there in _defined(grid, values, x, clamp, when):
+        # A node is nearer in every axis exactly if its weight is larger; half way, rounding must not choose.
+        nearer = defined & (weight > largest * (1 + 8 * jnp.finfo(x.dtype).eps))
+        answer, largest = jnp.where(nearer[..., None], there, answer), jnp.where(nearer, weight, largest)
+    return answer
+
+
+@functools.partial(jax.jit, static_argnames="clamp")
+def slopes_between(grid: Grid, values: Any, x: Any, clamp: bool, when: Any = None) -> jax.Array:
+    """DV, shape ``x.shape[:-1] + (n,)``: the slopes at the corners of the cell, interpolated."""
+    values, x = jnp.asarray(values), grid.wrap(x)
+    places = [grid._locate(axis, x[..., axis]) for axis in range(grid.ndim)]
+    hidden = jnp.any(jnp.isnan(x), axis=-1) | ((not clamp) & ~jnp.all(jnp.stack([p[2] for p in places]), axis=0))
+    layers: list[tuple[Any, tuple]] = [(jnp.ones((), x.dtype), ())]
+    if when is not None:
+        before, share, known = when
+        layers = [(1 - share, (before,)), (share, (jnp.minimum(before + 1, values.shape[0] - 1),))]
+        hidden |= (not clamp) & ~known
+    slopes = []
+    for axis in range(grid.ndim):
+        total: Any = 0.0
+        others = [(0, 1) if other != axis else (0,) for other in range(grid.ndim)]
+        for (layer, moment), corner in itertools.product(layers, itertools.product(*others)):
+            weight, nodes = layer, []
+            for other, bit in enumerate(corner):
+                cell, fraction, _ = places[other]
+                nodes.append((cell + bit) % grid.shape[other])
+                if other != axis:
+                    weight = weight * (fraction if bit else 1 - fraction)
+            row = _slope_along(grid, values, axis, moment, nodes, places[axis])
+            total = total + weight * jnp.where((weight == 0) & ~jnp.isfinite(row), 0, row)
+        slopes.append(total)
+    return jnp.where(hidden[..., None], jnp.nan, jnp.stack(slopes, axis=-1))
+
+
+def _slope_along(grid: Grid, values: Any, axis: int, moment: tuple, nodes: list, place: tuple) -> Any:
+    """The slope along one axis on the edge of the cell that begins at ``nodes``, linear between its two ends.
+
+    At a node it is that of the parabola through it and its neighbours; beside an end of the axis, or a node whose value
+    is not finite, that of the parabola through the next three, or what is left of it.
+    """
+    cell, fraction, _ = place
+    count, cyclic = grid.shape[axis], grid.periodic[axis]  # type: ignore[index]
+    row, at = [], []
+    coordinates = jnp.asarray(grid.axis(axis), fraction.dtype)
+    for shift in (-2, -1, 0, 1, 2):
+        index = cell + shift
+        there = list(nodes)
+        there[axis] = index % count if cyclic else jnp.clip(index, 0, count - 1)
+        outside = jnp.zeros((), bool) if cyclic else (index < 0) | (index > count - 1)
+        row.append(jnp.where(outside, jnp.nan, values[(*moment, *there)]))
+        at.append(coordinates[there[axis]])
+    spacing = grid.spacing(axis)
+    widths = [jnp.asarray(spacing, fraction.dtype)] * 4 if cyclic else [b - a for a, b in itertools.pairwise(at)]
+    widths = [jnp.where(width > 0, width, 1) for width in widths]
+    far, down, here, up = (
+        jnp.where(jnp.isfinite(b - a), b - a, jnp.nan) / width
+        for (a, b), width in zip(itertools.pairwise(row), widths, strict=True)
+    )
+    slopes = (far, down, here, up)
+    bend_far, bend_down, bend_up = ((slopes[k + 1] - slopes[k]) / (widths[k] + widths[k + 1]) for k in range(3))
+    first_bend = jnp.where(jnp.isnan(bend_down), jnp.nan_to_num(bend_up), bend_down)
+    last_bend = jnp.where(jnp.isnan(bend_up), jnp.nan_to_num(bend_down), bend_up)
+    # on the last node before an infinite one the cell is lost, and the parabola is that of the other side
+    first = jnp.where(jnp.isnan(here), down + widths[1] * jnp.nan_to_num(bend_far), here - widths[2] * first_bend)
+    last = here + widths[2] * last_bend
+    # On a node an end that is not finite has no say; one that is keeps the derivative along the axis.
+    lone_first, lone_last = (fraction == 0) & ~jnp.isfinite(last), (fraction == 1) & ~jnp.isfinite(first)
+    first, last = jnp.where(lone_last, last, first), jnp.where(lone_first, first, last)
+    return (1 - fraction) * first + fraction * last
+
+
+def extended(grid: Grid, values: Any, enumerated: bool) -> Any:
+    """Node values (..., *grid, m) with those of the nearest defined nodes where one of the 3^n around a node has any.
+
+    Axis by axis, the mean of the two neighbours, or of one of them; ``enumerated`` values are not averaged. The rest
+    stays NaN.
+    """
+    xp: Any = jnp if is_traced(values) else np
+    values = xp.asarray(values)
+    first = values.ndim - 1 - grid.ndim
+    for axis in range(grid.ndim):
+        lost = xp.any(xp.isnan(values), axis=-1, keepdims=True)
+        lower, upper = (xp.roll(values, shift, axis=first + axis) for shift in (1, -1))
+        if not grid.periodic[axis]:  # type: ignore[index]
+            place = xp.arange(grid.shape[axis]).reshape(-1, *(1,) * (grid.ndim - axis))
+            lower = xp.where(place == 0, xp.nan, lower)
+            upper = xp.where(place == grid.shape[axis] - 1, xp.nan, upper)
+        no_lower, no_upper = (xp.any(xp.isnan(side), axis=-1, keepdims=True) for side in (lower, upper))
+        both = lower if enumerated else (lower + upper) / 2
+        near = xp.where(no_lower, upper, xp.where(no_upper, lower, both))
+        values = xp.where(lost, near, values)
+    return values
+
+
+def _defined(grid: Grid, values: Any, x: Any, clamp: bool, when: Any) -> Iterator[tuple[Any, Any, Any]]:
+    """The nodes around each state: weight, whether the values there are defined and count, and the values."""
+    for weight, hidden, there in _corners(grid, values, x, clamp, when):
+        # On a node its neighbours have no weight, so where it has no control, they have no say.
+        yield weight, (weight > 0) & ~hidden & ~jnp.any(jnp.isnan(there), axis=-1), there
+
+
+def _corners(grid: Grid, values: Any, x: Any, clamp: bool, when: Any) -> Iterator[tuple[Any, Any, Any]]:
+    """The 2^n nodes around each state, at two times if marched: weight, whether the answer is hidden, and the values.
+
+    The cell, the weights and what is outside are those of ``Grid.interpolate``. Gathering before looking for NaN
+    keeps a query as cheap as a few nodes, however many the grid has.
+    """
+    values, x = jnp.asarray(values), grid.wrap(x)
+    cells, fractions, inside = zip(*(grid._locate(axis, x[..., axis]) for axis in range(grid.ndim)), strict=True)
+    hidden = jnp.any(jnp.isnan(x), axis=-1) | ((not clamp) & ~jnp.all(jnp.stack(inside), axis=0))
+    layers: list[tuple[Any, tuple]] = [(jnp.ones((), x.dtype), ())]
+    if when is not None:
+        before, share, known = when
+        last = values.shape[0] - 1
+        layers = [(1 - share, (before,)), (share, (jnp.minimum(before + 1, last),))]
+        hidden |= (not clamp) & ~known
+    for (layer, moment), corner in itertools.product(layers, np.ndindex(*(2,) * grid.ndim)):
+        weight = layer
+        for fraction, bit in zip(fractions, corner, strict=True):
+            weight = weight * (fraction if bit else 1 - fraction)
+        nodes = tuple((cell + bit) % n for cell, bit, n in zip(cells, corner, grid.shape, strict=True))
+        yield weight, hidden, values[moment + nodes]

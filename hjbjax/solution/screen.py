@@ -1,0 +1,126 @@
+"""Text for a terminal: the printed screen of a solution, one line of any text, and what an old encoding cannot show.
+
+What is printed may come from a file of somebody else's. So long texts are cut before anything looks at them, control
+characters are shown as Python would write them, and a statistic of another kind than expected is named, not formatted.
+"""
+
+import math
+import sys
+import textwrap
+from typing import Any
+
+import numpy as np
+
+from hjbjax.problem import arguments
+
+WIDTH = 100  # columns of the printed screen
+LONGEST = 2000  # characters of a text that are looked at; wrapping a million takes a second
+UNITS = ("bytes", "kB", "MB", "GB", "TB")
+SPELLED = {  # where the terminal has no such letter
+    **{"−": "-", "–": "-", "—": "-", "≤": "<=", "≥": ">=", "∞": "inf", "·": "*", "×": "x", "→": "->", "±": "+-"},
+    **{"²": "^2", "½": "1/2", "Δ": "d", "∂": "d", "Σ": "sum ", "“": '"', "”": '"', "‘": "'", "’": "'", "…": "..."},
+    **{"α": "alpha", "β": "beta", "γ": "gamma", "δ": "delta", "ε": "eps", "η": "eta", "θ": "theta", "κ": "kappa"},
+    **{"λ": "lambda", "μ": "mu", "π": "pi", "ρ": "rho", "σ": "sigma", "τ": "tau", "φ": "phi", "ψ": "psi", "ω": "omega"},
+}
+
+
+def show(solution: Any) -> str:
+    """The screen of a solution: at most 15 lines; what is not known is left out."""
+    stats, grid = solution.stats, solution.grid
+    axes = " x ".join(name + " (periodic)" * flag for name, flag in zip(grid.names, grid.periodic or (), strict=True))
+    last = "" if solution.residual is None else f", last residual {solution.residual:.3g}"
+    reached = 1.0 if solution.reached is None else float(np.mean(np.asarray(solution.reached)))
+    compiling = f", and {number(stats['compile_seconds'])} to check and compile" if "compile_seconds" in stats else ""
+    dtype = number(stats.get("dtype") or str(np.asarray(solution.value).dtype))
+    rows = {
+        "grid": f"{axes}: {' x '.join(map(str, grid.shape))} = {grid.size:,} nodes",
+        "times": "" if solution.times is None else str(np.size(solution.times)),
+        "method": ", ".join(number(stats[name]) for name in ("method", "scheme") if name in stats),
+        "steps": f"{int(solution.steps)}{last}",
+        "error": _certified(solution),
+        "reached": f"{percent(reached)} of the nodes" if reached < 1 else "",
+        "cut": _cuts(solution),
+        "isaacs gap": "" if solution.isaacs_gap is None else number(solution.isaacs_gap),
+        "seconds": f"{number(stats['seconds'])}{compiling}" if "seconds" in stats else "",
+        "memory": size(stats["bytes"]) if "bytes" in stats else "",
+        "device": f"{number(stats['device'])}, {dtype}" if "device" in stats else dtype,
+    }
+    said = plain(f"{solution.status.name}: {solution.message or solution.status.message}")
+    head = textwrap.wrap(said, WIDTH)
+    lines = head if len(head) < 4 else [*head[:2], one_line(" ".join(head[2:]))]
+    return encodable("\n".join(lines + [f"  {name:10}  {one_line(text)}" for name, text in rows.items() if text]))
+
+
+def _cuts(solution: Any) -> str:
+    """At which ends of the box the optimal drift is cut off, at how many nodes."""
+    if solution.cut is None or not np.any(solution.cut):
+        return ""
+    counts = np.max(np.asarray(solution.cut).reshape(-1, solution.grid.ndim, 2), axis=0)
+    ends = [
+        f"{counts[axis, side]} of the {('lower', 'upper')[side]} end of {solution.grid.names[axis]}"
+        for axis, side in np.argwhere(counts)
+    ]
+    return f"drift out of the box, at these nodes: {', '.join(ends)}"
+
+
+def _certified(solution: Any) -> str:
+    """The certified error and what certifies it, or why nothing does."""
+    error, tol = solution.error, solution.stats.get("tol")
+    what = "no certificate" if error is None else f"at most {error:.3g}"
+    asked = "" if error is None or tol is None else f" (tol {number(tol)})"
+    why = solution.stats.get("certificate")
+    return what + asked + (f": {number(why)}" if why else "")
+
+
+def one_line(text: str, width: int = WIDTH) -> str:
+    """A text in one line of at most ``width`` characters."""
+    text = plain(text)
+    return text if len(text) <= width else text[: width - 4] + " ..."
+
+
+def plain(text: str) -> str:
+    """A text without line breaks and control characters, cut where it is endless."""
+    cut = " ".join(text[:LONGEST].split()) + (" ..." if len(text) > LONGEST else "")
+    return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in cut)
+
+
+def encodable(text: str) -> str:
+    """A text that standard output can show: Greek and mathematical letters are spelled out where it has none."""
+    encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
+    try:
+        text.encode(encoding)
+    except UnicodeEncodeError:
+        return "".join(_spelled(letter, encoding) for letter in text)
+    except LookupError:  # an encoding that Python does not know
+        pass
+    return text
+
+
+def _spelled(letter: str, encoding: str) -> str:
+    try:
+        letter.encode(encoding)
+    except UnicodeEncodeError:
+        return SPELLED.get(letter) or ascii(letter)[1:-1]
+    return letter
+
+
+def number(value: Any) -> str:
+    """A number in three digits; a text as it is; of anything else its type."""
+    if arguments.is_number(value):
+        return f"{float(value):.3g}"
+    return value if isinstance(value, str) else f"a {type(value).__name__}"
+
+
+def percent(share: float) -> str:
+    """Rounded down to a tenth, so that 100 % is all and nothing else."""
+    return f"{math.floor(1000 * share) / 10:.1f} %"
+
+
+def size(count: Any) -> str:
+    """A number of bytes in the unit that suits it."""
+    if not arguments.is_number(count):
+        return number(count)
+    count, unit = float(count), 0
+    while count >= 1000 and unit < len(UNITS) - 1:
+        count, unit = count / 1000, unit + 1
+    return f"{count:.3g} {UNITS[unit]}"

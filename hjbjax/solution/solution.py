@@ -1,0 +1,318 @@
+"""The answer: value, policy, how it ended, and how far it can be off.
+
+A ``Solution`` is a pytree, so it may leave ``jit`` and ``vmap`` and be differentiated; timings and residuals
+are host matter and do not survive such a passage. Certified bounds lower ≤ V_h ≤ upper on the exact discrete
+solution V_h are affine in the value V, so that four numbers hold them; the error of V is at most
+max(upper − V, V − lower).
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.pytree import is_traced, node
+from hjbjax.problem.stretching import Sinh
+from hjbjax.solution import files, screen
+from hjbjax.solution.files import Expected, FileError
+from hjbjax.solution.interpolation import between, between_defined, nearest, query, slopes_between
+from hjbjax.solution.status import Status
+
+__all__ = ["FileError", "Solution", "SolveError", "Status", "load"]
+
+FORMAT, VERSION = "hjbjax.Solution", 1
+KINDS: dict[str, tuple[type, ...]] = {  # what a file's header holds, as JSON has it
+    "code": (int,),
+    "steps": (int,),
+    "isaacs_gap": (float, type(None)),
+    "discrete": (bool,),
+    "discrete_disturbance": (bool,),
+    "message": (str,),
+    "stats": (dict,),
+}
+
+
+class SolveError(RuntimeError):
+    """A solve that did not converge: the ``message`` says how it ended, ``.solution`` is what there is.
+
+    ``.solutions`` are those of all lanes of a batch, the finished ones among them.
+    """
+
+    def __init__(self, message: str, solution: Any = None, solutions: Sequence[Any] = ()):
+        super().__init__(message)
+        self.solution, self.solutions = solution, tuple(solutions)
+
+
+@node(static=("discrete", "discrete_disturbance"), host=("residuals", "stats", "message"))
+class Solution:
+    """A value function on a grid with its policy.
+
+    Args:
+      grid: the nodes.
+      value: V, shape (*grid), in cost units; infinite where the target is out of reach.
+      policy: u, shape (*grid, m); NaN at nodes where no control is defined.
+      disturbance: d, shape (*grid, l), in a game.
+      code: a ``Status`` number.
+      steps: how many steps were taken.
+      enclosure: shape (2, 2), or ``None`` without a certificate: the exact discrete solution is certified to lie
+        between ``enclosure[0, 0] * value + enclosure[0, 1]`` and ``enclosure[1, 0] * value + enclosure[1, 1]``.
+      isaacs_gap: the largest min-max minus max-min over the nodes, in cost units per unit time, in a game.
+      reached: the nodes from which the target can be reached, bool (*grid); ``None`` means all.
+      times: shape (k,) when marched; value and policy then have a leading axis.
+      cut: at how many nodes of each end of the box the optimal drift is cut off, shape (n, 2), lower and upper; when
+        marched, at each kept time, (k, n, 2). Zero at ends that are not projected; ``None`` where it was not counted.
+      discrete: whether the controls are enumerated, so that a mean of two need not be admissible.
+      discrete_disturbance: the same of the disturbances.
+      residuals: one number a step; host level.
+      stats: "method", "scheme", "device", "dtype", "seconds", "compile_seconds", "bytes", "tol",
+        "certificate" (a sentence) and "versions" (a dict), each where known; host level.
+      message: what happened in this very solve; empty after a passage through ``jit``; host level.
+
+    Example:
+      >>> grid = Grid([0.0], [1.0], (3,))
+      >>> solution = Solution(grid, np.array([0.0, 1.0, 4.0]), np.zeros((3, 1)), code=Status.CONVERGED, steps=2)
+      >>> solution, float(solution.value_at([0.75]))
+      (Solution(CONVERGED after 2 steps on 3 nodes), 2.5)
+    """
+
+    grid: Grid
+    value: Any
+    policy: Any
+    disturbance: Any = None
+    code: Any = 0
+    steps: Any = 0
+    enclosure: Any = None
+    isaacs_gap: Any = None
+    reached: Any = None
+    times: Any = None
+    cut: Any = None
+    discrete: bool = False
+    discrete_disturbance: bool = False
+    residuals: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
+    stats: dict = dataclasses.field(default_factory=dict)
+    message: str = ""
+
+    def __post_init__(self):
+        if isinstance(self.code, Status):
+            object.__setattr__(self, "code", int(self.code))
+
+    @property
+    def status(self) -> Any:
+        """The ``Status``; the bare numbers while traced, or of a batch."""
+        if is_traced(self.code) or np.ndim(self.code):
+            return self.code
+        return Status(int(self.code))
+
+    @property
+    def bounds(self) -> tuple[Any, Any] | None:
+        """The certified ``(lower, upper)``, each of shape (*grid), made when asked for; infinite where V is.
+
+        ``None`` without a certificate.
+        """
+        if self.enclosure is None:
+            return None
+        xp: Any = jnp if is_traced(self.value, self.enclosure) else np
+        value, (factors, shifts) = xp.asarray(self.value), self._lines(xp)
+        finite, numbers = xp.isfinite(value), (..., *(None,) * self.grid.ndim)
+        center = xp.where(finite, value, 0)
+        lower, upper = (
+            xp.where(finite, factors[..., side][numbers] * center + shifts[..., side][numbers], value)
+            for side in (0, 1)
+        )
+        return lower, upper
+
+    @property
+    def error(self) -> Any:
+        """The certified bound on |V − V_h|, the largest over the nodes where V is finite; ``None`` without one.
+
+        A NaN among the values or the bounds, or no finite node at all, makes it infinite: nothing is certified.
+        """
+        if self.enclosure is None:
+            return None
+        xp: Any = jnp if is_traced(self.value, self.enclosure) else np
+        value, (factors, shifts) = xp.asarray(self.value), self._lines(xp)
+        finite, nodes = xp.isfinite(value), tuple(range(-self.grid.ndim, 0))
+        ends = xp.min(xp.where(finite, value, xp.inf), axis=nodes), xp.max(xp.where(finite, value, -xp.inf), axis=nodes)
+        least, most = (xp.where(xp.isfinite(end), end, 0) for end in ends)
+        off = [
+            sign * ((factors[..., side] - 1) * end + shifts[..., side])  # an affine function is largest at an end
+            for side, sign in enumerate((-1, 1))
+            for end in (least, most)
+        ]
+        worst = xp.max(xp.stack(off))
+        worst = xp.where(xp.isnan(worst) | xp.any(xp.isnan(value)) | ~xp.any(finite), xp.inf, worst)
+        return worst if xp is jnp else float(worst)
+
+    def _lines(self, xp: Any) -> tuple[Any, Any]:
+        """Factors and shifts of the two bounds, each of shape (..., 2)."""
+        enclosure = xp.asarray(self.enclosure)
+        return enclosure[..., 0], enclosure[..., 1]
+
+    @property
+    def residual(self) -> float | None:
+        """The last residual; ``None`` where none was kept."""
+        return float(self.residuals[-1]) if len(self.residuals) else None
+
+    def value_at(self, *where: Any, clamp: bool = False) -> Any:
+        """V between the nodes: ``value_at(x)``, or ``value_at(t, x)`` of a marched solution; jit- and vmap-able.
+
+        Multilinear interpolation, second order, in the time as well. Concrete states and data give float64 NumPy;
+        under a tracer the answer has the tracer's dtype.
+
+        Args:
+          where: states x, shape (n,) or (..., n); of a marched solution first the time, a number or shape (...).
+          clamp: outside the grid, and outside the kept times, take the nearest point; otherwise NaN.
+
+        Returns:
+          Shape ``x.shape[:-1]``, in cost units.
+
+        Raises:
+          ValueError: a state of another length; a time too many or too few; a batch of solutions.
+          TypeError: states that are not numbers.
+        """
+        return self._query("value_at", between, self.value, 0, where, clamp)
+
+    def costate_at(self, *where: Any, clamp: bool = False) -> Any:
+        """DV between the nodes, shape ``x.shape[:-1] + (n,)``; arguments and refusals as for ``value_at``.
+
+        The costate of Pontryagin's principle, in current value. Central differences at the nodes (parabolas through
+        three of them beside an end), interpolated: second order where V is smooth; a kink is smeared over two cells.
+        Beside infinite values the differences are one-sided; where there are none, NaN.
+        """
+        return self._query("costate_at", slopes_between, self.value, 0, where, clamp)
+
+    def control_at(self, *where: Any, clamp: bool = False) -> Any:
+        """u between the nodes, shape ``x.shape[:-1] + (m,)``; arguments and refusals as for ``value_at``.
+
+        Only nodes of the cell where a control is defined count, with their weights scaled to sum to one, so
+        that the feedback reaches up to a target or to the edge of the reachable states; where no node of the
+        cell has one, the answer is NaN. Enumerated controls are not averaged: the nearest such node's is taken.
+        """
+        look = nearest if self.discrete else between_defined
+        return self._query("control_at", look, self.policy, 1, where, clamp)
+
+    def disturbance_at(self, *where: Any, clamp: bool = False) -> Any:
+        """The opponent's d between the nodes, shape ``x.shape[:-1] + (l,)``; as ``control_at``."""
+        look = nearest if self.discrete_disturbance else between_defined
+        return self._query("disturbance_at", look, self.disturbance, 1, where, clamp)
+
+    def _query(self, name: str, look: Any, values: Any, trailing: int, where: tuple, clamp: bool) -> Any:
+        t, x = _check_query(self, name, values, trailing, where)
+        return query(look, self.grid, values, x, clamp=clamp, name=f"Solution.{name}", times=self.times, t=t)
+
+    def save(self, path: Any, *, force: bool = False) -> None:
+        """Write the solution to ``path``, whole or not at all; ``load`` gives back the same bits.
+
+        Statistics come back as JSON has them: tuples as lists, objects as their text.
+
+        Raises:
+          FileExistsError: the file exists; another name or ``force=True`` helps.
+          FileError: it cannot be written; nothing is left behind.
+          ValueError: traced, or a batch: arrays that do not fit the grid.
+        """
+        if is_traced(self):
+            raise ValueError("Solution.save: got a traced solution; save it outside of jit, vmap and grad")
+        grid = self.grid
+        header = {
+            "format": FORMAT,
+            "version": VERSION,
+            "grid": {
+                "shape": grid.shape,
+                "periodic": grid.periodic,
+                "edges": grid.edges,
+                "names": grid.names,
+                "stretch": [s and [float(s.strength), float(s.center)] for s in grid.stretch or ()],
+            },
+            "marched": None if self.times is None else int(np.shape(self.times)[0]),
+            "isaacs_gap": np.asarray(self.isaacs_gap).tolist(),
+            "code": np.asarray(self.code).tolist(),
+            "steps": np.asarray(self.steps).tolist(),
+            **{name: getattr(self, name) for name in ("discrete", "discrete_disturbance", "message", "stats")},
+        }
+        arrays = {}
+        for name, wanted in _plan(header).items():
+            array = getattr(grid if name in ("lo", "hi") else self, name)
+            if array is None:
+                continue
+            arrays[name] = array = np.asarray(array)
+            if complaint := wanted.complaint(array.shape, array.dtype.str):
+                raise ValueError(f"Solution.save: {name} {complaint}; of a batch, save one solution at a time")
+        files.write(path, header, arrays, force=force)
+
+    def __repr__(self) -> str:
+        status = self.status
+        if not isinstance(status, Status):
+            return f"Solution({'traced' if is_traced(status) else 'a batch'}, grid of shape {self.grid.shape})"
+        return f"Solution({status.name} after {self.steps} steps on {self.grid.size:,} nodes)"
+
+    def __str__(self) -> str:
+        if is_traced(self) or np.ndim(self.code):
+            return repr(self)
+        return screen.show(self)
+
+
+def load(path: Any) -> Solution:
+    """The solution in the file ``path`` that ``Solution.save`` wrote; code in a file is never run.
+
+    Raises:
+      FileError: the file is missing, truncated, damaged, foreign, of a newer format, or contradicts itself.
+    """
+    return files.read(path, FORMAT, VERSION, _plan, _rebuild)
+
+
+def _plan(header: dict) -> dict[str, Expected]:
+    """What each array must look like, from the grid in the header alone."""
+    shape, marched = tuple(header["grid"]["shape"]), header["marched"]
+    if not all(type(count) is int and count >= 2 for count in shape):
+        raise FileError(f"its grid has shape {shape}")
+    many, lead = (None,), () if marched is None else (marched,)
+    controls = Expected((lead + shape + many, many * len(lead) + shape + many))
+    return {
+        "lo": Expected(((len(shape),),), optional=False),
+        "hi": Expected(((len(shape),),), optional=False),
+        "value": Expected((lead + shape,), optional=False),
+        "policy": controls,
+        "disturbance": controls,
+        "enclosure": Expected(((2, 2),)),
+        "reached": Expected((shape, lead + shape), (np.bool_,)),
+        "residuals": Expected((many,)),
+        "cut": Expected(((*lead, len(shape), 2),), (np.int64, np.int32)),
+        **({} if marched is None else {"times": Expected((lead,), optional=False)}),
+    }
+
+
+def _rebuild(header: dict, arrays: dict[str, np.ndarray]) -> Solution:
+    about = header["grid"]
+    stretch = tuple(pair and Sinh(*pair) for pair in about["stretch"])
+    grid = Grid(
+        arrays.pop("lo"), arrays.pop("hi"), tuple(about["shape"]), about["periodic"], tuple(about["names"]), stretch,
+        about.get("edges", "projected"),
+    )  # fmt: skip
+    for name, kinds in KINDS.items():
+        if type(header[name]) not in kinds:
+            raise FileError(f"its header has {name} = {header[name]!r:.60}, wanted {kinds[0].__name__}")
+    Status(header["code"])
+    return Solution(**{"policy": None, **arrays, "grid": grid, **{name: header[name] for name in KINDS}})
+
+
+def _check_query(solution: Solution, name: str, values: Any, trailing: int, where: tuple) -> tuple[Any, Any]:
+    """The time, None if stationary, and the state; refuses what has no answer."""
+    if values is None:
+        what = "policy" if name == "control_at" else "disturbance: the problem is not a game"
+        raise ValueError(f"Solution.{name}: this solution has no {what}")
+    marched = solution.times is not None
+    if len(where) != 1 + marched:
+        kind, call = ("marched over times", f"{name}(t, x)") if marched else ("stationary", f"{name}(x)")
+        raise ValueError(f"Solution.{name}: got {len(where)} arguments; this solution is {kind}: call {call}")
+    shape, wanted = np.shape(values), solution.grid.shape
+    if marched:
+        wanted = np.shape(solution.times) + wanted
+    if shape[: len(wanted)] != wanted or len(shape) != len(wanted) + trailing:
+        raise ValueError(
+            f"Solution.{name}: got node values of shape {shape} on a grid of shape {wanted}; of a batch of solutions "
+            f"ask one at a time, as in jax.vmap(lambda solution, x: solution.{name}(x))"
+        )
+    return (where[0] if marched else None), where[-1]

@@ -1,0 +1,224 @@
+"""Many problems on one grid at once: ``solve_batch``.
+
+Problems that differ in numbers alone are lanes of one ``vmap``ped loop. A batched loop runs until its slowest
+lane stops, so finished lanes are taken out between chunks; each lane has its own status, and one that goes NaN
+changes no bit of the others. Ctrl-C and the time limit end the lanes that still run, and those that have not begun.
+"""
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.discretisation.schemes import Upwind
+from hjbjax.finiteness import admissibility, survey
+from hjbjax.iteration import iteration
+from hjbjax.iteration.iteration import Method, Nested, State, Task
+from hjbjax.problem import checks
+from hjbjax.problem.arguments import shown
+from hjbjax.problem.closures import with_settled_functions
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.solution.clock import CHUNK_SECONDS, CUT, Clock, Stopped, noting_interrupts
+from hjbjax.solution.solution import Solution, SolveError
+from hjbjax.solution.status import Status
+from hjbjax.solvers import faults, memory, nested
+from hjbjax.solvers.driver import FIRST_NODES, imposed
+from hjbjax.solvers.preparation import choose, prepare_on_host
+from hjbjax.solvers.report import closed, describe, finish, unstarted
+from hjbjax.solvers.solver import as_dtype, check_arguments
+
+CHUNK = 8  # steps between two looks at which lanes are done, at most
+
+_begin = jax.vmap(iteration.begin)
+_run = jax.jit(jax.vmap(iteration.run, in_axes=(0, 0, 0)))
+
+
+@with_settled_functions
+def solve_batch(
+    problems: Iterable[Problem],
+    grid: Grid,
+    *,
+    method: Method | None = None,
+    scheme: Upwind = Upwind(),
+    tol: float = 1e-3,
+    dtype: Any = None,
+    max_steps: int | None = None,
+    time_limit: float | None = None,
+    throw: bool = True,
+    max_memory: int | None = None,
+) -> list[Solution]:
+    """Solve many problems on one grid; each answer is what ``solve`` with the same method gives.
+
+    Args:
+      problems: problems; those with the same functions and shapes run together, whatever their numbers.
+      grid: the nodes.
+      method: as in ``solve``, without nesting; ``None`` picks by the problem.
+      scheme: the discretisation.
+      tol: as in ``solve``.
+      dtype: as in ``solve``.
+      max_steps: at most so many steps for each lane.
+      time_limit: at most so many seconds for all lanes, checks and compilation included.
+      throw: raise when a lane does not converge; otherwise its status says it.
+      max_memory: bytes that one round of lanes may take; a batch that needs more runs in several.
+
+    Returns:
+      One solution for each problem, in their order.
+
+    Raises:
+      ValueError: a question without an answer; the lane is named.
+      SolveError: a lane did not converge, be it by Ctrl-C; ``.solution`` is the first such, ``.solutions`` are all.
+    """
+    if isinstance(problems, Problem) or not isinstance(problems, Iterable):
+        raise TypeError(f"solve_batch: got {shown(problems)}; wanted a list of problems, as in [problem]")
+    lanes = list(problems)
+    for lane in lanes:
+        check_arguments(lane, grid, method, scheme, tol, max_steps, time_limit)
+    kind = as_dtype(dtype)
+    grid.check_spacings(kind)
+    solutions: list[Any] = [None] * len(lanes)
+    clock = Clock(max_steps or 10**9, time_limit)
+    with noting_interrupts(clock), jax.enable_x64(kind == np.float64):
+        for members in _alike(lanes):
+            first = lanes[members[0]]
+            chosen = method or choose(first, grid, traced=False)
+            chosen = chosen.inner if isinstance(chosen, Nested) else chosen
+            checks.shapes(first, grid, scheme)
+            needed = memory.require(first, grid, chosen, kind, max_memory)
+            for some in _rounds(members, needed, max_memory):
+                with faults.explained(clock, needed * len(some), lambda _: next(filter(None, solutions), None)):
+                    together = _solve_together([lanes[i] for i in some], some, grid, chosen, scheme, tol, kind, clock)
+                for index, solution in zip(some, together, strict=True):
+                    solutions[index] = solution
+        if solutions and not any(solution.status in CUT for solution in solutions):
+            solutions[-1] = closed(solutions[-1], clock)  # no late Ctrl-C is lost
+    for index, solution in enumerate(solutions):
+        if throw and solution.status is not Status.CONVERGED:
+            raise SolveError(f"lane {index}: {solution.status.name}: {solution.message}", solution, solutions)
+    return solutions
+
+
+def _alike(problems: Sequence[Problem]) -> list[list[int]]:
+    """The indices of problems that share functions and shapes, in the order of first appearance."""
+    flat = map(jax.tree.flatten, problems)
+    return _grouped((structure, tuple(np.shape(leaf) for leaf in leaves)) for leaves, structure in flat)
+
+
+def _grouped(keys: Iterable[Any]) -> list[list[int]]:
+    """The positions of equal keys together, in the order of first appearance."""
+    groups: dict[Any, list[int]] = {}
+    for position, key in enumerate(keys):
+        groups.setdefault(key, []).append(position)
+    return list(groups.values())
+
+
+def _rounds(members: Sequence[int], bytes_each: int, limit: int | None) -> list[Sequence[int]]:
+    """Lanes that fit into half of the memory together."""
+    free = memory.available() if limit is None else int(limit)
+    most = len(members) if free is None else max(1, free // 2 // max(bytes_each, 1))
+    return [members[start : start + most] for start in range(0, len(members), most)]
+
+
+def _solve_together(
+    problems: Sequence[Problem],
+    names: Sequence[int],
+    grid: Grid,
+    method: Method,
+    scheme: Upwind,
+    tol: float,
+    kind: Any,
+    clock: Clock,
+) -> list[Solution]:
+    """The solutions of problems that run together, ``names`` their lanes."""
+    began = clock.elapsed()
+    prepared: list[tuple] = []
+    for name, problem in zip(names, problems, strict=True):
+        try:
+            survey.values(problem, grid, kind, clock)
+            admissibility.values(problem, grid, kind)
+            prepared.append(
+                prepare_on_host(problem, grid, method=method, scheme=scheme, tol=tol, dtype=kind, clock=clock)
+            )
+        except ValueError as refusal:
+            raise ValueError(f"lane {name}: {refusal}") from refusal
+        except Stopped as stop:
+            nothing = [unstarted(each, grid, np.zeros(grid.shape, kind), scheme, stop.status) for each in problems]
+            return [closed(solution, clock) for solution in nothing]
+    clock.phase = f"the steps of lanes {names[0]} to {names[-1]}"
+    has_lost = any(task.has_lost for task, _, _ in prepared)
+    prepared = [(dataclasses.replace(task, has_lost=has_lost), *rest) for task, *rest in prepared]
+    solutions: list[Any] = [None] * len(problems)
+    for members in _grouped(jax.tree.structure(task) for task, _, _ in prepared):  # by certificate, too
+        tasks = _stack([prepared[i][0] for i in members])
+        states = _begin(tasks, jax.vmap(Task.start)(tasks))
+        ended, histories = _finish_lanes(tasks, states, len(members), clock)
+        for i, (state, code), residuals in zip(members, ended, histories, strict=True):
+            solutions[i] = _finished(prepared[i], state, code, np.concatenate(residuals), grid, clock)
+    about = {"seconds": clock.elapsed() - began, "lanes": len(problems), "tol": tol}
+    for problem, solution in zip(problems, solutions, strict=True):
+        solution.stats.update(method=describe(method, problem), **about)
+    return solutions
+
+
+def _finished(lane: tuple, state: State, code: Status, residuals: np.ndarray, grid: Grid, clock: Clock) -> Solution:
+    """The solution of one prepared lane; one that had better leave a node where it rests goes on by itself."""
+    task, verdict, reached = lane
+    history = residuals[: int(state.step) + 1]
+    if code in CUT:
+        state = imposed(task, state)
+    elif nested.may_go_on(task, verdict, state, code):
+        task, verdict, reached, state, code, more = nested.settle(task, verdict, reached, state.value, clock)
+        history = np.concatenate([history, more])
+    solution = finish(task, state, code, reached, history, verdict, grid, cut=clock.over() is not None)
+    return closed(solution, clock) if code in CUT else solution
+
+
+def _finish_lanes(tasks: Task, states: State, count: int, clock: Clock) -> tuple[list[tuple], list[list]]:
+    """Chunks of steps until every lane is done, or the clock says stop; the last state and the status of each lane.
+
+    Lanes that are done are taken out where that halves the work.
+    """
+    final: list[Any] = [None] * count
+    histories: list[list] = [[np.zeros(0)] for _ in range(count)]
+    lanes = np.arange(count)  # which lane each row holds; −1 in rows that only fill up
+    nodes = states.value[0].size
+    chunk = int(np.clip(FIRST_NODES / (nodes * count), 1, CHUNK))
+    if clock.over() is None:
+        states = _run(tasks, states, np.full(count, -1))  # compiles and does nothing
+    while lanes.size:
+        began, before, cut = clock.elapsed(), np.asarray(states.step), clock.over()
+        if cut is None:
+            states = _run(tasks, states, np.minimum(before + chunk, clock.max_steps))
+        codes, steps, history = jax.device_get((states.code, states.step, states.history))
+        if cut is None:
+            clock.count(clock.elapsed() - began, max(int(np.max(steps - before)), 1), nodes * len(lanes))
+            chunk = int(np.clip(clock.steps_in(CHUNK_SECONDS, nodes * len(lanes)), 1, CHUNK))
+        going = (codes == Status.RUNNING) & (steps < clock.max_steps) & (lanes >= 0) & (cut is None)
+        live = [row for row, lane in enumerate(lanes) if lane >= 0 and final[lane] is None]
+        for row in live:
+            histories[lanes[row]].append(history[row, : steps[row] - before[row]])
+        ended = [row for row in live if not going[row]]
+        if ended:
+            on_host = jax.device_get(states)
+            for row in ended:
+                last = jax.tree.map(lambda leaf, row=row: leaf[row].copy(), on_host)
+                own = Status(int(last.code))
+                final[lanes[row]] = last, own if own is not Status.RUNNING else cut or Status.MAX_STEPS
+        left = np.flatnonzero(going)
+        width = 1 << (left.size - 1).bit_length() if left.size else 0
+        if width < lanes.size:
+            kept = np.resize(left, width)
+            lanes = np.where(np.arange(width) < left.size, lanes[kept], -1)
+            tasks, states = _take(tasks, kept), _take(states, kept)
+    return final, histories
+
+
+def _stack(trees: Sequence[Any]) -> Any:
+    return jax.tree.map(lambda *leaves: jnp.stack(jnp.broadcast_arrays(*leaves)), *trees)
+
+
+def _take(tree: Any, rows: np.ndarray) -> Any:
+    return jax.tree.map(lambda leaf: leaf[rows], tree)

@@ -1,0 +1,66 @@
+"""What breaks a run from outside: memory that runs out on the way, a callback of the user's that raises.
+
+The exception goes through, with what was there before it as ``.solution``; one for memory becomes a ``MemoryError``
+that says what was needed and what is free.
+"""
+
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import numpy as np
+
+from hjbjax.solution.clock import Clock
+from hjbjax.solvers import memory
+
+CALLBACK = "CpuCallback error"  # how JAX heads the exception of a callback, whatever its type
+
+
+def keep(error: Exception, grid: Any, *values: Callable[[], Any]) -> None:
+    """Notes on an exception the first of some node values that can still be read: a broken run takes its own along."""
+    for value in values:
+        with contextlib.suppress(Exception):
+            error.kept = np.asarray(value()), grid  # type: ignore[attr-defined]
+            return
+
+
+@contextlib.contextmanager
+def explained(clock: Clock, needed: int, partial: Callable[[Any], Any]) -> Iterator[None]:
+    """Exceptions of the runtime leave with a solution.
+
+    Args:
+      clock: how far the run came.
+      needed: the estimate of its memory, in bytes.
+      partial: from what ``keep`` noted, or None, to the solution so far.
+
+    Raises:
+      MemoryError: memory ran out.
+    """
+    try:
+        yield
+    except Exception as error:
+        starved = isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error)
+        if not (starved or isinstance(error, jax.errors.JaxRuntimeError) or CALLBACK in str(error)):
+            raise
+        solution = getattr(error, "solution", None)
+        if solution is None:
+            with contextlib.suppress(MemoryError):  # too little is left even for that
+                solution = partial(getattr(error, "kept", None))
+        where = f"It came as far as {clock.phase}; the value so far is .solution of this exception."
+        if starved:
+            raise _starved(error, needed, where, solution) from error
+        error.solution = solution  # type: ignore[attr-defined]
+        error.add_note(where)
+        raise
+
+
+def _starved(error: Exception, needed: int, where: str, solution: Any) -> MemoryError:
+    free, said = memory.available(), (str(error).strip() or type(error).__name__).splitlines()[0][:200]
+    left = "" if free is None else f", {free / 1e9:.3g} GB are free now"
+    report = MemoryError(
+        f"memory ran out: {said}\nThe run was estimated at {needed / 1e9:.3g} GB{left}. Take fewer nodes or "
+        f"dtype='float32'; {memory.NO_GRID}.\n{where}"
+    )
+    report.solution = solution  # type: ignore[attr-defined]
+    return report

@@ -1,0 +1,330 @@
+"""The front door of finite horizons: ``march``.
+
+At host level it validates, finds the longest stable step, goes backward in chunks of about half a second from
+one kept time to the next, and reports. Under a tracer the same steps run in a scan of fixed length.
+"""
+
+import functools
+import itertools
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.discretisation.schemes import Eno2, Limited, Scheme, Upwind, Weno5
+from hjbjax.finiteness import admissibility, survey
+from hjbjax.hamiltonian import players
+from hjbjax.iteration import bellman, marching
+from hjbjax.iteration.iteration import PolicyIteration
+from hjbjax.iteration.marching import Explicit, Implicit, March
+from hjbjax.iteration.relaxation import Krylov, Sweeps
+from hjbjax.problem import arguments, checks
+from hjbjax.problem.closures import with_settled_functions
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import altered, cast, is_traced
+from hjbjax.problem.sets import Box, Finite
+from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
+from hjbjax.solution.solution import Solution, SolveError
+from hjbjax.solution.status import Status
+from hjbjax.solvers import epochs, faults, memory
+from hjbjax.solvers.preparation import choose
+from hjbjax.solvers.report import closed, unstarted
+from hjbjax.solvers.solver import as_dtype, check_node_values
+
+PROBES = 33  # times at which a given step, and constrained ends, are held against a time-dependent problem
+FEWEST = 100  # steps where no stability limit is known for all of them: implicit, time-dependent, rates by samples
+
+_stable = jax.jit(marching.stable, static_argnames=("scheme", "dtype"))
+_rules = jax.jit(bellman.conditions, static_argnames="dtype")
+
+
+@with_settled_functions
+def march(
+    problem: Problem,
+    grid: Grid,
+    horizon: float,
+    *,
+    times: Any = None,
+    start: Any = None,
+    scheme: Scheme = Upwind(),
+    method: Explicit | Implicit | None = None,
+    step: float | None = None,
+    inner: float | None = None,
+    dtype: Any = None,
+    time_limit: float | None = None,
+    throw: bool = True,
+    progress: bool | None = None,
+    max_memory: int | None = None,
+) -> Solution:
+    """March a finite-horizon problem backward from its terminal cost at t = horizon to t = 0.
+
+    min{ max{ β V − V_t − H(x, DV, D²V), V − ψ }, V − g } = 0,  V(·, horizon) = terminal cost (else ψ, else g, else 0).
+
+    Order 1 in space with ``Upwind()``, monotone, which never leaves the range that the data allow; 2 with
+    ``Limited()`` or ``Eno2()`` and 5 with ``Weno5()`` where V is smooth. In time see ``Explicit`` and ``Implicit``.
+
+    Args:
+      problem: the question; its functions may depend on the time.
+      grid: the nodes.
+      horizon: T > 0, in units of time.
+      times: the times to keep, increasing, in [0, horizon]; ``None`` is (0.0,). Nothing else is kept.
+      start: node values at the horizon in place of the terminal cost, shape (*grid), to go on from another march.
+      scheme: ``Upwind(...)``, ``Limited()``, ``Eno2()`` or ``Weno5()``.
+      method: ``Explicit(...)``, the default, whose steps the grid limits, or ``Implicit(...)``, of any step.
+      step: the longest time step; ``None`` is the stable one, and a hundredth of the horizon if implicit, if the
+        functions depend on the time, or if the fastest action may be between the samples of its set.
+      inner: for a disturbance that is bounded only by the size of its ``Box``, as in an L₂ gain: the march stops,
+        DIVERGED, where the worst disturbance reaches that bound in this share of the grid's box about its middle,
+        since a value that blows up does. ``None``: ½ if the cost is quadratic in every disturbance, else 0, never.
+      dtype: ``None`` is float64; ``"float32"`` for memory and accelerators.
+      time_limit: at most so many seconds, checks and compilation included.
+      throw: raise when the march does not come to its end; otherwise the status says it.
+      progress: a progress bar; ``None`` shows it on a terminal after one second.
+      max_memory: bytes that the march may take, instead of what is free.
+
+    Returns:
+      The solution: ``value[i]`` is V(·, times[i]), shape (k, *grid), the policy likewise. One that stopped early
+      holds the times that it came to, and the last one it reached; one cut short by the time or by Ctrl-C may have no
+      policy there, which is NaN. Inside ``jit``, ``vmap`` and ``grad`` the
+      value is traced; there ``horizon``, ``times`` and ``step`` must be known numbers, and no limit is checked.
+
+    Raises:
+      ValueError: a bad argument; a step above the stability limit.
+      MemoryError: a grid that does not fit, before anything is compiled.
+      SolveError: the march stopped early, with the partial solution as ``.solution``.
+
+    Example:
+      >>> import hjbjax as hjb
+      >>> problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x + u @ u, hjb.Box([-4.0], [4.0]))
+      >>> solution = hjb.march(problem, hjb.Grid([-2.0], [2.0], (81,)), 1.0, scheme=hjb.Weno5())
+      >>> round(float(solution.value_at(0.0, [1.0])), 4)  # tanh(1)
+      0.7616
+    """
+    method = Explicit() if method is None else method
+    _check(problem, grid, scheme, method, step, time_limit)
+    horizon, kept = _times(horizon, times)
+    if is_traced(problem, grid, method, start):
+        return _march_traced(problem, grid, horizon, kept, start, scheme, method, step, dtype)
+    kind = as_dtype(dtype)
+    check_node_values(start, grid, "march: start")
+    grid.check_spacings(kind)
+    clock = Clock(seconds=time_limit, progress=progress)
+    with noting_interrupts(clock), jax.enable_x64(kind == np.float64):
+        needed = memory.fitting(_bytes(problem, grid, kept, method, kind), grid, max_memory)
+        unmoved = functools.partial(_unmoved, problem, grid, horizon, start, scheme, kind)
+        with faults.explained(clock, needed, unmoved):
+            try:
+                checks.shapes(problem, grid, scheme)
+                survey.values(_without_moving_target(problem), grid, kind, clock)
+                for t in np.linspace(horizon, 0.0, PROBES) if problem.time_dependent else (0.0,):
+                    admissibility.values(problem, grid, kind, t)
+                clock.enter("the preparation")
+                task = _prepare(problem, grid, horizon, scheme, method, step, inner, kind)
+                slices, front, code = epochs.drive(task, kept, start, clock)
+                solution = epochs.assemble(task, grid, slices, front, code)
+            except Stopped as stop:
+                solution = _unstarted(problem, grid, horizon, start, scheme, stop.status, kind)
+        solution = closed(solution, clock)
+    solution.stats.update(
+        seconds=clock.stepping, compile_seconds=clock.elapsed() - clock.stepping, bytes=needed, horizon=horizon
+    )
+    if throw and solution.status is not Status.CONVERGED:
+        raise SolveError(f"{solution.status.name}: {solution.message}", solution)
+    return solution
+
+
+def _unmoved(
+    problem: Problem, grid: Grid, horizon: float, start: Any, scheme: Scheme, dtype: Any, kept: Any
+) -> Solution:
+    """The solution of a march that broke before its first step."""
+    return _unstarted(problem, grid, horizon, start, scheme, Status.INTERRUPTED, dtype)
+
+
+def _unstarted(
+    problem: Problem, grid: Grid, horizon: float, start: Any, scheme: Scheme, code: Status, dtype: Any
+) -> Solution:
+    """The solution of a march that ended before its first step: the value it was to start from; NaN if not known."""
+    value = np.full((1, *grid.shape), np.nan if start is None else np.asarray(start), dtype)
+    message = f"The march did not leave t = {horizon:g}. {epochs.ADVICE[code]}"
+    return altered(unstarted(problem, grid, value, scheme, code), times=np.array([horizon]), message=message)
+
+
+def _check(problem: Any, grid: Any, scheme: Any, method: Any, step: Any, time_limit: Any) -> None:
+    """Refuse what no march can start with; needs no values of the problem's functions."""
+    if not isinstance(problem, Problem) or not isinstance(grid, Grid):
+        raise TypeError(f"march: got {type(problem).__name__}, {type(grid).__name__}; wanted a Problem and a Grid")
+    if not isinstance(scheme, (Upwind, Limited, Eno2, Weno5)):
+        raise TypeError(f"march: scheme is {scheme!r}; wanted hjb.Upwind(), Limited(), Eno2() or Weno5()")
+    if not isinstance(method, (Explicit, Implicit)):
+        raise TypeError(f"march: method is {method!r}; wanted hjb.Explicit(...) or hjb.Implicit(...)")
+    if isinstance(method, Implicit) and not isinstance(scheme, Upwind):
+        raise ValueError(f"march: Implicit(...) solves with the matrix of a chain; got {scheme!r}, wanted Upwind(...)")
+    if isinstance(scheme, (Eno2, Weno5)) and any(each is not None for each in grid.stretch or ()):
+        raise ValueError(
+            f"march: {scheme!r} wants equal spacings; leave out Grid.stretch, or use Upwind() or Limited()"
+        )
+    if step is not None:
+        arguments.positive(step, "march: step", "in units of time")
+    if time_limit is not None:
+        arguments.positive(time_limit, "march: time_limit", "in seconds", endless=True)
+
+
+def _times(horizon: Any, times: Any) -> tuple[float, np.ndarray]:
+    """The horizon and the kept times, checked."""
+    if is_traced(horizon, times):
+        raise ValueError("march: horizon and times set the number of steps and must be known numbers, not traced ones")
+    arguments.positive(horizon, "march: horizon", "in units of time")
+    try:
+        kept = np.array((0.0,) if times is None else times, np.float64)
+    except (TypeError, ValueError):
+        kept = np.zeros(())
+    if kept.ndim != 1 or kept.size == 0 or not np.all(np.isfinite(kept)):
+        raise ValueError(f"march: times = {times!r}; wanted numbers in [0, horizon], as in np.linspace(0, horizon, 21)")
+    if np.any(np.diff(kept) <= 0):
+        first = int(np.argmax(np.diff(kept) <= 0))
+        raise ValueError(
+            f"march: times are not increasing: times[{first}] = {kept[first]:g}, times[{first + 1}] = "
+            f"{kept[first + 1]:g}; sort them, as in np.unique(times)"
+        )
+    if kept[0] < 0 or kept[-1] > horizon:
+        raise ValueError(f"march: times run from {kept[0]:g} to {kept[-1]:g}; wanted them in [0, {horizon:g}]")
+    return float(horizon), kept
+
+
+def _bytes(problem: Problem, grid: Grid, kept: np.ndarray, method: Any, dtype: Any) -> int:
+    """Bytes at the peak: kept slices and policies, two slices, slopes, constraints; the matrix if implicit."""
+    word = np.dtype(dtype).itemsize
+    actions = sum(choices.dim for choices in (problem.controls, problem.disturbances) if choices is not None)
+    slices = len(kept) * (1 + actions) + 2 + 2 * grid.ndim + 3 + actions
+    if isinstance(method, Implicit):
+        inner = PolicyIteration(method.evaluation or Krylov())
+        slices += memory.estimate(problem, grid, inner, dtype) // (word * grid.size)
+    return word * slices * grid.size
+
+
+def _without_moving_target(problem: Problem) -> Problem:
+    """The problem without a target that may lie outside the box at the one time that is checked."""
+    if not problem.time_dependent or problem.target is None:
+        return problem
+    names = ("cost", "controls", "disturbances", "noise", "discount", "terminal_cost", "stopping_cost", "running_max")
+    return Problem(problem.drift, **{name: getattr(problem, name) for name in names}, time_dependent=True)
+
+
+def _prepare(
+    problem: Problem,
+    grid: Grid,
+    horizon: float,
+    scheme: Scheme,
+    method: Any,
+    step: float | None,
+    inner: float | None,
+    dtype: Any,
+) -> March:
+    """The task of a march, all arrays in ``dtype``, with a given step held against the limit."""
+    problem, grid = cast(problem, dtype), cast(grid, dtype)
+    moving = problem.time_dependent
+    limit: Any = None
+    if isinstance(method, Explicit):
+        method = Explicit(method.stages or scheme.stages, jnp.asarray(method.fraction, dtype))
+        probes = np.linspace(horizon, 0.0, PROBES) if moving else [horizon]
+        if step is not None or not moving:
+            limits = [_stable(problem, grid, scheme, jnp.asarray(t, dtype), dtype) for t in probes]
+            limit = jnp.min(jnp.stack(limits))
+            _check_step(step, float(limit))
+        limit = None if moving else jnp.asarray(limit * method.fraction if step is None else limit, dtype)
+    else:
+        evaluation = method.evaluation or _evaluation(problem, grid)
+        method = Implicit(evaluation, jnp.asarray(method.tol, dtype), method.max_steps)
+    checks = _checks(problem, grid, method, dtype)
+    if step is None:  # rates that are found on the way say nothing of the first steps
+        step = horizon / FEWEST if moving or checks[0] or isinstance(method, Implicit) else math.inf
+    return March(
+        problem, grid, method, None if moving else _rules(problem, grid, dtype), limit, jnp.asarray(step, dtype),
+        jnp.asarray(horizon, dtype), _watched(problem, grid, inner, dtype), scheme,
+        *checks,
+    )  # fmt: skip
+
+
+def _checks(problem: Problem, grid: Grid, method: Any, dtype: Any) -> tuple[bool, bool]:
+    """Whether steps must look at rates and at correlated noise under the actions that they choose."""
+    how, moving = players.setting(problem, grid.ndim, dtype), problem.time_dependent
+    sampled = not (how.control.fastest_at_ends and how.disturbance.fastest_at_ends)
+    rates = isinstance(method, Explicit) and (sampled or (moving and method.stages != 1))
+    return rates, callable(problem.noise) and (moving or how.steers_noise)
+
+
+def _check_step(step: float | None, limit: float) -> None:
+    if step is not None and step > limit * (1 + 1e-6):
+        raise ValueError(
+            f"march: step = {step:g} is above the stability limit 1/(max Q + β) = {limit:.6g} of explicit steps "
+            "on this grid;\nleave step out, or use method=hjb.Implicit()"
+        )
+
+
+def _evaluation(problem: Problem, grid: Grid) -> Any:
+    if grid.sides("open"):
+        chosen = choose(problem, grid, traced=False)
+        assert isinstance(chosen, PolicyIteration)
+        return chosen.evaluation
+    return Sweeps() if problem.noise is None else Krylov()
+
+
+def _watched(problem: Problem, grid: Grid, share: float | None, dtype: Any) -> Any:
+    """The nodes where a disturbance at its bound is taken for a blow-up; or None."""
+    if share is None:
+        how = players.setting(problem, grid.ndim, dtype).disturbance
+        share = 0.5 if isinstance(how.choices, Box) and all(how.curved) else 0.0
+    if not arguments.is_number(share) or not 0 <= share <= 1:
+        raise ValueError(f"march: inner = {share!r}; wanted the share of the box that is watched, from 0 (none) to 1")
+    if share == 0:
+        return None
+    if not isinstance(problem.disturbances, Box):
+        raise ValueError(f"march: inner = {share:g} watches a Box of disturbances; got {problem.disturbances!r}")
+    return jnp.asarray(grid.inner(share))
+
+
+def _march_traced(
+    problem: Problem,
+    grid: Grid,
+    horizon: float,
+    kept: np.ndarray,
+    start: Any,
+    scheme: Scheme,
+    method: Any,
+    step: float | None,
+    dtype: Any,
+) -> Solution:
+    """The same steps inside a JAX transformation, in a scan of fixed length: no chunks, no checks of values."""
+    if step is None:
+        raise ValueError(
+            "march: inside jit, vmap and grad the number of steps must be known: give step=, for explicit steps at "
+            "most 1/(max Q + β) of every problem that comes"
+        )
+    kind = jnp.result_type(float) if dtype is None else jnp.dtype(dtype)
+    if isinstance(method, Explicit):
+        method = Explicit(method.stages or scheme.stages, method.fraction)
+    else:
+        method = Implicit(method.evaluation or _evaluation(problem, grid), method.tol, method.max_steps)
+    problem, grid = cast(problem, kind), cast(grid, kind)
+    rules = None if problem.time_dependent else bellman.conditions(problem, grid, kind)
+    task = March(problem, grid, method, rules, jnp.inf, step, horizon, None, scheme)
+    value, values, actions, count = marching.terminal(problem, grid, horizon, kind, start), [], [], 0
+    for begin, end in itertools.pairwise([horizon, *kept[::-1].tolist()]):
+        steps = max(math.ceil((begin - end) / step - 1e-6), int(begin > end))
+        value, count = marching.repeat(task, value, begin, end, steps), count + steps
+        values.append(value)
+        actions.append(marching.greedy(task, value, end))
+    u, d = (
+        jnp.stack(
+            [jnp.stack(each[player], -1) if each[player] else jnp.zeros((*grid.shape, 0), kind) for each in actions]
+        )
+        for player in (0, 1)
+    )
+    return Solution(
+        grid, jnp.stack(values[::-1]), u[::-1], d[::-1] if problem.is_game else None, code=Status.CONVERGED,
+        steps=count, times=kept, discrete=isinstance(problem.controls, Finite),
+        discrete_disturbance=isinstance(problem.disturbances, Finite),
+    )  # fmt: skip

@@ -1,0 +1,166 @@
+"""What a solve needs before it starts, in Python integers, and what there is.
+
+What is free is the least of what the machine, the limits of the process (``ulimit -v``) and its control groups (as of a
+container) leave: the machine alone would say 60 GB where a container is killed at 4.
+"""
+
+import contextlib
+import math
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from hjbjax.iteration.iteration import Method, Nested, PolicyIteration
+from hjbjax.iteration.relaxation import Krylov, Sweeps
+from hjbjax.problem import arguments
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem, is_discounted
+
+INDEXABLE = 2**31  # nodes that 32-bit indices can number
+NO_GRID = "hjb.pontryagin(problem, x0) finds the optimal path from one state without a grid"
+
+
+def estimate(problem: Problem, grid: Grid, method: Method, dtype: Any) -> int:
+    """Bytes that a solve keeps at its peak, from a count of the arrays that live at once.
+
+    The state is the value, the rate that is left and the policy. A look at it makes the next one beside it; sweeps
+    need the weights (one an axis without noise, two with it) and the source twice, as they are and sheared, in single
+    precision; a Krylov method its vectors.
+    """
+    if isinstance(method, Nested):
+        return estimate(problem, grid, method.inner, dtype)
+    word, n = np.dtype(dtype).itemsize, grid.ndim
+    actions = sum(choices.dim for choices in (problem.controls, problem.disturbances) if choices is not None)
+    conditions = (problem.target, problem.stopping_cost, problem.running_max, problem.disturbances)
+    kept = word * (2 + actions + sum(each is not None for each in conditions) + (is_discounted(problem) is False)) + 2
+    look, correction = word * (4 + 2 * actions), 0
+    if isinstance(method, PolicyIteration):
+        jumps = 2 * n * n if np.ndim(problem.noise) == 2 or callable(problem.noise) else 2 * n
+        if isinstance(method.evaluation, Sweeps):
+            weights = n if problem.noise is None else jumps
+            correction = 4 * (2 * weights + 2) + 2 * word
+        else:
+            correction = word * (2 * jumps + 4 + 8 * isinstance(method.evaluation, Krylov))
+    else:
+        look += word  # the pace
+    return (kept + max(look, correction)) * grid.size
+
+
+def available() -> int | None:
+    """Free bytes on the device that JAX computes on, or None where nobody says."""
+    device = jax.devices()[0]
+    stats = device.memory_stats() if device.platform != "cpu" else None
+    if stats and "bytes_limit" in stats:
+        return int(stats["bytes_limit"]) - int(stats.get("bytes_in_use", 0))
+    known = [free for free in (_of_machine(), _of_process(), _of_groups()) if free is not None]
+    return max(min(known), 0) if known else None
+
+
+def _of_machine() -> int | None:
+    """What the machine has free, with caches that it would give up."""
+    try:
+        with open("/proc/meminfo") as lines:
+            for line in lines:
+                if line.startswith("MemAvailable:"):
+                    return int(line.split()[1]) * 1024
+        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError, AttributeError):
+        return None
+
+
+def _of_process() -> int | None:
+    """What the limit on the address space of this process leaves; None without one."""
+    try:
+        import resource
+
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if limit == resource.RLIM_INFINITY:
+            return None
+        used = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    except (ImportError, OSError, ValueError, AttributeError):  # Windows; a system without /proc
+        return None
+    return limit - used
+
+
+def _of_groups(process: Path = Path("/proc/self"), mount: Path = Path("/sys/fs/cgroup")) -> int | None:
+    """What the control groups of this process leave, of both versions; None where none is limited."""
+    left = []
+    for folder in _groups(process, mount):
+        for most, used in (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes")):
+            with contextlib.suppress(OSError, ValueError):  # "max" is no number, and no limit
+                limit = int((folder / most).read_text())
+                left.append(limit - int((folder / used).read_text()) + _reclaimable(folder))
+    return min(left) if left else None
+
+
+def _groups(process: Path, mount: Path) -> Iterator[Path]:
+    """The folders of the memory groups of a process and of all above it; in a container the mount is its own group."""
+    try:
+        lines = (process / "cgroup").read_text().splitlines()
+    except OSError:
+        return
+    for number, controllers, path in (line.split(":", 2) for line in lines if line.count(":") >= 2):
+        if number != "0" and "memory" not in controllers.split(","):
+            continue
+        top = mount if number == "0" else mount / "memory"
+        folder = top / path.strip("/")
+        while folder != top:
+            yield folder
+            folder = folder.parent
+        yield top
+
+
+def _reclaimable(folder: Path) -> int:
+    """Bytes of a group that are files it has read, which it would give up."""
+    with contextlib.suppress(OSError, ValueError):
+        stat = dict(line.split() for line in (folder / "memory.stat").read_text().splitlines())
+        return int(stat.get("inactive_file", 0))
+    return 0
+
+
+def require(problem: Problem, grid: Grid, method: Method, dtype: Any, limit: int | None) -> int:
+    """The estimate, if it fits.
+
+    Raises:
+      MemoryError: with the estimate, what is free, and the largest N that fits.
+    """
+    return fitting(estimate(problem, grid, method, dtype), grid, limit)
+
+
+def fitting(needed: int, grid: Grid, limit: int | None) -> int:
+    """``needed`` bytes, if they fit into what is free, or into ``limit``; refusals as for ``require``.
+
+    Raises:
+      ValueError: a limit that is no number of bytes.
+    """
+    if limit is not None:
+        arguments.positive(limit, "max_memory", "in bytes")
+    free = available() if limit is None else int(limit)
+    if grid.size >= INDEXABLE:
+        largest = math.floor((INDEXABLE - 1) ** (1 / grid.ndim))
+        raise MemoryError(
+            f"{_product(grid)} = {grid.size:,} nodes; 32-bit indices number fewer than {INDEXABLE:,}.\n"
+            f"At most N = {largest} points an axis in {grid.ndim}-D; {NO_GRID}."
+        )
+    if free is not None and needed > free:
+        raise MemoryError(
+            f"{_product(grid)} = {grid.size:,} nodes need about {needed / 1e9:.3g} GB, {free / 1e9:.3g} GB are free.\n"
+            f"{_fits(free / needed * grid.size, grid.ndim)}; max_memory= (bytes) overrides what counts as free.\n"
+            f"dtype='float32' takes about half; {NO_GRID}."
+        )
+    return needed
+
+
+def _fits(nodes: float, n: int) -> str:
+    largest = math.floor(nodes ** (1 / n))
+    if largest < 2:
+        return f"Not even two points an axis would fit in {n}-D"
+    return f"About N = {largest} points an axis would fit in {n}-D"
+
+
+def _product(grid: Grid) -> str:
+    return " x ".join(map(str, grid.shape))

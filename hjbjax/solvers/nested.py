@@ -1,0 +1,153 @@
+"""The way of a solve on the host: coarser grids, vanishing discounts, rest nodes that one had better leave."""
+
+import dataclasses
+import itertools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.discretisation.schemes import Upwind
+from hjbjax.finiteness import resting
+from hjbjax.iteration.certificates import Certificate
+from hjbjax.iteration.iteration import Method, Nested, PolicyIteration, State, Task
+from hjbjax.iteration.relaxation import Sweeps
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import altered
+from hjbjax.solution.clock import Clock, Stopped
+from hjbjax.solution.status import Status
+from hjbjax.solvers import transfer
+from hjbjax.solvers.driver import drive
+from hjbjax.solvers.preparation import Verdict, forced_only, held_jit, judge, linear_solve, prepare_jit
+
+VANISHING = (2.0, 0.2, 0.02)  # discounts on the way to none, over one by the time that crossing the box takes
+FURTHER = ((2e-3, 2e-4), (2e-5, 2e-6), (2e-7, 2e-8))  # where parts of the box are that much slower than the fastest
+FAILED = (Status.STALLED, Status.DIVERGED, Status.NONFINITE)
+WARM_STEPS = 60  # improvements for each of them
+
+
+def start(
+    problem: Problem, grid: Grid, method: Method, scheme: Upwind, tol: float, guess: Any, dtype: Any, clock: Clock
+) -> tuple[Any, list[tuple[int, ...]]]:
+    """The guess for the finest grid: the user's, or the answer of the coarser grids, and the shapes of those.
+
+    Where the clock says stop on the way, the answer so far on the finest grid, interpolated by NumPy, which compiles
+    nothing; None if there is none.
+    """
+    if guess is not None or not isinstance(method, Nested):
+        return guess, []
+    grids = levels(problem, grid, method, scheme, dtype, clock)
+    value = None
+    if clock.over() is not None:
+        return None, []
+    for coarse, fine in itertools.pairwise(grids):
+        clock.phase = f"the preparation of {' x '.join(map(str, coarse.shape))} nodes"
+        verdict = judge(problem, coarse, dtype)
+        task = prepare_jit(problem, coarse, method=method.inner, scheme=scheme, tol=tol, dtype=dtype, verdict=verdict)
+        state, _, _ = drive(task, warm(task, value, clock), clock)
+        if clock.over() is not None:
+            return transfer.prolong(np.asarray(state.value), coarse, grid), []
+        value = transfer.prolong(state.value, coarse, fine)
+    return value, [coarse.shape for coarse in grids[:-1]]
+
+
+def levels(problem: Problem, grid: Grid, method: Nested, scheme: Upwind, dtype: Any, clock: Clock) -> list[Grid]:
+    """The grids of a nested solve, coarsest first; a coarser grid that loses the target or rest point is left out."""
+    grids, verdict = [grid], judge(problem, grid, dtype)
+    needs_held = problem.target is not None or verdict.may_rest
+    while (smaller := transfer.coarser(grids[0])) is not None and smaller.size >= method.coarsest:
+        if clock.over() is not None:
+            break
+        clock.phase = f"the choice of coarser grids, {' x '.join(map(str, smaller.shape))} nodes"
+        if needs_held and not held_jit(problem, smaller, scheme=scheme, dtype=dtype, verdict=verdict).any():
+            break
+        grids.insert(0, smaller)
+    return grids
+
+
+def warm(task: Task, guess: Any, clock: Clock) -> jax.Array:
+    """The guess; without one zero, or without discount what leads to the right one of many fixed points.
+
+    A stopping cost or a running maximum is itself the start: ψ lies above all fixed points and g below. Otherwise
+    the answers for a discount that vanishes lead the way: from below an undiscounted problem is full of policies
+    that stay where they are at a cost; those of a small discount move to the target.
+    """
+    if guess is not None:
+        return guess
+    value = task.start() if task.constrained else jnp.asarray(np.zeros(task.grid.shape, task.tol.dtype))
+    if task.certificate is not Certificate.MULTIPLICATIVE or task.constrained:
+        return value
+    return _vanishing(task, value, VANISHING, clock)
+
+
+def _vanishing(task: Task, value: jax.Array, discounts: tuple[float, ...], clock: Clock) -> jax.Array:
+    """The answers for some discounts, over one by the time of a crossing, one after the other."""
+    for discount in discounts:
+        problem = altered(task.problem, discount=jnp.asarray(discount / task.crossing, task.tol.dtype))
+        value = drive(dataclasses.replace(task, problem=problem), value, clock, most=WARM_STEPS)[0].value
+    return value
+
+
+class Settled(NamedTuple):
+    """A task that was driven to its end, as it came to be on the way, and how it ended."""
+
+    task: Task
+    verdict: Verdict
+    reached: np.ndarray | None
+    state: State
+    code: Status
+    residuals: np.ndarray
+
+
+def may_go_on(task: Task, verdict: Verdict, state: State, code: Status) -> bool:
+    """Whether what ended so may have to go on: rest nodes that it had better leave, or a game that failed."""
+    if code is Status.CONVERGED:
+        return verdict.may_rest and float(np.min(np.asarray(state.value), initial=0)) < 0
+    return code in FAILED and task.problem.is_game
+
+
+def settle(task: Task, verdict: Verdict, reached: np.ndarray | None, guess: Any, clock: Clock) -> Settled:
+    """Solve with the nodes where the system can rest held; those that it had better leave are released, and again.
+
+    Held, their value is an upper bound of the one sought, from which the iteration only descends: a released node that
+    was too low would stay so, since resting costs nothing. A game that does not converge is asked from where its target
+    can be forced at all, and solved there. Sweeps that come to a halt, as they do where the drift goes round and round
+    under a small discount, give way to a linear solve.
+    """
+    value = warm(task, guess, clock)
+    state, code, residuals = drive(task, value, clock)
+    if task.certificate is Certificate.MULTIPLICATIVE and not task.constrained:
+        for discounts in FURTHER:  # a policy that stays where it is and pays, since the way takes too long for these
+            if code not in FAILED:
+                break
+            value = _vanishing(task, value, discounts, clock)
+            state, code, residuals = drive(task, value, clock)
+    if code is Status.STALLED and isinstance(getattr(task.method, "evaluation", None), Sweeps):
+        task = dataclasses.replace(task, method=PolicyIteration(linear_solve(task.grid)))
+        state, code, residuals = drive(task, state.value, clock)
+    if code in FAILED:
+        try:
+            fewer, forced = forced_only(task, clock)
+        except Stopped as stop:
+            return Settled(task, verdict, reached, state, stop.status, residuals)
+        if forced is not None and not forced.all():
+            task, reached = fewer, forced
+            state, code, residuals = drive(task, warm(task, None, clock), clock)
+    while code is Status.CONVERGED and may_go_on(task, verdict, state, code):
+        pays = _leaving_pays(task, state.value)
+        if not np.any(np.asarray(pays)):
+            break
+        verdict = dataclasses.replace(verdict, certificate=Certificate.NONE)
+        task = dataclasses.replace(
+            task, rules=resting.released(task.rules, pays), certificate=Certificate.NONE, least_cost=None
+        )
+        state, code, more = drive(task, state.value, clock)
+        residuals = np.concatenate([residuals, more])
+    return Settled(task, verdict, reached, state, code, residuals)
+
+
+@jax.jit
+def _leaving_pays(task: Task, value: jax.Array) -> jax.Array:
+    return resting.leaving_pays(task.problem, task.grid, task.rules, task.counted, value, scheme=task.scheme.chain)

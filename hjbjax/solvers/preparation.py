@@ -1,0 +1,276 @@
+"""From a problem on a grid to a task: what is held, what counts, which certificate applies, which method runs."""
+
+import dataclasses
+import functools
+import sys
+import warnings
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.discretisation import subcell
+from hjbjax.discretisation.schemes import Upwind
+from hjbjax.finiteness import proper, resting
+from hjbjax.hamiltonian import players
+from hjbjax.iteration import bellman
+from hjbjax.iteration.certificates import Certificate
+from hjbjax.iteration.iteration import Method, Nested, PolicyIteration, Task, ValueIteration
+from hjbjax.iteration.relaxation import Direct, Krylov, Sweeps
+from hjbjax.problem import checks
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem, is_discounted
+from hjbjax.problem.pytree import cast
+from hjbjax.solution.clock import Clock
+
+
+class SolveWarning(UserWarning):
+    """The solve went through, and something about its answer deserves attention."""
+
+
+def warn(message: str) -> None:
+    """A ``SolveWarning`` at the line outside of the package from which the front door was called."""
+    package, frame, level = __name__.split(".")[0], sys._getframe(1), 2
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] == package:
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, SolveWarning, stacklevel=level)
+
+
+DIRECT = 50_000  # nodes up to which a plane with open ends is solved by sparse LU: about a second a step
+NEST = 100_000  # nodes beyond which compiling coarser grids pays
+
+
+def is_constrained(problem: Problem) -> bool:
+    """Whether the problem has a stopping cost or a running maximum."""
+    return problem.stopping_cost is not None or problem.running_max is not None
+
+
+def choose(problem: Problem, grid: Grid, *, traced: bool) -> Method:
+    """The method that suits a problem.
+
+    Where transport rules, a few wavefront sweeps evaluate a policy well enough. Where there is noise they are
+    too slow and precondition a Krylov method; on a line a direct solve costs nothing. Large grids are nested. Tubes
+    without discount have policies without a value of their own: there value iteration alone keeps to the extreme
+    one of many fixed points.
+    """
+    if is_constrained(problem) and is_discounted(problem) is False:
+        return ValueIteration()
+    if grid.sides("open"):  # what is continued from inside is no matter for sweeps; see relaxation
+        small = grid.ndim < 3 and grid.size <= DIRECT
+        return PolicyIteration(Direct() if small else Krylov())
+    if problem.noise is None:
+        method = PolicyIteration(Sweeps())
+    else:
+        method = PolicyIteration(Krylov() if traced else linear_solve(grid))
+    return Nested(method) if grid.size > NEST and not traced else method
+
+
+def linear_solve(grid: Grid) -> Direct | Krylov:
+    """How a policy is evaluated where sweeps are too slow; host level."""
+    return Direct() if grid.ndim == 1 else Krylov()
+
+
+def prepare(
+    problem: Problem, grid: Grid, *, method: Method, scheme: Upwind, tol: Any, dtype: Any, verdict: "Verdict"
+) -> Task:
+    """The task of a solve, all arrays in ``dtype``; pure, so that it may be traced, batched and differentiated."""
+    problem, grid = cast(problem, dtype), cast(grid, dtype)
+    rules, still = _rules(problem, grid, scheme=scheme, dtype=dtype, verdict=verdict)
+    undecided = verdict.certificate is Certificate.BY_DISCOUNT and is_constrained(problem)
+    pace = None
+    if isinstance(method, ValueIteration) or undecided or verdict.certificate is Certificate.OPEN:
+        rate = bellman.fastest_rate(problem, grid, scheme=scheme, dtype=dtype) + problem.discount
+        pace = jnp.where(rate > 0, rate, 1)
+    priced = verdict.costs_certify and still is not None
+    return Task(
+        problem, grid, method, rules, jnp.ones(grid.shape, bool), still.least if priced and still else None, pace,
+        jnp.asarray(tol, dtype), scheme, verdict.certificate, still.crossing if priced and still else None,
+    )  # fmt: skip
+
+
+def _rules(
+    problem: Problem, grid: Grid, *, scheme: Upwind, dtype: Any, verdict: "Verdict"
+) -> tuple[bellman.Conditions, resting.Standstill | None]:
+    """The conditions, rest points among them, and what was found out about resting where it was needed."""
+    rules = bellman.conditions(problem, grid, dtype)
+    if scheme.subcell and problem.exit_cost is not None:
+        links = subcell.links(problem, grid, subcell=True, dtype=dtype)
+        met = [jnp.min(jnp.where(*meets, 0)) for link in links for meets in (link.meets_up, link.meets_down) if meets]
+        rules = dataclasses.replace(rules, least_exit=jnp.minimum(jnp.min(jnp.stack(met)), 0))
+    if not (verdict.may_rest or verdict.costs_certify):
+        return rules, None
+    still = resting.standstill(problem, grid, scheme=scheme, dtype=dtype)
+    if not verdict.may_rest:
+        return rules, still
+    return dataclasses.replace(rules, held=rules.held | (still.rests & (problem.discount == 0))), still
+
+
+@dataclasses.dataclass(frozen=True)
+class Verdict:
+    """What is known of a problem before its numbers are looked at.
+
+    Attributes:
+      certificate: which bound on the error applies.
+      exact: whether the minimum over the actions is exact.
+      may_rest: whether rest points at zero cost close the problem (no discount, no constraint).
+      costs_certify: whether without discount the running cost gives a bound, if it is positive.
+    """
+
+    certificate: Certificate
+    exact: bool
+    may_rest: bool
+    costs_certify: bool = False
+
+    @property
+    def sentence(self) -> str:
+        """What certifies the error, or why nothing does."""
+        if self.certificate is Certificate.NONE or self.exact:
+            return self.certificate.value
+        return self.certificate.value + "; for the refined sample of actions"
+
+
+def judge(problem: Problem, grid: Grid, dtype: Any) -> Verdict:
+    """Read the verdict from the problem's structure, which knows whether there is a discount unless that is traced."""
+    if grid.sides("open"):
+        return dataclasses.replace(judge(problem, grid.walled, dtype), certificate=Certificate.OPEN)
+    how, discounted = players.setting(problem, grid.ndim, dtype), is_discounted(problem)
+    if discounted:
+        return Verdict(Certificate.ADDITIVE, how.exact, may_rest=False)
+    fits = problem.running_max is None and problem.cost is not None and not how.disturbance_costs
+    kind = Certificate.MULTIPLICATIVE if fits else Certificate.NONE
+    may_rest = not is_constrained(problem) and problem.cost is not None
+    return Verdict(Certificate.BY_DISCOUNT if discounted is None else kind, how.exact, may_rest, fits)
+
+
+prepare_jit = jax.jit(prepare, static_argnames=("scheme", "dtype", "verdict"))
+
+
+@functools.partial(jax.jit, static_argnames=("scheme", "dtype", "verdict"))
+def held_jit(problem: Problem, grid: Grid, *, scheme: Upwind, dtype: Any, verdict: Verdict) -> jax.Array:
+    """The nodes at which the value is given, bool (*grid)."""
+    return _rules(cast(problem, dtype), cast(grid, dtype), scheme=scheme, dtype=dtype, verdict=verdict)[0].held
+
+
+def prepare_on_host(
+    problem: Problem, grid: Grid, *, method: Method, scheme: Upwind, tol: float, dtype: Any, clock: Clock | None = None
+) -> tuple[Task, Verdict, np.ndarray | None]:
+    """``prepare`` with the checks that need values: a finite solution exists, and where.
+
+    It looks at the clock on the way and may raise ``Stopped``.
+
+    Returns:
+      The task, the verdict, and the nodes that reach the target (None where there is nothing to reach).
+
+    Raises:
+      ValueError: there is no finite solution.
+    """
+    clock = clock or Clock()
+    clock.enter(f"the preparation of {' x '.join(map(str, grid.shape))} nodes")
+    verdict = judge(problem, grid, dtype)
+    task = prepare_jit(problem, grid, method=method, scheme=scheme, tol=tol, dtype=dtype, verdict=verdict)
+    priced = verdict.certificate is Certificate.MULTIPLICATIVE
+    if (priced and not _costs_suit(task)) or problem.cost is None:
+        task = _with_refuge(task)
+        verdict = dataclasses.replace(verdict, may_rest=not is_constrained(problem) and not problem.discount > 0)
+    if priced and problem.is_game and not _costs_suit(task) and isinstance(method, PolicyIteration):
+        # policies that go on for ever at no cost have any value: the one sought is the limit of those of long horizons
+        task = prepare_jit(problem, grid, method=ValueIteration(), scheme=scheme, tol=tol, dtype=dtype, verdict=verdict)
+    if priced and not _costs_suit(task):
+        verdict = dataclasses.replace(verdict, certificate=Certificate.NONE)
+        task = dataclasses.replace(task, certificate=Certificate.NONE, least_cost=None)
+    held = np.asarray(task.rules.held)
+    undiscounted = problem.discount == 0
+    checks.ill_posed(problem, bool(verdict.may_rest and held.any()), grid)
+    if problem.is_game or is_constrained(problem) or not held.any():
+        return task, verdict, None
+    reached = proper.reached(
+        task.problem,
+        task.grid,
+        held,
+        scheme=scheme,
+        dtype=dtype,
+        surely=undiscounted,
+        least=_least_rate(task),
+        clock=clock,
+    )
+    if not reached.all():
+        _warn_unreached(reached, undiscounted)
+        if undiscounted:
+            task = _without(task, reached)
+    return task, verdict, reached
+
+
+def forced_only(task: Task, clock: Clock) -> tuple[Task, np.ndarray | None]:
+    """The task of a game that did not converge, without the nodes from which the target cannot be forced.
+
+    Returns:
+      The task and the nodes that are left; ``None`` where that is no question.
+    """
+    held = np.asarray(task.rules.held)
+    if not task.problem.is_game or task.constrained or np.asarray(task.problem.discount) > 0 or not held.any():
+        return task, None
+    reached = proper.forced(
+        task.problem, task.grid, held, scheme=task.scheme.chain, dtype=task.tol.dtype, least=_least_rate(task),
+        clock=clock,
+    )  # fmt: skip
+    if reached.all():
+        return task, reached
+    _warn_unreached(reached, True)
+    return _without(task, reached), reached
+
+
+def _with_refuge(task: Task) -> Task:
+    """The task with the nodes held at zero among which a run may go on for ever and pay nothing, as where it rests."""
+    if task.problem.is_game or task.constrained or np.asarray(task.problem.discount) > 0:
+        return task
+    free = ~np.broadcast_to(np.asarray(task.rules.ended), task.grid.shape)
+    least = np.zeros(task.grid.shape) if task.least_cost is None else np.asarray(task.least_cost)
+    small = resting.ROUNDINGS * np.finfo(task.tol.dtype).eps * np.max(np.abs(least))
+    if np.any(least[free] < -small):
+        return task
+    found = proper.refuge(
+        task.problem, task.grid, jnp.asarray((least <= small) & free), jnp.asarray(small, task.tol.dtype),
+        scheme=task.scheme.chain, dtype=task.tol.dtype,
+    )  # fmt: skip
+    return dataclasses.replace(task, rules=dataclasses.replace(task.rules, held=task.rules.held | found))
+
+
+def _costs_suit(task: Task) -> bool:
+    """Whether the running cost is positive wherever the value is not given."""
+    return bool(np.all(np.asarray(task.least_cost)[~np.asarray(task.rules.held)] > 0))
+
+
+def prepare_traced(
+    problem: Problem, grid: Grid, *, method: Method, scheme: Upwind, tol: Any, dtype: Any
+) -> tuple[Task, Verdict]:
+    """``prepare`` with what of the host's checks runs inside a JAX transformation: nodes without a finite value."""
+    verdict = judge(problem, grid, dtype)
+    task = prepare(problem, grid, method=method, scheme=scheme, tol=tol, dtype=dtype, verdict=verdict)
+    ends = problem.target is not None or verdict.may_rest
+    if problem.is_game or is_constrained(problem) or is_discounted(problem) or not ends:
+        return task, verdict
+    known = jax.lax.stop_gradient(task)
+    reached = proper.surely_reached(
+        known.problem, known.grid, known.rules.held, scheme=scheme, dtype=dtype, least=_least_rate(known)
+    )
+    return _without(task, reached | (known.problem.discount > 0)), verdict
+
+
+def _least_rate(task: Task) -> Any:
+    """Rates up to this one are rounding beside those of the fastest motion on the grid; zero where nobody asks."""
+    if task.crossing is None:
+        return jnp.zeros((), task.tol.dtype)
+    return resting.ROUNDINGS * jnp.finfo(task.tol.dtype).eps * sum(task.grid.shape) / task.crossing
+
+
+def _without(task: Task, reached: Any) -> Task:
+    """The nodes with an infinite value are held above all others, so that no optimal action goes there."""
+    rules = dataclasses.replace(task.rules, held=task.rules.held | ~jnp.asarray(reached))
+    return dataclasses.replace(task, rules=rules, counted=task.counted & jnp.asarray(reached), has_lost=True)
+
+
+def _warn_unreached(reached: np.ndarray, undiscounted: bool) -> None:
+    share = 100 * (1 - float(np.mean(reached)))
+    what = "their value is inf" if undiscounted else "their value is the discounted cost of never arriving"
+    warn(f"{share:.3g} % of the nodes cannot reach the target: {what}; see Solution.reached")

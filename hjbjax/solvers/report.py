@@ -1,0 +1,302 @@
+"""From a state of the iteration to a Solution: NumPy arrays, masks, the Isaacs gap, the message."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.discretisation import chain, correlation, edges
+from hjbjax.finiteness import earnings
+from hjbjax.hamiltonian import hamiltonian, players
+from hjbjax.iteration import certificates, iteration
+from hjbjax.iteration.certificates import Certificate
+from hjbjax.iteration.iteration import Method, Nested, PolicyIteration, State, Task
+from hjbjax.problem import sets
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import is_traced
+from hjbjax.problem.sets import Finite
+from hjbjax.solution.clock import CUT, Clock
+from hjbjax.solution.solution import Solution
+from hjbjax.solution.status import Status
+from hjbjax.solvers.preparation import Verdict, warn
+
+GAP = 0.05  # of what the actions matter; where Isaacs' condition holds, upwinding left up to .019 on 21 nodes
+MOST = 2 / 3  # of an end's nodes: whatever has a velocity leaves by half of those where its position ends
+
+
+def finish(
+    task: Task,
+    state: State,
+    code: Status,
+    reached: np.ndarray | None,
+    residuals: np.ndarray,
+    verdict: Verdict,
+    grid: Grid,
+    cut: bool = False,
+) -> Solution:
+    """The solution in NumPy, with infinite values where the target cannot be reached and no policy where none is.
+
+    The Isaacs gap is a program of its own, and nothing is compiled after a ``cut``.
+    """
+    stopped = cut or code in CUT
+    if not stopped:
+        _refuse_noise(task, state, grid)
+    earning = None if stopped else earnings.earned(task, state)
+    code = code if earning is None else Status.DIVERGED
+    gap = None if stopped else _isaacs_gap(task, state)
+    unanswered = stopped or code in (Status.DIVERGED, Status.NONFINITE)
+    leaving = None if unanswered else _leaving(task, state, grid)
+    state = jax.device_get(state)
+    solution = assemble(task, state, verdict)
+    lost = ~np.asarray(task.counted)
+    arrays = {name: getattr(solution, name) for name in ("value", "policy", "disturbance")}
+    arrays = {name: None if array is None else np.require(array, requirements="W") for name, array in arrays.items()}
+    arrays["value"][lost] = np.inf
+    idle = lost | np.asarray(task.rules.ended) | (int(state.step) < 0)  # nobody looked for a policy yet
+    for array in (arrays["policy"], arrays["disturbance"]):
+        if array is not None:
+            array[idle] = np.nan
+    return Solution(
+        **arrays,
+        enclosure=solution.enclosure,
+        grid=grid,
+        code=int(code),
+        steps=max(int(state.step), 0),
+        isaacs_gap=gap,
+        reached=reached,
+        cut=leaving,
+        discrete=solution.discrete,
+        discrete_disturbance=solution.discrete_disturbance,
+        residuals=residuals,
+        message=_message(code, task, state, grid) if earning is None else _endless(earning, grid),
+        stats={
+            "scheme": repr(task.scheme),
+            "device": str(jax.devices()[0].device_kind),
+            "dtype": str(state.value.dtype),
+            "certificate": verdict.sentence,
+            "versions": {"jax": jax.__version__, "numpy": np.__version__},
+        },
+    )
+
+
+def unstarted(problem: Problem, grid: Grid, value: np.ndarray, scheme: Any, code: Status) -> Solution:
+    """The solution of a run that ended before its first step: the value it was to start from, and no policy."""
+    inputs = [0 if choices is None else choices.dim for choices in (problem.controls, problem.disturbances)]
+    nan = np.array(np.nan, value.dtype)  # one number seen everywhere: on 85 million nodes an array of it takes seconds
+    policy, disturbance = (np.broadcast_to(nan, (*value.shape, m)) for m in inputs)
+    return Solution(
+        grid, value, policy, disturbance if problem.is_game else None, code=code,
+        discrete=isinstance(problem.controls, Finite), discrete_disturbance=isinstance(problem.disturbances, Finite),
+        message=code.message,
+        stats={
+            "scheme": repr(scheme),
+            "device": str(jax.devices()[0].device_kind),
+            "dtype": str(value.dtype),
+            "certificate": "the value was not looked at",
+            "versions": {"jax": jax.__version__, "numpy": np.__version__},
+        },
+    )  # fmt: skip
+
+
+def closed(solution: Solution, clock: Clock) -> Solution:
+    """The solution with how far its run came, where that was cut short; no Ctrl-C is lost, even a late one."""
+    if clock.interrupted and solution.status is Status.CONVERGED:
+        message = f"It was interrupted after it had come to its end, and nothing is missing. {solution.message}"
+        return dataclasses.replace(solution, code=int(Status.INTERRUPTED), message=message)
+    if solution.status not in CUT:
+        return solution
+    return dataclasses.replace(solution, message=f"{solution.message} It came as far as {clock.phase}.")
+
+
+def assemble(task: Task, state: State, verdict: Verdict) -> Solution:
+    """The solution as it stands in the state; pure."""
+    problem = task.problem
+    controls, disturbances = state.policy.controls, state.policy.disturbances
+    xp: Any = jnp if is_traced(state) else np
+    return Solution(
+        value=state.value,
+        policy=xp.stack(controls, axis=-1) if controls else xp.zeros((*task.grid.shape, 0), state.value.dtype),
+        disturbance=xp.stack(disturbances, axis=-1) if problem.is_game else None,
+        code=state.code,
+        steps=state.step,
+        enclosure=certificates.enclosure(verdict.certificate, state.gap, problem.discount),
+        grid=task.grid,
+        discrete=isinstance(problem.controls, Finite),
+        discrete_disturbance=isinstance(problem.disturbances, Finite),
+    )
+
+
+def _leaving(task: Task, state: State, grid: Grid) -> np.ndarray:
+    """At how many nodes of each end the optimal drift is cut off, with a warning where those are most of them."""
+    value, policy, rules, counted = jax.device_get((state.value, state.policy, task.rules, task.counted))
+    u, d = (list(players) for players in (policy.controls, policy.disturbances))
+    cut, ends = edges.cut(task.problem, task.grid, value, u, d, counted & rules.acting(value))
+    warn_of_cuts(cut, ends, grid)
+    return cut
+
+
+def warn_of_cuts(cut: np.ndarray, ends: np.ndarray, grid: Grid) -> None:
+    """Warn of ends at more than ``MOST`` of whose nodes the optimal drift is cut off; both shape (n, 2)."""
+    most = [
+        f"the {('lower', 'upper')[side]} end of {grid.names[axis]} ({cut[axis, side]} of {ends[axis, side]} nodes)"
+        for axis, side in np.argwhere(cut > MOST * ends)
+    ]
+    if most:
+        warn(
+            f"the optimal drift leaves the box and is cut off at {', '.join(most)}, as if a wall stood there on which "
+            "to lean is free: near such an end the value is not that of your problem. Choose the box larger, or "
+            "Grid(..., edges='constrained') or 'open'"
+        )
+
+
+@jax.jit
+def _lacking(task: Task, controls: tuple, disturbances: tuple) -> jax.Array:
+    """The first node, counted flat, where the policy's noise is correlated more than the spacings allow, or −1."""
+    problem, grid, dtype = task.problem, task.grid, task.tol.dtype
+    a = chain.diffusion(problem, grid.components(dtype), list(controls), list(disturbances), 0.0, dtype)
+    lacking = chain.lacking(a, grid, dtype)
+    if lacking is None:
+        return jnp.full((), -1)
+    lacking = jnp.broadcast_to(lacking, grid.shape) & task.counted & ~task.rules.held
+    return jnp.where(jnp.any(lacking), jnp.argmax(lacking), -1)
+
+
+def _refuse_noise(task: Task, state: State, grid: Grid) -> None:
+    """Refuse noise that depends on the action where the one found lies between those that were tried before."""
+    problem, dtype = task.problem, task.tol.dtype
+    if not callable(problem.noise) or not players.setting(problem, grid.ndim, dtype).steers_noise:
+        return
+    policy = state.policy
+    first = int(_lacking(task, policy.controls, policy.disturbances))
+    if first < 0:
+        return
+    index = tuple(int(i) for i in np.unravel_index(first, grid.shape))
+    x, u, d = grid.state(index), *([float(a[index]) for a in each] for each in (policy.controls, policy.disturbances))
+    sigma = np.asarray(problem.diffusion(x, np.array(u), np.array(d), 0.0), dtype=float)
+    played = "".join(f", {letter} = {action}" for letter, action in (("u", u), ("d", d)) if action)
+    raise ValueError(
+        "noise: correlated noise that the chain cannot represent with non-negative probabilities under the policy "
+        f"that was found, first at node {index}, x = {np.asarray(x).tolist()}{played}.\n"
+        + correlation.advice(sigma @ sigma.T, grid, everywhere=False)
+    )
+
+
+def isaacs_gap(here: hamiltonian.Local, free: Any) -> tuple[jax.Array, jax.Array]:
+    """The largest min max − max min over the ``free`` nodes, and how much the actions matter there, per unit time.
+
+    What actions matter is the largest difference of H between two pairs of them, of nine representatives a player.
+    """
+    how = players.setting(here.problem, here.grid.ndim, here.dtype)
+    upper, lower = (hamiltonian.optimise(here, how, isaacs=which)[0] for which in ("upper", "lower"))
+    sets_of = (here.problem.controls, here.problem.disturbances)
+    mine, theirs = (jnp.asarray(_representatives(choices), here.dtype) for choices in sets_of)
+
+    def compare(extremes: Any, pair: Any) -> tuple[Any, None]:
+        total = here.at(list(mine[pair[0]]), list(theirs[pair[1]]))
+        total = jnp.where(jnp.isfinite(total), total, upper)  # an action that an end of the box rules out
+        return (jnp.minimum(extremes[0], total), jnp.maximum(extremes[1], total)), None
+
+    pairs = jnp.asarray([(i, j) for i in range(len(mine)) for j in range(len(theirs))])
+    (least, most), _ = jax.lax.scan(compare, (lower, upper), pairs)
+    size = 1e3 * jnp.finfo(here.dtype).eps * (jnp.abs(least) + jnp.abs(most))  # no gap is less than rounding
+    return jnp.max(jnp.where(free, upper - lower, 0)), jnp.max(jnp.where(free, most - least + size, 0))
+
+
+def _representatives(choices: Any) -> Any:
+    """At most nine actions of a player, shape (K, m), the first and the last of its samples among them."""
+    if choices is None:
+        return np.zeros((1, 0))
+    points = sets.samples(choices, 9)
+    return points[np.unique(np.linspace(0, len(points) - 1, 9).round().astype(int))]
+
+
+def warn_of_gap(gap: float, matter: float, isaacs: str) -> None:
+    """Warn of a gap that is no small part of what the actions matter; upwinding leaves one of the order of h."""
+    if gap > GAP * matter:
+        warn(
+            f"the Isaacs condition fails: min max and max min of the Hamiltonian differ by up to {gap:.3g} per unit "
+            f"time, {gap / matter:.0%} of what the actions matter; the value is the {isaacs} one, isaacs= gives the "
+            "other"
+        )
+
+
+@jax.jit
+def _gap_at(task: Task, value: jax.Array) -> tuple[jax.Array, jax.Array]:
+    here = hamiltonian.local(task.problem, task.grid, value, scheme=task.scheme, lost=task.lost)
+    return isaacs_gap(here, task.counted & ~task.rules.held)
+
+
+def _isaacs_gap(task: Task, state: State) -> float | None:
+    if not task.problem.is_game:
+        return None
+    gap, matter = (float(number) for number in _gap_at(task, state.value))
+    warn_of_gap(gap, matter, task.problem.isaacs)
+    return gap
+
+
+def _endless(earning: earnings.Earning, grid: Grid) -> str:
+    state = ", ".join(f"{x:.4g}" for x in grid.state(earning.node))
+    return (
+        f"The value is −∞: without discount, a policy can stay for ever where it pays {earning.mean:.3g} a unit time "
+        f"on the average, near x = ({state}) for one. Give discount > 0, a horizon (march), or a running cost that is "
+        "not negative there."
+    )
+
+
+_broken = jax.jit(iteration.broken)
+
+
+def _not_finite(task: Task, state: State, grid: Grid) -> str:
+    """Where NaN or infinity appeared, by taking the step once more that brought it."""
+    bad = np.asarray(_broken(task, state))
+    step = int(state.step)
+    when = "at the guess" if step == 0 else f"in step {step}"
+    kept = "the last finite value is kept"
+    discount, left = float(np.asarray(task.problem.discount)), float(np.max(np.abs(state.policy.rate)))
+    if 0 < discount < 1 and left > discount * float(np.finfo(np.float32).max):  # sweeps run in single precision
+        return (
+            f"Infinity appeared {when} and {kept}: discount = {discount:.3g} is so small that what is left, "
+            f"{left:.3g} a unit time, divided by it is no number; give a larger one, or 0 and a target."
+        )
+    if not np.any(bad):
+        return f"NaN or infinity appeared {when} and {kept}; check drift and cost."
+    index = tuple(int(i) for i in np.unravel_index(int(np.argmax(bad)), bad.shape))
+    x = ", ".join(f"{entry:.6g}" for entry in grid.state(index))
+    return (
+        f"NaN or infinity appeared {when} and {kept}: at {int(bad.sum())} of {bad.size} nodes, first at node {index}, "
+        f"x = [{x}]; check drift and cost there."
+    )
+
+
+def _message(code: Status, task: Task, state: State, grid: Grid) -> str:
+    if code is Status.NONFINITE:
+        return _not_finite(task, state, grid)
+    best, tol = float(state.best[0]), float(task.tol)
+    certified = task.certificate not in (Certificate.NONE, Certificate.RESIDUAL, Certificate.OPEN)
+    if code is Status.STALLED and np.isfinite(best) and certified:
+        return f"{code.message} The smallest error was {best:.2g}: a tolerance of {2 * best:.2g} is within reach."
+    if code is Status.STALLED and np.isfinite(best):
+        return (
+            f"Residual and last step stopped falling at {best:.2g}, above the tolerance, and no certificate says how "
+            "far off the value is; give a discount, some noise or a better guess, or compute in float64."
+        )
+    if code is Status.CONVERGED and task.certificate is Certificate.NONE and task.constrained:
+        return "The value no longer changes, up to rounding; no certificate bounds the error."
+    if code is Status.CONVERGED and task.certificate in (Certificate.NONE, Certificate.OPEN):
+        return f"Residual and last step are at most {tol:.2g}; no certificate bounds the error."
+    if code is Status.CONVERGED and task.certificate is Certificate.RESIDUAL:
+        return f"Residual of the second-order equation and last step are at most {tol:.2g} in cost units."
+    return code.message
+
+
+def describe(method: Method, problem: Problem) -> str:
+    """The method as one would write it, without what the problem does not use."""
+    if isinstance(method, Nested):
+        return f"Nested({describe(method.inner, problem)})"
+    if isinstance(method, PolicyIteration):
+        game = f", replies={method.replies}" if problem.is_game else ""
+        return f"PolicyIteration({method.evaluation!r}{game})"
+    return repr(method)

@@ -1,0 +1,247 @@
+"""The front door: ``solve``.
+
+At host level it validates, picks a method, drives the iteration from grid to grid and reports. Under a tracer the
+same iteration runs with a fixed method and none of that, and its value is differentiable.
+"""
+
+import contextlib
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.discretisation.schemes import Limited, Scheme, Upwind
+from hjbjax.finiteness import admissibility, resting, survey
+from hjbjax.iteration import iteration, sensitivity
+from hjbjax.iteration.certificates import Certificate
+from hjbjax.iteration.iteration import Method, Nested, PolicyIteration, State, Task, ValueIteration
+from hjbjax.problem import arguments, checks
+from hjbjax.problem.closures import with_settled_functions
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem, is_discounted
+from hjbjax.problem.pytree import altered, is_traced
+from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
+from hjbjax.solution.solution import Solution, SolveError
+from hjbjax.solution.status import Status
+from hjbjax.solvers import faults, memory, nested, transfer
+from hjbjax.solvers.driver import drive
+from hjbjax.solvers.preparation import choose, is_constrained, prepare_on_host, prepare_traced
+from hjbjax.solvers.report import assemble, closed, describe, finish, unstarted
+
+TRACED_STEPS = 10_000
+
+
+@with_settled_functions
+def solve(
+    problem: Problem,
+    grid: Grid,
+    *,
+    method: Method | None = None,
+    scheme: Scheme = Upwind(),
+    tol: float = 1e-3,
+    guess: Any = None,
+    dtype: Any = None,
+    max_steps: int | None = None,
+    time_limit: float | None = None,
+    throw: bool = True,
+    progress: bool | None = None,
+    max_memory: int | None = None,
+) -> Solution:
+    """Solve a stationary problem on a grid.
+
+    min{ max{ β V − H(x, DV, D²V), V − ψ }, V − g } = 0 for the Kushner–Dupuis chain, to a certified error.
+
+    Args:
+      problem: the question.
+      grid: the nodes.
+      method: ``PolicyIteration(...)`` or ``ValueIteration()``; ``None`` picks by the problem.
+      scheme: ``Upwind()``, first order and monotone, or ``Limited()``, second order where the value is smooth.
+      tol: bound to reach on |V − V_h|, in cost units, V_h the exact solution on the grid. Where no certificate
+        exists the solution says so, and the bound is on the residual and on the last step; a tube without discount
+        goes on until V no longer changes.
+      guess: node values to start from, shape (*grid); not for a tube without discount, which has many fixed points.
+      dtype: ``None`` is float64; ``"float32"`` for memory, with a tolerance that float32 can reach.
+      max_steps: at most so many steps.
+      time_limit: at most so many seconds, checks and compilation included; what cannot be cut, as one compilation or
+        one step, is let come to its end.
+      throw: raise when the solve does not converge; otherwise the status says it.
+      progress: a progress bar; ``None`` shows it on a terminal after one second.
+      max_memory: bytes that the solve may take, instead of what is free.
+
+    Returns:
+      The solution; NumPy arrays at host level. Inside ``jit``, ``vmap`` or ``grad`` its value is traced, and
+      differentiable with respect to every number in the problem and the grid.
+
+    Raises:
+      ValueError: a question without an answer, or a bad argument.
+      MemoryError: a grid that does not fit, before anything is compiled.
+      SolveError: no convergence, be it by Ctrl-C, with the partial solution as ``.solution``.
+
+    Example:
+      >>> import hjbjax as hjb
+      >>> problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), discount=1.0)
+      >>> solution = hjb.solve(problem, hjb.Grid([-2.0], [2.0], (81,)))
+      >>> solution.status.name, solution.error <= 1e-3
+      ('CONVERGED', True)
+    """
+    check_arguments(problem, grid, method, scheme, tol, max_steps, time_limit, guess)
+    if is_traced(problem, grid, guess, tol):
+        return _solve_traced(problem, grid, method, scheme, tol, guess, dtype, max_steps)
+    kind = as_dtype(dtype)
+    check_node_values(guess, grid, "solve: the guess")
+    grid.check_spacings(kind)
+    method = method or choose(problem, grid, traced=False)
+    clock = Clock(max_steps or 10**9, time_limit, progress)
+    with noting_interrupts(clock), jax.enable_x64(kind == np.float64):
+        needed = memory.require(problem, grid, method, kind, max_memory)
+        with faults.explained(clock, needed, lambda kept: _partial(problem, grid, scheme, kind, kept)):
+            solution = closed(_solve_on_host(problem, grid, method, scheme, tol, guess, kind=kind, clock=clock), clock)
+    solution.stats.setdefault("method", describe(method, problem))
+    solution.stats.update(
+        seconds=clock.stepping, compile_seconds=clock.elapsed() - clock.stepping,
+        bytes=needed, tol=tol,
+    )  # fmt: skip
+    if throw and solution.status is not Status.CONVERGED:
+        raise SolveError(f"{solution.status.name}: {solution.message}", solution)
+    return solution
+
+
+def _partial(problem: Problem, grid: Grid, scheme: Scheme, kind: Any, kept: Any) -> Solution:
+    """The solution of a run that broke, from the value that was kept, maybe on a coarser grid; else zero."""
+    value = np.broadcast_to(np.zeros((), kind), grid.shape) if kept is None else kept[0]  # takes no memory
+    if value.shape != grid.shape:
+        value = transfer.prolong(value, kept[1], grid)
+    return unstarted(problem, grid, np.asarray(value, kind), scheme, Status.INTERRUPTED)
+
+
+def _solve_on_host(
+    problem: Problem, grid: Grid, method: Method, scheme: Scheme, tol: float, guess: Any, *, kind: Any, clock: Clock
+) -> Solution:
+    """Checks, coarser grids, preparation and steps, in this order, as far as the clock lets them come."""
+    start = None if guess is None else np.asarray(guess, kind)
+    inner = method.inner if isinstance(method, Nested) else method
+    try:
+        checks.shapes(problem, grid, scheme)
+        survey.values(problem, grid, kind, clock)
+        admissibility.values(problem, grid, kind)
+        known = None if start is None else jnp.asarray(start)
+        start, shapes = nested.start(problem, grid, method, scheme.chain, tol, known, kind, clock)
+        task, verdict, reached = prepare_on_host(
+            problem, grid, method=inner, scheme=scheme.chain, tol=tol, dtype=kind, clock=clock
+        )
+    except Stopped as stop:
+        value = np.zeros(grid.shape, kind) if start is None else np.array(start)
+        return unstarted(problem, grid, value, scheme, stop.status)
+    task, verdict, reached, state, code, residuals = nested.settle(task, verdict, reached, start, clock)
+    monotone = None
+    if isinstance(scheme, Limited) and clock.over() is None:
+        higher = dataclasses.replace(task, certificate=Certificate.RESIDUAL, scheme=scheme)
+        better, code, more = drive(higher, state.value, clock)
+        if int(better.step) >= 0:  # else it was stopped before its first look, and the monotone answer stands
+            monotone, task, state, residuals = state.value, higher, better, more
+            verdict = dataclasses.replace(verdict, certificate=Certificate.RESIDUAL)
+    elif isinstance(scheme, Limited):
+        code = clock.over() or code
+    solution = finish(task, state, code, reached, residuals, verdict, grid)
+    solution.stats.update(levels=[*shapes, grid.shape])
+    if type(getattr(task.method, "evaluation", None)) is not type(getattr(inner, "evaluation", None)):
+        solution.stats["method"] = describe(task.method, problem)
+    if monotone is not None:
+        counted = np.asarray(task.counted)
+        apart = np.abs(np.asarray(state.value)[counted] - np.asarray(monotone)[counted])
+        solution.stats["from_monotone"] = float(np.max(apart, initial=0))
+    return solution
+
+
+def _solve_traced(
+    problem: Problem, grid: Grid, method: Any, scheme: Any, tol: Any, guess: Any, dtype: Any, max_steps: Any
+) -> Solution:
+    """The same iteration inside a JAX transformation: no chunks, no files, no exceptions, no checks of values."""
+    if isinstance(scheme, Limited):
+        raise ValueError("solve: Limited() runs at host level only; inside jit, vmap and grad use Upwind()")
+    kind = jnp.result_type(float) if dtype is None else jnp.dtype(dtype)
+    method = method or choose(problem, grid, traced=True)
+    if isinstance(method, Nested):
+        raise ValueError("solve: Nested(...) runs at host level only; inside jit, vmap and grad use its inner method")
+    task, verdict = prepare_traced(problem, grid, method=method, scheme=scheme, tol=tol, dtype=kind)
+    frozen = jax.lax.stop_gradient(task)
+    start = frozen.start() if guess is None else jax.lax.stop_gradient(jnp.asarray(guess, kind))
+    state = iteration.run(frozen, iteration.begin(frozen, start), max_steps or TRACED_STEPS)
+    wrong = jnp.zeros((), bool)
+    if verdict.may_rest:
+        state, wrong = _doubted(frozen, state)
+    solution, value = assemble(task, state, verdict), sensitivity.attach(task, state)
+    wrong |= state.code == Status.NONFINITE
+    value = value * jnp.where(wrong, jnp.nan, 1).astype(value.dtype)  # a derivative drops the code, and is NaN, too
+    return altered(solution, value=jnp.where(task.counted, value, jnp.inf) if task.has_lost else value)
+
+
+def _doubted(task: Task, state: State) -> tuple[State, jax.Array]:
+    """The state, stalled and without bounds where leaving a held rest node would pay: the host alone goes on then."""
+    pays = resting.leaving_pays(
+        task.problem, task.grid, task.rules, task.counted, state.value, scheme=task.scheme.chain
+    )
+    wrong = jnp.any(pays) & (state.code == Status.CONVERGED) & (task.problem.discount == 0)
+    gap, infinite = state.gap, jnp.asarray(jnp.inf, state.value.dtype)
+    gap = dataclasses.replace(
+        gap, below=jnp.where(wrong, 0, gap.below), above=jnp.where(wrong, infinite, gap.above),
+        lift=jnp.where(wrong, infinite, gap.lift), error=jnp.where(wrong, infinite, gap.error),
+    )  # fmt: skip
+    code = jnp.where(wrong, Status.STALLED, state.code).astype(state.code.dtype)
+    return dataclasses.replace(state, gap=gap, code=code), wrong
+
+
+def as_dtype(dtype: Any) -> np.dtype:
+    """The floating-point type that a user asked for; None is float64."""
+    for kind in (np.dtype(np.float64), np.dtype(np.float32)):
+        with contextlib.suppress(TypeError):
+            if kind == (np.float64 if dtype is None else np.dtype(dtype)):
+                return kind
+    raise ValueError(f"dtype: got {dtype!r}, wanted 'float64' or 'float32'")
+
+
+def check_arguments(
+    problem: Any, grid: Any, method: Any, scheme: Any, tol: Any, max_steps: Any, time_limit: Any, guess: Any = None
+) -> None:
+    """Refuse what no solve can start with; needs no values of the problem's functions."""
+    if not isinstance(problem, Problem) or not isinstance(grid, Grid):
+        raise TypeError(f"solve: got {type(problem).__name__}, {type(grid).__name__}; wanted a Problem and a Grid")
+    if method is not None:
+        kinds = (ValueIteration, PolicyIteration, Nested)
+        arguments.one_of(method, "solve: method", kinds, "hjb.PolicyIteration(...) or hjb.ValueIteration()")
+    arguments.one_of(scheme, "solve: scheme", (Upwind, Limited), "hjb.Upwind(...) or hjb.Limited()")
+    arguments.positive(tol, "solve: tol", "in the units of the cost")
+    if max_steps is not None:
+        arguments.count(max_steps, "solve: max_steps")
+    if time_limit is not None:
+        arguments.positive(time_limit, "solve: time_limit", "in seconds", endless=True)
+    if guess is not None and is_constrained(problem) and is_discounted(problem) is False:
+        raise ValueError(
+            "solve: without discount a stopping_cost or a running_max has many fixed points, and the one sought is "
+            "found from the constraint itself;\nleave out guess, and raise max_steps where they ran out"
+        )
+    if problem.terminal_cost is not None:
+        raise ValueError("solve: a terminal_cost belongs to a finite horizon; a stationary problem has none")
+    if problem.time_dependent:
+        raise ValueError("solve: a time-dependent problem has no stationary value; it needs a finite horizon")
+
+
+def check_node_values(values: Any, grid: Grid, name: str) -> None:
+    """Refuse what cannot be a value at the nodes; None is none."""
+    if values is None:
+        return
+    try:
+        array = np.asarray(values)
+    except ValueError:  # rows of different lengths
+        raise ValueError(
+            f"{name} is {arguments.shown(values)}; wanted real node values of shape {grid.shape}"
+        ) from None
+    if array.dtype.kind not in "fiu":
+        raise ValueError(f"{name} holds {array.dtype}; wanted real node values of shape {grid.shape}")
+    if array.shape != grid.shape:
+        hint = "; it looks transposed" if array.shape == grid.shape[::-1] else ""
+        raise ValueError(f"{name} has shape {array.shape}, the grid {grid.shape}{hint}")
+    if not np.all(np.isfinite(array)):
+        raise ValueError(f"{name} is NaN or infinite at {int(np.sum(~np.isfinite(array)))} nodes")

@@ -564,7 +564,7 @@ import signal, sys, threading, time
 signal.signal(signal.SIGINT, signal.SIG_IGN)  # as in a job that a shell starts in the background
 import jax, jax.numpy as jnp, numpy as np
 import hjbjax
-from hjbjax.cli import main
+from hjbjax.cli.main import main
 
 def busy():
     jax.jit(lambda x: jax.lax.fori_loop(0, 30_000, lambda i, x: jnp.sin(x), x))(jnp.ones(10**5)).block_until_ready()

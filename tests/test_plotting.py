@@ -113,8 +113,8 @@ def test_nothing_is_shown_and_no_global_state_changes():
 import sys, numpy as np, matplotlib
 before = dict(matplotlib.rcParams.copy())  # looking at rcParams['backend'] itself would choose one
 from hjbjax import plotting
-from hjbjax.grid import Grid
-from hjbjax.solution import Solution
+from hjbjax.problem.grid import Grid
+from hjbjax.solution.solution import Solution
 grid = Grid([-1.0, -1.0], [1.0, 1.0], (5, 5))
 solution = Solution(grid, grid.nodes()[..., 0], grid.nodes()[..., :1], residuals=np.array([1.0, 0.1]))
 for draw in (plotting.value, plotting.policy, plotting.switching_curve, plotting.residuals):

@@ -245,7 +245,7 @@ def matrix(
 
     Example:
       >>> import numpy as np
-      >>> from hjbjax.sets import Box
+      >>> from hjbjax.problem.sets import Box
       >>> problem = Problem(lambda x, u: u, None, Box([-1.0], [1.0]), discount=1.0)
       >>> matrix(problem, Grid([0.0], [3.0], (4,)), np.array([[1.0], [0.5], [1.0], [1.0]])).toarray().tolist()
       [[0.0, 1.0, 0.0, 0.0], [0.0, 0.5, 0.5, 0.0], [0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0]]

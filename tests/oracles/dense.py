@@ -69,9 +69,10 @@ def _evaluate(chain, u, d, ended, at_end, source=None):
     matrix[ended] = np.eye(chain.size)[ended]
     right = np.where(ended, np.where(np.isfinite(at_end), at_end, 0), right)
     value = np.linalg.solve(matrix, right)
-    for _ in range(3):  # refinement: rows of very different size leave residuals above their own rounding
-        value = value + np.linalg.solve(matrix, right - matrix @ value)
-    return np.where(ended, at_end, value)  # to the last bit
+    exact, wanted = matrix.astype(np.longdouble), right.astype(np.longdouble)
+    for _ in range(3):  # with little discount residuals of rounding hide which of two policies is better
+        value = value + np.linalg.solve(matrix, (wanted - exact @ value).astype(float))
+    return np.where(ended, at_end, value.astype(float))  # to the last bit
 
 
 def _start(chain):

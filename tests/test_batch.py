@@ -104,6 +104,16 @@ def test_one_lane_that_goes_nan_leaves_the_others_unchanged():
         assert same(solution.value, alone(question).value)
 
 
+def test_lanes_of_second_order_are_their_own_solves_and_claim_no_bound():
+    questions = [problem(k, 1.0) for k in (0.0, 1.0)]
+    for lane, question in zip(hjb.solve_batch(questions, GRID, scheme=hjb.Limited(), tol=1e-6), questions, strict=True):
+        own = alone(question, scheme=hjb.Limited())
+        assert lane.error is None
+        assert lane.stats["certificate"] == own.stats["certificate"]
+        assert np.allclose(lane.value, own.value, atol=1e-5)
+        assert not np.allclose(lane.value, alone(question).value, atol=1e-3)
+
+
 def paid(x, u):
     return 1.0 + x @ x
 

@@ -464,6 +464,14 @@ def test_help_and_version():
     assert "--shape" in run("solve", "--help").stdout
 
 
+def test_the_schemes_on_offer_solve_and_others_are_refused():
+    for name in ("eno2", "weno5"):
+        result = run("solve", "bang-bang", "--scheme", name)
+        assert result.exit_code == 2
+        assert "upwind" in result.stderr
+    assert run("solve", "bang-bang", "--scheme", "limited").exit_code == 0
+
+
 def test_help_loads_nothing_heavy():
     code = "import sys, hjbjax.cli.main; print(*sys.modules)"
     answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment())

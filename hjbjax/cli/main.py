@@ -24,7 +24,7 @@ from hjbjax.cli.command_line import Failure, Name, Number, OneLineGroup, Shape, 
 FILES = ("solution.npz", "value.png", "policy.png", "trajectory.png")
 CODES = {"CONVERGED": 0, "DIVERGED": 4, "NONFINITE": 4, "INTERRUPTED": 130}  # any other status: 3, not converged
 METHODS = {"value-iteration": "ValueIteration", "policy-iteration": "PolicyIteration"}
-SCHEMES = {"upwind": "Upwind", "limited": "Limited", "eno2": "Eno2", "weno5": "Weno5"}
+SCHEMES = {"upwind": "Upwind", "limited": "Limited"}
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "diffrax", "optax", "matplotlib", "tqdm", "click")
 
 

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation.schemes import Upwind
+from hjbjax.discretisation.schemes import Limited, Scheme, Upwind
 from hjbjax.finiteness import admissibility, survey
 from hjbjax.iteration import iteration
 from hjbjax.iteration.iteration import Method, Nested, State, Task
@@ -29,7 +29,7 @@ from hjbjax.solvers import faults, memory, nested
 from hjbjax.solvers.driver import FIRST_NODES, imposed
 from hjbjax.solvers.preparation import choose, prepare_on_host
 from hjbjax.solvers.report import closed, describe, finish, unstarted
-from hjbjax.solvers.solver import as_dtype, check_arguments
+from hjbjax.solvers.solver import as_dtype, check_arguments, sharpened
 
 CHUNK = 8  # steps between two looks at which lanes are done, at most
 
@@ -43,7 +43,7 @@ def solve_batch(
     grid: Grid,
     *,
     method: Method | None = None,
-    scheme: Upwind = Upwind(),
+    scheme: Scheme = Upwind(),
     tol: float = 1e-3,
     dtype: Any = None,
     max_steps: int | None = None,
@@ -57,7 +57,7 @@ def solve_batch(
       problems: problems; those with the same functions and shapes run together, whatever their numbers.
       grid: the nodes.
       method: as in ``solve``, without nesting; ``None`` picks by the problem.
-      scheme: the discretisation.
+      scheme: the discretisation; ``Limited()`` goes on from the chain's answer lane by lane.
       tol: as in ``solve``.
       dtype: as in ``solve``.
       max_steps: at most so many steps for each lane.
@@ -127,7 +127,7 @@ def _solve_together(
     names: Sequence[int],
     grid: Grid,
     method: Method,
-    scheme: Upwind,
+    scheme: Scheme,
     tol: float,
     kind: Any,
     clock: Clock,
@@ -140,7 +140,7 @@ def _solve_together(
             survey.values(problem, grid, kind, clock)
             admissibility.values(problem, grid, kind)
             prepared.append(
-                prepare_on_host(problem, grid, method=method, scheme=scheme, tol=tol, dtype=kind, clock=clock)
+                prepare_on_host(problem, grid, method=method, scheme=scheme.chain, tol=tol, dtype=kind, clock=clock)
             )
         except ValueError as refusal:
             raise ValueError(f"lane {name}: {refusal}") from refusal
@@ -156,23 +156,29 @@ def _solve_together(
         states = _begin(tasks, jax.vmap(Task.start)(tasks))
         ended, histories = _finish_lanes(tasks, states, len(members), clock)
         for i, (state, code), residuals in zip(members, ended, histories, strict=True):
-            solutions[i] = _finished(prepared[i], state, code, np.concatenate(residuals), grid, clock)
+            solutions[i] = _finished(prepared[i], state, code, np.concatenate(residuals), grid, scheme, clock)
     about = {"seconds": clock.elapsed() - began, "lanes": len(problems), "tol": tol}
     for problem, solution in zip(problems, solutions, strict=True):
         solution.stats.update(method=describe(method, problem), **about)
     return solutions
 
 
-def _finished(lane: tuple, state: State, code: Status, residuals: np.ndarray, grid: Grid, clock: Clock) -> Solution:
-    """The solution of one prepared lane; one that had better leave a node where it rests goes on by itself."""
+def _finished(
+    lane: tuple, state: State, code: Status, residuals: np.ndarray, grid: Grid, scheme: Scheme, clock: Clock
+) -> Solution:
+    """The solution of one prepared lane, which may go on by itself: off a node where it rests, or to second order."""
     task, verdict, reached = lane
     history = residuals[: int(state.step) + 1]
+    apart: dict[str, Any] = {}
     if code in CUT:
         state = imposed(task, state)
     elif nested.may_go_on(task, verdict, state, code):
         task, verdict, reached, state, code, more = nested.settle(task, verdict, reached, state.value, clock)
         history = np.concatenate([history, more])
+    if isinstance(scheme, Limited) and code not in CUT:
+        task, verdict, state, code, history, apart = sharpened(task, verdict, state, code, history, scheme, clock)
     solution = finish(task, state, code, reached, history, verdict, grid, cut=clock.over() is not None)
+    solution.stats.update(apart)
     return closed(solution, clock) if code in CUT else solution
 
 

@@ -27,7 +27,7 @@ from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
 from hjbjax.solvers import faults, memory, nested, transfer
 from hjbjax.solvers.driver import drive
-from hjbjax.solvers.preparation import choose, is_constrained, prepare_on_host, prepare_traced
+from hjbjax.solvers.preparation import Verdict, choose, is_constrained, prepare_on_host, prepare_traced
 from hjbjax.solvers.report import assemble, closed, describe, finish, unstarted
 
 TRACED_STEPS = 10_000
@@ -135,24 +135,34 @@ def _solve_on_host(
         value = np.zeros(grid.shape, kind) if start is None else np.array(start)
         return unstarted(problem, grid, value, scheme, stop.status)
     task, verdict, reached, state, code, residuals = nested.settle(task, verdict, reached, start, clock)
-    monotone = None
-    if isinstance(scheme, Limited) and clock.over() is None:
-        higher = dataclasses.replace(task, certificate=Certificate.RESIDUAL, scheme=scheme)
-        better, code, more = drive(higher, state.value, clock)
-        if int(better.step) >= 0:  # else it was stopped before its first look, and the monotone answer stands
-            monotone, task, state, residuals = state.value, higher, better, more
-            verdict = dataclasses.replace(verdict, certificate=Certificate.RESIDUAL)
-    elif isinstance(scheme, Limited):
-        code = clock.over() or code
+    about: dict[str, Any] = {"levels": [*shapes, grid.shape]}
+    if isinstance(scheme, Limited):
+        task, verdict, state, code, residuals, apart = sharpened(task, verdict, state, code, residuals, scheme, clock)
+        about |= apart
     solution = finish(task, state, code, reached, residuals, verdict, grid)
-    solution.stats.update(levels=[*shapes, grid.shape])
     if type(getattr(task.method, "evaluation", None)) is not type(getattr(inner, "evaluation", None)):
-        solution.stats["method"] = describe(task.method, problem)
-    if monotone is not None:
-        counted = np.asarray(task.counted)
-        apart = np.abs(np.asarray(state.value)[counted] - np.asarray(monotone)[counted])
-        solution.stats["from_monotone"] = float(np.max(apart, initial=0))
+        about["method"] = describe(task.method, problem)
+    solution.stats.update(about)
     return solution
+
+
+def sharpened(
+    task: Task, verdict: Verdict, state: State, code: Status, residuals: np.ndarray, scheme: Limited, clock: Clock
+) -> tuple[Task, Verdict, State, Status, np.ndarray, dict[str, Any]]:
+    """The second-order answer, from the monotone one in ``state``, and how far apart they are.
+
+    Its scheme is not monotone, so that no certificate of the chain holds for it.
+    """
+    if clock.over() is not None:
+        return task, verdict, state, clock.over() or code, residuals, {}
+    higher = dataclasses.replace(task, certificate=Certificate.RESIDUAL, scheme=scheme)
+    better, ended, more = drive(higher, state.value, clock)
+    if int(better.step) < 0:  # it was stopped before its first look, and the monotone answer stands
+        return task, verdict, state, ended, residuals, {}
+    verdict = dataclasses.replace(verdict, certificate=Certificate.RESIDUAL)
+    counted = np.asarray(task.counted)
+    apart = np.abs(np.asarray(better.value)[counted] - np.asarray(state.value)[counted])
+    return higher, verdict, better, ended, more, {"from_monotone": float(np.max(apart, initial=0))}
 
 
 def _solve_traced(

@@ -17,8 +17,8 @@ from hjbjax.feedback.safety import least_restrictive
 from hjbjax.feedback.simulation import simulate
 from hjbjax.geometry import stability
 from hjbjax.geometry.lyapunov import lyapunov_check
-from hjbjax.iteration.iteration import Nested, PolicyIteration, ValueIteration
 from hjbjax.iteration.marching import Explicit, Implicit
+from hjbjax.iteration.methods import Nested, PolicyIteration, ValueIteration
 from hjbjax.iteration.relaxation import Direct, Krylov, Sweeps
 from hjbjax.problem.fields import FallbackWarning
 from hjbjax.problem.grid import Grid

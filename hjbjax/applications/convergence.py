@@ -26,7 +26,7 @@ from hjbjax.applications.reference import (
     words_for,
 )
 from hjbjax.discretisation.schemes import Scheme, Upwind
-from hjbjax.iteration.iteration import Method
+from hjbjax.iteration.methods import Method
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import is_traced

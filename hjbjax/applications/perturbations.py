@@ -21,7 +21,7 @@ from hjbjax.applications.convergence import fitted_order
 from hjbjax.applications.gain import attenuation, saturation
 from hjbjax.applications.reference import mask_of
 from hjbjax.discretisation.schemes import Limited, Scheme
-from hjbjax.iteration.iteration import Method
+from hjbjax.iteration.methods import Method
 from hjbjax.problem import checks
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem

@@ -19,7 +19,7 @@ import numpy as np
 from hjbjax.applications import exits
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.finiteness import proper, survey
-from hjbjax.iteration.iteration import ValueIteration
+from hjbjax.iteration.methods import ValueIteration
 from hjbjax.problem import checks
 from hjbjax.problem.fields import FallbackWarning
 from hjbjax.problem.grid import Grid

@@ -10,8 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.feedback.closed_loop import Loop, Stepping, integrate, some, unbegun
+from hjbjax.feedback.closed_loop import Stepping, integrate, some, unbegun
 from hjbjax.feedback.feedback import check_kept, lookups
+from hjbjax.feedback.loop import Loop
 from hjbjax.feedback.path import Interrupted, Path, PathStatus, truncated
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem

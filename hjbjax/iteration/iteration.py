@@ -23,8 +23,7 @@ from hjbjax.hamiltonian import players
 from hjbjax.iteration import bellman, certificates, relaxation
 from hjbjax.iteration.bellman import Conditions, Correction, Greedy
 from hjbjax.iteration.certificates import Certificate, Gap
-from hjbjax.iteration.relaxation import Evaluation, Sweeps
-from hjbjax.problem import arguments
+from hjbjax.iteration.methods import Method, PolicyIteration, ValueIteration
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, is_traced, node
@@ -39,55 +38,6 @@ CLIMB = 100_000  # steps of value iteration without progress: without discount V
 TO_THE_END = (Certificate.NONE, Certificate.BY_DISCOUNT)  # of tubes: V falls or climbs until nothing moves
 PATIENCE = 10  # steps without progress of a residual that is rounding
 ROUNDING = 64  # residuals below this many units in the last place of max|V| are rounding
-
-
-@node()
-class ValueIteration:
-    """V ← max(g, min(ψ, V + (min max H − β V)/(max_u Q + β))): monotone, converges from every guess.
-
-    The error falls by 1/(1 + βΔt) a step: many cheap steps. For reference, for games, and where memory rules.
-    """
-
-
-@node(static=("replies",))
-class PolicyIteration:
-    """Improve the policy, evaluate it, repeat; the evaluation is what distinguishes the methods of this family.
-
-    Args:
-      evaluation: ``Sweeps(count)`` is modified policy iteration; ``Krylov()`` and ``Direct()`` are Howard's.
-      replies: in a game, the inner player's improvements for each of the outer player's, at most.
-    """
-
-    evaluation: Evaluation = Sweeps()
-    replies: int = 20
-
-    def __post_init__(self):
-        relaxation.check_evaluation(self.evaluation, "PolicyIteration: evaluation")
-        arguments.count(self.replies, "PolicyIteration: replies")
-
-
-@node(static=("coarsest",))
-class Nested:
-    """Solve on coarser grids first, and start each finer one from the interpolated answer.
-
-    From a cold start the count of policy improvements grows with N, one cell of good policy an improvement; from
-    the coarser grid's answer it stays at a few. Host level only: every level is compiled on its own.
-
-    Args:
-      inner: what runs on each level.
-      coarsest: do not go on to grids with fewer nodes than this.
-    """
-
-    inner: PolicyIteration | ValueIteration = PolicyIteration()
-    coarsest: int = 2000
-
-    def __post_init__(self):
-        wanted = "hjb.PolicyIteration(...) or hjb.ValueIteration()"
-        arguments.one_of(self.inner, "Nested: inner", (PolicyIteration, ValueIteration), wanted)
-        arguments.count(self.coarsest, "Nested: coarsest")
-
-
-Method = ValueIteration | PolicyIteration | Nested
 
 
 @node(static=("scheme", "certificate", "has_lost"))

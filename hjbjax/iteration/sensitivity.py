@@ -19,7 +19,8 @@ import jax.numpy as jnp
 from hjbjax.discretisation import chain
 from hjbjax.iteration import bellman, iteration, relaxation
 from hjbjax.iteration.bellman import Correction
-from hjbjax.iteration.iteration import PolicyIteration, State, Task
+from hjbjax.iteration.iteration import State, Task
+from hjbjax.iteration.methods import PolicyIteration
 from hjbjax.iteration.relaxation import Evaluation, Krylov
 from hjbjax.problem.grid import Grid
 

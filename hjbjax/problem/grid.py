@@ -7,7 +7,6 @@ and whether a node on the boundary of a target belongs to it must not depend on 
 """
 
 import dataclasses
-import difflib
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -16,12 +15,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.problem.pytree import altered, is_traced, node, numbers
-from hjbjax.problem.stretching import Sinh, Stretching
+from hjbjax.problem import grid_arguments
+from hjbjax.problem.pytree import altered, is_traced, node
+from hjbjax.problem.stretching import Stretching
 
 ROUNDINGS = 16  # units of eps of the largest coordinate by which the formula may miss its table
-EDGES = ("projected", "constrained", "open")  # names, as they carry no numbers: static, hashable, saved as they are
-Ends = tuple[str, str] | None  # of an axis: the kinds of its lower and its upper end; none where it is periodic
 
 
 COINCIDING = 16  # units in the last place of a coordinate, of which a spacing must be more
@@ -66,9 +64,9 @@ class Grid:
     coordinates: tuple[Any, ...] = dataclasses.field(init=False, repr=False)
 
     def __post_init__(self):
-        lo, hi = _corner(self.lo, "lo"), _corner(self.hi, "hi")
-        shape = _sizes(self.shape)
-        periodic = _flags(self.periodic, len(shape))
+        lo, hi = grid_arguments.corner(self.lo, "lo"), grid_arguments.corner(self.hi, "hi")
+        shape = grid_arguments.counts(self.shape)
+        periodic = grid_arguments.periodic_flags(self.periodic, len(shape))
         names = tuple(str(name) for name in self.names) or tuple(f"x{axis + 1}" for axis in range(len(shape)))
         stretch = (None,) * len(shape) if self.stretch is None else tuple(self.stretch)
         lengths = (len(lo), len(hi), len(shape), len(periodic), len(names), len(stretch))
@@ -77,12 +75,12 @@ class Grid:
                 "Grid: got lo, hi, shape, periodic, names and stretch of lengths {}, {}, {}, {}, {} and {}; "
                 "wanted one entry an axis in each".format(*lengths)
             )
-        _check_stretch(stretch, periodic)
+        grid_arguments.check_stretch(stretch, periodic)
         if isinstance(lo, np.ndarray) and isinstance(hi, np.ndarray):
             for axis, (low, high) in enumerate(zip(lo, hi, strict=True)):
                 if not (math.isfinite(low) and math.isfinite(high) and low < high):
                     raise ValueError(f"Grid: axis {axis} runs from {low:g} to {high:g}; wanted finite lo < hi")
-        edges = _edges(self.edges, periodic, shape)
+        edges = grid_arguments.kinds_of_ends(self.edges, periodic, shape)
         checked = {
             "lo": lo, "hi": hi, "shape": shape, "periodic": periodic, "names": names, "stretch": stretch, "edges": edges
         }  # fmt: skip
@@ -280,80 +278,3 @@ def _derivative_of_the_formula(primals: tuple, tangents: tuple) -> tuple:
 def _states(x: Any) -> jax.Array:
     x = jnp.asarray(x)
     return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(float)
-
-
-def _check_stretch(stretch: tuple, periodic: tuple[bool, ...]) -> None:
-    for axis, (stretching, cyclic) in enumerate(zip(stretch, periodic, strict=True)):
-        if stretching is not None and not isinstance(stretching, Sinh):
-            raise TypeError(f"Grid.stretch: entry {axis} is {stretching!r}; wanted Sinh(strength, center) or None")
-        if stretching is not None and cyclic:
-            raise ValueError(f"Grid.stretch: axis {axis} is periodic; only an axis with ends can be stretched")
-
-
-def _edges(edges: Any, periodic: tuple[bool, ...], shape: tuple[int, ...]) -> tuple[Ends, ...]:
-    """The kinds of both ends of every axis, checked."""
-    if edges is None or isinstance(edges, str):
-        _kind(edges, "every end")
-        edges = [None if cyclic else edges for cyclic in periodic]
-    if not isinstance(edges, Sequence) or len(edges) != len(periodic):
-        pair = '(("open", "constrained"),)' if len(periodic) == 1 else '("open", ("projected", "constrained"))'
-        raise ValueError(
-            f"Grid.edges: got {edges!r} for {len(periodic)} axes; wanted a name for all, or one entry an axis: a name "
-            f"or a pair (lower end, upper end), as in {pair}"
-        )
-    return tuple(_ends(entry, axis, periodic[axis], shape[axis]) for axis, entry in enumerate(edges))
-
-
-def _ends(entry: Any, axis: int, cyclic: bool, count: int) -> Ends:
-    """The kinds of the two ends of one axis."""
-    if cyclic and entry is not None:
-        raise ValueError(f"Grid.edges: axis {axis} is periodic and has no ends; got {entry!r} there, wanted None")
-    if cyclic:
-        return None
-    pair = (entry, entry) if entry is None or isinstance(entry, str) else entry
-    if not isinstance(pair, Sequence) or len(pair) != 2:
-        raise ValueError(f"Grid.edges: axis {axis} has {entry!r}; wanted a name or a pair (lower end, upper end)")
-    lower, upper = (_kind(name, f"axis {axis}") for name in pair)
-    if "open" in (lower, upper) and count < 3:
-        raise ValueError(f"Grid.edges: axis {axis} has {count} points; an open end continues the last three")
-    return lower, upper
-
-
-def _kind(name: Any, where: str) -> str:
-    if name is None:
-        return "projected"
-    if name not in EDGES:
-        near = difflib.get_close_matches(str(name), EDGES, 1, 0.4)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise ValueError(f"Grid.edges: got {name!r} for {where}; wanted one of {', '.join(map(repr, EDGES))}{hint}")
-    return name
-
-
-def _corner(value: Any, name: str) -> Any:
-    corner = numbers(value, f"Grid.{name}")
-    if np.ndim(corner) != 1 or np.size(corner) == 0:
-        raise ValueError(f"Grid.{name}: got {value!r}, wanted a list of numbers, one an axis")
-    return corner
-
-
-def _sizes(shape: Any) -> tuple[int, ...]:
-    if isinstance(shape, str) or not isinstance(shape, (Sequence, np.ndarray)):
-        raise TypeError(f"Grid.shape: got {shape!r}, wanted a tuple of integers, one an axis")
-    for axis, count in enumerate(shape):
-        if isinstance(count, (bool, np.bool_)) or not isinstance(count, (int, np.integer)):
-            raise TypeError(f"Grid.shape: axis {axis} has {count!r} points; wanted an integer")
-        if count < 2:
-            raise ValueError(f"Grid.shape: axis {axis} has {count} points; wanted at least 2")
-    return tuple(int(count) for count in shape)
-
-
-def _flags(periodic: Any, n: int) -> tuple[bool, ...]:
-    if periodic is None:
-        return (False,) * n
-    wanted = f"wanted one bool an axis (not axis numbers), as in {(True,) + (False,) * (n - 1)}"
-    if isinstance(periodic, (str, bool)) or not isinstance(periodic, (Sequence, np.ndarray)):
-        raise TypeError(f"Grid.periodic: got {periodic!r}, {wanted}")
-    for axis, flag in enumerate(periodic):
-        if not isinstance(flag, (bool, np.bool_)):
-            raise ValueError(f"Grid.periodic: entry {axis} is {flag!r}; {wanted}")
-    return tuple(bool(flag) for flag in periodic)

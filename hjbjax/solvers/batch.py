@@ -16,7 +16,8 @@ import numpy as np
 from hjbjax.discretisation.schemes import Limited, Scheme, Upwind
 from hjbjax.finiteness import admissibility, survey
 from hjbjax.iteration import iteration
-from hjbjax.iteration.iteration import Method, Nested, State, Task
+from hjbjax.iteration.iteration import State, Task
+from hjbjax.iteration.methods import Method, Nested
 from hjbjax.problem import checks
 from hjbjax.problem.arguments import shown
 from hjbjax.problem.closures import with_settled_functions

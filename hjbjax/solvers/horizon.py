@@ -17,8 +17,8 @@ from hjbjax.discretisation.schemes import Eno2, Limited, Scheme, Upwind, Weno5
 from hjbjax.finiteness import admissibility, survey
 from hjbjax.hamiltonian import players
 from hjbjax.iteration import bellman, marching
-from hjbjax.iteration.iteration import PolicyIteration
 from hjbjax.iteration.marching import Explicit, Implicit, March
+from hjbjax.iteration.methods import PolicyIteration
 from hjbjax.iteration.relaxation import Krylov, Sweeps
 from hjbjax.problem import arguments, checks
 from hjbjax.problem.closures import with_settled_functions

@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from hjbjax.iteration.iteration import Method, Nested, PolicyIteration
+from hjbjax.iteration.methods import Method, Nested, PolicyIteration
 from hjbjax.iteration.relaxation import Krylov, Sweeps
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid

@@ -11,7 +11,8 @@ import numpy as np
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.finiteness import resting
 from hjbjax.iteration.certificates import Certificate
-from hjbjax.iteration.iteration import Method, Nested, PolicyIteration, State, Task
+from hjbjax.iteration.iteration import State, Task
+from hjbjax.iteration.methods import Method, Nested, PolicyIteration
 from hjbjax.iteration.relaxation import Sweeps
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem

@@ -16,7 +16,8 @@ from hjbjax.finiteness import proper, resting
 from hjbjax.hamiltonian import players
 from hjbjax.iteration import bellman
 from hjbjax.iteration.certificates import Certificate
-from hjbjax.iteration.iteration import Method, Nested, PolicyIteration, Task, ValueIteration
+from hjbjax.iteration.iteration import Task
+from hjbjax.iteration.methods import Method, Nested, PolicyIteration, ValueIteration
 from hjbjax.iteration.relaxation import Direct, Krylov, Sweeps
 from hjbjax.problem import checks
 from hjbjax.problem.grid import Grid

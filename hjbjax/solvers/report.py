@@ -12,7 +12,8 @@ from hjbjax.finiteness import earnings
 from hjbjax.hamiltonian import hamiltonian, players
 from hjbjax.iteration import certificates, iteration
 from hjbjax.iteration.certificates import Certificate
-from hjbjax.iteration.iteration import Method, Nested, PolicyIteration, State, Task
+from hjbjax.iteration.iteration import State, Task
+from hjbjax.iteration.methods import Method, Nested, PolicyIteration
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem

@@ -16,7 +16,8 @@ from hjbjax.discretisation.schemes import Limited, Scheme, Upwind
 from hjbjax.finiteness import admissibility, resting, survey
 from hjbjax.iteration import iteration, sensitivity
 from hjbjax.iteration.certificates import Certificate
-from hjbjax.iteration.iteration import Method, Nested, PolicyIteration, State, Task, ValueIteration
+from hjbjax.iteration.iteration import State, Task
+from hjbjax.iteration.methods import Method, Nested, PolicyIteration, ValueIteration
 from hjbjax.problem import arguments, checks
 from hjbjax.problem.closures import with_settled_functions
 from hjbjax.problem.grid import Grid

@@ -6,10 +6,10 @@ import jax
 import numpy as np
 
 import hjbjax as hjb
-from hjbjax.iteration import iteration
+from hjbjax.iteration import fixed_point
 from hjbjax.problem.pytree import cast
-from hjbjax.solvers import driver
-from hjbjax.solvers.preparation import choose, judge, prepare
+from hjbjax.solvers import host_loop
+from hjbjax.solvers.setup import choose, judge, prepare
 
 
 def bytes_of(lowered: Any) -> int:
@@ -29,7 +29,7 @@ def of_solve(problem: Any, grid: Any, tol: float, *, method: Any = None, dtype: 
 
         def begin(problem, grid):
             task = prepare(problem, grid, method=inner, scheme=hjb.Upwind(), tol=tol, dtype=kind, verdict=verdict)
-            return task, iteration.begin(task, jax.numpy.zeros(grid.shape, kind))
+            return task, fixed_point.begin(task, jax.numpy.zeros(grid.shape, kind))
 
         shapes = jax.eval_shape(begin, *cast((problem, grid), kind))
-        return {"bytes_per_node": bytes_of(driver.run.lower(*shapes, 1)) / grid.size}
+        return {"bytes_per_node": bytes_of(host_loop.run.lower(*shapes, 1)) / grid.size}

@@ -17,8 +17,8 @@ import numpy as np
 
 import hjbjax as hjb
 from benchmarks.report import RESULTS, attempt, publish, table
-from hjbjax.iteration import marching
-from hjbjax.solvers import epochs, horizon
+from hjbjax.iteration import time_stepping
+from hjbjax.solvers import epochs, finite_horizon
 
 COLUMNS = ("problem", "scheme", "who", "shape", "ms_per_step", "times", "bytes_per_node", "compile_seconds", "differs")
 SCHEMES = {"low": hjb.Upwind(), "medium": hjb.Eno2(), "very_high": hjb.Weno5()}
@@ -59,10 +59,10 @@ def ours(problem: Any, grid: Any, scheme: Any, steps: int) -> tuple[Any, float, 
     """A function that marches so many steps, how far that goes, bytes a node and seconds to compile."""
     began = time.perf_counter()
     dtype = np.dtype(np.float32)
-    task = horizon._prepare(problem, grid, 1e3, scheme, hjb.Explicit(fraction=FRACTION), None, None, dtype)
-    start = marching.begin(task, epochs._terminal(task.problem, task.grid, task.horizon, dtype))
+    task = finite_horizon._prepare(problem, grid, 1e3, scheme, hjb.Explicit(fraction=FRACTION), None, None, dtype)
+    start = time_stepping.begin(task, epochs._terminal(task.problem, task.grid, task.horizon, dtype))
     until = jnp.asarray(0.0, dtype)
-    compiled = jax.jit(marching.run).lower(task, start, until, steps).compile()
+    compiled = jax.jit(time_stepping.run).lower(task, start, until, steps).compile()
     seconds = time.perf_counter() - began
     return lambda: compiled(task, start, until, steps).value, float(task.limit), _bytes(compiled, grid), seconds
 

@@ -99,7 +99,7 @@ def picture(
     """
     from matplotlib.figure import Figure
 
-    from hjbjax.plotting.canvas import COLOURS, logarithmic, styled
+    from hjbjax.plotting.style import COLOURS, logarithmic, styled
 
     rows = [row for row in rows if all(_is_number(row.get(key)) and 0 < row[key] < math.inf for key in (*x, y))]
     if not rows:

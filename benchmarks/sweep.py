@@ -24,10 +24,10 @@ from benchmarks import floors, questions
 from benchmarks.footprint import bytes_of
 from benchmarks.report import RESULTS, attempt, publish, table, without
 from benchmarks.timing import interleaved
-from hjbjax.iteration import bellman, iteration
+from hjbjax.iteration import bellman, fixed_point
 from hjbjax.problem.pytree import cast
-from hjbjax.solvers import driver, memory
-from hjbjax.solvers.preparation import prepare_on_host
+from hjbjax.solvers import host_loop, memory
+from hjbjax.solvers.setup import prepare_on_host
 
 COLUMNS = (
     "problem", "kernel", "shape", "controls", "seconds", "compile_seconds", "node_controls_per_second",
@@ -156,10 +156,10 @@ def whole_steps(problem: Any, grid: hjb.Grid, count: int) -> Any:
     """Steps of ``solve`` with value iteration, as its host loop runs them."""
     method = hjb.ValueIteration()
     task, _, _ = prepare_on_host(problem, grid, method=method, scheme=SCHEME, tol=1e-30, dtype=KIND)
-    states = [driver.run(task, iteration.begin(task, started(grid)), 0)]
+    states = [host_loop.run(task, fixed_point.begin(task, started(grid)), 0)]
 
     def call():
-        states[0] = driver.run(task, states[0], int(states[0].step) + count)
+        states[0] = host_loop.run(task, states[0], int(states[0].step) + count)
         return states[0].value
 
     return call

@@ -3,24 +3,24 @@
 from hjbjax import geometry, plotting, zoo
 from hjbjax._version import __version__
 from hjbjax.applications.convergence import convergence_study
-from hjbjax.applications.gain import attenuation, saturation
+from hjbjax.applications.hinf import hinf_level
+from hjbjax.applications.l2_gain import attenuation, saturation
 from hjbjax.applications.perturbations import perturbation_study
 from hjbjax.applications.probabilities import expected_exit_time, reach_probability, stay_probability
 from hjbjax.applications.reachability import avoid, reach, reach_avoid
-from hjbjax.applications.robust import hinf_level
 from hjbjax.discretisation import chain
 from hjbjax.discretisation.schemes import Eno2, Limited, Upwind, Weno5
-from hjbjax.extremals.extremals import FreeTime, pontryagin
+from hjbjax.extremals.indirect_method import FreeTime, pontryagin
 from hjbjax.feedback.dissipation import dissipation
 from hjbjax.feedback.feedback import greedy_feedback
-from hjbjax.feedback.safety import least_restrictive
+from hjbjax.feedback.safety_filter import least_restrictive
 from hjbjax.feedback.simulation import simulate
 from hjbjax.geometry import stability
 from hjbjax.geometry.lyapunov import lyapunov_check
-from hjbjax.iteration.marching import Explicit, Implicit
 from hjbjax.iteration.methods import Nested, PolicyIteration, ValueIteration
 from hjbjax.iteration.relaxation import Direct, Krylov, Sweeps
-from hjbjax.problem.fields import FallbackWarning
+from hjbjax.iteration.time_stepping import Explicit, Implicit
+from hjbjax.problem.components import FallbackWarning
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import Ball, Box, Finite
@@ -29,9 +29,9 @@ from hjbjax.solution.files import FileError
 from hjbjax.solution.solution import Solution, SolveError, load
 from hjbjax.solution.status import Status
 from hjbjax.solvers.batch import solve_batch
-from hjbjax.solvers.horizon import march
-from hjbjax.solvers.preparation import SolveWarning
-from hjbjax.solvers.solver import solve
+from hjbjax.solvers.finite_horizon import march
+from hjbjax.solvers.setup import SolveWarning
+from hjbjax.solvers.stationary import solve
 
 __all__ = [
     "Ball",

@@ -5,7 +5,7 @@ import pytest
 
 from hjbjax import Box, Grid, Problem
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.finiteness import survey
+from hjbjax.finiteness import node_checks
 from hjbjax.problem import checks
 
 GRID = Grid([-1.0, -2.0], [1.0, 2.0], (5, 9))
@@ -27,7 +27,7 @@ def refused(ask, match, grid=GRID, cause=None, **ingredients):
         checks.shapes(problem, grid, Upwind())
     asked = {
         "shapes": lambda: checks.shapes(problem, grid, Upwind()),
-        "values": lambda: survey.values(problem, grid, "float64"),
+        "values": lambda: node_checks.values(problem, grid, "float64"),
     }
     with pytest.raises(ValueError, match=match) as caught:
         asked[ask]()
@@ -40,4 +40,4 @@ def refused(ask, match, grid=GRID, cause=None, **ingredients):
 def accepted(grid=GRID, dtype="float64", **ingredients):
     problem = Problem(**({"drift": drift, "controls": U} | ingredients))
     checks.shapes(problem, grid, Upwind())
-    survey.values(problem, grid, dtype)
+    node_checks.values(problem, grid, dtype)

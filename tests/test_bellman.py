@@ -11,7 +11,7 @@ from systems import SEEDS, random_game, random_grid, random_problem
 
 from hjbjax.discretisation import chain
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.hamiltonian import hamiltonian
+from hjbjax.hamiltonian import discrete
 from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import Conditions
 from hjbjax.problem.grid import Grid
@@ -326,6 +326,6 @@ def _replies(problem, grid, value, other):
         point = (problem.disturbances if problem.isaacs == "upper" else problem.controls).points[k, 0]
         sides = {"controls": first.controls, "disturbances": first.disturbances}
         sides[name] = (jnp.broadcast_to(point, grid.shape),)
-        here = hamiltonian.local(problem, grid, value, scheme=Upwind())
+        here = discrete.local(problem, grid, value, scheme=Upwind())
         tried.append(here.at(list(sides["controls"]), list(sides["disturbances"])) - problem.discount * value)
     return first, reply, jnp.stack(tried)

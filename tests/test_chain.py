@@ -320,7 +320,7 @@ SLOW = [
 def test_quantecon_finds_our_value(n, kind, with_target):
     from quantecon.markov import DiscreteDP
 
-    from hjbjax.solvers.solver import solve
+    from hjbjax.solvers.stationary import solve
 
     rng = np.random.default_rng(n)
     ending = {"target": lambda x: abs(x[0]) - 0.5, "exit_cost": lambda x: x[0] - 1} if with_target else {}

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 import hjbjax
 from hjbjax import zoo
-from hjbjax.cli import results
+from hjbjax.cli import run_folder
 from hjbjax.cli.main import main
 from hjbjax.feedback.path import Path, PathStatus
 from hjbjax.solution.solution import Solution, Status, load
@@ -85,7 +85,7 @@ def solver(monkeypatch):
     stand_in = Solver()
     stand_in.calls = []
     monkeypatch.setattr(hjbjax, "solve", stand_in, raising=False)
-    monkeypatch.setattr(results, "simulate", straight)  # the integrator takes seconds to compile
+    monkeypatch.setattr(run_folder, "simulate", straight)  # the integrator takes seconds to compile
     return stand_in
 
 
@@ -172,7 +172,7 @@ def test_a_folder_without_permission_is_refused(solver, folder):
     assert not solver.calls
 
 
-@pytest.mark.parametrize("old", results.FILES)
+@pytest.mark.parametrize("old", run_folder.FILES)
 def test_an_existing_result_is_refused_and_stays(solver, folder, old):
     (folder / "bang-bang").mkdir()
     (folder / "bang-bang" / old).write_text("old")
@@ -184,9 +184,9 @@ def test_an_existing_result_is_refused_and_stays(solver, folder, old):
 def test_a_solve_writes_four_files_and_prints_the_screen(solver, folder):
     result = run("solve", "double-integrator-lq", "--shape", "11x13", "--set", "mass=2", "--set", "noise=0.5")
     assert result.exit_code == 0, result.output
-    assert sorted(os.listdir("double-integrator-lq")) == sorted(results.FILES)
+    assert sorted(os.listdir("double-integrator-lq")) == sorted(run_folder.FILES)
     assert os.listdir(".") == ["double-integrator-lq"]
-    for name in results.FILES[1:]:
+    for name in run_folder.FILES[1:]:
         assert (folder / "double-integrator-lq" / name).read_bytes().startswith(PNG)
     solution = load("double-integrator-lq/solution.npz")
     problem, grid, options = solver.calls[0]
@@ -215,7 +215,7 @@ def test_options_reach_the_solver(solver):
     assert (options["tol"], options["max_steps"], options["time_limit"], options["throw"]) == (1e-5, 9, 2.5, False)
     assert isinstance(options["method"], hjbjax.ValueIteration)
     assert isinstance(options["scheme"], hjbjax.Upwind)
-    assert sorted(os.listdir("a/b")) == sorted(results.FILES)
+    assert sorted(os.listdir("a/b")) == sorted(run_folder.FILES)
 
 
 def strict(text):
@@ -234,7 +234,7 @@ def test_json_is_one_object_without_infinities(solver):
     assert report["problem"] == "zermelo"
     assert report["parameters"] == {"current": [0.25, 0.0]}
     assert (report["status"], report["steps"], report["residual"], report["shape"]) == ("CONVERGED", 7, 1e-4, [9, 9])
-    assert report["files"] == [f"zermelo/{name}" for name in results.FILES]
+    assert report["files"] == [f"zermelo/{name}" for name in run_folder.FILES]
     assert report["trajectory"]["start"] == list(zoo.catalogue["zermelo"].start)
     assert report["version"] == hjbjax.__version__
     assert 0 < report["exact_difference"] < 10
@@ -245,7 +245,7 @@ def test_a_report_has_null_for_what_json_cannot_say():
     solution = answer(
         problem, grid, stats={"tol": np.float64(np.nan), "seconds": np.float32(0.5), "on": np.bool_(True)}
     )
-    report = results.report(solution, None, [])
+    report = run_folder.report(solution, None, [])
     assert report["stats"] == {"tol": None, "seconds": 0.5, "on": True}
     assert (report["trajectory"], report["error"]) == (None, None)
     assert strict(json.dumps(report, allow_nan=False)) == report
@@ -254,12 +254,12 @@ def test_a_report_has_null_for_what_json_cannot_say():
 @pytest.mark.parametrize(
     ("status", "code", "files"),
     [
-        (Status.MAX_STEPS, 3, results.FILES[:3]),
-        (Status.STALLED, 3, results.FILES[:3]),
-        (Status.TIME_LIMIT, 3, results.FILES[:3]),
-        (Status.DIVERGED, 4, results.FILES[:3]),
-        (Status.NONFINITE, 4, results.FILES[:3]),
-        (Status.INTERRUPTED, 130, results.FILES[:1]),
+        (Status.MAX_STEPS, 3, run_folder.FILES[:3]),
+        (Status.STALLED, 3, run_folder.FILES[:3]),
+        (Status.TIME_LIMIT, 3, run_folder.FILES[:3]),
+        (Status.DIVERGED, 4, run_folder.FILES[:3]),
+        (Status.NONFINITE, 4, run_folder.FILES[:3]),
+        (Status.INTERRUPTED, 130, run_folder.FILES[:1]),
     ],
 )
 def test_the_exit_code_says_how_the_solve_ended(solver, status, code, files):
@@ -308,7 +308,7 @@ def test_force_replaces_all_and_takes_stale_files_away(solver, folder):
     assert sorted(os.listdir("bang-bang")) == ["notes.txt", "policy.png", "solution.npz", "value.png"]
 
 
-@pytest.mark.parametrize("file", results.FILES)
+@pytest.mark.parametrize("file", run_folder.FILES)
 def test_a_full_disk_leaves_no_half_file(solver, folder, monkeypatch, file):
     """The old files stay whole where the new one cannot be written, and what came out whole before is kept."""
     from matplotlib.figure import Figure
@@ -321,13 +321,13 @@ def test_a_full_disk_leaves_no_half_file(solver, folder, monkeypatch, file):
 
     whole = {}
     (folder / "out").mkdir()
-    for name in results.FILES:
+    for name in run_folder.FILES:
         (folder / "out" / name).write_bytes(b"old")
     monkeypatch.setattr(Figure, "savefig", full)
     if file == "solution.npz":
         monkeypatch.setattr(Solution, "save", full)
     assert refused(run("solve", "bang-bang", "--out", "out", "--force"), 5, "No space left on device")
-    made = results.FILES[: results.FILES.index(file)]
+    made = run_folder.FILES[: run_folder.FILES.index(file)]
     for name in os.listdir("out"):
         whole[name] = (folder / "out" / name).read_bytes()
     assert all(whole[name] != b"old" for name in made)
@@ -380,26 +380,26 @@ def test_a_warning_is_one_line_and_a_path_that_cannot_be_is_left_out(solver, mon
     def refuses(*args, **options):
         raise ValueError("simulate: x0 lies\n outside the box")
 
-    monkeypatch.setattr(results, "simulate", leaves)
+    monkeypatch.setattr(run_folder, "simulate", leaves)
     result = run("solve", "bang-bang")
     assert (result.exit_code, result.stderr) == (0, "hjbjax: warning: simulate: the path left the box\n")
-    monkeypatch.setattr(results, "simulate", refuses)
+    monkeypatch.setattr(run_folder, "simulate", refuses)
     result = run("solve", "bang-bang", "--out", "other")
     assert result.exit_code == 0
     assert result.stderr == "hjbjax: warning: no trajectory.png: simulate: x0 lies outside the box\n"
-    assert sorted(os.listdir("other")) == sorted(results.FILES[:3])
+    assert sorted(os.listdir("other")) == sorted(run_folder.FILES[:3])
 
 
 def test_a_bang_bang_feedback_is_sampled(solver, monkeypatch):
     seen = []
     monkeypatch.setattr(
-        results, "simulate", lambda *args, **options: seen.append(options) or straight(*args, **options)
+        run_folder, "simulate", lambda *args, **options: seen.append(options) or straight(*args, **options)
     )
     run("solve", "bang-bang", "--out", "smooth")
     real = hjbjax.solve
     monkeypatch.setattr(hjbjax, "solve", lambda *args, **options: jumping(real(*args, **options)))
     run("solve", "bang-bang", "--out", "jumping")
-    assert seen == [{}, {"hold": zoo.catalogue["bang-bang"].duration / results.SAMPLES}]
+    assert seen == [{}, {"hold": zoo.catalogue["bang-bang"].duration / run_folder.SAMPLES}]
 
 
 def jumping(solution):
@@ -412,9 +412,9 @@ def test_the_difference_from_the_exact_answer_is_that_of_the_inner_half():
     value = np.array([float(exact(x)) for x in grid.nodes()])
     value[[0, 1, 2, 5, 6]] += [9.0, np.inf, -0.25, 0.125, -0.5]
     solution = Solution(grid, value, grid.nodes())
-    assert results.difference(exact, solution) == pytest.approx(0.5)
+    assert run_folder.difference(exact, solution) == pytest.approx(0.5)
     value[2:7] = np.inf
-    assert results.difference(exact, solution) is None
+    assert run_folder.difference(exact, solution) is None
 
 
 def test_bang_bang_is_recognised():
@@ -422,11 +422,11 @@ def test_bang_bang_is_recognised():
     x = grid.nodes()
     smooth = Solution(grid, x[..., 0], np.clip(x, -0.9, 0.9))
     undefined = Solution(grid, x[..., 0], np.where(x == 0, np.nan, np.sign(x)))
-    assert not results.is_bang_bang(problem, smooth)
-    assert results.is_bang_bang(problem, undefined)
-    assert results.is_bang_bang(problem, Solution(grid, x[..., 0], x, discrete=True))
+    assert not run_folder.is_bang_bang(problem, smooth)
+    assert run_folder.is_bang_bang(problem, undefined)
+    assert run_folder.is_bang_bang(problem, Solution(grid, x[..., 0], x, discrete=True))
     problem, grid = zoo.brownian_exit(shape=(5,))
-    assert not results.is_bang_bang(problem, answer(problem, grid))
+    assert not run_folder.is_bang_bang(problem, answer(problem, grid))
 
 
 def test_list_shows_one_line_each_and_the_parameters_of_one():
@@ -526,7 +526,7 @@ def test_problems_of_every_kind_give_four_files(words):
     """With noise and without a control, a game, bang-bang in the plane, three states."""
     result = run("solve", *words)
     assert result.exit_code == 0, result.output
-    assert sorted(os.listdir(words[0])) == sorted(results.FILES)
+    assert sorted(os.listdir(words[0])) == sorted(run_folder.FILES)
     assert "CONVERGED" in result.stdout
 
 

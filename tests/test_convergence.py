@@ -16,7 +16,7 @@ import hjbjax as hjb
 from hjbjax import plotting, zoo
 from hjbjax.applications.convergence import Study, fitted_order
 from hjbjax.applications.reference import distance, mask_of, richardson
-from hjbjax.plotting.canvas import few
+from hjbjax.plotting.style import few
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
 

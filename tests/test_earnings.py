@@ -10,7 +10,7 @@ import pytest
 import hjbjax as hjb
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.solution.status import Status
-from hjbjax.solvers import report
+from hjbjax.solvers import result
 
 P = jax.tree_util.Partial
 U = hjb.Box([-1.0], [1.0])
@@ -107,6 +107,6 @@ def test_in_a_batch_only_the_lane_that_earns():
 @pytest.mark.parametrize("certificate", list(Certificate))
 def test_without_a_certificate_no_tolerance_is_promised(certificate):
     task = SimpleNamespace(certificate=certificate, tol=1e-3)
-    message = report._message(Status.STALLED, task, SimpleNamespace(best=np.array([0.4, 0.4])), GRID)
+    message = result._message(Status.STALLED, task, SimpleNamespace(best=np.array([0.4, 0.4])), GRID)
     assert ("a tolerance of 0.8 is within reach" in message) == (certificate.value[:4] == "from")
     assert ("no certificate says" in message) == (certificate.value[:4] != "from")

@@ -11,7 +11,7 @@ import pytest
 import hjbjax as hjb
 from hjbjax.problem import checks
 from hjbjax.solution.status import Status
-from hjbjax.solvers import driver, epochs
+from hjbjax.solvers import epochs, host_loop
 
 U = hjb.Box([-1.0], [1.0])
 GRID = hjb.Grid([-1.0], [1.0], (9,))
@@ -63,23 +63,23 @@ def test_what_calls_python_is_known(trouble):
 def test_a_callback_that_raises_in_a_solve(trouble, monkeypatch):
     """The value of the last chunk before it, on the way and at the very start."""
     seen = []
-    first = driver._first_chunk
-    monkeypatch.setattr(driver, "_first_chunk", lambda *a: first(*a) and 1)
-    look = driver._ended
+    first = host_loop._first_chunk
+    monkeypatch.setattr(host_loop, "_first_chunk", lambda *a: first(*a) and 1)
+    look = host_loop._ended
 
     def arm(clock, done, *rest):
         trouble.armed = done >= 2
         seen.append(done)
         return look(clock, done, *rest)
 
-    monkeypatch.setattr(driver, "_ended", arm)
+    monkeypatch.setattr(host_loop, "_ended", arm)
     # float32: JAX runs callbacks in a thread of its own, which knows nothing of float64 inside a ``with``
     options = {"method": hjb.ValueIteration(), "tol": 1e-5, "dtype": "float32"}
     with pytest.raises(Exception, match="my own trouble") as caught:
         hjb.solve(trouble.problem, GRID, **options)
     kept = broken(caught).value
     trouble.armed = False
-    monkeypatch.setattr(driver, "_ended", look)
+    monkeypatch.setattr(host_loop, "_ended", look)
     steps = max(done for done in seen)
     known = hjb.solve(trouble.problem, GRID, max_steps=steps, throw=False, **options)
     np.testing.assert_array_equal(kept, known.value)
@@ -117,7 +117,7 @@ def plain(discount=1.0):
 
 @pytest.mark.parametrize("error", [out_of_memory, lambda *_: np.empty(2**55)], ids=["JAX", "NumPy"])
 def test_memory_that_runs_out(monkeypatch, error):
-    monkeypatch.setattr(driver, "run", error)
+    monkeypatch.setattr(host_loop, "run", error)
     guess = np.arange(9.0)
     with pytest.raises(MemoryError, match=r"memory ran out: .*") as caught:
         hjb.solve(plain(), GRID, guess=guess)
@@ -134,13 +134,13 @@ def test_memory_that_runs_out(monkeypatch, error):
 
 
 def test_memory_that_runs_out_on_a_coarser_grid(monkeypatch):
-    run, calls = driver.run, []
+    run, calls = host_loop.run, []
 
     def later(task, state, until):
         calls.append(task.grid.shape)
         return out_of_memory() if len(set(calls)) == 2 else run(task, state, until)
 
-    monkeypatch.setattr(driver, "run", later)
+    monkeypatch.setattr(host_loop, "run", later)
     with pytest.raises(MemoryError) as caught:
         hjb.solve(plain(), hjb.Grid([-1.0], [1.0], (33,)), method=hjb.Nested(coarsest=5))
     value = caught.value.solution.value

@@ -14,7 +14,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import Box, Finite
 from hjbjax.solution.solution import Solution
-from hjbjax.solvers.solver import solve
+from hjbjax.solvers.stationary import solve
 
 
 def exact_at_nodes(grid, exact, policy):

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hjbjax import Grid
-from hjbjax.problem import fields
+from hjbjax.problem import components
 
 RISE = np.arange(16.0).reshape(4, 4) / 7
 TABLE = np.linspace(-1.5, 1.5, 9)
@@ -117,7 +117,7 @@ def by_vmap(function, grid, dtype):
 
 
 def by_components(function, grid, dtype):
-    entries = fields.components(function, grid.components(dtype), dtype=dtype)
+    entries = components.components(function, grid.components(dtype), dtype=dtype)
     full = [jnp.broadcast_to(jnp.asarray(entry), grid.shape) for entry in entries.flat]
     return jnp.stack(full, axis=-1).reshape(*grid.shape, *entries.shape)
 
@@ -129,7 +129,7 @@ def both(function, grid, dtype):
 
 @pytest.fixture(autouse=True)
 def fresh_warnings():
-    fields._warn_once.cache_clear()
+    components._warn_once.cache_clear()
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
@@ -149,7 +149,7 @@ def test_what_has_no_rule_falls_back_and_says_so_once(name):
             warnings.simplefilter("always")
             got, expected = both(WRITTEN[name], GRID, "float64")(0.7)
             again, _ = both(WRITTEN[name], GRID, "float64")(0.7)
-        said = [str(warning.message) for warning in caught if warning.category is fields.FallbackWarning]
+        said = [str(warning.message) for warning in caught if warning.category is components.FallbackWarning]
         assert said
         assert len(set(said)) == len(said) == len(caught)
         np.testing.assert_allclose(got, expected, rtol=1e-12)
@@ -207,7 +207,7 @@ def test_every_dimension_runs_the_same_code(n):
 
 def test_an_entry_varies_along_its_own_axes_alone():
     grid = Grid([-1.0, -1.0], [1.0, 1.0], (5, 7))
-    entries = fields.components(
+    entries = components.components(
         lambda x: jnp.stack([jnp.sin(x[0]), jax.nn.softplus(x)[1], x[0] * x[1], jnp.float32(3)]),
         grid.components("float32"),
         dtype="float32",
@@ -217,7 +217,7 @@ def test_an_entry_varies_along_its_own_axes_alone():
 
 def test_several_arguments_and_numbers_for_vectors():
     x = GRID.components("float32")
-    entries = fields.components(
+    entries = components.components(
         lambda t, x, u: jnp.stack([t * x[0] + u[0], u[1] * u[0]]), 2.0, x, [x[1], 3.0], dtype="float32"
     )
     np.testing.assert_allclose(entries[0], 2 * x[0] + x[1])
@@ -226,9 +226,9 @@ def test_several_arguments_and_numbers_for_vectors():
 
 def test_a_scalar_function_must_return_a_scalar():
     x = GRID.components("float32")
-    assert fields.scalar(lambda x: x[0], x, dtype="float32").shape == (3, 1, 1, 1)
+    assert components.scalar(lambda x: x[0], x, dtype="float32").shape == (3, 1, 1, 1)
     with pytest.raises(ValueError, match=r"returned shape \(4,\), expected a scalar"):
-        fields.scalar(lambda x: x, x, dtype="float32")
+        components.scalar(lambda x: x, x, dtype="float32")
 
 
 PAIR = Grid([-1.0, -1.0], [1.0, 1.0], (3, 4))

@@ -11,7 +11,7 @@ from systems import SEEDS, random_game, random_grid, random_problem, random_sigm
 
 from hjbjax.discretisation import chain
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.hamiltonian import hamiltonian, players
+from hjbjax.hamiltonian import discrete, players
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import node
@@ -30,7 +30,7 @@ def _float64():
 
 @functools.partial(jax.jit, static_argnames="scheme")
 def both_forms(problem, grid, value, u, d, scheme):
-    here = hamiltonian.local(problem, grid, value, scheme=scheme)
+    here = discrete.local(problem, grid, value, scheme=scheme)
     other = d if problem.is_game else None
     rates = chain.rates(problem, grid, u, other, scheme=scheme, dtype=value.dtype)
     cost = chain.running_cost(problem, here.x, u, other, 0.0, value.dtype)
@@ -85,8 +85,8 @@ class Coupled:
 def best_and_scan(problem, grid, value, scan, scheme):
     how = players.setting(problem, grid.ndim, value.dtype)
     assert how.exact
-    here = hamiltonian.local(problem, grid, value, scheme=scheme)
-    best, u, _ = hamiltonian.optimise(here, how)
+    here = discrete.local(problem, grid, value, scheme=scheme)
+    best, u, _ = discrete.optimise(here, how)
     table = jax.lax.map(lambda point: here.at([point[j] for j in range(scan.shape[1])], []), scan)
     full = [jnp.broadcast_to(component, grid.shape) for component in u]
     return best, jnp.stack(full), jnp.min(table, axis=0), here.at(full, [])
@@ -180,8 +180,8 @@ def test_samples_and_search_come_close_where_the_minimum_is_not_exact(scheme, se
 
 @functools.partial(jax.jit, static_argnames="scheme")
 def sampled_and_scan(problem, grid, value, scheme):
-    here = hamiltonian.local(problem, grid, value, scheme=scheme)
-    best = hamiltonian.optimise(here, players.setting(problem, grid.ndim, value.dtype))[0]
+    here = discrete.local(problem, grid, value, scheme=scheme)
+    best = discrete.optimise(here, players.setting(problem, grid.ndim, value.dtype))[0]
 
     def lowest(points):
         return jnp.min(jax.lax.map(lambda point: here.at(list(point), []), points), axis=0)
@@ -194,14 +194,14 @@ def sampled_and_scan(problem, grid, value, scheme):
 
 @functools.partial(jax.jit, static_argnames=("scheme", "isaacs"))
 def optimum(problem, grid, value, scheme, isaacs=None):
-    here = hamiltonian.local(problem, grid, value, scheme=scheme)
-    return hamiltonian.optimise(here, players.setting(problem, grid.ndim, value.dtype), isaacs=isaacs)
+    here = discrete.local(problem, grid, value, scheme=scheme)
+    return discrete.optimise(here, players.setting(problem, grid.ndim, value.dtype), isaacs=isaacs)
 
 
 @functools.partial(jax.jit, static_argnames="scheme")
 def table_of(problem, grid, value, controls, disturbances, scheme):
     """H for every pair, shape (K, L, *grid)."""
-    here = hamiltonian.local(problem, grid, value, scheme=scheme)
+    here = discrete.local(problem, grid, value, scheme=scheme)
 
     def at(u, d):
         return here.at(list(u), list(d))
@@ -260,7 +260,7 @@ def test_lower_is_at_most_upper(seed):
 @jax.jit
 def replies(problem, grid, value, u, d):
     """max over d of H(u, d) and min over u of H(u, d), over scans, at given actions of the other."""
-    here = hamiltonian.local(problem, grid, value, scheme=Upwind())
+    here = discrete.local(problem, grid, value, scheme=Upwind())
     against_u = jax.lax.map(lambda point: here.at(u, list(point)), problem.disturbances.grid(301).points)
     against_d = jax.lax.map(lambda point: here.at(list(point), d), problem.controls.grid(301).points)
     return jnp.max(against_u, axis=0), jnp.min(against_d, axis=0)
@@ -337,8 +337,8 @@ def test_a_reply_meets_the_others_action():
     problem = Problem(lambda x, u, d: 0 * x, lambda x, u, d: u[0] * d[0], UNIT, disturbances=UNIT, discount=1.0)
     grid = Grid([0.0], [1.0], (3,))
     how = players.setting(problem, 1, np.float64)
-    here = hamiltonian.local(problem, grid, jnp.zeros(3), scheme=Upwind())
+    here = discrete.local(problem, grid, jnp.zeros(3), scheme=Upwind())
     fixed = [jnp.array([-1.0, 0.5, 1.0])]
-    value, action = hamiltonian.best_response(here, how.disturbance, lambda d: (fixed, d))
+    value, action = discrete.best_response(here, how.disturbance, lambda d: (fixed, d))
     assert np.allclose(value, [1.0, 0.5, 1.0], rtol=1e-14)
     assert np.allclose(action[0], [-1.0, 1.0, 1.0], rtol=1e-14)

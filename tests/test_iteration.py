@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
-from hjbjax.iteration import iteration
+from hjbjax.iteration import fixed_point
 from hjbjax.iteration.certificates import Gap
 from hjbjax.solution.status import Status
-from hjbjax.solvers.preparation import prepare_on_host
+from hjbjax.solvers.setup import prepare_on_host
 
 GRID = hjb.Grid([-1.0], [1.0], (11,))
 LARGE = 1e6  # the size of the value, whose rounding is 64 eps of it
-ROUNDING = iteration.ROUNDING * np.finfo(np.float64).eps * LARGE
+ROUNDING = fixed_point.ROUNDING * np.finfo(np.float64).eps * LARGE
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -47,7 +47,7 @@ def test_every_rule_of_a_verdict():
     @jax.jit
     def judge(residual, error, best, nearest, since):
         measured = Gap(-error, error, jnp.zeros(()), error, residual)
-        return iteration._judge(task, jnp.full(11, -LARGE), measured, jnp.stack([nearest, best]), since)
+        return fixed_point._judge(task, jnp.full(11, -LARGE), measured, jnp.stack([nearest, best]), since)
 
     residuals = (0.0, 0.9 * ROUNDING, 1.1 * ROUNDING, 1.0, 0.9e6 * ROUNDING, 1.1e6 * ROUNDING, 1e7, np.inf, np.nan)
     seen = set()

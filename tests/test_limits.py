@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
-from hjbjax.applications import convergence, perturbations, robust
-from hjbjax.extremals import rests, shooting, two_point
+from hjbjax.applications import convergence, hinf, perturbations
+from hjbjax.extremals import boundary_value, continuation, equilibria
 from hjbjax.feedback import simulation
-from hjbjax.finiteness import survey
+from hjbjax.finiteness import node_checks
 from hjbjax.problem.pytree import node
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
-from hjbjax.solvers import batch, driver, epochs
+from hjbjax.solvers import batch, epochs, host_loop
 
 U = hjb.Box([-1.0], [1.0])
 GRID = hjb.Grid([-1.0], [1.0], (25,))
@@ -100,7 +100,7 @@ def calls(monkeypatch):
 
     The first call on a grid, up to step −1, compiles; the others are chunks.
     """
-    first, run = driver._first_chunk, driver.run
+    first, run = host_loop._first_chunk, host_loop.run
 
     def calls(act, at):
         made, clocks = [], []
@@ -112,8 +112,10 @@ def calls(monkeypatch):
                 act(clocks[-1])
             return state
 
-        monkeypatch.setattr(driver, "_first_chunk", lambda task, clock: (clocks.append(clock), first(task, clock))[1])
-        monkeypatch.setattr(driver, "run", watched)
+        monkeypatch.setattr(
+            host_loop, "_first_chunk", lambda task, clock: (clocks.append(clock), first(task, clock))[1]
+        )
+        monkeypatch.setattr(host_loop, "run", watched)
         return made
 
     return calls
@@ -209,7 +211,7 @@ PHASES = ["survey of the nodes", "preparation of 25 nodes", "jumps of the chain"
 def test_in_a_phase_before_the_steps(upon, monkeypatch, phase, act, status):
     """Nothing runs after the phase in which it ended, and the guess comes back."""
     met, ran = upon(phase, act), []
-    monkeypatch.setattr(driver, "run", lambda *_: ran.append(1))
+    monkeypatch.setattr(host_loop, "run", lambda *_: ran.append(1))
     guess = np.arange(25.0)
     solution = hjb.solve(to_rest(), GRID, guess=guess, throw=False)
     assert (solution.status, solution.steps, ran) == (status, 0, [])
@@ -251,7 +253,7 @@ def test_a_march_that_did_not_begin_knows_no_value(upon):
 
 
 def test_a_survey_of_many_actions_is_cut_between_two_of_them(monkeypatch):
-    monkeypatch.setattr(survey, "LOOK", 4 * GRID.size)
+    monkeypatch.setattr(node_checks, "LOOK", 4 * GRID.size)
     phases, enter = [], Clock.enter
 
     def entered(self, phase):
@@ -271,7 +273,7 @@ def test_some_actions_at_a_time_refuse_what_all_at_once_refuse(monkeypatch):
     """The last of 21 actions is the bad one."""
     points = np.linspace(-1.0, 1.0, 21)[:, None]
     bad = hjb.Problem(drift, lambda x, u: 1 / (u[0] - 1), hjb.Finite(points), discount=1.0)
-    monkeypatch.setattr(survey, "LOOK", 4 * GRID.size)
+    monkeypatch.setattr(node_checks, "LOOK", 4 * GRID.size)
     with pytest.raises(ValueError, match=r"cost\(x, u\) is NaN or infinite at 25 of 25.* with u = \[1\]"):
         hjb.solve(bad, GRID)
 
@@ -322,7 +324,7 @@ def test_during_the_compilation_of_the_steps(calls, act, status):
 
 def test_a_step_that_would_come_too_late_is_not_begun(calls, monkeypatch):
     """By the pace of the look at the guess, which on many nodes is a chunk of its own."""
-    monkeypatch.setattr(driver, "MANY_NODES", 10)
+    monkeypatch.setattr(host_loop, "MANY_NODES", 10)
 
     def slow(clock):
         clock.per_node, clock.seconds = 1.0, clock.elapsed() + 20.0  # 25 nodes take 25 seconds
@@ -512,7 +514,7 @@ def attenuated(gamma):
     return hjb.attenuation(PLANT, gamma, WIDE)
 
 
-def hinf(make):
+def level_of(make):
     return hjb.hinf_level(make, hjb.Grid([-1.0], [1.0], (21,)), 0.5, 1.0, horizon=16.0)
 
 
@@ -526,11 +528,11 @@ def test_an_interrupted_search_for_a_level_keeps_its_bracket_and_its_trials():
             signal.raise_signal(signal.SIGINT)
         return attenuated(gamma)
 
-    whole = hinf(attenuated)
+    whole = level_of(attenuated)
     with pytest.raises(
         hjb.SolveError, match=rf"hinf_level: at gamma = {0.5**0.75:g}|at gamma = {0.5**0.25:g}"
     ) as caught:
-        hinf(pressing)
+        level_of(pressing)
     level = caught.value.solution
     assert len(tried) == 4
     assert level.status is INTERRUPTED
@@ -543,10 +545,10 @@ def test_an_interrupted_search_for_a_level_keeps_its_bracket_and_its_trials():
 
 
 def test_ctrl_c_after_the_last_trial_is_not_lost(monkeypatch):
-    bisect = robust._bisect
-    monkeypatch.setattr(robust, "_bisect", lambda *a: (bisect(*a), signal.raise_signal(signal.SIGINT)))
+    bisect = hinf._bisect
+    monkeypatch.setattr(hinf, "_bisect", lambda *a: (bisect(*a), signal.raise_signal(signal.SIGINT)))
     with pytest.raises(hjb.SolveError, match="hinf_level: interrupted after it had come to its end") as caught:
-        hinf(attenuated)
+        level_of(attenuated)
     level = caught.value.solution
     assert level.status is INTERRUPTED
     assert level.gamma == pytest.approx(0.5**0.5, rel=0.02)
@@ -617,7 +619,7 @@ DOUBLE = hjb.Problem(lambda x, u: jnp.stack([x[1], u[0]]), lambda x, u: 1.0, U)
 @pytest.fixture
 def slopes(monkeypatch):
     """``slopes(number)``: Ctrl-C before the Jacobian of that number, one or two a Newton step; how many were made."""
-    inner = two_point._slopes
+    inner = boundary_value._slopes
 
     def slopes(number):
         made = []
@@ -628,7 +630,7 @@ def slopes(monkeypatch):
                 signal.raise_signal(signal.SIGINT)
             return inner(*arguments)
 
-        monkeypatch.setattr(two_point, "_slopes", counted)
+        monkeypatch.setattr(boundary_value, "_slopes", counted)
         return made
 
     return slopes
@@ -669,16 +671,16 @@ def test_a_last_iterate_is_a_guess_to_go_on_from(slopes):
 
 
 def test_an_extremal_interrupted_on_the_way_to_a_first_guess(monkeypatch):
-    find = rests.find
-    monkeypatch.setattr(rests, "find", lambda *a: (signal.raise_signal(signal.SIGINT), find(*a))[1])
+    find = equilibria.find
+    monkeypatch.setattr(equilibria, "find", lambda *a: (signal.raise_signal(signal.SIGINT), find(*a))[1])
     with pytest.raises(hjb.SolveError, match="pontryagin: INTERRUPTED: on the way to a first guess") as caught:
         hjb.pontryagin(LQ, [1.0], throw=False)
     assert caught.value.solution is None
 
 
 def test_ctrl_c_while_an_extremal_is_checked_is_not_lost(monkeypatch):
-    assemble = shooting.assemble
-    monkeypatch.setattr(shooting, "assemble", lambda *a: (signal.raise_signal(signal.SIGINT), assemble(*a))[1])
+    assemble = continuation.assemble
+    monkeypatch.setattr(continuation, "assemble", lambda *a: (signal.raise_signal(signal.SIGINT), assemble(*a))[1])
     extremal = hjb.pontryagin(LQ, [1.0], throw=False)
     assert extremal.status is INTERRUPTED
     assert extremal.cost == pytest.approx(1.0, rel=1e-6)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
-from hjbjax.iteration import marching, splitting
+from hjbjax.iteration import splitting, time_stepping
 
 UNIT = hjb.Box([-1.0], [1.0])
 LINE = hjb.Grid([-1.0], [1.0], (41,))
@@ -151,4 +151,4 @@ def test_no_action_is_faster_than_what_a_march_sees(name):
     problem = QUESTIONS[name]
     u, d = [jnp.asarray(0.3)], [jnp.asarray(1.0)] if problem.is_game else []
     fast = float(jnp.max(rates(problem, u, d, np.float32)))
-    assert fast * float(marching.stable(problem, LINE, hjb.Upwind(), 0.0, np.float32)) > 1.2
+    assert fast * float(time_stepping.stable(problem, LINE, hjb.Upwind(), 0.0, np.float32)) > 1.2

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
-from hjbjax.iteration import iteration
+from hjbjax.iteration import fixed_point
 from hjbjax.problem.pytree import cast
-from hjbjax.solvers import driver, memory
-from hjbjax.solvers.preparation import judge, prepare
+from hjbjax.solvers import host_loop, memory
+from hjbjax.solvers.setup import judge, prepare
 
 METHODS = [
     hjb.ValueIteration(),
@@ -62,8 +62,8 @@ def test_the_estimate_is_what_the_compiled_loop_needs(n, noise, method):
         verdict = judge(problem, grid, np.float64)
         options = {"method": method, "scheme": hjb.Upwind(), "tol": 1e-3, "dtype": np.float64, "verdict": verdict}
         task = jax.eval_shape(lambda p, g: prepare(p, g, **options), problem, grid)
-        state = jax.eval_shape(iteration.begin, task, jax.ShapeDtypeStruct(grid.shape, np.float64))
-        found = driver.run.lower(task, state, 1).compile().memory_analysis()
+        state = jax.eval_shape(fixed_point.begin, task, jax.ShapeDtypeStruct(grid.shape, np.float64))
+        found = host_loop.run.lower(task, state, 1).compile().memory_analysis()
     together = found.argument_size_in_bytes + found.output_size_in_bytes + found.temp_size_in_bytes
     ratio = memory.estimate(problem, grid, method, np.float64) / (together - found.alias_size_in_bytes)
     assert 0.95 <= ratio <= 1.4
@@ -218,16 +218,16 @@ def test_the_estimate_is_near_what_the_compiler_reports(method):
     """Between half and four times the peak of the compiled step."""
     import jax
 
-    from hjbjax.iteration import iteration
-    from hjbjax.solvers import preparation
+    from hjbjax.iteration import fixed_point
+    from hjbjax.solvers import setup
 
     grid = square(64)
     with jax.enable_x64(True):
-        task, _, _ = preparation.prepare_on_host(
+        task, _, _ = setup.prepare_on_host(
             PROBLEM, grid, method=method, scheme=hjb.Upwind(), tol=1e-3, dtype=np.dtype(np.float64)
         )
-        state = jax.eval_shape(iteration.begin, task, jnp.zeros(grid.shape))
-        analysis = jax.jit(iteration.run).lower(task, state, 1).compile().memory_analysis()
+        state = jax.eval_shape(fixed_point.begin, task, jnp.zeros(grid.shape))
+        analysis = jax.jit(fixed_point.run).lower(task, state, 1).compile().memory_analysis()
     peak = analysis.argument_size_in_bytes + analysis.output_size_in_bytes + analysis.temp_size_in_bytes
     estimate = memory.estimate(PROBLEM, grid, method, np.float64)
     assert peak / 4 <= estimate <= 4 * peak

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from systems import SEEDS
 
 import hjbjax as hjb
-from hjbjax.hamiltonian import hamiltonian, players
-from hjbjax.hamiltonian.minimisers import UNROLL, enumerate_actions, refine
+from hjbjax.hamiltonian import discrete, players
+from hjbjax.hamiltonian.search import UNROLL, enumerate_actions, refine
 
 NODES = 6
 laws = settings(max_examples=30)
@@ -141,6 +141,6 @@ def test_a_search_inside_a_search_is_compiled_in_few_places():
     assert not how.disturbance.exact
 
     def best(value):
-        return hamiltonian.optimise(hamiltonian.local(problem, grid, value, scheme=hjb.Upwind()), how)
+        return discrete.optimise(discrete.local(problem, grid, value, scheme=hjb.Upwind()), how)
 
     assert len(jax.jit(best).lower(jnp.zeros(11)).as_text().splitlines()) < 1500

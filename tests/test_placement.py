@@ -13,7 +13,7 @@ import sys
 import numpy as np
 import pytest
 
-from hjbjax.cli import results
+from hjbjax.cli import run_folder
 from hjbjax.solution import files, placement
 from hjbjax.solution.placement import FileError
 
@@ -106,24 +106,24 @@ def test_a_file_system_without_links(tmp_path, monkeypatch):
 
 
 def test_of_two_commands_one_keeps_its_results(tmp_path):
-    made = results.FILES[:2]
+    made = run_folder.FILES[:2]
     out = tmp_path / "out"
-    with results.staging(out) as mine, results.staging(out) as theirs:
+    with run_folder.staging(out) as mine, run_folder.staging(out) as theirs:
         for folder, text in ((mine, "mine"), (theirs, "theirs")):
             for name in made:
                 (folder / name).write_text(text)
-        results.publish(theirs, out, made)
+        run_folder.publish(theirs, out, made)
         with pytest.raises(FileExistsError, match="holds solution.npz, value.png already"):
-            results.publish(mine, out, made)
+            run_folder.publish(mine, out, made)
         out_again = tmp_path / "again"  # taken between the check and the move
         out_again.mkdir()
         with pytest.MonkeyPatch.context() as patch:
-            check = results.check_folder
+            check = run_folder.check_folder
             patch.setattr(
-                results, "check_folder", lambda *a: (check(*a), (out_again / made[0]).write_text("theirs"))[0]
+                run_folder, "check_folder", lambda *a: (check(*a), (out_again / made[0]).write_text("theirs"))[0]
             )
             with pytest.raises(FileExistsError):
-                results.publish(mine, out_again, made)
+                run_folder.publish(mine, out_again, made)
     assert {(out / name).read_text() for name in made} == {"theirs"}
     assert [(path.name, path.read_text()) for path in out_again.iterdir()] == [(made[0], "theirs")]
     assert sorted(os.listdir(tmp_path)) == ["again", "out"]
@@ -167,7 +167,7 @@ def test_devices_pipes_and_sockets_are_not_replaced(tmp_path, make, force, by_li
 def test_a_command_replaces_no_pipe(tmp_path):
     make_pipe(tmp_path / "value.png")
     with pytest.raises(FileError, match=r"value.png: cannot be written: it is a device"):
-        results.check_folder(tmp_path, force=True)
+        run_folder.check_folder(tmp_path, force=True)
 
 
 # --- names ---
@@ -248,6 +248,6 @@ files.write({str(tmp_path / "run.npz")!r}, {{"format": "test", "version": 1}}, {
     assert child.returncode == -signal.SIGKILL
     (left,) = os.listdir(tmp_path)
     assert placement.OWN.fullmatch(left)
-    with results.staging(tmp_path / "out"):  # a command takes it away as well
+    with run_folder.staging(tmp_path / "out"):  # a command takes it away as well
         assert left not in os.listdir(tmp_path)
     assert os.listdir(tmp_path) == []

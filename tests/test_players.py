@@ -7,7 +7,7 @@ import pytest
 
 import hjbjax as hjb
 from hjbjax.hamiltonian import players
-from hjbjax.solvers.preparation import judge
+from hjbjax.solvers.setup import judge
 
 LINE = hjb.Grid([-2.0], [2.0], (21,))
 UNIT = hjb.Box([-1.0], [1.0])

@@ -10,9 +10,9 @@ from scipy.stats import norm
 from systems import SEEDS, random_grid, random_problem
 
 import hjbjax as hjb
-from hjbjax.applications import exits, probabilities
+from hjbjax.applications import exit_problems, probabilities
 from hjbjax.discretisation import chain
-from hjbjax.iteration import marching
+from hjbjax.iteration import time_stepping
 from hjbjax.problem.pytree import node
 
 UNIT = hjb.Box([-1.0], [1.0])
@@ -121,7 +121,7 @@ def test_without_drift_the_chance_is_linear_also_between_the_nodes(k, low, m, hi
 )
 def test_who_ends_on_a_boundary_ends_in_the_set_that_it_met(x, paid):
     """The target is x ≥ .6, the obstacle x ≤ .4 and x ≥ .9; on a boundary rounding decides of the sign."""
-    question = exits.ending(
+    question = exit_problems.ending(
         hjb.Problem(still), lambda x: 0.6 - x[0], lambda x: jnp.minimum(x[0] - 0.4, 0.9 - x[0]), 0.0, 1.0
     )
     with jax.enable_x64(True):
@@ -337,7 +337,7 @@ def test_any_feedback_lies_between_the_least_and_the_greatest(seed):
     there, away = Edge(np.asarray(grid.hi)[0], 1.0), Edge(np.asarray(grid.lo)[0], -1.0)
     policy = hjb.Solution(grid, np.zeros(grid.shape), rng.uniform(-1, 1, (*grid.shape, 1)))
     with jax.enable_x64(True):  # one step for all three, so that one monotone scheme is compared with itself
-        step = min(0.3, 0.99 * float(marching.stable(problem, grid, hjb.Upwind(), 0.0, np.float64)))
+        step = min(0.3, 0.99 * float(time_stepping.stable(problem, grid, hjb.Upwind(), 0.0, np.float64)))
     least, some, most = (
         hjb.reach_probability(problem, grid, there, obstacle=away, horizon=0.3, step=step, **choice).value[0]
         for choice in ({"least": True}, {"feedback": policy}, {})

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import hjbjax as hjb
 from hjbjax.discretisation import chain
-from hjbjax.finiteness import proper
+from hjbjax.finiteness import attainability
 from hjbjax.solution.clock import Clock
 
 MOVES = np.array([[-1.0], [0.0], [1.0]])
@@ -42,7 +42,9 @@ def on_line(drifts, noises):
 
 def reached(problem, grid, held, surely):
     with jax.enable_x64(True):
-        return proper.reached(problem, grid, held, scheme=hjb.Upwind(), dtype=np.dtype(np.float64), surely=surely)
+        return attainability.reached(
+            problem, grid, held, scheme=hjb.Upwind(), dtype=np.dtype(np.float64), surely=surely
+        )
 
 
 def brute(problem, grid, held, surely):
@@ -103,14 +105,16 @@ def test_paths_followed_on_the_device_are_those_of_the_search(monkeypatch, surel
     held = np.zeros(PLANE.shape, bool)
     held[3, 4] = True
     searched = reached(problem, PLANE, held, surely)
-    monkeypatch.setattr(proper, "LARGE", 0)
-    monkeypatch.setattr(proper, "LONG", long)
+    monkeypatch.setattr(attainability, "LARGE", 0)
+    monkeypatch.setattr(attainability, "LONG", long)
     np.testing.assert_array_equal(reached(problem, PLANE, held, surely), searched)
     with jax.enable_x64(True):
-        jumps = proper._open_jumps(problem, PLANE, None, scheme=hjb.Upwind(), dtype=np.dtype(np.float64), clock=Clock())
-        found = proper._spread(held, jumps, PLANE, Clock(), long * sum(PLANE.shape))
+        jumps = attainability._open_jumps(
+            problem, PLANE, None, scheme=hjb.Upwind(), dtype=np.dtype(np.float64), clock=Clock()
+        )
+        found = attainability._spread(held, jumps, PLANE, Clock(), long * sum(PLANE.shape))
     if long:
-        np.testing.assert_array_equal(found, proper._searched(held, jumps, PLANE))
+        np.testing.assert_array_equal(found, attainability._searched(held, jumps, PLANE))
     else:
         assert found is None
 
@@ -124,11 +128,11 @@ def test_how_often_the_clock_is_looked_at_changes_no_node(monkeypatch, surely):
     searched = reached(problem, PLANE, held, surely)
     phases, enter = [], Clock.enter
     monkeypatch.setattr(Clock, "enter", lambda clock, phase: (phases.append(phase), enter(clock, phase)))
-    monkeypatch.setattr(proper, "LARGE", 0)
-    monkeypatch.setattr(proper, "LOOK", 2 * PLANE.size)
-    monkeypatch.setattr(proper, "LONG", 0)
-    monkeypatch.setattr(proper, "SEARCHABLE", 0)
-    monkeypatch.setattr(proper, "_searched", None)
+    monkeypatch.setattr(attainability, "LARGE", 0)
+    monkeypatch.setattr(attainability, "LOOK", 2 * PLANE.size)
+    monkeypatch.setattr(attainability, "LONG", 0)
+    monkeypatch.setattr(attainability, "SEARCHABLE", 0)
+    monkeypatch.setattr(attainability, "_searched", None)
     np.testing.assert_array_equal(reached(problem, PLANE, held, surely), searched)
     assert sum("jumps of the chain" in phase for phase in phases) >= len(MOVES) // 2
     assert sum("paths of" in phase for phase in phases) > 2

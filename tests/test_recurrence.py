@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from systems import SEEDS, random_grid, random_problem
 
-from hjbjax.discretisation import chain, recurrence
+from hjbjax.discretisation import chain, stationary_law
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
@@ -118,7 +118,7 @@ def test_a_damped_oscillator_under_noise():
 
 def test_a_density_under_the_policy_that_was_found():
     """LQ: u = −p x makes a Gauss of variance σ²/2p."""
-    from hjbjax.solvers.solver import solve
+    from hjbjax.solvers.stationary import solve
 
     problem = Problem(lambda x, u: u, lambda x, u: x @ x + u @ u, Box([-9.0], [9.0]), noise=1.0, discount=1.0)
     grid = Grid([-5.0], [5.0], (201,))
@@ -141,10 +141,10 @@ def test_quantecon_finds_the_same_law(n, kind, seed):
     problem, policy = random_problem(rng, grid, kind), rng.uniform(-1, 1, (*grid.shape, 1))
     generator = chain.generator(problem, grid, policy)
     theirs = quantecon.MarkovChain(chain.matrix(problem, grid, policy).toarray())
-    found = recurrence.classes(generator)
+    found = stationary_law.classes(generator)
     assert sorted(map(tuple, found)) == sorted(map(tuple, theirs.recurrent_classes))
     for states in found:
-        ours, error = recurrence.law(generator, states)
+        ours, error = stationary_law.law(generator, states)
         by_them = next(p for p in theirs.stationary_distributions if p[states].sum() > 0.5)
         assert 0.5 * np.abs(ours - by_them).sum() <= error + 1e-9
         assert error < 1e-9
@@ -154,7 +154,7 @@ def test_a_law_over_many_orders_of_magnitude_is_found_from_its_peak():
     """exp(−x²) up to x = 36: seen from the middle of the box, where nobody comes, rounding would decide."""
     grid = Grid([-12.0], [36.0], (481,))
     problem, plain = Problem(ornstein_uhlenbeck, noise=1.0), Upwind(central=False)
-    assert [len(states) for states in recurrence.classes(chain.generator(problem, grid, scheme=plain))] == [481]
+    assert [len(states) for states in stationary_law.classes(chain.generator(problem, grid, scheme=plain))] == [481]
     density = chain.stationary_density(problem, grid, scheme=plain)
     assert density.max() == pytest.approx(1 / np.sqrt(np.pi), rel=0.05)
     assert density[-1] == pytest.approx(0, abs=1e-100)
@@ -167,7 +167,7 @@ def test_the_bound_on_rounding_holds_where_wells_hardly_exchange():
     asymmetry, bounds = [], []
     for sigma in (0.8, 0.6, 0.5):
         generator = chain.generator(Problem(double_well, noise=sigma), grid)
-        found, bound = recurrence.law(generator, np.arange(257))
+        found, bound = stationary_law.law(generator, np.arange(257))
         asymmetry.append(0.5 * np.abs(found - found[::-1]).sum())
         bounds.append(bound)
     assert np.all(np.array(asymmetry) <= bounds)

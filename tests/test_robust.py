@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 import hjbjax as hjb
 from hjbjax import zoo
-from hjbjax.applications import robust
-from hjbjax.applications.robust import Trial
+from hjbjax.applications import hinf
+from hjbjax.applications.hinf import Trial
 from hjbjax.feedback.path import PathStatus
 from hjbjax.problem.pytree import node
 from hjbjax.problem.sets import Ball, Box, Finite
@@ -249,8 +249,8 @@ def test_the_marches_of_one_gamma_share_its_time(monkeypatch):
         now[0] += 3.0
         return hjb.march(*arguments, **options)
 
-    monkeypatch.setattr(robust, "march", slow)
-    monkeypatch.setattr(robust, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(hinf, "march", slow)
+    monkeypatch.setattr(hinf, "perf_counter", lambda: now[0])
     with pytest.raises(ValueError, match=r"hi = 0.6 is not feasible"):
         hjb.hinf_level(LAG.game(), cube(1, 21), 0.5, 0.6, horizon=8.0, time_limit=10.0)
     assert limits[:4] == [10.0, 7.0, 4.0, 1.0]

@@ -12,8 +12,8 @@ import pytest
 
 import hjbjax as hjb
 from hjbjax.problem.pytree import node
-from hjbjax.solvers import driver
-from hjbjax.solvers.preparation import prepare_on_host
+from hjbjax.solvers import host_loop
+from hjbjax.solvers.setup import prepare_on_host
 
 GRID = hjb.Grid([-1.0, -2.0], [1.0, 2.0], (17, 18))
 SLOW = hjb.ValueIteration()
@@ -60,14 +60,14 @@ def test_converged_history_has_one_residual_a_step_and_one_for_the_guess():
 @pytest.fixture
 def asked(monkeypatch):
     """Up to which step the driver runs, call by call."""
-    steps, run = [], driver.run
+    steps, run = [], host_loop.run
 
     def watched(task, state, until):
         steps.append(int(until))
         return run(task, state, until)
 
-    monkeypatch.setattr(driver, "run", watched)
-    monkeypatch.setattr(driver, "_run_kept", watched)  # where Python is called on the way
+    monkeypatch.setattr(host_loop, "run", watched)
+    monkeypatch.setattr(host_loop, "_run_kept", watched)  # where Python is called on the way
     return steps
 
 
@@ -77,11 +77,11 @@ def test_a_first_chunk_is_as_long_as_coarser_grids_tell(asked):
         question(1e-3), GRID, method=SLOW, scheme=hjb.Upwind(), tol=1e-13, dtype=np.dtype(np.float32)
     )
     histories = []
-    for per_node, first in [(1e-9, driver.HISTORY - 1), (driver.CHUNK_SECONDS / (20 * GRID.size), 10), (1.0, 1)]:
-        clock = driver.Clock(300, np.inf, False)
+    for per_node, first in [(1e-9, host_loop.HISTORY - 1), (host_loop.CHUNK_SECONDS / (20 * GRID.size), 10), (1.0, 1)]:
+        clock = host_loop.Clock(300, np.inf, False)
         clock.per_node = per_node
         asked.clear()
-        state, code, residuals = driver.drive(task, jnp.zeros(GRID.shape), clock)
+        state, code, residuals = host_loop.drive(task, jnp.zeros(GRID.shape), clock)
         assert asked[:2] == [-1, first]  # one call that compiles, and the first chunk
         assert (code, int(state.step)) == (hjb.Status.MAX_STEPS, 300)
         histories.append(residuals)
@@ -92,7 +92,7 @@ def test_a_first_chunk_is_as_long_as_coarser_grids_tell(asked):
 
 @pytest.mark.parametrize(
     ("method", "first"),
-    [(SLOW, driver.FIRST_NODES // GRID.size), (hjb.PolicyIteration(), driver.FIRST_NODES // GRID.size)]
+    [(SLOW, host_loop.FIRST_NODES // GRID.size), (hjb.PolicyIteration(), host_loop.FIRST_NODES // GRID.size)]
     + [(hjb.PolicyIteration(evaluation), 1) for evaluation in (hjb.Krylov(), hjb.Direct())],
 )
 def test_where_nothing_is_known_a_first_chunk_is_short(asked, method, first):
@@ -184,7 +184,7 @@ def pressed(monkeypatch):
 
     A process that a shell started in the background ignores the signal; here it is in the foreground.
     """
-    times, run = [], driver.run
+    times, run = [], host_loop.run
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def press():
@@ -199,14 +199,14 @@ def pressed(monkeypatch):
             timers[0].start()
         return run(task, state, until)
 
-    monkeypatch.setattr(driver, "run", watched)
+    monkeypatch.setattr(host_loop, "run", watched)
     yield times
     signal.signal(signal.SIGINT, before)
 
 
 def test_ctrl_c_keeps_the_partial_solution(pressed):
     solution = hjb.solve(**endless(), throw=False)
-    assert time.perf_counter() - pressed[0] < driver.CHUNK_SECONDS + 0.3
+    assert time.perf_counter() - pressed[0] < host_loop.CHUNK_SECONDS + 0.3
     assert solution.status is hjb.Status.INTERRUPTED
     assert solution.steps > 0
     assert np.all(np.isfinite(solution.value))
@@ -290,7 +290,7 @@ def test_what_stops_before_the_first_look_keeps_what_is_given():
         problem, hjb.Grid([-1.0], [1.0], (21,)), method=hjb.ValueIteration(), scheme=hjb.Upwind(), tol=1e-3,
         dtype=np.dtype(np.float32),
     )  # fmt: skip
-    state, code, _ = driver.drive(task, jnp.full(21, 7.0), driver.Clock(10, np.inf, False))
+    state, code, _ = host_loop.drive(task, jnp.full(21, 7.0), host_loop.Clock(10, np.inf, False))
     assert code is hjb.Status.NONFINITE
     assert np.all(np.isfinite(state.value))
     assert (state.value[0], state.value[10], state.value[-1]) == (3.0, 7.0, 3.0)

@@ -7,7 +7,7 @@ import pytest
 
 import hjbjax as hjb
 from hjbjax import zoo
-from hjbjax.iteration import sensitivity
+from hjbjax.iteration import adjoint
 from hjbjax.problem.pytree import node
 
 TRACES = []
@@ -244,7 +244,7 @@ def test_the_gradient_is_right_where_sweeps_gain_little():
 
 @pytest.mark.filterwarnings("ignore:the optimal drift leaves")
 def test_a_derivative_that_is_not_found_is_nan_and_the_value_stays(monkeypatch):
-    monkeypatch.setattr(sensitivity, "STEPS", 1)
+    monkeypatch.setattr(adjoint, "STEPS", 1)
     numbers = np.array([1.0, 1e-3, 1e6])
     with jax.enable_x64(True):
         value, ahead = jax.jit(lambda at: jax.jvp(spun_value, (at,), (jnp.ones(3),)))(numbers)
@@ -255,7 +255,7 @@ def test_a_derivative_that_is_not_found_is_nan_and_the_value_stays(monkeypatch):
 def test_a_constraint_that_rounds_otherwise_is_the_same_constraint():
     psi = jnp.asarray(np.array([0.3, 1e9, -2.0, 0.0]), jnp.float32)
     one_off = jnp.nextafter(psi, jnp.float32(-1e30))
-    assert np.all(sensitivity._same(psi, one_off)[:3])
-    assert np.all(sensitivity._same(one_off, psi)[:3])
-    assert np.all(sensitivity._same(psi, psi))
-    assert not np.any(sensitivity._same(psi * 1.001 - 1e-3, psi))
+    assert np.all(adjoint._same(psi, one_off)[:3])
+    assert np.all(adjoint._same(one_off, psi)[:3])
+    assert np.all(adjoint._same(psi, psi))
+    assert not np.any(adjoint._same(psi * 1.001 - 1e-3, psi))

@@ -5,20 +5,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hjbjax.problem import structure
+from hjbjax.problem import dependence
 from hjbjax.problem.pytree import as_partial, node
 
 MATRIX = np.array([[1.0, 2.0], [0.5, -1.0]])
 ARGUMENTS = ((3, False), (2, True))  # a state of three entries, a control of two
 
 
-def dependence(function, arguments=ARGUMENTS):
-    return structure.dependence(as_partial(function), *arguments, dtype="float32")
+def found(function, arguments=ARGUMENTS):
+    return dependence.dependence(as_partial(function), *arguments, dtype="float32")
 
 
 def verdict(function):
     """constant, affine, separable (quadratic), quadratic or nonlinear: the strongest that was proved."""
-    result = dependence(function)
+    result = found(function)
     if result.is_constant:
         return "constant"
     if result.affine_in([0, 1]):
@@ -106,7 +106,7 @@ def test_what_has_no_rule_is_constant_only_where_the_control_has_no_part():
     def solved(x, u):
         return jnp.stack([jnp.sort(x)[0] + u[0], jnp.arange(4.0)[u[0].astype(int)]])
 
-    assert dependence(solved).entries == (frozenset({(), (0,)}), frozenset({frozenset({0})}))
+    assert found(solved).entries == (frozenset({(), (0,)}), frozenset({frozenset({0})}))
 
 
 @pytest.mark.parametrize("name", [name for name, (_, expected) in VERDICTS.items() if expected == "affine"])
@@ -118,15 +118,15 @@ def test_what_is_called_affine_has_no_curvature(name):
 
 
 def test_which_entries_each_input_drives():
-    result = dependence(lambda x, u: jnp.stack([x[1], u[0] + x[0], u[1] ** 2, jnp.abs(u[0])]))
+    result = found(lambda x, u: jnp.stack([x[1], u[0] + x[0], u[1] ** 2, jnp.abs(u[0])]))
     assert result.driven_by([0]) == (1, 3)
     assert result.driven_by([1]) == (2,)
     assert not result.free_of([0])
-    assert dependence(lambda x, u: x * u[0]).free_of([1])
+    assert found(lambda x, u: x * u[0]).free_of([1])
 
 
 def test_squares_are_found_input_by_input():
-    result = dependence(lambda x, u: u[0] ** 2 + u[0] * u[1])
+    result = found(lambda x, u: u[0] ** 2 + u[0] * u[1])
     assert result.has_square([0])
     assert not result.has_square([1])
     assert result.affine_in([1])
@@ -135,13 +135,13 @@ def test_squares_are_found_input_by_input():
 
 
 def test_what_is_no_polynomial_is_known_by_its_inputs():
-    result = dependence(lambda x, u: jnp.stack([jnp.abs(u[0]) + u[1] ** 2, jnp.sin(u[0]) * u[1], u[1] + x[0]]))
+    result = found(lambda x, u: jnp.stack([jnp.abs(u[0]) + u[1] ** 2, jnp.sin(u[0]) * u[1], u[1] + x[0]]))
     assert not result.affine_in([0])
     assert not result.affine_in([1])
     assert result.has_square([1])
     assert not result.has_square([0])
     assert result.crosses([0], [1])
-    mixed = dependence(lambda x, u: jnp.abs(u[0]) + u[1])
+    mixed = found(lambda x, u: jnp.abs(u[0]) + u[1])
     assert mixed.affine_in([1])
     assert mixed.separable_quadratic_in([1])
     assert not mixed.crosses([0], [1])
@@ -149,13 +149,13 @@ def test_what_is_no_polynomial_is_known_by_its_inputs():
 
 def test_inputs_are_numbered_through_both_players():
     game = ((None, False), (3, False), (2, True), (1, True))  # t, x, u, d
-    result = dependence(lambda t, x, u, d: jnp.stack([t * u[1], d[0] * u[0], d[0] ** 2]), game)
+    result = found(lambda t, x, u, d: jnp.stack([t * u[1], d[0] * u[0], d[0] ** 2]), game)
     assert result.entries == (frozenset({(1,)}), frozenset({(0, 2)}), frozenset({(2, 2)}))
     assert result.affine_in([0, 1])
 
 
 def test_a_control_without_entries():
-    assert dependence(lambda x, u: x + jnp.sum(u), ((3, False), (0, True))).is_constant
+    assert found(lambda x, u: x + jnp.sum(u), ((3, False), (0, True))).is_constant
 
 
 @node()
@@ -169,6 +169,6 @@ class Power:
 
 
 def test_numbers_decide_what_is_proved():
-    assert dependence(Power(2)).separable_quadratic_in([0])
-    assert not dependence(Power(4)).separable_quadratic_in([0])
-    assert dependence(Power(2)).separable_quadratic_in([0])
+    assert found(Power(2)).separable_quadratic_in([0])
+    assert not found(Power(4)).separable_quadratic_in([0])
+    assert found(Power(2)).separable_quadratic_in([0])

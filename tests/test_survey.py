@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from questions import GRID, U, accepted, in_disc, refused
 
 from hjbjax import Box, Finite, Grid, Problem
-from hjbjax.discretisation import chain, correlation
-from hjbjax.finiteness import survey
+from hjbjax.discretisation import chain, correlated_noise
+from hjbjax.finiteness import node_checks
 from hjbjax.problem.pytree import node
 
 
@@ -78,7 +78,7 @@ def test_another_parameter_value_does_not_trace_again():
 
     counts = []
     for rate in (1.0, 2.0, 3.0):
-        survey.values(Problem(Counted(rate).drift, controls=U), GRID, "float64")
+        node_checks.values(Problem(Counted(rate).drift, controls=U), GRID, "float64")
         counts.append(count)
     assert counts[0] > 0
     assert len(set(counts)) == 1
@@ -127,7 +127,7 @@ ENTRY = st.floats(0.1, 3.0)
 @given(ENTRY, ENTRY, st.floats(-1.0, 1.0), ENTRY)
 def test_in_two_dimensions_some_spacing_always_does(s1, s2, r, h):
     a = np.array([[s1 * s1, r * s1 * s2], [r * s1 * s2, s2 * s2]])
-    spacings = correlation.spacings(a, [h, 1.0])
+    spacings = correlated_noise.spacings(a, [h, 1.0])
     assert spacings is not None
     assert np.prod(spacings) == pytest.approx(h)
     assert least(a, Grid([0.0, 0.0], spacings, (2, 2))) >= -1e-6  # in float32
@@ -137,7 +137,7 @@ def test_in_two_dimensions_some_spacing_always_does(s1, s2, r, h):
 def test_in_three_dimensions_spacings_do_what_they_promise_and_exist_when_equal_ones_do(entries):
     sigma = np.reshape(entries, (3, 3)) + 0.5 * np.eye(3)
     a = sigma @ sigma.T + 1e-3 * np.eye(3)
-    spacings = correlation.spacings(a, [1.0, 1.0, 1.0])
+    spacings = correlated_noise.spacings(a, [1.0, 1.0, 1.0])
     if spacings is not None:
         assert least(a, Grid([0.0] * 3, spacings, (2, 2, 2))) >= -1e-5
     else:
@@ -146,5 +146,5 @@ def test_in_three_dimensions_spacings_do_what_they_promise_and_exist_when_equal_
 
 def test_axes_without_correlation_keep_their_spacing():
     a = np.array([[1.0, 0.0, 0.9], [0.0, 0.0, 0.0], [0.9, 0.0, 4.0]])
-    spacings = correlation.spacings(a, [0.1, 0.3, 0.1])
+    spacings = correlated_noise.spacings(a, [0.1, 0.3, 0.1])
     np.testing.assert_allclose(spacings, [0.1 / np.sqrt(2), 0.3, 0.1 * np.sqrt(2)])

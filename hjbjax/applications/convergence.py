@@ -33,7 +33,7 @@ from hjbjax.problem.pytree import is_traced
 from hjbjax.solution.clock import Clock, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
-from hjbjax.solvers.solver import solve
+from hjbjax.solvers.stationary import solve
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

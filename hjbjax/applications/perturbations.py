@@ -18,7 +18,7 @@ import jax
 import numpy as np
 
 from hjbjax.applications.convergence import fitted_order
-from hjbjax.applications.gain import attenuation, saturation
+from hjbjax.applications.l2_gain import attenuation, saturation
 from hjbjax.applications.reference import mask_of
 from hjbjax.discretisation.schemes import Limited, Scheme
 from hjbjax.iteration.methods import Method
@@ -29,7 +29,7 @@ from hjbjax.problem.sets import AdmissibleSet, Ball, Box
 from hjbjax.solution.clock import Clock, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
-from hjbjax.solvers.solver import check_arguments, solve
+from hjbjax.solvers.stationary import check_arguments, solve
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -1,9 +1,9 @@
 """Front doors of probabilities and exit times: ``reach_probability``, ``stay_probability``, ``expected_exit_time``.
 
-The equations are those of ``solve`` and ``march`` with the exit costs of ``exits``; nothing is solved here. For all
-times without discount a chain that may stay away for ever has more than one solution: there value iteration from zero
-finds the least one, which is the probability; where every pair of actions must end, any method does. The chain
-tells at host level; inside jit, vmap and grad it is taken for granted that every pair must end.
+The equations are those of ``solve`` and ``march`` with the exit costs of ``exit_problems``; nothing is solved here.
+For all times without discount a chain that may stay away for ever has more than one solution: there value iteration
+from zero finds the least one, which is the probability; where every pair of actions must end, any method does. The
+chain tells at host level; inside jit, vmap and grad it is taken for granted that every pair must end.
 """
 
 import contextlib
@@ -16,19 +16,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.applications import exits
+from hjbjax.applications import exit_problems
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.finiteness import proper, survey
+from hjbjax.finiteness import attainability, node_checks
 from hjbjax.iteration.methods import ValueIteration
 from hjbjax.problem import checks
-from hjbjax.problem.fields import FallbackWarning
+from hjbjax.problem.components import FallbackWarning
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, is_traced
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solvers import memory
-from hjbjax.solvers.horizon import march
-from hjbjax.solvers.solver import as_dtype, check_arguments, solve
+from hjbjax.solvers.finite_horizon import march
+from hjbjax.solvers.stationary import as_dtype, check_arguments, solve
 
 TOL = 1e-6
 
@@ -86,7 +86,7 @@ def reach_probability(
     _refuse_open(grid, name)
     problem, inside, hit = _asked(problem, target, obstacle, feedback, horizon, name)
     sign = 1.0 if least else -1.0
-    question = exits.ending(problem, inside, hit, 0.0, sign)
+    question = exit_problems.ending(problem, inside, hit, 0.0, sign)
     with _quiet(feedback):
         if horizon is None:
             question, options = _without_end(question, grid, least, options)
@@ -131,7 +131,7 @@ def stay_probability(
       >>> round(float(kept.value_at(0.0, [0.0])), 2)  # (4/π) e^{−π²/8} − ...
       0.37
     """
-    leaving = jax.tree_util.Partial(exits.outside, as_partial(region, "stay_probability: region"))
+    leaving = jax.tree_util.Partial(exit_problems.outside, as_partial(region, "stay_probability: region"))
     with _scaled_errors(1.0, -1.0):
         left = reach_probability(problem, grid, leaving, horizon=horizon, least=not least, feedback=feedback, **options)
     return _scaled(left, 1.0, -1.0)
@@ -182,7 +182,7 @@ def expected_exit_time(
     _refuse_open(grid, name)
     problem, inside, _ = _asked(problem, target, None, feedback, horizon, name)
     sign = -1.0 if greatest else 1.0
-    question = exits.ending(problem, inside, None, sign, 0.0)
+    question = exit_problems.ending(problem, inside, None, sign, 0.0)
     with _quiet(feedback):
         if horizon is None:
             options = {"tol": TOL} | options
@@ -211,9 +211,9 @@ def _asked(
     hit = as_partial(obstacle, f"{name}: obstacle")
     if feedback is None:
         return problem, inside, hit
-    loop = exits.closed(problem, feedback, horizon, name)
+    loop = exit_problems.closed(problem, feedback, horizon, name)
     needs_time = loop.time_dependent and not problem.time_dependent
-    return loop, exits.timed(inside, needs_time), exits.timed(hit, needs_time)
+    return loop, exit_problems.timed(inside, needs_time), exit_problems.timed(hit, needs_time)
 
 
 @contextlib.contextmanager
@@ -254,8 +254,8 @@ def _may_stay(question: Problem, grid: Grid, options: dict) -> int:
     with jax.enable_x64(kind == np.float64):
         memory.require(question, grid, method, kind, options.get("max_memory"))
         checks.shapes(question, grid, scheme)
-        survey.values(question, grid, kind)
-        return int(np.sum(np.asarray(proper.refuge(question, grid, scheme=scheme.chain, dtype=kind))))
+        node_checks.values(question, grid, kind)
+        return int(np.sum(np.asarray(attainability.refuge(question, grid, scheme=scheme.chain, dtype=kind))))
 
 
 def _refuse_staying(question: Problem, grid: Grid, options: dict) -> None:

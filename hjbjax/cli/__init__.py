@@ -1,1 +1,1 @@
-"""The command ``hjbjax``: ``main``, its words (``command_line``), its files (``results``), and ``doctor``."""
+"""The command ``hjbjax``: ``main``, its words (``command_line``), its files (``run_folder``), and ``doctor``."""

@@ -89,18 +89,18 @@ def solve(
 ) -> None:
     """Solve the ready problem NAME; write solution.npz, value.png, policy.png and trajectory.png."""
     from hjbjax import zoo
-    from hjbjax.cli import results
+    from hjbjax.cli import run_folder
 
     entry = zoo.catalogue[name]
     parameters = _parameters(entry, settings)
     out = Path(name) if out is None else out
     with _failing(OSError, 2, "--out: "):
-        results.check_folder(out, force)
+        run_folder.check_folder(out, force)
     problem, grid = _build(entry, parameters, shape)
     path, made = None, []
     with contextlib.ExitStack() as stack:
         with _failing(OSError, 2, "--out: "):
-            staging = stack.enter_context(results.staging(out))
+            staging = stack.enter_context(run_folder.staging(out))
         stack.enter_context(_one_line_warnings())
         stack.enter_context(_interruptible())
         solution = _solve(problem, grid, options)
@@ -108,19 +108,21 @@ def solve(
             try:
                 start = entry.initial_state(grid.ndim)
                 finish = None if entry.finish is None else entry.finish(**parameters)
-                pictures = results.make(problem, solution, staging, start=start, duration=entry.duration, finish=finish)
+                pictures = run_folder.make(
+                    problem, solution, staging, start=start, duration=entry.duration, finish=finish
+                )
                 for file, drawn in pictures:
                     made.append(file)
                     path = drawn
             finally:  # what is whole is kept
-                results.publish(staging, out, made, force)
+                run_folder.publish(staging, out, made, force)
     files = [out / file for file in made]
     off = None
     with contextlib.suppress(ValueError):  # no answer is known for these parameters
-        off = None if entry.exact is None else results.difference(entry.exact(**parameters), solution)
+        off = None if entry.exact is None else run_folder.difference(entry.exact(**parameters), solution)
     if as_json:
         about = {"problem": name, "parameters": parameters, "exact_difference": off}
-        click.echo(json.dumps(results.report(solution, path, files, **about)))
+        click.echo(json.dumps(run_folder.report(solution, path, files, **about)))
     else:
         click.echo(str(solution))
         if off is not None:

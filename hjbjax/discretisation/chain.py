@@ -23,11 +23,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import edges, export, recurrence, stencil
+from hjbjax.discretisation import decision_process, edges, stationary_law, stencil
+from hjbjax.discretisation.cut_cells import links
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.discretisation.stencil import Links
-from hjbjax.discretisation.subcell import links
-from hjbjax.problem import checks, fields
+from hjbjax.problem import checks, components
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import cast, node
@@ -74,14 +74,14 @@ class Rates:
 
 def drift(problem: Problem, x: list, u: list, d: list | None, t: Any, dtype: Any) -> list:
     """The n components of f on per-node scalars."""
-    return list(fields.components(problem.drift, *problem.arguments(x, u, d, t), dtype=dtype))
+    return list(components.components(problem.drift, *problem.arguments(x, u, d, t), dtype=dtype))
 
 
 def running_cost(problem: Problem, x: list, u: list, d: list | None, t: Any, dtype: Any) -> Any:
     """L on per-node scalars; zero where the problem has none."""
     if problem.cost is None:
         return jnp.zeros((), dtype)
-    return fields.scalar(problem.cost, *problem.arguments(x, u, d, t), dtype=dtype)
+    return components.scalar(problem.cost, *problem.arguments(x, u, d, t), dtype=dtype)
 
 
 def diffusion(problem: Problem, x: list, u: list, d: list | None, t: Any, dtype: Any) -> dict[tuple[int, int], Any]:
@@ -90,9 +90,9 @@ def diffusion(problem: Problem, x: list, u: list, d: list | None, t: Any, dtype:
     if problem.noise is None:
         return {}
     if callable(problem.noise):
-        sigma = fields.components(problem.noise, *problem.arguments(x, u, d, t), dtype=dtype)
+        sigma = components.components(problem.noise, *problem.arguments(x, u, d, t), dtype=dtype)
     else:
-        sigma = fields.components(lambda x: jnp.asarray(problem.noise, dtype), x, dtype=dtype)
+        sigma = components.components(lambda x: jnp.asarray(problem.noise, dtype), x, dtype=dtype)
     if sigma.ndim < 2:
         return {(i, i): s * s for i, s in enumerate(np.broadcast_to(sigma, (n,)))}
     pairs = itertools.combinations_with_replacement(range(n), 2)
@@ -251,7 +251,7 @@ def matrix(
       [[0.0, 1.0, 0.0, 0.0], [0.0, 0.5, 0.5, 0.0], [0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0]]
     """
     jumps = _under_policy(problem, grid, policy, disturbance, scheme, t)
-    steps = jumps.scaled(export.time_step(jumps.total()))
+    steps = jumps.scaled(decision_process.time_step(jumps.total()))
     return stencil.sparse(steps.offsets, steps.values, np.maximum(1 - steps.total(), 0), grid)
 
 
@@ -269,7 +269,7 @@ def stationary_density(
     The chain's law over the nodes, divided by the cells that its rates belong to, in which a wall that reflects
     stands half a spacing beyond the end of the box; then scaled to the integral one over the box itself,
     ``np.sum(density * grid.volumes())``. Second order where central differences are monotone, first elsewhere; by
-    a sparse LU factorisation, see ``recurrence``. Arguments are those of ``generator``.
+    a sparse LU factorisation, see ``stationary_law``. Arguments are those of ``generator``.
 
     Returns:
       The density at the nodes, shape (*grid), in 1/(units of the states); zero where the chain never comes back.
@@ -292,7 +292,7 @@ def stationary_density(
         )
     jumps = _under_policy(problem, grid, policy, disturbance, scheme, t)
     moves = stencil.sparse(jumps.offsets, jumps.values, -jumps.total(), grid)
-    probabilities = export.single_law(recurrence.classes(moves), moves, grid)
+    probabilities = decision_process.single_law(stationary_law.classes(moves), moves, grid)
     density = probabilities.reshape(grid.shape)
     with jax.enable_x64(True):
         for link in (stencil.links(cast(grid, np.float64), axis) for axis in range(grid.ndim)):
@@ -328,28 +328,29 @@ def transition_arrays(
       ValueError: a problem that is no such decision problem, rates or costs that are not finite, or noise that
         the chain cannot represent.
     """
-    actions = export.actions(problem)
-    held, given = export.target(problem, grid)
+    actions = decision_process.actions(problem)
+    held, given = decision_process.target(problem, grid)
     found = (
         _checked(problem, grid, list(action), None, scheme, 0.0, ~held, np.finfo(np.float64).eps) for action in actions
     )
     with jax.enable_x64(True):
         cut = links(cast(problem, np.float64), cast(grid, np.float64), subcell=scheme.subcell, dtype=np.float64)
-        surcharge = export.surcharge(cut, given, grid)
+        surcharge = decision_process.surcharge(cut, given, grid)
     tables = (
-        (jumps.offsets, jumps.values, cost + export.paid(jumps, surcharge), ~leaving) for jumps, cost, leaving in found
+        (jumps.offsets, jumps.values, cost + decision_process.paid(jumps, surcharge), ~leaving)
+        for jumps, cost, leaving in found
     )
-    return export.decision_problem(tables, grid, len(actions), held, given, float(problem.discount))
+    return decision_process.decision_problem(tables, grid, len(actions), held, given, float(problem.discount))
 
 
 def _under_policy(problem: Problem, grid: Grid, policy: Any, disturbance: Any, scheme: Upwind, t: float) -> Rates:
     """The rates under a policy; zero on the target and where there is no action."""
-    u, d, active = export.policies(problem, grid, policy, disturbance)
-    active &= ~export.target(problem, grid, t)[0]
+    u, d, active = decision_process.policies(problem, grid, policy, disturbance)
+    active &= ~decision_process.target(problem, grid, t)[0]
     kinds = [np.asarray(array).dtype for array in (policy, disturbance) if array is not None]
     eps = max([np.finfo(kind).eps for kind in kinds if kind.kind == "f"], default=np.finfo(np.float64).eps)
     jumps, _, leaving = _checked(problem, grid, u, d, scheme, t, active, eps)
-    export.refuse("the policy leaves the box across a constrained end", leaving, grid)
+    decision_process.refuse("the policy leaves the box across a constrained end", leaving, grid)
     return jumps
 
 
@@ -369,9 +370,11 @@ def _checked(
         jumps, cost, lacking, leaving = jax.device_get(
             _evaluate(*cast((problem, grid, u, d), np.float64), t, scheme, eps)
         )
-    export.refuse("the running cost is not finite", active & ~np.isfinite(cost), grid)
-    export.refuse("a jump rate, made of drift and noise, is not finite", active & ~np.isfinite(jumps.total()), grid)
-    export.refuse("the noise is correlated more than the spacings allow", active & lacking, grid)
+    decision_process.refuse("the running cost is not finite", active & ~np.isfinite(cost), grid)
+    decision_process.refuse(
+        "a jump rate, made of drift and noise, is not finite", active & ~np.isfinite(jumps.total()), grid
+    )
+    decision_process.refuse("the noise is correlated more than the spacings allow", active & lacking, grid)
     kept = Rates(jumps.offsets, tuple(np.where(active, c, 0) for c in jumps.values))
     return kept, np.where(active, cost, 0), active & leaving
 

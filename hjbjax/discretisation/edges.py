@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation import stencil
-from hjbjax.problem import fields, structure
+from hjbjax.problem import components, dependence
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 
@@ -48,7 +48,7 @@ def slack(problem: Problem, grid: Grid, t: Any, dtype: Any) -> list[Rounding]:
     """What is rounding of the drift along every axis, node by node."""
     m, k = (0 if choices is None else choices.dim for choices in (problem.controls, problem.disturbances))
     nothing = ([jnp.zeros((), dtype)] * m, [jnp.zeros((), dtype)] * k)
-    f = fields.components(problem.drift, *problem.arguments(grid.components(dtype), *nothing, t), dtype=dtype)
+    f = components.components(problem.drift, *problem.arguments(grid.components(dtype), *nothing, t), dtype=dtype)
     found = []
     for entry in f:
         idle = jnp.broadcast_to(jnp.where(jnp.isfinite(entry), entry, 0), grid.shape)
@@ -95,7 +95,7 @@ def inadmissible(
     bad = jnp.zeros(grid.shape, bool)
     if not grid.sides("constrained"):
         return bad
-    f = fields.components(problem.drift, *problem.arguments(grid.components(dtype), u, d, t), dtype=dtype)
+    f = components.components(problem.drift, *problem.arguments(grid.components(dtype), u, d, t), dtype=dtype)
     coarser = 1 if eps is None else eps / jnp.finfo(dtype).eps
     for axis, rounding in enumerate(slack(problem, grid, t, dtype)):
         out = barred(f[axis], grid, axis, rounding, coarser)
@@ -149,7 +149,7 @@ def cut(
 @jax.jit
 def _drift(problem: Problem, x: list, u: list, d: list, t: Any) -> jax.Array:
     """The drift at states (K,) an entry, shape (n, K)."""
-    f = fields.components(problem.drift, *problem.arguments(x, u, d, t), dtype=x[0].dtype)
+    f = components.components(problem.drift, *problem.arguments(x, u, d, t), dtype=x[0].dtype)
     return jnp.stack([jnp.broadcast_to(entry, x[0].shape) for entry in f])
 
 
@@ -159,4 +159,4 @@ def _actions_cost(problem: Problem, n: int, dtype: Any) -> bool:
         return False
     m, k = (0 if choices is None else choices.dim for choices in (problem.controls, problem.disturbances))
     time, game = ((None, False),) * problem.time_dependent, ((k, True),) * problem.is_game
-    return not structure.dependence(problem.cost, *time, (n, False), (m, True), *game, dtype=dtype).is_constant
+    return not dependence.dependence(problem.cost, *time, (n, False), (m, True), *game, dtype=dtype).is_constant

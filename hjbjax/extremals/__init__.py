@@ -1,6 +1,6 @@
 """Pontryagin's equations as a boundary-value problem: extremals without a grid.
 
-Read ``extremals`` for ``pontryagin``, ``two_point`` for the equations, ``first_guess`` and ``rests`` for where it
-starts, ``shooting`` for its solve with arcs between the ``seams`` of an angle, ``switching`` for controls that jump,
-and ``optimality`` for how well the conditions are met.
+Read ``indirect_method`` for ``pontryagin``, ``boundary_value`` for the equations, ``initial_guess`` and
+``equilibria`` for where it starts, ``continuation`` for its solve with arcs between the seams of an angle
+(``periodic_arcs``), ``switching`` for controls that jump, and ``necessary_conditions`` for how well they are met.
 """

@@ -1,11 +1,11 @@
 """Extremals whose control jumps: the order of its values by smoothing, the switching times by the arcs themselves.
 
-Mixtures with smaller and smaller ε (see ``two_point``) show in which order the values come; then all arcs are solved
-at once. Where the final time is free, a smoothed problem need not have a solution: effort is charged that the true one
-does not know, and discounted away by waiting. So there the mixtures have given final times, first one that is long
-enough to get to the end, then nearer and nearer to the time at which H fits. An arc may come out empty; one that
-comes out negative is left out. A start on a switching curve needs an empty arc in front, whose condition fixes the
-costate.
+Mixtures with smaller and smaller ε (see ``boundary_value``) show in which order the values come; then all arcs are
+solved at once. Where the final time is free, a smoothed problem need not have a solution: effort is charged that the
+true one does not know, and discounted away by waiting. So there the mixtures have given final times, first one that
+is long enough to get to the end, then nearer and nearer to the time at which H fits. An arc may come out empty; one
+that comes out negative is left out. A start on a switching curve needs an empty arc in front, whose condition fixes
+the costate.
 """
 
 import dataclasses
@@ -14,10 +14,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from hjbjax.extremals import first_guess
-from hjbjax.extremals.optimality import EMPTY
-from hjbjax.extremals.shooting import Found, Limits, attempt, carry_on, report, unknowns
-from hjbjax.extremals.two_point import Closing, Law, TwoPoint, conditions
+from hjbjax.extremals import initial_guess
+from hjbjax.extremals.boundary_value import Closing, Law, TwoPoint, conditions
+from hjbjax.extremals.continuation import Found, Limits, attempt, carry_on, report, unknowns
+from hjbjax.extremals.necessary_conditions import EMPTY
 from hjbjax.solution.status import Status
 
 SMOOTHING = (1.0, 0.3, 0.1, 0.03, 0.01)  # ε over the size of the Hamiltonian, so far that the order of arcs shows
@@ -58,7 +58,7 @@ def switching(ask: TwoPoint, times: np.ndarray, columns: np.ndarray, limits: Lim
 
 def _mixtures(ask: TwoPoint, times: np.ndarray, columns: np.ndarray, rough: Limits) -> Iterator[Found]:
     """Smoothed extremals, the likeliest first; a failure where there are no more."""
-    size, found = first_guess.size(ask, times, columns), None
+    size, found = initial_guess.size(ask, times, columns), None
     if ask.free:
         yield from _walk(dataclasses.replace(ask, epsilon=size), times, columns, rough)
         return
@@ -100,7 +100,7 @@ def _sharpened(ask: TwoPoint, blurred: Found, limits: Limits, least: float) -> F
     """The arcs in the order that a mixture shows."""
     fine = np.linspace(0, 1, 2001)
     y = np.stack([np.interp(fine, blurred.s, row) for row in blurred.y])
-    order, starts = first_guess.sequence(blurred.ask, fine * blurred.horizon, y, least)
+    order, starts = initial_guess.sequence(blurred.ask, fine * blurred.horizon, y, least)
     carry_on(blurred, limits)
     if len(order) > MOST_ARCS:
         trouble = f"{len(order) - 1} switches: the control chatters, or an arc is singular; this is a smoothed extremal"
@@ -125,7 +125,7 @@ def _with_an_empty_arc(
     ask: TwoPoint, blurred: Found, order: np.ndarray, starts: np.ndarray, limits: Limits
 ) -> Found | None:
     """The same after an arc of another value that may stay empty."""
-    for value in first_guess.values(blurred.ask):
+    for value in initial_guess.values(blurred.ask):
         if not np.array_equal(value, order[0], equal_nan=True):
             found = _arcs(ask, blurred, np.concatenate([value[None], order]), np.append(0.0, starts), limits)
             if found.solved and np.min(found.lengths) > -EMPTY * found.horizon:

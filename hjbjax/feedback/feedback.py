@@ -17,7 +17,7 @@ import numpy as np
 from hjbjax.discretisation.schemes import Limited
 from hjbjax.discretisation.stencil import Links
 from hjbjax.hamiltonian import players
-from hjbjax.hamiltonian.hamiltonian import Local, optimise
+from hjbjax.hamiltonian.discrete import Local, optimise
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, cast, is_traced, node

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.hamiltonian import hamiltonian, players
+from hjbjax.hamiltonian import discrete, players
 from hjbjax.iteration import bellman
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
@@ -57,6 +57,6 @@ def values(problem: Problem, grid: Grid, dtype: Any, t: float = 0.0) -> None:
 def _stuck(problem: Problem, grid: Grid, t: Any, dtype: Any) -> jax.Array:
     """The nodes off the target without an admissible action, bool (*grid)."""
     free = altered(problem, cost=None)
-    here = hamiltonian.local(free, grid, jnp.zeros(grid.shape, dtype), scheme=Upwind(), t=t)
-    least = hamiltonian.optimise(here, players.setting(free, grid.ndim, dtype))[0]
+    here = discrete.local(free, grid, jnp.zeros(grid.shape, dtype), scheme=Upwind(), t=t)
+    least = discrete.optimise(here, players.setting(free, grid.ndim, dtype))[0]
     return ~jnp.isfinite(least) & ~bellman.conditions(problem, grid, dtype, t).held

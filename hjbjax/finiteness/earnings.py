@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import chain, recurrence, stencil
+from hjbjax.discretisation import chain, stationary_law, stencil
 from hjbjax.iteration.certificates import Certificate
-from hjbjax.iteration.iteration import State, Task
+from hjbjax.iteration.fixed_point import State, Task
 
 LARGEST = 200_000  # nodes of a class whose stationary law is solved for; of a larger one every node must earn
 
@@ -45,7 +45,7 @@ def earned(task: Task, state: State) -> Earning | None:
         return None
     values = [np.where(going, rate, 0) for rate in jumps.values]
     generator = stencil.sparse(jumps.offsets, values, -np.sum(values, axis=0), task.grid)
-    for states in recurrence.classes(generator):
+    for states in stationary_law.classes(generator):
         if not going.flat[states[0]]:
             continue
         paid = cost.flat[states]
@@ -68,6 +68,6 @@ def _mean(generator: Any, states: np.ndarray, cost: np.ndarray) -> float:
     """An upper bound on the mean cost of a class: with what rounding may do to its stationary law."""
     if len(states) > LARGEST or not np.any(cost.flat[states] < 0):
         return np.inf
-    probabilities, error = recurrence.law(generator, states)
+    probabilities, error = stationary_law.law(generator, states)
     paid = cost.flat[states]
     return float(probabilities[states] @ paid + error * np.max(np.abs(paid))) if np.isfinite(error) else np.inf

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 from hjbjax.discretisation import chain
 from hjbjax.discretisation.schemes import Scheme, Upwind
-from hjbjax.hamiltonian import hamiltonian, players
+from hjbjax.hamiltonian import discrete, players
 from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import Conditions
 from hjbjax.problem import sets
@@ -46,14 +46,14 @@ def standstill(problem: Problem, grid: Grid, *, scheme: Scheme, dtype: Any) -> S
     With slopes ±s, s_i = max L/max|f_i|, the Hamiltonian is L + Σ s_i |f_i|: its minimum vanishes at rest alone.
     """
     how = players.setting(problem, grid.ndim, dtype)
-    nowhere = hamiltonian.local(problem, grid, jnp.zeros(grid.shape, dtype), scheme=scheme)
-    least = hamiltonian.optimise(nowhere, how)[0]
+    nowhere = discrete.local(problem, grid, jnp.zeros(grid.shape, dtype), scheme=scheme)
+    least = discrete.optimise(nowhere, how)[0]
     speeds, dearest = _scales(problem, grid, dtype)
     cost = jnp.max(jnp.where(jnp.isfinite(least), jnp.abs(least), 0))  # infinite where a constrained end leaves none
     cost = jnp.where(cost > 0, cost, jnp.where(dearest > 0, dearest, 1))
     speeds = jnp.where(speeds > 0, speeds, 1)
-    at_rest = hamiltonian.at_rest(problem, grid, cost / speeds, scheme=scheme)
-    effort, u, d = hamiltonian.optimise(at_rest, how)
+    at_rest = discrete.at_rest(problem, grid, cost / speeds, scheme=scheme)
+    effort, u, d = discrete.optimise(at_rest, how)
     small = ROUNDINGS * jnp.finfo(dtype).eps
     rests = (jnp.abs(effort) <= small * cost) & (jnp.abs(least) <= small * cost)
     for axis, speed in enumerate(_spread(problem, grid, u, d, dtype)):

@@ -1,13 +1,13 @@
 """Vector fields of control systems: brackets, what they span, linearisation by feedback, stability.
 
-Read ``brackets`` and ``distributions`` first, then ``linearisation`` and ``linearisability``; ``lyapunov`` searches
-against Lyapunov functions, and ``stability`` has Brockett's condition.
+Read ``brackets`` and ``distributions`` first, then ``feedback_linearisation`` and ``linearisability``; ``lyapunov``
+searches against Lyapunov functions, and ``stability`` has Brockett's condition.
 """
 
 from hjbjax.geometry.brackets import ad, affine_fields, lie_bracket, lie_derivative
 from hjbjax.geometry.distributions import Distribution, observability_codistribution, reachability_distribution
+from hjbjax.geometry.feedback_linearisation import Linearisation, RelativeDegree, linearising_feedback, relative_degree
 from hjbjax.geometry.linearisability import Linearisability, is_feedback_linearisable
-from hjbjax.geometry.linearisation import Linearisation, RelativeDegree, linearising_feedback, relative_degree
 
 __all__ = [
     "Distribution",

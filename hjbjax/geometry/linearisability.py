@@ -1,13 +1,14 @@
 """Geometry of control systems ẋ = f(x) + Σ g_j(x) u_j: brackets, ranks, and exact linearisation by feedback.
 
 Lie derivatives and brackets, reachability and observability, relative degree and linearising feedback are defined in
-``brackets``, ``distributions`` and ``linearisation``, and are all found here. With G_k(x) the span of ad_f^i g_j(x),
-i ≤ k, the system is linearised at x by a change of coordinates and a feedback exactly when (§5 with one input)
+``brackets``, ``distributions`` and ``feedback_linearisation``, and are all found here. With G_k(x) the span of ad_f^i
+g_j(x), i ≤ k, the system is linearised at x by a change of coordinates and a feedback exactly when (§5 with one
+input)
 
     G_{n−1}(x) has dimension n,     G_k is involutive near x for k ≤ n − 2,     G_k has constant dimension near x
 
 With one input the first condition implies the third, and the second is needed for k = n − 2 alone. "Near x" and the
-tolerance are those of ``linearisation``; each condition comes with its margin.
+tolerance are those of ``feedback_linearisation``; each condition comes with its margin.
 """
 
 from collections.abc import Sequence
@@ -26,7 +27,7 @@ from hjbjax.geometry.brackets import (
     stacked,
 )
 from hjbjax.geometry.distributions import span
-from hjbjax.geometry.linearisation import (
+from hjbjax.geometry.feedback_linearisation import (
     near,
     plain,
 )

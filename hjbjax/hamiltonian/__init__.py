@@ -1,5 +1,5 @@
 """H at a node, and its min-max over the admissible sets, by exact formulas or by samples.
 
-Read ``hamiltonian`` first. ``players`` finds how H depends on each player, ``piecewise`` has the exact optima,
-``minimisers`` the searches, and ``pointwise`` the minimum at one state for Pontryagin's equations.
+Read ``discrete`` first. ``players`` finds how H depends on each player, ``piecewise`` has the exact optima,
+``search`` the searches, and ``pointwise`` the minimum at one state for Pontryagin's equations.
 """

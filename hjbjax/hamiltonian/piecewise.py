@@ -11,7 +11,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from hjbjax.hamiltonian.minimisers import Action, better, pick
+from hjbjax.hamiltonian.search import Action, better, pick
 
 
 class Kinked:

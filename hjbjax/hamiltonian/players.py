@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax.problem import structure
+from hjbjax.problem import dependence
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite
 
@@ -118,10 +118,10 @@ def setting(problem: Problem, n: int, dtype: Any) -> Setting:
     time = ((None, False),) * problem.time_dependent
     game = ((k, True),) * problem.is_game
     arguments = (*time, (n, False), (m, True), *game)
-    drift = structure.dependence(problem.drift, *arguments, dtype=dtype)
-    constant = structure.Dependence((structure.CONSTANT,))
-    cost = constant if problem.cost is None else structure.dependence(problem.cost, *arguments, dtype=dtype)
-    noise = structure.dependence(problem.noise, *arguments, dtype=dtype) if callable(problem.noise) else constant
+    drift = dependence.dependence(problem.drift, *arguments, dtype=dtype)
+    constant = dependence.Dependence((dependence.CONSTANT,))
+    cost = constant if problem.cost is None else dependence.dependence(problem.cost, *arguments, dtype=dtype)
+    noise = dependence.dependence(problem.noise, *arguments, dtype=dtype) if callable(problem.noise) else constant
     inputs_u, inputs_d = range(m), range(m, m + k)
     branches = 2 if problem.noise is None else 4  # central differences have three kinks a component
     mine = _player(problem.controls, 1, inputs_u, drift, cost, noise, branches)
@@ -139,9 +139,9 @@ def _player(
     choices: AdmissibleSet | None,
     sign: int,
     inputs: range,
-    drift: structure.Dependence,
-    cost: structure.Dependence,
-    noise: structure.Dependence,
+    drift: dependence.Dependence,
+    cost: dependence.Dependence,
+    noise: dependence.Dependence,
     branches: int,
 ) -> Player:
     driven = tuple(drift.driven_by([j]) for j in inputs)

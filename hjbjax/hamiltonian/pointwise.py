@@ -3,7 +3,7 @@
     H(t, x, p, u) = L(t, x, u) + f(t, x, u)·p,      u*(t, x, p) = argmin of H over the admissible set
 
 Unlike on a grid there is no upwinding, so H has no kinks in u. How it depends on u is read from the jaxpr
-(``structure``), and the minimum is found accordingly:
+(``dependence``), and the minimum is found accordingly:
 
     Finite                            enumerated
     Box, separable quadratic in u     the stationary point clipped, input by input; an end where H is affine or concave
@@ -22,10 +22,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.hamiltonian.minimisers import enumerate_actions, refine
+from hjbjax.hamiltonian.search import enumerate_actions, refine
+from hjbjax.problem.dependence import dependence
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import Ball, Box, Finite, samples, spacing
-from hjbjax.problem.structure import dependence
 
 BUDGET = 64  # samples that start a search
 NEWTON = 24  # steps for the multiplier of a ball, monotone and at last quadratic; an affine H needs none

@@ -16,11 +16,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax.discretisation import chain, stencil, subcell
+from hjbjax.discretisation import chain, cut_cells, stencil
 from hjbjax.discretisation.chain import Rates
 from hjbjax.discretisation.schemes import Scheme
-from hjbjax.hamiltonian import hamiltonian, players
-from hjbjax.problem import fields, sets
+from hjbjax.hamiltonian import discrete, players
+from hjbjax.problem import components, sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import node
@@ -97,14 +97,14 @@ def conditions(problem: Problem, grid: Grid, dtype: Any, t: Any = 0.0) -> Condit
         None if ingredient is None else at_nodes(problem, grid, ingredient, dtype, t)
         for ingredient in (problem.exit_cost, problem.stopping_cost, problem.running_max)
     )
-    held = jnp.zeros(grid.shape, bool) if problem.target is None else subcell.level(problem, grid, dtype, t) <= 0
+    held = jnp.zeros(grid.shape, bool) if problem.target is None else cut_cells.level(problem, grid, dtype, t) <= 0
     given = jnp.zeros((), dtype) if exit_cost is None else jnp.where(held, exit_cost, 0)
     return Conditions(held, given, stop, floor, ended=held)
 
 
 def at_nodes(problem: Problem, grid: Grid, ingredient: Any, dtype: Any, t: Any = 0.0) -> jax.Array:
     """A function of the state alone, or a number, at every node, shape (*grid); None is zero."""
-    return jnp.broadcast_to(fields.of_state(problem, ingredient, grid.components(dtype), t, dtype), grid.shape)
+    return jnp.broadcast_to(components.of_state(problem, ingredient, grid.components(dtype), t, dtype), grid.shape)
 
 
 def greedy(
@@ -124,7 +124,7 @@ def greedy(
     """
     how = players.setting(problem, grid.ndim, value.dtype)
     here = _around(problem, grid, value, scheme, t, incumbent, lost)
-    return _left_over(problem, grid, value, held, *hamiltonian.optimise(here, how))
+    return _left_over(problem, grid, value, held, *discrete.optimise(here, how))
 
 
 def kept(
@@ -160,16 +160,16 @@ def respond(
     here = _around(problem, grid, value, scheme, t, current, lost)
     u, d = list(current.controls), list(current.disturbances)
     if problem.isaacs == "upper":
-        best, d = hamiltonian.best_response(here, how.disturbance, lambda d: (u, d))
+        best, d = discrete.best_response(here, how.disturbance, lambda d: (u, d))
     else:
-        best, u = hamiltonian.best_response(here, how.control, lambda u: (u, d))
+        best, u = discrete.best_response(here, how.control, lambda u: (u, d))
     return _left_over(problem, grid, value, held, best, u, d)
 
 
 def _around(
     problem: Problem, grid: Grid, value: Any, scheme: Scheme, t: Any, policy: Greedy | None, lost: Any = None
 ) -> Any:
-    here = hamiltonian.local(problem, grid, value, scheme=scheme, t=t, lost=lost)
+    here = discrete.local(problem, grid, value, scheme=scheme, t=t, lost=lost)
     if policy is None:
         return here
     return dataclasses.replace(here, tried=(list(policy.controls), list(policy.disturbances)))

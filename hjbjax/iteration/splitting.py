@@ -18,11 +18,11 @@ import jax.numpy as jnp
 
 from hjbjax.discretisation import chain
 from hjbjax.discretisation.schemes import Scheme
-from hjbjax.hamiltonian import hamiltonian
-from hjbjax.hamiltonian.minimisers import Action
+from hjbjax.hamiltonian import discrete
 from hjbjax.hamiltonian.players import setting
+from hjbjax.hamiltonian.search import Action
 from hjbjax.iteration import bellman
-from hjbjax.problem import structure
+from hjbjax.problem import dependence
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import node
@@ -32,11 +32,11 @@ def optimise(
     problem: Problem, grid: Grid, value: jax.Array, *, scheme: Scheme, t: Any = 0.0
 ) -> tuple[jax.Array, Action, Action]:
     """min max of H around ``value`` at the time t: the value at every node, the control and the disturbance."""
-    here = hamiltonian.local(problem, grid, value, scheme=scheme, t=t)
+    here = discrete.local(problem, grid, value, scheme=scheme, t=t)
     best, players = [], []
     for part in halves(problem, grid, value.dtype):
         how = setting(part, grid.ndim, value.dtype)
-        total, u, d = hamiltonian.optimise(dataclasses.replace(here, problem=part), how)
+        total, u, d = discrete.optimise(dataclasses.replace(here, problem=part), how)
         best.append(total)
         players.append((u, d))
     return sum(best[1:], start=best[0]), players[0][0], players[-1][1]
@@ -93,7 +93,7 @@ def halves(problem: Problem, grid: Grid, dtype: Any) -> list[Problem]:
 def _driven(function: Any, problem: Problem, n: int, m: int, k: int, dtype: Any) -> tuple[int, ...]:
     """The components that the disturbance drives."""
     time = ((None, False),) * problem.time_dependent
-    return structure.dependence(function, *time, (n, False), (m, True), (k, True), dtype=dtype).driven_by(
+    return dependence.dependence(function, *time, (n, False), (m, True), (k, True), dtype=dtype).driven_by(
         range(m, m + k)
     )
 

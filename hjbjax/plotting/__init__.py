@@ -9,11 +9,11 @@ linearly between nodes as ``value_at`` does. Entries that are not finite are nev
 numbers: they get a grey of their own and a line in the legend. A periodic axis is closed at its seam.
 """
 
-from hjbjax.plotting.canvas import COLOURS, GREY, styled
+from hjbjax.plotting.costates import costates
 from hjbjax.plotting.level_sets import animation, zero_level_set
 from hjbjax.plotting.maps import closed_loop, controls, policy, residuals, switching_curve, trajectory, value
-from hjbjax.plotting.momenta import costates
 from hjbjax.plotting.studies import convergence, perturbation
+from hjbjax.plotting.style import COLOURS, GREY, styled
 
 __all__ = [
     "COLOURS",

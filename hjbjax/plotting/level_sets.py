@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from hjbjax.plotting.canvas import COLOURS, axes_of, frame, label_axes, legend
-from hjbjax.plotting.sections import Section, at_time, axis_number, section_of
+from hjbjax.plotting.slices import Section, at_time, axis_number, section_of
+from hjbjax.plotting.style import COLOURS, axes_of, frame, label_axes, legend
 from hjbjax.problem.grid import Grid
 
 LAYERS = 25  # cuts through the third axis

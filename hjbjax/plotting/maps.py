@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from hjbjax.plotting.canvas import COLOURS, axes_of, bands, draw, frame, label_axes, legend, styled
-from hjbjax.plotting.sections import at_time, feedback, folded, lifted, nodes_in, section_of, zeros
+from hjbjax.plotting.slices import at_time, feedback, folded, lifted, nodes_in, section_of, zeros
+from hjbjax.plotting.style import COLOURS, axes_of, bands, draw, frame, label_axes, legend, styled
 from hjbjax.problem.grid import Grid
 
 

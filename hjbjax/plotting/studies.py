@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from hjbjax.plotting.canvas import COLOURS, GREY, axes_of, label_axes, legend, logarithmic, pair_of_axes
+from hjbjax.plotting.style import COLOURS, GREY, axes_of, label_axes, legend, logarithmic, pair_of_axes
 
 
 def convergence(study: Any, *, ax: Any = None) -> list[Any]:

@@ -1,4 +1,4 @@
-"""JAX's primitives by the rule that evaluates them component by component; see ``fields``."""
+"""JAX's primitives by the rule that evaluates them component by component; see ``components``."""
 
 from collections.abc import Callable, Sequence
 

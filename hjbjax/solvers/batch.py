@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation.schemes import Limited, Scheme, Upwind
-from hjbjax.finiteness import admissibility, survey
-from hjbjax.iteration import iteration
-from hjbjax.iteration.iteration import State, Task
+from hjbjax.finiteness import admissibility, node_checks
+from hjbjax.iteration import fixed_point
+from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import Method, Nested
 from hjbjax.problem import checks
 from hjbjax.problem.arguments import shown
@@ -27,15 +27,15 @@ from hjbjax.solution.clock import CHUNK_SECONDS, CUT, Clock, Stopped, noting_int
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
 from hjbjax.solvers import faults, memory, nested
-from hjbjax.solvers.driver import FIRST_NODES, imposed
-from hjbjax.solvers.preparation import choose, prepare_on_host
-from hjbjax.solvers.report import closed, describe, finish, unstarted
-from hjbjax.solvers.solver import as_dtype, check_arguments, sharpened
+from hjbjax.solvers.host_loop import FIRST_NODES, imposed
+from hjbjax.solvers.result import closed, describe, finish, unstarted
+from hjbjax.solvers.setup import choose, prepare_on_host
+from hjbjax.solvers.stationary import as_dtype, check_arguments, sharpened
 
 CHUNK = 8  # steps between two looks at which lanes are done, at most
 
-_begin = jax.vmap(iteration.begin)
-_run = jax.jit(jax.vmap(iteration.run, in_axes=(0, 0, 0)))
+_begin = jax.vmap(fixed_point.begin)
+_run = jax.jit(jax.vmap(fixed_point.run, in_axes=(0, 0, 0)))
 
 
 @with_settled_functions
@@ -138,7 +138,7 @@ def _solve_together(
     prepared: list[tuple] = []
     for name, problem in zip(names, problems, strict=True):
         try:
-            survey.values(problem, grid, kind, clock)
+            node_checks.values(problem, grid, kind, clock)
             admissibility.values(problem, grid, kind)
             prepared.append(
                 prepare_on_host(problem, grid, method=method, scheme=scheme.chain, tol=tol, dtype=kind, clock=clock)

@@ -11,17 +11,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import correlation, edges
-from hjbjax.hamiltonian import hamiltonian, players
-from hjbjax.iteration import marching
-from hjbjax.iteration.marching import Explicit, Front, Implicit, March
+from hjbjax.discretisation import correlated_noise, edges
+from hjbjax.hamiltonian import discrete, players
+from hjbjax.iteration import time_stepping
+from hjbjax.iteration.time_stepping import Explicit, Front, Implicit, March
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.sets import Finite
 from hjbjax.solution.clock import CHUNK_SECONDS, CUT, Clock
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
-from hjbjax.solvers.driver import ticker
-from hjbjax.solvers.report import isaacs_gap, warn_of_cuts, warn_of_gap
+from hjbjax.solvers.host_loop import ticker
+from hjbjax.solvers.result import isaacs_gap, warn_of_cuts, warn_of_gap
 
 CERTIFICATE = "of a march there is none; halve the spacings and the step to see its error"
 ADVICE = {
@@ -34,13 +34,13 @@ ADVICE = {
     Status.STALLED: "The policy iteration of an implicit step did not come to its end; take a shorter step.",
 }
 
-_run = jax.jit(marching.run)
-_terminal = jax.jit(marching.terminal, static_argnames="dtype")
+_run = jax.jit(time_stepping.run)
+_terminal = jax.jit(time_stepping.terminal, static_argnames="dtype")
 
 
 @jax.jit
 def _greedy(march: March, value: jax.Array, t: Any) -> tuple:
-    u, d = marching.greedy(march, value, t)
+    u, d = time_stepping.greedy(march, value, t)
     rules = march.rules_at(t, value.dtype)
     return (u, d), rules.ended, rules.acting(value)
 
@@ -51,7 +51,7 @@ def _gap_at(task: March, value: jax.Array, t: Any) -> tuple[jax.Array, jax.Array
     how = players.setting(task.problem, task.grid.ndim, value.dtype)
     if how.separable:
         return jnp.zeros(()), jnp.ones(())
-    here = hamiltonian.local(task.problem, task.grid, value, scheme=task.scheme, t=t)
+    here = discrete.local(task.problem, task.grid, value, scheme=task.scheme, t=t)
     return isaacs_gap(here, ~task.rules_at(t, value.dtype).held)
 
 
@@ -97,7 +97,7 @@ def drive(task: March, kept: np.ndarray, start: Any, clock: Clock) -> tuple[Slic
     """From kept time to kept time in chunks; stops at a code, at the time limit, or at Ctrl-C."""
     dtype, slices, chunk = np.dtype(task.horizon.dtype), Slices(task, kept), 1
     start = None if start is None else jnp.asarray(start, dtype)
-    front = marching.begin(task, _terminal(task.problem, task.grid, task.horizon, dtype, start))
+    front = time_stepping.begin(task, _terminal(task.problem, task.grid, task.horizon, dtype, start))
     code = Status.RUNNING if bool(jnp.all(jnp.isfinite(front.value))) else Status.NONFINITE
     with ticker(clock.progress, float(task.horizon), "march") as show:
         try:
@@ -203,7 +203,7 @@ def _unrepresentable(task: March, front: Front) -> str:
     return (
         "noise: correlated noise that the chain cannot represent with non-negative probabilities at "
         f"t = {float(t):.6g}, node {index}, x = {np.asarray(x).tolist()}{''.join(', ' + each for each in played)}.\n"
-        + correlation.advice(sigma @ sigma.T, grid, everywhere=False)
+        + correlated_noise.advice(sigma @ sigma.T, grid, everywhere=False)
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.finiteness import resting
 from hjbjax.iteration.certificates import Certificate
-from hjbjax.iteration.iteration import State, Task
+from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import Method, Nested, PolicyIteration
 from hjbjax.iteration.relaxation import Sweeps
 from hjbjax.problem.grid import Grid
@@ -20,8 +20,8 @@ from hjbjax.problem.pytree import altered
 from hjbjax.solution.clock import Clock, Stopped
 from hjbjax.solution.status import Status
 from hjbjax.solvers import transfer
-from hjbjax.solvers.driver import drive
-from hjbjax.solvers.preparation import Verdict, forced_only, held_jit, judge, linear_solve, prepare_jit
+from hjbjax.solvers.host_loop import drive
+from hjbjax.solvers.setup import Verdict, forced_only, held_jit, judge, linear_solve, prepare_jit
 
 VANISHING = (2.0, 0.2, 0.02)  # discounts on the way to none, over one by the time that crossing the box takes
 FURTHER = ((2e-3, 2e-4), (2e-5, 2e-6), (2e-7, 2e-8))  # where parts of the box are that much slower than the fastest

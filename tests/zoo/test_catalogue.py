@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hjbjax import zoo
-from hjbjax.problem import fields
+from hjbjax.problem import components
 from hjbjax.problem.sets import Ball, Finite
 
 ENTRIES = list(zoo.catalogue.values())
@@ -82,7 +82,7 @@ def test_functions_are_evaluated_by_components(entry, sample_state):
         for function, acts in functions:
             if callable(function):
                 inputs = arguments(problem, states[0])[1:] if acts else ()
-                entries = fields.components(function, list(states.T), *map(list, inputs), dtype=np.float64)
+                entries = components.components(function, list(states.T), *map(list, inputs), dtype=np.float64)
                 rows = jnp.stack([jnp.broadcast_to(entry, 3) for entry in entries.reshape(-1)], axis=-1)
                 found.append((rows, jax.vmap(lambda x, f=function, inputs=inputs: f(x, *inputs))(states)))
         return found

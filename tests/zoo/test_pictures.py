@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from hjbjax import Grid, Problem, Solution, Status, plotting, simulate, zoo
-from hjbjax.cli import results
+from hjbjax.cli import run_folder
 from hjbjax.feedback.path import PathStatus, joined
 
 
@@ -27,7 +27,7 @@ def exact_solution(entry, **parameters):
 def test_the_picture_of_the_moon_landing_coasts_and_burns_and_stands_on_the_ground(tmp_path):
     entry = zoo.catalogue["moon-landing"]
     problem, solution = exact_solution(entry)
-    *_, (name, path) = results.make(
+    *_, (name, path) = run_folder.make(
         problem, solution, tmp_path, start=entry.start, duration=entry.duration, finish=entry.finish()
     )
     assert name == "trajectory.png"

@@ -1,9 +1,9 @@
 """Extremals: paths that meet Pontryagin's necessary conditions, by ``pontryagin``.
 
-The boundary-value problem and what closes it are in ``two_point``, the pointwise minimum in ``pointwise``, the rest of
-an infinite horizon in ``rests``. SciPy's ``solve_bvp`` solves it by collocation of order 4 on a mesh of its own, to a
-relative residual below ``tol``. An extremal is a candidate: its path is admissible, so its cost bounds the value from
-above, and the value is that of the best one.
+The boundary-value problem and what closes it are in ``boundary_value``, the pointwise minimum in ``pointwise``, the
+rest of an infinite horizon in ``equilibria``. SciPy's ``solve_bvp`` solves it by collocation of order 4 on a mesh of
+its own, to a relative residual below ``tol``. An extremal is a candidate: its path is admissible, so its cost bounds
+the value from above, and the value is that of the best one.
 """
 
 import dataclasses
@@ -12,9 +12,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from hjbjax.extremals import first_guess, rests, shooting, switching
-from hjbjax.extremals.optimality import Extremal
-from hjbjax.extremals.two_point import Closing, Law, TwoPoint
+from hjbjax.extremals import continuation, equilibria, initial_guess, switching
+from hjbjax.extremals.boundary_value import Closing, Law, TwoPoint
+from hjbjax.extremals.necessary_conditions import Extremal
 from hjbjax.hamiltonian.pointwise import rule_of
 from hjbjax.problem import checks
 from hjbjax.problem.grid import Grid
@@ -109,7 +109,7 @@ def pontryagin(
     _check_guess(guess, len(start), horizon)
     _check_grid(grid, len(start))
     clock = Clock()
-    limits = shooting.Limits(tol, max_nodes, clock)
+    limits = continuation.Limits(tol, max_nodes, clock)
     with noting_interrupts(clock), jax.enable_x64(True):
         try:
             ask = _question(problem, start, horizon, terminal, getattr(guess, "grid", grid))
@@ -119,17 +119,17 @@ def pontryagin(
                 times, columns = _guess(ask, guess, horizon)
                 if not ask.free:
                     times = times * (float(ask.horizon) / times[-1])
-            solve = switching.switching if ask.rule.jumps else shooting.smooth
+            solve = switching.switching if ask.rule.jumps else continuation.smooth
             found = solve(ask, times, columns, limits, trusted=guess is not None)
             if clock.interrupted:
                 raise Stopped(Status.INTERRUPTED, dataclasses.replace(found, code=Status.INTERRUPTED))
-            extremal = shooting.report(found)
+            extremal = continuation.report(found)
             if clock.interrupted:
                 extremal = dataclasses.replace(extremal, code=int(Status.INTERRUPTED))
         except Stopped as stop:
             if stop.reached is None:
                 raise SolveError(f"pontryagin: {stop.status}: on the way to a first guess; there is no path") from None
-            extremal = shooting.report(stop.reached)
+            extremal = continuation.report(stop.reached)
     if throw and extremal.status is not Status.CONVERGED:
         raise SolveError(f"pontryagin: {extremal.status}: {extremal.message}", extremal)
     return extremal
@@ -253,11 +253,11 @@ def _positive(horizon: Any) -> float:
 def _guess(ask: TwoPoint, guess: Any, horizon: Any) -> tuple[np.ndarray, np.ndarray]:
     """Times and columns where the solver starts, for a horizon that ends."""
     if isinstance(guess, Extremal):
-        return first_guess.earlier(ask, guess)
+        return initial_guess.earlier(ask, guess)
     long = float(horizon.guess) if isinstance(horizon, FreeTime) else float(ask.horizon)
     if guess is not None:
-        return first_guess.along_loop(ask, guess, long or LONGEST)
-    return first_guess.straight(ask, long or 1.0)
+        return initial_guess.along_loop(ask, guess, long or LONGEST)
+    return initial_guess.straight(ask, long or 1.0)
 
 
 def _to_rest(ask: TwoPoint, guess: Any, rest: Any, clock: Clock) -> tuple[TwoPoint, np.ndarray, np.ndarray]:
@@ -270,14 +270,15 @@ def _to_rest(ask: TwoPoint, guess: Any, rest: Any, clock: Clock) -> tuple[TwoPoi
         near = solution.grid.state(np.unravel_index(np.nanargmin(solution.value), solution.grid.shape))
     if isinstance(guess, Extremal) and rest is None:
         near = guess.states[-1]
-    found, slowest = rests.find(ask, near, np.zeros(n))
+    found, slowest = equilibria.find(ask, near, np.zeros(n))
     clock.look()
     ask = dataclasses.replace(ask, rest=found, horizon=SETTLED / slowest)
     if solution is None and guess is None:
-        return ask, *first_guess.into_rest(ask, ask.start, float(ask.horizon), clock)
+        return ask, *initial_guess.into_rest(ask, ask.start, float(ask.horizon), clock)
     if solution is None:
-        times, columns = first_guess.earlier(ask, guess)
+        times, columns = initial_guess.earlier(ask, guess)
     else:
-        times, columns = first_guess.along_loop(ask, solution, 2 * float(ask.horizon))
-        found, _ = rests.find(ask, columns[:n, -1], found.costate)  # a periodic state may come to rest a period away
+        times, columns = initial_guess.along_loop(ask, solution, 2 * float(ask.horizon))
+        # a periodic state may come to rest a period away
+        found, _ = equilibria.find(ask, columns[:n, -1], found.costate)
     return dataclasses.replace(ask, rest=found, horizon=float(times[-1])), times, columns

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from hjbjax.plotting.canvas import COLOURS, axes_of, label_axes, legend
+from hjbjax.plotting.style import COLOURS, axes_of, label_axes, legend
 
 
 def costates(extremal: Any, *, solution: Any = None, ax: Any = None, names: Sequence[str] | None = None) -> list[Any]:

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.extremals.two_point import TwoPoint
+from hjbjax.extremals.boundary_value import TwoPoint
 from hjbjax.hamiltonian import pointwise
 from hjbjax.problem.pytree import node
 from hjbjax.problem.sets import samples

@@ -10,8 +10,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from hjbjax.discretisation import recurrence, stencil, subcell
-from hjbjax.problem import fields
+from hjbjax.discretisation import cut_cells, stationary_law, stencil
+from hjbjax.problem import components
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import AdmissibleSet, Finite
@@ -48,11 +48,11 @@ def single_law(classes: list[np.ndarray], generator: Any, grid: Grid) -> np.ndar
             f"stationary_density: got {len(classes)} recurrent classes, wanted one: {why};\nthe first two hold the "
             f"states {first[0]} and {first[1]}, {len(classes[0])} and {len(classes[1])} nodes; {fix}"
         )
-    probabilities, error = recurrence.law(generator, classes[0])
-    if error > recurrence.LARGEST_ERROR:
+    probabilities, error = stationary_law.law(generator, classes[0])
+    if error > stationary_law.LARGEST_ERROR:
         raise ValueError(
             f"stationary_density: parts of the box exchange so little that rounding alone may move {error:.2g} of the "
-            f"probability between them, wanted at most {recurrence.LARGEST_ERROR:g}:\n{why}; {fix}"
+            f"probability between them, wanted at most {stationary_law.LARGEST_ERROR:g}:\n{why}; {fix}"
         )
     return probabilities
 
@@ -60,10 +60,10 @@ def single_law(classes: list[np.ndarray], generator: Any, grid: Grid) -> np.ndar
 def target(problem: Problem, grid: Grid, t: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Which nodes lie on the target, and the exit cost; both (*grid)."""
     with jax.enable_x64(True):
-        paid = fields.of_state(problem, problem.exit_cost, grid.components(np.float64), t, np.float64)
+        paid = components.of_state(problem, problem.exit_cost, grid.components(np.float64), t, np.float64)
         inside = np.zeros(grid.shape, bool)
         if problem.target is not None:
-            inside = np.asarray(subcell.level(problem, grid, np.float64, t) <= 0)
+            inside = np.asarray(cut_cells.level(problem, grid, np.float64, t) <= 0)
     return inside, np.broadcast_to(paid, grid.shape)
 
 

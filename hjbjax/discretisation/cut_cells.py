@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from hjbjax.discretisation import stencil
 from hjbjax.discretisation.stencil import Links
-from hjbjax.problem import fields
+from hjbjax.problem import components
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 
@@ -28,7 +28,7 @@ def level(problem: Problem, grid: Grid, dtype: Any, t: Any = 0.0) -> jax.Array:
     What rounding does to l is taken from its slopes, so that neither its units nor values far away matter; from the
     lesser of two, since one may lead across a jump.
     """
-    found = jnp.broadcast_to(fields.of_state(problem, problem.target, grid.components(dtype), t, dtype), grid.shape)
+    found = jnp.broadcast_to(components.of_state(problem, problem.target, grid.components(dtype), t, dtype), grid.shape)
     slack = jnp.zeros((), dtype)
     for axis in range(grid.ndim):
         up, down = stencil.one_sided(found, grid, axis)
@@ -54,7 +54,7 @@ def links(problem: Problem, grid: Grid, *, subcell: bool, dtype: Any, t: Any = 0
         theta = jnp.where(meets, jnp.maximum(here / jnp.where(meets, here - beyond, 1), SHORTEST), 1)
         crossing = _wrapped(x[axis] + step * theta * length, grid, axis)
         boundary = [crossing if i == axis else entry for i, entry in enumerate(x)]
-        paid = fields.of_state(problem, problem.exit_cost, boundary, t, dtype)
+        paid = components.of_state(problem, problem.exit_cost, boundary, t, dtype)
         return theta * length, (meets, jnp.broadcast_to(paid, grid.shape))
 
     result = []

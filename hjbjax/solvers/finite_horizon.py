@@ -14,12 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation.schemes import Eno2, Limited, Scheme, Upwind, Weno5
-from hjbjax.finiteness import admissibility, survey
+from hjbjax.finiteness import admissibility, node_checks
 from hjbjax.hamiltonian import players
-from hjbjax.iteration import bellman, marching
-from hjbjax.iteration.marching import Explicit, Implicit, March
+from hjbjax.iteration import bellman, time_stepping
 from hjbjax.iteration.methods import PolicyIteration
 from hjbjax.iteration.relaxation import Krylov, Sweeps
+from hjbjax.iteration.time_stepping import Explicit, Implicit, March
 from hjbjax.problem import arguments, checks
 from hjbjax.problem.closures import with_settled_functions
 from hjbjax.problem.grid import Grid
@@ -30,14 +30,14 @@ from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
 from hjbjax.solvers import epochs, faults, memory
-from hjbjax.solvers.preparation import choose
-from hjbjax.solvers.report import closed, unstarted
-from hjbjax.solvers.solver import as_dtype, check_node_values
+from hjbjax.solvers.result import closed, unstarted
+from hjbjax.solvers.setup import choose
+from hjbjax.solvers.stationary import as_dtype, check_node_values
 
 PROBES = 33  # times at which a given step, and constrained ends, are held against a time-dependent problem
 FEWEST = 100  # steps where no stability limit is known for all of them: implicit, time-dependent, rates by samples
 
-_stable = jax.jit(marching.stable, static_argnames=("scheme", "dtype"))
+_stable = jax.jit(time_stepping.stable, static_argnames=("scheme", "dtype"))
 _rules = jax.jit(bellman.conditions, static_argnames="dtype")
 
 
@@ -118,7 +118,7 @@ def march(
         with faults.explained(clock, needed, unmoved):
             try:
                 checks.shapes(problem, grid, scheme)
-                survey.values(_without_moving_target(problem), grid, kind, clock)
+                node_checks.values(_without_moving_target(problem), grid, kind, clock)
                 for t in np.linspace(horizon, 0.0, PROBES) if problem.time_dependent else (0.0,):
                     admissibility.values(problem, grid, kind, t)
                 clock.enter("the preparation")
@@ -311,12 +311,12 @@ def _march_traced(
     problem, grid = cast(problem, kind), cast(grid, kind)
     rules = None if problem.time_dependent else bellman.conditions(problem, grid, kind)
     task = March(problem, grid, method, rules, jnp.inf, step, horizon, None, scheme)
-    value, values, actions, count = marching.terminal(problem, grid, horizon, kind, start), [], [], 0
+    value, values, actions, count = time_stepping.terminal(problem, grid, horizon, kind, start), [], [], 0
     for begin, end in itertools.pairwise([horizon, *kept[::-1].tolist()]):
         steps = max(math.ceil((begin - end) / step - 1e-6), int(begin > end))
-        value, count = marching.repeat(task, value, begin, end, steps), count + steps
+        value, count = time_stepping.repeat(task, value, begin, end, steps), count + steps
         values.append(value)
-        actions.append(marching.greedy(task, value, end))
+        actions.append(time_stepping.greedy(task, value, end))
     u, d = (
         jnp.stack(
             [jnp.stack(each[player], -1) if each[player] else jnp.zeros((*grid.shape, 0), kind) for each in actions]

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.extremals.two_point import TwoPoint
+from hjbjax.extremals.boundary_value import TwoPoint
 from hjbjax.feedback.simulation import simulate
 from hjbjax.hamiltonian import pointwise
 from hjbjax.solution.clock import Clock, Stopped

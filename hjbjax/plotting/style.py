@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hjbjax.plotting.sections import Section
+from hjbjax.plotting.slices import Section
 from hjbjax.problem.grid import Grid
 
 GREY = "#c9c9c9"

@@ -9,7 +9,7 @@ import dataclasses
 
 import numpy as np
 
-from hjbjax.extremals.two_point import TwoPoint
+from hjbjax.extremals.boundary_value import TwoPoint
 
 FINE = 4001  # samples in which a guess is looked through for crossings
 NODES = 33  # of an arc's first mesh

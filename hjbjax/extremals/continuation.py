@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.extremals import first_guess, seams
-from hjbjax.extremals.optimality import Extremal, assemble, unchecked
-from hjbjax.extremals.two_point import Closing, TwoPoint, collocate
+from hjbjax.extremals import initial_guess, periodic_arcs
+from hjbjax.extremals.boundary_value import Closing, TwoPoint, collocate
+from hjbjax.extremals.necessary_conditions import Extremal, assemble, unchecked
 from hjbjax.solution.clock import CUT, Clock, Stopped
 from hjbjax.solution.status import Status
 
@@ -119,7 +119,7 @@ def smooth(ask: TwoPoint, times: np.ndarray, columns: np.ndarray, limits: Limits
       limits: how far to go.
       trusted: whether the guess is of the very problem, so that easier ones would lead away from it.
     """
-    apart = seams.split(ask, times, columns)
+    apart = periodic_arcs.split(ask, times, columns)
     if apart is not None:
         multiplier = unknowns(ask, times, columns)[int(ask.timed) :]
         return _arrived(attempt(*apart[:3], np.append(apart[3], multiplier), limits))
@@ -167,10 +167,10 @@ def _continued(failed: Found, limits: Limits) -> Found:
         if ask.closing is Closing.REST:
             start = ask.rest.state + share * (ask.start - ask.rest.state)
             easier = dataclasses.replace(ask, start=start)
-            times, columns = first_guess.into_rest(easier, start, float(ask.horizon), limits.clock)
+            times, columns = initial_guess.into_rest(easier, start, float(ask.horizon), limits.clock)
         else:
             easier = dataclasses.replace(ask, horizon=share * ask.horizon)
-            times, columns = first_guess.straight(easier, float(easier.horizon))
+            times, columns = initial_guess.straight(easier, float(easier.horizon))
         s, y = (times / times[-1], columns) if found is None else (found.s, found.y)
         found = attempt(easier, s, y, np.zeros(0), limits if last else limits.rough)
         if not found.solved:
@@ -200,7 +200,7 @@ def _settled(found: Found, limits: Limits) -> Found:
         if _near(ask, last) or not found.solved:
             return found
         more = float(ask.horizon) * (LONGER - 1)
-        times, columns = first_guess.into_rest(ask, last, more, limits.clock)
+        times, columns = initial_guess.into_rest(ask, last, more, limits.clock)
         longer = dataclasses.replace(ask, horizon=float(ask.horizon) * LONGER)
         t = np.concatenate([found.times, float(ask.horizon) + times[1:]])
         found = attempt(longer, t / t[-1], np.concatenate([found.y, columns[:, 1:]], 1), np.zeros(0), limits)

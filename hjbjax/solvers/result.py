@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import chain, correlation, edges
+from hjbjax.discretisation import chain, correlated_noise, edges
 from hjbjax.finiteness import earnings
-from hjbjax.hamiltonian import hamiltonian, players
-from hjbjax.iteration import certificates, iteration
+from hjbjax.hamiltonian import discrete, players
+from hjbjax.iteration import certificates, fixed_point
 from hjbjax.iteration.certificates import Certificate
-from hjbjax.iteration.iteration import State, Task
+from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import Method, Nested, PolicyIteration
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
@@ -22,7 +22,7 @@ from hjbjax.problem.sets import Finite
 from hjbjax.solution.clock import CUT, Clock
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
-from hjbjax.solvers.preparation import Verdict, warn
+from hjbjax.solvers.setup import Verdict, warn
 
 GAP = 0.05  # of what the actions matter; where Isaacs' condition holds, upwinding left up to .019 on 21 nodes
 MOST = 2 / 3  # of an end's nodes: whatever has a velocity leaves by half of those where its position ends
@@ -181,17 +181,17 @@ def _refuse_noise(task: Task, state: State, grid: Grid) -> None:
     raise ValueError(
         "noise: correlated noise that the chain cannot represent with non-negative probabilities under the policy "
         f"that was found, first at node {index}, x = {np.asarray(x).tolist()}{played}.\n"
-        + correlation.advice(sigma @ sigma.T, grid, everywhere=False)
+        + correlated_noise.advice(sigma @ sigma.T, grid, everywhere=False)
     )
 
 
-def isaacs_gap(here: hamiltonian.Local, free: Any) -> tuple[jax.Array, jax.Array]:
+def isaacs_gap(here: discrete.Local, free: Any) -> tuple[jax.Array, jax.Array]:
     """The largest min max − max min over the ``free`` nodes, and how much the actions matter there, per unit time.
 
     What actions matter is the largest difference of H between two pairs of them, of nine representatives a player.
     """
     how = players.setting(here.problem, here.grid.ndim, here.dtype)
-    upper, lower = (hamiltonian.optimise(here, how, isaacs=which)[0] for which in ("upper", "lower"))
+    upper, lower = (discrete.optimise(here, how, isaacs=which)[0] for which in ("upper", "lower"))
     sets_of = (here.problem.controls, here.problem.disturbances)
     mine, theirs = (jnp.asarray(_representatives(choices), here.dtype) for choices in sets_of)
 
@@ -226,7 +226,7 @@ def warn_of_gap(gap: float, matter: float, isaacs: str) -> None:
 
 @jax.jit
 def _gap_at(task: Task, value: jax.Array) -> tuple[jax.Array, jax.Array]:
-    here = hamiltonian.local(task.problem, task.grid, value, scheme=task.scheme, lost=task.lost)
+    here = discrete.local(task.problem, task.grid, value, scheme=task.scheme, lost=task.lost)
     return isaacs_gap(here, task.counted & ~task.rules.held)
 
 
@@ -247,7 +247,7 @@ def _endless(earning: earnings.Earning, grid: Grid) -> str:
     )
 
 
-_broken = jax.jit(iteration.broken)
+_broken = jax.jit(fixed_point.broken)
 
 
 def _not_finite(task: Task, state: State, grid: Grid) -> str:

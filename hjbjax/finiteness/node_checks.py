@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import chain, correlation, subcell
-from hjbjax.problem import fields, sets
+from hjbjax.discretisation import chain, correlated_noise, cut_cells
+from hjbjax.problem import components, sets
 from hjbjax.problem.checks import OF_ACTION, STATE_COSTS, call
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
@@ -110,14 +110,14 @@ def _state_amiss(problem: Problem, grid: Grid, dtype: Any) -> jax.Array:
     x = grid.components(dtype)
     amiss, inside = jnp.zeros((), bool), jnp.ones((), bool)
     if problem.target is not None:
-        distance = subcell.level(problem, grid, dtype)
+        distance = cut_cells.level(problem, grid, dtype)
         inside = distance <= 0
         amiss |= ~jnp.all(jnp.isfinite(distance)) | ~jnp.any(inside) | jnp.all(inside)
     for name in STATE_COSTS:
         ingredient = getattr(problem, name)
         if ingredient is not None:
             relevant = inside if name == "exit_cost" else True
-            amiss |= jnp.any(relevant & ~jnp.isfinite(fields.of_state(problem, ingredient, x, 0.0, dtype)))
+            amiss |= jnp.any(relevant & ~jnp.isfinite(components.of_state(problem, ingredient, x, 0.0, dtype)))
     return amiss
 
 
@@ -128,7 +128,7 @@ def _survey(problem: Problem, grid: Grid, actions: tuple[Any, Any], dtype: Any) 
     found: dict[str, Any] = {}
     inside: Any = True
     if problem.target is not None:
-        distance = subcell.level(problem, grid, dtype)
+        distance = cut_cells.level(problem, grid, dtype)
         inside = distance <= 0
         found["target"] = _count(~jnp.isfinite(distance), grid)
         found["inside"] = jnp.sum(inside)
@@ -137,7 +137,9 @@ def _survey(problem: Problem, grid: Grid, actions: tuple[Any, Any], dtype: Any) 
         ingredient = getattr(problem, name)
         if ingredient is not None:
             relevant = inside if name == "exit_cost" else True
-            found[name] = _count(relevant & ~jnp.isfinite(fields.of_state(problem, ingredient, x, 0.0, dtype)), grid)
+            found[name] = _count(
+                relevant & ~jnp.isfinite(components.of_state(problem, ingredient, x, 0.0, dtype)), grid
+            )
 
     def body(carry, index_and_action):
         index, u, d = index_and_action
@@ -170,7 +172,7 @@ def _of_action(problem: Problem, grid: Grid, x: list, u: list, d: list | None, d
     if a:
         bad["noise"] = faulty(a.values())
     if callable(problem.noise):
-        sigma = fields.components(problem.noise, *problem.arguments(x, u, d, 0.0), dtype=dtype)
+        sigma = components.components(problem.noise, *problem.arguments(x, u, d, 0.0), dtype=dtype)
         if sigma.ndim < 2:
             bad["negative"] = functools.reduce(jnp.logical_or, (jnp.asarray(entry) < 0 for entry in sigma.flat))
     lacking = chain.lacking(a, grid, dtype)
@@ -248,5 +250,5 @@ def _not_representable(problem: Problem, grid: Grid, finding: _Finding, actions:
     raise ValueError(
         f"noise: correlated noise that the chain cannot represent with non-negative probabilities at "
         f"{_where(problem, grid, finding, actions)}.\n"
-        + correlation.advice(sigma @ sigma.T, grid, everywhere=not callable(problem.noise))
+        + correlated_noise.advice(sigma @ sigma.T, grid, everywhere=not callable(problem.noise))
     )

@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.iteration import iteration
-from hjbjax.iteration.iteration import HISTORY, State, Task
+from hjbjax.iteration import fixed_point
+from hjbjax.iteration.fixed_point import HISTORY, State, Task
 from hjbjax.iteration.relaxation import Direct, Krylov
 from hjbjax.problem import checks
 from hjbjax.solution.clock import CHUNK_SECONDS, CUT, Clock
@@ -25,8 +25,10 @@ from hjbjax.solvers import faults
 FIRST_NODES = 20_000  # a first chunk steps over about so many nodes
 MANY_NODES = 2_000_000  # beyond which the look at the guess is a chunk of its own: a step may take many times as long
 
-run = jax.jit(iteration.run, donate_argnames="state")  # a state is used once: the next one takes its place in memory
-_run_kept = jax.jit(iteration.run)  # where Python is called on the way, and may raise, the state before must outlast it
+# a state is used once: the next one takes its place in memory
+run = jax.jit(fixed_point.run, donate_argnames="state")
+# where Python is called on the way, and may raise, the state before must outlast it
+_run_kept = jax.jit(fixed_point.run)
 
 
 def drive(task: Task, guess: Any, clock: Clock, most: int | None = None) -> tuple[State, Status, np.ndarray]:
@@ -42,7 +44,7 @@ def drive(task: Task, guess: Any, clock: Clock, most: int | None = None) -> tupl
       The last state, how it ended, and the residuals of all steps, that of the guess first.
     """
     limit = clock.max_steps if most is None else min(most, clock.max_steps)
-    state, residuals, nodes = iteration.begin(task, guess), [np.zeros(0)], " x ".join(map(str, task.grid.shape))
+    state, residuals, nodes = fixed_point.begin(task, guess), [np.zeros(0)], " x ".join(map(str, task.grid.shape))
     code = clock.over()
     if code is not None:
         return imposed(task, state), code, residuals[0]

@@ -13,12 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import chain, edges, stencil, subcell
+from hjbjax.discretisation import chain, cut_cells, edges, stencil
 from hjbjax.discretisation.chain import Rates
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.hamiltonian import players
 from hjbjax.hamiltonian.players import Player
-from hjbjax.problem import fields, sets
+from hjbjax.problem import components, sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import Ball
@@ -99,7 +99,7 @@ def _with_kinks(problem: Problem, grid: Grid, player: Player, action: list, dtyp
             at_zero = [jnp.zeros((), dtype) if k == j else entry for k, entry in enumerate(base)]
             offset = chain.drift(problem, x, at_zero, None, 0.0, dtype)
             arguments = problem.arguments(x, at_zero, None, 0.0)
-            slope = fields.components(player.derivative(problem, problem.drift, j), *arguments, dtype=dtype)
+            slope = components.components(player.derivative(problem, problem.drift, j), *arguments, dtype=dtype)
             for i in driven:
                 kink = jnp.where(slope[i] != 0, -offset[i] / jnp.where(slope[i] != 0, slope[i], 1), base[j])
                 moved = [kink if k == j else entry for k, entry in enumerate(base)]
@@ -261,7 +261,7 @@ def refuge(
         for choices in (problem.controls, problem.disturbances)
     )
     mine, x = players.setting(problem, grid.ndim, dtype).control, grid.components(dtype)
-    start = subcell.level(problem, grid, dtype) > 0 if inside is None else inside
+    start = cut_cells.level(problem, grid, dtype) > 0 if inside is None else inside
 
     def shrink(carry):
         inside, _ = carry

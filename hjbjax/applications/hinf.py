@@ -34,7 +34,7 @@ from typing import Any
 
 import numpy as np
 
-from hjbjax.applications.gain import Saturation, saturation
+from hjbjax.applications.l2_gain import Saturation, saturation
 from hjbjax.discretisation.schemes import Scheme, Weno5
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_discounted
@@ -42,7 +42,7 @@ from hjbjax.problem.sets import Ball, Box
 from hjbjax.solution.clock import Clock, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
-from hjbjax.solvers.horizon import march
+from hjbjax.solvers.finite_horizon import march
 
 DOUBLINGS = 6  # of the time marched, at most
 SOON = 1e-6  # seconds: a limit that ends a march after its first look

@@ -22,13 +22,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax.discretisation import chain, edges, slopes, stencil, subcell
+from hjbjax.discretisation import chain, cut_cells, edges, slopes, stencil
 from hjbjax.discretisation.schemes import Eno2, Limited, Scheme, Upwind, Weno5
 from hjbjax.hamiltonian import players
-from hjbjax.hamiltonian.minimisers import UNROLL, Action, best_of, enumerate_actions, refine
 from hjbjax.hamiltonian.piecewise import Kinked, inverse_root, kinked_ball, piecewise_input, piecewise_pair
 from hjbjax.hamiltonian.players import SAMPLES, Player, Setting, shared
-from hjbjax.problem import fields, sets
+from hjbjax.hamiltonian.search import UNROLL, Action, best_of, enumerate_actions, refine
+from hjbjax.problem import components, sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered
@@ -134,7 +134,7 @@ def local(
 ) -> Local:
     """Coordinates and differences around ``value``, tied together so that no loop hoists tables out of itself."""
     x, value = jax.lax.optimization_barrier((grid.components(value.dtype), value))
-    links = tuple(subcell.links(problem, grid, subcell=scheme.subcell, dtype=value.dtype, t=t))
+    links = tuple(cut_cells.links(problem, grid, subcell=scheme.subcell, dtype=value.dtype, t=t))
     differences = [stencil.one_sided(value, grid, axis, link) for axis, link in enumerate(links)]
     bends = tuple(up - down for up, down in differences)
     if isinstance(scheme, Weno5):
@@ -266,7 +266,7 @@ def _exact(here: Local, player: Player, join: Callable) -> Action:
     arguments = here.problem.arguments(here.x, u, d, here.t)
     offsets = chain.drift(here.problem, here.x, u, d, here.t, here.dtype)
     slopes = [
-        fields.components(player.derivative(here.problem, here.problem.drift, j), *arguments, dtype=here.dtype)
+        components.components(player.derivative(here.problem, here.problem.drift, j), *arguments, dtype=here.dtype)
         for j in range(choices.dim)
     ]
     linear, square = zip(*(_cost_coefficients(here, player, arguments, j) for j in range(choices.dim)), strict=True)
@@ -298,10 +298,10 @@ def _cost_coefficients(here: Local, player: Player, arguments: tuple, j: int) ->
     if cost is None:
         return none, none
     slope = player.derivative(here.problem, cost, j)
-    linear = fields.scalar(slope, *arguments, dtype=here.dtype)
+    linear = components.scalar(slope, *arguments, dtype=here.dtype)
     if not player.curved[j]:
         return linear, none
-    return linear, fields.scalar(player.derivative(here.problem, slope, j), *arguments, dtype=here.dtype) / 2
+    return linear, components.scalar(player.derivative(here.problem, slope, j), *arguments, dtype=here.dtype) / 2
 
 
 def _kinked(here: Local, base: tuple[Action, Action], axis: int, offset: Any, slope: Any) -> Kinked:

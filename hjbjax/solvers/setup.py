@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import subcell
+from hjbjax.discretisation import cut_cells
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.finiteness import proper, resting
+from hjbjax.finiteness import attainability, resting
 from hjbjax.hamiltonian import players
 from hjbjax.iteration import bellman
 from hjbjax.iteration.certificates import Certificate
-from hjbjax.iteration.iteration import Task
+from hjbjax.iteration.fixed_point import Task
 from hjbjax.iteration.methods import Method, Nested, PolicyIteration, ValueIteration
 from hjbjax.iteration.relaxation import Direct, Krylov, Sweeps
 from hjbjax.problem import checks
@@ -96,7 +96,7 @@ def _rules(
     """The conditions, rest points among them, and what was found out about resting where it was needed."""
     rules = bellman.conditions(problem, grid, dtype)
     if scheme.subcell and problem.exit_cost is not None:
-        links = subcell.links(problem, grid, subcell=True, dtype=dtype)
+        links = cut_cells.links(problem, grid, subcell=True, dtype=dtype)
         met = [jnp.min(jnp.where(*meets, 0)) for link in links for meets in (link.meets_up, link.meets_down) if meets]
         rules = dataclasses.replace(rules, least_exit=jnp.minimum(jnp.min(jnp.stack(met)), 0))
     if not (verdict.may_rest or verdict.costs_certify):
@@ -185,7 +185,7 @@ def prepare_on_host(
     checks.ill_posed(problem, bool(verdict.may_rest and held.any()), grid)
     if problem.is_game or is_constrained(problem) or not held.any():
         return task, verdict, None
-    reached = proper.reached(
+    reached = attainability.reached(
         task.problem,
         task.grid,
         held,
@@ -211,7 +211,7 @@ def forced_only(task: Task, clock: Clock) -> tuple[Task, np.ndarray | None]:
     held = np.asarray(task.rules.held)
     if not task.problem.is_game or task.constrained or np.asarray(task.problem.discount) > 0 or not held.any():
         return task, None
-    reached = proper.forced(
+    reached = attainability.forced(
         task.problem, task.grid, held, scheme=task.scheme.chain, dtype=task.tol.dtype, least=_least_rate(task),
         clock=clock,
     )  # fmt: skip
@@ -230,7 +230,7 @@ def _with_refuge(task: Task) -> Task:
     small = resting.ROUNDINGS * np.finfo(task.tol.dtype).eps * np.max(np.abs(least))
     if np.any(least[free] < -small):
         return task
-    found = proper.refuge(
+    found = attainability.refuge(
         task.problem, task.grid, jnp.asarray((least <= small) & free), jnp.asarray(small, task.tol.dtype),
         scheme=task.scheme.chain, dtype=task.tol.dtype,
     )  # fmt: skip
@@ -252,7 +252,7 @@ def prepare_traced(
     if problem.is_game or is_constrained(problem) or is_discounted(problem) or not ends:
         return task, verdict
     known = jax.lax.stop_gradient(task)
-    reached = proper.surely_reached(
+    reached = attainability.surely_reached(
         known.problem, known.grid, known.rules.held, scheme=scheme, dtype=dtype, least=_least_rate(known)
     )
     return _without(task, reached | (known.problem.discount > 0)), verdict

@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation.schemes import Limited, Scheme, Upwind
-from hjbjax.finiteness import admissibility, resting, survey
-from hjbjax.iteration import iteration, sensitivity
+from hjbjax.finiteness import admissibility, node_checks, resting
+from hjbjax.iteration import adjoint, fixed_point
 from hjbjax.iteration.certificates import Certificate
-from hjbjax.iteration.iteration import State, Task
+from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import Method, Nested, PolicyIteration, ValueIteration
 from hjbjax.problem import arguments, checks
 from hjbjax.problem.closures import with_settled_functions
@@ -27,9 +27,9 @@ from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
 from hjbjax.solvers import faults, memory, nested, transfer
-from hjbjax.solvers.driver import drive
-from hjbjax.solvers.preparation import Verdict, choose, is_constrained, prepare_on_host, prepare_traced
-from hjbjax.solvers.report import assemble, closed, describe, finish, unstarted
+from hjbjax.solvers.host_loop import drive
+from hjbjax.solvers.result import assemble, closed, describe, finish, unstarted
+from hjbjax.solvers.setup import Verdict, choose, is_constrained, prepare_on_host, prepare_traced
 
 TRACED_STEPS = 10_000
 
@@ -125,7 +125,7 @@ def _solve_on_host(
     inner = method.inner if isinstance(method, Nested) else method
     try:
         checks.shapes(problem, grid, scheme)
-        survey.values(problem, grid, kind, clock)
+        node_checks.values(problem, grid, kind, clock)
         admissibility.values(problem, grid, kind)
         known = None if start is None else jnp.asarray(start)
         start, shapes = nested.start(problem, grid, method, scheme.chain, tol, known, kind, clock)
@@ -179,11 +179,11 @@ def _solve_traced(
     task, verdict = prepare_traced(problem, grid, method=method, scheme=scheme, tol=tol, dtype=kind)
     frozen = jax.lax.stop_gradient(task)
     start = frozen.start() if guess is None else jax.lax.stop_gradient(jnp.asarray(guess, kind))
-    state = iteration.run(frozen, iteration.begin(frozen, start), max_steps or TRACED_STEPS)
+    state = fixed_point.run(frozen, fixed_point.begin(frozen, start), max_steps or TRACED_STEPS)
     wrong = jnp.zeros((), bool)
     if verdict.may_rest:
         state, wrong = _doubted(frozen, state)
-    solution, value = assemble(task, state, verdict), sensitivity.attach(task, state)
+    solution, value = assemble(task, state, verdict), adjoint.attach(task, state)
     wrong |= state.code == Status.NONFINITE
     value = value * jnp.where(wrong, jnp.nan, 1).astype(value.dtype)  # a derivative drops the code, and is NaN, too
     return altered(solution, value=jnp.where(task.counted, value, jnp.inf) if task.has_lost else value)

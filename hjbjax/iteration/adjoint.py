@@ -17,9 +17,9 @@ import jax
 import jax.numpy as jnp
 
 from hjbjax.discretisation import chain
-from hjbjax.iteration import bellman, iteration, relaxation
+from hjbjax.iteration import bellman, fixed_point, relaxation
 from hjbjax.iteration.bellman import Correction
-from hjbjax.iteration.iteration import State, Task
+from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import PolicyIteration
 from hjbjax.iteration.relaxation import Evaluation, Krylov
 from hjbjax.problem.grid import Grid
@@ -81,7 +81,7 @@ def _ties_to_constraints(task: Task, state: State) -> Correction:
     Where going on is worth as much both branches hold. On a plateau without discount only this one has a derivative:
     a policy may go round on it for ever.
     """
-    equation = iteration.equation(task, state.value, state.policy)
+    equation = fixed_point.equation(task, state.value, state.policy)
     free = jnp.ones(task.grid.shape, bool)
     for constraint in (task.rules.stop, task.rules.floor):
         if constraint is not None:

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.extremals.two_point import Rest, TwoPoint
+from hjbjax.extremals.boundary_value import Rest, TwoPoint
 from hjbjax.hamiltonian import pointwise
 from hjbjax.problem.sets import Ball
 

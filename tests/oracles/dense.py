@@ -138,6 +138,20 @@ def _noise(chain, value, u, d, eps):
     return eps * size
 
 
+def _cancelled(chain, value, u, d, eps):
+    """What rounding leaves of costs and of drift where their parts cancel, as in a control that holds its place."""
+    model, finite = chain.model, np.where(np.isfinite(value), value, 0)
+    size = np.full(chain.size, np.max(np.abs(model.q), initial=0)) + np.sum(np.abs(model.l * u), axis=-1)
+    drift = np.abs(model.b) + np.einsum("snm,sm->sn", np.abs(model.G), np.abs(u))
+    if d is not None:
+        size = size + np.sum(np.abs(model.k * d), axis=-1)
+        drift = drift + np.einsum("snm,sm->sn", np.abs(model.E), np.abs(d))
+    for way in (drift, -drift):
+        for lead, rate in zip(chain.leads, chain.rates(way), strict=True):
+            size = size + rate * np.abs(finite[lead] - finite)
+    return eps * size
+
+
 def _one_player(chain, value, u, lost, eps):
     """Howard's iteration over actions and stopping; an action is kept unless another is better beyond rounding."""
     held, given, stop = _obstacles(chain.model, chain.size)
@@ -165,8 +179,7 @@ def _one_player(chain, value, u, lost, eps):
 
 
 def _answer(chain, value, u, d, ended, eps):
-    parts = eps * np.max(np.abs(chain.model.q), initial=0)  # a cost that nearly vanishes is a difference of such
-    going = 16 * (_noise(chain, value, u, d, eps) + parts)
+    going = 16 * (_noise(chain, value, u, d, eps) + _cancelled(chain, value, u, d, eps))
     noise = np.where(ended, 4 * eps * np.where(np.isfinite(value), np.abs(value), 0), going)
     rounding = _evaluate(chain, u, d, ended, noise, source=noise)
     best, *played = optimum(chain, value)

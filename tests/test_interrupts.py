@@ -51,7 +51,9 @@ def solve():
     return hjb.solve(question(), GRID, method=hjb.ValueIteration(), tol=1e-12)
 
 def to_target():
-    return hjb.solve(question(discount=0.0, target=disc), GRID, tol=1e-14, max_steps=10**6, method=hjb.ValueIteration())
+    fine = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (401, 401))  # without noise it is there within seconds
+    noisy = question(discount=0.0, target=disc, noise=0.5)
+    return hjb.solve(noisy, fine, tol=1e-14, max_steps=10**8, method=hjb.ValueIteration())
 
 def march():
     return hjb.march(question(discount=0.0), GRID, 1e5, times=np.linspace(0, 1e5, 11))
@@ -113,7 +115,10 @@ for number in range(count):
         row["message"] = str(error)
         row["finite"] = hasattr(error, "path") and bool(np.all(np.isfinite(error.path.states)))
     ended = time.perf_counter()
-    hand.join()
+    try:
+        hand.join()
+    except KeyboardInterrupt:
+        row["how"] += " before the signal"
     ends = [(when, seconds) for when, seconds in compiled if when > pressed[0] and seconds > 0.2]
     row["late"] = ended - max([pressed[0], *(when for when, _ in ends[:1])])
     row["followed"] = sum(seconds > 1.0 for _, seconds in ends[1:])

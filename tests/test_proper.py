@@ -147,6 +147,41 @@ def test_certain_arrival_is_more_than_possible_arrival():
     np.testing.assert_array_equal(reached(problem, GRID, held, True), held)
 
 
+def thin(inputs, unit):
+    """Beside currents that lead away for ever only actions with f₁ ≤ 0 ≤ f₂ will do, a thousandth of the ball."""
+    across = np.array([0.28, 0.96]) * 0.9995 * unit
+
+    def drift(x, u):
+        right, down = (jnp.where(beyond, 20 * unit, 0.0) for beyond in (x[0] > 0.6, x[1] < -0.6))
+        return jnp.stack([across[0] + u[0] + right, u[1] - across[1] - down, *(u[k] for k in range(2, inputs))])
+
+    def corner(x):
+        return jnp.maximum(x[0] + 0.9, 0.9 - x[1]) - 0.2
+
+    problem = hjb.Problem(drift, lambda x, u: 1.0, hjb.Ball(unit, inputs), discount=0.0, target=corner)
+    grid = hjb.Grid([-1.0] * inputs, [1.0] * inputs, (5,) * inputs)
+    x = grid.nodes()
+    return problem, grid, (x[..., 0] <= 0.6) & (x[..., 1] >= -0.6)
+
+
+@pytest.mark.parametrize(("inputs", "unit"), [(2, 1e-6), (2, 1.0), (3, 1e3)])
+def test_a_part_of_a_ball_thinner_than_its_samples(inputs, unit):
+    problem, grid, known = thin(inputs, unit)
+    held = np.array([problem.target(x) <= 0 for x in grid.nodes().reshape(-1, inputs)]).reshape(grid.shape)
+    np.testing.assert_array_equal(reached(problem, grid, held, surely=True), known)
+
+
+@pytest.mark.filterwarnings("ignore:.*cannot reach the target")
+def test_the_long_way_through_a_thin_part_of_a_ball_is_found_in_a_batch_as_well():
+    """From zero the iteration waits at rest, at a cost; the answers under a vanishing discount lead it on its way."""
+    problem, grid, known = thin(2, 1.0)
+    alone = hjb.solve(problem, grid)
+    (lane,) = hjb.solve_batch([problem], grid)
+    np.testing.assert_array_equal(np.isfinite(lane.value), known)
+    np.testing.assert_allclose(lane.value[known], alone.value[known], atol=lane.error + alone.error, rtol=0)
+    assert len(lane.residuals) == int(lane.steps) + 1
+
+
 def test_nothing_is_reached_but_the_held_nodes():
     problem = on_line(np.zeros((8, 3)), np.zeros((8, 3)))
     np.testing.assert_array_equal(reached(problem, GRID, np.arange(8) == 3, True), np.arange(8) == 3)

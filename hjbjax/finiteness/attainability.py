@@ -16,16 +16,13 @@ import numpy as np
 from hjbjax.discretisation import chain, cut_cells, edges, stencil
 from hjbjax.discretisation.chain import Rates
 from hjbjax.discretisation.schemes import Upwind
+from hjbjax.finiteness import tried_actions
 from hjbjax.hamiltonian import players
-from hjbjax.hamiltonian.players import Player
-from hjbjax.problem import components, sets
+from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.sets import Ball
 from hjbjax.solution.clock import Clock
 
-COMBINATIONS = 32  # of kinks of all inputs that are tried with one action
-SAMPLES = 33  # actions of a continuum that are tried
 FEW = 9  # of each player in a game, where all pairs are
 LARGE = 200_000  # nodes beyond which paths are first followed on the device, all at once
 LONG = 4  # times the nodes of all axes together: jumps of a path that are followed there
@@ -35,7 +32,7 @@ LOOK = 10**7  # nodes times actions, or times jumps of a path, between two looks
 
 def _open_jumps(problem: Problem, grid: Grid, inside: jax.Array | None, clock: Clock, **options: Any) -> Rates:
     """For every jump whether some action makes it while all jumps of that action stay ``inside``; None is the box."""
-    points = _points(problem)
+    points = tried_actions.sampled(problem)
     count, some, known = len(points), max(1, LOOK // grid.size), None
     for first in range(0, count, some):
         clock.enter(f"the jumps of the chain, {first} of {count} actions")
@@ -43,10 +40,6 @@ def _open_jumps(problem: Problem, grid: Grid, inside: jax.Array | None, clock: C
         known = _also_open(problem, grid, inside, known, points, first, last, **options)
     assert known is not None
     return known
-
-
-def _points(problem: Problem) -> Any:
-    return np.zeros((1, 0)) if problem.controls is None else sets.samples(problem.controls, SAMPLES)
 
 
 @functools.partial(jax.jit, static_argnames=("scheme", "dtype", "kinks"))
@@ -70,9 +63,8 @@ def _also_open(
         start = chain.rates(problem, grid, list(points[0]), None, scheme=scheme, dtype=dtype)
         known = Rates(start.offsets, tuple(jnp.zeros(grid.shape, bool) for _ in start.offsets))
 
-    def also(k, opened):
-        action = list(points[k])
-        for each in _with_kinks(problem, grid, mine, action, dtype) if kinks else [action]:
+    def tried(actions, opened):
+        for each in actions:
             rates = chain.rates(problem, grid, each, None, scheme=scheme, dtype=dtype)
             stays = ~edges.inadmissible(problem, grid, each, None, 0.0, dtype)
             if inside is not None:
@@ -80,41 +72,12 @@ def _also_open(
             opened = tuple(p | ((c > least) & stays) for p, c in zip(opened, rates.values, strict=True))
         return opened
 
-    return Rates(known.offsets, jax.lax.fori_loop(first, last, also, known.values))
+    def also(k, opened):
+        action = list(points[k])
+        return tried(tried_actions.with_kinks(problem, grid, mine, action, dtype) if kinks else [action], opened)
 
-
-def _with_kinks(problem: Problem, grid: Grid, player: Player, action: list, dtype: Any) -> list[list]:
-    """An action, and those with some inputs where one component of the drift vanishes: (x), each input on the nodes.
-
-    Only there may a jump stay away that all samples make. Where the drift is not affine in the inputs there are none.
-    """
-    found = [action]
-    if not player.exact or problem.is_game:
-        return found
-    x = grid.components(dtype)
-    for j, driven in enumerate(player.driven):
-        if len(found) * (1 + len(driven)) > COMBINATIONS:
-            break
-        for base in tuple(found):
-            at_zero = [jnp.zeros((), dtype) if k == j else entry for k, entry in enumerate(base)]
-            offset = chain.drift(problem, x, at_zero, None, 0.0, dtype)
-            arguments = problem.arguments(x, at_zero, None, 0.0)
-            slope = components.components(player.derivative(problem, problem.drift, j), *arguments, dtype=dtype)
-            for i in driven:
-                kink = jnp.where(slope[i] != 0, -offset[i] / jnp.where(slope[i] != 0, slope[i], 1), base[j])
-                moved = [kink if k == j else entry for k, entry in enumerate(base)]
-                admissible = _contains(player.choices, moved)
-                found.append([jnp.where(admissible, new, old) for new, old in zip(moved, base, strict=True)])
-    return found
-
-
-def _contains(choices: Any, action: list) -> Any:
-    """Where an action with an entry a node lies in a box or a ball."""
-    if isinstance(choices, Ball):
-        return sum(u * u for u in action) <= choices.radius**2
-    return functools.reduce(
-        jnp.logical_and, ((u >= choices.lo[j]) & (u <= choices.hi[j]) for j, u in enumerate(action))
-    )
+    opened = tried(tried_actions.of_a_ball(problem, grid, mine, dtype) if kinks else [], known.values)
+    return Rates(known.offsets, jax.lax.fori_loop(first, last, also, opened))
 
 
 def _stays(rates: Rates, grid: Grid, inside: jax.Array, least: Any) -> jax.Array:
@@ -176,7 +139,7 @@ def surely_reached(
     problem: Problem, grid: Grid, held: jax.Array, *, scheme: Upwind, dtype: Any, least: Any = 0.0
 ) -> jax.Array:
     """The nodes from which the held ones are reached with probability one, bool (*grid); inside a transformation."""
-    points, grid = _points(problem), grid.walled
+    points, grid = tried_actions.sampled(problem), grid.walled
 
     def shrink(carry):
         inside, _ = carry
@@ -257,7 +220,7 @@ def refuge(
       dearest: actions of a higher running cost do not count; ``None`` for all.
     """
     u, d = (
-        jnp.asarray(np.zeros((1, 0)) if choices is None else sets.samples(choices, SAMPLES), dtype)
+        jnp.asarray(np.zeros((1, 0)) if choices is None else sets.samples(choices, tried_actions.SAMPLES), dtype)
         for choices in (problem.controls, problem.disturbances)
     )
     mine, x = players.setting(problem, grid.ndim, dtype).control, grid.components(dtype)
@@ -266,17 +229,23 @@ def refuge(
     def shrink(carry):
         inside, _ = carry
 
+        def kept(action, answer):
+            rates = chain.rates(problem, grid, action, answer, scheme=scheme, dtype=dtype)
+            allowed = ~edges.inadmissible(problem, grid, action, answer, 0.0, dtype)
+            if dearest is not None:
+                allowed &= chain.running_cost(problem, x, action, answer, 0.0, dtype) <= dearest
+            return allowed & _stays(rates, grid, inside, 0.0)
+
         def also(found, pair):
-            for action in _with_kinks(problem, grid, mine, list(u[pair[0]]), dtype):
-                rates = chain.rates(problem, grid, action, list(d[pair[1]]), scheme=scheme, dtype=dtype)
-                allowed = ~edges.inadmissible(problem, grid, action, list(d[pair[1]]), 0.0, dtype)
-                if dearest is not None:
-                    allowed &= chain.running_cost(problem, x, action, list(d[pair[1]]), 0.0, dtype) <= dearest
-                found |= allowed & _stays(rates, grid, inside, 0.0)
+            for action in tried_actions.with_kinks(problem, grid, mine, list(u[pair[0]]), dtype):
+                found |= kept(action, list(d[pair[1]]))
             return found, None
 
         pairs = jnp.stack(jnp.meshgrid(jnp.arange(len(u)), jnp.arange(len(d)), indexing="ij"), -1).reshape(-1, 2)
-        found = inside & jax.lax.scan(also, jnp.zeros(grid.shape, bool), pairs)[0]
+        found = jnp.zeros(grid.shape, bool)
+        for action in tried_actions.of_a_ball(problem, grid, mine, dtype):
+            found |= kept(action, list(d[0]))
+        found = inside & jax.lax.scan(also, found, pairs)[0]
         return found, jnp.any(found != inside)
 
     return jax.lax.while_loop(lambda carry: carry[1], shrink, (start, jnp.ones((), bool)))[0]

@@ -174,8 +174,10 @@ def _finished(
     if code in CUT:
         state = imposed(task, state)
     elif nested.may_go_on(task, verdict, state, code):
-        task, verdict, reached, state, code, more = nested.settle(task, verdict, reached, state.value, clock)
-        history = np.concatenate([history, more])
+        onwards = code is Status.CONVERGED or task.problem.is_game
+        guess = state.value if onwards else None
+        task, verdict, reached, state, code, more = nested.settle(task, verdict, reached, guess, clock)
+        history = np.concatenate([history, more]) if onwards else more
     if isinstance(scheme, Limited) and code not in CUT:
         task, verdict, state, code, history, apart = sharpened(task, verdict, state, code, history, scheme, clock)
     solution = finish(task, state, code, reached, history, verdict, grid, cut=clock.over() is not None)

@@ -78,9 +78,12 @@ def warm(task: Task, guess: Any, clock: Clock) -> jax.Array:
     if guess is not None:
         return guess
     value = task.start() if task.constrained else jnp.asarray(np.zeros(task.grid.shape, task.tol.dtype))
-    if task.certificate is not Certificate.MULTIPLICATIVE or task.constrained:
-        return value
-    return _vanishing(task, value, VANISHING, clock)
+    return _vanishing(task, value, VANISHING, clock) if _needs_a_way(task) else value
+
+
+def _needs_a_way(task: Task) -> bool:
+    """Whether from zero the iteration may be caught by policies that stay where they are, at a cost."""
+    return task.certificate is Certificate.MULTIPLICATIVE and not task.constrained
 
 
 def _vanishing(task: Task, value: jax.Array, discounts: tuple[float, ...], clock: Clock) -> jax.Array:
@@ -103,10 +106,10 @@ class Settled(NamedTuple):
 
 
 def may_go_on(task: Task, verdict: Verdict, state: State, code: Status) -> bool:
-    """Whether what ended so may have to go on: rest nodes that it had better leave, or a game that failed."""
+    """Whether what ended so may have to go on: rest nodes that it had better leave, a game or a way that failed."""
     if code is Status.CONVERGED:
         return verdict.may_rest and float(np.min(np.asarray(state.value), initial=0)) < 0
-    return code in FAILED and task.problem.is_game
+    return code in FAILED and (task.problem.is_game or _needs_a_way(task))
 
 
 def settle(task: Task, verdict: Verdict, reached: np.ndarray | None, guess: Any, clock: Clock) -> Settled:
@@ -119,7 +122,7 @@ def settle(task: Task, verdict: Verdict, reached: np.ndarray | None, guess: Any,
     """
     value = warm(task, guess, clock)
     state, code, residuals = drive(task, value, clock)
-    if task.certificate is Certificate.MULTIPLICATIVE and not task.constrained:
+    if _needs_a_way(task):
         for discounts in FURTHER:  # a policy that stays where it is and pays, since the way takes too long for these
             if code not in FAILED:
                 break

@@ -1,0 +1,94 @@
+"""The actions that are tried where it counts which jumps an action makes, and not what it costs.
+
+Samples of a set, and the actions between them at which a jump vanishes: a set of actions whose jumps all lead where
+they should may be thinner than the samples are dense.
+"""
+
+import functools
+import itertools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.discretisation import chain
+from hjbjax.hamiltonian.players import Player
+from hjbjax.problem import components, sets
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.sets import Ball
+
+COMBINATIONS = 32  # of kinks of all inputs that are tried with one action
+SAMPLES = 33  # actions of a continuum that are tried
+
+
+def sampled(problem: Problem) -> Any:
+    """Actions of the control (count, m); one of no entries where there is no control."""
+    return np.zeros((1, 0)) if problem.controls is None else sets.samples(problem.controls, SAMPLES)
+
+
+def with_kinks(problem: Problem, grid: Grid, player: Player, action: list, dtype: Any) -> list[list]:
+    """An action, and those with some inputs where one component of the drift vanishes: (x), each input on the nodes.
+
+    Only there may a jump stay away that all samples make. Where the drift is not affine in the inputs there are none.
+    """
+    found = [action]
+    if not player.exact or problem.is_game:
+        return found
+    for j, driven in enumerate(player.driven):
+        if len(found) * (1 + len(driven)) > COMBINATIONS:
+            break
+        for base in tuple(found):
+            for kink in _kinks(problem, grid, player, base, j, dtype):
+                moved = [kink if k == j else entry for k, entry in enumerate(base)]
+                found.append(_where(_contains(player.choices, moved), moved, base))
+    return found
+
+
+def of_a_ball(problem: Problem, grid: Grid, player: Player, dtype: Any) -> list[list]:
+    """The actions of a ball that go furthest along one input while others let their components vanish; else none.
+
+    Each input u_j drives one component f_j of its own. Among the actions with given signs of all f_j, that with the
+    largest |f_k| has some inputs S at their kinks, f_S = 0, no others, and all the room they leave in u_k.
+    """
+    if not player.exact or problem.is_game or not isinstance(player.choices, Ball):
+        return []
+    none, radius = [jnp.zeros((), dtype)] * player.choices.dim, player.choices.radius
+    kinks = [_kinks(problem, grid, player, none, j, dtype) or [none[j]] for j in range(len(none))]
+    found: list[list] = []
+    for count in range(len(none)):
+        if len(found) >= COMBINATIONS:
+            break
+        for still in itertools.combinations(range(len(none)), count):
+            room = radius**2 - sum((kinks[j][0] ** 2 for j in still), start=none[0])
+            for k, way in itertools.product(sorted(set(range(len(none))) - set(still)), (-1, 1)):
+                action = [kinks[j][0] if j in still else entry for j, entry in enumerate(none)]
+                action[k] = way * jnp.sqrt(jnp.maximum(room, 0))
+                found.append(_where(room >= 0, action, none))
+    return found
+
+
+def _kinks(problem: Problem, grid: Grid, player: Player, base: list, j: int, dtype: Any) -> list:
+    """Where the components that input j drives vanish, given the other inputs; its own place if they never do."""
+    x = grid.components(dtype)
+    at_zero = [jnp.zeros((), dtype) if k == j else entry for k, entry in enumerate(base)]
+    offset = chain.drift(problem, x, at_zero, None, 0.0, dtype)
+    arguments = problem.arguments(x, at_zero, None, 0.0)
+    slope = components.components(player.derivative(problem, problem.drift, j), *arguments, dtype=dtype)
+    return [
+        jnp.where(slope[i] != 0, -offset[i] / jnp.where(slope[i] != 0, slope[i], 1), base[j]) for i in player.driven[j]
+    ]
+
+
+def _where(condition: jax.Array, action: list, otherwise: list) -> list:
+    return [jnp.where(condition, new, old) for new, old in zip(action, otherwise, strict=True)]
+
+
+def _contains(choices: Any, action: list) -> Any:
+    """Where an action with an entry a node lies in a box or a ball."""
+    if isinstance(choices, Ball):
+        return sum(u * u for u in action) <= choices.radius**2
+    return functools.reduce(
+        jnp.logical_and, ((u >= choices.lo[j]) & (u <= choices.hi[j]) for j, u in enumerate(action))
+    )

@@ -20,7 +20,6 @@ from hjbjax.geometry.lyapunov import lyapunov_check
 from hjbjax.iteration.methods import Nested, PolicyIteration, ValueIteration
 from hjbjax.iteration.relaxation import Direct, Krylov, Sweeps
 from hjbjax.iteration.time_stepping import Explicit, Implicit
-from hjbjax.problem.components import FallbackWarning
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import Ball, Box, Finite
@@ -32,6 +31,7 @@ from hjbjax.solvers.batch import solve_batch
 from hjbjax.solvers.finite_horizon import march
 from hjbjax.solvers.setup import SolveWarning
 from hjbjax.solvers.stationary import solve
+from hjbjax.tracing.components import FallbackWarning
 
 __all__ = [
     "Ball",

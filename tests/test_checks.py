@@ -8,8 +8,8 @@ from questions import GRID, U, accepted, drift, in_disc, refused
 
 from hjbjax import Grid, Problem
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.problem import checks
 from hjbjax.problem.pytree import node
+from hjbjax.tracing import checks
 
 # --- shapes ---
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
-from hjbjax.problem import closures
+from hjbjax.tracing import closures
 
 UNIT = hjb.Box([-1.0], [1.0])
 LINE = hjb.Grid([-1.0], [1.0], (11,))

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
-from hjbjax.problem import checks
 from hjbjax.solution.status import Status
 from hjbjax.solvers import epochs, host_loop
+from hjbjax.tracing import checks
 
 U = hjb.Box([-1.0], [1.0])
 GRID = hjb.Grid([-1.0], [1.0], (9,))

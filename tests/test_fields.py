@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hjbjax import Grid
-from hjbjax.problem import components
+from hjbjax.tracing import components
 
 RISE = np.arange(16.0).reshape(4, 4) / 7
 TABLE = np.linspace(-1.5, 1.5, 9)

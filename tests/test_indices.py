@@ -8,7 +8,7 @@ from questions import U, drift, refused
 
 import hjbjax as hjb
 from hjbjax import zoo
-from hjbjax.problem import checks, indices
+from hjbjax.tracing import checks, indices
 
 ALONG = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (5, 5))
 TABLE = np.array([1.0, 2.0, 3.0])

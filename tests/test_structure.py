@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hjbjax.problem import dependence
 from hjbjax.problem.pytree import as_partial, node
+from hjbjax.tracing import dependence
 
 MATRIX = np.array([[1.0, 2.0], [0.5, -1.0]])
 ARGUMENTS = ((3, False), (2, True))  # a state of three entries, a control of two

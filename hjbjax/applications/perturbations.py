@@ -22,7 +22,6 @@ from hjbjax.applications.l2_gain import attenuation, saturation
 from hjbjax.applications.reference import mask_of
 from hjbjax.discretisation.schemes import Limited, Scheme
 from hjbjax.iteration.methods import Method
-from hjbjax.problem import checks
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box
@@ -30,6 +29,7 @@ from hjbjax.solution.clock import Clock, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
 from hjbjax.solvers.stationary import check_arguments, solve
+from hjbjax.tracing import checks
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

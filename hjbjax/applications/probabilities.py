@@ -20,8 +20,6 @@ from hjbjax.applications import exit_problems
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.finiteness import attainability, node_checks
 from hjbjax.iteration.methods import ValueIteration
-from hjbjax.problem import checks
-from hjbjax.problem.components import FallbackWarning
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, is_traced
@@ -29,6 +27,8 @@ from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solvers import memory
 from hjbjax.solvers.finite_horizon import march
 from hjbjax.solvers.stationary import as_dtype, check_arguments, solve
+from hjbjax.tracing import checks
+from hjbjax.tracing.components import FallbackWarning
 
 TOL = 1e-6
 

@@ -27,10 +27,10 @@ from hjbjax.discretisation import decision_process, edges, stationary_law, stenc
 from hjbjax.discretisation.cut_cells import links
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.discretisation.stencil import Links
-from hjbjax.problem import checks, components
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import cast, node
+from hjbjax.tracing import checks, components
 
 Offset = tuple[int, ...]
 

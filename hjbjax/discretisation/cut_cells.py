@@ -14,9 +14,9 @@ import jax.numpy as jnp
 
 from hjbjax.discretisation import stencil
 from hjbjax.discretisation.stencil import Links
-from hjbjax.problem import components
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
+from hjbjax.tracing import components
 
 SHORTEST = 1e-2  # of a spacing: a shorter link would only make the rates large
 ROUNDINGS = 8  # units of eps of the largest coordinate: a distance made of a few operations

@@ -11,10 +11,10 @@ import jax
 import numpy as np
 
 from hjbjax.discretisation import cut_cells, stationary_law, stencil
-from hjbjax.problem import components
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import AdmissibleSet, Finite
+from hjbjax.tracing import components
 
 Offsets = tuple[tuple[int, ...], ...]
 Table = tuple[Offsets, Sequence[Any], Any, np.ndarray]

@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation import stencil
-from hjbjax.problem import components, dependence
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
+from hjbjax.tracing import components, dependence
 
 PLANES = 5  # coordinates of an axis at which the size of the drift is looked at, for the count of what is cut
 ROUNDINGS = 256  # units of eps in parts of a drift: what its formula may leave where they cancel

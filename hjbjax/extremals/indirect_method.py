@@ -16,13 +16,13 @@ from hjbjax.extremals import continuation, equilibria, initial_guess, switching
 from hjbjax.extremals.boundary_value import Closing, Law, TwoPoint
 from hjbjax.extremals.necessary_conditions import Extremal
 from hjbjax.hamiltonian.pointwise import rule_of
-from hjbjax.problem import checks
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, is_traced, node
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solution.solution import SolveError
 from hjbjax.solution.status import Status
+from hjbjax.tracing import checks
 
 SETTLED = 12.0  # time constants of the loop near a rest that an infinite horizon is followed: what is left is e⁻¹²
 LONGEST = 20.0  # units of time that the loop of a solution is followed to a target without a guess of the time

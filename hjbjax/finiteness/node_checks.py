@@ -14,11 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation import chain, correlated_noise, cut_cells
-from hjbjax.problem import components, sets
-from hjbjax.problem.checks import OF_ACTION, STATE_COSTS, call
+from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.solution.clock import Clock
+from hjbjax.tracing import components
+from hjbjax.tracing.checks import OF_ACTION, STATE_COSTS, call
 
 ACTIONS = 33  # at most so many actions of one player are tried, 9 where both play; ends and middle are among them
 LOOK = 10**7  # nodes times actions between two looks at the clock: about a second of a drift with some sines

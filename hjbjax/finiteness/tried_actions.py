@@ -14,10 +14,11 @@ import numpy as np
 
 from hjbjax.discretisation import chain
 from hjbjax.hamiltonian.players import Player
-from hjbjax.problem import components, sets
+from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import Ball
+from hjbjax.tracing import components
 
 COMBINATIONS = 32  # of kinks of all inputs that are tried with one action
 SAMPLES = 33  # actions of a continuum that are tried

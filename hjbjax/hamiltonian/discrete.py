@@ -28,11 +28,12 @@ from hjbjax.hamiltonian import players
 from hjbjax.hamiltonian.piecewise import Kinked, inverse_root, kinked_ball, piecewise_input, piecewise_pair
 from hjbjax.hamiltonian.players import SAMPLES, Player, Setting, shared
 from hjbjax.hamiltonian.search import UNROLL, Action, best_of, enumerate_actions, refine
-from hjbjax.problem import components, sets
+from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite
+from hjbjax.tracing import components
 
 INNER = 8  # evaluations written out of a search inside a search: with all 33 XLA gets up to five times the lines
 

@@ -14,9 +14,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax.problem import dependence
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite
+from hjbjax.tracing import dependence
 
 SAMPLES = 33  # points of a continuum before refinement
 CELLS = {1: 64, 2: 16}  # by the inputs of a group: combinations of pieces that are tried at most

@@ -23,9 +23,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.hamiltonian.search import enumerate_actions, refine
-from hjbjax.problem.dependence import dependence
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import Ball, Box, Finite, samples, spacing
+from hjbjax.tracing.dependence import dependence
 
 BUDGET = 64  # samples that start a search
 NEWTON = 24  # steps for the multiplier of a ball, monotone and at last quadratic; an affine H needs none

@@ -20,10 +20,11 @@ from hjbjax.discretisation import chain, cut_cells, stencil
 from hjbjax.discretisation.chain import Rates
 from hjbjax.discretisation.schemes import Scheme
 from hjbjax.hamiltonian import discrete, players
-from hjbjax.problem import components, sets
+from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import node
+from hjbjax.tracing import components
 
 ROUNDING = 8  # units of eps in (Q + β)|V|, below which one action is no better than another
 

@@ -22,10 +22,10 @@ from hjbjax.hamiltonian import discrete
 from hjbjax.hamiltonian.players import setting
 from hjbjax.hamiltonian.search import Action
 from hjbjax.iteration import bellman
-from hjbjax.problem import dependence
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import node
+from hjbjax.tracing import dependence
 
 
 def optimise(

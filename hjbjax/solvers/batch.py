@@ -18,9 +18,7 @@ from hjbjax.finiteness import admissibility, node_checks
 from hjbjax.iteration import fixed_point
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import Method, Nested
-from hjbjax.problem import checks
 from hjbjax.problem.arguments import shown
-from hjbjax.problem.closures import with_settled_functions
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.solution.clock import CHUNK_SECONDS, CUT, Clock, Stopped, noting_interrupts
@@ -31,6 +29,8 @@ from hjbjax.solvers.host_loop import FIRST_NODES, imposed
 from hjbjax.solvers.result import closed, describe, finish, unstarted
 from hjbjax.solvers.setup import choose, prepare_on_host
 from hjbjax.solvers.stationary import as_dtype, check_arguments, sharpened
+from hjbjax.tracing import checks
+from hjbjax.tracing.closures import with_settled_functions
 
 CHUNK = 8  # steps between two looks at which lanes are done, at most
 

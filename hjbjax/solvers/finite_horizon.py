@@ -20,8 +20,7 @@ from hjbjax.iteration import bellman, time_stepping
 from hjbjax.iteration.methods import PolicyIteration
 from hjbjax.iteration.relaxation import Krylov, Sweeps
 from hjbjax.iteration.time_stepping import Explicit, Implicit, March
-from hjbjax.problem import arguments, checks
-from hjbjax.problem.closures import with_settled_functions
+from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, cast, is_traced
@@ -33,6 +32,8 @@ from hjbjax.solvers import epochs, faults, memory
 from hjbjax.solvers.result import closed, unstarted
 from hjbjax.solvers.setup import choose
 from hjbjax.solvers.stationary import as_dtype, check_node_values
+from hjbjax.tracing import checks
+from hjbjax.tracing.closures import with_settled_functions
 
 PROBES = 33  # times at which a given step, and constrained ends, are held against a time-dependent problem
 FEWEST = 100  # steps where no stability limit is known for all of them: implicit, time-dependent, rates by samples

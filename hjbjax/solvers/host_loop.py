@@ -17,10 +17,10 @@ import numpy as np
 from hjbjax.iteration import fixed_point
 from hjbjax.iteration.fixed_point import HISTORY, State, Task
 from hjbjax.iteration.relaxation import Direct, Krylov
-from hjbjax.problem import checks
 from hjbjax.solution.clock import CHUNK_SECONDS, CUT, Clock
 from hjbjax.solution.status import Status
 from hjbjax.solvers import faults
+from hjbjax.tracing import checks
 
 FIRST_NODES = 20_000  # a first chunk steps over about so many nodes
 MANY_NODES = 2_000_000  # beyond which the look at the guess is a chunk of its own: a step may take many times as long

@@ -17,9 +17,9 @@ from hjbjax.iteration.relaxation import Sweeps
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered
+from hjbjax.solution import transfer
 from hjbjax.solution.clock import Clock, Stopped
 from hjbjax.solution.status import Status
-from hjbjax.solvers import transfer
 from hjbjax.solvers.host_loop import drive
 from hjbjax.solvers.setup import Verdict, forced_only, held_jit, judge, linear_solve, prepare_jit
 

@@ -19,11 +19,11 @@ from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.fixed_point import Task
 from hjbjax.iteration.methods import Method, Nested, PolicyIteration, ValueIteration
 from hjbjax.iteration.relaxation import Direct, Krylov, Sweeps
-from hjbjax.problem import checks
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_discounted
 from hjbjax.problem.pytree import cast
 from hjbjax.solution.clock import Clock
+from hjbjax.tracing import checks
 
 
 class SolveWarning(UserWarning):

@@ -18,18 +18,20 @@ from hjbjax.iteration import adjoint, fixed_point
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import Method, Nested, PolicyIteration, ValueIteration
-from hjbjax.problem import arguments, checks
-from hjbjax.problem.closures import with_settled_functions
+from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_discounted
 from hjbjax.problem.pytree import altered, is_traced
+from hjbjax.solution import transfer
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
-from hjbjax.solvers import faults, memory, nested, transfer
+from hjbjax.solvers import faults, memory, nested
 from hjbjax.solvers.host_loop import drive
 from hjbjax.solvers.result import assemble, closed, describe, finish, unstarted
 from hjbjax.solvers.setup import Verdict, choose, is_constrained, prepare_on_host, prepare_traced
+from hjbjax.tracing import checks
+from hjbjax.tracing.closures import with_settled_functions
 
 TRACED_STEPS = 10_000
 

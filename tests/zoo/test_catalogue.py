@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from hjbjax import zoo
-from hjbjax.problem import components
 from hjbjax.problem.sets import Ball, Finite
+from hjbjax.tracing import components
 
 ENTRIES = list(zoo.catalogue.values())
 WITH_ANSWER = [entry for entry in ENTRIES if entry.exact is not None]

@@ -21,9 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core as jex
 
-from hjbjax.problem import indices
-from hjbjax.problem.primitives import CALLS, CUMULATIVE, ENTRYWISE, IN_NUMPY, MOVES, REDUCTIONS, SCATTERS
 from hjbjax.problem.problem import Problem
+from hjbjax.tracing import indices
+from hjbjax.tracing.primitives import CALLS, CUMULATIVE, ENTRYWISE, IN_NUMPY, MOVES, REDUCTIONS, SCATTERS
 
 
 class FallbackWarning(UserWarning):

@@ -11,10 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.problem import indices, sets
+from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import remembered
+from hjbjax.tracing import indices
 
 OF_ACTION = ("drift", "cost", "noise")
 STATE_COSTS = ("exit_cost", "terminal_cost", "stopping_cost", "running_max")

@@ -16,8 +16,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from hjbjax.problem import components
 from hjbjax.problem.pytree import remembered
+from hjbjax.tracing import components
 
 Term = tuple[int, ...] | frozenset[int]  # a product of at most two inputs, or some function of these inputs
 Terms = frozenset

@@ -37,6 +37,22 @@ def test_the_inverse_map(strength, center, fraction):
         assert float(stretching.fraction(stretching.place(fraction))) == pytest.approx(fraction, abs=1e-8)
 
 
+@settings(max_examples=50, deadline=None)
+@given(st.floats(0.3, 8), st.floats(0, 1), st.floats(-3, 0), st.floats(0.5, 6), st.sampled_from(["float64", "float32"]))
+def test_every_program_finds_the_nodes_where_they_are_to_a_few_roundings(strength, center, lo, length, dtype):
+    """A node that moved by more from program to program would lie in a target in one and not in another."""
+    k, c = np.longdouble(strength), np.longdouble(center)
+    middle = np.log((1 - c + c * np.exp(k)) / (1 - c + c * np.exp(-k))) / (2 * k)
+    low, high = np.sinh(k * middle), np.sinh(k * (1 - middle))
+    exact = lo + length * (np.sinh(k * (np.arange(21) / np.longdouble(20) - middle)) + low) / (low + high)
+    grid = hjb.Grid([lo], [lo + length], (21,), stretch=(hjb.Sinh(strength, center),))
+    with jax.enable_x64(True):
+        compiled = jax.jit(lambda grid: grid.axis(0))(jax.tree.map(lambda entry: np.asarray(entry, dtype), grid))
+    few = 9 * max(-lo, lo + length)
+    np.testing.assert_allclose(np.asarray(grid.axis(0)), exact.astype(float), rtol=0, atol=few * np.finfo(float).eps)
+    np.testing.assert_allclose(compiled, exact.astype(float), rtol=0, atol=few * np.finfo(dtype).eps)
+
+
 def test_a_node_in_the_middle_is_exactly_zero():
     grid = hjb.Grid([-3.7], [3.7], (41,), stretch=(hjb.Sinh(5.0),))
     assert grid.axis(0)[20] == 0.0

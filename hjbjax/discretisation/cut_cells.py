@@ -19,7 +19,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.tracing import components
 
 SHORTEST = 1e-2  # of a spacing: a shorter link would only make the rates large
-ROUNDINGS = 8  # units of eps of the largest coordinate: a distance made of a few operations
+ROUNDINGS = 16  # units of eps of the largest coordinate: 6 of a stretched axis, and a distance made of a few operations
 
 
 def level(problem: Problem, grid: Grid, dtype: Any, t: Any = 0.0) -> jax.Array:

@@ -41,7 +41,8 @@ class Sinh:
 
     def _frame(self, xp: Any) -> tuple[Any, Any, Any]:
         k, c = self.strength, self.center
-        middle = xp.arctanh(c * xp.sinh(k) / (1 - c + c * xp.cosh(k))) / k
+        # tanh κξ₀ = c sinh κ/(1 − c + c cosh κ) may be near 1, where arctanh loses up to e^(2κ) units in the last place
+        middle = xp.log((1 - c + c * xp.exp(k)) / (1 - c + c * xp.exp(-k))) / (2 * k)
         middle = xp.where(c == 0.5, 0.5, middle)  # to the last bit, so that a node stands exactly there
         below, above = xp.sinh(k * middle), xp.sinh(k * (1 - middle))
         return middle, below, above

@@ -109,12 +109,12 @@ def _axis(lo, hi, count, periodic, stretching):
     last = count if periodic else count - 1
     place = np.arange(count)
     if stretching is not None:  # sinh with its inflection so placed that the centre is mapped onto itself
-        k, center = stretching
+        k, center = map(np.longdouble, stretching)  # arctanh near 1 would leave little of a double
         middle = 0.5 if center == 0.5 else np.arctanh(center * np.sinh(k) / (1 - center + center * np.cosh(k))) / k
         place = place / last
         low, high = np.sinh(k * middle), np.sinh(k * (1 - middle))
         place = last * (np.sinh(k * (place - middle)) + low) / (low + high)
-    return (lo * (last - place) + hi * place) / last
+    return np.asarray((lo * (last - place) + hi * place) / last, float)
 
 
 def _set(kind, rng):

@@ -1,6 +1,6 @@
 """``python -m benchmarks NAME [options]`` runs one benchmark; without a name it lists them.
 
-A benchmark is a file here with a click command called ``command``, and its name in ``NAMES``.
+A benchmark is a file of ``speed`` or ``accuracy`` with a click command called ``command``; ``NAMES`` says in which.
 """
 
 import difflib
@@ -9,17 +9,20 @@ import sys
 from collections.abc import Sequence
 
 NAMES = {
-    "accuracy": "errors, orders and seconds over the zoo's problems with known answers",
-    "sweep": "node-controls per second of one sweep, against numba and the copy bandwidth",
-    "peers": "a certified solve beside QuantEcon, mdpsolver and a hand-written numba solver",
-    "growth": "seconds, steps and bytes a node of certified solves on finer and finer grids",
-    "scaling": "the N^n law: seconds, steps and bytes a node in one to six dimensions",
-    "controls": "seconds against the number of controls and against the error: O(1/ε^{2n+m}) and less",
-    "batch": "solve_batch of pendulums of different mass, against one after the other",
-    "startup": "from process start to pictures, cold and with the compile cache",
-    "precision": "error against seconds: what second order is worth",
-    "march": "marching beside hj_reachability: seconds and bytes at equal scheme",
-    "bounds": "random problems beside a dense solver: which certified bounds hold, and how tight they are",
+    "accuracy": ("accuracy", "errors, orders and seconds over the zoo's problems with known answers"),
+    "sweep": ("speed", "node-controls per second of one sweep, against numba and the copy bandwidth"),
+    "peers": ("speed", "a certified solve beside QuantEcon, mdpsolver and a hand-written numba solver"),
+    "growth": ("speed", "seconds, steps and bytes a node of certified solves on finer and finer grids"),
+    "scaling": ("speed", "the N^n law: seconds, steps and bytes a node in one to six dimensions"),
+    "controls": ("speed", "seconds against the number of controls and against the error: O(1/ε^{2n+m}) and less"),
+    "batch": ("speed", "solve_batch of pendulums of different mass, against one after the other"),
+    "startup": ("speed", "from process start to pictures, cold and with the compile cache"),
+    "precision": ("accuracy", "error against seconds: what second order is worth"),
+    "march": ("speed", "marching beside hj_reachability: seconds and bytes at equal scheme"),
+    "bounds": (
+        "accuracy",
+        "random problems beside a dense solver: which certified bounds hold, and how tight they are",
+    ),
 }
 
 
@@ -27,14 +30,15 @@ def main(arguments: Sequence[str]) -> None:
     name, *rest = arguments or ("--help",)
     if name in ("-h", "--help"):
         print("usage: python -m benchmarks NAME [options]\n")
-        print("\n".join(f"  {each:12} {summary}" for each, summary in NAMES.items()))
+        print("\n".join(f"  {each:12} {summary}" for each, (_, summary) in NAMES.items()))
         return
     if name not in NAMES:
         near = difflib.get_close_matches(name, NAMES, 1)
         hint = f"; did you mean {near[0]}?" if near else ""
         print(f"benchmarks: got {name!r}, wanted one of {', '.join(NAMES)}{hint}", file=sys.stderr)
         raise SystemExit(2)
-    importlib.import_module(f"benchmarks.{name}").command.main(rest, prog_name=f"python -m benchmarks {name}")
+    module = importlib.import_module(f"benchmarks.{NAMES[name][0]}.{name}")
+    module.command.main(rest, prog_name=f"python -m benchmarks {name}")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The benchmarks at small sizes: what they compare agrees, every row is complete, every floor has its line."""
+"""The benchmarks at small sizes: what they compare agrees, every row is complete, every threshold has its line."""
 
 import functools
 import json
@@ -12,8 +12,10 @@ import pytest
 from click.testing import CliRunner
 
 import hjbjax as hjb
-from benchmarks import batch, controls, floors, footprint, growth, peers, questions, scaling, startup, sweep, timing
+from benchmarks import cases
 from benchmarks.__main__ import NAMES
+from benchmarks.harness import footprint, thresholds, timing
+from benchmarks.speed import batch, controls, growth, peers, scaling, startup, sweep
 from hjbjax.problem.pytree import cast
 
 COMPLETE = {"benchmark", "device", "dtype", "versions", "date", "cores", "status"}
@@ -33,12 +35,12 @@ def rows_of(benchmark, folder, *options):
 
 def test_every_name_leads_to_a_command():
     for module in (sweep, peers, growth, scaling, controls, batch, startup):
-        name = module.__name__.removeprefix("benchmarks.")
-        assert NAMES[name]
+        _, folder, name = module.__name__.split(".")
+        assert NAMES[name][0] == folder
         assert CliRunner().invoke(module.command, ["--help"]).exit_code == 0
 
 
-# --- timing and floors ---
+# --- timing and thresholds ---
 
 
 def test_candidates_take_turns_and_what_comes_before_is_not_timed():
@@ -63,15 +65,15 @@ def test_ratios_are_taken_round_by_round():
 
 
 @pytest.mark.parametrize(("measured", "met"), [(1.5, True), (1.49, False), (math.nan, False)])
-def test_a_floor_is_met_or_missed(measured, met, capsys):
-    (row,) = floors.announced({"sweep 1024": measured}, "sweep")
+def test_a_threshold_is_met_or_missed(measured, met, capsys):
+    (row,) = thresholds.announced({"sweep 1024": measured}, "sweep")
     assert capsys.readouterr().out.endswith("met\n" if met else "MISSED\n")
     assert row["status"] == ("MET" if met else "MISSED")
 
 
-def test_a_floor_from_above():
-    assert floors.FLOORS["growth"].met(24.0)
-    assert not floors.FLOORS["growth"].met(24.1)
+def test_a_threshold_from_above():
+    assert thresholds.THRESHOLDS["growth"].met(24.0)
+    assert not thresholds.THRESHOLDS["growth"].met(24.1)
 
 
 # --- sweep ---
@@ -79,7 +81,7 @@ def test_a_floor_from_above():
 
 @pytest.mark.parametrize("shape", [(6,), (5, 4), (4, 3, 4), pytest.param((3, 3, 3, 4), marks=pytest.mark.slow)])
 def test_the_timed_sweep_is_that_of_the_exported_chain(shape):
-    problem, grid = questions.integrators(shape)
+    problem, grid = cases.integrators(shape)
     value = np.random.default_rng(0).uniform(-1, 1, shape)
     costs, probabilities, _, _, factor = hjb.chain.transition_arrays(problem, grid)
     dt = (1 / factor - 1) / problem.discount
@@ -97,7 +99,7 @@ def test_the_timed_sweep_is_that_of_the_exported_chain(shape):
 @pytest.mark.slow
 def test_a_sweep_is_compared_with_the_peer_before_it_is_timed(monkeypatch):
     pytest.importorskip("numba")
-    problem, grid = questions.pendulum(32, 21)
+    problem, grid = cases.pendulum(32, 21)
     points = np.ascontiguousarray(problem.controls.points[:, 0], np.float32)
     assert 0 < sweep.largest_difference(problem, grid, points) <= sweep.AGREE
     ours = sweep.sweep
@@ -107,7 +109,7 @@ def test_a_sweep_is_compared_with_the_peer_before_it_is_timed(monkeypatch):
 
 
 def test_sweep_kernels_compute_what_a_step_of_value_iteration_does():
-    problem, grid = questions.pendulum(16, 5)
+    problem, grid = cases.pendulum(16, 5)
     calls = sweep.candidates(problem, grid, 3)
     iterated = hjb.solve(
         problem, grid, method=hjb.ValueIteration(), guess=np.asarray(sweep.started(grid)),
@@ -122,7 +124,7 @@ def test_six_dimensions_need_little_beside_the_values():
     for row in sweep.in_six_dimensions():
         word = np.dtype(row["dtype"]).itemsize
         assert row["bytes_per_node"] == row["bytes_beyond"] + 2 * word
-        assert word <= row["bytes_beyond"] <= floors.FLOORS["sweep 6-D"].bound
+        assert word <= row["bytes_beyond"] <= thresholds.THRESHOLDS["sweep 6-D"].bound
 
 
 def test_sizes_are_fitted_to_the_machine(monkeypatch):
@@ -172,7 +174,7 @@ def test_a_peer_that_is_not_there_is_skipped(tmp_path, monkeypatch):
 
 
 def test_bytes_of_a_solve_hold_at_least_what_it_keeps():
-    problem, grid = questions.pendulum(30, 5)
+    problem, grid = cases.pendulum(30, 5)
     double, single = (footprint.of_solve(problem, grid, 1e-3, dtype=kind) for kind in (np.float64, np.float32))
     assert double["bytes_per_node"] > single["bytes_per_node"] > 2 * (4 + 4 + 4)  # value, rate and control, twice
 
@@ -207,7 +209,7 @@ def test_growth_is_the_median_of_the_rounds():
 
 def test_the_value_of_states_apart_is_a_sum():
     line = np.array([1.0, 2.0])
-    np.testing.assert_array_equal(questions.sum_over_axes(line, 2), [[2.0, 3.0], [3.0, 4.0]])
+    np.testing.assert_array_equal(cases.sum_over_axes(line, 2), [[2.0, 3.0], [3.0, 4.0]])
 
 
 @pytest.mark.slow

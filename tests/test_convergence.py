@@ -299,7 +299,7 @@ def test_benchmarks_are_listed_and_a_wrong_name_is_refused(capsys):
 
 
 def test_a_measurement_that_fails_is_a_row_and_json_has_no_nan(tmp_path):
-    from benchmarks import report
+    from benchmarks.harness import report
 
     def fail():
         raise ValueError("no\nsuch thing")
@@ -321,7 +321,7 @@ def test_a_measurement_that_fails_is_a_row_and_json_has_no_nan(tmp_path):
 
 @pytest.mark.slow
 def test_the_control_that_the_peer_marches_with_is_the_best_one():
-    from benchmarks import marching
+    from benchmarks.peers import stationary_march
 
     rng = np.random.default_rng(0)
     for name, entry in zoo.catalogue.items():
@@ -337,8 +337,8 @@ def test_the_control_that_the_peer_marches_with_is_the_best_one():
             else:
                 samples = rng.uniform(problem.controls.lo, problem.controls.hi, samples.shape)
             scan = jax.vmap(lambda u: problem.cost(x, u) + p @ problem.drift(x, u))(jnp.asarray(samples)).min()  # noqa: B023
-            got = marching.rate(problem, x, 0.0, p)
-            u = marching.best(problem, x, p)
+            got = stationary_march.rate(problem, x, 0.0, p)
+            u = stationary_march.best(problem, x, p)
             assert float(got) <= scan + 1e-5, name
             assert float(got) == pytest.approx(float(problem.cost(x, u) + p @ problem.drift(x, u)), abs=1e-5)
             if ball:

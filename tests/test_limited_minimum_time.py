@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
-from benchmarks import questions
+from benchmarks import cases
 from hjbjax import zoo
 
 pytestmark = pytest.mark.slow  # 161 x 161 nodes, and every problem twice
@@ -18,7 +18,7 @@ PLAIN = hjb.Upwind(central=False)
 @functools.cache
 def solved(n, scheme):
     exact = zoo.double_integrator_exact()
-    problem, grid = questions.double_integrator(n)
+    problem, grid = cases.double_integrator(n)
     solution = hjb.solve(problem, grid, scheme=scheme, tol=1e-6)
     with jax.enable_x64(True):
         known = jax.jit(jax.vmap(exact))(grid.nodes().reshape(-1, 2))

@@ -20,9 +20,10 @@ import click
 import numpy as np
 
 import hjbjax as hjb
-from benchmarks import floors, footprint, questions
-from benchmarks.report import RESULTS, attempt, publish, table
-from benchmarks.timing import interleaved, timed
+from benchmarks import cases
+from benchmarks.harness import footprint, thresholds
+from benchmarks.harness.report import RESULTS, attempt, publish, table
+from benchmarks.harness.timing import interleaved, timed
 from hjbjax.applications.convergence import fitted_order
 
 COLUMNS = (
@@ -34,7 +35,7 @@ FITTED = 10_000
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """A family of questions by one number, the sizes at which it is asked, quick ones apart, and the tolerance.
+    """A family of cases by one number, the sizes at which it is asked, quick ones apart, and the tolerance.
 
     ``repeats`` is how often each is solved once it is compiled.
     """
@@ -48,10 +49,10 @@ class Case:
 
 
 CASES = (
-    Case("pendulum", questions.pendulum, (100, 200, 400, 800, 1600), (16, 32), 1e-3, repeats=9),
-    Case("dubins", lambda n: questions.dubins(n, 1.0), (24, 50, 100), (10, 12), 1e-3),
-    Case("dubins undiscounted", lambda n: questions.dubins(n, 0.0), (24, 50, 100), (10, 12), 1e-3),
-    Case("manipulator", questions.manipulator, (14, 20, 28, 40), (4, 6), 1e-2),
+    Case("pendulum", cases.pendulum, (100, 200, 400, 800, 1600), (16, 32), 1e-3, repeats=9),
+    Case("dubins", lambda n: cases.dubins(n, 1.0), (24, 50, 100), (10, 12), 1e-3),
+    Case("dubins undiscounted", lambda n: cases.dubins(n, 0.0), (24, 50, 100), (10, 12), 1e-3),
+    Case("manipulator", cases.manipulator, (14, 20, 28, 40), (4, 6), 1e-2),
 )
 
 
@@ -95,7 +96,7 @@ def fit(rows: list[dict[str, Any]]) -> None:
 
 
 def judged(rows: list[dict[str, Any]]) -> dict[str, float]:
-    """The figures of the floors that these rows hold."""
+    """The figures of the thresholds that these rows hold."""
     found = {(row["problem"], row["shape"][0]): row for row in rows if row["status"] == "CONVERGED"}
     figures = {}
     if {("pendulum", 400), ("pendulum", 1600)} <= set(found):
@@ -142,5 +143,5 @@ def command(
         click.echo(table(mine, COLUMNS) + "\n")
         rows += mine
     figures = judged([row for row in rows if "nodes" in row])
-    rows += floors.announced(figures, "growth")
+    rows += thresholds.announced(figures, "growth")
     publish(out, "growth", rows, panel="problem", line="benchmark", x=("nodes",), y="seconds")

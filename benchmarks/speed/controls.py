@@ -18,10 +18,9 @@ import click
 import numpy as np
 
 import hjbjax as hjb
-from benchmarks import questions
-from benchmarks.accuracy import inner
-from benchmarks.report import RESULTS, attempt, picture, stamped, table, write_json
-from benchmarks.timing import interleaved
+from benchmarks import cases
+from benchmarks.harness.report import RESULTS, attempt, picture, stamped, table, write_json
+from benchmarks.harness.timing import interleaved
 from hjbjax.applications.convergence import fitted_order
 from hjbjax.applications.reference import at_nodes_of, mask_of
 
@@ -32,21 +31,21 @@ COLUMNS = (
 TOL = 1e-5  # well below the errors of the grids
 
 
-def solved(questions_: dict[str, tuple[Any, Any]], repeats: int) -> dict[str, tuple[hjb.Solution, dict[str, Any]]]:
-    """The solution and the timing of each question, all in turn."""
+def solved(problems: dict[str, tuple[Any, Any]], repeats: int) -> dict[str, tuple[hjb.Solution, dict[str, Any]]]:
+    """The solution and the timing of each problem, all in turn."""
     solutions: dict[str, hjb.Solution] = {}
 
     def call(name):
-        solutions[name] = hjb.solve(*questions_[name], tol=TOL, throw=False)
+        solutions[name] = hjb.solve(*problems[name], tol=TOL, throw=False)
 
-    _, timings = interleaved({name: lambda name=name: call(name) for name in questions_}, repeats)  # type: ignore[misc]
-    return {name: (solutions[name], timings[name].row) for name in questions_}
+    _, timings = interleaved({name: lambda name=name: call(name) for name in problems}, repeats)  # type: ignore[misc]
+    return {name: (solutions[name], timings[name].row) for name in problems}
 
 
 def by_number(nodes: int, counts: tuple[int, ...], repeats: int) -> list[dict[str, Any]]:
     """More and more torques on one grid of the pendulum, and all of them at once."""
-    asked = {str(count): questions.pendulum(nodes, count) for count in counts}
-    found = solved(asked | {"exact": questions.pendulum(nodes, None)}, repeats)
+    asked = {str(count): cases.pendulum(nodes, count) for count in counts}
+    found = solved(asked | {"exact": cases.pendulum(nodes, None)}, repeats)
     limit = found["exact"][0].value
     rows = []
     for name, (solution, timing) in found.items():
@@ -64,7 +63,7 @@ def by_error(sizes: tuple[int, ...], repeats: int) -> list[dict[str, Any]]:
     for nodes in sizes:
         problem, grid = entry.build(shape=(nodes, nodes))
         sampled = dataclasses.replace(problem, controls=problem.controls.grid(nodes))
-        mask = mask_of(inner, grid)
+        mask = mask_of(cases.inner, grid)
         exact = at_nodes_of(entry.exact(), grid, mask)  # type: ignore[misc]
         for name, (solution, timing) in solved({"sampled": (sampled, grid), "exact": (problem, grid)}, repeats).items():
             error = float(np.max(np.abs(solution.value - exact)[mask]))

@@ -16,7 +16,7 @@ from typing import Any
 
 import click
 
-RESULTS = Path(__file__).parent / "results"
+RESULTS = Path(__file__).parents[1] / "results"
 PACKAGES = ("jax", "numpy", "scipy", "hj-reachability", "quantecon", "numba", "mdpsolver", "scikit-fmm")
 
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import hjbjax as hjb
-from benchmarks.report import RESULTS, attempt, publish, table
+from benchmarks.harness.report import RESULTS, attempt, publish, table
 from hjbjax.iteration import time_stepping
 from hjbjax.solvers import epochs, finite_horizon
 

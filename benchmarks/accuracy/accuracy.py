@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import click
-import jax.numpy as jnp
 import numpy as np
 
 import hjbjax as hjb
-from benchmarks import marching
-from benchmarks.report import RESULTS, attempt, publish, table
+from benchmarks.cases import inner
+from benchmarks.harness.report import RESULTS, attempt, publish, table
+from benchmarks.peers import stationary_march
 from hjbjax.applications.convergence import fitted_order
 from hjbjax.applications.reference import at_nodes_of, distance, mask_of, mean_spacing
 from hjbjax.zoo import catalogue
@@ -22,11 +22,6 @@ from hjbjax.zoo import catalogue
 COLUMNS = ("problem", "scheme", "shape", "h", "error", "mean_error", "order", "seconds", "compile_seconds", "status")
 SCHEMES = (hjb.Upwind(), hjb.Limited())
 HORIZON, TIME_LIMIT = 40.0, 60.0  # of hj_reachability's march: units of the problem's time, and seconds
-
-
-def inner(x: Any) -> Any:
-    """Where the value of "smooth" is free of the edge."""
-    return (jnp.abs(x[0]) <= 0.5) & (jnp.abs(x[1]) <= 0.45)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,7 +40,7 @@ class Case:
     def name(self) -> str:
         return " ".join([self.entry, *(f"{key}={value:.3g}" for key, value in self.parameters)])
 
-    def questions(self, nodes: Sequence[int]) -> tuple[Any, list[Any], Any]:
+    def build(self, nodes: Sequence[int]) -> tuple[Any, list[Any], Any]:
         """The problem, its grids and its exact value."""
         entry, options = catalogue[self.entry], dict(self.parameters)
         dim = entry.build(**options)[1].ndim
@@ -72,18 +67,18 @@ CASES = (
 
 def ours(case: Case, nodes: Sequence[int], scheme: Any, tol: float) -> list[dict[str, Any]]:
     """One row a grid from ``convergence_study``."""
-    problem, grids, exact = case.questions(nodes)
+    problem, grids, exact = case.build(nodes)
     study = hjb.convergence_study(problem, grids, exact, scheme=scheme, tol=tol, region=case.region)
     return [{**row, "order": study.order, "mean_order": study.mean_order, "tol": tol} for row in study.rows]
 
 
 def marched(problem: Any, grids: Sequence[Any], exact: Any, *, tol: float, region: Any = None) -> list[dict[str, Any]]:
     """One row a grid from hj_reachability, or one row with the reason why there is none."""
-    if reason := marching.obstacle(problem, grids[0]):
+    if reason := stationary_march.obstacle(problem, grids[0]):
         return [{"status": "SKIPPED", "reason": reason}]
     rows = []
     for grid in grids:
-        run = marching.march(problem, grid, exact, tol=tol, horizon=HORIZON, time_limit=TIME_LIMIT)
+        run = stationary_march.march(problem, grid, exact, tol=tol, horizon=HORIZON, time_limit=TIME_LIMIT)
         mask = mask_of(region, grid)
         off = distance(run.pop("value"), at_nodes_of(exact, grid, mask))[mask]
         error, mean = float(np.max(off)), float(np.mean(off))
@@ -108,7 +103,7 @@ def measure(cases: Sequence[Case], *, quick: bool, tol: float) -> list[dict[str,
             label = {"code": "hjbjax", "scheme": type(scheme).__name__, "options": str(scheme)}
             found += attempt(lambda scheme=scheme: ours(case, nodes, scheme, tol), about | label)  # noqa: B023
         label = {"code": "hj_reachability", "scheme": "hj_reachability very_high"}
-        found += attempt(lambda: marched(*case.questions(nodes), tol=tol, region=case.region), about | label)  # noqa: B023
+        found += attempt(lambda: marched(*case.build(nodes), tol=tol, region=case.region), about | label)  # noqa: B023
         click.echo(table([row for row in found if "shape" in row], COLUMNS))
         for row in found:
             if "reason" in row:

@@ -13,12 +13,12 @@ import numpy as np
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "oracles"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "oracles"))
 
 import agreement
 import random_problems
 
-from benchmarks.report import RESULTS, publish, table
+from benchmarks.harness.report import RESULTS, publish, table
 
 COLUMNS = ("problem", "count", "certified", "refused", "held", "unfinished", "tightest", "seconds")
 

@@ -13,9 +13,11 @@ import click
 import numpy as np
 
 import hjbjax as hjb
-from benchmarks import footprint, growth, questions
-from benchmarks.report import RESULTS, attempt, publish, table
-from benchmarks.timing import interleaved
+from benchmarks import cases
+from benchmarks.harness import footprint
+from benchmarks.harness.report import RESULTS, attempt, publish, table
+from benchmarks.harness.timing import interleaved
+from benchmarks.speed import growth
 
 COLUMNS = (
     "dimension", "shape", "nodes", "steps", "seconds", "compile_seconds", "microseconds_per_node", "bytes_per_node",
@@ -31,8 +33,8 @@ TOL = 1e-3
 
 def measure(dimension: int, nodes: int, repeats: int) -> list[dict[str, Any]]:
     """One row: a solve that compiles, ``repeats`` that do not, and the check of their value."""
-    problem, grid = questions.apart(dimension, nodes)
-    line = hjb.solve(*questions.apart(1, nodes), tol=TOL / dimension).value
+    problem, grid = cases.apart(dimension, nodes)
+    line = hjb.solve(*cases.apart(1, nodes), tol=TOL / dimension).value
     solutions: list[hjb.Solution] = []
 
     def call():
@@ -40,7 +42,7 @@ def measure(dimension: int, nodes: int, repeats: int) -> list[dict[str, Any]]:
 
     _, timings = interleaved({"hjbjax": call}, repeats)
     (solution,), timing = solutions, timings["hjbjax"]
-    off = float(np.max(np.abs(solution.value - questions.sum_over_axes(line, dimension))))
+    off = float(np.max(np.abs(solution.value - cases.sum_over_axes(line, dimension))))
     status = solution.status.name if off <= 2 * TOL else "DISAGREES"
     row = {"shape": list(grid.shape), "nodes": grid.size, "steps": solution.steps, "difference": off, "status": status}
     row |= timing.row | {"microseconds_per_node": 1e6 * timing.seconds / grid.size, "error": solution.error}

@@ -11,9 +11,10 @@ import click
 import numpy as np
 
 import hjbjax as hjb
-from benchmarks import floors, questions
-from benchmarks.report import RESULTS, attempt, publish, table
-from benchmarks.timing import interleaved
+from benchmarks import cases
+from benchmarks.harness import thresholds
+from benchmarks.harness.report import RESULTS, attempt, publish, table
+from benchmarks.harness.timing import interleaved
 
 COLUMNS = (
     "code", "shape", "lanes", "seconds", "compile_seconds", "solves_per_second", "throughput", "difference", "status",
@@ -24,9 +25,9 @@ MASSES = (0.5, 2.0)
 
 def measure(nodes: int, lanes: int, repeats: int) -> list[dict[str, Any]]:
     """Two rows: the batch, and the same problems one by one."""
-    problems, (_, grid) = [], questions.pendulum(nodes, None)
+    problems, (_, grid) = [], cases.pendulum(nodes, None)
     for mass in np.geomspace(*MASSES, lanes):
-        problems.append(questions.pendulum(nodes, None, float(mass))[0])
+        problems.append(cases.pendulum(nodes, None, float(mass))[0])
     solutions: dict[str, list[hjb.Solution]] = {}
 
     def together():
@@ -64,5 +65,5 @@ def command(quick: bool, lanes: int | None, nodes: int | None, repeats: int | No
     figures = {}
     if "throughput" in rows[0] and (rows[0]["shape"], lanes) == ([100, 101], 64):
         figures["batch"] = rows[0]["throughput"]
-    rows += floors.announced(figures, "batch")
+    rows += thresholds.announced(figures, "batch")
     publish(out, "batch", rows)

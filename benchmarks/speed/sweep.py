@@ -20,10 +20,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import hjbjax as hjb
-from benchmarks import floors, questions
-from benchmarks.footprint import bytes_of
-from benchmarks.report import RESULTS, attempt, publish, table, without
-from benchmarks.timing import interleaved
+from benchmarks import cases
+from benchmarks.harness import thresholds
+from benchmarks.harness.footprint import bytes_of
+from benchmarks.harness.report import RESULTS, attempt, publish, table, without
+from benchmarks.harness.timing import interleaved
 from hjbjax.iteration import bellman, fixed_point
 from hjbjax.problem.pytree import cast
 from hjbjax.solvers import host_loop, memory
@@ -131,21 +132,21 @@ def largest_difference(problem: Any, grid: hjb.Grid, points: np.ndarray) -> floa
 
 def candidates(problem: Any, grid: hjb.Grid, count: int) -> dict[str, Any]:
     """What is timed at one size, ``count`` sweeps a call."""
-    question = cast((problem, grid), KIND)
-    pace, value = paces(*question), started(grid)
+    case = cast((problem, grid), KIND)
+    pace, value = paces(*case), started(grid)
     again, looping = jnp.copy, [started(grid)]
 
     def looped():
-        looping[0] = several(looping[0], *question, pace, count)
+        looping[0] = several(looping[0], *case, pace, count)
         return looping[0]
 
     def improvements():
         for _ in range(count):
-            found = improve(*question, value)
+            found = improve(*case, value)
         return found
 
     return {
-        "sweep": turning(lambda old, new: one(old, *question, new, pace), again(value), again(value), count=count),
+        "sweep": turning(lambda old, new: one(old, *case, new, pace), again(value), again(value), count=count),
         "loop": looped,
         "improve": improvements,
         "copy": turning(copy, again(value), again(value), count=count),
@@ -172,7 +173,7 @@ def sweeps_per_call(grid: hjb.Grid) -> int:
 
 def against_numba(nodes: int, actions: int, repeats: int) -> list[dict[str, Any]]:
     """All kernels on nodes x nodes of the pendulum."""
-    problem, grid = questions.pendulum(nodes, actions)
+    problem, grid = cases.pendulum(nodes, actions)
     grid = hjb.Grid(grid.lo, grid.hi, (nodes, nodes), periodic=grid.periodic)
     points = np.ascontiguousarray(problem.controls.points[:, 0], KIND)
     count = sweeps_per_call(grid)
@@ -190,7 +191,7 @@ def against_numba(nodes: int, actions: int, repeats: int) -> list[dict[str, Any]
 
 def by_dimension(shape: tuple[int, ...], actions: int, repeats: int) -> list[dict[str, Any]]:
     """The kernels in any dimension, on the chain of integrators, with what they take in memory."""
-    problem, grid = questions.integrators(shape, actions)
+    problem, grid = cases.integrators(shape, actions)
     count = sweeps_per_call(grid)
     calls = candidates(problem, grid, count)
     _, timings = interleaved(calls, repeats)
@@ -217,12 +218,12 @@ def footprint(kernel: str, problem: Any, grid: hjb.Grid, dtype: Any = KIND) -> d
 
     Nothing is allocated: the arrays are shapes.
     """
-    question = cast((problem, grid), dtype)
+    case = cast((problem, grid), dtype)
     values = jax.ShapeDtypeStruct(grid.shape, dtype)
     if kernel == "sweep":
-        lowered = jax.jit(sweep).lower(*question, values, values)
+        lowered = jax.jit(sweep).lower(*case, values, values)
     elif kernel == "improve":
-        lowered = improve.lower(*question, values)
+        lowered = improve.lower(*case, values)
     else:
         return {}
     per_node = bytes_of(lowered) / grid.size
@@ -234,7 +235,7 @@ def in_six_dimensions() -> list[dict[str, Any]]:
     rows = []
     for dtype in (np.float32, np.float64):
         with jax.enable_x64(dtype is np.float64):
-            problem, grid = questions.integrators(SIX)
+            problem, grid = cases.integrators(SIX)
             row = {"kernel": "sweep", "shape": list(SIX), "nodes": grid.size, "controls": 3, "status": "DONE"}
             rows.append(row | {"dtype": np.dtype(dtype).name} | footprint("sweep", problem, grid, np.dtype(dtype)))
     return rows
@@ -251,14 +252,14 @@ def fitted(shape: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def judged(rows: list[dict[str, Any]]) -> dict[str, float]:
-    """The figures of the floors that these rows hold."""
+    """The figures of the thresholds that these rows hold."""
     figures = {}
     for row in rows:
         if row.get("kernel") == "sweep" and row.get("controls") == 21 and "against_numba" in row:
             figures[f"sweep {row['shape'][0]}"] = row["against_numba"]
         if row.get("shape") == list(SIX) and row["problem"] == "memory":
             figures["sweep 6-D"] = max(figures.get("sweep 6-D", 0.0), row["bytes_beyond"])
-    return {name: value for name, value in figures.items() if name in floors.FLOORS}
+    return {name: value for name, value in figures.items() if name in thresholds.THRESHOLDS}
 
 
 @click.command()
@@ -283,5 +284,5 @@ def command(quick: bool, repeats: int | None, controls: int, few: int, out: Path
         click.echo(table(found, COLUMNS) + "\n")
         rows += found
     figures = judged(rows)
-    rows += floors.announced(figures, "sweep")
+    rows += thresholds.announced(figures, "sweep")
     publish(out, "sweep", rows, panel="problem", line="kernel", x=("nodes",), y="node_controls_per_second")

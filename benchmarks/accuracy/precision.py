@@ -20,9 +20,10 @@ import click
 import numpy as np
 
 import hjbjax as hjb
-from benchmarks import accuracy, questions
-from benchmarks.report import RESULTS, attempt, publish, table
-from benchmarks.timing import interleaved
+from benchmarks import cases
+from benchmarks.accuracy import accuracy
+from benchmarks.harness.report import RESULTS, attempt, publish, table
+from benchmarks.harness.timing import interleaved
 
 COLUMNS = ("problem", "scheme", "shape", "error", "seconds", "compile_seconds", "status")
 PLAIN, LIMITED = hjb.Upwind(central=False), hjb.Limited()
@@ -58,7 +59,7 @@ def pendulum(nodes: Sequence[int]) -> list[dict[str, Any]]:
 def double_integrator(nodes: Sequence[int]) -> list[dict[str, Any]]:
     """One row a code, scheme and grid; the error is the mean one over the box."""
     exact = hjb.zoo.double_integrator_exact()
-    problem, grids = questions.double_integrator(nodes[0])[0], [questions.double_integrator(n)[1] for n in nodes]
+    problem, grids = cases.double_integrator(nodes[0])[0], [cases.double_integrator(n)[1] for n in nodes]
     rows, asked = [], []
     for scheme in (PLAIN, HELD):
         label = {"code": "hjbjax", "scheme": _name(scheme), "tol": TOL}
@@ -128,13 +129,15 @@ def verdicts(rows: Sequence[dict[str, Any]]) -> list[str]:
         factor = would_need(plain, here[0]["error"]) / here[0]["seconds"]
         said.append(
             f"pendulum: Limited() on 100 x 101 is {here[0]['error']:.2%} off; by its fitted order and growth the plain "
-            f"scheme would need {factor:.3g} times its time (floor 50)"
+            f"scheme would need {factor:.3g} times its time (threshold 50)"
         )
     ours = of("double integrator", "Limited()")
     for scheme in ("plain upwind", "hj_reachability very_high"):
         found = advantage(ours, others) if ours and (others := of("double integrator", scheme)) else None
         if found:
-            said.append(f"double integrator: {scheme} takes {found[0]:.3g} to {found[1]:.3g} times our time (floor 1)")
+            said.append(
+                f"double integrator: {scheme} takes {found[0]:.3g} to {found[1]:.3g} times our time (threshold 1)"
+            )
     return said
 
 

@@ -15,10 +15,10 @@ from typing import Any
 
 import click
 
-from benchmarks import floors
-from benchmarks.report import RESULTS, attempt, publish, table
+from benchmarks.harness import thresholds
+from benchmarks.harness.report import RESULTS, attempt, publish, table
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 COLUMNS = ("start", "seconds", "fastest", "cpu_seconds", "repeats", "pictures", "status")
 CACHE = {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0", "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1"}
 
@@ -71,5 +71,5 @@ def command(quick: bool, problem: str, repeats: int | None, out: Path) -> None:
     figures = {}
     if not quick and problem == "double-integrator" and rows[0]["status"] == "DONE":
         figures = {f"{row['start']} start": row["seconds"] for row in rows}
-    rows += floors.announced(figures, "startup")
+    rows += thresholds.announced(figures, "startup")
     publish(out, "startup", rows)

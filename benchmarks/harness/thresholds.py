@@ -1,0 +1,76 @@
+"""What the measurements are held to: one line a figure, "figure: measured, threshold".
+
+A benchmark looks its figures up here, so that all thresholds stand in one place; a figure that was not measured at the
+size it is meant for has no line.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import click
+
+
+@dataclasses.dataclass(frozen=True)
+class Threshold:
+    """A figure in words, its bound, the aim where there is one, and whether more is better."""
+
+    figure: str
+    bound: float
+    aim: float | None = None
+    unit: str = "×"
+    most: bool = False
+
+    def met(self, measured: float) -> bool:
+        """Whether the bound holds; NaN meets none."""
+        return measured <= self.bound if self.most else measured >= self.bound
+
+    def line(self, measured: float) -> str:
+        """The figure, what was measured, and the threshold."""
+        sign = "≤" if self.most else "≥"
+        aim = "" if self.aim is None else f", aim {self.aim:g}{self.unit}"
+        return (
+            f"{self.figure}: {measured:.3g}{self.unit}, threshold {sign} {self.bound:g}{self.unit}{aim}: "
+            f"{'met' if self.met(measured) else 'MISSED'}"
+        )
+
+
+CHAIN = "pendulum 200 x 201, 21 controls, to 1e-3, against the faster of QuantEcon's two methods"
+HAND = "pendulum {} to 1e-3, 21 controls, against the numba solver"
+THRESHOLDS = {
+    "sweep 1024": Threshold("sweep on 1024 x 1024, 21 controls, float32, against the numba loop", 1.5, 2.5),
+    "sweep 2048": Threshold("sweep on 2048 x 2048, 21 controls, float32, against the numba loop", 1.5, 2.5),
+    "sweep 6-D": Threshold("one value-iteration sweep on 20^6, beside two values", 16, unit=" bytes a node", most=True),
+    "quantecon": Threshold(f"{CHAIN}, compiled", 20, 50),
+    "quantecon cold": Threshold(f"{CHAIN}, our compile time counted", 2, 3.5),
+    "numba 800": Threshold(HAND.format("800 x 801"), 1.5, 3.5),
+    "numba 1600": Threshold(HAND.format("1600 x 1601"), 1.5, 3.5),
+    "growth": Threshold("pendulum, seconds at 1600 x 1601 over those at 400 x 401", 24, most=True),
+    "dubins bytes": Threshold("Dubins car 101 x 101 x 100, peak", 100, unit=" bytes a node", most=True),
+    "dubins exponent": Threshold("Dubins car, exponent of seconds in nodes", 1.2, unit="", most=True),
+    "manipulator bytes": Threshold("two-link arm 40 x 40 x 41 x 41, peak", 100, unit=" bytes a node", most=True),
+    "manipulator exponent": Threshold("two-link arm, exponent of seconds in nodes", 1.2, unit="", most=True),
+    "cold start": Threshold("process start to pictures, no cache", 12, unit=" s", most=True),
+    "cached start": Threshold("process start to pictures, with the compile cache", 7, unit=" s", most=True),
+    "batch": Threshold("solve_batch of 64 pendulums at 100 x 101, against one by one", 1, 10),
+}
+
+
+def announced(measured: Mapping[str, float], benchmark: str) -> list[dict[str, Any]]:
+    """Says one line for every figure measured; the same as rows of a JSON file."""
+    rows = []
+    for name, value in measured.items():
+        threshold = THRESHOLDS[name]
+        click.echo(threshold.line(value))
+        rows.append(
+            {
+                "benchmark": benchmark,
+                "figure": threshold.figure,
+                "measured": value,
+                "floor": threshold.bound,
+                "aim": threshold.aim,
+                "dtype": None,
+                "status": "MET" if threshold.met(value) else "MISSED",
+            }
+        )
+    return rows

@@ -1,0 +1,158 @@
+"""A certified solve beside other people's solvers, on one chain: the pendulum, K torques, discount .1.
+
+The hand-written numba solver (``peers.numba_pendulum``) knows this one problem; QuantEcon and mdpsolver
+(``peers.decision``) get the exported chain, which is built beforehand and whose making is not in their seconds.
+mdpsolver gets that of half as many nodes an axis, and one round, since it takes minutes on the whole one. All stop at
+the same tolerance, so that two values differ by at most twice that, which is checked before anything is called faster.
+Our first call, which compiles, is measured in this process before any other, and twice more after clearing JAX's
+caches. hj_reachability would march such a problem for thousands of steps; ``python -m benchmarks accuracy`` has it
+where it does better.
+"""
+
+import time
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import click
+import jax
+import numpy as np
+
+import hjbjax as hjb
+from benchmarks import cases
+from benchmarks.harness import thresholds
+from benchmarks.harness.report import RESULTS, attempt, publish, table, without
+from benchmarks.harness.timing import interleaved, timed
+from benchmarks.peers import decision
+
+PAIRS = 2_000_000  # of state and action in a chain: beyond that it takes gigabytes
+OURS, NUMBA, MDP = "hjbjax", "numba", "mdpsolver"
+COLUMNS = (
+    "code", "shape", "controls", "seconds", "fastest", "compile_seconds", "first_seconds", "first_cpu_seconds",
+    "ours_is_faster", "difference", "build_seconds", "status",
+)  # fmt: skip
+ABOUT = {"benchmark": "peers", "problem": "pendulum", "dtype": "float64"}
+
+
+def our_first(problem: Any, grid: Any, tol: float, times: int) -> dict[str, float]:
+    """First calls, compiling each time: the median of their seconds, and of the processor's."""
+    seconds, busy = [], []
+    for count in range(times):
+        if count:
+            jax.clear_caches()
+        before = time.process_time()
+        seconds.append(timed(lambda: hjb.solve(problem, grid, tol=tol).value)[1])
+        busy.append(time.process_time() - before)
+    return {"first_seconds": median(seconds), "first_cpu_seconds": median(busy)}
+
+
+def handwritten(nodes: int, actions: int, discount: float, tol: float) -> Any:
+    """The numba solver at one size, compiled."""
+    from benchmarks.peers import numba_pendulum
+
+    numba_pendulum.solve(8, actions, discount, tol)
+    return lambda: numba_pendulum.solve(nodes, actions, discount, tol)[0]
+
+
+def measure(nodes: int, actions: int, tol: float, repeats: int, *, chain: bool, first: int) -> list[dict[str, Any]]:
+    """Our solver and the numba one at one size; QuantEcon where ``chain`` says so."""
+    problem, grid = cases.pendulum(nodes, actions)
+    cold = our_first(problem, grid, tol, first)
+    solutions: list[hjb.Solution] = []
+
+    def ours():
+        solutions[:] = [hjb.solve(problem, grid, tol=tol)]
+        return solutions[0].value
+
+    calls, missing, build = {OURS: ours}, [], {}
+    if (reason := without("numba")) is None:
+        calls[NUMBA] = handwritten(nodes, actions, float(problem.discount), tol)
+    else:
+        missing.append({"code": NUMBA, "status": "SKIPPED", "reason": reason})
+    if chain and (reason := without("quantecon")) is None:
+        made, took = timed(lambda: decision.quantecon(hjb.chain.transition_arrays(problem, grid), tol))
+        calls |= made
+        build = dict.fromkeys(made, took)
+    elif chain:
+        missing.append({"code": "QuantEcon", "status": "SKIPPED", "reason": reason})
+    rows = _rows(calls, interleaved(calls, repeats), build)
+    mine, stats = rows[0], solutions[0].stats
+    mine |= {"status": solutions[0].status.name, "steps": solutions[0].steps, "error": solutions[0].error}
+    mine |= cold | {"method": stats["method"], "compile_seconds": cold["first_seconds"] - mine["seconds"]}
+    return [_about(grid, actions, tol) | row for row in (*rows, *missing)]
+
+
+def beside_mdpsolver(nodes: int, actions: int, tol: float) -> list[dict[str, Any]]:
+    """mdpsolver, one round of it: minutes at a size that the others do in seconds."""
+    problem, grid = cases.pendulum(nodes, actions)
+    if reason := without("mdpsolver"):
+        return [_about(grid, actions, tol) | {"code": MDP, "status": "SKIPPED", "reason": reason}]
+    make = lambda: decision.mdpsolver(hjb.chain.transition_arrays(problem, grid), tol)  # noqa: E731
+    (afresh, solve), took = timed(make)
+    calls = {OURS: lambda: hjb.solve(problem, grid, tol=tol).value, MDP: solve}
+    rows = _rows(calls, interleaved(calls, 1, {MDP: afresh}), {MDP: took})
+    return [_about(grid, actions, tol) | row for row in rows[1:]]
+
+
+def _about(grid: hjb.Grid, actions: int, tol: float) -> dict[str, Any]:
+    return {"shape": list(grid.shape), "nodes": grid.size, "controls": actions, "tol": tol}
+
+
+def _rows(calls: Any, measured: Any, build: dict[str, float]) -> list[dict[str, Any]]:
+    results, timings = measured
+    ours = np.asarray(results[OURS])
+    rows = [{"code": OURS, "status": "DONE"} | timings[OURS].row]
+    for code in list(calls)[1:]:
+        off = float(np.max(np.abs(np.asarray(results[code]).reshape(ours.shape) - ours)))
+        row = {"code": code, "status": "DONE", "difference": off, "ours_is_faster": timings[code].over(timings[OURS])}
+        rows.append(row | {"build_seconds": build.get(code)} | timings[code].row)
+    return rows
+
+
+def checked(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The rows, those whose value is off by more than both tolerances marked as such."""
+    for row in rows:
+        if not row.get("difference", 0.0) <= 2 * row.get("tol", 0.0):
+            row["status"] = "DISAGREES"
+    return rows
+
+
+def judged(rows: list[dict[str, Any]]) -> dict[str, float]:
+    """The figures of the thresholds that these rows hold."""
+    figures = {}
+    done = [row for row in rows if row["status"] == "DONE" and row["controls"] == 21 and row["tol"] == 1e-3]
+    chain = [row for row in done if row["code"].startswith("QuantEcon") and row["shape"] == [200, 201]]
+    if chain:
+        best = min(chain, key=lambda row: row["seconds"])
+        mine = next(row for row in rows if row["code"] == OURS and row["shape"] == [200, 201])
+        figures |= {"quantecon": best["ours_is_faster"], "quantecon cold": best["seconds"] / mine["first_seconds"]}
+    hand = {f"numba {row['shape'][0]}": row["ours_is_faster"] for row in done if row["code"] == NUMBA}
+    return figures | {name: value for name, value in hand.items() if name in thresholds.THRESHOLDS}
+
+
+@click.command()
+@click.option("--quick", is_flag=True, help="Small grids, one round.")
+@click.option("--nodes", multiple=True, type=click.IntRange(8), help="N, even, of N x (N + 1); repeatable.")
+@click.option("--repeats", type=click.IntRange(1), default=None, help="Rounds; 5 if not given, quick 1.")
+@click.option("--controls", type=click.IntRange(2), default=21, show_default=True)
+@click.option("--tol", type=click.FloatRange(0, min_open=True), default=1e-3, show_default=True)
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Folder of the files.")
+def command(quick: bool, nodes: tuple[int, ...], repeats: int | None, controls: int, tol: float, out: Path) -> None:
+    """A certified solve beside QuantEcon, mdpsolver and a hand-written numba solver, on one chain."""
+    sizes = nodes or ((26, 52) if quick else (200, 400, 800, 1600))
+    rows: list[dict[str, Any]] = []
+    for place, count in enumerate(sizes):
+        chain = not place and count * (count + 1) * controls <= PAIRS
+        rounds = repeats or (1 if quick else 5 if count < 800 else 3)
+        first = 1 if quick or place else 3
+        found = attempt(
+            lambda n=count, r=rounds, c=chain, f=first: measure(n, controls, tol, r, chain=c, first=f), ABOUT
+        )
+        if chain:
+            found += attempt(lambda n=count: beside_mdpsolver(n // 4 * 2, controls, tol), ABOUT)
+        rows += checked(found)
+        click.echo(table(found, COLUMNS))
+        click.echo("\n".join(f"{row['status'].lower()}: {row['reason']}" for row in found if "reason" in row))
+    figures = judged(rows)
+    rows += thresholds.announced(figures, "peers")
+    publish(out, "peers", rows, panel="problem", line="code", x=("nodes",), y="seconds")

@@ -11,7 +11,7 @@ Sources of the verdicts, by the abstracts and pages that were read:
 - K. Groves and A. Serrani, Modeling and Nonlinear Control of a Single-link Flexible Joint Manipulator, Ohio State
   University: state feedback makes the response of the tip angle that of a linear system.
 - B. d'Andréa-Novel, J.-M. Coron and W. Perruquetti, arXiv:1905.11132: the unicycle fails Brockett's condition
-  (tests/test_stability.py), although brackets span its state space.
+  (tests/geometry/test_stability.py), although brackets span its state space.
 """
 
 import jax

@@ -4,8 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_solver_faults import question
-from test_solver_refusals import GRID, problem, refusal
+from refusals import GRID, problem, refusal
 
 import hjbjax as hjb
 from hjbjax import zoo
@@ -50,7 +49,7 @@ class Burst:
 
 def test_nan_in_the_loop_is_never_taken_for_convergence():
     points = np.linspace(-1.0, 1.0, 41)  # more than the checks before a solve try: they pass over the fourth
-    hidden = question(cost=Burst(points[3]).cost, controls=hjb.Finite(points[:, None]))
+    hidden = problem(cost=Burst(points[3]).cost, controls=hjb.Finite(points[:, None]))
     with pytest.raises(hjb.SolveError, match="NONFINITE") as caught:
         hjb.solve(hidden, GRID)
     assert np.all(np.isfinite(caught.value.solution.value))

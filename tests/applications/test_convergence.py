@@ -20,7 +20,7 @@ from hjbjax.plotting.style import few
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 PROBLEM, _ = zoo.bang_bang()
 EXACT = zoo.bang_bang_exact()
 

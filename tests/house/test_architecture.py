@@ -13,7 +13,7 @@ import pytest
 
 import hjbjax as hjb
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "hjbjax"
 
 # The README's architecture table: a folder imports only from folders before it, and inside it a file from files before.

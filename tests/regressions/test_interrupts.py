@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 LATE = 5.0  # seconds: a chunk is half a second by the pace of the one before, and a program is traced before it is
 # compiled, which takes as long again; on a machine that others use, too
 

@@ -6,6 +6,7 @@ import jax
 import numpy as np
 
 import hjbjax as hjb
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import fixed_point
 from hjbjax.problem.pytree import cast
 from hjbjax.solvers import host_loop
@@ -25,11 +26,12 @@ def of_solve(problem: Any, grid: Any, tol: float, *, method: Any = None, dtype: 
     inner = method.inner if isinstance(method, hjb.Nested) else method
     kind = np.dtype(dtype)
     with jax.enable_x64(kind == np.float64):
-        verdict = judge(problem, grid, kind)
+        on = Discretisation(*cast((problem, grid), kind), hjb.Upwind(), kind)
+        verdict = judge(on)
 
-        def begin(problem, grid):
-            task = prepare(problem, grid, method=inner, scheme=hjb.Upwind(), tol=tol, dtype=kind, verdict=verdict)
+        def begin(on):
+            task = prepare(on, method=inner, tol=tol, verdict=verdict)
             return task, fixed_point.begin(task, jax.numpy.zeros(grid.shape, kind))
 
-        shapes = jax.eval_shape(begin, *cast((problem, grid), kind))
+        shapes = jax.eval_shape(begin, on)
         return {"bytes_per_node": bytes_of(host_loop.run.lower(*shapes, 1)) / grid.size}

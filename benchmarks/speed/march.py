@@ -17,6 +17,7 @@ import numpy as np
 
 import hjbjax as hjb
 from benchmarks.harness.report import RESULTS, attempt, publish, table
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import time_stepping
 from hjbjax.solvers import epochs, finite_horizon
 
@@ -59,8 +60,9 @@ def ours(problem: Any, grid: Any, scheme: Any, steps: int) -> tuple[Any, float, 
     """A function that marches so many steps, how far that goes, bytes a node and seconds to compile."""
     began = time.perf_counter()
     dtype = np.dtype(np.float32)
-    task = finite_horizon._prepare(problem, grid, 1e3, scheme, hjb.Explicit(fraction=FRACTION), None, None, dtype)
-    start = time_stepping.begin(task, epochs._terminal(task.problem, task.grid, task.horizon, dtype))
+    on = Discretisation(problem, grid, scheme, dtype)
+    task = finite_horizon._prepare(on, 1e3, hjb.Explicit(fraction=FRACTION), None, None)
+    start = time_stepping.begin(task, epochs._terminal(task.on.at(task.horizon)))
     until = jnp.asarray(0.0, dtype)
     compiled = jax.jit(time_stepping.run).lower(task, start, until, steps).compile()
     seconds = time.perf_counter() - began

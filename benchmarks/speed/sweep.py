@@ -25,6 +25,7 @@ from benchmarks.harness import thresholds
 from benchmarks.harness.footprint import bytes_of
 from benchmarks.harness.report import RESULTS, attempt, publish, table, without
 from benchmarks.harness.timing import interleaved
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import bellman, fixed_point
 from hjbjax.problem.pytree import cast
 from hjbjax.solvers import host_loop, memory
@@ -42,9 +43,14 @@ LIMIT_ON_CPU = 1 << 24  # nodes: beyond that a sweep on two cores tells nothing 
 SIX = (20,) * 6
 
 
+def greedy(problem: Any, grid: Any, value: jax.Array) -> Any:
+    """The greedy policy and r = min H − β V."""
+    return bellman.greedy(Discretisation(problem, grid, SCHEME, value.dtype), value, jnp.zeros((), bool))
+
+
 def sweep(problem: Any, grid: Any, value: jax.Array, pace: jax.Array) -> jax.Array:
     """V + r/(max Q + β) with r = min H − β V."""
-    return value + bellman.greedy(problem, grid, value, jnp.zeros((), bool), scheme=SCHEME).rate / pace
+    return value + greedy(problem, grid, value).rate / pace
 
 
 @functools.partial(jax.jit, donate_argnums=0, keep_unused=True)
@@ -62,7 +68,7 @@ def several(value: jax.Array, problem: Any, grid: Any, pace: jax.Array, count: i
 @jax.jit
 def improve(problem: Any, grid: Any, value: jax.Array) -> Any:
     """The greedy controls and the rate they leave."""
-    return bellman.greedy(problem, grid, value, jnp.zeros((), bool), scheme=SCHEME)
+    return greedy(problem, grid, value)
 
 
 @functools.partial(jax.jit, donate_argnums=0, keep_unused=True)
@@ -74,7 +80,7 @@ def copy(old: jax.Array, value: jax.Array) -> jax.Array:
 @jax.jit
 def paces(problem: Any, grid: Any) -> jax.Array:
     """max_u Q + β at the nodes."""
-    return bellman.fastest_rate(problem, grid, scheme=SCHEME, dtype=KIND) + problem.discount
+    return bellman.fastest_rate(Discretisation(problem, grid, SCHEME, KIND)) + problem.discount
 
 
 def started(grid: hjb.Grid) -> jax.Array:
@@ -156,7 +162,7 @@ def candidates(problem: Any, grid: hjb.Grid, count: int) -> dict[str, Any]:
 def whole_steps(problem: Any, grid: hjb.Grid, count: int) -> Any:
     """Steps of ``solve`` with value iteration, as its host loop runs them."""
     method = hjb.ValueIteration()
-    task, _, _ = prepare_on_host(problem, grid, method=method, scheme=SCHEME, tol=1e-30, dtype=KIND)
+    task, _, _ = prepare_on_host(Discretisation(problem, grid, SCHEME, KIND), method=method, tol=1e-30)
     states = [host_loop.run(task, fixed_point.begin(task, started(grid)), 0)]
 
     def call():

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.applications import exit_problems
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.finiteness import attainability, node_checks
 from hjbjax.iteration.methods import ValueIteration
@@ -255,7 +256,8 @@ def _may_stay(question: Problem, grid: Grid, options: dict) -> int:
         memory.require(question, grid, method, kind, options.get("max_memory"))
         checks.shapes(question, grid, scheme)
         node_checks.values(question, grid, kind)
-        return int(np.sum(np.asarray(attainability.refuge(question, grid, scheme=scheme.chain, dtype=kind))))
+        kept = attainability.refuge(Discretisation(question, grid, scheme.chain, kind))
+        return int(np.sum(np.asarray(kept)))
 
 
 def _refuse_staying(question: Problem, grid: Grid, options: dict) -> None:

@@ -25,12 +25,13 @@ import numpy as np
 
 from hjbjax.discretisation import decision_process, edges, stationary_law, stencil
 from hjbjax.discretisation.cut_cells import links
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.discretisation.stencil import Links
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import cast, node
-from hjbjax.tracing import checks, components
+from hjbjax.tracing import checks
 
 Offset = tuple[int, ...]
 
@@ -72,33 +73,6 @@ class Rates:
         return Rates(tuple(opposite), tuple(arriving))
 
 
-def drift(problem: Problem, x: list, u: list, d: list | None, t: Any, dtype: Any) -> list:
-    """The n components of f on per-node scalars."""
-    return list(components.components(problem.drift, *problem.arguments(x, u, d, t), dtype=dtype))
-
-
-def running_cost(problem: Problem, x: list, u: list, d: list | None, t: Any, dtype: Any) -> Any:
-    """L on per-node scalars; zero where the problem has none."""
-    if problem.cost is None:
-        return jnp.zeros((), dtype)
-    return components.scalar(problem.cost, *problem.arguments(x, u, d, t), dtype=dtype)
-
-
-def diffusion(problem: Problem, x: list, u: list, d: list | None, t: Any, dtype: Any) -> dict[tuple[int, int], Any]:
-    """The entries a_ij, i ≤ j, of a = σσᵀ on per-node scalars; those that are zero by construction are left out."""
-    n = len(x)
-    if problem.noise is None:
-        return {}
-    if callable(problem.noise):
-        sigma = components.components(problem.noise, *problem.arguments(x, u, d, t), dtype=dtype)
-    else:
-        sigma = components.components(lambda x: jnp.asarray(problem.noise, dtype), x, dtype=dtype)
-    if sigma.ndim < 2:
-        return {(i, i): s * s for i, s in enumerate(np.broadcast_to(sigma, (n,)))}
-    pairs = itertools.combinations_with_replacement(range(n), 2)
-    return {(i, j): sum(p * q for p, q in zip(sigma[i], sigma[j], strict=True)) for i, j in pairs}
-
-
 def along_axis(a: dict[tuple[int, int], Any], grid: Grid, axis: int) -> Any:
     """What is left of a_ii for jumps along axis i once the diagonal jumps have taken Σ_j |a_ij| h_i/h_j."""
     left = a.get((axis, axis))
@@ -113,12 +87,12 @@ def along_axis(a: dict[tuple[int, int], Any], grid: Grid, axis: int) -> Any:
     return left
 
 
-def lacking(a: dict[tuple[int, int], Any], grid: Grid, dtype: Any) -> Any:
+def lacking(on: Discretisation, a: dict[tuple[int, int], Any]) -> Any:
     """Where the diagonal jumps take more than there is along some axis, per node; None without correlation."""
     if all(i == j for i, j in a):
         return None
-    slack = 16 * grid.ndim * jnp.finfo(dtype).eps  # rounding of σσᵀ and of the spacings
-    short = (along_axis(a, grid, i) < -slack * jnp.asarray(a[i, i], dtype) for i in range(grid.ndim))
+    slack = 16 * on.grid.ndim * jnp.finfo(on.dtype).eps  # rounding of σσᵀ and of the spacings
+    short = (along_axis(a, on.grid, i) < -slack * jnp.asarray(a[i, i], on.dtype) for i in range(on.grid.ndim))
     return functools.reduce(jnp.logical_or, short)
 
 
@@ -145,32 +119,27 @@ def axis_rates(f: Any, a: Any, grid: Grid, axis: int, scheme: Upwind, link: Link
     return upward / (h_up * (h_up + h_down)), downward / (h_down * (h_up + h_down))
 
 
-def rates(
-    problem: Problem, grid: Grid, u: list, d: list | None = None, *, scheme: Upwind, dtype: Any, t: Any = 0.0
-) -> Rates:
-    """The jump rates of the chain under a policy.
+def rates(on: Discretisation, u: list, d: list | None = None) -> Rates:
+    """The jump rates under a policy of the monotone chain that goes with the scheme.
 
     Args:
-      problem: the problem; only its drift and noise matter.
-      grid: the grid.
-      u: the m components of the control on per-node scalars.
+      on: the chain; of its problem only drift and noise matter.
+      u: the m components of the control, each of a shape that broadcasts to (*grid).
       d: likewise of the disturbance, in a game.
-      scheme: how the rates are made.
-      dtype: the floating-point type of the rates.
-      t: the time, if the problem depends on it.
     """
-    x, u, d = jax.lax.optimization_barrier((grid.components(dtype), u, d))  # or loops keep drift that u does not move
-    f, a = drift(problem, x, u, d, t, dtype), diffusion(problem, x, u, d, t, dtype)
+    grid, scheme = on.grid, on.scheme.chain
+    x, u, d = jax.lax.optimization_barrier((on.coordinates(), u, d))  # or loops keep drift that u does not move
+    f, a = on.drift(u, d, x), on.diffusion(u, d, x)
     table: dict[Offset, Any] = {}
-    for axis, link in enumerate(links(problem, grid, subcell=scheme.subcell, dtype=dtype, t=t)):
+    for axis, link in enumerate(links(on.chain)):
         pair = axis_rates(f[axis], along_axis(a, grid, axis), grid, axis, scheme, link)
         for step, rate in zip((1, -1), pair, strict=True):
             table[stencil.unit(grid, axis, step)] = _inside(rate, grid, axis, step)
     for (i, j), entry in a.items():
         if i != j:
             _add_diagonal_jumps(table, entry, grid, i, j)
-    values = tuple(jnp.broadcast_to(jnp.asarray(rate, dtype), grid.shape) for rate in table.values())
-    return Rates(tuple(table), values, one_way=problem.noise is None)
+    values = tuple(jnp.broadcast_to(jnp.asarray(rate, on.dtype), grid.shape) for rate in table.values())
+    return Rates(tuple(table), values, one_way=on.problem.noise is None)
 
 
 def _inside(rate: Any, grid: Grid, axis: int, step: int) -> Any:
@@ -334,7 +303,7 @@ def transition_arrays(
         _checked(problem, grid, list(action), None, scheme, 0.0, ~held, np.finfo(np.float64).eps) for action in actions
     )
     with jax.enable_x64(True):
-        cut = links(cast(problem, np.float64), cast(grid, np.float64), subcell=scheme.subcell, dtype=np.float64)
+        cut = links(Discretisation(*cast((problem, grid), np.float64), scheme, np.dtype(np.float64)))
         surcharge = decision_process.surcharge(cut, given, grid)
     tables = (
         (jumps.offsets, jumps.values, cost + decision_process.paid(jumps, surcharge), ~leaving)
@@ -368,7 +337,7 @@ def _checked(
         )
     with jax.enable_x64(True):
         jumps, cost, lacking, leaving = jax.device_get(
-            _evaluate(*cast((problem, grid, u, d), np.float64), t, scheme, eps)
+            _evaluate(*cast((Discretisation(problem, grid, scheme, np.dtype(np.float64), t), u, d), np.float64), eps)
         )
     decision_process.refuse("the running cost is not finite", active & ~np.isfinite(cost), grid)
     decision_process.refuse(
@@ -379,12 +348,10 @@ def _checked(
     return kept, np.where(active, cost, 0), active & leaving
 
 
-@functools.partial(jax.jit, static_argnames="scheme")
-def _evaluate(problem: Problem, grid: Grid, u: list, d: list | None, t: Any, scheme: Upwind, eps: Any) -> Any:
+@jax.jit
+def _evaluate(on: Discretisation, u: list, d: list | None, eps: Any) -> Any:
     """Rates and running cost at the nodes, where the noise leaves a negative rate, and where an end is crossed."""
-    x, dtype = grid.components(np.float64), np.float64
-    jumps = rates(problem, grid, u, d, scheme=scheme, dtype=dtype, t=t)
-    cost = jnp.broadcast_to(running_cost(problem, x, u, d, t, dtype), grid.shape)
-    a = diffusion(problem, x, u, d, t, dtype)
-    short, leaving = lacking(a, grid, dtype), edges.inadmissible(problem, grid, u, d, t, dtype, eps=eps)
-    return jumps, cost, jnp.broadcast_to(jnp.zeros((), bool) if short is None else short, grid.shape), leaving
+    jumps, shape = rates(on, u, d), on.grid.shape
+    cost, short = jnp.broadcast_to(on.running_cost(u, d), shape), lacking(on, on.diffusion(u, d))
+    leaving = edges.inadmissible(on, u, d, eps=eps)
+    return jumps, cost, jnp.broadcast_to(jnp.zeros((), bool) if short is None else short, shape), leaving

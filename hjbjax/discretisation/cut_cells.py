@@ -13,39 +13,39 @@ import jax
 import jax.numpy as jnp
 
 from hjbjax.discretisation import stencil
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.stencil import Links
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.problem import Problem
 from hjbjax.tracing import components
 
 SHORTEST = 1e-2  # of a spacing: a shorter link would only make the rates large
 ROUNDINGS = 16  # units of eps of the largest coordinate: 6 of a stretched axis, and a distance made of a few operations
 
 
-def level(problem: Problem, grid: Grid, dtype: Any, t: Any = 0.0) -> jax.Array:
+def level(on: Discretisation) -> jax.Array:
     """l at every node, shape (*grid), with an exact zero where it is zero up to rounding: ≤ 0 in the target.
 
     What rounding does to l is taken from its slopes, so that neither its units nor values far away matter; from the
     lesser of two, since one may lead across a jump.
     """
-    found = jnp.broadcast_to(components.of_state(problem, problem.target, grid.components(dtype), t, dtype), grid.shape)
-    slack = jnp.zeros((), dtype)
+    found, grid, slack = on.at_nodes(on.problem.target), on.grid, jnp.zeros((), on.dtype)
     for axis in range(grid.ndim):
         up, down = stencil.one_sided(found, grid, axis)
         farthest = jnp.maximum(jnp.abs(grid.lo[axis]), jnp.abs(grid.hi[axis]))
         up, down = jnp.abs(up), jnp.abs(down)
         end = stencil.on_edge(grid, axis, 1) | stencil.on_edge(grid, axis, -1)  # where one of them is none
         slope = jnp.where(end, jnp.maximum(up, down), jnp.minimum(up, down))
-        slack = slack + ROUNDINGS * jnp.finfo(dtype).eps * farthest * slope
+        slack = slack + ROUNDINGS * jnp.finfo(on.dtype).eps * farthest * slope
     return jnp.where(jnp.abs(found) <= slack, 0, found)
 
 
-def links(problem: Problem, grid: Grid, *, subcell: bool, dtype: Any, t: Any = 0.0) -> list[Links]:
+def links(on: Discretisation) -> list[Links]:
     """The links along every axis, cut at the target's boundary where the scheme wants that."""
+    problem, grid = on.problem, on.grid
     plain = [stencil.links(grid, axis) for axis in range(grid.ndim)]
-    if not subcell or problem.target is None:
+    if not on.scheme.subcell or problem.target is None:
         return plain
-    x, here = grid.components(dtype), level(problem, grid, dtype, t)
+    x, here = on.coordinates(), level(on)
 
     def cut(axis: int, step: int, length: Any) -> tuple[Any, tuple[Any, Any]]:
         """The length of every link in one direction, and where it meets the target with the exit cost there."""
@@ -54,7 +54,7 @@ def links(problem: Problem, grid: Grid, *, subcell: bool, dtype: Any, t: Any = 0
         theta = jnp.where(meets, jnp.maximum(here / jnp.where(meets, here - beyond, 1), SHORTEST), 1)
         crossing = _wrapped(x[axis] + step * theta * length, grid, axis)
         boundary = [crossing if i == axis else entry for i, entry in enumerate(x)]
-        paid = components.of_state(problem, problem.exit_cost, boundary, t, dtype)
+        paid = components.of_state(problem, problem.exit_cost, boundary, on.t, on.dtype)
         return theta * length, (meets, jnp.broadcast_to(paid, grid.shape))
 
     result = []

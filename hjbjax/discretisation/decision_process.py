@@ -11,10 +11,11 @@ import jax
 import numpy as np
 
 from hjbjax.discretisation import cut_cells, stationary_law, stencil
+from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.schemes import Upwind
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import AdmissibleSet, Finite
-from hjbjax.tracing import components
 
 Offsets = tuple[tuple[int, ...], ...]
 Table = tuple[Offsets, Sequence[Any], Any, np.ndarray]
@@ -60,11 +61,12 @@ def single_law(classes: list[np.ndarray], generator: Any, grid: Grid) -> np.ndar
 def target(problem: Problem, grid: Grid, t: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Which nodes lie on the target, and the exit cost; both (*grid)."""
     with jax.enable_x64(True):
-        paid = components.of_state(problem, problem.exit_cost, grid.components(np.float64), t, np.float64)
+        on = Discretisation(problem, grid, Upwind(), np.dtype(np.float64), t)
+        paid = np.asarray(on.at_nodes(problem.exit_cost))
         inside = np.zeros(grid.shape, bool)
         if problem.target is not None:
-            inside = np.asarray(cut_cells.level(problem, grid, np.float64, t) <= 0)
-    return inside, np.broadcast_to(paid, grid.shape)
+            inside = np.asarray(cut_cells.level(on) <= 0)
+    return inside, paid
 
 
 def policies(problem: Problem, grid: Grid, policy: Any, disturbance: Any) -> tuple[list, list, np.ndarray]:

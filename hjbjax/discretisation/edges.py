@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation import stencil
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.tracing import components, dependence
@@ -44,13 +45,13 @@ class Rounding:
         return ROUNDINGS * eps * (jnp.abs(self.idle) + jnp.abs(f - self.idle)) + self.shift
 
 
-def slack(problem: Problem, grid: Grid, t: Any, dtype: Any) -> list[Rounding]:
+def slack(on: Discretisation) -> list[Rounding]:
     """What is rounding of the drift along every axis, node by node."""
+    problem, grid, dtype = on.problem, on.grid, on.dtype
     m, k = (0 if choices is None else choices.dim for choices in (problem.controls, problem.disturbances))
     nothing = ([jnp.zeros((), dtype)] * m, [jnp.zeros((), dtype)] * k)
-    f = components.components(problem.drift, *problem.arguments(grid.components(dtype), *nothing, t), dtype=dtype)
     found = []
-    for entry in f:
+    for entry in on.drift(*nothing):
         idle = jnp.broadcast_to(jnp.where(jnp.isfinite(entry), entry, 0), grid.shape)
         shift = jnp.zeros((), dtype)
         for axis in range(grid.ndim):
@@ -88,17 +89,15 @@ def strays(f: Any, beside: tuple[Any, Any], rounding: Rounding) -> Any:
     return ((up & (f > 0)) | (down & (f < 0))) & (jnp.abs(f) <= rounding.of(f))
 
 
-def inadmissible(
-    problem: Problem, grid: Grid, u: list, d: list | None, t: Any, dtype: Any, *, eps: Any = None
-) -> jax.Array:
+def inadmissible(on: Discretisation, u: list, d: list | None = None, *, eps: Any = None) -> jax.Array:
     """The nodes at which these actions lead out across a constrained end, bool (*grid); ``eps`` is their rounding."""
-    bad = jnp.zeros(grid.shape, bool)
-    if not grid.sides("constrained"):
+    bad = jnp.zeros(on.grid.shape, bool)
+    if not on.grid.sides("constrained"):
         return bad
-    f = components.components(problem.drift, *problem.arguments(grid.components(dtype), u, d, t), dtype=dtype)
-    coarser = 1 if eps is None else eps / jnp.finfo(dtype).eps
-    for axis, rounding in enumerate(slack(problem, grid, t, dtype)):
-        out = barred(f[axis], grid, axis, rounding, coarser)
+    f = on.drift(u, d)
+    coarser = 1 if eps is None else eps / jnp.finfo(on.dtype).eps
+    for axis, rounding in enumerate(slack(on)):
+        out = barred(f[axis], on.grid, axis, rounding, coarser)
         bad = bad if out is None else bad | out
     return bad
 

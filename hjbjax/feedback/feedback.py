@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Limited
 from hjbjax.discretisation.stencil import Links
 from hjbjax.hamiltonian import players
@@ -243,7 +244,8 @@ def _at(greedy: Greedy, when: tuple, x: Any, p: Any) -> tuple[Any, Any]:
     # A block of nodes around the state, of which only the middle one is looked at; no upwinding: both slopes are DV.
     block = Grid(x - h, x + h, (3,) * n)
     slopes, links = tuple(p), tuple(Links(width, width) for width in h)
-    here = Local(problem, block, Limited(), x.dtype, t, list(x), value, slopes, slopes, bends, links)
+    on = Discretisation(problem, block, Limited(), x.dtype, t)
+    here = Local(on, list(x), value, slopes, slopes, bends, links)
     _, u, d = optimise(here, players.setting(problem, n, x.dtype))
     known = jnp.all(jnp.isfinite(p))
     return tuple(jnp.where(known, _stacked(action, x.dtype, n), jnp.nan) for action in (u, d))  # type: ignore[return-value]

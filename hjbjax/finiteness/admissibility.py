@@ -3,13 +3,13 @@
 Without costs and at V = 0 the Hamiltonian is zero where there is one, and infinite elsewhere.
 """
 
-import functools
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.hamiltonian import discrete, players
 from hjbjax.iteration import bellman
@@ -33,7 +33,7 @@ def values(problem: Problem, grid: Grid, dtype: Any, t: float = 0.0) -> None:
     if not grid.sides("constrained"):
         return
     with jax.enable_x64(True):
-        stuck = np.asarray(_stuck(problem, grid, t, dtype=np.dtype(dtype)))
+        stuck = np.asarray(_stuck(Discretisation(problem, grid, Upwind(), np.dtype(dtype), t)))
     if not stuck.any():
         return
     index = tuple(int(i) for i in np.argwhere(stuck)[0])
@@ -53,10 +53,10 @@ def values(problem: Problem, grid: Grid, dtype: Any, t: float = 0.0) -> None:
     )
 
 
-@functools.partial(jax.jit, static_argnames="dtype")
-def _stuck(problem: Problem, grid: Grid, t: Any, dtype: Any) -> jax.Array:
+@jax.jit
+def _stuck(on: Discretisation) -> jax.Array:
     """The nodes off the target without an admissible action, bool (*grid)."""
-    free = altered(problem, cost=None)
-    here = discrete.local(free, grid, jnp.zeros(grid.shape, dtype), scheme=Upwind(), t=t)
-    least = discrete.optimise(here, players.setting(free, grid.ndim, dtype))[0]
-    return ~jnp.isfinite(least) & ~bellman.conditions(problem, grid, dtype, t).held
+    free = altered(on.problem, cost=None)
+    here = discrete.local(on.asking(free), jnp.zeros(on.grid.shape, on.dtype))
+    least = discrete.optimise(here, players.setting(free, on.grid.ndim, on.dtype))[0]
+    return ~jnp.isfinite(least) & ~bellman.conditions(on).held

@@ -15,12 +15,11 @@ import numpy as np
 
 from hjbjax.discretisation import chain, cut_cells, edges, stencil
 from hjbjax.discretisation.chain import Rates
-from hjbjax.discretisation.schemes import Upwind
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.finiteness import tried_actions
 from hjbjax.hamiltonian import players
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.problem import Problem
 from hjbjax.solution.clock import Clock
 
 FEW = 9  # of each player in a game, where all pairs are
@@ -30,43 +29,33 @@ SEARCHABLE = 5 * 10**7  # jumps that a search on the host can list: some 60 byte
 LOOK = 10**7  # nodes times actions, or times jumps of a path, between two looks at the clock: about a second
 
 
-def _open_jumps(problem: Problem, grid: Grid, inside: jax.Array | None, clock: Clock, **options: Any) -> Rates:
+def _open_jumps(on: Discretisation, inside: jax.Array | None, clock: Clock, **options: Any) -> Rates:
     """For every jump whether some action makes it while all jumps of that action stay ``inside``; None is the box."""
-    points = tried_actions.sampled(problem)
-    count, some, known = len(points), max(1, LOOK // grid.size), None
+    points = tried_actions.sampled(on.problem)
+    count, some, known = len(points), max(1, LOOK // on.grid.size), None
     for first in range(0, count, some):
         clock.enter(f"the jumps of the chain, {first} of {count} actions")
         last = min(first + some, count)
-        known = _also_open(problem, grid, inside, known, points, first, last, **options)
+        known = _also_open(on, inside, known, points[max(last - some, 0) : last], **options)
     assert known is not None
     return known
 
 
-@functools.partial(jax.jit, static_argnames=("scheme", "dtype", "kinks"))
+@functools.partial(jax.jit, static_argnames="kinks")
 def _also_open(
-    problem: Problem,
-    grid: Grid,
-    inside: Any,
-    known: Any,
-    points: Any,
-    first: Any,
-    last: Any,
-    *,
-    scheme: Upwind,
-    dtype: Any,
-    least: Any = 0.0,
-    kinks: bool = False,
+    on: Discretisation, inside: Any, known: Any, points: Any, *, least: Any = 0.0, kinks: bool = False
 ) -> Rates:
-    """The jumps that are known to be open and those of the actions from ``first`` to before ``last``."""
-    points, mine = jnp.asarray(points, dtype), players.setting(problem, grid.ndim, dtype).control
+    """The jumps that are known to be open and those of the actions ``points``, shape (count, m)."""
+    grid, points = on.grid, jnp.asarray(points, on.dtype)
+    mine = players.setting(on.problem, grid.ndim, on.dtype).control
     if known is None:
-        start = chain.rates(problem, grid, list(points[0]), None, scheme=scheme, dtype=dtype)
+        start = chain.rates(on, list(points[0]))
         known = Rates(start.offsets, tuple(jnp.zeros(grid.shape, bool) for _ in start.offsets))
 
     def tried(actions, opened):
         for each in actions:
-            rates = chain.rates(problem, grid, each, None, scheme=scheme, dtype=dtype)
-            stays = ~edges.inadmissible(problem, grid, each, None, 0.0, dtype)
+            rates = chain.rates(on, each)
+            stays = ~edges.inadmissible(on, each)
             if inside is not None:
                 stays &= _stays(rates, grid, inside, least)
             opened = tuple(p | ((c > least) & stays) for p, c in zip(opened, rates.values, strict=True))
@@ -74,10 +63,10 @@ def _also_open(
 
     def also(k, opened):
         action = list(points[k])
-        return tried(tried_actions.with_kinks(problem, grid, mine, action, dtype) if kinks else [action], opened)
+        return tried(tried_actions.with_kinks(on, mine, action) if kinks else [action], opened)
 
-    opened = tried(tried_actions.of_a_ball(problem, grid, mine, dtype) if kinks else [], known.values)
-    return Rates(known.offsets, jax.lax.fori_loop(first, last, also, opened))
+    opened = tried(tried_actions.of_a_ball(on, mine) if kinks else [], known.values)
+    return Rates(known.offsets, jax.lax.fori_loop(0, len(points), also, opened))
 
 
 def _stays(rates: Rates, grid: Grid, inside: jax.Array, least: Any) -> jax.Array:
@@ -89,20 +78,12 @@ def _stays(rates: Rates, grid: Grid, inside: jax.Array, least: Any) -> jax.Array
 
 
 def reached(
-    problem: Problem,
-    grid: Grid,
-    held: np.ndarray,
-    *,
-    scheme: Upwind,
-    dtype: Any,
-    surely: bool,
-    least: Any = 0.0,
-    clock: Clock | None = None,
+    on: Discretisation, held: np.ndarray, *, surely: bool, least: Any = 0.0, clock: Clock | None = None
 ) -> np.ndarray:
     """The nodes from which the held nodes can be reached; host level, for problems with one player.
 
     Args:
-      problem, grid, scheme, dtype: the chain.
+      on: the chain.
       held: bool (*grid), the nodes to reach.
       surely: with probability one rather than with some probability.
       least: a rate per unit time; up to it jumps are rounding.
@@ -111,72 +92,62 @@ def reached(
     Returns:
       bool (*grid).
     """
-    grid = grid.walled  # what goes on beyond an open end is not known to come back
-    clock, found = clock or Clock(), np.zeros(grid.shape, bool)
+    on = on.on_grid(on.grid.walled)  # what goes on beyond an open end is not known to come back
+    clock, found = clock or Clock(), np.zeros(on.grid.shape, bool)
     for kinks in (False, True):  # what samples do not reach may be reached by the one action that keeps to a way
-        found |= _by_some_actions(
-            problem, grid, held, surely, clock, scheme=scheme, dtype=dtype, least=least, kinks=kinks
-        )
+        found |= _by_some_actions(on, held, surely, clock, least=least, kinks=kinks)
         if found.all():
             break
     return found
 
 
-def _by_some_actions(
-    problem: Problem, grid: Grid, held: np.ndarray, surely: bool, clock: Clock, **options: Any
-) -> np.ndarray:
+def _by_some_actions(on: Discretisation, held: np.ndarray, surely: bool, clock: Clock, **options: Any) -> np.ndarray:
     def staying(inside: jax.Array | None) -> np.ndarray:
-        return _leads_to(held, _open_jumps(problem, grid, inside, clock, **options), grid, clock)
+        return _leads_to(held, _open_jumps(on, inside, clock, **options), on.grid, clock)
 
-    found, inside = staying(None), np.ones(grid.shape, bool)
+    found, inside = staying(None), np.ones(on.grid.shape, bool)
     while surely and not np.array_equal(found, inside):
         inside = found
         found = inside & staying(jnp.asarray(inside))
     return found
 
 
-def surely_reached(
-    problem: Problem, grid: Grid, held: jax.Array, *, scheme: Upwind, dtype: Any, least: Any = 0.0
-) -> jax.Array:
+def surely_reached(on: Discretisation, held: jax.Array, *, least: Any = 0.0) -> jax.Array:
     """The nodes from which the held ones are reached with probability one, bool (*grid); inside a transformation."""
-    points, grid = tried_actions.sampled(problem), grid.walled
+    points, on = tried_actions.sampled(on.problem), on.on_grid(on.grid.walled)
+    grid = on.grid
 
     def shrink(carry):
         inside, _ = carry
-        jumps = _also_open(
-            problem, grid, inside, None, points, 0, len(points), scheme=scheme, dtype=dtype, least=least, kinks=True
-        )
+        jumps = _also_open(on, inside, None, points, least=least, kinks=True)
         found = inside & _further(held, jumps, grid, grid.size)[0]
         return found, jnp.any(found != inside)
 
     return jax.lax.while_loop(lambda carry: carry[1], shrink, (jnp.ones(grid.shape, bool), jnp.ones((), bool)))[0]
 
 
-def forced(
-    problem: Problem, grid: Grid, held: np.ndarray, *, scheme: Upwind, dtype: Any, least: Any, clock: Clock
-) -> np.ndarray:
+def forced(on: Discretisation, held: np.ndarray, *, least: Any, clock: Clock) -> np.ndarray:
     """The nodes of a game from which the control reaches the held ones for certain, whatever the disturbance does.
 
     The largest set R in which some control keeps all jumps inside under every disturbance, and leads on to a nearer
     node; in a lower game, some control for every disturbance. Of a continuum few actions are tried. Arguments are those
     of ``reached``. Costs a step a cell of the longest way, each of all pairs of actions: for games that fail.
     """
-    found, grid = np.ones(grid.shape, bool), grid.walled
+    found, on = np.ones(on.grid.shape, bool), on.on_grid(on.grid.walled)
     while True:
         inside, nearer, more = found, jnp.asarray(held), True
         while more:
             clock.enter("the search for nodes from which the target can be forced")
-            nearer, more = _forced_further(problem, grid, inside, nearer, least, scheme=scheme, dtype=dtype)
+            nearer, more = _forced_further(on, inside, nearer, least)
         found = np.asarray(nearer)
         if np.array_equal(found, inside):
             return found
 
 
-@functools.partial(jax.jit, static_argnames=("scheme", "dtype"))
-def _forced_further(
-    problem: Problem, grid: Grid, inside: jax.Array, found: jax.Array, least: Any, *, scheme: Upwind, dtype: Any
-) -> tuple[jax.Array, jax.Array]:
+@jax.jit
+def _forced_further(on: Discretisation, inside: jax.Array, found: jax.Array, least: Any) -> tuple[jax.Array, jax.Array]:
     """The nodes one jump further from which the control leads to ``found`` and stays ``inside``; if there are more."""
+    problem, grid, dtype = on.problem, on.grid, on.dtype
     us, ds = (
         jnp.asarray(np.zeros((1, 0)) if choices is None else sets.samples(choices, FEW), dtype)
         for choices in (problem.controls, problem.disturbances)
@@ -187,12 +158,12 @@ def _forced_further(
     def answered(first):
         def also(ok, second):
             u, d = (first, second) if upper else (second, first)
-            rates = chain.rates(problem, grid, list(u), list(d), scheme=scheme, dtype=dtype)
+            rates = chain.rates(on, list(u), list(d))
             jumps = zip(rates.offsets, rates.values, strict=True)
             leads = functools.reduce(
                 jnp.logical_or, ((c > least) & stencil.neighbour(found, grid, offset) for offset, c in jumps)
             )
-            allowed = ~edges.inadmissible(problem, grid, list(u), list(d), 0.0, dtype)
+            allowed = ~edges.inadmissible(on, list(u), list(d))
             good = leads & allowed & _stays(rates, grid, inside, least)
             return (ok & good if upper else ok | good), None
 
@@ -205,45 +176,44 @@ def _forced_further(
     return new, jnp.any(new != found)
 
 
-@functools.partial(jax.jit, static_argnames=("scheme", "dtype"))
-def refuge(
-    problem: Problem, grid: Grid, inside: Any = None, dearest: Any = None, *, scheme: Upwind, dtype: Any
-) -> jax.Array:
+@jax.jit
+def refuge(on: Discretisation, inside: Any = None, dearest: Any = None) -> jax.Array:
     """The nodes from which some actions of both players keep the state off the target for ever, bool (*grid).
 
     The largest set in which every node has an action whose jumps all stay in it: nodes without one are taken away until
     nothing changes. Empty means that under every policy the target is reached with probability one.
 
     Args:
-      problem, grid, scheme, dtype: the chain.
+      on: the chain.
       inside: the nodes among which it is sought, bool (*grid); ``None`` is all off the target.
       dearest: actions of a higher running cost do not count; ``None`` for all.
     """
+    problem, grid, dtype = on.problem, on.grid, on.dtype
     u, d = (
         jnp.asarray(np.zeros((1, 0)) if choices is None else sets.samples(choices, tried_actions.SAMPLES), dtype)
         for choices in (problem.controls, problem.disturbances)
     )
-    mine, x = players.setting(problem, grid.ndim, dtype).control, grid.components(dtype)
-    start = cut_cells.level(problem, grid, dtype) > 0 if inside is None else inside
+    mine, start = players.setting(problem, grid.ndim, dtype).control, inside
+    if inside is None:
+        start = cut_cells.level(on) > 0
 
     def shrink(carry):
         inside, _ = carry
 
         def kept(action, answer):
-            rates = chain.rates(problem, grid, action, answer, scheme=scheme, dtype=dtype)
-            allowed = ~edges.inadmissible(problem, grid, action, answer, 0.0, dtype)
+            allowed = ~edges.inadmissible(on, action, answer)
             if dearest is not None:
-                allowed &= chain.running_cost(problem, x, action, answer, 0.0, dtype) <= dearest
-            return allowed & _stays(rates, grid, inside, 0.0)
+                allowed &= on.running_cost(action, answer) <= dearest
+            return allowed & _stays(chain.rates(on, action, answer), grid, inside, 0.0)
 
         def also(found, pair):
-            for action in tried_actions.with_kinks(problem, grid, mine, list(u[pair[0]]), dtype):
+            for action in tried_actions.with_kinks(on, mine, list(u[pair[0]])):
                 found |= kept(action, list(d[pair[1]]))
             return found, None
 
         pairs = jnp.stack(jnp.meshgrid(jnp.arange(len(u)), jnp.arange(len(d)), indexing="ij"), -1).reshape(-1, 2)
         found = jnp.zeros(grid.shape, bool)
-        for action in tried_actions.of_a_ball(problem, grid, mine, dtype):
+        for action in tried_actions.of_a_ball(on, mine):
             found |= kept(action, list(d[0]))
         found = inside & jax.lax.scan(also, found, pairs)[0]
         return found, jnp.any(found != inside)

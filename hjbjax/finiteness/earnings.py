@@ -58,10 +58,8 @@ def earned(task: Task, state: State) -> Earning | None:
 @jax.jit
 def _at(task: Task, controls: tuple) -> Any:
     """Rates and running cost under a policy."""
-    problem, grid, dtype = task.problem, task.grid, task.tol.dtype
-    jumps = chain.rates(problem, grid, list(controls), None, scheme=task.scheme.chain, dtype=dtype)
-    cost = chain.running_cost(problem, grid.components(dtype), list(controls), None, 0.0, dtype)
-    return jumps, jnp.broadcast_to(cost, grid.shape)
+    cost = task.on.running_cost(list(controls))
+    return chain.rates(task.on, list(controls)), jnp.broadcast_to(cost, task.grid.shape)
 
 
 def _mean(generator: Any, states: np.ndarray, cost: np.ndarray) -> float:

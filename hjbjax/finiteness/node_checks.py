@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation import chain, correlated_noise, cut_cells
+from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.schemes import Upwind
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
@@ -37,13 +39,13 @@ def values(problem: Problem, grid: Grid, dtype: Any, clock: Clock | None = None)
     Raises:
       ValueError: with the number of nodes, the first of them and its state, and what to do.
     """
-    clock = clock or Clock()
-    actions = _actions(problem)
+    clock, actions = clock or Clock(), _actions(problem)
+    on = Discretisation(problem, grid, Upwind(), np.dtype(dtype))
     with jax.enable_x64(True):
-        if _all_sound(problem, grid, actions, np.dtype(dtype), clock):
+        if _all_sound(on, actions, clock):
             return
         clock.look()
-        found = jax.device_get(_survey(problem, grid, actions, dtype=np.dtype(dtype)))
+        found = jax.device_get(_survey(on, actions))
     for name in (*OF_ACTION, "target", *STATE_COSTS):
         if name in found and found[name].count:
             _not_finite(problem, grid, name, found[name], actions)
@@ -82,54 +84,54 @@ def _thinned(choices: sets.AdmissibleSet | None, most: int) -> np.ndarray:
     return points[np.unique(np.linspace(0, len(points) - 1, min(most, len(points))).round().astype(int))]
 
 
-def _all_sound(problem: Problem, grid: Grid, actions: tuple[Any, Any], dtype: Any, clock: Clock) -> bool:
+def _all_sound(on: Discretisation, actions: tuple[Any, Any], clock: Clock) -> bool:
     """Whether there is nothing that ``values`` refuses, some actions at a time."""
-    count, some = len(actions[0]), max(1, LOOK // grid.size)
+    count, some = len(actions[0]), max(1, LOOK // on.grid.size)
     for first in range(0, count, some):
         clock.enter(f"the survey of the nodes, {first} of {count} actions")
-        if not _sound(problem, grid, actions, first, min(first + some, count), dtype=dtype):
+        if not _sound(on, actions, first, min(first + some, count)):
             return False
     return True
 
 
-@functools.partial(jax.jit, static_argnames=("dtype",))
-def _sound(problem: Problem, grid: Grid, actions: tuple[Any, Any], first: Any, last: Any, dtype: Any) -> jax.Array:
+@jax.jit
+def _sound(on: Discretisation, actions: tuple[Any, Any], first: Any, last: Any) -> jax.Array:
     """Whether nothing is refused of the actions from ``first`` to before ``last``; with the first, of the state."""
-    amiss = jax.lax.cond(first == 0, lambda: _state_amiss(problem, grid, dtype), lambda: jnp.zeros((), bool))
-    x, tried = grid.components(dtype), jax.tree.map(lambda rows: jnp.asarray(rows, dtype), actions)
+    amiss = jax.lax.cond(first == 0, lambda: _state_amiss(on), lambda: jnp.zeros((), bool))
+    x, tried = on.coordinates(), jax.tree.map(lambda rows: jnp.asarray(rows, on.dtype), actions)
 
     def look(k, amiss):
         here, (u, d) = jax.lax.optimization_barrier((x, jax.tree.map(lambda rows: rows[k], tried)))  # see _survey
-        bad = _of_action(problem, grid, here, list(u), list(d), dtype).values()
+        bad = _of_action(on, here, list(u), list(d)).values()
         return amiss | jnp.any(functools.reduce(jnp.logical_or, bad))
 
     return ~jax.lax.fori_loop(first, last, look, amiss)
 
 
-def _state_amiss(problem: Problem, grid: Grid, dtype: Any) -> jax.Array:
+def _state_amiss(on: Discretisation) -> jax.Array:
     """Whether ``values`` refuses what the functions of the state alone return."""
-    x = grid.components(dtype)
+    problem = on.problem
     amiss, inside = jnp.zeros((), bool), jnp.ones((), bool)
     if problem.target is not None:
-        distance = cut_cells.level(problem, grid, dtype)
+        distance = cut_cells.level(on)
         inside = distance <= 0
         amiss |= ~jnp.all(jnp.isfinite(distance)) | ~jnp.any(inside) | jnp.all(inside)
     for name in STATE_COSTS:
         ingredient = getattr(problem, name)
         if ingredient is not None:
             relevant = inside if name == "exit_cost" else True
-            amiss |= jnp.any(relevant & ~jnp.isfinite(components.of_state(problem, ingredient, x, 0.0, dtype)))
+            amiss |= jnp.any(relevant & ~jnp.isfinite(on.at_nodes(ingredient)))
     return amiss
 
 
-@functools.partial(jax.jit, static_argnames=("dtype",))
-def _survey(problem: Problem, grid: Grid, actions: tuple[Any, Any], dtype: Any) -> dict[str, Any]:
+@jax.jit
+def _survey(on: Discretisation, actions: tuple[Any, Any]) -> dict[str, Any]:
     """Counts and first nodes of everything that ``values`` refuses."""
-    x = grid.components(dtype)
+    problem, grid, x = on.problem, on.grid, on.coordinates()
     found: dict[str, Any] = {}
     inside: Any = True
     if problem.target is not None:
-        distance = cut_cells.level(problem, grid, dtype)
+        distance = cut_cells.level(on)
         inside = distance <= 0
         found["target"] = _count(~jnp.isfinite(distance), grid)
         found["inside"] = jnp.sum(inside)
@@ -138,14 +140,12 @@ def _survey(problem: Problem, grid: Grid, actions: tuple[Any, Any], dtype: Any) 
         ingredient = getattr(problem, name)
         if ingredient is not None:
             relevant = inside if name == "exit_cost" else True
-            found[name] = _count(
-                relevant & ~jnp.isfinite(components.of_state(problem, ingredient, x, 0.0, dtype)), grid
-            )
+            found[name] = _count(relevant & ~jnp.isfinite(on.at_nodes(ingredient)), grid)
 
     def body(carry, index_and_action):
         index, u, d = index_and_action
         here, u, d = jax.lax.optimization_barrier((x, u, d))  # or XLA keeps an array of all nodes per invariant
-        new = _of_action(problem, grid, here, list(u), list(d), dtype)
+        new = _of_action(on, here, list(u), list(d))
         new = {name: _count(bad, grid, index) for name, bad in new.items()}
         kept = {
             name: jax.tree.map(functools.partial(jnp.where, carry[name].count > 0), carry[name], new[name])
@@ -153,30 +153,31 @@ def _survey(problem: Problem, grid: Grid, actions: tuple[Any, Any], dtype: Any) 
         }
         return kept, None
 
-    us, ds = (jnp.asarray(action, dtype) for action in actions)
+    us, ds = (jnp.asarray(action, on.dtype) for action in actions)
     nothing = _Finding(*(jnp.zeros((), jnp.int64),) * 3)
-    names = jax.eval_shape(lambda: _of_action(problem, grid, x, list(us[0]), list(ds[0]), dtype))
+    names = jax.eval_shape(lambda: _of_action(on, x, list(us[0]), list(ds[0])))
     carry, _ = jax.lax.scan(body, dict.fromkeys(names, nothing), (jnp.arange(len(us)), us, ds))
     return found | carry
 
 
-def _of_action(problem: Problem, grid: Grid, x: list, u: list, d: list | None, dtype: Any) -> dict[str, Any]:
+def _of_action(on: Discretisation, x: list, u: list, d: list | None) -> dict[str, Any]:
     """Where drift, cost and noise are what they must not be, for one action."""
+    problem = on.problem
 
     def faulty(entries):
-        return functools.reduce(jnp.logical_or, (~jnp.isfinite(jnp.asarray(entry, dtype)) for entry in entries))
+        return functools.reduce(jnp.logical_or, (~jnp.isfinite(jnp.asarray(entry, on.dtype)) for entry in entries))
 
-    bad = {"drift": faulty(chain.drift(problem, x, u, d, 0.0, dtype))}
+    bad = {"drift": faulty(on.drift(u, d, x))}
     if problem.cost is not None:
-        bad["cost"] = faulty([chain.running_cost(problem, x, u, d, 0.0, dtype)])
-    a = chain.diffusion(problem, x, u, d, 0.0, dtype)
+        bad["cost"] = faulty([on.running_cost(u, d, x)])
+    a = on.diffusion(u, d, x)
     if a:
         bad["noise"] = faulty(a.values())
     if callable(problem.noise):
-        sigma = components.components(problem.noise, *problem.arguments(x, u, d, 0.0), dtype=dtype)
+        sigma = components.components(problem.noise, *problem.arguments(x, u, d, 0.0), dtype=on.dtype)
         if sigma.ndim < 2:
             bad["negative"] = functools.reduce(jnp.logical_or, (jnp.asarray(entry) < 0 for entry in sigma.flat))
-    lacking = chain.lacking(a, grid, dtype)
+    lacking = chain.lacking(on, a)
     if lacking is not None:
         bad["correlation"] = lacking
     return bad

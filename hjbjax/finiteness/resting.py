@@ -14,13 +14,11 @@ import jax
 import jax.numpy as jnp
 
 from hjbjax.discretisation import chain
-from hjbjax.discretisation.schemes import Scheme, Upwind
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.hamiltonian import discrete, players
 from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import Conditions
 from hjbjax.problem import sets
-from hjbjax.problem.grid import Grid
-from hjbjax.problem.problem import Problem
 
 ROUNDINGS = 8  # units of eps: sin π, in float32 as well, times what it is multiplied with
 GAIN = 64  # units of eps of Q max|V|: a smaller gain of leaving is rounding
@@ -40,71 +38,69 @@ class Standstill(NamedTuple):
     crossing: jax.Array
 
 
-def standstill(problem: Problem, grid: Grid, *, scheme: Scheme, dtype: Any) -> Standstill:
+def standstill(on: Discretisation) -> Standstill:
     """Where the system can rest at no cost, up to rounding: sin π is not zero in floating point.
 
     With slopes ±s, s_i = max L/max|f_i|, the Hamiltonian is L + Σ s_i |f_i|: its minimum vanishes at rest alone.
     """
-    how = players.setting(problem, grid.ndim, dtype)
-    nowhere = discrete.local(problem, grid, jnp.zeros(grid.shape, dtype), scheme=scheme)
-    least = discrete.optimise(nowhere, how)[0]
-    speeds, dearest = _scales(problem, grid, dtype)
+    grid, dtype = on.grid, on.dtype
+    how = players.setting(on.problem, grid.ndim, dtype)
+    least = discrete.optimise(discrete.local(on, jnp.zeros(grid.shape, dtype)), how)[0]
+    speeds, dearest = _scales(on)
     cost = jnp.max(jnp.where(jnp.isfinite(least), jnp.abs(least), 0))  # infinite where a constrained end leaves none
     cost = jnp.where(cost > 0, cost, jnp.where(dearest > 0, dearest, 1))
     speeds = jnp.where(speeds > 0, speeds, 1)
-    at_rest = discrete.at_rest(problem, grid, cost / speeds, scheme=scheme)
-    effort, u, d = discrete.optimise(at_rest, how)
+    effort, u, d = discrete.optimise(discrete.at_rest(on, cost / speeds), how)
     small = ROUNDINGS * jnp.finfo(dtype).eps
     rests = (jnp.abs(effort) <= small * cost) & (jnp.abs(least) <= small * cost)
-    for axis, speed in enumerate(_spread(problem, grid, u, d, dtype)):
+    for axis, speed in enumerate(_spread(on, u, d)):
         rests &= speed <= small * speeds[axis]
     extents = jnp.stack([jnp.asarray(grid.hi[axis] - grid.lo[axis], dtype) for axis in range(grid.ndim)])
     return Standstill(rests, least, jnp.sum(extents / speeds))
 
 
-def _spread(problem: Problem, grid: Grid, u: list, d: list, dtype: Any) -> list[Any]:
+def _spread(on: Discretisation, u: list, d: list) -> list[Any]:
     """a_ii/h_i along every axis: the speed at which noise leaves a node, correlated noise included."""
-    a = chain.diffusion(problem, grid.components(dtype), u, d, 0.0, dtype)
-    return [a.get((axis, axis), jnp.zeros((), dtype)) / grid.spacing(axis) for axis in range(grid.ndim)]
+    a, none = on.diffusion(u, d), jnp.zeros((), on.dtype)
+    return [a.get((axis, axis), none) / on.grid.spacing(axis) for axis in range(on.grid.ndim)]
 
 
-def _scales(problem: Problem, grid: Grid, dtype: Any) -> tuple[jax.Array, jax.Array]:
+def _scales(on: Discretisation) -> tuple[jax.Array, jax.Array]:
     """The largest speed along every axis, drift or noise, shape (n,), and the largest |L|, over nodes and actions."""
+    grid, dtype = on.grid, on.dtype
 
     def rows(choices: Any) -> jax.Array:
         return jnp.stack(
             [jnp.stack(action) if action else jnp.zeros(0, dtype) for action in sets.probes(choices, dtype)]
         )
 
-    us, ds = rows(problem.controls), rows(problem.disturbances)
+    us, ds = rows(on.problem.controls), rows(on.problem.disturbances)
     pairs = jnp.stack(jnp.meshgrid(jnp.arange(len(us)), jnp.arange(len(ds)), indexing="ij"), -1).reshape(-1, 2)
 
     def largest(entry: Any) -> jax.Array:
         return jnp.max(jnp.abs(jnp.broadcast_to(jnp.asarray(entry, dtype), grid.shape)))
 
     def look(found: tuple, pair: jax.Array) -> tuple:
-        x, (u, d) = jax.lax.optimization_barrier((grid.components(dtype), (list(us[pair[0]]), list(ds[pair[1]]))))
-        f, spread = chain.drift(problem, x, u, d, 0.0, dtype), _spread(problem, grid, u, d, dtype)
+        x, (u, d) = jax.lax.optimization_barrier((on.coordinates(), (list(us[pair[0]]), list(ds[pair[1]]))))
+        f, spread = on.drift(u, d, x), _spread(on, u, d)
         speeds = jnp.stack([largest(jnp.abs(drift) + noise) for drift, noise in zip(f, spread, strict=True)])
-        cost = largest(chain.running_cost(problem, x, u, d, 0.0, dtype))
+        cost = largest(on.running_cost(u, d, x))
         return (jnp.maximum(found[0], speeds), jnp.maximum(found[1], cost)), None
 
     start = (jnp.zeros(grid.ndim, dtype), jnp.zeros((), dtype))
     return jax.lax.scan(look, start, pairs)[0]
 
 
-def leaving_pays(
-    problem: Problem, grid: Grid, rules: Conditions, counted: Any, value: jax.Array, *, scheme: Upwind
-) -> jax.Array:
+def leaving_pays(on: Discretisation, rules: Conditions, counted: Any, value: jax.Array) -> jax.Array:
     """The held rest nodes at which some action has L + Σ_o c_o (V(x + o) − V(x)) < 0, bool (*grid).
 
     With none of them the value with held rest nodes solves the problem in which they may be left, too.
     """
     rests = rules.held & counted & ~jnp.asarray(rules.ended)
-    policy = bellman.greedy(problem, grid, value, rules.held & ~rests, scheme=scheme)
+    policy = bellman.greedy(on, value, rules.held & ~rests)
     u, d = list(policy.controls), list(policy.disturbances)
-    leaving = chain.rates(problem, grid, u, d, scheme=scheme, dtype=value.dtype).total()
-    cost = jnp.max(jnp.abs(chain.running_cost(problem, grid.components(value.dtype), u, d, 0.0, value.dtype)))
+    leaving = chain.rates(on, u, d).total()
+    cost = jnp.max(jnp.abs(on.running_cost(u, d)))
     size = jnp.max(jnp.where(counted, jnp.abs(value), 0))
     return rests & (policy.rate < -GAIN * jnp.finfo(value.dtype).eps * (leaving * size + cost))
 

@@ -12,10 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import chain
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.hamiltonian.players import Player
 from hjbjax.problem import sets
-from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import Ball
 from hjbjax.tracing import components
@@ -29,34 +28,34 @@ def sampled(problem: Problem) -> Any:
     return np.zeros((1, 0)) if problem.controls is None else sets.samples(problem.controls, SAMPLES)
 
 
-def with_kinks(problem: Problem, grid: Grid, player: Player, action: list, dtype: Any) -> list[list]:
+def with_kinks(on: Discretisation, player: Player, action: list) -> list[list]:
     """An action, and those with some inputs where one component of the drift vanishes: (x), each input on the nodes.
 
     Only there may a jump stay away that all samples make. Where the drift is not affine in the inputs there are none.
     """
     found = [action]
-    if not player.exact or problem.is_game:
+    if not player.exact or on.problem.is_game:
         return found
     for j, driven in enumerate(player.driven):
         if len(found) * (1 + len(driven)) > COMBINATIONS:
             break
         for base in tuple(found):
-            for kink in _kinks(problem, grid, player, base, j, dtype):
+            for kink in _kinks(on, player, base, j):
                 moved = [kink if k == j else entry for k, entry in enumerate(base)]
                 found.append(_where(_contains(player.choices, moved), moved, base))
     return found
 
 
-def of_a_ball(problem: Problem, grid: Grid, player: Player, dtype: Any) -> list[list]:
+def of_a_ball(on: Discretisation, player: Player) -> list[list]:
     """The actions of a ball that go furthest along one input while others let their components vanish; else none.
 
     Each input u_j drives one component f_j of its own. Among the actions with given signs of all f_j, that with the
     largest |f_k| has some inputs S at their kinks, f_S = 0, no others, and all the room they leave in u_k.
     """
-    if not player.exact or problem.is_game or not isinstance(player.choices, Ball):
+    if not player.exact or on.problem.is_game or not isinstance(player.choices, Ball):
         return []
-    none, radius = [jnp.zeros((), dtype)] * player.choices.dim, player.choices.radius
-    kinks = [_kinks(problem, grid, player, none, j, dtype) or [none[j]] for j in range(len(none))]
+    none, radius = [jnp.zeros((), on.dtype)] * player.choices.dim, player.choices.radius
+    kinks = [_kinks(on, player, none, j) or [none[j]] for j in range(len(none))]
     found: list[list] = []
     for count in range(len(none)):
         if len(found) >= COMBINATIONS:
@@ -70,13 +69,13 @@ def of_a_ball(problem: Problem, grid: Grid, player: Player, dtype: Any) -> list[
     return found
 
 
-def _kinks(problem: Problem, grid: Grid, player: Player, base: list, j: int, dtype: Any) -> list:
+def _kinks(on: Discretisation, player: Player, base: list, j: int) -> list:
     """Where the components that input j drives vanish, given the other inputs; its own place if they never do."""
-    x = grid.components(dtype)
-    at_zero = [jnp.zeros((), dtype) if k == j else entry for k, entry in enumerate(base)]
-    offset = chain.drift(problem, x, at_zero, None, 0.0, dtype)
-    arguments = problem.arguments(x, at_zero, None, 0.0)
-    slope = components.components(player.derivative(problem, problem.drift, j), *arguments, dtype=dtype)
+    problem = on.problem
+    at_zero = [jnp.zeros((), on.dtype) if k == j else entry for k, entry in enumerate(base)]
+    offset = on.drift(at_zero)
+    arguments = problem.arguments(on.coordinates(), at_zero, None, 0.0)
+    slope = components.components(player.derivative(problem, problem.drift, j), *arguments, dtype=on.dtype)
     return [
         jnp.where(slope[i] != 0, -offset[i] / jnp.where(slope[i] != 0, slope[i], 1), base[j]) for i in player.driven[j]
     ]

@@ -23,13 +23,13 @@ import jax
 import jax.numpy as jnp
 
 from hjbjax.discretisation import chain, cut_cells, edges, slopes, stencil
-from hjbjax.discretisation.schemes import Eno2, Limited, Scheme, Upwind, Weno5
+from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.schemes import Eno2, Limited, Upwind, Weno5
 from hjbjax.hamiltonian import players
 from hjbjax.hamiltonian.piecewise import Kinked, inverse_root, kinked_ball, piecewise_input, piecewise_pair
 from hjbjax.hamiltonian.players import SAMPLES, Player, Setting, shared
 from hjbjax.hamiltonian.search import UNROLL, Action, best_of, enumerate_actions, refine
 from hjbjax.problem import sets
-from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite
@@ -43,6 +43,9 @@ class Local:
     """The Hamiltonian around one value function: coordinates, slopes, and how to evaluate H(u, d).
 
     Attributes:
+      on: the problem on its grid.
+      x: the coordinates of the nodes.
+      value: V at the nodes.
       up, down: the slopes that drift sees; D⁺ and D⁻, or those of a scheme of higher order.
       links: the distances to the neighbours along every axis.
       bends: D⁺ − D⁻ along every axis, which noise sees.
@@ -52,11 +55,7 @@ class Local:
       lost: for every axis whether the next node up and the next node down are lost; None where none is.
     """
 
-    problem: Problem
-    grid: Grid
-    scheme: Scheme
-    dtype: Any
-    t: Any
+    on: Discretisation
     x: list
     value: jax.Array
     up: tuple[jax.Array, ...]
@@ -66,6 +65,10 @@ class Local:
     tried: tuple[Action, Action] | None = None
     slack: tuple[Any, ...] | None = None
     lost: tuple[tuple[Any, Any], ...] | None = None
+
+    def asking(self, problem: Problem) -> "Local":
+        """The Hamiltonian of another problem around the same value."""
+        return dataclasses.replace(self, on=self.on.asking(problem))
 
     def gain(self, axis: int, f: Any, a: Any) -> Any:
         """[(e + h⁻ f) D⁺ − (e − h⁺ f) D⁻]/(h⁺ + h⁻), or with other slopes; infinite where f leaves a constrained end.
@@ -77,7 +80,7 @@ class Local:
             assert self.slack is not None
             f = jnp.where(edges.strays(f, self.lost[axis], self.slack[axis]), 0, f)
         gain = self._free_gain(axis, f, a)
-        out = None if self.slack is None else edges.barred(f, self.grid, axis, self.slack[axis])
+        out = None if self.slack is None else edges.barred(f, self.on.grid, axis, self.slack[axis])
         return gain if out is None else jnp.where(out, jnp.inf, gain)
 
     def _free_gain(self, axis: int, f: Any, a: Any) -> Any:
@@ -87,55 +90,52 @@ class Local:
             return upwind
         link = self.links[axis]
         h_up, h_down = link.up, link.down
-        if not isinstance(self.scheme, Upwind):
+        if not isinstance(self.on.scheme, Upwind):
             return upwind + jnp.maximum(a, 0) * self.bends[axis] / (h_up + h_down)
-        e = chain.excess(f, a, self.grid, axis, self.scheme, link)
+        e = chain.excess(f, a, self.on.grid, axis, self.on.scheme, link)
         upward, downward = (e + h_down * f) / (h_up + h_down), (e - h_up * f) / (h_up + h_down)
         return upward * self.up[axis] - downward * self.down[axis]
 
     def at(self, u: Action, d: Action) -> Any:
         """H(u, d) at every node, in cost per unit time."""
-        f = chain.drift(self.problem, self.x, u, d, self.t, self.dtype)
-        a = chain.diffusion(self.problem, self.x, u, d, self.t, self.dtype)
-        total = chain.running_cost(self.problem, self.x, u, d, self.t, self.dtype)
-        for axis in range(self.grid.ndim):
-            total = total + self.gain(axis, f[axis], chain.along_axis(a, self.grid, axis))
+        f, a, grid = self.on.drift(u, d, self.x), self.on.diffusion(u, d, self.x), self.on.grid
+        total = self.on.running_cost(u, d, self.x)
+        for axis in range(grid.ndim):
+            total = total + self.gain(axis, f[axis], chain.along_axis(a, grid, axis))
         for (i, j), entry in a.items():
             if i != j:
                 total = total + self._diagonal(i, j, entry)
-        return jnp.broadcast_to(total, self.grid.shape)
+        return jnp.broadcast_to(total, grid.shape)
 
     def _diagonal(self, i: int, j: int, entry: Any) -> Any:
+        grid = self.on.grid
         ends = {
-            (p, q): stencil.continued(
-                self.value, self.grid, tuple(p * (k == i) + q * (k == j) for k in range(self.grid.ndim))
-            )
+            (p, q): stencil.continued(self.value, grid, tuple(p * (k == i) + q * (k == j) for k in range(grid.ndim)))
             for p, q in itertools.product((1, -1), repeat=2)
         }
         same, opposite = ends[1, 1] + ends[-1, -1], ends[1, -1] + ends[-1, 1]
-        scale = 2 * self.grid.spacing(i) * self.grid.spacing(j)
+        scale = 2 * grid.spacing(i) * grid.spacing(j)
         return (
             jnp.maximum(entry, 0) * (same - 2 * self.value) + jnp.maximum(-entry, 0) * (opposite - 2 * self.value)
         ) / scale
 
 
-def at_rest(problem: Problem, grid: Grid, slopes: jax.Array, *, scheme: Scheme) -> Local:
+def at_rest(on: Discretisation, slopes: jax.Array) -> Local:
     """A Hamiltonian with slopes D⁺ = s_i and D⁻ = −s_i everywhere: H = L + Σ s_i |f_i| and what noise adds.
 
     With s > 0, shape (n,), its minimum is zero exactly where an action rests at no cost, if the cost is not negative.
     """
-    here = local(problem, grid, jnp.zeros(grid.shape, slopes.dtype), scheme=scheme)
-    one = jnp.ones(grid.shape, slopes.dtype)
+    here = local(on, jnp.zeros(on.grid.shape, slopes.dtype))
+    one = jnp.ones(on.grid.shape, slopes.dtype)
     ups, downs, bends = (tuple(sign * slope * one for slope in slopes) for sign in (1, -1, 2))
     return dataclasses.replace(here, up=ups, down=downs, bends=bends)
 
 
-def local(
-    problem: Problem, grid: Grid, value: jax.Array, *, scheme: Scheme, t: Any = 0.0, lost: jax.Array | None = None
-) -> Local:
+def local(on: Discretisation, value: jax.Array, lost: jax.Array | None = None) -> Local:
     """Coordinates and differences around ``value``, tied together so that no loop hoists tables out of itself."""
-    x, value = jax.lax.optimization_barrier((grid.components(value.dtype), value))
-    links = tuple(cut_cells.links(problem, grid, subcell=scheme.subcell, dtype=value.dtype, t=t))
+    grid, scheme = on.grid, on.scheme
+    x, value = jax.lax.optimization_barrier((on.coordinates(), value))
+    links = tuple(cut_cells.links(on))
     differences = [stencil.one_sided(value, grid, axis, link) for axis, link in enumerate(links)]
     bends = tuple(up - down for up, down in differences)
     if isinstance(scheme, Weno5):
@@ -143,24 +143,24 @@ def local(
     elif isinstance(scheme, Eno2):
         differences = slopes.eno2(value, grid)
     elif isinstance(scheme, Limited):
-        differences = _limited(problem, grid, x, differences, links, t)
+        differences = _limited(on, x, differences, links)
     up, down = zip(*differences, strict=True)
     careful = lost is not None or grid.sides("constrained")
-    slack = tuple(edges.slack(problem, grid, t, value.dtype)) if careful else None
+    slack = tuple(edges.slack(on)) if careful else None
     beside = None if lost is None else edges.beside(lost, grid)
-    return Local(problem, grid, scheme, value.dtype, t, x, value, up, down, bends, links, slack=slack, lost=beside)
+    return Local(on, x, value, up, down, bends, links, slack=slack, lost=beside)
 
 
-def _limited(problem: Problem, grid: Grid, x: list, differences: list, links: tuple, t: Any) -> list:
+def _limited(on: Discretisation, x: list, differences: list, links: tuple) -> list:
     """Limited slopes; central ones where noise keeps those monotone, a_ii ≥ h |f_i| for all actions."""
+    problem, grid = on.problem, on.grid
     found = [stencil.limited(up, down, grid, axis, links[axis]) for axis, (up, down) in enumerate(differences)]
     if problem.noise is None:
         return found
     dtype = differences[0][0].dtype
     calm: list = [True] * grid.ndim
     for u, d in itertools.product(sets.probes(problem.controls, dtype), sets.probes(problem.disturbances, dtype)):
-        f = chain.drift(problem, x, u, d, t, dtype)
-        a = chain.diffusion(problem, x, u, d, t, dtype)
+        f, a = on.drift(u, d, x), on.diffusion(u, d, x)
         for axis, link in enumerate(links):
             left = chain.along_axis(a, grid, axis)
             calm[axis] &= left >= jnp.maximum(link.up, link.down) * jnp.abs(f[axis])
@@ -181,7 +181,7 @@ def optimise(here: Local, how: Setting, isaacs: str | None = None) -> tuple[jax.
         _, u = best_response(here, how.control, lambda u: (u, start))
         value, d = best_response(here, how.disturbance, lambda d: (u, d))
         return value, u, d
-    if (isaacs or here.problem.isaacs) == "upper":
+    if (isaacs or here.on.problem.isaacs) == "upper":
         return _nested(here, how.control, how.disturbance, lambda u, d: (u, d))
     value, d, u = _nested(here, how.disturbance, how.control, lambda d, u: (u, d))
     return value, u, d
@@ -219,16 +219,16 @@ def _admissible(here: Local, player: Player, join: Callable) -> Action | None:
     """At constrained ends an action of a sampled control that does not leave, where that can be found exactly."""
     if here.slack is None or player.sign < 0:
         return None
-    free = altered(here.problem, cost=None)
-    alone = players.setting(free, here.grid.ndim, here.dtype).control
-    return _exact(dataclasses.replace(here, problem=free), alone, join) if alone.exact else None
+    free = altered(here.on.problem, cost=None)
+    alone = players.setting(free, here.on.grid.ndim, here.on.dtype).control
+    return _exact(here.asking(free), alone, join) if alone.exact else None
 
 
 def _sampled(
     here: Local, player: Player, objective: Callable, weight: int, most: int = UNROLL, start: Action | None = None
 ) -> Any:
     assert player.choices is not None
-    points = jnp.asarray(sets.samples(player.choices, SAMPLES), here.dtype)
+    points = jnp.asarray(sets.samples(player.choices, SAMPLES), here.on.dtype)
     best = enumerate_actions(objective, points, player.sign, weight=weight, most=most)
     if isinstance(player.choices, Finite):
         return best
@@ -262,12 +262,13 @@ def _exact(here: Local, player: Player, join: Callable) -> Action:
     """The exact optimum over a box or a ball; see ``piecewise`` for why the candidates suffice."""
     choices = player.choices
     assert isinstance(choices, (Box, Ball))
-    zero = [jnp.zeros((), here.dtype)] * choices.dim
+    problem, dtype = here.on.problem, here.on.dtype
+    zero = [jnp.zeros((), dtype)] * choices.dim
     u, d = join(zero)
-    arguments = here.problem.arguments(here.x, u, d, here.t)
-    offsets = chain.drift(here.problem, here.x, u, d, here.t, here.dtype)
+    arguments = problem.arguments(here.x, u, d, here.on.t)
+    offsets = here.on.drift(u, d, here.x)
     slopes = [
-        components.components(player.derivative(here.problem, here.problem.drift, j), *arguments, dtype=here.dtype)
+        components.components(player.derivative(problem, problem.drift, j), *arguments, dtype=dtype)
         for j in range(choices.dim)
     ]
     linear, square = zip(*(_cost_coefficients(here, player, arguments, j) for j in range(choices.dim)), strict=True)
@@ -295,29 +296,28 @@ def _exact(here: Local, player: Player, join: Callable) -> Action:
 
 def _cost_coefficients(here: Local, player: Player, arguments: tuple, j: int) -> tuple[Any, Any]:
     """l_j and q_j of a cost l_j u + q_j u² + ... by differentiation at zero."""
-    cost, none = here.problem.cost, jnp.zeros((), here.dtype)
+    cost, none = here.on.problem.cost, jnp.zeros((), here.on.dtype)
     if cost is None:
         return none, none
-    slope = player.derivative(here.problem, cost, j)
-    linear = components.scalar(slope, *arguments, dtype=here.dtype)
+    slope = player.derivative(here.on.problem, cost, j)
+    linear = components.scalar(slope, *arguments, dtype=here.on.dtype)
     if not player.curved[j]:
         return linear, none
-    return linear, components.scalar(player.derivative(here.problem, slope, j), *arguments, dtype=here.dtype) / 2
+    return linear, components.scalar(player.derivative(here.on.problem, slope, j), *arguments, dtype=here.on.dtype) / 2
 
 
 def _kinked(here: Local, base: tuple[Action, Action], axis: int, offset: Any, slope: Any) -> Kinked:
     u, d = base
-    a = chain.diffusion(here.problem, here.x, u, d, here.t, here.dtype)
-    left = chain.along_axis(a, here.grid, axis)
+    left = chain.along_axis(here.on.diffusion(u, d, here.x), here.on.grid, axis)
     up, down = here.up[axis], here.down[axis]
 
     def gain(f):
         return here.gain(axis, f, left)
 
-    if left is None or not isinstance(here.scheme, Upwind) or not here.scheme.central:
+    if left is None or not isinstance(here.on.scheme, Upwind) or not here.on.scheme.central:
         return Kinked(gain, offset, slope, (0.0,), (down, up))
     h_up, h_down = here.links[axis].up, here.links[axis].down
-    edge = stencil.walls(here.grid, axis)
+    edge = stencil.walls(here.on.grid, axis)
     width = jnp.maximum(left, 0)
     middle = (h_down * up + h_up * down) / (h_up + h_down)
     kinks = (jnp.where(edge, 0, -width / h_down), 0.0, jnp.where(edge, 0, width / h_up))

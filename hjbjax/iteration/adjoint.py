@@ -91,15 +91,13 @@ def _ties_to_constraints(task: Task, state: State) -> Correction:
 
 def _residual(task: Task, state: State, equation: Correction) -> jax.Array:
     """Φ at the frozen value and branches, as a function of the problem and of the grid."""
-    problem, grid, value, policy = task.problem, task.grid, state.value, state.policy
-    rules = bellman.conditions(problem, grid, value.dtype)
+    value, policy = state.value, state.policy
+    rules = bellman.conditions(task.on)
     u, d = list(policy.controls), list(policy.disturbances)
     held = jax.lax.stop_gradient(task.rules.held)
     lost = jax.lax.stop_gradient(task.lost)
-    rate = bellman.greedy(problem, grid, value, held, scheme=task.scheme, incumbent=policy, lost=lost).rate
-    scheme = task.scheme.chain
-    total = chain.rates(problem, grid, u, d, scheme=scheme, dtype=value.dtype).total()
-    pace = jax.lax.stop_gradient(total + problem.discount)
+    rate = bellman.greedy(task.on, value, held, incumbent=policy, lost=lost).rate
+    pace = jax.lax.stop_gradient(chain.rates(task.on, u, d).total() + task.problem.discount)
     phi = rate / jnp.where(pace > 0, pace, 1)
     bound = equation.weights.total() == 0  # rows of the constraints hold no weights
     for constraint in (rules.stop, rules.floor):

@@ -18,13 +18,10 @@ import jax.numpy as jnp
 
 from hjbjax.discretisation import chain, cut_cells, stencil
 from hjbjax.discretisation.chain import Rates
-from hjbjax.discretisation.schemes import Scheme
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.hamiltonian import discrete, players
 from hjbjax.problem import sets
-from hjbjax.problem.grid import Grid
-from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import node
-from hjbjax.tracing import components
 
 ROUNDING = 8  # units of eps in (Q + β)|V|, below which one action is no better than another
 
@@ -92,30 +89,23 @@ class Correction:
     fastest: Any = None
 
 
-def conditions(problem: Problem, grid: Grid, dtype: Any, t: Any = 0.0) -> Conditions:
+def conditions(on: Discretisation) -> Conditions:
     """Target, stopping cost and running maximum at the nodes."""
+    problem = on.problem
     exit_cost, stop, floor = (
-        None if ingredient is None else at_nodes(problem, grid, ingredient, dtype, t)
+        None if ingredient is None else on.at_nodes(ingredient)
         for ingredient in (problem.exit_cost, problem.stopping_cost, problem.running_max)
     )
-    held = jnp.zeros(grid.shape, bool) if problem.target is None else cut_cells.level(problem, grid, dtype, t) <= 0
-    given = jnp.zeros((), dtype) if exit_cost is None else jnp.where(held, exit_cost, 0)
+    held = jnp.zeros(on.grid.shape, bool) if problem.target is None else cut_cells.level(on) <= 0
+    given = jnp.zeros((), on.dtype) if exit_cost is None else jnp.where(held, exit_cost, 0)
     return Conditions(held, given, stop, floor, ended=held)
 
 
-def at_nodes(problem: Problem, grid: Grid, ingredient: Any, dtype: Any, t: Any = 0.0) -> jax.Array:
-    """A function of the state alone, or a number, at every node, shape (*grid); None is zero."""
-    return jnp.broadcast_to(components.of_state(problem, ingredient, grid.components(dtype), t, dtype), grid.shape)
-
-
 def greedy(
-    problem: Problem,
-    grid: Grid,
+    on: Discretisation,
     value: jax.Array,
     held: jax.Array,
     *,
-    scheme: Scheme,
-    t: Any = 0.0,
     incumbent: Greedy | None = None,
     lost: jax.Array | None = None,
 ) -> Greedy:
@@ -123,75 +113,54 @@ def greedy(
 
     To the nodes that are ``lost``, bool (*grid), no drift leads that is only rounding.
     """
-    how = players.setting(problem, grid.ndim, value.dtype)
-    here = _around(problem, grid, value, scheme, t, incumbent, lost)
-    return _left_over(problem, grid, value, held, *discrete.optimise(here, how))
+    how = players.setting(on.problem, on.grid.ndim, on.dtype)
+    return _left_over(on, value, held, *discrete.optimise(_around(on, value, incumbent, lost), how))
 
 
-def kept(
-    problem: Problem, grid: Grid, value: jax.Array, fixed: jax.Array, new: Greedy, old: Greedy, *, scheme: Scheme
-) -> Greedy:
+def kept(on: Discretisation, value: jax.Array, fixed: jax.Array, new: Greedy, old: Greedy) -> Greedy:
     """The new policy where it is better by more than rounding or where nodes are ``fixed``, else the old one.
 
     From a policy that ends, one improvement after the other then keeps it so: among actions that are worth the same
     the first one found leads to where its value came from, and another one may go round. There is no disturbance.
     """
-    here, u = _around(problem, grid, value, scheme, 0.0, None), list(old.controls)
-    rates = chain.rates(problem, grid, u, [], scheme=scheme.chain, dtype=value.dtype)
-    rounding = ROUNDING * jnp.finfo(value.dtype).eps * (rates.total() + problem.discount) * jnp.abs(value)
-    rate = here.at(u, []) - problem.discount * value
+    here, u, discount = _around(on, value, None), list(old.controls), on.problem.discount
+    rates = chain.rates(on, u, [])
+    rounding = ROUNDING * jnp.finfo(on.dtype).eps * (rates.total() + discount) * jnp.abs(value)
+    rate = here.at(u, []) - discount * value
     stays = ~fixed & (rate <= new.rate + rounding)
     controls = (jnp.where(stays, before, after) for before, after in zip(old.controls, new.controls, strict=True))
     return Greedy(jnp.where(stays, rate, new.rate), tuple(controls), ())
 
 
 def respond(
-    problem: Problem,
-    grid: Grid,
-    value: jax.Array,
-    held: jax.Array,
-    current: Greedy,
-    *,
-    scheme: Scheme,
-    t: Any = 0.0,
-    lost: jax.Array | None = None,
+    on: Discretisation, value: jax.Array, held: jax.Array, current: Greedy, *, lost: jax.Array | None = None
 ) -> Greedy:
     """The inner player's best answer to the outer player's current policy, in a game."""
-    how = players.setting(problem, grid.ndim, value.dtype)
-    here = _around(problem, grid, value, scheme, t, current, lost)
+    how = players.setting(on.problem, on.grid.ndim, on.dtype)
+    here = _around(on, value, current, lost)
     u, d = list(current.controls), list(current.disturbances)
-    if problem.isaacs == "upper":
+    if on.problem.isaacs == "upper":
         best, d = discrete.best_response(here, how.disturbance, lambda d: (u, d))
     else:
         best, u = discrete.best_response(here, how.control, lambda u: (u, d))
-    return _left_over(problem, grid, value, held, best, u, d)
+    return _left_over(on, value, held, best, u, d)
 
 
-def _around(
-    problem: Problem, grid: Grid, value: Any, scheme: Scheme, t: Any, policy: Greedy | None, lost: Any = None
-) -> Any:
-    here = discrete.local(problem, grid, value, scheme=scheme, t=t, lost=lost)
+def _around(on: Discretisation, value: Any, policy: Greedy | None, lost: Any = None) -> discrete.Local:
+    here = discrete.local(on, value, lost)
     if policy is None:
         return here
     return dataclasses.replace(here, tried=(list(policy.controls), list(policy.disturbances)))
 
 
-def _left_over(problem: Problem, grid: Grid, value: Any, held: Any, best: Any, u: list, d: list) -> Greedy:
-    rate = jnp.where(held, 0, best - problem.discount * value)
-    full = [tuple(jnp.broadcast_to(jnp.asarray(c, value.dtype), grid.shape) for c in action) for action in (u, d)]
+def _left_over(on: Discretisation, value: Any, held: Any, best: Any, u: list, d: list) -> Greedy:
+    rate = jnp.where(held, 0, best - on.problem.discount * value)
+    full = [tuple(jnp.broadcast_to(jnp.asarray(c, on.dtype), on.grid.shape) for c in action) for action in (u, d)]
     return Greedy(rate, *full)
 
 
 def correction(
-    problem: Problem,
-    grid: Grid,
-    value: jax.Array,
-    policy: Greedy,
-    rules: Conditions,
-    *,
-    scheme: Scheme,
-    t: Any = 0.0,
-    fastest: Any = None,
+    on: Discretisation, value: jax.Array, policy: Greedy, rules: Conditions, *, fastest: Any = None
 ) -> Correction:
     """The linear equation for δ under one policy; the active branch of the constraints is chosen node by node.
 
@@ -199,8 +168,8 @@ def correction(
     every rate counts, however small it is beside the others.
     """
     u, d = list(policy.controls), list(policy.disturbances)
-    rates = chain.rates(problem, grid, u, d, scheme=scheme.chain, dtype=value.dtype, t=t)
-    leaving = rates.total() + problem.discount
+    rates = chain.rates(on, u, d)
+    leaving = rates.total() + on.problem.discount
     fastest = jnp.max(leaving) if fastest is None else fastest
     moves = leaving > 8 * jnp.finfo(value.dtype).eps * fastest  # a drift that cancels leaves rounding
     pace = jnp.where(moves, leaving, jnp.where(fastest > 0, fastest, 1))  # where nothing moves the cost piles up
@@ -212,22 +181,21 @@ def correction(
         floored = ~rules.held & (rules.floor - value > source)
         source, free = jnp.where(floored, rules.floor - value, source), free & ~floored
     weights = rates.scaled(jnp.where(free, 1 / pace, 0))
-    if scheme.subcell:  # what leads to a held node ends on the target's boundary, where nothing is to be corrected
+    if on.scheme.subcell:  # what leads to a held node ends on the target's boundary, where nothing is to be corrected
         loose = ~rules.held
         jumps = zip(weights.offsets, weights.values, strict=True)
-        cut = tuple(jnp.where(stencil.neighbour(loose, grid, offset), w, 0) for offset, w in jumps)
+        cut = tuple(jnp.where(stencil.neighbour(loose, on.grid, offset), w, 0) for offset, w in jumps)
         weights = dataclasses.replace(weights, values=cut)
     return Correction(source, weights, fastest)
 
 
-def fastest_rate(problem: Problem, grid: Grid, *, scheme: Scheme, dtype: Any, t: Any = 0.0) -> jax.Array:
+def fastest_rate(on: Discretisation) -> jax.Array:
     """max over the actions of Q at every node, (*grid): with Δt = 1/(Q + β) value iteration is monotone.
 
     Q is convex in u for a drift affine in u, so that corners of the sets suffice; samples are added for others.
     """
-    result = jnp.zeros(grid.shape, dtype)
-    for u in sets.probes(problem.controls, dtype):
-        for d in sets.probes(problem.disturbances, dtype):
-            rates = chain.rates(problem, grid, u, d, scheme=scheme.chain, dtype=dtype, t=t)
-            result = jnp.maximum(result, rates.total())
+    result = jnp.zeros(on.grid.shape, on.dtype)
+    for u in sets.probes(on.problem.controls, on.dtype):
+        for d in sets.probes(on.problem.disturbances, on.dtype):
+            result = jnp.maximum(result, chain.rates(on, u, d).total())
     return result

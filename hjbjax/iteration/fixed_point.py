@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation import chain, edges, stencil
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Limited, Scheme
 from hjbjax.hamiltonian import players
 from hjbjax.iteration import bellman, certificates, relaxation
@@ -40,35 +41,52 @@ PATIENCE = 10  # steps without progress of a residual that is rounding
 ROUNDING = 64  # residuals below this many units in the last place of max|V| are rounding
 
 
-@node(static=("scheme", "certificate", "has_lost"))
+@node(static=("certificate", "has_lost"))
 class Task:
     """All that stays the same during a solve.
 
     Args:
-      problem, grid: the question.
+      on: the problem on its grid.
       method: how the correction is made.
       rules: held nodes and constraints.
       counted: bool (*grid), nodes that have a finite value.
       least_cost: the least running cost at each node, for the multiplicative certificate; else None.
       pace: max Q + β at each node, for value iteration and for open ends; else None.
       tol: certified error to reach, cost units.
-      scheme, certificate: static choices.
+      certificate: which bound on the error applies.
       crossing: the time that it takes to cross the box at the largest speeds, where that was asked for; else None.
       has_lost: whether nodes that do not count may lie beside others, so that no action may lead there.
     """
 
-    problem: Problem
-    grid: Grid
+    on: Discretisation
     method: Method
     rules: Conditions
     counted: jax.Array
     least_cost: jax.Array | None
     pace: jax.Array | None
     tol: Any
-    scheme: Scheme
     certificate: Certificate
     crossing: Any = None
     has_lost: bool = False
+
+    @property
+    def problem(self) -> Problem:
+        """The question."""
+        return self.on.problem
+
+    @property
+    def grid(self) -> Grid:
+        """The nodes."""
+        return self.on.grid
+
+    @property
+    def scheme(self) -> Scheme:
+        """How derivatives are made."""
+        return self.on.scheme
+
+    def asking(self, problem: Problem) -> "Task":
+        """The task of another problem, all else as it is."""
+        return dataclasses.replace(self, on=self.on.asking(problem))
 
     @property
     def lost(self) -> jax.Array | None:
@@ -146,7 +164,8 @@ def run(task: Task, state: State, until: Any) -> State:
     def step(state):
         # loop variant, or XLA compiles a kernel for every scalar of every action that it can hoist
         controls, grid, count = jax.lax.optimization_barrier((task.problem.controls, task.grid, state.step))
-        here = dataclasses.replace(task, problem=altered(task.problem, controls=controls), grid=grid)
+        on = dataclasses.replace(task.on, problem=altered(task.problem, controls=controls), grid=grid)
+        here = dataclasses.replace(task, on=on)
         return advance(here, dataclasses.replace(state, step=count), start)
 
     return jax.lax.while_loop(goes_on, step, state)
@@ -180,7 +199,7 @@ def broken(task: Task, state: State) -> jax.Array:
     stay = jnp.zeros_like(state.value)
     delta = jax.lax.cond(state.step < 0, lambda: stay, lambda: _correct(task, state))
     value = task.impose(state.value + delta)
-    rate = bellman.greedy(task.problem, task.grid, value, task.rules.held, scheme=task.scheme, lost=task.lost).rate
+    rate = bellman.greedy(task.on, value, task.rules.held, lost=task.lost).rate
     return task.counted & ~(jnp.isfinite(value) & jnp.isfinite(rate))
 
 
@@ -210,11 +229,11 @@ def _held_back(task: Task, state: State) -> Any:
 def _look(
     task: Task, value: jax.Array, incumbent: Greedy, *, moved: jax.Array, first: jax.Array
 ) -> tuple[Greedy, jax.Array, Gap]:
-    problem, grid, scheme = task.problem, task.grid, task.scheme
-    policy = bellman.greedy(problem, grid, value, task.rules.held, scheme=scheme, incumbent=incumbent, lost=task.lost)
+    problem = task.problem
+    policy = bellman.greedy(task.on, value, task.rules.held, incumbent=incumbent, lost=task.lost)
     if problem.stopping_cost is not None and not problem.is_game and task.certificate in TO_THE_END:
         fixed = task.rules.held | first  # nobody has chosen the actions before the first look
-        policy = bellman.kept(problem, grid, value, fixed, policy, incumbent, scheme=scheme)
+        policy = bellman.kept(task.on, value, fixed, policy, incumbent)
     left = equation(task, value, policy)
     measured = certificates.gap(
         task.certificate,
@@ -234,16 +253,14 @@ def _look(
 
 def _leaks(task: Task, policy: Greedy) -> jax.Array:
     """Whether the policy leads from a node that counts to one that is lost, by more than rounding."""
-    problem, grid, dtype = task.problem, task.grid, policy.rate.dtype
-    u, d = list(policy.controls), list(policy.disturbances)
-    rates = chain.rates(problem, grid, u, d, scheme=task.scheme.chain, dtype=dtype)
-    beside, slack = edges.beside(~task.counted, grid), edges.slack(problem, grid, 0.0, dtype)
-    f = chain.drift(problem, grid.components(dtype), u, d, 0.0, dtype)
-    strays = [edges.strays(*each) for each in zip(f, beside, slack, strict=True)]
+    grid, dtype, u, d = task.grid, policy.rate.dtype, list(policy.controls), list(policy.disturbances)
+    rates = chain.rates(task.on, u, d)
+    beside, slack = edges.beside(~task.counted, grid), edges.slack(task.on)
+    strays = [edges.strays(*each) for each in zip(task.on.drift(u, d), beside, slack, strict=True)]
     leaking = jnp.zeros(grid.shape, dtype)
     for offset, c in zip(rates.offsets, rates.values, strict=True):
         leak = jnp.where(stencil.neighbour(task.counted, grid, offset), 0, c)
-        if problem.noise is None:  # jumps go along one axis
+        if task.problem.noise is None:  # jumps go along one axis
             axis = next(axis for axis, step in enumerate(offset) if step)
             leak = jnp.where(strays[axis], 0, leak)
         leaking = leaking + leak
@@ -293,7 +310,7 @@ def _evaluated(task: Task, state: State) -> jax.Array:
     assert isinstance(task.method, PolicyIteration)
     if task.certificate is Certificate.OPEN:  # in a game, too: steps in time improve both players at once
         later = altered(task.problem, discount=task.problem.discount + _shift(task, state))
-        left = equation(dataclasses.replace(task, problem=later), state.value, state.policy)
+        left = equation(task.asking(later), state.value, state.policy)
         return relaxation.solve(task.method.evaluation, left, task.grid)
     if task.problem.is_game:
         return _hoffman_karp(task, state)
@@ -308,7 +325,7 @@ def _pace(task: Task, state: State) -> jax.Array:
     if how.control.fastest_at_ends and how.disturbance.fastest_at_ends:
         return task.pace
     u, d = list(state.policy.controls), list(state.policy.disturbances)
-    chosen = chain.rates(task.problem, task.grid, u, d, scheme=task.scheme.chain, dtype=state.value.dtype).total()
+    chosen = chain.rates(task.on, u, d).total()
     return jnp.maximum(task.pace, chosen + task.problem.discount)
 
 
@@ -316,7 +333,7 @@ def equation(task: Task, value: jax.Array, policy: Greedy, fastest: Any = None) 
     """The linear equation of a policy; ``fastest``, its largest Q + β, spares a pass where it is known and wanted."""
     if task.certificate is Certificate.ADDITIVE:  # no rate is only rounding: there is a discount
         fastest = jnp.zeros((), value.dtype)
-    return bellman.correction(task.problem, task.grid, value, policy, task.rules, scheme=task.scheme, fastest=fastest)
+    return bellman.correction(task.on, value, policy, task.rules, fastest=fastest)
 
 
 def _hoffman_karp(task: Task, state: State) -> jax.Array:
@@ -328,7 +345,7 @@ def _hoffman_karp(task: Task, state: State) -> jax.Array:
     def reply(carry):
         value, policy, _, count = carry
         value = task.impose(value + relaxation.solve(evaluation, equation(task, value, policy), task.grid))
-        policy = bellman.respond(task.problem, task.grid, value, held, policy, scheme=task.scheme, lost=task.lost)
+        policy = bellman.respond(task.on, value, held, policy, lost=task.lost)
         left = jnp.max(jnp.where(task.counted, jnp.abs(equation(task, value, policy).source), 0))
         return value, policy, left, count + 1
 

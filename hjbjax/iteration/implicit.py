@@ -15,41 +15,34 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax.discretisation.schemes import Scheme
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import bellman, certificates, relaxation
 from hjbjax.iteration.bellman import Conditions, Correction, Greedy
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.relaxation import Evaluation
-from hjbjax.problem.grid import Grid
-from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, node
 
 ROUNDING = 16  # residuals below this many units in the last place of max|V| are rounding
 REPLIES = 20  # of the inner player to one policy of the outer one, at most
 
 
-@node(static=("scheme",))
+@node()
 class Step:
     """The stationary problem of one step.
 
     Args:
-      problem: the problem with discount β + 1/Δt.
-      grid, scheme: the chain.
-      rules: held nodes and constraints at t.
+      on: the problem with discount β + 1/Δt on its grid at the time of W.
+      rules: held nodes and constraints at that time.
       arriving: V/Δt, what is added to the running cost.
-      t: the time of W.
     """
 
-    problem: Problem
-    grid: Grid
-    scheme: Scheme
+    on: Discretisation
     rules: Conditions
     arriving: jax.Array
-    t: Any
 
     def equation(self, value: jax.Array, policy: Greedy) -> Correction:
         """The linear equation of a policy at ``value``."""
-        return bellman.correction(self.problem, self.grid, value, policy, self.rules, scheme=self.scheme, t=self.t)
+        return bellman.correction(self.on, value, policy, self.rules)
 
     def complete(self, policy: Greedy) -> Greedy:
         """A policy of the problem with its rate, V/Δt included."""
@@ -57,26 +50,19 @@ class Step:
 
     def improved(self, value: jax.Array) -> Greedy:
         """The greedy policy at ``value``."""
-        held = self.rules.held
-        return self.complete(bellman.greedy(self.problem, self.grid, value, held, scheme=self.scheme, t=self.t))
+        return self.complete(bellman.greedy(self.on, value, self.rules.held))
 
     def reply(self, value: jax.Array, policy: Greedy) -> Greedy:
         """The inner player's answer to the outer player's policy."""
-        held = self.rules.held
-        return self.complete(
-            bellman.respond(self.problem, self.grid, value, held, policy, scheme=self.scheme, t=self.t)
-        )
+        return self.complete(bellman.respond(self.on, value, self.rules.held, policy))
 
 
 def advance(
-    problem: Problem,
-    grid: Grid,
+    on: Discretisation,
     rules: Conditions,
     value: jax.Array,
-    t: Any,
     dt: Any,
     *,
-    scheme: Scheme,
     evaluation: Evaluation,
     tol: Any,
     max_steps: int,
@@ -84,17 +70,17 @@ def advance(
     """W at the time t from V = ``value`` at t + Δt, its policy, and whether it is known to ``tol`` or to rounding.
 
     Args:
-      problem, grid, scheme: the chain.
+      on: the chain at the time t of the result.
       rules: held nodes and constraints at t.
       value: V, shape (*grid).
-      t: the time of the result.
       dt: Δt > 0.
       evaluation: how a policy is evaluated.
       tol: bound on the algebraic error of the step, cost units.
       max_steps: policy improvements, at most.
     """
-    shifted = altered(problem, discount=problem.discount + 1 / dt)  # a problem refuses it beside a running maximum
-    step = Step(shifted, grid, scheme, rules, value / dt, t)
+    # not by Problem(...), which refuses a discount beside a running maximum
+    shifted = altered(on.problem, discount=on.problem.discount + 1 / dt)
+    step = Step(on.asking(shifted), rules, value / dt)
 
     def look(value):
         policy = step.improved(value)
@@ -125,10 +111,10 @@ def _evaluated(step: Step, value: jax.Array, policy: Greedy, residual: Any, eval
     """The value of the (outer player's) policy, roughly; in a game to a tenth of the residual."""
 
     def solved(value, policy):
-        delta = relaxation.solve(evaluation, step.equation(value, policy), step.grid)
+        delta = relaxation.solve(evaluation, step.equation(value, policy), step.on.grid)
         return step.rules.impose(value + delta)
 
-    if not step.problem.is_game:
+    if not step.on.problem.is_game:
         return solved(value, policy)
 
     def reply(carry):

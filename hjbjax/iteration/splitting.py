@@ -10,58 +10,51 @@ of |f₁ + f₂| in the dissipation, as it does in a Lax–Friedrichs flux. Upwi
 condition at a node (f = u + d, D⁺ = 1, D⁻ = −1: min max 1, max min 0); the halves keep it.
 """
 
-import dataclasses
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from hjbjax.discretisation import chain
-from hjbjax.discretisation.schemes import Scheme
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.hamiltonian import discrete
 from hjbjax.hamiltonian.players import setting
 from hjbjax.hamiltonian.search import Action
 from hjbjax.iteration import bellman
-from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import node
 from hjbjax.tracing import dependence
 
 
-def optimise(
-    problem: Problem, grid: Grid, value: jax.Array, *, scheme: Scheme, t: Any = 0.0
-) -> tuple[jax.Array, Action, Action]:
-    """min max of H around ``value`` at the time t: the value at every node, the control and the disturbance."""
-    here = discrete.local(problem, grid, value, scheme=scheme, t=t)
+def optimise(on: Discretisation, value: jax.Array) -> tuple[jax.Array, Action, Action]:
+    """min max of H around ``value``: the value at every node, the control and the disturbance."""
+    here = discrete.local(on, value)
     best, players = [], []
-    for part in halves(problem, grid, value.dtype):
-        how = setting(part, grid.ndim, value.dtype)
-        total, u, d = discrete.optimise(dataclasses.replace(here, problem=part), how)
+    for part in halves(on):
+        how = setting(part, on.grid.ndim, on.dtype)
+        total, u, d = discrete.optimise(here.asking(part), how)
         best.append(total)
         players.append((u, d))
     return sum(best[1:], start=best[0]), players[0][0], players[-1][1]
 
 
-def fastest_rate(problem: Problem, grid: Grid, *, scheme: Scheme, dtype: Any, t: Any = 0.0) -> jax.Array:
+def fastest_rate(on: Discretisation) -> jax.Array:
     """max over the actions of the rate at which value flows out of each node, (*grid), per unit time."""
-    parts = halves(problem, grid, dtype)
-    rates = [bellman.fastest_rate(part, grid, scheme=scheme, dtype=dtype, t=t) for part in parts]
+    rates = [bellman.fastest_rate(on.asking(part)) for part in halves(on)]
     return rates[0] if len(rates) == 1 else rates[0] + rates[1]
 
 
-def rate(problem: Problem, grid: Grid, u: Action, d: Action, *, scheme: Scheme, dtype: Any, t: Any = 0.0) -> jax.Array:
+def rate(on: Discretisation, u: Action, d: Action) -> jax.Array:
     """The rate at which value flows out of each node under given actions, (*grid), per unit time."""
-    parts = halves(problem, grid, dtype)
+    parts = halves(on)
     players = [(u, d)] if len(parts) == 1 else [(u, []), ([], d)]
-    rates = [
-        chain.rates(part, grid, *actions, scheme=scheme.chain, dtype=dtype, t=t).total()
-        for part, actions in zip(parts, players, strict=True)
-    ]
+    rates = [chain.rates(on.asking(part), *actions).total() for part, actions in zip(parts, players, strict=True)]
     return sum(rates[1:], start=rates[0])
 
 
-def halves(problem: Problem, grid: Grid, dtype: Any) -> list[Problem]:
+def halves(on: Discretisation) -> list[Problem]:
     """The problems of the two players where they share components and can be told apart; else the problem itself."""
+    problem, grid, dtype = on.problem, on.grid, on.dtype
     if not problem.is_game or grid.sides("constrained"):  # what is admissible depends on both players' sum
         return [problem]
     how = setting(problem, grid.ndim, dtype)

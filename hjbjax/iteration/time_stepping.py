@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 
 from hjbjax.discretisation import chain
-from hjbjax.discretisation.schemes import Scheme
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import bellman, implicit, relaxation, splitting
 from hjbjax.iteration.bellman import Conditions
 from hjbjax.iteration.relaxation import Evaluation
@@ -80,46 +80,53 @@ class Implicit:
         arguments.count(self.max_steps, "Implicit: max_steps")
 
 
-@node(static=("scheme", "checks_rates", "checks_noise"))
+@node(static=("checks_rates", "checks_noise"))
 class March:
     """All that stays the same during a march.
 
     Args:
-      problem, grid: the question.
+      on: the problem on its grid, with the slopes of a scheme.
       method: ``Explicit`` with its stages, or ``Implicit`` with its evaluation.
       rules: held nodes and constraints; ``None`` where they depend on the time.
       limit: the longest stable step of an explicit method; ``None`` where it depends on the time, and if implicit.
       step: the longest step wanted; inf where the limit alone counts.
       horizon: the time at which the terminal cost is paid.
       watched: bool (*grid), nodes where a disturbance at its bound means that the value blows up; or ``None``.
-      scheme: the slopes.
       checks_rates: whether explicit steps look at Q under the actions that they chose.
       checks_noise: whether steps look for correlated noise that the chain cannot represent.
     """
 
-    problem: Problem
-    grid: Grid
+    on: Discretisation
     method: Any
     rules: Conditions | None
     limit: Any
     step: Any
     horizon: Any
     watched: Any
-    scheme: Scheme
     checks_rates: bool = False
     checks_noise: bool = False
 
-    def rules_at(self, t: Any, dtype: Any) -> Conditions:
-        """Held nodes and constraints at the time t."""
-        return bellman.conditions(self.problem, self.grid, dtype, t) if self.rules is None else self.rules
+    @property
+    def problem(self) -> Problem:
+        """The question."""
+        return self.on.problem
 
-    def longest(self, t: Any, dtype: Any) -> Any:
+    @property
+    def grid(self) -> Grid:
+        """The nodes."""
+        return self.on.grid
+
+    def rules_at(self, t: Any) -> Conditions:
+        """Held nodes and constraints at the time t."""
+        return bellman.conditions(self.on.at(t)) if self.rules is None else self.rules
+
+    def longest(self, t: Any) -> Any:
         """The longest step that may start at the time t."""
         if isinstance(self.method, Implicit):
             return self.step
         limit = self.limit
         if limit is None:
-            limit = self.method.fraction * stable(self.problem, self.grid, self.scheme, t, dtype)
+            limit = self.method.fraction * stable(self.on.at(t))
         return jnp.minimum(self.step, limit)
 
 
@@ -158,24 +165,24 @@ class Seen:
         )
 
 
-def stable(problem: Problem, grid: Grid, scheme: Scheme, t: Any, dtype: Any) -> jax.Array:
+def stable(on: Discretisation) -> jax.Array:
     """The longest step for which explicit Euler is monotone, 1/(max Q + β); inf where nothing moves."""
-    rate = jnp.max(splitting.fastest_rate(problem, grid, scheme=scheme, dtype=dtype, t=t)) + problem.discount
+    rate = jnp.max(splitting.fastest_rate(on)) + on.problem.discount
     return jnp.where(rate > 0, 1 / jnp.where(rate > 0, rate, 1), jnp.inf)
 
 
-def terminal(problem: Problem, grid: Grid, horizon: Any, dtype: Any, start: Any = None) -> jax.Array:
-    """V at the horizon: ``start`` or the terminal cost, with given values and constraints put in.
+def terminal(on: Discretisation, start: Any = None) -> jax.Array:
+    """V at the horizon, the time of ``on``: ``start`` or the terminal cost, with given values and constraints put in.
 
     Without either a stopping cost is paid at the latest then, and a running maximum is g itself; else nothing is paid.
     """
-    rules = bellman.conditions(problem, grid, dtype, horizon)
+    rules, problem = bellman.conditions(on), on.problem
     if start is not None:
-        return rules.impose(jnp.asarray(start, dtype))
+        return rules.impose(jnp.asarray(start, on.dtype))
     cost = problem.terminal_cost
     if cost is None:
         cost = problem.running_max if problem.stopping_cost is None else problem.stopping_cost
-    return rules.impose(bellman.at_nodes(problem, grid, cost, dtype, horizon))
+    return rules.impose(on.at_nodes(cost))
 
 
 def begin(march: March, value: jax.Array) -> Front:
@@ -208,7 +215,7 @@ def advance(march: March, front: Front, until: Any) -> Front:
     """One step towards ``until``; what is left is cut into equal steps."""
     dtype = front.value.dtype
     until, left = jnp.asarray(until, dtype), front.t - until
-    longest, ok = march.longest(front.t, dtype), jnp.ones((), bool)
+    longest, ok = march.longest(front.t), jnp.ones((), bool)
     if march.checks_rates:  # a step like the last one rather than one that is done again
         longest = jnp.minimum(longest, march.method.fraction / front.seen.fastest)
     count = jnp.maximum(jnp.ceil(left / longest - 1e-4), 1)
@@ -278,45 +285,46 @@ def _explicit(march: March, value: jax.Array, t: Any, dt: Any) -> tuple[jax.Arra
     dtype, stages = value.dtype, march.method.stages
     if stages == 1:
         rate, seen = _rate(march, value, t)
-        return march.rules_at(t - dt, dtype).impose(value + dt * rate), seen
+        return march.rules_at(t - dt).impose(value + dt * rate), seen
     means, starts, ends = (jnp.asarray(table[stages], dtype) for table in (MEANS, STARTS, ENDS))
 
     def stage(k, carry):
         w, seen = carry
         rate, now = _rate(march, w, t - starts[k] * dt)
         moved = means[k] * value + (1 - means[k]) * (w + dt * rate)
-        return march.rules_at(t - ends[k] * dt, dtype).impose(moved), seen.joined(now)
+        return march.rules_at(t - ends[k] * dt).impose(moved), seen.joined(now)
 
     return jax.lax.fori_loop(0, stages, stage, (value, _nothing(dtype)))
 
 
 def _implicit(march: March, value: jax.Array, t: Any, dt: Any) -> tuple[jax.Array, jax.Array, Seen]:
     """V at t from V at t + Δt, whether the policy iteration came to its end, and what its last policy saw."""
-    method, rules = march.method, march.rules_at(t, value.dtype)
+    method = march.method
     value, policy, ok = implicit.advance(
-        march.problem, march.grid, rules, value, t, dt, scheme=march.scheme, evaluation=method.evaluation,
+        march.on.at(t), march.rules_at(t), value, dt, evaluation=method.evaluation,
         tol=method.tol * dt / march.horizon, max_steps=method.max_steps,
     )  # fmt: skip
-    return value, ok, _look(march, list(policy.controls), list(policy.disturbances), t, value.dtype)
+    return value, ok, _look(march, list(policy.controls), list(policy.disturbances), t)
 
 
 def _rate(march: March, value: jax.Array, t: Any) -> tuple[jax.Array, Seen]:
     """F = min max H − β V, cost per unit time, and what the optimal actions show."""
-    best, u, d = splitting.optimise(march.problem, march.grid, value, scheme=march.scheme, t=t)
-    return best - march.problem.discount * value, _look(march, u, d, t, value.dtype)
+    best, u, d = splitting.optimise(march.on.at(t), value)
+    return best - march.problem.discount * value, _look(march, u, d, t)
 
 
-def _look(march: March, u: list, d: list, t: Any, dtype: Any) -> Seen:
+def _look(march: March, u: list, d: list, t: Any) -> Seen:
     """How fast the chain leaves a node under these actions, and where it cannot represent the noise."""
-    seen, problem, grid = _nothing(dtype), march.problem, march.grid
+    on, dtype = march.on.at(t), march.on.dtype
+    seen = _nothing(dtype)
     if march.checks_rates:
-        rate = splitting.rate(problem, grid, u, d, scheme=march.scheme, dtype=dtype, t=t)
-        seen = dataclasses.replace(seen, fastest=jnp.max(rate) + jnp.asarray(problem.discount, dtype))
+        fastest = jnp.max(splitting.rate(on, u, d)) + jnp.asarray(on.problem.discount, dtype)
+        seen = dataclasses.replace(seen, fastest=fastest)
     if march.checks_noise:
-        lacking = chain.lacking(chain.diffusion(problem, grid.components(dtype), u, d, t, dtype), grid, dtype)
+        lacking = chain.lacking(on, on.diffusion(u, d))
         if lacking is None:
             return seen
-        lacking = jnp.broadcast_to(lacking, grid.shape) & ~march.rules_at(t, dtype).held
+        lacking = jnp.broadcast_to(lacking, on.grid.shape) & ~march.rules_at(t).held
         first = jnp.where(jnp.any(lacking), jnp.argmax(lacking), -1).astype(jnp.int32)
         seen = dataclasses.replace(seen, lacking=first, t=jnp.asarray(t, dtype))
     return seen
@@ -324,7 +332,7 @@ def _look(march: March, u: list, d: list, t: Any, dtype: Any) -> Seen:
 
 def greedy(march: March, value: jax.Array, t: Any) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, ...]]:
     """The control and the disturbance at the time t, each component of shape (*grid)."""
-    _, u, d = splitting.optimise(march.problem, march.grid, value, scheme=march.scheme, t=t)
+    _, u, d = splitting.optimise(march.on.at(t), value)
 
     def full(action):
         return tuple(jnp.broadcast_to(jnp.asarray(entry, value.dtype), march.grid.shape) for entry in action)
@@ -340,4 +348,4 @@ def _saturates(march: March, value: jax.Array, t: Any) -> jax.Array:
     for j, entry in enumerate(greedy(march, value, t)[1]):
         slack = NEAR * (choices.hi[j] - choices.lo[j])
         on_bound |= (entry <= choices.lo[j] + slack) | (entry >= choices.hi[j] - slack)
-    return jnp.any(on_bound & march.watched & ~march.rules_at(t, value.dtype).held)
+    return jnp.any(on_bound & march.watched & ~march.rules_at(t).held)

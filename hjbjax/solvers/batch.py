@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Limited, Scheme, Upwind
 from hjbjax.finiteness import admissibility, node_checks
 from hjbjax.iteration import fixed_point
@@ -141,7 +142,7 @@ def _solve_together(
             node_checks.values(problem, grid, kind, clock)
             admissibility.values(problem, grid, kind)
             prepared.append(
-                prepare_on_host(problem, grid, method=method, scheme=scheme.chain, tol=tol, dtype=kind, clock=clock)
+                prepare_on_host(Discretisation(problem, grid, scheme.chain, kind), method=method, tol=tol, clock=clock)
             )
         except ValueError as refusal:
             raise ValueError(f"lane {name}: {refusal}") from refusal

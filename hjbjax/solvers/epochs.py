@@ -35,13 +35,13 @@ ADVICE = {
 }
 
 _run = jax.jit(time_stepping.run)
-_terminal = jax.jit(time_stepping.terminal, static_argnames="dtype")
+_terminal = jax.jit(time_stepping.terminal)
 
 
 @jax.jit
 def _greedy(march: March, value: jax.Array, t: Any) -> tuple:
     u, d = time_stepping.greedy(march, value, t)
-    rules = march.rules_at(t, value.dtype)
+    rules = march.rules_at(t)
     return (u, d), rules.ended, rules.acting(value)
 
 
@@ -51,8 +51,8 @@ def _gap_at(task: March, value: jax.Array, t: Any) -> tuple[jax.Array, jax.Array
     how = players.setting(task.problem, task.grid.ndim, value.dtype)
     if how.separable:
         return jnp.zeros(()), jnp.ones(())
-    here = discrete.local(task.problem, task.grid, value, scheme=task.scheme, t=t)
-    return isaacs_gap(here, ~task.rules_at(t, value.dtype).held)
+    here = discrete.local(task.on.at(t), value)
+    return isaacs_gap(here, ~task.rules_at(t).held)
 
 
 def _isaacs_gap(task: March, front: Front, code: Status) -> float | None:
@@ -97,7 +97,7 @@ def drive(task: March, kept: np.ndarray, start: Any, clock: Clock) -> tuple[Slic
     """From kept time to kept time in chunks; stops at a code, at the time limit, or at Ctrl-C."""
     dtype, slices, chunk = np.dtype(task.horizon.dtype), Slices(task, kept), 1
     start = None if start is None else jnp.asarray(start, dtype)
-    front = time_stepping.begin(task, _terminal(task.problem, task.grid, task.horizon, dtype, start))
+    front = time_stepping.begin(task, _terminal(task.on.at(task.horizon), start))
     code = Status.RUNNING if bool(jnp.all(jnp.isfinite(front.value))) else Status.NONFINITE
     with ticker(clock.progress, float(task.horizon), "march") as show:
         try:
@@ -171,7 +171,7 @@ def assemble(task: March, grid: Grid, slices: Slices, front: Front, code: Status
         message=_message(task, front, code),
         stats={
             "method": _describe(task.method),
-            "scheme": repr(task.scheme),
+            "scheme": repr(task.on.scheme),
             "device": str(jax.devices()[0].device_kind),
             "dtype": str(slices.value.dtype),
             "certificate": CERTIFICATE,

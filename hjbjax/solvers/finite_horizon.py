@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Eno2, Limited, Scheme, Upwind, Weno5
 from hjbjax.finiteness import admissibility, node_checks
 from hjbjax.hamiltonian import players
@@ -38,8 +39,8 @@ from hjbjax.tracing.closures import with_settled_functions
 PROBES = 33  # times at which a given step, and constrained ends, are held against a time-dependent problem
 FEWEST = 100  # steps where no stability limit is known for all of them: implicit, time-dependent, rates by samples
 
-_stable = jax.jit(time_stepping.stable, static_argnames=("scheme", "dtype"))
-_rules = jax.jit(bellman.conditions, static_argnames="dtype")
+_stable = jax.jit(time_stepping.stable)
+_rules = jax.jit(bellman.conditions)
 
 
 @with_settled_functions
@@ -108,7 +109,8 @@ def march(
     _check(problem, grid, scheme, method, step, time_limit)
     horizon, kept = _times(horizon, times)
     if is_traced(problem, grid, method, start):
-        return _march_traced(problem, grid, horizon, kept, start, scheme, method, step, dtype)
+        traced = jnp.result_type(float) if dtype is None else jnp.dtype(dtype)
+        return _march_traced(Discretisation(problem, grid, scheme, traced), horizon, kept, start, method, step)
     kind = as_dtype(dtype)
     check_node_values(start, grid, "march: start")
     grid.check_spacings(kind)
@@ -123,7 +125,7 @@ def march(
                 for t in np.linspace(horizon, 0.0, PROBES) if problem.time_dependent else (0.0,):
                     admissibility.values(problem, grid, kind, t)
                 clock.enter("the preparation")
-                task = _prepare(problem, grid, horizon, scheme, method, step, inner, kind)
+                task = _prepare(Discretisation(problem, grid, scheme, kind), horizon, method, step, inner)
                 slices, front, code = epochs.drive(task, kept, start, clock)
                 solution = epochs.assemble(task, grid, slices, front, code)
             except Stopped as stop:
@@ -214,44 +216,36 @@ def _without_moving_target(problem: Problem) -> Problem:
     return Problem(problem.drift, **{name: getattr(problem, name) for name in names}, time_dependent=True)
 
 
-def _prepare(
-    problem: Problem,
-    grid: Grid,
-    horizon: float,
-    scheme: Scheme,
-    method: Any,
-    step: float | None,
-    inner: float | None,
-    dtype: Any,
-) -> March:
-    """The task of a march, all arrays in ``dtype``, with a given step held against the limit."""
-    problem, grid = cast(problem, dtype), cast(grid, dtype)
+def _prepare(on: Discretisation, horizon: float, method: Any, step: float | None, inner: float | None) -> March:
+    """The task of a march, all arrays in its type, with a given step held against the limit."""
+    on, dtype = cast(on, on.dtype), on.dtype
+    problem, grid = on.problem, on.grid
     moving = problem.time_dependent
     limit: Any = None
     if isinstance(method, Explicit):
-        method = Explicit(method.stages or scheme.stages, jnp.asarray(method.fraction, dtype))
+        method = Explicit(method.stages or on.scheme.stages, jnp.asarray(method.fraction, dtype))
         probes = np.linspace(horizon, 0.0, PROBES) if moving else [horizon]
         if step is not None or not moving:
-            limits = [_stable(problem, grid, scheme, jnp.asarray(t, dtype), dtype) for t in probes]
+            limits = [_stable(on.at(jnp.asarray(t, dtype))) for t in probes]
             limit = jnp.min(jnp.stack(limits))
             _check_step(step, float(limit))
         limit = None if moving else jnp.asarray(limit * method.fraction if step is None else limit, dtype)
     else:
         evaluation = method.evaluation or _evaluation(problem, grid)
         method = Implicit(evaluation, jnp.asarray(method.tol, dtype), method.max_steps)
-    checks = _checks(problem, grid, method, dtype)
+    checks = _checks(on, method)
     if step is None:  # rates that are found on the way say nothing of the first steps
         step = horizon / FEWEST if moving or checks[0] or isinstance(method, Implicit) else math.inf
     return March(
-        problem, grid, method, None if moving else _rules(problem, grid, dtype), limit, jnp.asarray(step, dtype),
-        jnp.asarray(horizon, dtype), _watched(problem, grid, inner, dtype), scheme,
-        *checks,
+        on, method, None if moving else _rules(on), limit, jnp.asarray(step, dtype),
+        jnp.asarray(horizon, dtype), _watched(on, inner), *checks,
     )  # fmt: skip
 
 
-def _checks(problem: Problem, grid: Grid, method: Any, dtype: Any) -> tuple[bool, bool]:
+def _checks(on: Discretisation, method: Any) -> tuple[bool, bool]:
     """Whether steps must look at rates and at correlated noise under the actions that they choose."""
-    how, moving = players.setting(problem, grid.ndim, dtype), problem.time_dependent
+    problem = on.problem
+    how, moving = players.setting(problem, on.grid.ndim, on.dtype), problem.time_dependent
     sampled = not (how.control.fastest_at_ends and how.disturbance.fastest_at_ends)
     rates = isinstance(method, Explicit) and (sampled or (moving and method.stages != 1))
     return rates, callable(problem.noise) and (moving or how.steers_noise)
@@ -273,10 +267,11 @@ def _evaluation(problem: Problem, grid: Grid) -> Any:
     return Sweeps() if problem.noise is None else Krylov()
 
 
-def _watched(problem: Problem, grid: Grid, share: float | None, dtype: Any) -> Any:
+def _watched(on: Discretisation, share: float | None) -> Any:
     """The nodes where a disturbance at its bound is taken for a blow-up; or None."""
+    problem, grid = on.problem, on.grid
     if share is None:
-        how = players.setting(problem, grid.ndim, dtype).disturbance
+        how = players.setting(problem, grid.ndim, on.dtype).disturbance
         share = 0.5 if isinstance(how.choices, Box) and all(how.curved) else 0.0
     if not arguments.is_number(share) or not 0 <= share <= 1:
         raise ValueError(f"march: inner = {share!r}; wanted the share of the box that is watched, from 0 (none) to 1")
@@ -288,15 +283,7 @@ def _watched(problem: Problem, grid: Grid, share: float | None, dtype: Any) -> A
 
 
 def _march_traced(
-    problem: Problem,
-    grid: Grid,
-    horizon: float,
-    kept: np.ndarray,
-    start: Any,
-    scheme: Scheme,
-    method: Any,
-    step: float | None,
-    dtype: Any,
+    on: Discretisation, horizon: float, kept: np.ndarray, start: Any, method: Any, step: float | None
 ) -> Solution:
     """The same steps inside a JAX transformation, in a scan of fixed length: no chunks, no checks of values."""
     if step is None:
@@ -304,15 +291,15 @@ def _march_traced(
             "march: inside jit, vmap and grad the number of steps must be known: give step=, for explicit steps at "
             "most 1/(max Q + β) of every problem that comes"
         )
-    kind = jnp.result_type(float) if dtype is None else jnp.dtype(dtype)
+    kind, problem, grid = on.dtype, on.problem, on.grid
     if isinstance(method, Explicit):
-        method = Explicit(method.stages or scheme.stages, method.fraction)
+        method = Explicit(method.stages or on.scheme.stages, method.fraction)
     else:
         method = Implicit(method.evaluation or _evaluation(problem, grid), method.tol, method.max_steps)
-    problem, grid = cast(problem, kind), cast(grid, kind)
-    rules = None if problem.time_dependent else bellman.conditions(problem, grid, kind)
-    task = March(problem, grid, method, rules, jnp.inf, step, horizon, None, scheme)
-    value, values, actions, count = time_stepping.terminal(problem, grid, horizon, kind, start), [], [], 0
+    on = cast(on, kind)
+    rules = None if problem.time_dependent else bellman.conditions(on)
+    task = March(on, method, rules, jnp.inf, step, horizon, None)
+    value, values, actions, count = time_stepping.terminal(on.at(horizon), start), [], [], 0
     for begin, end in itertools.pairwise([horizon, *kept[::-1].tolist()]):
         steps = max(math.ceil((begin - end) / step - 1e-6), int(begin > end))
         value, count = time_stepping.repeat(task, value, begin, end, steps), count + steps

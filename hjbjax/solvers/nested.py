@@ -8,14 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation.schemes import Upwind
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.finiteness import resting
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import Method, Nested, PolicyIteration
 from hjbjax.iteration.relaxation import Sweeps
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered
 from hjbjax.solution import transfer
 from hjbjax.solution.clock import Clock, Stopped
@@ -30,7 +29,7 @@ WARM_STEPS = 60  # improvements for each of them
 
 
 def start(
-    problem: Problem, grid: Grid, method: Method, scheme: Upwind, tol: float, guess: Any, dtype: Any, clock: Clock
+    on: Discretisation, method: Method, tol: float, guess: Any, clock: Clock
 ) -> tuple[Any, list[tuple[int, ...]]]:
     """The guess for the finest grid: the user's, or the answer of the coarser grids, and the shapes of those.
 
@@ -39,30 +38,30 @@ def start(
     """
     if guess is not None or not isinstance(method, Nested):
         return guess, []
-    grids = levels(problem, grid, method, scheme, dtype, clock)
+    grids = levels(on, method, clock)
     value = None
     if clock.over() is not None:
         return None, []
     for coarse, fine in itertools.pairwise(grids):
         clock.phase = f"the preparation of {' x '.join(map(str, coarse.shape))} nodes"
-        verdict = judge(problem, coarse, dtype)
-        task = prepare_jit(problem, coarse, method=method.inner, scheme=scheme, tol=tol, dtype=dtype, verdict=verdict)
+        level = on.on_grid(coarse)
+        task = prepare_jit(level, method=method.inner, tol=tol, verdict=judge(level))
         state, _, _ = drive(task, warm(task, value, clock), clock)
         if clock.over() is not None:
-            return transfer.prolong(np.asarray(state.value), coarse, grid), []
+            return transfer.prolong(np.asarray(state.value), coarse, on.grid), []
         value = transfer.prolong(state.value, coarse, fine)
     return value, [coarse.shape for coarse in grids[:-1]]
 
 
-def levels(problem: Problem, grid: Grid, method: Nested, scheme: Upwind, dtype: Any, clock: Clock) -> list[Grid]:
+def levels(on: Discretisation, method: Nested, clock: Clock) -> list[Grid]:
     """The grids of a nested solve, coarsest first; a coarser grid that loses the target or rest point is left out."""
-    grids, verdict = [grid], judge(problem, grid, dtype)
-    needs_held = problem.target is not None or verdict.may_rest
+    grids, verdict = [on.grid], judge(on)
+    needs_held = on.problem.target is not None or verdict.may_rest
     while (smaller := transfer.coarser(grids[0])) is not None and smaller.size >= method.coarsest:
         if clock.over() is not None:
             break
         clock.phase = f"the choice of coarser grids, {' x '.join(map(str, smaller.shape))} nodes"
-        if needs_held and not held_jit(problem, smaller, scheme=scheme, dtype=dtype, verdict=verdict).any():
+        if needs_held and not held_jit(on.on_grid(smaller), verdict=verdict).any():
             break
         grids.insert(0, smaller)
     return grids
@@ -90,7 +89,7 @@ def _vanishing(task: Task, value: jax.Array, discounts: tuple[float, ...], clock
     """The answers for some discounts, over one by the time of a crossing, one after the other."""
     for discount in discounts:
         problem = altered(task.problem, discount=jnp.asarray(discount / task.crossing, task.tol.dtype))
-        value = drive(dataclasses.replace(task, problem=problem), value, clock, most=WARM_STEPS)[0].value
+        value = drive(task.asking(problem), value, clock, most=WARM_STEPS)[0].value
     return value
 
 
@@ -154,4 +153,4 @@ def settle(task: Task, verdict: Verdict, reached: np.ndarray | None, guess: Any,
 
 @jax.jit
 def _leaving_pays(task: Task, value: jax.Array) -> jax.Array:
-    return resting.leaving_pays(task.problem, task.grid, task.rules, task.counted, value, scheme=task.scheme.chain)
+    return resting.leaving_pays(task.on.chain, task.rules, task.counted, value)

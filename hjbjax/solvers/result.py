@@ -156,12 +156,10 @@ def warn_of_cuts(cut: np.ndarray, ends: np.ndarray, grid: Grid) -> None:
 @jax.jit
 def _lacking(task: Task, controls: tuple, disturbances: tuple) -> jax.Array:
     """The first node, counted flat, where the policy's noise is correlated more than the spacings allow, or −1."""
-    problem, grid, dtype = task.problem, task.grid, task.tol.dtype
-    a = chain.diffusion(problem, grid.components(dtype), list(controls), list(disturbances), 0.0, dtype)
-    lacking = chain.lacking(a, grid, dtype)
+    lacking = chain.lacking(task.on, task.on.diffusion(list(controls), list(disturbances)))
     if lacking is None:
         return jnp.full((), -1)
-    lacking = jnp.broadcast_to(lacking, grid.shape) & task.counted & ~task.rules.held
+    lacking = jnp.broadcast_to(lacking, task.grid.shape) & task.counted & ~task.rules.held
     return jnp.where(jnp.any(lacking), jnp.argmax(lacking), -1)
 
 
@@ -190,10 +188,11 @@ def isaacs_gap(here: discrete.Local, free: Any) -> tuple[jax.Array, jax.Array]:
 
     What actions matter is the largest difference of H between two pairs of them, of nine representatives a player.
     """
-    how = players.setting(here.problem, here.grid.ndim, here.dtype)
+    problem, grid, dtype = here.on.problem, here.on.grid, here.on.dtype
+    how = players.setting(problem, grid.ndim, dtype)
     upper, lower = (discrete.optimise(here, how, isaacs=which)[0] for which in ("upper", "lower"))
-    sets_of = (here.problem.controls, here.problem.disturbances)
-    mine, theirs = (jnp.asarray(_representatives(choices), here.dtype) for choices in sets_of)
+    sets_of = (problem.controls, problem.disturbances)
+    mine, theirs = (jnp.asarray(_representatives(choices), dtype) for choices in sets_of)
 
     def compare(extremes: Any, pair: Any) -> tuple[Any, None]:
         total = here.at(list(mine[pair[0]]), list(theirs[pair[1]]))
@@ -202,7 +201,7 @@ def isaacs_gap(here: discrete.Local, free: Any) -> tuple[jax.Array, jax.Array]:
 
     pairs = jnp.asarray([(i, j) for i in range(len(mine)) for j in range(len(theirs))])
     (least, most), _ = jax.lax.scan(compare, (lower, upper), pairs)
-    size = 1e3 * jnp.finfo(here.dtype).eps * (jnp.abs(least) + jnp.abs(most))  # no gap is less than rounding
+    size = 1e3 * jnp.finfo(dtype).eps * (jnp.abs(least) + jnp.abs(most))  # no gap is less than rounding
     return jnp.max(jnp.where(free, upper - lower, 0)), jnp.max(jnp.where(free, most - least + size, 0))
 
 
@@ -226,7 +225,7 @@ def warn_of_gap(gap: float, matter: float, isaacs: str) -> None:
 
 @jax.jit
 def _gap_at(task: Task, value: jax.Array) -> tuple[jax.Array, jax.Array]:
-    here = discrete.local(task.problem, task.grid, value, scheme=task.scheme, lost=task.lost)
+    here = discrete.local(task.on, value, task.lost)
     return isaacs_gap(here, task.counted & ~task.rules.held)
 
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation import cut_cells
-from hjbjax.discretisation.schemes import Upwind
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.finiteness import attainability, resting
 from hjbjax.hamiltonian import players
 from hjbjax.iteration import bellman
@@ -72,36 +72,32 @@ def linear_solve(grid: Grid) -> Direct | Krylov:
     return Direct() if grid.ndim == 1 else Krylov()
 
 
-def prepare(
-    problem: Problem, grid: Grid, *, method: Method, scheme: Upwind, tol: Any, dtype: Any, verdict: "Verdict"
-) -> Task:
-    """The task of a solve, all arrays in ``dtype``; pure, so that it may be traced, batched and differentiated."""
-    problem, grid = cast(problem, dtype), cast(grid, dtype)
-    rules, still = _rules(problem, grid, scheme=scheme, dtype=dtype, verdict=verdict)
-    undecided = verdict.certificate is Certificate.BY_DISCOUNT and is_constrained(problem)
+def prepare(on: Discretisation, *, method: Method, tol: Any, verdict: "Verdict") -> Task:
+    """The task of a solve, all arrays in its type; pure, so that it may be traced, batched and differentiated."""
+    on = cast(on, on.dtype)
+    rules, still = _rules(on, verdict)
+    undecided = verdict.certificate is Certificate.BY_DISCOUNT and is_constrained(on.problem)
     pace = None
     if isinstance(method, ValueIteration) or undecided or verdict.certificate is Certificate.OPEN:
-        rate = bellman.fastest_rate(problem, grid, scheme=scheme, dtype=dtype) + problem.discount
+        rate = bellman.fastest_rate(on) + on.problem.discount
         pace = jnp.where(rate > 0, rate, 1)
     priced = verdict.costs_certify and still is not None
     return Task(
-        problem, grid, method, rules, jnp.ones(grid.shape, bool), still.least if priced and still else None, pace,
-        jnp.asarray(tol, dtype), scheme, verdict.certificate, still.crossing if priced and still else None,
+        on, method, rules, jnp.ones(on.grid.shape, bool), still.least if priced and still else None, pace,
+        jnp.asarray(tol, on.dtype), verdict.certificate, still.crossing if priced and still else None,
     )  # fmt: skip
 
 
-def _rules(
-    problem: Problem, grid: Grid, *, scheme: Upwind, dtype: Any, verdict: "Verdict"
-) -> tuple[bellman.Conditions, resting.Standstill | None]:
+def _rules(on: Discretisation, verdict: "Verdict") -> tuple[bellman.Conditions, resting.Standstill | None]:
     """The conditions, rest points among them, and what was found out about resting where it was needed."""
-    rules = bellman.conditions(problem, grid, dtype)
-    if scheme.subcell and problem.exit_cost is not None:
-        links = cut_cells.links(problem, grid, subcell=True, dtype=dtype)
+    rules, problem = bellman.conditions(on), on.problem
+    if on.scheme.subcell and problem.exit_cost is not None:
+        links = cut_cells.links(on)
         met = [jnp.min(jnp.where(*meets, 0)) for link in links for meets in (link.meets_up, link.meets_down) if meets]
         rules = dataclasses.replace(rules, least_exit=jnp.minimum(jnp.min(jnp.stack(met)), 0))
     if not (verdict.may_rest or verdict.costs_certify):
         return rules, None
-    still = resting.standstill(problem, grid, scheme=scheme, dtype=dtype)
+    still = resting.standstill(on)
     if not verdict.may_rest:
         return rules, still
     return dataclasses.replace(rules, held=rules.held | (still.rests & (problem.discount == 0))), still
@@ -131,11 +127,12 @@ class Verdict:
         return self.certificate.value + "; for the refined sample of actions"
 
 
-def judge(problem: Problem, grid: Grid, dtype: Any) -> Verdict:
+def judge(on: Discretisation) -> Verdict:
     """Read the verdict from the problem's structure, which knows whether there is a discount unless that is traced."""
-    if grid.sides("open"):
-        return dataclasses.replace(judge(problem, grid.walled, dtype), certificate=Certificate.OPEN)
-    how, discounted = players.setting(problem, grid.ndim, dtype), is_discounted(problem)
+    if on.grid.sides("open"):
+        return dataclasses.replace(judge(on.on_grid(on.grid.walled)), certificate=Certificate.OPEN)
+    problem = on.problem
+    how, discounted = players.setting(problem, on.grid.ndim, on.dtype), is_discounted(problem)
     if discounted:
         return Verdict(Certificate.ADDITIVE, how.exact, may_rest=False)
     fits = problem.running_max is None and problem.cost is not None and not how.disturbance_costs
@@ -144,17 +141,17 @@ def judge(problem: Problem, grid: Grid, dtype: Any) -> Verdict:
     return Verdict(Certificate.BY_DISCOUNT if discounted is None else kind, how.exact, may_rest, fits)
 
 
-prepare_jit = jax.jit(prepare, static_argnames=("scheme", "dtype", "verdict"))
+prepare_jit = jax.jit(prepare, static_argnames="verdict")
 
 
-@functools.partial(jax.jit, static_argnames=("scheme", "dtype", "verdict"))
-def held_jit(problem: Problem, grid: Grid, *, scheme: Upwind, dtype: Any, verdict: Verdict) -> jax.Array:
+@functools.partial(jax.jit, static_argnames="verdict")
+def held_jit(on: Discretisation, *, verdict: Verdict) -> jax.Array:
     """The nodes at which the value is given, bool (*grid)."""
-    return _rules(cast(problem, dtype), cast(grid, dtype), scheme=scheme, dtype=dtype, verdict=verdict)[0].held
+    return _rules(cast(on, on.dtype), verdict)[0].held
 
 
 def prepare_on_host(
-    problem: Problem, grid: Grid, *, method: Method, scheme: Upwind, tol: float, dtype: Any, clock: Clock | None = None
+    on: Discretisation, *, method: Method, tol: float, clock: Clock | None = None
 ) -> tuple[Task, Verdict, np.ndarray | None]:
     """``prepare`` with the checks that need values: a finite solution exists, and where.
 
@@ -166,17 +163,17 @@ def prepare_on_host(
     Raises:
       ValueError: there is no finite solution.
     """
-    clock = clock or Clock()
+    clock, problem, grid = clock or Clock(), on.problem, on.grid
     clock.enter(f"the preparation of {' x '.join(map(str, grid.shape))} nodes")
-    verdict = judge(problem, grid, dtype)
-    task = prepare_jit(problem, grid, method=method, scheme=scheme, tol=tol, dtype=dtype, verdict=verdict)
+    verdict = judge(on)
+    task = prepare_jit(on, method=method, tol=tol, verdict=verdict)
     priced = verdict.certificate is Certificate.MULTIPLICATIVE
     if (priced and not _costs_suit(task)) or problem.cost is None:
         task = _with_refuge(task)
         verdict = dataclasses.replace(verdict, may_rest=not is_constrained(problem) and not problem.discount > 0)
     if priced and problem.is_game and not _costs_suit(task) and isinstance(method, PolicyIteration):
         # policies that go on for ever at no cost have any value: the one sought is the limit of those of long horizons
-        task = prepare_jit(problem, grid, method=ValueIteration(), scheme=scheme, tol=tol, dtype=dtype, verdict=verdict)
+        task = prepare_jit(on, method=ValueIteration(), tol=tol, verdict=verdict)
     if priced and not _costs_suit(task):
         verdict = dataclasses.replace(verdict, certificate=Certificate.NONE)
         task = dataclasses.replace(task, certificate=Certificate.NONE, least_cost=None)
@@ -185,16 +182,7 @@ def prepare_on_host(
     checks.ill_posed(problem, bool(verdict.may_rest and held.any()), grid)
     if problem.is_game or is_constrained(problem) or not held.any():
         return task, verdict, None
-    reached = attainability.reached(
-        task.problem,
-        task.grid,
-        held,
-        scheme=scheme,
-        dtype=dtype,
-        surely=undiscounted,
-        least=_least_rate(task),
-        clock=clock,
-    )
+    reached = attainability.reached(task.on, held, surely=undiscounted, least=_least_rate(task), clock=clock)
     if not reached.all():
         _warn_unreached(reached, undiscounted)
         if undiscounted:
@@ -211,10 +199,7 @@ def forced_only(task: Task, clock: Clock) -> tuple[Task, np.ndarray | None]:
     held = np.asarray(task.rules.held)
     if not task.problem.is_game or task.constrained or np.asarray(task.problem.discount) > 0 or not held.any():
         return task, None
-    reached = attainability.forced(
-        task.problem, task.grid, held, scheme=task.scheme.chain, dtype=task.tol.dtype, least=_least_rate(task),
-        clock=clock,
-    )  # fmt: skip
+    reached = attainability.forced(task.on, held, least=_least_rate(task), clock=clock)
     if reached.all():
         return task, reached
     _warn_unreached(reached, True)
@@ -230,10 +215,7 @@ def _with_refuge(task: Task) -> Task:
     small = resting.ROUNDINGS * np.finfo(task.tol.dtype).eps * np.max(np.abs(least))
     if np.any(least[free] < -small):
         return task
-    found = attainability.refuge(
-        task.problem, task.grid, jnp.asarray((least <= small) & free), jnp.asarray(small, task.tol.dtype),
-        scheme=task.scheme.chain, dtype=task.tol.dtype,
-    )  # fmt: skip
+    found = attainability.refuge(task.on, jnp.asarray((least <= small) & free), jnp.asarray(small, task.tol.dtype))
     return dataclasses.replace(task, rules=dataclasses.replace(task.rules, held=task.rules.held | found))
 
 
@@ -242,19 +224,15 @@ def _costs_suit(task: Task) -> bool:
     return bool(np.all(np.asarray(task.least_cost)[~np.asarray(task.rules.held)] > 0))
 
 
-def prepare_traced(
-    problem: Problem, grid: Grid, *, method: Method, scheme: Upwind, tol: Any, dtype: Any
-) -> tuple[Task, Verdict]:
+def prepare_traced(on: Discretisation, *, method: Method, tol: Any) -> tuple[Task, Verdict]:
     """``prepare`` with what of the host's checks runs inside a JAX transformation: nodes without a finite value."""
-    verdict = judge(problem, grid, dtype)
-    task = prepare(problem, grid, method=method, scheme=scheme, tol=tol, dtype=dtype, verdict=verdict)
+    verdict, problem = judge(on), on.problem
+    task = prepare(on, method=method, tol=tol, verdict=verdict)
     ends = problem.target is not None or verdict.may_rest
     if problem.is_game or is_constrained(problem) or is_discounted(problem) or not ends:
         return task, verdict
     known = jax.lax.stop_gradient(task)
-    reached = attainability.surely_reached(
-        known.problem, known.grid, known.rules.held, scheme=scheme, dtype=dtype, least=_least_rate(known)
-    )
+    reached = attainability.surely_reached(known.on, known.rules.held, least=_least_rate(known))
     return _without(task, reached | (known.problem.discount > 0)), verdict
 
 

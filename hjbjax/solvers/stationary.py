@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Limited, Scheme, Upwind
 from hjbjax.finiteness import admissibility, node_checks, resting
 from hjbjax.iteration import adjoint, fixed_point
@@ -123,17 +124,15 @@ def _solve_on_host(
     problem: Problem, grid: Grid, method: Method, scheme: Scheme, tol: float, guess: Any, *, kind: Any, clock: Clock
 ) -> Solution:
     """Checks, coarser grids, preparation and steps, in this order, as far as the clock lets them come."""
-    start = None if guess is None else np.asarray(guess, kind)
+    start, on = None if guess is None else np.asarray(guess, kind), Discretisation(problem, grid, scheme, kind)
     inner = method.inner if isinstance(method, Nested) else method
     try:
         checks.shapes(problem, grid, scheme)
         node_checks.values(problem, grid, kind, clock)
         admissibility.values(problem, grid, kind)
         known = None if start is None else jnp.asarray(start)
-        start, shapes = nested.start(problem, grid, method, scheme.chain, tol, known, kind, clock)
-        task, verdict, reached = prepare_on_host(
-            problem, grid, method=inner, scheme=scheme.chain, tol=tol, dtype=kind, clock=clock
-        )
+        start, shapes = nested.start(on.chain, method, tol, known, clock)
+        task, verdict, reached = prepare_on_host(on.chain, method=inner, tol=tol, clock=clock)
     except Stopped as stop:
         value = np.zeros(grid.shape, kind) if start is None else np.array(start)
         return unstarted(problem, grid, value, scheme, stop.status)
@@ -158,7 +157,7 @@ def sharpened(
     """
     if clock.over() is not None:
         return task, verdict, state, clock.over() or code, residuals, {}
-    higher = dataclasses.replace(task, certificate=Certificate.RESIDUAL, scheme=scheme)
+    higher = dataclasses.replace(task, certificate=Certificate.RESIDUAL, on=dataclasses.replace(task.on, scheme=scheme))
     better, ended, more = drive(higher, state.value, clock)
     if int(better.step) < 0:  # it was stopped before its first look, and the monotone answer stands
         return task, verdict, state, ended, residuals, {}
@@ -178,7 +177,7 @@ def _solve_traced(
     method = method or choose(problem, grid, traced=True)
     if isinstance(method, Nested):
         raise ValueError("solve: Nested(...) runs at host level only; inside jit, vmap and grad use its inner method")
-    task, verdict = prepare_traced(problem, grid, method=method, scheme=scheme, tol=tol, dtype=kind)
+    task, verdict = prepare_traced(Discretisation(problem, grid, scheme, kind), method=method, tol=tol)
     frozen = jax.lax.stop_gradient(task)
     start = frozen.start() if guess is None else jax.lax.stop_gradient(jnp.asarray(guess, kind))
     state = fixed_point.run(frozen, fixed_point.begin(frozen, start), max_steps or TRACED_STEPS)
@@ -193,9 +192,7 @@ def _solve_traced(
 
 def _doubted(task: Task, state: State) -> tuple[State, jax.Array]:
     """The state, stalled and without bounds where leaving a held rest node would pay: the host alone goes on then."""
-    pays = resting.leaving_pays(
-        task.problem, task.grid, task.rules, task.counted, state.value, scheme=task.scheme.chain
-    )
+    pays = resting.leaving_pays(task.on.chain, task.rules, task.counted, state.value)
     wrong = jnp.any(pays) & (state.code == Status.CONVERGED) & (task.problem.discount == 0)
     gap, infinite = state.gap, jnp.asarray(jnp.inf, state.value.dtype)
     gap = dataclasses.replace(

@@ -12,6 +12,7 @@ from systems import SEEDS, random_grid, random_problem
 import hjbjax as hjb
 from hjbjax.applications import exit_problems, probabilities
 from hjbjax.discretisation import chain
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import time_stepping
 from hjbjax.problem.pytree import node
 
@@ -337,7 +338,7 @@ def test_any_feedback_lies_between_the_least_and_the_greatest(seed):
     there, away = Edge(np.asarray(grid.hi)[0], 1.0), Edge(np.asarray(grid.lo)[0], -1.0)
     policy = hjb.Solution(grid, np.zeros(grid.shape), rng.uniform(-1, 1, (*grid.shape, 1)))
     with jax.enable_x64(True):  # one step for all three, so that one monotone scheme is compared with itself
-        step = min(0.3, 0.99 * float(time_stepping.stable(problem, grid, hjb.Upwind(), 0.0, np.float64)))
+        step = min(0.3, 0.99 * float(time_stepping.stable(Discretisation(problem, grid, hjb.Upwind(), np.float64))))
     least, some, most = (
         hjb.reach_probability(problem, grid, there, obstacle=away, horizon=0.3, step=step, **choice).value[0]
         for choice in ({"least": True}, {"feedback": policy}, {})

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 import hjbjax as hjb
 from hjbjax.discretisation import chain
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.finiteness import attainability
 from hjbjax.solution.clock import Clock
 
@@ -42,9 +43,7 @@ def on_line(drifts, noises):
 
 def reached(problem, grid, held, surely):
     with jax.enable_x64(True):
-        return attainability.reached(
-            problem, grid, held, scheme=hjb.Upwind(), dtype=np.dtype(np.float64), surely=surely
-        )
+        return attainability.reached(Discretisation(problem, grid, hjb.Upwind(), np.float64), held, surely=surely)
 
 
 def brute(problem, grid, held, surely):
@@ -109,9 +108,7 @@ def test_paths_followed_on_the_device_are_those_of_the_search(monkeypatch, surel
     monkeypatch.setattr(attainability, "LONG", long)
     np.testing.assert_array_equal(reached(problem, PLANE, held, surely), searched)
     with jax.enable_x64(True):
-        jumps = attainability._open_jumps(
-            problem, PLANE, None, scheme=hjb.Upwind(), dtype=np.dtype(np.float64), clock=Clock()
-        )
+        jumps = attainability._open_jumps(Discretisation(problem, PLANE, hjb.Upwind(), np.float64), None, Clock())
         found = attainability._spread(held, jumps, PLANE, Clock(), long * sum(PLANE.shape))
     if long:
         np.testing.assert_array_equal(found, attainability._searched(held, jumps, PLANE))

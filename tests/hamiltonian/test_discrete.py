@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from systems import SEEDS, random_game, random_grid, random_problem, random_sigma
 
 from hjbjax.discretisation import chain
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.hamiltonian import discrete, players
 from hjbjax.problem.grid import Grid
@@ -30,11 +31,9 @@ def _float64():
 
 @functools.partial(jax.jit, static_argnames="scheme")
 def both_forms(problem, grid, value, u, d, scheme):
-    here = discrete.local(problem, grid, value, scheme=scheme)
-    other = d if problem.is_game else None
-    rates = chain.rates(problem, grid, u, other, scheme=scheme, dtype=value.dtype)
-    cost = chain.running_cost(problem, here.x, u, other, 0.0, value.dtype)
-    return here.at(u, d), cost + rates.apply(grid, value)
+    on, other = Discretisation(problem, grid, scheme, value.dtype), d if problem.is_game else None
+    rates, cost = chain.rates(on, u, other), on.running_cost(u, other)
+    return discrete.local(on, value).at(u, d), cost + rates.apply(grid, value)
 
 
 @pytest.mark.parametrize("scheme", SCHEMES, ids=["plain", "central"])
@@ -85,7 +84,7 @@ class Coupled:
 def best_and_scan(problem, grid, value, scan, scheme):
     how = players.setting(problem, grid.ndim, value.dtype)
     assert how.exact
-    here = discrete.local(problem, grid, value, scheme=scheme)
+    here = discrete.local(Discretisation(problem, grid, scheme, value.dtype), value)
     best, u, _ = discrete.optimise(here, how)
     table = jax.lax.map(lambda point: here.at([point[j] for j in range(scan.shape[1])], []), scan)
     full = [jnp.broadcast_to(component, grid.shape) for component in u]
@@ -180,7 +179,7 @@ def test_samples_and_search_come_close_where_the_minimum_is_not_exact(scheme, se
 
 @functools.partial(jax.jit, static_argnames="scheme")
 def sampled_and_scan(problem, grid, value, scheme):
-    here = discrete.local(problem, grid, value, scheme=scheme)
+    here = discrete.local(Discretisation(problem, grid, scheme, value.dtype), value)
     best = discrete.optimise(here, players.setting(problem, grid.ndim, value.dtype))[0]
 
     def lowest(points):
@@ -194,14 +193,14 @@ def sampled_and_scan(problem, grid, value, scheme):
 
 @functools.partial(jax.jit, static_argnames=("scheme", "isaacs"))
 def optimum(problem, grid, value, scheme, isaacs=None):
-    here = discrete.local(problem, grid, value, scheme=scheme)
+    here = discrete.local(Discretisation(problem, grid, scheme, value.dtype), value)
     return discrete.optimise(here, players.setting(problem, grid.ndim, value.dtype), isaacs=isaacs)
 
 
 @functools.partial(jax.jit, static_argnames="scheme")
 def table_of(problem, grid, value, controls, disturbances, scheme):
     """H for every pair, shape (K, L, *grid)."""
-    here = discrete.local(problem, grid, value, scheme=scheme)
+    here = discrete.local(Discretisation(problem, grid, scheme, value.dtype), value)
 
     def at(u, d):
         return here.at(list(u), list(d))
@@ -260,7 +259,7 @@ def test_lower_is_at_most_upper(seed):
 @jax.jit
 def replies(problem, grid, value, u, d):
     """max over d of H(u, d) and min over u of H(u, d), over scans, at given actions of the other."""
-    here = discrete.local(problem, grid, value, scheme=Upwind())
+    here = discrete.local(Discretisation(problem, grid, Upwind(), value.dtype), value)
     against_u = jax.lax.map(lambda point: here.at(u, list(point)), problem.disturbances.grid(301).points)
     against_d = jax.lax.map(lambda point: here.at(list(point), d), problem.controls.grid(301).points)
     return jnp.max(against_u, axis=0), jnp.min(against_d, axis=0)
@@ -337,7 +336,7 @@ def test_a_reply_meets_the_others_action():
     problem = Problem(lambda x, u, d: 0 * x, lambda x, u, d: u[0] * d[0], UNIT, disturbances=UNIT, discount=1.0)
     grid = Grid([0.0], [1.0], (3,))
     how = players.setting(problem, 1, np.float64)
-    here = discrete.local(problem, grid, jnp.zeros(3), scheme=Upwind())
+    here = discrete.local(Discretisation(problem, grid, Upwind(), jnp.zeros(3).dtype), jnp.zeros(3))
     fixed = [jnp.array([-1.0, 0.5, 1.0])]
     value, action = discrete.best_response(here, how.disturbance, lambda d: (fixed, d))
     assert np.allclose(value, [1.0, 0.5, 1.0], rtol=1e-14)

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from systems import SEEDS
 
 import hjbjax as hjb
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.hamiltonian import discrete, players
 from hjbjax.hamiltonian.search import UNROLL, enumerate_actions, refine
 
@@ -141,6 +142,6 @@ def test_a_search_inside_a_search_is_compiled_in_few_places():
     assert not how.disturbance.exact
 
     def best(value):
-        return discrete.optimise(discrete.local(problem, grid, value, scheme=hjb.Upwind()), how)
+        return discrete.optimise(discrete.local(Discretisation(problem, grid, hjb.Upwind(), value.dtype), value), how)
 
     assert len(jax.jit(best).lower(jnp.zeros(11)).as_text().splitlines()) < 1500

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from systems import SEEDS, random_game, random_grid, random_problem
 
 from hjbjax.discretisation import chain
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.hamiltonian import discrete
 from hjbjax.iteration import bellman
@@ -30,11 +31,16 @@ def _float64():
         yield
 
 
+def upwind(problem, grid):
+    return Discretisation(problem, grid, Upwind(), np.float64)
+
+
 @functools.partial(jax.jit, static_argnames="scheme")
 def operator(problem, grid, value, rules, scheme=Upwind()):
     """One step of value iteration; and βΔt, by which it contracts."""
-    pace = bellman.fastest_rate(problem, grid, scheme=scheme, dtype=value.dtype) + problem.discount
-    greedy = bellman.greedy(problem, grid, value, rules.held, scheme=scheme)
+    on = Discretisation(problem, grid, scheme, value.dtype)
+    pace = bellman.fastest_rate(on) + problem.discount
+    greedy = bellman.greedy(on, value, rules.held)
     return rules.impose(value + greedy.rate / pace), problem.discount / jnp.max(pace)
 
 
@@ -93,7 +99,7 @@ def test_a_constant_shifts_the_rate_by_the_discount(kind, seed):
 
 @jax.jit
 def _rate(problem, grid, value, held):
-    return bellman.greedy(problem, grid, value, held, scheme=Upwind()).rate
+    return bellman.greedy(upwind(problem, grid), value, held).rate
 
 
 @given(seed=SEEDS)
@@ -177,7 +183,7 @@ def test_conditions_are_read_at_the_nodes():
         discount=1.0,
     )
     grid = Grid([-1.0], [1.0], (5,))
-    rules = bellman.conditions(problem, grid, np.float64)
+    rules = bellman.conditions(upwind(problem, grid))
     assert rules.held.tolist() == [False, True, True, True, False]
     assert rules.given.tolist() == [0.0, -5.0, 0.0, 5.0, 0.0]
     assert rules.stop.tolist() == [3.0] * 5
@@ -196,8 +202,8 @@ def test_the_floor_wins_over_stopping_and_the_target_over_both():
 
 @jax.jit
 def _equation(problem, grid, value, rules):
-    policy = bellman.greedy(problem, grid, value, rules.held, scheme=Upwind())
-    return policy, bellman.correction(problem, grid, value, policy, rules, scheme=Upwind())
+    policy = bellman.greedy(upwind(problem, grid), value, rules.held)
+    return policy, bellman.correction(upwind(problem, grid), value, policy, rules)
 
 
 @pytest.mark.parametrize("kind", [*NOISES, "game"])
@@ -223,7 +229,7 @@ def test_the_source_is_the_residual_and_the_weights_are_the_chain(kind, seed):
 
 @jax.jit
 def _told(problem, grid, value, policy, rules, fastest):
-    return bellman.correction(problem, grid, value, policy, rules, scheme=Upwind(), fastest=fastest)
+    return bellman.correction(upwind(problem, grid), value, policy, rules, fastest=fastest)
 
 
 @pytest.mark.parametrize("kind", ["none", "matrix"])
@@ -295,7 +301,7 @@ def test_no_action_is_faster_than_the_fastest_rate(controls, seed):
 
 @jax.jit
 def _fastest(problem, grid):
-    return bellman.fastest_rate(problem, grid, scheme=Upwind(), dtype=np.float64)
+    return bellman.fastest_rate(upwind(problem, grid))
 
 
 @pytest.mark.parametrize("isaacs", ["upper", "lower"])
@@ -318,14 +324,14 @@ def test_the_inner_player_replies_to_the_outer_one(isaacs, seed):
 @jax.jit
 def _replies(problem, grid, value, other):
     held = jnp.zeros(grid.shape, bool)
-    first = bellman.greedy(problem, grid, other, held, scheme=Upwind())
-    reply = bellman.respond(problem, grid, value, held, first, scheme=Upwind())
+    first = bellman.greedy(upwind(problem, grid), other, held)
+    reply = bellman.respond(upwind(problem, grid), value, held, first)
     tried = []
     for k in range(3):
         name = "disturbances" if problem.isaacs == "upper" else "controls"
         point = (problem.disturbances if problem.isaacs == "upper" else problem.controls).points[k, 0]
         sides = {"controls": first.controls, "disturbances": first.disturbances}
         sides[name] = (jnp.broadcast_to(point, grid.shape),)
-        here = discrete.local(problem, grid, value, scheme=Upwind())
+        here = discrete.local(upwind(problem, grid), value)
         tried.append(here.at(list(sides["controls"]), list(sides["disturbances"])) - problem.discount * value)
     return first, reply, jnp.stack(tried)

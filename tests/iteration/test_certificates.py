@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from systems import SEEDS, random_grid, random_problem
 
 from hjbjax.discretisation import chain
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.iteration import bellman, certificates
 from hjbjax.iteration.bellman import Conditions
@@ -34,8 +35,9 @@ def _float64():
 
 @functools.partial(jax.jit, static_argnames="kind")
 def measured(kind, problem, grid, value, rules, least_cost, counted, moved):
-    policy = bellman.greedy(problem, grid, value, rules.held, scheme=Upwind())
-    equation = bellman.correction(problem, grid, value, policy, rules, scheme=Upwind())
+    on = Discretisation(problem, grid, Upwind(), value.dtype)
+    policy = bellman.greedy(on, value, rules.held)
+    equation = bellman.correction(on, value, policy, rules)
     settings_ = {"discount": problem.discount, "least_cost": least_cost, "counted": counted, "moved": moved}
     return certificates.gap(kind, value, policy, equation, rules, **settings_), equation
 

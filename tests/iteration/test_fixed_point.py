@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import fixed_point
 from hjbjax.iteration.certificates import Gap
 from hjbjax.solution.status import Status
@@ -41,8 +42,8 @@ def expected(residual, error, best, nearest, since, tol):
 
 def test_every_rule_of_a_verdict():
     problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), discount=1.0)
-    method, dtype = hjb.PolicyIteration(), np.dtype(np.float64)
-    task, _, _ = prepare_on_host(problem, GRID, method=method, scheme=hjb.Upwind(), tol=1e-3, dtype=dtype)
+    on = Discretisation(problem, GRID, hjb.Upwind(), np.float64)
+    task, _, _ = prepare_on_host(on, method=hjb.PolicyIteration(), tol=1e-3)
 
     @jax.jit
     def judge(residual, error, best, nearest, since):

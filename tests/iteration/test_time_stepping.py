@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import splitting, time_stepping
 
 UNIT = hjb.Box([-1.0], [1.0])
@@ -142,7 +143,7 @@ def test_noise_between_the_sampled_controls_is_looked_at_under_the_policy(ask):
 
 @functools.partial(jax.jit, static_argnames="dtype")
 def rates(problem, u, d, dtype):
-    return splitting.rate(problem, LINE, u, d, scheme=hjb.Upwind(), dtype=dtype)
+    return splitting.rate(Discretisation(problem, LINE, hjb.Upwind(), dtype), u, d)
 
 
 @pytest.mark.parametrize("name", QUESTIONS)
@@ -151,4 +152,4 @@ def test_no_action_is_faster_than_what_a_march_sees(name):
     problem = QUESTIONS[name]
     u, d = [jnp.asarray(0.3)], [jnp.asarray(1.0)] if problem.is_game else []
     fast = float(jnp.max(rates(problem, u, d, np.float32)))
-    assert fast * float(time_stepping.stable(problem, LINE, hjb.Upwind(), 0.0, np.float32)) > 1.2
+    assert fast * float(time_stepping.stable(Discretisation(problem, LINE, hjb.Upwind(), np.float32))) > 1.2

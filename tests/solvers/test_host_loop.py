@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.problem.pytree import node
 from hjbjax.solvers import host_loop
 from hjbjax.solvers.setup import prepare_on_host
@@ -73,9 +74,8 @@ def asked(monkeypatch):
 
 def test_a_first_chunk_is_as_long_as_coarser_grids_tell(asked):
     """Half a chunk's time by what a step took at a node, and never more than the history of one chunk can hold."""
-    task, *_ = prepare_on_host(
-        question(1e-3), GRID, method=SLOW, scheme=hjb.Upwind(), tol=1e-13, dtype=np.dtype(np.float32)
-    )
+    on = Discretisation(question(1e-3), GRID, hjb.Upwind(), np.float32)
+    task, *_ = prepare_on_host(on, method=SLOW, tol=1e-13)
     histories = []
     for per_node, first in [(1e-9, host_loop.HISTORY - 1), (host_loop.CHUNK_SECONDS / (20 * GRID.size), 10), (1.0, 1)]:
         clock = host_loop.Clock(300, np.inf, False)
@@ -286,10 +286,8 @@ def test_what_stops_before_the_first_look_keeps_what_is_given():
         target=lambda x: 1 - jnp.abs(x[0]),
         exit_cost=3.0,
     )
-    task, _, _ = prepare_on_host(
-        problem, hjb.Grid([-1.0], [1.0], (21,)), method=hjb.ValueIteration(), scheme=hjb.Upwind(), tol=1e-3,
-        dtype=np.dtype(np.float32),
-    )  # fmt: skip
+    on = Discretisation(problem, hjb.Grid([-1.0], [1.0], (21,)), hjb.Upwind(), np.float32)
+    task, _, _ = prepare_on_host(on, method=hjb.ValueIteration(), tol=1e-3)
     state, code, _ = host_loop.drive(task, jnp.full(21, 7.0), host_loop.Clock(10, np.inf, False))
     assert code is hjb.Status.NONFINITE
     assert np.all(np.isfinite(state.value))

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import fixed_point
 from hjbjax.problem.pytree import cast
 from hjbjax.solvers import host_loop, memory
@@ -59,9 +60,9 @@ def test_the_estimate_is_what_the_compiled_loop_needs(n, noise, method):
     grid = hjb.Grid([-1.0] * n, [1.0] * n, ({2: 121, 3: 41}[n],) * n)
     with jax.enable_x64(True):
         problem, grid = cast((problem, grid), np.float64)
-        verdict = judge(problem, grid, np.float64)
-        options = {"method": method, "scheme": hjb.Upwind(), "tol": 1e-3, "dtype": np.float64, "verdict": verdict}
-        task = jax.eval_shape(lambda p, g: prepare(p, g, **options), problem, grid)
+        on = Discretisation(problem, grid, hjb.Upwind(), np.float64)
+        options = {"method": method, "tol": 1e-3, "verdict": judge(on)}
+        task = jax.eval_shape(lambda on: prepare(on, **options), on)
         state = jax.eval_shape(fixed_point.begin, task, jax.ShapeDtypeStruct(grid.shape, np.float64))
         found = host_loop.run.lower(task, state, 1).compile().memory_analysis()
     together = found.argument_size_in_bytes + found.output_size_in_bytes + found.temp_size_in_bytes
@@ -223,9 +224,8 @@ def test_the_estimate_is_near_what_the_compiler_reports(method):
 
     grid = square(64)
     with jax.enable_x64(True):
-        task, _, _ = setup.prepare_on_host(
-            PROBLEM, grid, method=method, scheme=hjb.Upwind(), tol=1e-3, dtype=np.dtype(np.float64)
-        )
+        on = Discretisation(PROBLEM, grid, hjb.Upwind(), np.float64)
+        task, _, _ = setup.prepare_on_host(on, method=method, tol=1e-3)
         state = jax.eval_shape(fixed_point.begin, task, jnp.zeros(grid.shape))
         analysis = jax.jit(fixed_point.run).lower(task, state, 1).compile().memory_analysis()
     peak = analysis.argument_size_in_bytes + analysis.output_size_in_bytes + analysis.temp_size_in_bytes

@@ -1,0 +1,94 @@
+"""A problem on a grid by a scheme: what every step of the computation is asked about."""
+
+import dataclasses
+import itertools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.discretisation.schemes import Scheme
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import node
+from hjbjax.tracing import components
+
+
+@node(static=("scheme", "dtype"))
+class Discretisation:
+    """A problem on a grid by a scheme, in one floating-point type and at one time.
+
+    Its methods evaluate the functions of one state on all nodes at once: an action is a list of its components, each a
+    number or an array that broadcasts over the nodes, and so is what they return.
+
+    Args:
+      problem: the question.
+      grid: the nodes.
+      scheme: how derivatives are made.
+      dtype: the floating-point type of all node values.
+      t: the time, which matters if the problem's functions depend on it.
+    """
+
+    problem: Problem
+    grid: Grid
+    scheme: Scheme
+    dtype: Any
+    t: Any = 0.0
+
+    def __post_init__(self):
+        object.__setattr__(self, "dtype", np.dtype(self.dtype))
+
+    @property
+    def chain(self) -> "Discretisation":
+        """The monotone chain that goes with the scheme."""
+        return dataclasses.replace(self, scheme=self.scheme.chain)
+
+    def at(self, t: Any) -> "Discretisation":
+        """The discretisation at another time."""
+        return dataclasses.replace(self, t=t)
+
+    def asking(self, problem: Problem) -> "Discretisation":
+        """The discretisation of another problem."""
+        return dataclasses.replace(self, problem=problem)
+
+    def on_grid(self, grid: Grid) -> "Discretisation":
+        """The discretisation on another grid."""
+        return dataclasses.replace(self, grid=grid)
+
+    def coordinates(self) -> list:
+        """The n coordinates of all nodes, each of a shape that broadcasts to (*grid)."""
+        return self.grid.components(self.dtype)
+
+    def drift(self, u: list, d: list | None = None, x: list | None = None) -> list:
+        """The n components of f; at the nodes, or where ``x`` is."""
+        return list(components.components(self.problem.drift, *self._arguments(u, d, x), dtype=self.dtype))
+
+    def running_cost(self, u: list, d: list | None = None, x: list | None = None) -> Any:
+        """L, in cost per unit time; zero where the problem has none."""
+        if self.problem.cost is None:
+            return jnp.zeros((), self.dtype)
+        return components.scalar(self.problem.cost, *self._arguments(u, d, x), dtype=self.dtype)
+
+    def diffusion(self, u: list, d: list | None = None, x: list | None = None) -> dict[tuple[int, int], Any]:
+        """The entries a_ij, i ≤ j, of a = σσᵀ; those that are zero by construction are left out."""
+        noise, n = self.problem.noise, self.grid.ndim
+        if noise is None:
+            return {}
+        if callable(noise):
+            sigma = components.components(noise, *self._arguments(u, d, x), dtype=self.dtype)
+        else:
+            places = self.coordinates() if x is None else x
+            sigma = components.components(lambda x: jnp.asarray(noise, self.dtype), places, dtype=self.dtype)
+        if sigma.ndim < 2:
+            return {(i, i): s * s for i, s in enumerate(np.broadcast_to(sigma, (n,)))}
+        pairs = itertools.combinations_with_replacement(range(n), 2)
+        return {(i, j): sum(p * q for p, q in zip(sigma[i], sigma[j], strict=True)) for i, j in pairs}
+
+    def at_nodes(self, ingredient: Any) -> jax.Array:
+        """A function of the state alone, or a number, at every node, shape (*grid); None is zero."""
+        found = components.of_state(self.problem, ingredient, self.coordinates(), self.t, self.dtype)
+        return jnp.broadcast_to(found, self.grid.shape)
+
+    def _arguments(self, u: list, d: list | None, x: list | None) -> tuple:
+        return self.problem.arguments(self.coordinates() if x is None else x, u, d, self.t)

@@ -25,7 +25,8 @@ from hjbjax.applications.reference import (
     thinned,
     words_for,
 )
-from hjbjax.discretisation.schemes import Scheme, Upwind
+from hjbjax.discretisation.discretisation import Scheme
+from hjbjax.discretisation.schemes import Upwind
 from hjbjax.iteration.methods import Method
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem

@@ -35,7 +35,8 @@ from typing import Any
 import numpy as np
 
 from hjbjax.applications.l2_gain import Saturation, saturation
-from hjbjax.discretisation.schemes import Scheme, Weno5
+from hjbjax.discretisation.discretisation import Scheme
+from hjbjax.discretisation.schemes import Weno5
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_discounted
 from hjbjax.problem.sets import Ball, Box

@@ -20,7 +20,8 @@ import numpy as np
 from hjbjax.applications.convergence import fitted_order
 from hjbjax.applications.l2_gain import attenuation, saturation
 from hjbjax.applications.reference import mask_of
-from hjbjax.discretisation.schemes import Limited, Scheme
+from hjbjax.discretisation.discretisation import Scheme
+from hjbjax.discretisation.schemes import Limited
 from hjbjax.iteration.methods import Method
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem

@@ -15,7 +15,6 @@ and P. Dupuis, Numerical Methods for Stochastic Control Problems in Continuous T
 """
 
 import dataclasses
-import functools
 import itertools
 from typing import Any
 
@@ -23,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import decision_process, edges, stationary_law, stencil
+from hjbjax.discretisation import correlated_noise, decision_process, edges, stationary_law, stencil
 from hjbjax.discretisation.cut_cells import links
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
@@ -31,7 +30,6 @@ from hjbjax.discretisation.stencil import Links
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import cast, node
-from hjbjax.tracing import checks
 
 Offset = tuple[int, ...]
 
@@ -73,29 +71,6 @@ class Rates:
         return Rates(tuple(opposite), tuple(arriving))
 
 
-def along_axis(a: dict[tuple[int, int], Any], grid: Grid, axis: int) -> Any:
-    """What is left of a_ii for jumps along axis i once the diagonal jumps have taken Σ_j |a_ij| h_i/h_j."""
-    left = a.get((axis, axis))
-    if left is None:
-        return None
-    for (i, j), entry in a.items():
-        if i != j:
-            checks.refuse_stretched(grid)
-        if i != j and axis in (i, j):
-            other = j if axis == i else i
-            left = left - jnp.abs(entry) * (grid.spacing(axis) / grid.spacing(other))
-    return left
-
-
-def lacking(on: Discretisation, a: dict[tuple[int, int], Any]) -> Any:
-    """Where the diagonal jumps take more than there is along some axis, per node; None without correlation."""
-    if all(i == j for i, j in a):
-        return None
-    slack = 16 * on.grid.ndim * jnp.finfo(on.dtype).eps  # rounding of σσᵀ and of the spacings
-    short = (along_axis(a, on.grid, i) < -slack * jnp.asarray(a[i, i], on.dtype) for i in range(on.grid.ndim))
-    return functools.reduce(jnp.logical_or, short)
-
-
 def excess(f: Any, a: Any, grid: Grid, axis: int, scheme: Upwind, link: Links) -> Any:
     """e_i, the diffusion that the chain has along an axis: a_ii and what keeps its rates non-negative."""
     least = jnp.maximum(link.up * f, -link.down * f)
@@ -132,7 +107,7 @@ def rates(on: Discretisation, u: list, d: list | None = None) -> Rates:
     f, a = on.drift(u, d, x), on.diffusion(u, d, x)
     table: dict[Offset, Any] = {}
     for axis, link in enumerate(links(on.chain)):
-        pair = axis_rates(f[axis], along_axis(a, grid, axis), grid, axis, scheme, link)
+        pair = axis_rates(f[axis], correlated_noise.along_axis(a, grid, axis), grid, axis, scheme, link)
         for step, rate in zip((1, -1), pair, strict=True):
             table[stencil.unit(grid, axis, step)] = _inside(rate, grid, axis, step)
     for (i, j), entry in a.items():
@@ -352,6 +327,6 @@ def _checked(
 def _evaluate(on: Discretisation, u: list, d: list | None, eps: Any) -> Any:
     """Rates and running cost at the nodes, where the noise leaves a negative rate, and where an end is crossed."""
     jumps, shape = rates(on, u, d), on.grid.shape
-    cost, short = jnp.broadcast_to(on.running_cost(u, d), shape), lacking(on, on.diffusion(u, d))
+    cost, short = jnp.broadcast_to(on.running_cost(u, d), shape), correlated_noise.lacking(on, on.diffusion(u, d))
     leaving = edges.inadmissible(on, u, d, eps=eps)
     return jumps, cost, jnp.broadcast_to(jnp.zeros((), bool) if short is None else short, shape), leaving

@@ -9,11 +9,15 @@ most one; then 1/h = D^(−1/2) v with (I − B) v = 1, or at one with the Perro
 there always are: h₁/h₂ = √(a₁₁/a₂₂).
 """
 
+import functools
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.problem.grid import Grid
+from hjbjax.tracing import checks
 
 
 def spacings(a: Any, now: Any) -> np.ndarray | None:
@@ -101,3 +105,26 @@ def advice(a: Any, grid: Grid, *, everywhere: bool) -> str:
 
 def _numbers(entries: Any) -> str:
     return "[" + ", ".join(f"{entry:.6g}" for entry in np.asarray(entries, dtype=float)) + "]"
+
+
+def along_axis(a: dict[tuple[int, int], Any], grid: Grid, axis: int) -> Any:
+    """What is left of a_ii for jumps along axis i once the diagonal jumps have taken Σ_j |a_ij| h_i/h_j."""
+    left = a.get((axis, axis))
+    if left is None:
+        return None
+    for (i, j), entry in a.items():
+        if i != j:
+            checks.refuse_stretched(grid)
+        if i != j and axis in (i, j):
+            other = j if axis == i else i
+            left = left - jnp.abs(entry) * (grid.spacing(axis) / grid.spacing(other))
+    return left
+
+
+def lacking(on: Discretisation, a: dict[tuple[int, int], Any]) -> Any:
+    """Where the diagonal jumps take more than there is along some axis, per node; None without correlation."""
+    if all(i == j for i, j in a):
+        return None
+    slack = 16 * on.grid.ndim * jnp.finfo(on.dtype).eps  # rounding of σσᵀ and of the spacings
+    short = (along_axis(a, on.grid, i) < -slack * jnp.asarray(a[i, i], on.dtype) for i in range(on.grid.ndim))
+    return functools.reduce(jnp.logical_or, short)

@@ -1,18 +1,58 @@
-"""A problem on a grid by a scheme: what every step of the computation is asked about."""
+"""A problem on a grid by a scheme: what every step of the computation is asked about.
+
+And what a scheme must offer, so that one of the user's own serves as well; ``schemes`` tells how to write one.
+"""
 
 import dataclasses
 import itertools
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation.schemes import Scheme
+from hjbjax.discretisation.stencil import Links
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import node
 from hjbjax.tracing import components
+
+
+@runtime_checkable
+class Scheme(Protocol):
+    """How derivatives are made, as a value: frozen, hashable, without numbers that are traced."""
+
+    @property
+    def monotone(self) -> bool:
+        """Whether it is a chain: only then does a bound certify its answer, and only then is it implicit in time."""
+
+    @property
+    def stationary(self) -> bool:
+        """Whether the residual with its slopes can be driven to zero by corrections with the matrix of ``chain``."""
+
+    @property
+    def even(self) -> bool:
+        """Whether it wants equal spacings along every axis."""
+
+    @property
+    def subcell(self) -> bool:
+        """Whether the boundary of a target is met between two nodes."""
+
+    @property
+    def stages(self) -> int:
+        """The stages, and the order, of the explicit Runge–Kutta method that goes with it: 1, 2 or 3."""
+
+    @property
+    def points(self) -> int:
+        """The nodes that an axis must have."""
+
+    @property
+    def chain(self) -> Any:
+        """The monotone chain that goes with it, an ``Upwind``: it starts and corrects, and limits explicit steps."""
+
+    def slopes(self, around: "Differences") -> Sequence[tuple[jax.Array, jax.Array]]:
+        """The slopes P⁺ and P⁻ along every axis, each (*grid): drift f has the gain f⁺ P⁺ + f⁻ P⁻; zero at a wall."""
 
 
 @node(static=("scheme", "dtype"))
@@ -92,3 +132,22 @@ class Discretisation:
 
     def _arguments(self, u: list, d: list | None, x: list | None) -> tuple:
         return self.problem.arguments(self.coordinates() if x is None else x, u, d, self.t)
+
+
+@dataclasses.dataclass(frozen=True)
+class Differences:
+    """What a scheme makes slopes of: V at the nodes and how it changes from node to node.
+
+    Attributes:
+      on: the problem on its grid.
+      x: the coordinates of the nodes.
+      value: V, (*grid).
+      links: the distances to the neighbours along every axis.
+      one_sided: D⁺ and D⁻ along every axis, each (*grid); zero across a wall.
+    """
+
+    on: Discretisation
+    x: list
+    value: jax.Array
+    links: tuple[Links, ...]
+    one_sided: tuple[tuple[jax.Array, jax.Array], ...]

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import chain, correlated_noise, cut_cells
+from hjbjax.discretisation import correlated_noise, cut_cells
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.problem import sets
@@ -177,7 +177,7 @@ def _of_action(on: Discretisation, x: list, u: list, d: list | None) -> dict[str
         sigma = components.components(problem.noise, *problem.arguments(x, u, d, 0.0), dtype=on.dtype)
         if sigma.ndim < 2:
             bad["negative"] = functools.reduce(jnp.logical_or, (jnp.asarray(entry) < 0 for entry in sigma.flat))
-    lacking = chain.lacking(on, a)
+    lacking = correlated_noise.lacking(on, a)
     if lacking is not None:
         bad["correlation"] = lacking
     return bad

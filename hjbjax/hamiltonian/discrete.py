@@ -22,9 +22,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax.discretisation import chain, cut_cells, edges, slopes, stencil
-from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.discretisation.schemes import Eno2, Limited, Upwind, Weno5
+from hjbjax.discretisation import chain, correlated_noise, cut_cells, edges, stencil
+from hjbjax.discretisation.discretisation import Differences, Discretisation
 from hjbjax.hamiltonian import players
 from hjbjax.hamiltonian.piecewise import Kinked, inverse_root, kinked_ball, piecewise_input, piecewise_pair
 from hjbjax.hamiltonian.players import SAMPLES, Player, Setting, shared
@@ -90,9 +89,9 @@ class Local:
             return upwind
         link = self.links[axis]
         h_up, h_down = link.up, link.down
-        if not isinstance(self.on.scheme, Upwind):
+        if not self.on.scheme.monotone:
             return upwind + jnp.maximum(a, 0) * self.bends[axis] / (h_up + h_down)
-        e = chain.excess(f, a, self.on.grid, axis, self.on.scheme, link)
+        e = chain.excess(f, a, self.on.grid, axis, self.on.scheme.chain, link)
         upward, downward = (e + h_down * f) / (h_up + h_down), (e - h_up * f) / (h_up + h_down)
         return upward * self.up[axis] - downward * self.down[axis]
 
@@ -101,7 +100,7 @@ class Local:
         f, a, grid = self.on.drift(u, d, self.x), self.on.diffusion(u, d, self.x), self.on.grid
         total = self.on.running_cost(u, d, self.x)
         for axis in range(grid.ndim):
-            total = total + self.gain(axis, f[axis], chain.along_axis(a, grid, axis))
+            total = total + self.gain(axis, f[axis], correlated_noise.along_axis(a, grid, axis))
         for (i, j), entry in a.items():
             if i != j:
                 total = total + self._diagonal(i, j, entry)
@@ -133,42 +132,16 @@ def at_rest(on: Discretisation, slopes: jax.Array) -> Local:
 
 def local(on: Discretisation, value: jax.Array, lost: jax.Array | None = None) -> Local:
     """Coordinates and differences around ``value``, tied together so that no loop hoists tables out of itself."""
-    grid, scheme = on.grid, on.scheme
+    grid = on.grid
     x, value = jax.lax.optimization_barrier((on.coordinates(), value))
     links = tuple(cut_cells.links(on))
-    differences = [stencil.one_sided(value, grid, axis, link) for axis, link in enumerate(links)]
+    differences = tuple(stencil.one_sided(value, grid, axis, link) for axis, link in enumerate(links))
     bends = tuple(up - down for up, down in differences)
-    if isinstance(scheme, Weno5):
-        differences = slopes.weno5(value, grid)
-    elif isinstance(scheme, Eno2):
-        differences = slopes.eno2(value, grid)
-    elif isinstance(scheme, Limited):
-        differences = _limited(on, x, differences, links)
-    up, down = zip(*differences, strict=True)
+    up, down = zip(*on.scheme.slopes(Differences(on, x, value, links, differences)), strict=True)
     careful = lost is not None or grid.sides("constrained")
     slack = tuple(edges.slack(on)) if careful else None
     beside = None if lost is None else edges.beside(lost, grid)
     return Local(on, x, value, up, down, bends, links, slack=slack, lost=beside)
-
-
-def _limited(on: Discretisation, x: list, differences: list, links: tuple) -> list:
-    """Limited slopes; central ones where noise keeps those monotone, a_ii ≥ h |f_i| for all actions."""
-    problem, grid = on.problem, on.grid
-    found = [stencil.limited(up, down, grid, axis, links[axis]) for axis, (up, down) in enumerate(differences)]
-    if problem.noise is None:
-        return found
-    dtype = differences[0][0].dtype
-    calm: list = [True] * grid.ndim
-    for u, d in itertools.product(sets.probes(problem.controls, dtype), sets.probes(problem.disturbances, dtype)):
-        f, a = on.drift(u, d, x), on.diffusion(u, d, x)
-        for axis, link in enumerate(links):
-            left = chain.along_axis(a, grid, axis)
-            calm[axis] &= left >= jnp.maximum(link.up, link.down) * jnp.abs(f[axis])
-    for axis, ((up, down), link) in enumerate(zip(differences, links, strict=True)):
-        inner = calm[axis] & ~stencil.walls(grid, axis)
-        middle = (link.down * up + link.up * down) / (link.up + link.down)
-        found[axis] = (jnp.where(inner, middle, found[axis][0]), jnp.where(inner, middle, found[axis][1]))
-    return found
 
 
 def optimise(here: Local, how: Setting, isaacs: str | None = None) -> tuple[jax.Array, Action, Action]:
@@ -308,13 +281,13 @@ def _cost_coefficients(here: Local, player: Player, arguments: tuple, j: int) ->
 
 def _kinked(here: Local, base: tuple[Action, Action], axis: int, offset: Any, slope: Any) -> Kinked:
     u, d = base
-    left = chain.along_axis(here.on.diffusion(u, d, here.x), here.on.grid, axis)
+    left = correlated_noise.along_axis(here.on.diffusion(u, d, here.x), here.on.grid, axis)
     up, down = here.up[axis], here.down[axis]
 
     def gain(f):
         return here.gain(axis, f, left)
 
-    if left is None or not isinstance(here.on.scheme, Upwind) or not here.on.scheme.central:
+    if left is None or not (here.on.scheme.monotone and here.on.scheme.chain.central):
         return Kinked(gain, offset, slope, (0.0,), (down, up))
     h_up, h_down = here.links[axis].up, here.links[axis].down
     edge = stencil.walls(here.on.grid, axis)

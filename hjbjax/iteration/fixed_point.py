@@ -18,8 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation import chain, edges, stencil
-from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.discretisation.schemes import Limited, Scheme
+from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.hamiltonian import players
 from hjbjax.iteration import bellman, certificates, relaxation
 from hjbjax.iteration.bellman import Conditions, Correction, Greedy
@@ -175,7 +174,7 @@ def advance(task: Task, state: State, start: Any) -> State:
     """One step; a step that ends in numbers that are not finite is taken back."""
     stay = jnp.zeros_like(state.value)
     delta = jax.lax.cond(state.step < 0, lambda: stay, lambda: _correct(task, state))
-    if isinstance(task.scheme, Limited):
+    if not task.scheme.monotone:
         delta = jnp.where(state.step < FULL_STEPS, 1.0, 0.5).astype(delta.dtype) * delta
     value = task.impose(state.value + delta)
     moved = jnp.max(jnp.abs(jnp.where(task.counted, value - state.value, 0)))

@@ -22,7 +22,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax.discretisation import chain
+from hjbjax.discretisation import correlated_noise
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import bellman, implicit, relaxation, splitting
 from hjbjax.iteration.bellman import Conditions
@@ -321,7 +321,7 @@ def _look(march: March, u: list, d: list, t: Any) -> Seen:
         fastest = jnp.max(splitting.rate(on, u, d)) + jnp.asarray(on.problem.discount, dtype)
         seen = dataclasses.replace(seen, fastest=fastest)
     if march.checks_noise:
-        lacking = chain.lacking(on, on.diffusion(u, d))
+        lacking = correlated_noise.lacking(on, on.diffusion(u, d))
         if lacking is None:
             return seen
         lacking = jnp.broadcast_to(lacking, on.grid.shape) & ~march.rules_at(t).held

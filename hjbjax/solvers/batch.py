@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.discretisation.schemes import Limited, Scheme, Upwind
+from hjbjax.discretisation.discretisation import Discretisation, Scheme
+from hjbjax.discretisation.schemes import Upwind
 from hjbjax.finiteness import admissibility, node_checks
 from hjbjax.iteration import fixed_point
 from hjbjax.iteration.fixed_point import State, Task
@@ -179,7 +179,7 @@ def _finished(
         guess = state.value if onwards else None
         task, verdict, reached, state, code, more = nested.settle(task, verdict, reached, guess, clock)
         history = np.concatenate([history, more]) if onwards else more
-    if isinstance(scheme, Limited) and code not in CUT:
+    if not scheme.monotone and code not in CUT:
         task, verdict, state, code, history, apart = sharpened(task, verdict, state, code, history, scheme, clock)
     solution = finish(task, state, code, reached, history, verdict, grid, cut=clock.over() is not None)
     solution.stats.update(apart)

@@ -13,8 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.discretisation.schemes import Eno2, Limited, Scheme, Upwind, Weno5
+from hjbjax.discretisation import schemes
+from hjbjax.discretisation.discretisation import Discretisation, Scheme
+from hjbjax.discretisation.schemes import Upwind
 from hjbjax.finiteness import admissibility, node_checks
 from hjbjax.hamiltonian import players
 from hjbjax.iteration import bellman, time_stepping
@@ -159,16 +160,11 @@ def _check(problem: Any, grid: Any, scheme: Any, method: Any, step: Any, time_li
     """Refuse what no march can start with; needs no values of the problem's functions."""
     if not isinstance(problem, Problem) or not isinstance(grid, Grid):
         raise TypeError(f"march: got {type(problem).__name__}, {type(grid).__name__}; wanted a Problem and a Grid")
-    if not isinstance(scheme, (Upwind, Limited, Eno2, Weno5)):
-        raise TypeError(f"march: scheme is {scheme!r}; wanted hjb.Upwind(), Limited(), Eno2() or Weno5()")
+    schemes.check(scheme, "march: scheme", grid)
     if not isinstance(method, (Explicit, Implicit)):
         raise TypeError(f"march: method is {method!r}; wanted hjb.Explicit(...) or hjb.Implicit(...)")
-    if isinstance(method, Implicit) and not isinstance(scheme, Upwind):
+    if isinstance(method, Implicit) and not scheme.monotone:
         raise ValueError(f"march: Implicit(...) solves with the matrix of a chain; got {scheme!r}, wanted Upwind(...)")
-    if isinstance(scheme, (Eno2, Weno5)) and any(each is not None for each in grid.stretch or ()):
-        raise ValueError(
-            f"march: {scheme!r} wants equal spacings; leave out Grid.stretch, or use Upwind() or Limited()"
-        )
     if step is not None:
         arguments.positive(step, "march: step", "in units of time")
     if time_limit is not None:

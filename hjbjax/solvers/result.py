@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import chain, correlated_noise, edges
+from hjbjax.discretisation import correlated_noise, edges
 from hjbjax.finiteness import earnings
 from hjbjax.hamiltonian import discrete, players
 from hjbjax.iteration import certificates, fixed_point
@@ -156,7 +156,7 @@ def warn_of_cuts(cut: np.ndarray, ends: np.ndarray, grid: Grid) -> None:
 @jax.jit
 def _lacking(task: Task, controls: tuple, disturbances: tuple) -> jax.Array:
     """The first node, counted flat, where the policy's noise is correlated more than the spacings allow, or −1."""
-    lacking = chain.lacking(task.on, task.on.diffusion(list(controls), list(disturbances)))
+    lacking = correlated_noise.lacking(task.on, task.on.diffusion(list(controls), list(disturbances)))
     if lacking is None:
         return jnp.full((), -1)
     lacking = jnp.broadcast_to(lacking, task.grid.shape) & task.counted & ~task.rules.held

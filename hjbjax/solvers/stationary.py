@@ -12,8 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.discretisation.schemes import Limited, Scheme, Upwind
+from hjbjax.discretisation import schemes
+from hjbjax.discretisation.discretisation import Discretisation, Scheme
+from hjbjax.discretisation.schemes import Upwind
 from hjbjax.finiteness import admissibility, node_checks, resting
 from hjbjax.iteration import adjoint, fixed_point
 from hjbjax.iteration.certificates import Certificate
@@ -138,7 +139,7 @@ def _solve_on_host(
         return unstarted(problem, grid, value, scheme, stop.status)
     task, verdict, reached, state, code, residuals = nested.settle(task, verdict, reached, start, clock)
     about: dict[str, Any] = {"levels": [*shapes, grid.shape]}
-    if isinstance(scheme, Limited):
+    if not scheme.monotone:
         task, verdict, state, code, residuals, apart = sharpened(task, verdict, state, code, residuals, scheme, clock)
         about |= apart
     solution = finish(task, state, code, reached, residuals, verdict, grid)
@@ -149,7 +150,7 @@ def _solve_on_host(
 
 
 def sharpened(
-    task: Task, verdict: Verdict, state: State, code: Status, residuals: np.ndarray, scheme: Limited, clock: Clock
+    task: Task, verdict: Verdict, state: State, code: Status, residuals: np.ndarray, scheme: Scheme, clock: Clock
 ) -> tuple[Task, Verdict, State, Status, np.ndarray, dict[str, Any]]:
     """The second-order answer, from the monotone one in ``state``, and how far apart they are.
 
@@ -171,8 +172,8 @@ def _solve_traced(
     problem: Problem, grid: Grid, method: Any, scheme: Any, tol: Any, guess: Any, dtype: Any, max_steps: Any
 ) -> Solution:
     """The same iteration inside a JAX transformation: no chunks, no files, no exceptions, no checks of values."""
-    if isinstance(scheme, Limited):
-        raise ValueError("solve: Limited() runs at host level only; inside jit, vmap and grad use Upwind()")
+    if not scheme.monotone:
+        raise ValueError(f"solve: {scheme!r} runs at host level only; inside jit, vmap and grad use Upwind()")
     kind = jnp.result_type(float) if dtype is None else jnp.dtype(dtype)
     method = method or choose(problem, grid, traced=True)
     if isinstance(method, Nested):
@@ -221,7 +222,7 @@ def check_arguments(
     if method is not None:
         kinds = (ValueIteration, PolicyIteration, Nested)
         arguments.one_of(method, "solve: method", kinds, "hjb.PolicyIteration(...) or hjb.ValueIteration()")
-    arguments.one_of(scheme, "solve: scheme", (Upwind, Limited), "hjb.Upwind(...) or hjb.Limited()")
+    schemes.check(scheme, "solve: scheme", grid, stationary=True)
     arguments.positive(tol, "solve: tol", "in the units of the cost")
     if max_steps is not None:
         arguments.count(max_steps, "solve: max_steps")

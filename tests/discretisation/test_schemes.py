@@ -1,0 +1,106 @@
+"""A scheme of somebody else's, in every front door; and what is none."""
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hjbjax as hjb
+from hjbjax.discretisation import stencil
+
+
+@dataclasses.dataclass(frozen=True)
+class Minmod:
+    """Second order by the smaller of two second differences of one sign; equal spacings."""
+
+    chain: Any = hjb.Upwind()
+    monotone, stationary, even, subcell = False, True, True, False
+    stages, points = 2, 3
+
+    def slopes(self, around):
+        grid, found = around.on.grid, []
+        for axis, (up, down) in enumerate(around.one_sided):
+            bend = up - down
+            above, below = (stencil.neighbour(bend, grid, stencil.unit(grid, axis, step)) for step in (1, -1))
+            up, down = up - least(bend, above) / 2, down + least(bend, below) / 2
+            found.append(stencil.stopped(up, down, grid, axis))
+        return found
+
+
+def least(a, b):
+    return jnp.where(a * b > 0, jnp.where(jnp.abs(a) < jnp.abs(b), a, b), 0)
+
+
+def smooth(count):
+    """V = 1 − cos x on a ring, β = 1: f = u, L = ½ u² + V + ½ |DV|² with the optimal u = −DV."""
+
+    def cost(x, u):
+        return 0.5 * u @ u + 1 - jnp.cos(x[0]) + 0.5 * jnp.sin(x[0]) ** 2
+
+    problem = hjb.Problem(lambda x, u: u, cost, hjb.Box([-2.0], [2.0]), discount=1.0)
+    return problem, hjb.Grid([-np.pi], [np.pi], (count,), periodic=[True])
+
+
+def largest_error(count, scheme):
+    problem, grid = smooth(count)
+    solution = hjb.solve(problem, grid, scheme=scheme, tol=1e-9)
+    assert solution.enclosure is None or scheme.monotone
+    return np.max(np.abs(solution.value - (1 - np.cos(grid.nodes()[..., 0]))))
+
+
+def test_another_scheme_is_of_its_order_in_a_stationary_problem():
+    """Nearly of order 2: limiters of this kind lose some of it at extrema."""
+    coarse, fine = largest_error(40, Minmod()), largest_error(160, Minmod())
+    assert np.log(coarse / fine) / np.log(4) > 1.3
+    assert fine < 0.2 * largest_error(160, hjb.Upwind())
+
+
+def test_another_scheme_marches_and_goes_lane_by_lane():
+    problem, grid = smooth(80)
+    free = hjb.Problem(problem.drift, problem.cost, problem.controls)
+    values = [hjb.march(free, grid, 1.0, scheme=scheme).value[0] for scheme in (hjb.Upwind(), Minmod(), hjb.Weno5())]
+    assert np.max(np.abs(values[1] - values[2])) < 0.2 * np.max(np.abs(values[0] - values[2]))
+    alone = hjb.solve(problem, grid, scheme=Minmod(), tol=1e-9)
+    (lane,) = hjb.solve_batch([problem], grid, scheme=Minmod(), tol=1e-9)
+    np.testing.assert_allclose(lane.value, alone.value, rtol=0, atol=1e-8)
+
+
+@dataclasses.dataclass  # neither frozen nor hashable
+class Loose:
+    chain: Any = hjb.Upwind()
+    monotone, stationary, even, subcell, stages, points = False, True, False, False, 2, 3
+
+    def slopes(self, around):
+        return around.one_sided
+
+
+@pytest.mark.parametrize("scheme", [Minmod, hjb.Upwind, None, "upwind", Loose(), 1.0])
+@pytest.mark.parametrize("door", ["solve", "march", "solve_batch"])
+def test_what_is_no_scheme_is_refused(door, scheme):
+    problem, grid = smooth(20)
+    free = hjb.Problem(problem.drift, problem.cost, problem.controls)
+    ask = {
+        "solve": lambda: hjb.solve(problem, grid, scheme=scheme),
+        "march": lambda: hjb.march(free, grid, 1.0, scheme=scheme),
+        "solve_batch": lambda: hjb.solve_batch([problem], grid, scheme=scheme),
+    }
+    with pytest.raises(TypeError, match=r"scheme is .*; wanted hjb.Upwind\("):
+        ask[door]()
+
+
+def test_what_a_scheme_of_ones_own_cannot_do_is_said():
+    problem, grid = smooth(20)
+    free = hjb.Problem(problem.drift, problem.cost, problem.controls)
+    with pytest.raises(ValueError, match=r"solves with the matrix of a chain; got Minmod"):
+        hjb.march(free, grid, 1.0, scheme=Minmod(), method=hjb.Implicit())
+    stretched = hjb.Grid([-1.0], [1.0], (20,), stretch=(hjb.Sinh(2.0),))
+    for ask in (lambda: hjb.solve(problem, stretched, scheme=Minmod()),
+                lambda: hjb.march(free, stretched, 1.0, scheme=Minmod())):  # fmt: skip
+        with pytest.raises(ValueError, match=r"Minmod\(.*\) wants equal spacings"):
+            ask()
+    with pytest.raises(TypeError, match=r"Weno5\(\); wanted hjb.Upwind"):
+        hjb.solve(problem, grid, scheme=hjb.Weno5())
+    with pytest.raises(ValueError, match="axis 0 has 2 points; Minmod needs at least 3"):
+        hjb.march(free, hjb.Grid([-1.0], [1.0], (2,)), 1.0, scheme=Minmod())

@@ -17,8 +17,8 @@ from hjbjax.feedback.safety_filter import least_restrictive
 from hjbjax.feedback.simulation import simulate
 from hjbjax.geometry import stability
 from hjbjax.geometry.lyapunov import lyapunov_check
+from hjbjax.iteration.evaluation import Direct, Krylov, Sweeps
 from hjbjax.iteration.methods import Nested, PolicyIteration, ValueIteration
-from hjbjax.iteration.relaxation import Direct, Krylov, Sweeps
 from hjbjax.iteration.time_stepping import Explicit, Implicit
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem

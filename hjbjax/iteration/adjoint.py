@@ -17,11 +17,11 @@ import jax
 import jax.numpy as jnp
 
 from hjbjax.discretisation import chain
-from hjbjax.iteration import bellman, fixed_point, relaxation
+from hjbjax.iteration import bellman, fixed_point
 from hjbjax.iteration.bellman import Correction
+from hjbjax.iteration.evaluation import Evaluation, Krylov, direct, evaluate, left_over
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import PolicyIteration
-from hjbjax.iteration.relaxation import Evaluation, Krylov
 from hjbjax.problem.grid import Grid
 
 STEPS = 200  # refinements of the linear solve in each of its two stages, at most
@@ -46,7 +46,7 @@ def attach(task: Task, state: State) -> jax.Array:
         return lambda _, right: refined(evaluation, Correction(right, weights), task_kept.grid)
 
     def matvec(delta):
-        return -relaxation.left_over(Correction(jnp.zeros_like(delta), equation.weights), task_kept.grid, delta)
+        return -left_over(Correction(jnp.zeros_like(delta), equation.weights), task_kept.grid, delta)
 
     weights, solvers = equation.weights, _exact_solvers(equation, task_kept.grid)
     if not task_kept.grid.sides("open"):
@@ -70,7 +70,7 @@ def _exact_solvers(equation: Correction, grid: Grid) -> tuple[Any, Any]:
     """The solves of I − W and of its transpose by factorisation; rows of open ends are no jumps to be turned round."""
 
     def solve(transposed: bool) -> Any:
-        return lambda _, right: relaxation.direct(Correction(right, equation.weights), grid, transposed=transposed)
+        return lambda _, right: direct(Correction(right, equation.weights), grid, transposed=transposed)
 
     return solve(False), solve(True)
 
@@ -126,8 +126,8 @@ def refined(evaluation: Evaluation, equation: Correction, grid: Grid) -> jax.Arr
         def refine(carry: Any) -> Any:
             delta, left, _, count = carry
             before = jnp.max(jnp.abs(left))
-            delta = delta + relaxation.solve(method, Correction(left, equation.weights), grid)
-            return delta, relaxation.left_over(equation, grid, delta), before, count + 1
+            delta = delta + evaluate(method, Correction(left, equation.weights), grid)
+            return delta, left_over(equation, grid, delta), before, count + 1
 
         def unfinished(carry: Any) -> Any:
             delta, left, before, count = carry
@@ -135,7 +135,7 @@ def refined(evaluation: Evaluation, equation: Correction, grid: Grid) -> jax.Arr
             return (size > goal(delta)) & (count < STEPS) & ~(size > slow * before)
 
         before, none = jnp.full((), jnp.inf, delta.dtype), jnp.zeros((), jnp.int32)
-        start = (delta, relaxation.left_over(equation, grid, delta), before, none)
+        start = (delta, left_over(equation, grid, delta), before, none)
         return jax.lax.while_loop(unfinished, refine, start)[0]
 
     delta = jnp.zeros_like(equation.source)
@@ -143,5 +143,5 @@ def refined(evaluation: Evaluation, equation: Correction, grid: Grid) -> jax.Arr
         delta = stage(evaluation, delta, SLOW)
         evaluation = Krylov()
     delta = stage(evaluation, delta, jnp.inf)
-    left = jnp.max(jnp.abs(relaxation.left_over(equation, grid, delta)))
+    left = jnp.max(jnp.abs(left_over(equation, grid, delta)))
     return jnp.where(left <= goal(delta), delta, jnp.nan)

@@ -20,9 +20,10 @@ import numpy as np
 from hjbjax.discretisation import chain, edges, stencil
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.hamiltonian import players
-from hjbjax.iteration import bellman, certificates, relaxation
+from hjbjax.iteration import bellman, certificates
 from hjbjax.iteration.bellman import Conditions, Correction, Greedy
 from hjbjax.iteration.certificates import Certificate, Gap
+from hjbjax.iteration.evaluation import evaluate
 from hjbjax.iteration.methods import Method, PolicyIteration, ValueIteration
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
@@ -310,11 +311,11 @@ def _evaluated(task: Task, state: State) -> jax.Array:
     if task.certificate is Certificate.OPEN:  # in a game, too: steps in time improve both players at once
         later = altered(task.problem, discount=task.problem.discount + _shift(task, state))
         left = equation(task.asking(later), state.value, state.policy)
-        return relaxation.solve(task.method.evaluation, left, task.grid)
+        return evaluate(task.method.evaluation, left, task.grid)
     if task.problem.is_game:
         return _hoffman_karp(task, state)
     left = equation(task, state.value, state.policy, state.fastest)
-    return relaxation.solve(task.method.evaluation, left, task.grid)
+    return evaluate(task.method.evaluation, left, task.grid)
 
 
 def _pace(task: Task, state: State) -> jax.Array:
@@ -343,7 +344,7 @@ def _hoffman_karp(task: Task, state: State) -> jax.Array:
 
     def reply(carry):
         value, policy, _, count = carry
-        value = task.impose(value + relaxation.solve(evaluation, equation(task, value, policy), task.grid))
+        value = task.impose(value + evaluate(evaluation, equation(task, value, policy), task.grid))
         policy = bellman.respond(task.on, value, held, policy, lost=task.lost)
         left = jnp.max(jnp.where(task.counted, jnp.abs(equation(task, value, policy).source), 0))
         return value, policy, left, count + 1

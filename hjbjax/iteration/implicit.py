@@ -16,10 +16,10 @@ import jax
 import jax.numpy as jnp
 
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.iteration import bellman, certificates, relaxation
+from hjbjax.iteration import bellman, certificates
 from hjbjax.iteration.bellman import Conditions, Correction, Greedy
 from hjbjax.iteration.certificates import Certificate
-from hjbjax.iteration.relaxation import Evaluation
+from hjbjax.iteration.evaluation import Evaluation, evaluate
 from hjbjax.problem.pytree import altered, node
 
 ROUNDING = 16  # residuals below this many units in the last place of max|V| are rounding
@@ -111,7 +111,7 @@ def _evaluated(step: Step, value: jax.Array, policy: Greedy, residual: Any, eval
     """The value of the (outer player's) policy, roughly; in a game to a tenth of the residual."""
 
     def solved(value, policy):
-        delta = relaxation.solve(evaluation, step.equation(value, policy), step.on.grid)
+        delta = evaluate(evaluation, step.equation(value, policy), step.on.grid)
         return step.rules.impose(value + delta)
 
     if not step.on.problem.is_game:

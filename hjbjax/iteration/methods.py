@@ -1,7 +1,6 @@
 """The methods of a stationary solve, as values: what is done, and not how."""
 
-from hjbjax.iteration import relaxation
-from hjbjax.iteration.relaxation import Evaluation, Sweeps
+from hjbjax.iteration.evaluation import Evaluation, Sweeps, check_evaluation
 from hjbjax.problem import arguments
 from hjbjax.problem.pytree import node
 
@@ -27,7 +26,7 @@ class PolicyIteration:
     replies: int = 20
 
     def __post_init__(self):
-        relaxation.check_evaluation(self.evaluation, "PolicyIteration: evaluation")
+        check_evaluation(self.evaluation, "PolicyIteration: evaluation")
         arguments.count(self.replies, "PolicyIteration: replies")
 
 

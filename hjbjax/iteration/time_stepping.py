@@ -24,9 +24,9 @@ import jax.numpy as jnp
 
 from hjbjax.discretisation import correlated_noise
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.iteration import bellman, implicit, relaxation, splitting
+from hjbjax.iteration import bellman, implicit, splitting
 from hjbjax.iteration.bellman import Conditions
-from hjbjax.iteration.relaxation import Evaluation
+from hjbjax.iteration.evaluation import Evaluation, check_evaluation
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
@@ -75,7 +75,7 @@ class Implicit:
 
     def __post_init__(self):
         if self.evaluation is not None:
-            relaxation.check_evaluation(self.evaluation, "Implicit: evaluation")
+            check_evaluation(self.evaluation, "Implicit: evaluation")
         arguments.positive(self.tol, "Implicit: tol", "in the units of the cost")
         arguments.count(self.max_steps, "Implicit: max_steps")
 

@@ -19,8 +19,8 @@ from hjbjax.discretisation.schemes import Upwind
 from hjbjax.finiteness import admissibility, node_checks
 from hjbjax.hamiltonian import players
 from hjbjax.iteration import bellman, time_stepping
+from hjbjax.iteration.evaluation import Krylov, Sweeps
 from hjbjax.iteration.methods import PolicyIteration
-from hjbjax.iteration.relaxation import Krylov, Sweeps
 from hjbjax.iteration.time_stepping import Explicit, Implicit, March
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid

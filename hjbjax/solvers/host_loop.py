@@ -16,7 +16,6 @@ import numpy as np
 
 from hjbjax.iteration import fixed_point
 from hjbjax.iteration.fixed_point import HISTORY, State, Task
-from hjbjax.iteration.relaxation import Direct, Krylov
 from hjbjax.solution.clock import CHUNK_SECONDS, CUT, Clock
 from hjbjax.solution.status import Status
 from hjbjax.solvers import faults
@@ -84,7 +83,7 @@ def drive(task: Task, guess: Any, clock: Clock, most: int | None = None) -> tupl
 
 def _calls_back(task: Task) -> bool:
     evaluation = getattr(task.method, "evaluation", None)
-    return isinstance(evaluation, Direct) or checks.calls_back(task.problem, task.grid.ndim)
+    return (evaluation is not None and evaluation.calls_back) or checks.calls_back(task.problem, task.grid.ndim)
 
 
 def _ended(clock: Clock, done: int, limit: int, nodes: int) -> Status:
@@ -106,7 +105,8 @@ def _first_chunk(task: Task, clock: Clock) -> int:
     method, nodes = task.method, task.grid.size
     if clock.per_node is None and nodes > MANY_NODES:
         return 0
-    if task.problem.is_game or isinstance(getattr(method, "evaluation", None), (Krylov, Direct)):
+    evaluation = getattr(method, "evaluation", None)
+    if task.problem.is_game or (evaluation is not None and not evaluation.rough):
         return 1
     if clock.per_node is None:
         steps = FIRST_NODES / nodes

@@ -15,7 +15,6 @@ import jax
 import numpy as np
 
 from hjbjax.iteration.methods import Method, Nested, PolicyIteration
-from hjbjax.iteration.relaxation import Krylov, Sweeps
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_discounted
@@ -39,12 +38,10 @@ def estimate(problem: Problem, grid: Grid, method: Method, dtype: Any) -> int:
     kept = word * (2 + actions + sum(each is not None for each in conditions) + (is_discounted(problem) is False)) + 2
     look, correction = word * (4 + 2 * actions), 0
     if isinstance(method, PolicyIteration):
-        jumps = 2 * n * n if np.ndim(problem.noise) == 2 or callable(problem.noise) else 2 * n
-        if isinstance(method.evaluation, Sweeps):
-            weights = n if problem.noise is None else jumps
-            correction = 4 * (2 * weights + 2) + 2 * word
-        else:
-            correction = word * (2 * jumps + 4 + 8 * isinstance(method.evaluation, Krylov))
+        weights = 2 * n * n if np.ndim(problem.noise) == 2 or callable(problem.noise) else 2 * n
+        if problem.noise is None and method.evaluation.rough:
+            weights = n  # one way an axis, since sweeps may keep the two as one
+        correction = method.evaluation.bytes_per_node(weights, word)
     else:
         look += word  # the pace
     return (kept + max(look, correction)) * grid.size

@@ -13,7 +13,6 @@ from hjbjax.finiteness import resting
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import Method, Nested, PolicyIteration
-from hjbjax.iteration.relaxation import Sweeps
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import altered
 from hjbjax.solution import transfer
@@ -127,7 +126,8 @@ def settle(task: Task, verdict: Verdict, reached: np.ndarray | None, guess: Any,
                 break
             value = _vanishing(task, value, discounts, clock)
             state, code, residuals = drive(task, value, clock)
-    if code is Status.STALLED and isinstance(getattr(task.method, "evaluation", None), Sweeps):
+    evaluation = getattr(task.method, "evaluation", None)
+    if code is Status.STALLED and evaluation is not None and evaluation.rough:
         task = dataclasses.replace(task, method=PolicyIteration(linear_solve(task.grid)))
         state, code, residuals = drive(task, state.value, clock)
     if code in FAILED:

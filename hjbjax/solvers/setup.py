@@ -16,9 +16,9 @@ from hjbjax.finiteness import attainability, resting
 from hjbjax.hamiltonian import players
 from hjbjax.iteration import bellman
 from hjbjax.iteration.certificates import Certificate
+from hjbjax.iteration.evaluation import Direct, Krylov, Sweeps
 from hjbjax.iteration.fixed_point import Task
 from hjbjax.iteration.methods import Method, Nested, PolicyIteration, ValueIteration
-from hjbjax.iteration.relaxation import Direct, Krylov, Sweeps
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_discounted
 from hjbjax.problem.pytree import cast

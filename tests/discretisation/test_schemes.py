@@ -1,7 +1,6 @@
 """A scheme of somebody else's, in every front door; and what is none."""
 
 import dataclasses
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,9 +14,8 @@ from hjbjax.discretisation import stencil
 class Minmod:
     """Second order by the smaller of two second differences of one sign; equal spacings."""
 
-    chain: Any = hjb.Upwind()
     monotone, stationary, even, subcell = False, True, True, False
-    stages, points = 2, 3
+    stages, points, chain = 2, 3, hjb.Upwind()
 
     def slopes(self, around):
         grid, found = around.on.grid, []
@@ -69,7 +67,6 @@ def test_another_scheme_marches_and_goes_lane_by_lane():
 
 @dataclasses.dataclass  # neither frozen nor hashable
 class Loose:
-    chain: Any = hjb.Upwind()
     monotone, stationary, even, subcell, stages, points = False, True, False, False, 2, 3
 
     def slopes(self, around):

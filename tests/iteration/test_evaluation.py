@@ -1,5 +1,6 @@
 """Sweeps, Krylov and direct solves of δ = s + Σ_o w_o δ(x + o) against dense linear algebra."""
 
+import dataclasses
 import functools
 
 import jax
@@ -10,10 +11,10 @@ from equations import LAYOUTS, ids, make_grid, random_equation
 from hypothesis import given, settings
 from systems import SEEDS
 
+import hjbjax as hjb
 from hjbjax.discretisation.chain import Rates
-from hjbjax.iteration import relaxation
 from hjbjax.iteration.bellman import Correction
-from hjbjax.iteration.relaxation import Direct, Krylov, Sweeps
+from hjbjax.iteration.evaluation import Direct, Krylov, Sweeps, evaluate, gauss_seidel, jacobi, left_over
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -24,10 +25,10 @@ def _float64():
 
 @functools.partial(jax.jit, static_argnames="rounds")
 def sweeps(equation, grid, rounds):
-    return relaxation.gauss_seidel(equation, grid, rounds)
+    return gauss_seidel(equation, grid, rounds)
 
 
-left_over = jax.jit(relaxation.left_over)
+left_over = jax.jit(left_over)
 
 
 @pytest.mark.parametrize(("n", "flags"), LAYOUTS, ids=ids)
@@ -47,7 +48,7 @@ def test_rounds_of_sweeps_converge_to_the_dense_solve(n, flags, seed):
 @functools.partial(jax.jit, static_argnames="method_type")
 def solved(equation, grid, method_type):
     method = {"krylov": Krylov(fraction=1e-12), "direct": Direct(), "sweeps": Sweeps(3)}[method_type]
-    return relaxation.solve(method, equation, grid)
+    return evaluate(method, equation, grid)
 
 
 @pytest.mark.parametrize(
@@ -82,7 +83,7 @@ def test_diagonal_jumps_are_relaxed_and_solved(seed):
 
 @functools.partial(jax.jit, static_argnames="count")
 def _jacobi(equation, grid, count):
-    return relaxation.jacobi(equation, grid, count)
+    return jacobi(equation, grid, count)
 
 
 def test_sweeps_run_in_single_precision_and_return_the_type_they_got():
@@ -119,3 +120,71 @@ def test_a_batch_is_solved_lane_by_lane():
     for method in ("direct", "krylov"):
         found = jax.vmap(lambda equation, method=method: solved(equation, grid, method))(stacked)
         assert np.allclose(found, np.stack([exact for *_, exact in lanes]), rtol=0, atol=1e-9)
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class Gmres:
+    """An evaluation of somebody else's."""
+
+    restart: int = 20
+    rough, open_ends, calls_back = False, True, False
+
+    def solve(self, equation, grid):
+        def matvec(delta):
+            return equation.source - left_over(equation, grid, delta)
+
+        zero = jnp.zeros_like(equation.source)
+        return jax.scipy.sparse.linalg.gmres(matvec, equation.source, zero, tol=1e-3, restart=self.restart)[0]
+
+    def bytes_per_node(self, weights, word):
+        return word * (weights + self.restart + 6)
+
+
+class Unregistered(Gmres):
+    """Hashable, but no pytree of its own."""
+
+
+def controlled(x, u):
+    return u
+
+
+def costs(x, u):
+    return x @ x + u @ u
+
+
+LINE, WALK = hjb.Grid([-1.0], [1.0], (31,)), hjb.Problem(controlled, costs, hjb.Box([-1.0], [1.0]), noise=0.5)
+FOR_EVER = hjb.Problem(controlled, costs, hjb.Box([-1.0], [1.0]), noise=0.5, discount=0.3)
+
+
+def test_another_evaluation_solves_marches_and_goes_lane_by_lane():
+    method, known = hjb.PolicyIteration(Gmres()), hjb.solve(FOR_EVER, LINE, tol=1e-8)
+    alone = hjb.solve(FOR_EVER, LINE, method=method, tol=1e-6)
+    (lane,) = hjb.solve_batch([FOR_EVER], LINE, method=method, tol=1e-6)
+    for found in (alone, lane):
+        assert found.status is hjb.Status.CONVERGED
+        np.testing.assert_allclose(found.value, known.value, rtol=0, atol=found.error + known.error)
+    steps = [hjb.march(WALK, LINE, 1.0, step=0.1, method=hjb.Implicit(each)).value for each in (Gmres(), Direct())]
+    np.testing.assert_allclose(*steps, rtol=0, atol=1e-5)
+
+
+def test_another_evaluation_inside_a_derivative():
+    def value(weight, method):
+        problem = hjb.Problem(
+            controlled, lambda x, u: weight * x @ x + u @ u, FOR_EVER.controls, noise=0.5, discount=0.3
+        )
+        return hjb.solve(problem, LINE, method=method).value[20]
+
+    found, known = (jax.grad(value)(2.0, hjb.PolicyIteration(each)) for each in (Gmres(), hjb.Krylov()))
+    assert float(found) == pytest.approx(float(known), rel=1e-6)
+
+
+@pytest.mark.parametrize("evaluation", [Gmres, hjb.Sweeps, None, "krylov", 3])
+def test_what_is_no_evaluation_is_refused(evaluation):
+    with pytest.raises(TypeError, match=r"PolicyIteration: evaluation is .*; wanted hjb.Sweeps\("):
+        hjb.PolicyIteration(evaluation)
+
+
+def test_an_evaluation_that_is_no_pytree_is_told_how_to_become_one():
+    with pytest.raises(TypeError, match=r"Unregistered is no pytree.*\n?.*jax.tree_util.register_static"):
+        hjb.PolicyIteration(Unregistered())

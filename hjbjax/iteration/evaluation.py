@@ -1,7 +1,37 @@
-"""Solving δ = s + Σ_o w_o δ(x + o): sweeps, Krylov, direct."""
+"""Evaluating a policy, as values: solving δ = s + Σ_o w_o δ(x + o), and how to write an evaluation of your own.
+
+``PolicyIteration`` and ``Implicit`` take anything with the attributes of ``Evaluation``. One by GMRES:
+
+    >>> import dataclasses
+    >>> import jax
+    >>> import jax.numpy as jnp
+    >>> import hjbjax as hjb
+    >>> from hjbjax.iteration.evaluation import left_over
+    >>> @jax.tree_util.register_static
+    ... @dataclasses.dataclass(frozen=True)
+    ... class Gmres:
+    ...     restart: int = 20
+    ...     rough, open_ends, calls_back = False, True, False
+    ...
+    ...     def solve(self, equation, grid):
+    ...         zero = jnp.zeros_like(equation.source)
+    ...
+    ...         def matvec(delta):  # (I − W) δ
+    ...             return equation.source - left_over(equation, grid, delta)
+    ...
+    ...         return jax.scipy.sparse.linalg.gmres(matvec, equation.source, zero, tol=1e-3, restart=self.restart)[0]
+    ...
+    ...     def bytes_per_node(self, weights, word):
+    ...         return word * (weights + self.restart + 6)
+    >>> problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), noise=0.5, discount=1.0)
+    >>> hjb.solve(problem, hjb.Grid([-1.0], [1.0], (41,)), method=hjb.PolicyIteration(Gmres())).status.name
+    'CONVERGED'
+
+It goes into compiled programs as a pytree, here one without numbers, and what it does is traced.
+"""
 
 import dataclasses
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +47,32 @@ from hjbjax.problem.pytree import node
 OPEN_FRACTION = 1e-8  # of the residual, to which a Krylov method goes with open ends
 
 
+@runtime_checkable
+class Evaluation(Protocol):
+    """How the linear equation of a policy is solved: a value, frozen and hashable or a pytree."""
+
+    @property
+    def rough(self) -> bool:
+        """Whether it only relaxes: a step is cheap, and the loop goes over to a linear solve where it comes to a halt.
+
+        What is not rough is held against its residual, and relaxed where it fails, as for a policy without a value.
+        """
+
+    @property
+    def open_ends(self) -> bool:
+        """Whether it holds where a value is continued from inside beyond open ends."""
+
+    @property
+    def calls_back(self) -> bool:
+        """Whether it runs Python on the host in the middle of a compiled program."""
+
+    def solve(self, equation: Correction, grid: Grid) -> jax.Array:
+        """δ with δ = s + Σ_o w_o δ(x + o), roughly or not, (*grid), in the type of the equation."""
+
+    def bytes_per_node(self, weights: int, word: int) -> int:
+        """The memory that it takes a node for ``weights`` jumps of ``word`` bytes each, its input included."""
+
+
 @node(static=("count",))
 class Sweeps:
     """Rough evaluation by Gauss–Seidel: in every order ``count`` times a forward and a backward sweep.
@@ -26,9 +82,19 @@ class Sweeps:
     """
 
     count: int = 3
+    rough, open_ends, calls_back = True, False, False
 
     def __post_init__(self):
         arguments.count(self.count, "Sweeps: count")
+
+    def solve(self, equation: Correction, grid: Grid) -> jax.Array:
+        """Rounds of Gauss–Seidel in single precision."""
+        single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), equation)
+        return gauss_seidel(single, grid, self.count).astype(equation.source.dtype)
+
+    def bytes_per_node(self, weights: int, word: int) -> int:
+        """Weights and source twice in single precision, as they are and sheared."""
+        return 4 * (2 * weights + 2) + 2 * word
 
 
 @node(static=("max_steps",))
@@ -42,18 +108,47 @@ class Krylov:
 
     fraction: Any = 1e-3
     max_steps: int = 200
+    rough, open_ends, calls_back = False, True, False
 
     def __post_init__(self):
         arguments.positive(self.fraction, "Krylov: fraction", most=1)
         arguments.count(self.max_steps, "Krylov: max_steps")
+
+    def solve(self, equation: Correction, grid: Grid) -> jax.Array:
+        """BiCGStab on (I − W) δ = s with one Gauss–Seidel round as preconditioner."""
+
+        def matvec(delta):
+            return -left_over(Correction(jnp.zeros_like(delta), equation.weights), grid, delta)
+
+        def precondition(residual):
+            return gauss_seidel(Correction(residual, equation.weights), grid, 1)
+
+        fraction = self.fraction
+        if grid.sides("open"):  # at 1e-3 the errors of the solves led a step in time to another solution
+            fraction = jnp.minimum(fraction, OPEN_FRACTION)
+        delta, _ = jax.scipy.sparse.linalg.bicgstab(
+            matvec, equation.source, tol=fraction, maxiter=self.max_steps, M=precondition
+        )
+        return delta
+
+    def bytes_per_node(self, weights: int, word: int) -> int:
+        """The weights twice, and the vectors of BiCGStab."""
+        return word * (2 * weights + 12)
 
 
 @node()
 class Direct:
     """Exact evaluation by a sparse LU factorisation (SciPy's SuperLU, on the host): small grids and oracles."""
 
+    rough, open_ends, calls_back = False, True, True
 
-Evaluation = Sweeps | Krylov | Direct
+    def solve(self, equation: Correction, grid: Grid) -> jax.Array:
+        """By factorisation."""
+        return direct(equation, grid)
+
+    def bytes_per_node(self, weights: int, word: int) -> int:
+        """The weights twice; what the factors fill on the host depends on the order of the nodes and is not counted."""
+        return word * (2 * weights + 4)
 
 
 def check_evaluation(evaluation: Any, name: str) -> None:
@@ -62,23 +157,29 @@ def check_evaluation(evaluation: Any, name: str) -> None:
     Raises:
       TypeError: with the evaluations that there are.
     """
-    arguments.one_of(evaluation, name, (Sweeps, Krylov, Direct), "hjb.Sweeps(...), hjb.Krylov(...) or hjb.Direct()")
-
-
-def solve(method: Evaluation, equation: Correction, grid: Grid) -> jax.Array:
-    """An approximate solution δ, shape (*grid), in the dtype of the equation."""
-    if isinstance(method, Sweeps) and grid.sides("open"):
-        raise ValueError(
-            "Sweeps(...) relax node by node, which does not converge where open ends continue the value from inside; "
-            "use hjb.PolicyIteration(hjb.Direct()) or Krylov(), in a march Implicit(hjb.Direct())"
+    if isinstance(evaluation, type) or not isinstance(evaluation, Evaluation):
+        wanted = "hjb.Sweeps(...), hjb.Krylov(...) or hjb.Direct()"
+        raise TypeError(f"{name} is {arguments.shown(evaluation)}; wanted {wanted}")
+    if any(leaf is evaluation for leaf in jax.tree.leaves(evaluation)):
+        raise TypeError(
+            f"{name}: {type(evaluation).__name__} is no pytree, which compiled programs want; decorate the class with "
+            "jax.tree_util.register_static, or register_dataclass if it holds numbers"
         )
-    if not isinstance(method, Sweeps):
-        delta = direct(equation, grid) if isinstance(method, Direct) else krylov(method, equation, grid)
-        size, left = jnp.max(jnp.abs(equation.source)), jnp.max(jnp.abs(left_over(equation, grid, delta)))
-        # an improper policy has no value, and BiCGStab may break down: then relax, which always makes sense
-        return jax.lax.cond(left <= size, lambda: delta, lambda: gauss_seidel(equation, grid, 2))
-    single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), equation)
-    return gauss_seidel(single, grid, method.count).astype(equation.source.dtype)
+
+
+def evaluate(method: Evaluation, equation: Correction, grid: Grid) -> jax.Array:
+    """An approximate solution δ, shape (*grid), in the dtype of the equation."""
+    if grid.sides("open") and not method.open_ends:
+        raise ValueError(
+            f"{type(method).__name__}(...) relax node by node, which does not converge where open ends continue the "
+            "value from inside; use hjb.PolicyIteration(hjb.Direct()) or Krylov(), in a march Implicit(hjb.Direct())"
+        )
+    delta = method.solve(equation, grid)
+    if method.rough:
+        return delta
+    size, left = jnp.max(jnp.abs(equation.source)), jnp.max(jnp.abs(left_over(equation, grid, delta)))
+    # an improper policy has no value, and BiCGStab may break down: then relax, which always makes sense
+    return jax.lax.cond(left <= size, lambda: delta, lambda: gauss_seidel(equation, grid, 2))
 
 
 def left_over(equation: Correction, grid: Grid, delta: jax.Array) -> jax.Array:
@@ -127,24 +228,6 @@ def _walled(equation: Correction, grid: Grid) -> Correction:
     scale = 1 / jnp.where(outside < 1, 1 - outside, 1)
     weights = dataclasses.replace(equation.weights, values=tuple(scale * w for w in inside))
     return Correction(scale * equation.source, weights)
-
-
-def krylov(method: Krylov, equation: Correction, grid: Grid) -> jax.Array:
-    """BiCGStab on (I − W) δ = s with one Gauss–Seidel round as preconditioner."""
-
-    def matvec(delta):
-        return -left_over(Correction(jnp.zeros_like(delta), equation.weights), grid, delta)
-
-    def precondition(residual):
-        return gauss_seidel(Correction(residual, equation.weights), grid, 1)
-
-    fraction = method.fraction
-    if grid.sides("open"):  # at 1e-3 the errors of the solves led a step in time to another solution
-        fraction = jnp.minimum(fraction, OPEN_FRACTION)
-    delta, _ = jax.scipy.sparse.linalg.bicgstab(
-        matvec, equation.source, tol=fraction, maxiter=method.max_steps, M=precondition
-    )
-    return delta
 
 
 def direct(equation: Correction, grid: Grid, *, transposed: bool = False) -> jax.Array:

@@ -2,13 +2,13 @@
 
 Explicit: strong-stability-preserving Runge–Kutta methods of Shu and Osher, with F = min max H − β V,
 
-    W ← a_k V + (1 − a_k) (W + Δt F(W)),    a = (0), (0, ½) or (0, ¾, ⅓),
+    W ← a_k V + (1 − a_k) (W + c Δt F(W)),    a = (0), (0, ½), (0, ¾, ⅓) with c = 1; (0, 0, ⅔, 0) with c = ½,
 
 each stage a mean of Euler steps, so that what one Euler step keeps, they keep: V ← max(g, min(ψ, ·)) and the given
 values after every stage, and for the monotone chain the order of two values and the range of the data, as long as
-Δt (max Q + β) ≤ 1 with Q the rate at which the chain leaves a node. Order 1, 2, 3 in time. Where the fastest action is
-not at an end of its set, or Q changes within a step, Q is looked at under the actions that every stage chose, and a
-step that was too long for it is done again in shorter ones.
+c Δt (max Q + β) ≤ 1 with Q the rate at which the chain leaves a node. Order 1, 2, 3 and 3 in time. Where the fastest
+action is not at an end of its set, or Q changes within a step, Q is looked at under the actions that every stage chose,
+and a step that was too long for it is done again in shorter ones.
 
 Implicit (Euler): min{ max{ (β + 1/Δt) W − V/Δt − min max H(W), W − ψ }, W − g } = 0, a discounted stationary problem
 for W by policy iteration, any Δt, order 1. Against the other player's own solved problem, as in ``iteration``.
@@ -26,58 +26,15 @@ from hjbjax.discretisation import correlated_noise
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import bellman, implicit, splitting
 from hjbjax.iteration.bellman import Conditions
-from hjbjax.iteration.evaluation import Evaluation, check_evaluation
-from hjbjax.problem import arguments
+from hjbjax.iteration.methods import Implicit
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import node
 from hjbjax.problem.sets import Box
 from hjbjax.solution.status import Status
 
-MEANS = {1: (0.0,), 2: (0.0, 1 / 2), 3: (0.0, 3 / 4, 1 / 3)}  # a_k: the share of V in a stage
-STARTS = {1: (0.0,), 2: (0.0, 1.0), 3: (0.0, 1.0, 0.5)}  # where a stage evaluates F, in steps
-ENDS = {1: (1.0,), 2: (1.0, 1.0), 3: (1.0, 0.5, 1.0)}  # the time of its result
 TRIES = 30  # of a step that is shortened, at most; what its first stage sees does not depend on its length
 NEAR = 1e-3  # of a bound's distance: a disturbance so near its bound sits on it
-
-
-@node(static=("stages",))
-class Explicit:
-    """Explicit steps: the SSP Runge–Kutta method with ``stages`` stages, which is also its order in time.
-
-    Args:
-      stages: 1 (Euler), 2 or 3; ``None`` takes what goes with the scheme: 1 for ``Upwind``, 3 for ``Weno5``, else 2.
-      fraction: the length of a step over the stability limit 1/(max Q + β), at most 1.
-    """
-
-    stages: int | None = None
-    fraction: Any = 0.9
-
-    def __post_init__(self):
-        if isinstance(self.stages, bool) or self.stages not in (None, *MEANS):
-            raise ValueError(f"Explicit: got stages = {self.stages!r}, wanted 1, 2, 3 or None")
-        arguments.positive(self.fraction, "Explicit: fraction", most=1)
-
-
-@node(static=("max_steps",))
-class Implicit:
-    """Implicit Euler steps, each by policy iteration: any length, first order in time.
-
-    Args:
-      evaluation: how a policy is evaluated; ``None`` is ``Krylov()`` with noise and ``Sweeps()`` without.
-      tol: bound on what the policy iterations leave over the whole march, in cost units.
-      max_steps: policy improvements in one step, at most.
-    """
-
-    evaluation: Evaluation | None = None
-    tol: Any = 1e-6
-    max_steps: int = 100
-
-    def __post_init__(self):
-        if self.evaluation is not None:
-            check_evaluation(self.evaluation, "Implicit: evaluation")
-        arguments.positive(self.tol, "Implicit: tol", "in the units of the cost")
-        arguments.count(self.max_steps, "Implicit: max_steps")
 
 
 @node(static=("checks_rates", "checks_noise"))
@@ -126,7 +83,7 @@ class March:
             return self.step
         limit = self.limit
         if limit is None:
-            limit = self.method.fraction * stable(self.on.at(t))
+            limit = self.method.courant * stable(self.on.at(t))
         return jnp.minimum(self.step, limit)
 
 
@@ -217,7 +174,7 @@ def advance(march: March, front: Front, until: Any) -> Front:
     until, left = jnp.asarray(until, dtype), front.t - until
     longest, ok = march.longest(front.t), jnp.ones((), bool)
     if march.checks_rates:  # a step like the last one rather than one that is done again
-        longest = jnp.minimum(longest, march.method.fraction / front.seen.fastest)
+        longest = jnp.minimum(longest, march.method.courant / front.seen.fastest)
     count = jnp.maximum(jnp.ceil(left / longest - 1e-4), 1)
     t = until + left * ((count - 1) / count)
     if isinstance(march.method, Implicit):
@@ -247,11 +204,12 @@ def _short_enough(march: March, front: Front, until: Any, count: Any) -> tuple[j
 
     def too_long(carry):
         count, tries, _, seen = carry
-        return (seen.fastest * (front.t - end(count)) > 1 + 1e-6) & (tries < TRIES)
+        euler = march.method.tableau.euler * (front.t - end(count))
+        return (seen.fastest * euler > 1 + 1e-6) & (tries < TRIES)
 
     def attempt(carry):
         count, tries, _, seen = carry
-        more = jnp.maximum(jnp.ceil(left * seen.fastest / march.method.fraction - 1e-4), count + 1)
+        more = jnp.maximum(jnp.ceil(left * seen.fastest / march.method.courant - 1e-4), count + 1)
         count = jnp.where(tries > 0, more, count)
         return count, tries + 1, *_explicit(march, front.value, front.t, front.t - end(count))
 
@@ -282,19 +240,21 @@ def explicit(march: March, value: jax.Array, t: Any, dt: Any) -> jax.Array:
 
 def _explicit(march: March, value: jax.Array, t: Any, dt: Any) -> tuple[jax.Array, Seen]:
     """V at t − Δt, and what the stages saw."""
-    dtype, stages = value.dtype, march.method.stages
-    if stages == 1:
+    dtype, tableau = value.dtype, march.method.tableau
+    if len(tableau.means) == 1:
         rate, seen = _rate(march, value, t)
         return march.rules_at(t - dt).impose(value + dt * rate), seen
-    means, starts, ends = (jnp.asarray(table[stages], dtype) for table in (MEANS, STARTS, ENDS))
+    means, starts, ends = (
+        jnp.asarray(table, dtype) for table in (tableau.means, tableau.times[:-1], tableau.times[1:])
+    )
 
     def stage(k, carry):
         w, seen = carry
         rate, now = _rate(march, w, t - starts[k] * dt)
-        moved = means[k] * value + (1 - means[k]) * (w + dt * rate)
+        moved = means[k] * value + (1 - means[k]) * (w + tableau.euler * dt * rate)
         return march.rules_at(t - ends[k] * dt).impose(moved), seen.joined(now)
 
-    return jax.lax.fori_loop(0, stages, stage, (value, _nothing(dtype)))
+    return jax.lax.fori_loop(0, len(tableau.means), stage, (value, _nothing(dtype)))
 
 
 def _implicit(march: March, value: jax.Array, t: Any, dt: Any) -> tuple[jax.Array, jax.Array, Seen]:

@@ -14,7 +14,8 @@ import numpy as np
 from hjbjax.discretisation import correlated_noise, edges
 from hjbjax.hamiltonian import discrete, players
 from hjbjax.iteration import time_stepping
-from hjbjax.iteration.time_stepping import Explicit, Front, Implicit, March
+from hjbjax.iteration.methods import Explicit, Implicit
+from hjbjax.iteration.time_stepping import Front, March
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.sets import Finite
 from hjbjax.solution.clock import CHUNK_SECONDS, CUT, Clock

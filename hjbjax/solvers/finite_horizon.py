@@ -20,8 +20,8 @@ from hjbjax.finiteness import admissibility, node_checks
 from hjbjax.hamiltonian import players
 from hjbjax.iteration import bellman, time_stepping
 from hjbjax.iteration.evaluation import Krylov, Sweeps
-from hjbjax.iteration.methods import PolicyIteration
-from hjbjax.iteration.time_stepping import Explicit, Implicit, March
+from hjbjax.iteration.methods import Explicit, Implicit, PolicyIteration
+from hjbjax.iteration.time_stepping import March
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
@@ -224,8 +224,11 @@ def _prepare(on: Discretisation, horizon: float, method: Any, step: float | None
         if step is not None or not moving:
             limits = [_stable(on.at(jnp.asarray(t, dtype))) for t in probes]
             limit = jnp.min(jnp.stack(limits))
-            _check_step(step, float(limit))
-        limit = None if moving else jnp.asarray(limit * method.fraction if step is None else limit, dtype)
+            _check_step(step, float(limit) / method.tableau.euler)
+        if moving:
+            limit = None
+        else:
+            limit = jnp.asarray(limit * (method.courant if step is None else 1 / method.tableau.euler), dtype)
     else:
         evaluation = method.evaluation or _evaluation(problem, grid)
         method = Implicit(evaluation, jnp.asarray(method.tol, dtype), method.max_steps)
@@ -243,7 +246,7 @@ def _checks(on: Discretisation, method: Any) -> tuple[bool, bool]:
     problem = on.problem
     how, moving = players.setting(problem, on.grid.ndim, on.dtype), problem.time_dependent
     sampled = not (how.control.fastest_at_ends and how.disturbance.fastest_at_ends)
-    rates = isinstance(method, Explicit) and (sampled or (moving and method.stages != 1))
+    rates = isinstance(method, Explicit) and (sampled or (moving and len(method.tableau.means) > 1))
     return rates, callable(problem.noise) and (moving or how.steers_noise)
 
 

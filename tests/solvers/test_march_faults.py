@@ -65,8 +65,8 @@ def test_bad_input_is_refused(changes, error, reason):
 
 
 def test_stages_and_fractions_that_are_none():
-    with pytest.raises(ValueError, match=r"stages = 4, wanted 1, 2, 3 or None"):
-        hjb.Explicit(4)
+    with pytest.raises(ValueError, match=r"stages = 5, wanted 1, 2, 3, 4, a Tableau or None"):
+        hjb.Explicit(5)
     with pytest.raises(ValueError, match=r"Explicit: fraction = 1.5; wanted a number > 0 and at most 1"):
         hjb.Explicit(fraction=1.5)
 

@@ -30,7 +30,7 @@ from hjbjax.solvers.batch import solve_batch
 from hjbjax.solvers.finite_horizon import march
 from hjbjax.solvers.setup import SolveWarning
 from hjbjax.solvers.stationary import solve
-from hjbjax.tracing.components import FallbackWarning
+from hjbjax.tracing.interpreter import FallbackWarning
 
 __all__ = [
     "Ball",

@@ -37,6 +37,7 @@ import numpy as np
 from hjbjax.applications.l2_gain import Saturation, saturation
 from hjbjax.discretisation.discretisation import Scheme
 from hjbjax.discretisation.schemes import Weno5
+from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_discounted
 from hjbjax.problem.sets import Ball, Box
@@ -291,10 +292,7 @@ def _check_rule(make: Any, lo: Any, hi: Any, tol: Any, inner: Any, settle: Any, 
         ("settle", settle, 0.5),
         ("horizon", horizon, math.inf),
     ):
-        plain = isinstance(number, (int, float, np.number)) and not isinstance(number, bool)
-        if not plain or not 0 < number <= most or math.isinf(number):
-            wanted = "a finite number > 0" if math.isinf(most) else f"a number in (0, {most:g}]"
-            raise ValueError(f"hinf_level: got {name} = {number!r}, wanted {wanted}")
+        arguments.positive(number, f"hinf_level: {name}", most=most)
     if lo >= hi:
         raise ValueError(f"hinf_level: got lo = {lo:g} and hi = {hi:g}, wanted lo < hi")
 

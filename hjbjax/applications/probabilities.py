@@ -29,7 +29,7 @@ from hjbjax.solvers import memory
 from hjbjax.solvers.finite_horizon import march
 from hjbjax.solvers.stationary import as_dtype, check_arguments, solve
 from hjbjax.tracing import checks
-from hjbjax.tracing.components import FallbackWarning
+from hjbjax.tracing.interpreter import FallbackWarning
 
 TOL = 1e-6
 

@@ -14,6 +14,7 @@ from hjbjax.feedback.closed_loop import Stepping, integrate, some, unbegun
 from hjbjax.feedback.feedback import check_kept, lookups
 from hjbjax.feedback.loop import Loop
 from hjbjax.feedback.path import Interrupted, Path, PathStatus, truncated
+from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, cast, is_traced
@@ -81,7 +82,6 @@ def simulate(
       KeyboardInterrupt: Ctrl-C; its ``.path`` is the Path so far, once that has begun.
 
     Example:
-      >>> import jax.numpy as jnp
       >>> from hjbjax import Box, Problem
       >>> problem = Problem(lambda x, u: u, lambda x, u: x @ x + u @ u, Box([-9.0], [9.0]))
       >>> path = simulate(problem, lambda x: -x, [1.0], 20.0)
@@ -90,17 +90,18 @@ def simulate(
     """
     if is_traced(problem, feedback, x0, duration, key, grid):
         raise ValueError("simulate: got traced values; inside jit, vmap or grad use hjbjax.feedback.simulation.rollout")
+    duration = float(arguments.positive(duration, "simulate: duration", "in units of time"))
     if getattr(feedback, "times", None) is not None:
-        problem = _within_horizon(problem, feedback, _positive(duration, "duration"))
+        problem = _within_horizon(problem, feedback, duration)
     loop = _close(problem, feedback, disturbance, grid, clamp, time_varying)
     x0 = _initial(x0, loop.grid)
     hold = None if hold is False else hold
-    times = _times(_positive(duration, "duration"), steps, hold)
+    times = _times(duration, steps, hold)
     stepping = Stepping(
-        rtol=_positive(rtol, "rtol"),
-        atol=_positive(atol, "atol"),
-        max_step=np.inf if max_step is None else _positive(max_step, "max_step"),
-        max_steps=_count(max_steps, "max_steps"),
+        rtol=float(arguments.positive(rtol, "simulate: rtol")),
+        atol=float(arguments.positive(atol, "simulate: atol")),
+        max_step=np.inf if max_step is None else float(arguments.positive(max_step, "simulate: max_step")),
+        max_steps=arguments.count(max_steps, "simulate: max_steps"),
         held=hold is not None,
     )
     key = _key(key)
@@ -275,30 +276,14 @@ def _initial(x0: Any, grid: Grid | None) -> np.ndarray:
 def _times(duration: float, steps: Any, hold: Any) -> np.ndarray:
     """The output times; under a hold, the sampling instants."""
     if hold is None:
-        return np.linspace(0.0, duration, 1 + (200 if steps is None else _count(steps, "steps")))
-    if isinstance(hold, bool):
-        raise ValueError("simulate: hold is True, wanted the sampling interval, as in hold=0.05")
-    hold = _positive(hold, "hold")
+        return np.linspace(0.0, duration, 1 + (200 if steps is None else arguments.count(steps, "simulate: steps")))
+    hold = float(arguments.positive(hold, "simulate: hold", "the sampling interval in units of time"))
     if steps is not None:
         raise ValueError(f"simulate: got steps = {steps} and hold = {hold}; leave out steps: the output is every hold")
     count = max(1, duration / hold - 1e-9)
     if count > 10**7:
-        raise ValueError(
-            f"simulate: hold = {hold} makes {count:.3g} intervals of duration {duration:g}, wanted at most 1e7"
-        )
+        raise ValueError(f"simulate: hold = {hold} makes {count:.3g} intervals of {duration:g}, wanted at most 1e7")
     return np.append(np.arange(math.ceil(count)) * hold, duration)
-
-
-def _positive(value: Any, name: str) -> float:
-    if isinstance(value, (bool, str)) or np.ndim(value) or not (np.isfinite(value) and value > 0):
-        raise ValueError(f"simulate: {name} is {value!r}, wanted a finite number > 0")
-    return float(value)
-
-
-def _count(value: Any, name: str) -> int:
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-        raise ValueError(f"simulate: {name} is {value!r}, wanted a positive integer")
-    return int(value)
 
 
 def _key(key: Any) -> Any:
@@ -330,7 +315,7 @@ def _probe(loop: Loop, x0: Any) -> None:
     opponents = 0 if problem.disturbances is None else problem.disturbances.dim
     u, d = jnp.zeros(m, x0.dtype), jnp.zeros(opponents, x0.dtype)
     players, state = (x0[0], x0), problem.arguments(x0, u, d, x0[0])
-    for name, function, arguments, wanted in (
+    for name, function, fed, wanted in (
         ("feedback", loop.control, players, (m,)),
         ("disturbance", loop.opponent, players, (opponents,)),
         ("drift", problem.drift, state, (n,)),
@@ -340,7 +325,7 @@ def _probe(loop: Loop, x0: Any) -> None:
         if function is None:
             continue
         try:
-            found = jax.eval_shape(functools.partial(_array, function, name), *arguments)
+            found = jax.eval_shape(functools.partial(_array, function, name), *fed)
         except jax.errors.JAXTypeError as error:
             raise ValueError(
                 f"simulate: {name} cannot be traced: use jnp.where instead of if, and jnp instead of numpy"

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hjbjax.problem import arguments
 from hjbjax.problem.pytree import as_partial, cast, is_traced, node
 
 Field = Callable[[Any], Any]
@@ -77,7 +78,7 @@ def ad(f: Field, g: Field, k: int) -> Field:
       >>> chain(jnp.zeros(3)).tolist()
       [1.0, 0.0, 0.0]
     """
-    check_count("ad", "k", k)
+    arguments.count(k, "ad: k", least=0)
     for _ in range(k):
         g = lie_bracket(f, g)
     return g
@@ -95,7 +96,7 @@ def affine_fields(drift: Callable, inputs: int) -> tuple[Field, Sequence[Field]]
       >>> f(jnp.array([0.0, 3.0])).tolist(), g(jnp.zeros(2)).tolist()
       ([3.0, 0.0], [0.0, 2.0])
     """
-    check_count("affine_fields", "inputs", inputs)
+    arguments.count(inputs, "affine_fields: inputs", least=0)
     held = as_partial(drift, "affine_fields: drift")
     return _Affine(held, inputs, None), [_Affine(held, inputs, j) for j in range(inputs)]
 
@@ -172,12 +173,6 @@ def _compiled(rule, static):
 def as_fields(gs: Any) -> list[Field]:
     """A sequence of fields from one or several."""
     return [gs] if callable(gs) else list(gs)
-
-
-def check_count(owner: str, name: str, value: Any) -> None:
-    """Refuse what is no integer ≥ 0."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0:
-        raise ValueError(f"{owner}: got {name} = {value!r}, wanted an integer ≥ 0")
 
 
 def as_state(x: Any) -> Any:

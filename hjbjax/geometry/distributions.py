@@ -16,7 +16,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax.geometry.brackets import Field, along, as_fields, check_count, decide, floating, stacked
+from hjbjax.geometry.brackets import Field, along, as_fields, decide, floating, stacked
+from hjbjax.problem import arguments
 from hjbjax.problem.pytree import as_partial, is_traced, node
 
 
@@ -100,7 +101,7 @@ def reachability_distribution(
       >>> [reachability_distribution(parabola, push, [0.0, 5.0], depth).rank for depth in (0, 1, 2)]
       [1, 1, 2]
     """
-    check_count("reachability_distribution", "depth", depth)
+    arguments.count(depth, "reachability_distribution: depth", least=0)
     fields = tuple(as_partial(field) for field in [*([] if f is None else [f]), *as_fields(gs)])
     return decide(_reach, fields, x, tolerance, depth=int(depth))
 
@@ -134,7 +135,7 @@ def observability_codistribution(
       >>> observability_codistribution(swing, [], lambda x: x[0], [0.3, 0.0], 1).rank
       2
     """
-    check_count("observability_codistribution", "depth", depth)
+    arguments.count(depth, "observability_codistribution: depth", least=0)
     fields = tuple(as_partial(field) for field in [*([] if f is None else [f]), *as_fields(gs)])
     return decide(_observe, (fields, as_partial(h)), x, tolerance, depth=int(depth))
 

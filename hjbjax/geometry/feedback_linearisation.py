@@ -20,7 +20,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.geometry.brackets import Field, along, as_fields, as_state, check_count, decide, floating, stacked
+from hjbjax.geometry.brackets import Field, along, as_fields, as_state, decide, floating, stacked
+from hjbjax.problem import arguments
 from hjbjax.problem.pytree import as_partial, is_traced, node
 
 
@@ -193,7 +194,7 @@ def relative_degree(
       >>> print(relative_degree(drift, lambda x: jnp.array([0.0, 1.0, 0.0]), lambda x: x[0], jnp.zeros(3)).message)
       relative degree 2 of 3 states: zero dynamics of dimension 1 on {h = L_f h = 0}
     """
-    check_count("relative_degree", "samples", samples)
+    arguments.count(samples, "relative_degree: samples", least=0)
     functions = (tuple(as_partial(field) for field in (f, *as_fields(g))), as_partial(h))
     settings = {"radius": float(radius), "samples": int(samples)}
     states = np.shape(x)[0] if np.ndim(x) else 1

@@ -22,7 +22,6 @@ from hjbjax.geometry.brackets import (
     Field,
     along,
     as_fields,
-    check_count,
     decide,
     stacked,
 )
@@ -31,6 +30,7 @@ from hjbjax.geometry.feedback_linearisation import (
     near,
     plain,
 )
+from hjbjax.problem import arguments
 from hjbjax.problem.pytree import as_partial, is_traced, node
 
 
@@ -97,7 +97,7 @@ def is_feedback_linearisable(
       >>> is_feedback_linearisable(pendulum, lambda x: jnp.array([0.0, 1.0]), [0.5, 0.0]).linearisable
       True
     """
-    check_count("is_feedback_linearisable", "samples", samples)
+    arguments.count(samples, "is_feedback_linearisable: samples", least=0)
     fields = tuple(as_partial(field) for field in (f, *as_fields(g)))
     settings = {"radius": float(radius), "samples": int(samples)}
     states = np.shape(x)[0] if np.ndim(x) else 1

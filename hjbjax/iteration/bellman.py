@@ -16,13 +16,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax.discretisation import chain, cut_cells, stencil
+from hjbjax.discretisation import chain, cut_cells, edges, stencil
 from hjbjax.discretisation.chain import Rates
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.hamiltonian import discrete, players
 from hjbjax.problem import sets
 from hjbjax.problem.pytree import node
 
+LEAK = 64  # units of eps of Q: a smaller rate towards a lost node is rounding
 ROUNDING = 8  # units of eps in (Q + β)|V|, below which one action is no better than another
 
 
@@ -187,6 +188,22 @@ def correction(
         cut = tuple(jnp.where(stencil.neighbour(loose, on.grid, offset), w, 0) for offset, w in jumps)
         weights = dataclasses.replace(weights, values=cut)
     return Correction(source, weights, fastest)
+
+
+def leaks(on: Discretisation, policy: Greedy, held: jax.Array, lost: jax.Array) -> jax.Array:
+    """Whether the policy leads from a node that counts to one that is ``lost``, by more than rounding."""
+    grid, u, d = on.grid, list(policy.controls), list(policy.disturbances)
+    rates, beside = chain.rates(on, u, d), edges.beside(lost, grid)
+    strays = [edges.strays(*each) for each in zip(on.drift(u, d), beside, edges.slack(on), strict=True)]
+    leaking = jnp.zeros(grid.shape, on.dtype)
+    for offset, c in zip(rates.offsets, rates.values, strict=True):
+        leak = jnp.where(stencil.neighbour(~lost, grid, offset), 0, c)
+        if on.problem.noise is None:  # jumps go along one axis
+            axis = next(axis for axis, step in enumerate(offset) if step)
+            leak = jnp.where(strays[axis], 0, leak)
+        leaking = leaking + leak
+    limit = LEAK * jnp.finfo(on.dtype).eps * rates.total()
+    return jnp.any(~lost & ~held & (leaking > limit))
 
 
 def fastest_rate(on: Discretisation) -> jax.Array:

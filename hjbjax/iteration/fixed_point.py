@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import chain, edges, stencil
+from hjbjax.discretisation import chain
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.hamiltonian import players
 from hjbjax.iteration import bellman, certificates
@@ -247,25 +247,9 @@ def _look(
         moved=moved,
     )
     if task.has_lost:
-        measured = dataclasses.replace(measured, error=jnp.where(_leaks(task, policy), jnp.inf, measured.error))
+        leaks = bellman.leaks(task.on, policy, task.rules.held, ~task.counted)
+        measured = dataclasses.replace(measured, error=jnp.where(leaks, jnp.inf, measured.error))
     return policy, left.fastest, measured
-
-
-def _leaks(task: Task, policy: Greedy) -> jax.Array:
-    """Whether the policy leads from a node that counts to one that is lost, by more than rounding."""
-    grid, dtype, u, d = task.grid, policy.rate.dtype, list(policy.controls), list(policy.disturbances)
-    rates = chain.rates(task.on, u, d)
-    beside, slack = edges.beside(~task.counted, grid), edges.slack(task.on)
-    strays = [edges.strays(*each) for each in zip(task.on.drift(u, d), beside, slack, strict=True)]
-    leaking = jnp.zeros(grid.shape, dtype)
-    for offset, c in zip(rates.offsets, rates.values, strict=True):
-        leak = jnp.where(stencil.neighbour(task.counted, grid, offset), 0, c)
-        if task.problem.noise is None:  # jumps go along one axis
-            axis = next(axis for axis, step in enumerate(offset) if step)
-            leak = jnp.where(strays[axis], 0, leak)
-        leaking = leaking + leak
-    limit = ROUNDING * jnp.finfo(dtype).eps * rates.total()
-    return jnp.any(task.counted & ~task.rules.held & (leaking > limit))
 
 
 def _judge(task: Task, value: jax.Array, measured: Gap, best: jax.Array, since: jax.Array) -> jax.Array:

@@ -5,17 +5,19 @@ and what is wanted. Tracers pass: inside a JAX transformation no value can be lo
 """
 
 import math
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from hjbjax.problem.pytree import is_traced
 
+T = TypeVar("T")
+
 SHOWN = 80  # characters of a refused value that are quoted
 
 
-def positive(value: Any, name: str, unit: str = "", *, most: float = math.inf, endless: bool = False) -> None:
-    """Refuse what is not one finite number above zero.
+def positive(value: T, name: str, unit: str = "", *, most: float = math.inf, endless: bool = False) -> T:
+    """The value, unless it is not one finite number above zero.
 
     Args:
       value: what was given.
@@ -28,14 +30,16 @@ def positive(value: Any, name: str, unit: str = "", *, most: float = math.inf, e
       ValueError: zero, negative, NaN, infinite, a truth value, an array, no number at all.
     """
     if is_traced(value) or (endless and is_number(value) and value == math.inf):
-        return
-    if not (is_number(value) and math.isfinite(value) and 0 < value <= most):
+        return value
+    number: Any = value
+    if not (is_number(value) and math.isfinite(number) and 0 < number <= most):
         wanted = "a finite number > 0" if most == math.inf else f"a number > 0 and at most {most:g}"
         raise ValueError(f"{name} = {shown(value)}; wanted {wanted}{unit and ', ' + unit}")
+    return value
 
 
-def count(value: Any, name: str, least: int = 1) -> None:
-    """Refuse what is not an integer of at least ``least``.
+def count(value: Any, name: str, least: int = 1) -> int:
+    """The value, unless it is not an integer of at least ``least``.
 
     Raises:
       ValueError: too small, a float, a truth value, no number at all.
@@ -44,6 +48,7 @@ def count(value: Any, name: str, least: int = 1) -> None:
     if not whole or value < least:
         wanted = "a positive integer" if least == 1 else f"an integer of at least {least}"
         raise ValueError(f"{name} = {shown(value)}; wanted {wanted}")
+    return int(value)
 
 
 def one_of(value: Any, name: str, kinds: tuple[type, ...], wanted: str) -> None:

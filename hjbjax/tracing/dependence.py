@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from hjbjax.problem.pytree import remembered
-from hjbjax.tracing import components
+from hjbjax.tracing.interpreter import evaluate
 
 Term = tuple[int, ...] | frozenset[int]  # a product of at most two inputs, or some function of these inputs
 Terms = frozenset
@@ -96,7 +96,7 @@ def dependence(function: Callable, *arguments: tuple[int | None, bool], dtype: A
             entries[index] = frozenset({(number,)}) if counts else CONSTANT
             number += counts
         packed.append(entries)
-    (result,) = components.evaluate(closed, packed, _POLYNOMIALS)
+    (result,) = evaluate(closed, packed, _POLYNOMIALS)
     if not (isinstance(result, np.ndarray) and result.dtype == object):
         return Dependence((CONSTANT,) * int(np.size(result)))
     return Dependence(tuple(result.reshape(-1)))

@@ -320,7 +320,7 @@ BOX2 = Grid([-1.0, -1.0], [1.0, 1.0], (3, 3))
         (PLAIN, toward_zero, [1.0], {"steps": 2.5}, "steps"),
         (PLAIN, toward_zero, [1.0], {"hold": 0}, "hold"),
         (PLAIN, toward_zero, [1.0], {"hold": -0.1}, "hold"),
-        (PLAIN, toward_zero, [1.0], {"hold": True}, "sampling interval"),
+        (PLAIN, toward_zero, [1.0], {"hold": True}, "hold = True; wanted a finite number > 0, the sampling interval"),
         (PLAIN, toward_zero, [1.0], {"hold": 1e-12}, "1e7"),
         (PLAIN, toward_zero, [1.0], {"hold": 0.1, "steps": 20}, "leave out steps"),
         (PLAIN, toward_zero, [1.0], {"rtol": 0.0}, "rtol"),

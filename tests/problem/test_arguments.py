@@ -48,9 +48,9 @@ def test_fractions_end_at_one(value):
             POSITIVE[name](value)
 
 
-@pytest.mark.parametrize("stages", [0, 4, True, 1.5, "2"])
+@pytest.mark.parametrize("stages", [0, 5, True, 1.5, "2"])
 def test_stages(stages):
-    with pytest.raises(ValueError, match="stages = .*, wanted 1, 2, 3 or None"):
+    with pytest.raises(ValueError, match="stages = .*, wanted 1, 2, 3, 4, a Tableau or None"):
         hjb.Explicit(stages)
 
 

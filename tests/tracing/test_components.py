@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hjbjax import Grid
-from hjbjax.tracing import components
+from hjbjax.tracing import components, interpreter
 
 RISE = np.arange(16.0).reshape(4, 4) / 7
 TABLE = np.linspace(-1.5, 1.5, 9)
@@ -129,7 +129,7 @@ def both(function, grid, dtype):
 
 @pytest.fixture(autouse=True)
 def fresh_warnings():
-    components._warn_once.cache_clear()
+    interpreter._warn_once.cache_clear()
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
@@ -149,7 +149,7 @@ def test_what_has_no_rule_falls_back_and_says_so_once(name):
             warnings.simplefilter("always")
             got, expected = both(WRITTEN[name], GRID, "float64")(0.7)
             again, _ = both(WRITTEN[name], GRID, "float64")(0.7)
-        said = [str(warning.message) for warning in caught if warning.category is components.FallbackWarning]
+        said = [str(warning.message) for warning in caught if warning.category is interpreter.FallbackWarning]
         assert said
         assert len(set(said)) == len(said) == len(caught)
         np.testing.assert_allclose(got, expected, rtol=1e-12)

@@ -1,0 +1,245 @@
+"""A jaxpr of a function of one state, evaluated on object arrays whose entries an algebra knows to handle.
+
+Three kinds of primitives have a rule: those that move entries about (one rule: move labels instead), those that act
+entry by entry, and sums and products. Anything else is left to the algebra's ``nodewise``, with one warning.
+"""
+
+import functools
+import itertools
+import math
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend import core as jex
+
+from hjbjax.tracing.primitives import CALLS, CUMULATIVE, ENTRYWISE, IN_NUMPY, MOVES, REDUCTIONS, SCATTERS
+
+
+class FallbackWarning(UserWarning):
+    """A primitive has no component rule and is evaluated node by node with ``vmap``: correct, slower."""
+
+
+def pack(argument: Any) -> np.ndarray:
+    """A list of per-node scalars, or one of them, as an object array."""
+    if isinstance(argument, (list, tuple)):
+        return object_array(argument, (len(argument),))
+    return object_array([argument], ())
+
+
+def object_array(entries: Sequence[Any], shape: tuple[int, ...]) -> np.ndarray:
+    """An array of objects of a shape, whatever the entries are."""
+    array = np.empty(len(entries), dtype=object)
+    for index, entry in enumerate(entries):
+        array[index] = entry
+    return array.reshape(shape)
+
+
+def is_components(value: Any) -> bool:
+    """Whether a value is an object array, one that may vary from node to node."""
+    return isinstance(value, np.ndarray) and value.dtype == object
+
+
+def lift(value: Any, algebra: Any) -> np.ndarray:
+    """A value that is the same at all nodes, as an object array of the algebra's scalars."""
+    if is_components(value):
+        return value
+    shape = np.shape(value)
+    return object_array([algebra.constant(value, index) for index in np.ndindex(*shape)], shape)
+
+
+def evaluate(closed: jex.ClosedJaxpr, arguments: Sequence[Any], algebra: Any) -> list[Any]:
+    """Evaluate a jaxpr on object arrays.
+
+    Args:
+      closed: the jaxpr of a function of one state.
+      arguments: one value an input; an object array, or an array that is the same at all nodes.
+      algebra: what the scalars are; arrays over the nodes, or abstract ones that record how results depend on inputs.
+
+    Returns:
+      One value an output, likewise.
+    """
+    env = dict(zip(closed.jaxpr.constvars, closed.consts, strict=True))
+    env |= dict(zip(closed.jaxpr.invars, arguments, strict=True))
+    for eqn in closed.jaxpr.eqns:
+        operands = [var.val if isinstance(var, jex.Literal) else env[var] for var in eqn.invars]
+        results = _apply(eqn, operands, algebra)
+        env.update(zip(eqn.outvars, results, strict=True))
+    return [var.val if isinstance(var, jex.Literal) else env[var] for var in closed.jaxpr.outvars]
+
+
+def _apply(eqn: Any, operands: list[Any], algebra: Any) -> list[Any]:
+    name = eqn.primitive.name
+    if not any(map(is_components, operands)):
+        return _uniform(eqn, operands)
+    if name in CALLS and CALLS[name] in eqn.params:
+        inner = eqn.params[CALLS[name]]
+        inner = inner if isinstance(inner, jex.ClosedJaxpr) else jex.ClosedJaxpr(inner, ())
+        return (
+            algebra.custom_jvp(eqn, inner, operands)
+            if name == "custom_jvp_call"
+            else evaluate(inner, operands, algebra)
+        )
+    if name == "cond":
+        return _branch(eqn, operands, algebra)
+    if name in MOVES:
+        moved = _move(eqn, operands, algebra)
+        if moved is not None:
+            return moved
+    elif name in ENTRYWISE:
+        return [_entrywise(eqn, operands, algebra)]
+    elif name in SCATTERS:
+        scattered = _scatter(eqn, operands, algebra)
+        if scattered is not None:
+            return [scattered]
+    elif name in CUMULATIVE:
+        return [_accumulate(eqn, lift(operands[0], algebra), algebra)]
+    elif name in REDUCTIONS:
+        return [_reduce(eqn, lift(operands[0], algebra), algebra)]
+    elif name == "dot_general":
+        return [_contract(eqn, lift(operands[0], algebra), lift(operands[1], algebra), algebra)]
+    if any(np.shape(value) != () for value in operands) or any(var.aval.shape != () for var in eqn.outvars):
+        _warn_once(name)
+    return algebra.nodewise(eqn, operands)
+
+
+def _uniform(eqn: Any, operands: list[Any]) -> list[Any]:
+    """An equation none of whose operands varies over the nodes; kept concrete while its operands are."""
+    if any(isinstance(value, jax.core.Tracer) for value in operands):
+        return bind(eqn, operands)
+    with jax.ensure_compile_time_eval():
+        return bind(eqn, operands)
+
+
+def bind(eqn: Any, operands: list[Any]) -> list[Any]:
+    """The results of one equation on JAX arrays."""
+    results = eqn.primitive.bind(*operands, **eqn.primitive.get_bind_params(eqn.params))
+    return list(results) if eqn.primitive.multiple_results else [results]
+
+
+def _known(values: Sequence[Any]) -> bool:
+    return not any(is_components(value) or isinstance(value, jax.core.Tracer) for value in values)
+
+
+def _move(eqn: Any, operands: list[Any], algebra: Any) -> list[Any] | None:
+    """Where every entry of a data-moving primitive goes, found by moving integer labels."""
+    data = set(MOVES[eqn.primitive.name](len(operands)))
+    if not _known([value for position, value in enumerate(operands) if position not in data]):
+        return None
+    pool: list[Any] = []
+    labelled = list(operands)
+    for position in sorted(data):
+        entries = lift(operands[position], algebra)
+        labelled[position] = np.arange(len(pool), len(pool) + entries.size, dtype=np.int32).reshape(entries.shape)
+        pool.extend(entries.reshape(-1))
+    fill = eqn.params.get("fill_value")
+    pool.append(algebra.constant(np.asarray(np.nan if fill is None else fill), ()))
+    if fill is not None:
+        eqn = eqn.replace(params=eqn.params | {"fill_value": -1})
+    if eqn.primitive.name in IN_NUMPY:
+        moved = [IN_NUMPY[eqn.primitive.name](*labelled, **eqn.params)]
+    else:
+        with jax.ensure_compile_time_eval():
+            moved = bind(eqn, labelled)
+    return [  # a gather out of range has a negative label: it takes the fill value at the end
+        object_array([pool[max(label, -1)] for label in np.ravel(labels)], np.shape(labels)) for labels in moved
+    ]
+
+
+def _scatter(eqn: Any, operands: list[Any], algebra: Any) -> np.ndarray | None:
+    """``x.at[known].add(...)`` and its like: each update goes where a one in its place would go."""
+    target, indices, updates = operands
+    if not _known([indices]):
+        return None
+    entries, updates = lift(target, algebra).copy(), lift(updates, algebra)
+    numbers, mode = eqn.params["dimension_numbers"], eqn.params["mode"]
+    combine = functools.partial(algebra.combine, SCATTERS[eqn.primitive.name], eqn.invars[0].aval.dtype)
+    for position in np.ndindex(*updates.shape):
+        one = np.zeros(updates.shape, np.int32)
+        one[position] = 1
+        with jax.ensure_compile_time_eval():
+            hit = jax.lax.scatter_add(jnp.zeros(entries.shape, np.int32), indices, one, numbers, mode=mode)
+        for place in zip(*np.nonzero(hit), strict=True):
+            entries[place] = combine(entries[place], updates[position])
+    return entries
+
+
+def _branch(eqn: Any, operands: list[Any], algebra: Any) -> list[Any]:
+    """``cond`` and ``switch``: the branch that is known to be taken, or a choice node by node, as under ``vmap``."""
+    index, *rest = operands
+    branches = eqn.params["branches"]
+    if _known([index]):
+        return evaluate(branches[int(np.clip(index, 0, len(branches) - 1))], rest, algebra)
+    index = lift(index, algebra).item()
+    outputs = [[lift(value, algebra) for value in evaluate(branch, rest, algebra)] for branch in branches]
+    results = []
+    for var, cases in zip(eqn.outvars, zip(*outputs, strict=True), strict=True):
+        dtypes = [eqn.invars[0].aval.dtype] + [var.aval.dtype] * len(cases)
+        rows = zip(*(case.reshape(-1) for case in cases), strict=True)
+        chosen = [algebra.entrywise(jax.lax.select_n_p, {}, [index, *row], dtypes) for row in rows]
+        results.append(object_array(chosen, cases[0].shape))
+    return results
+
+
+def _entrywise(eqn: Any, operands: list[Any], algebra: Any) -> np.ndarray:
+    lifted = np.broadcast_arrays(*(lift(value, algebra) for value in operands))
+    dtypes = [var.aval.dtype for var in eqn.invars]
+    rows = zip(*(value.reshape(-1) for value in lifted), strict=True)
+    results = [algebra.entrywise(eqn.primitive, eqn.params, list(row), dtypes) for row in rows]
+    return object_array(results, lifted[0].shape)
+
+
+def _reduce(eqn: Any, entries: np.ndarray, algebra: Any) -> np.ndarray:
+    axes = tuple(eqn.params["axes"])
+    kept = [axis for axis in range(entries.ndim) if axis not in axes]
+    shape = tuple(entries.shape[axis] for axis in kept)
+    if entries.size == 0:  # the neutral element
+        return lift(_uniform(eqn, [np.zeros(entries.shape, eqn.invars[0].aval.dtype)])[0], algebra)
+    rows = entries.transpose(*kept, *axes).reshape(math.prod(shape), -1)
+    combine = functools.partial(algebra.combine, REDUCTIONS[eqn.primitive.name], eqn.invars[0].aval.dtype)
+    return object_array([functools.reduce(combine, row) for row in rows], shape)
+
+
+def _accumulate(eqn: Any, entries: np.ndarray, algebra: Any) -> np.ndarray:
+    axis, step = eqn.params["axis"], -1 if eqn.params["reverse"] else 1
+    combine = functools.partial(algebra.combine, CUMULATIVE[eqn.primitive.name], eqn.invars[0].aval.dtype)
+    rows = np.moveaxis(entries, axis, -1)[..., ::step]
+    result = np.empty(rows.shape, dtype=object)
+    for index in np.ndindex(*rows.shape[:-1]):
+        result[index] = object_array(list(itertools.accumulate(rows[index], combine)), rows.shape[-1:])
+    return np.moveaxis(result[..., ::step], -1, axis)
+
+
+def _contract(eqn: Any, left: np.ndarray, right: np.ndarray, algebra: Any) -> np.ndarray:
+    """dot_general: batch axes first, then the free axes of the left and of the right operand."""
+    (contract_l, contract_r), (batch_l, batch_r) = eqn.params["dimension_numbers"]
+    free_l = [axis for axis in range(left.ndim) if axis not in (*contract_l, *batch_l)]
+    free_r = [axis for axis in range(right.ndim) if axis not in (*contract_r, *batch_r)]
+    batch = tuple(left.shape[axis] for axis in batch_l)
+    rows = tuple(left.shape[axis] for axis in free_l)
+    columns = tuple(right.shape[axis] for axis in free_r)
+    length = math.prod(left.shape[axis] for axis in contract_l)
+    left = left.transpose(*batch_l, *free_l, *contract_l).reshape(math.prod(batch), math.prod(rows), length)
+    right = right.transpose(*batch_r, *free_r, *contract_r).reshape(math.prod(batch), math.prod(columns), length)
+    dtype = eqn.outvars[0].aval.dtype
+    if length == 0:
+        return lift(np.zeros(batch + rows + columns), algebra)
+    add, multiply = (functools.partial(algebra.combine, op, dtype) for op in (jax.lax.add, jax.lax.mul))
+    inner = [
+        functools.reduce(add, map(multiply, left[b, i], right[b, j]))
+        for b, i, j in np.ndindex(math.prod(batch), math.prod(rows), math.prod(columns))
+    ]
+    return object_array(inner, batch + rows + columns)
+
+
+@functools.cache
+def _warn_once(name: str) -> None:
+    warnings.warn(
+        f"the primitive {name!r} has no component rule: the function that uses it is evaluated node by node, "
+        "which is correct and slower; entry-by-entry arithmetic on x[0], x[1], ... avoids it",
+        FallbackWarning,
+        stacklevel=2,
+    )

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from questions import GRID, U, accepted, in_disc, refused
 
 from hjbjax import Box, Finite, Grid, Problem
-from hjbjax.discretisation import chain, correlated_noise
+from hjbjax.discretisation import correlated_noise
 from hjbjax.finiteness import node_checks
 from hjbjax.problem.pytree import node
 

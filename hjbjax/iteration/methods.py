@@ -120,6 +120,7 @@ class Explicit:
 
     stages: int | Tableau | None = None
     fraction: Any = 0.9
+    halves = True  # players who meet in a component are upwinded each by itself, see ``splitting``
 
     def __post_init__(self):
         named = not isinstance(self.stages, bool) and self.stages in (None, *TABLEAUX)
@@ -152,6 +153,7 @@ class Implicit:
     evaluation: Evaluation | None = None
     tol: Any = 1e-6
     max_steps: int = 100
+    halves = False  # a chain has one drift, the sum of both players'
 
     def __post_init__(self):
         if self.evaluation is not None:

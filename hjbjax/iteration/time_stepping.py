@@ -24,6 +24,7 @@ import jax.numpy as jnp
 
 from hjbjax.discretisation import correlated_noise
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.hamiltonian import discrete, players
 from hjbjax.iteration import bellman, implicit, splitting
 from hjbjax.iteration.bellman import Conditions
 from hjbjax.iteration.methods import Implicit
@@ -291,8 +292,12 @@ def _look(march: March, u: list, d: list, t: Any) -> Seen:
 
 
 def greedy(march: March, value: jax.Array, t: Any) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, ...]]:
-    """The control and the disturbance at the time t, each component of shape (*grid)."""
-    _, u, d = splitting.optimise(march.on.at(t), value)
+    """The control and the disturbance at the time t, each component of shape (*grid), of the H that steps solve."""
+    on = march.on.at(t)
+    if march.method.halves:
+        _, u, d = splitting.optimise(on, value)
+    else:
+        _, u, d = discrete.optimise(discrete.local(on, value), players.setting(on.problem, on.grid.ndim, on.dtype))
 
     def full(action):
         return tuple(jnp.broadcast_to(jnp.asarray(entry, value.dtype), march.grid.shape) for entry in action)

@@ -48,9 +48,12 @@ def _greedy(march: March, value: jax.Array, t: Any) -> tuple:
 
 @jax.jit
 def _gap_at(task: March, value: jax.Array, t: Any) -> tuple[jax.Array, jax.Array]:
-    """The largest min max − max min over the nodes, and how much the actions matter; none where players are apart."""
+    """The largest min max − max min of the H that steps solve, and how much the actions matter.
+
+    None where the players drive components of their own, and where each is upwinded by itself.
+    """
     how = players.setting(task.problem, task.grid.ndim, value.dtype)
-    if how.separable:
+    if how.decoupled or (how.separable and task.method.halves):
         return jnp.zeros(()), jnp.ones(())
     here = discrete.local(task.on.at(t), value)
     return isaacs_gap(here, ~task.rules_at(t).held)

@@ -144,7 +144,7 @@ def perturbation_study(
       >>> round(study.noise.order, 1), round(study.gain.order, 1)
       (2.0, 2.0)
     """
-    check_arguments(problem, grid, method, scheme, tol, None, None)
+    check_arguments(problem, grid, method, scheme, tol)
     levels = _increasing("noises", noises), _increasing("gammas", gammas)
     if problem.is_game or problem.noise is not None:
         raise ValueError("perturbation_study: the problem has noise or disturbances already; leave them out")

@@ -248,7 +248,7 @@ def _zero(*where: Any) -> Any:
 def _may_stay(question: Problem, grid: Grid, options: dict) -> int:
     """The number of nodes at which some actions keep the state away from every end for ever; 0 while traced."""
     scheme, kind = options.get("scheme", Upwind()), as_dtype(options.get("dtype"))
-    check_arguments(question, grid, options.get("method"), scheme, options["tol"], None, None)
+    check_arguments(question, grid, options.get("method"), scheme, options["tol"])
     if is_traced(question, grid):
         return 0
     method = options.get("method") or ValueIteration()  # needs the least; solve asks again for what it takes

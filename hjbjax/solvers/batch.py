@@ -27,9 +27,10 @@ from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
 from hjbjax.solvers import faults, memory, nested
 from hjbjax.solvers.host_loop import FIRST_NODES, imposed
+from hjbjax.solvers.nested import Settled
 from hjbjax.solvers.result import closed, describe, finish, unstarted
-from hjbjax.solvers.setup import choose, prepare_on_host
-from hjbjax.solvers.stationary import as_dtype, check_arguments, sharpened
+from hjbjax.solvers.setup import Verdict, choose, prepare_on_host
+from hjbjax.solvers.stationary import as_dtype, check_arguments, check_limits, sharpened
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
 
@@ -77,8 +78,9 @@ def solve_batch(
     if isinstance(problems, Problem) or not isinstance(problems, Iterable):
         raise TypeError(f"solve_batch: got {shown(problems)}; wanted a list of problems, as in [problem]")
     lanes = list(problems)
+    check_limits(max_steps, time_limit)
     for lane in lanes:
-        check_arguments(lane, grid, method, scheme, tol, max_steps, time_limit)
+        check_arguments(lane, grid, method, scheme, tol)
     kind = as_dtype(dtype)
     grid.check_spacings(kind)
     solutions: list[Any] = [None] * len(lanes)
@@ -89,10 +91,11 @@ def solve_batch(
             chosen = method or choose(first, grid, traced=False)
             chosen = chosen.inner if isinstance(chosen, Nested) else chosen
             checks.shapes(first, grid, scheme)
+            on = Discretisation(first, grid, scheme, kind)
             needed = memory.require(first, grid, chosen, kind, max_memory)
             for some in _rounds(members, needed, max_memory):
                 with faults.explained(clock, needed * len(some), lambda _: next(filter(None, solutions), None)):
-                    together = _solve_together([lanes[i] for i in some], some, grid, chosen, scheme, tol, kind, clock)
+                    together = _solve_together({i: on.asking(lanes[i]) for i in some}, chosen, tol, clock)
                 for index, solution in zip(some, together, strict=True):
                     solutions[index] = solution
         if solutions and not any(solution.status in CUT for solution in solutions):
@@ -124,66 +127,54 @@ def _rounds(members: Sequence[int], bytes_each: int, limit: int | None) -> list[
     return [members[start : start + most] for start in range(0, len(members), most)]
 
 
-def _solve_together(
-    problems: Sequence[Problem],
-    names: Sequence[int],
-    grid: Grid,
-    method: Method,
-    scheme: Scheme,
-    tol: float,
-    kind: Any,
-    clock: Clock,
-) -> list[Solution]:
-    """The solutions of problems that run together, ``names`` their lanes."""
-    began = clock.elapsed()
-    prepared: list[tuple] = []
-    for name, problem in zip(names, problems, strict=True):
+def _solve_together(lanes: dict[int, Discretisation], method: Method, tol: float, clock: Clock) -> list[Solution]:
+    """The solutions of problems that run together, by the numbers of their lanes."""
+    began, names, asked = clock.elapsed(), list(lanes), list(lanes.values())
+    prepared: list[tuple[Task, Verdict, np.ndarray | None]] = []
+    for name, on in lanes.items():
         try:
-            node_checks.values(problem, grid, kind, clock)
-            admissibility.values(problem, grid, kind)
-            prepared.append(
-                prepare_on_host(Discretisation(problem, grid, scheme.chain, kind), method=method, tol=tol, clock=clock)
-            )
+            node_checks.values(on.problem, on.grid, on.dtype, clock)
+            admissibility.values(on.problem, on.grid, on.dtype)
+            prepared.append(prepare_on_host(on.chain, method=method, tol=tol, clock=clock))
         except ValueError as refusal:
             raise ValueError(f"lane {name}: {refusal}") from refusal
         except Stopped as stop:
-            nothing = [unstarted(each, grid, np.zeros(grid.shape, kind), scheme, stop.status) for each in problems]
+            nothing = [unstarted(each, np.zeros(each.grid.shape), stop.status) for each in asked]
             return [closed(solution, clock) for solution in nothing]
     clock.phase = f"the steps of lanes {names[0]} to {names[-1]}"
     has_lost = any(task.has_lost for task, _, _ in prepared)
-    prepared = [(dataclasses.replace(task, has_lost=has_lost), *rest) for task, *rest in prepared]
-    solutions: list[Any] = [None] * len(problems)
+    prepared = [(dataclasses.replace(task, has_lost=has_lost), verdict, reached) for task, verdict, reached in prepared]
+    solutions: list[Any] = [None] * len(lanes)
     for members in _grouped(jax.tree.structure(task) for task, _, _ in prepared):  # by certificate, too
         tasks = _stack([prepared[i][0] for i in members])
         states = _begin(tasks, jax.vmap(Task.start)(tasks))
         ended, histories = _finish_lanes(tasks, states, len(members), clock)
         for i, (state, code), residuals in zip(members, ended, histories, strict=True):
-            solutions[i] = _finished(prepared[i], state, code, np.concatenate(residuals), grid, scheme, clock)
-    about = {"seconds": clock.elapsed() - began, "lanes": len(problems), "tol": tol}
-    for problem, solution in zip(problems, solutions, strict=True):
-        solution.stats.update(method=describe(method, problem), **about)
+            history = np.concatenate(residuals)[: int(state.step) + 1]
+            solutions[i] = _finished(Settled(*prepared[i], state, code, history), asked[i], clock)
+    about = {"seconds": clock.elapsed() - began, "lanes": len(lanes), "tol": tol}
+    for on, solution in zip(asked, solutions, strict=True):
+        solution.stats.update(method=describe(method, on.problem), **about)
     return solutions
 
 
-def _finished(
-    lane: tuple, state: State, code: Status, residuals: np.ndarray, grid: Grid, scheme: Scheme, clock: Clock
-) -> Solution:
-    """The solution of one prepared lane, which may go on by itself: off a node where it rests, or to second order."""
-    task, verdict, reached = lane
-    history = residuals[: int(state.step) + 1]
+def _finished(settled: Settled, on: Discretisation, clock: Clock) -> Solution:
+    """The solution of one lane, which may go on by itself: off a node where it rests, or to second order."""
+    task, verdict, reached, state, code, history = settled
     apart: dict[str, Any] = {}
     if code in CUT:
-        state = imposed(task, state)
+        settled = settled._replace(state=imposed(task, state))
     elif nested.may_go_on(task, verdict, state, code):
         onwards = code is Status.CONVERGED or task.problem.is_game
         guess = state.value if onwards else None
-        task, verdict, reached, state, code, more = nested.settle(task, verdict, reached, guess, clock)
-        history = np.concatenate([history, more]) if onwards else more
-    if not scheme.monotone and code not in CUT:
-        task, verdict, state, code, history, apart = sharpened(task, verdict, state, code, history, scheme, clock)
-    solution = finish(task, state, code, reached, history, verdict, grid, cut=clock.over() is not None)
+        settled = nested.settle(task, verdict, reached, guess, clock)
+        if onwards:
+            settled = settled._replace(residuals=np.concatenate([history, settled.residuals]))
+    if not on.scheme.monotone and settled.code not in CUT:
+        settled, apart = sharpened(settled, on.scheme, clock)
+    solution = finish(settled, on.grid, cut=clock.over() is not None)
     solution.stats.update(apart)
-    return closed(solution, clock) if code in CUT else solution
+    return closed(solution, clock) if settled.code in CUT else solution
 
 
 def _finish_lanes(tasks: Task, states: State, count: int, clock: Clock) -> tuple[list[tuple], list[list]]:

@@ -118,7 +118,8 @@ def march(
     clock = Clock(seconds=time_limit, progress=progress)
     with noting_interrupts(clock), jax.enable_x64(kind == np.float64):
         needed = memory.fitting(_bytes(problem, grid, kept, method, kind), grid, max_memory)
-        unmoved = functools.partial(_unmoved, problem, grid, horizon, start, scheme, kind)
+        on = Discretisation(problem, grid, scheme, kind)
+        unmoved = functools.partial(_unmoved, on, horizon, start)
         with faults.explained(clock, needed, unmoved):
             try:
                 checks.shapes(problem, grid, scheme)
@@ -126,11 +127,11 @@ def march(
                 for t in np.linspace(horizon, 0.0, PROBES) if problem.time_dependent else (0.0,):
                     admissibility.values(problem, grid, kind, t)
                 clock.enter("the preparation")
-                task = _prepare(Discretisation(problem, grid, scheme, kind), horizon, method, step, inner)
+                task = _prepare(on, horizon, method, step, inner)
                 slices, front, code = epochs.drive(task, kept, start, clock)
                 solution = epochs.assemble(task, grid, slices, front, code)
             except Stopped as stop:
-                solution = _unstarted(problem, grid, horizon, start, scheme, stop.status, kind)
+                solution = _unstarted(on, horizon, start, stop.status)
         solution = closed(solution, clock)
     solution.stats.update(
         seconds=clock.stepping, compile_seconds=clock.elapsed() - clock.stepping, bytes=needed, horizon=horizon
@@ -140,20 +141,16 @@ def march(
     return solution
 
 
-def _unmoved(
-    problem: Problem, grid: Grid, horizon: float, start: Any, scheme: Scheme, dtype: Any, kept: Any
-) -> Solution:
+def _unmoved(on: Discretisation, horizon: float, start: Any, kept: Any) -> Solution:
     """The solution of a march that broke before its first step."""
-    return _unstarted(problem, grid, horizon, start, scheme, Status.INTERRUPTED, dtype)
+    return _unstarted(on, horizon, start, Status.INTERRUPTED)
 
 
-def _unstarted(
-    problem: Problem, grid: Grid, horizon: float, start: Any, scheme: Scheme, code: Status, dtype: Any
-) -> Solution:
+def _unstarted(on: Discretisation, horizon: float, start: Any, code: Status) -> Solution:
     """The solution of a march that ended before its first step: the value it was to start from; NaN if not known."""
-    value = np.full((1, *grid.shape), np.nan if start is None else np.asarray(start), dtype)
+    value = np.full((1, *on.grid.shape), np.nan if start is None else np.asarray(start), on.dtype)
     message = f"The march did not leave t = {horizon:g}. {epochs.ADVICE[code]}"
-    return altered(unstarted(problem, grid, value, scheme, code), times=np.array([horizon]), message=message)
+    return altered(unstarted(on, value, code), times=np.array([horizon]), message=message)
 
 
 def _check(problem: Any, grid: Any, scheme: Any, method: Any, step: Any, time_limit: Any) -> None:

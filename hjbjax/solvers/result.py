@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation import correlated_noise, edges
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.finiteness import earnings
 from hjbjax.hamiltonian import discrete, players
 from hjbjax.iteration import certificates, fixed_point
@@ -22,26 +23,19 @@ from hjbjax.problem.sets import Finite
 from hjbjax.solution.clock import CUT, Clock
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
+from hjbjax.solvers.nested import Settled
 from hjbjax.solvers.setup import Verdict, warn
 
 GAP = 0.05  # of what the actions matter; where Isaacs' condition holds, upwinding left up to .019 on 21 nodes
 MOST = 2 / 3  # of an end's nodes: whatever has a velocity leaves by half of those where its position ends
 
 
-def finish(
-    task: Task,
-    state: State,
-    code: Status,
-    reached: np.ndarray | None,
-    residuals: np.ndarray,
-    verdict: Verdict,
-    grid: Grid,
-    cut: bool = False,
-) -> Solution:
+def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
     """The solution in NumPy, with infinite values where the target cannot be reached and no policy where none is.
 
     The Isaacs gap is a program of its own, and nothing is compiled after a ``cut``.
     """
+    task, verdict, reached, state, code, residuals = settled
     stopped = cut or code in CUT
     if not stopped:
         _refuse_noise(task, state, grid)
@@ -83,17 +77,18 @@ def finish(
     )
 
 
-def unstarted(problem: Problem, grid: Grid, value: np.ndarray, scheme: Any, code: Status) -> Solution:
+def unstarted(on: Discretisation, value: Any, code: Status) -> Solution:
     """The solution of a run that ended before its first step: the value it was to start from, and no policy."""
+    problem, value = on.problem, np.asarray(value, on.dtype)
     inputs = [0 if choices is None else choices.dim for choices in (problem.controls, problem.disturbances)]
     nan = np.array(np.nan, value.dtype)  # one number seen everywhere: on 85 million nodes an array of it takes seconds
     policy, disturbance = (np.broadcast_to(nan, (*value.shape, m)) for m in inputs)
     return Solution(
-        grid, value, policy, disturbance if problem.is_game else None, code=code,
+        on.grid, value, policy, disturbance if problem.is_game else None, code=code,
         discrete=isinstance(problem.controls, Finite), discrete_disturbance=isinstance(problem.disturbances, Finite),
         message=code.message,
         stats={
-            "scheme": repr(scheme),
+            "scheme": repr(on.scheme),
             "device": str(jax.devices()[0].device_kind),
             "dtype": str(value.dtype),
             "certificate": "the value was not looked at",

@@ -30,8 +30,9 @@ from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
 from hjbjax.solvers import faults, memory, nested
 from hjbjax.solvers.host_loop import drive
+from hjbjax.solvers.nested import Settled
 from hjbjax.solvers.result import assemble, closed, describe, finish, unstarted
-from hjbjax.solvers.setup import Verdict, choose, is_constrained, prepare_on_host, prepare_traced
+from hjbjax.solvers.setup import choose, is_constrained, prepare_on_host, prepare_traced
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
 
@@ -91,18 +92,21 @@ def solve(
       >>> solution.status.name, solution.error <= 1e-3
       ('CONVERGED', True)
     """
-    check_arguments(problem, grid, method, scheme, tol, max_steps, time_limit, guess)
+    check_limits(max_steps, time_limit)
+    check_arguments(problem, grid, method, scheme, tol, guess)
     if is_traced(problem, grid, guess, tol):
-        return _solve_traced(problem, grid, method, scheme, tol, guess, dtype, max_steps)
+        traced = jnp.result_type(float) if dtype is None else jnp.dtype(dtype)
+        return _solve_traced(Discretisation(problem, grid, scheme, traced), method, tol, guess, max_steps)
     kind = as_dtype(dtype)
+    on = Discretisation(problem, grid, scheme, kind)
     check_node_values(guess, grid, "solve: the guess")
     grid.check_spacings(kind)
     method = method or choose(problem, grid, traced=False)
     clock = Clock(max_steps or 10**9, time_limit, progress)
     with noting_interrupts(clock), jax.enable_x64(kind == np.float64):
         needed = memory.require(problem, grid, method, kind, max_memory)
-        with faults.explained(clock, needed, lambda kept: _partial(problem, grid, scheme, kind, kept)):
-            solution = closed(_solve_on_host(problem, grid, method, scheme, tol, guess, kind=kind, clock=clock), clock)
+        with faults.explained(clock, needed, lambda kept: _partial(on, kept)):
+            solution = closed(_solve_on_host(on, method, tol, guess, clock), clock)
     solution.stats.setdefault("method", describe(method, problem))
     solution.stats.update(
         seconds=clock.stepping, compile_seconds=clock.elapsed() - clock.stepping,
@@ -113,74 +117,68 @@ def solve(
     return solution
 
 
-def _partial(problem: Problem, grid: Grid, scheme: Scheme, kind: Any, kept: Any) -> Solution:
+def _partial(on: Discretisation, kept: Any) -> Solution:
     """The solution of a run that broke, from the value that was kept, maybe on a coarser grid; else zero."""
-    value = np.broadcast_to(np.zeros((), kind), grid.shape) if kept is None else kept[0]  # takes no memory
-    if value.shape != grid.shape:
-        value = transfer.prolong(value, kept[1], grid)
-    return unstarted(problem, grid, np.asarray(value, kind), scheme, Status.INTERRUPTED)
+    value = np.broadcast_to(np.zeros((), on.dtype), on.grid.shape) if kept is None else kept[0]  # takes no memory
+    if value.shape != on.grid.shape:
+        value = transfer.prolong(value, kept[1], on.grid)
+    return unstarted(on, value, Status.INTERRUPTED)
 
 
-def _solve_on_host(
-    problem: Problem, grid: Grid, method: Method, scheme: Scheme, tol: float, guess: Any, *, kind: Any, clock: Clock
-) -> Solution:
+def _solve_on_host(on: Discretisation, method: Method, tol: float, guess: Any, clock: Clock) -> Solution:
     """Checks, coarser grids, preparation and steps, in this order, as far as the clock lets them come."""
-    start, on = None if guess is None else np.asarray(guess, kind), Discretisation(problem, grid, scheme, kind)
+    problem, grid, start = on.problem, on.grid, None if guess is None else np.asarray(guess, on.dtype)
     inner = method.inner if isinstance(method, Nested) else method
     try:
-        checks.shapes(problem, grid, scheme)
-        node_checks.values(problem, grid, kind, clock)
-        admissibility.values(problem, grid, kind)
+        checks.shapes(problem, grid, on.scheme)
+        node_checks.values(problem, grid, on.dtype, clock)
+        admissibility.values(problem, grid, on.dtype)
         known = None if start is None else jnp.asarray(start)
         start, shapes = nested.start(on.chain, method, tol, known, clock)
         task, verdict, reached = prepare_on_host(on.chain, method=inner, tol=tol, clock=clock)
     except Stopped as stop:
-        value = np.zeros(grid.shape, kind) if start is None else np.array(start)
-        return unstarted(problem, grid, value, scheme, stop.status)
-    task, verdict, reached, state, code, residuals = nested.settle(task, verdict, reached, start, clock)
+        return unstarted(on, np.zeros(grid.shape) if start is None else np.array(start), stop.status)
+    settled = nested.settle(task, verdict, reached, start, clock)
     about: dict[str, Any] = {"levels": [*shapes, grid.shape]}
-    if not scheme.monotone:
-        task, verdict, state, code, residuals, apart = sharpened(task, verdict, state, code, residuals, scheme, clock)
+    if not on.scheme.monotone:
+        settled, apart = sharpened(settled, on.scheme, clock)
         about |= apart
-    solution = finish(task, state, code, reached, residuals, verdict, grid)
-    if type(getattr(task.method, "evaluation", None)) is not type(getattr(inner, "evaluation", None)):
-        about["method"] = describe(task.method, problem)
+    solution = finish(settled, grid)
+    if type(getattr(settled.task.method, "evaluation", None)) is not type(getattr(inner, "evaluation", None)):
+        about["method"] = describe(settled.task.method, problem)
     solution.stats.update(about)
     return solution
 
 
-def sharpened(
-    task: Task, verdict: Verdict, state: State, code: Status, residuals: np.ndarray, scheme: Scheme, clock: Clock
-) -> tuple[Task, Verdict, State, Status, np.ndarray, dict[str, Any]]:
-    """The second-order answer, from the monotone one in ``state``, and how far apart they are.
+def sharpened(settled: Settled, scheme: Scheme, clock: Clock) -> tuple[Settled, dict[str, Any]]:
+    """The second-order answer, from the monotone one, and how far apart they are.
 
     Its scheme is not monotone, so that no certificate of the chain holds for it.
     """
-    if clock.over() is not None:
-        return task, verdict, state, clock.over() or code, residuals, {}
+    task, state, over = settled.task, settled.state, clock.over()
+    if over is not None:
+        return settled._replace(code=over), {}
     higher = dataclasses.replace(task, certificate=Certificate.RESIDUAL, on=dataclasses.replace(task.on, scheme=scheme))
     better, ended, more = drive(higher, state.value, clock)
     if int(better.step) < 0:  # it was stopped before its first look, and the monotone answer stands
-        return task, verdict, state, ended, residuals, {}
-    verdict = dataclasses.replace(verdict, certificate=Certificate.RESIDUAL)
+        return settled._replace(code=ended), {}
+    verdict = dataclasses.replace(settled.verdict, certificate=Certificate.RESIDUAL)
     counted = np.asarray(task.counted)
     apart = np.abs(np.asarray(better.value)[counted] - np.asarray(state.value)[counted])
-    return higher, verdict, better, ended, more, {"from_monotone": float(np.max(apart, initial=0))}
+    sharp = Settled(higher, verdict, settled.reached, better, ended, more)
+    return sharp, {"from_monotone": float(np.max(apart, initial=0))}
 
 
-def _solve_traced(
-    problem: Problem, grid: Grid, method: Any, scheme: Any, tol: Any, guess: Any, dtype: Any, max_steps: Any
-) -> Solution:
-    """The same iteration inside a JAX transformation: no chunks, no files, no exceptions, no checks of values."""
-    if not scheme.monotone:
-        raise ValueError(f"solve: {scheme!r} runs at host level only; inside jit, vmap and grad use Upwind()")
-    kind = jnp.result_type(float) if dtype is None else jnp.dtype(dtype)
-    method = method or choose(problem, grid, traced=True)
+def _solve_traced(on: Discretisation, method: Any, tol: Any, guess: Any, max_steps: Any) -> Solution:
+    """The iteration inside a JAX transformation: no chunks, no files, no exceptions, no checks of values."""
+    if not on.scheme.monotone:
+        raise ValueError(f"solve: {on.scheme!r} runs at host level only; inside jit, vmap and grad use Upwind()")
+    method = method or choose(on.problem, on.grid, traced=True)
     if isinstance(method, Nested):
         raise ValueError("solve: Nested(...) runs at host level only; inside jit, vmap and grad use its inner method")
-    task, verdict = prepare_traced(Discretisation(problem, grid, scheme, kind), method=method, tol=tol)
+    task, verdict = prepare_traced(on, method=method, tol=tol)
     frozen = jax.lax.stop_gradient(task)
-    start = frozen.start() if guess is None else jax.lax.stop_gradient(jnp.asarray(guess, kind))
+    start = frozen.start() if guess is None else jax.lax.stop_gradient(jnp.asarray(guess, on.dtype))
     state = fixed_point.run(frozen, fixed_point.begin(frozen, start), max_steps or TRACED_STEPS)
     wrong = jnp.zeros((), bool)
     if verdict.may_rest:
@@ -213,9 +211,15 @@ def as_dtype(dtype: Any) -> np.dtype:
     raise ValueError(f"dtype: got {dtype!r}, wanted 'float64' or 'float32'")
 
 
-def check_arguments(
-    problem: Any, grid: Any, method: Any, scheme: Any, tol: Any, max_steps: Any, time_limit: Any, guess: Any = None
-) -> None:
+def check_limits(max_steps: Any, time_limit: Any) -> None:
+    """Refuse what limits no run."""
+    if max_steps is not None:
+        arguments.count(max_steps, "solve: max_steps")
+    if time_limit is not None:
+        arguments.positive(time_limit, "solve: time_limit", "in seconds", endless=True)
+
+
+def check_arguments(problem: Any, grid: Any, method: Any, scheme: Any, tol: Any, guess: Any = None) -> None:
     """Refuse what no solve can start with; needs no values of the problem's functions."""
     if not isinstance(problem, Problem) or not isinstance(grid, Grid):
         raise TypeError(f"solve: got {type(problem).__name__}, {type(grid).__name__}; wanted a Problem and a Grid")
@@ -224,10 +228,6 @@ def check_arguments(
         arguments.one_of(method, "solve: method", kinds, "hjb.PolicyIteration(...) or hjb.ValueIteration()")
     schemes.check(scheme, "solve: scheme", grid, stationary=True)
     arguments.positive(tol, "solve: tol", "in the units of the cost")
-    if max_steps is not None:
-        arguments.count(max_steps, "solve: max_steps")
-    if time_limit is not None:
-        arguments.positive(time_limit, "solve: time_limit", "in seconds", endless=True)
     if guess is not None and is_constrained(problem) and is_discounted(problem) is False:
         raise ValueError(
             "solve: without discount a stopping_cost or a running_max has many fixed points, and the one sought is "

@@ -172,7 +172,8 @@ def sharpened(settled: Settled, scheme: Scheme, clock: Clock) -> tuple[Settled, 
 def _solve_traced(on: Discretisation, method: Any, tol: Any, guess: Any, max_steps: Any) -> Solution:
     """The iteration inside a JAX transformation: no chunks, no files, no exceptions, no checks of values."""
     if not on.scheme.monotone:
-        raise ValueError(f"solve: {on.scheme!r} runs at host level only; inside jit, vmap and grad use Upwind()")
+        name = type(on.scheme).__name__
+        raise ValueError(f"solve: {name}() runs at host level only; inside jit, vmap and grad use Upwind()")
     method = method or choose(on.problem, on.grid, traced=True)
     if isinstance(method, Nested):
         raise ValueError("solve: Nested(...) runs at host level only; inside jit, vmap and grad use its inner method")

@@ -1,6 +1,5 @@
 """The benchmarks at small sizes: what they compare agrees, every row is complete, every threshold has its line."""
 
-import functools
 import json
 import math
 import re
@@ -16,6 +15,8 @@ from benchmarks import cases
 from benchmarks.__main__ import NAMES
 from benchmarks.harness import footprint, thresholds, timing
 from benchmarks.speed import batch, controls, growth, peers, scaling, startup, sweep
+from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.iteration import bellman
 from hjbjax.problem.pytree import cast
 
 COMPLETE = {"benchmark", "device", "dtype", "versions", "date", "cores", "status"}
@@ -88,11 +89,9 @@ def test_the_timed_sweep_is_that_of_the_exported_chain(shape):
     pairs = costs / (factor * dt) + (probabilities @ value.ravel() - np.repeat(value.ravel(), 3)) / dt
     rate = pairs.reshape(*shape, 3).min(axis=-1) - problem.discount * value
     with jax.enable_x64(True):
-        fastest = jax.jit(functools.partial(sweep.bellman.fastest_rate, scheme=sweep.SCHEME, dtype=np.float64))
-        pace = np.asarray(fastest(*cast((problem, grid), np.float64)))
-        found = sweep.sweep(
-            *cast((problem, grid), np.float64), jnp.asarray(value), jnp.asarray(pace + problem.discount)
-        )
+        on = cast(Discretisation(problem, grid, sweep.SCHEME, np.float64), np.float64)
+        pace = np.asarray(jax.jit(bellman.fastest_rate)(on))
+        found = sweep.sweep(on.problem, on.grid, jnp.asarray(value), jnp.asarray(pace + problem.discount))
     np.testing.assert_allclose(found, value + rate / (pace + problem.discount), rtol=0, atol=1e-12)
 
 

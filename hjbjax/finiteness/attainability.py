@@ -48,6 +48,7 @@ def _also_open(
     """The jumps that are known to be open and those of the actions ``points``, shape (count, m)."""
     grid, points = on.grid, jnp.asarray(points, on.dtype)
     mine = players.setting(on.problem, grid.ndim, on.dtype).control
+    outmost = tried_actions.of_a_ball(on, mine) if kinks and known is None else []
     if known is None:
         start = chain.rates(on, list(points[0]))
         known = Rates(start.offsets, tuple(jnp.zeros(grid.shape, bool) for _ in start.offsets))
@@ -65,8 +66,7 @@ def _also_open(
         action = list(points[k])
         return tried(tried_actions.with_kinks(on, mine, action) if kinks else [action], opened)
 
-    opened = tried(tried_actions.of_a_ball(on, mine) if kinks else [], known.values)
-    return Rates(known.offsets, jax.lax.fori_loop(0, len(points), also, opened))
+    return Rates(known.offsets, jax.lax.fori_loop(0, len(points), also, tried(outmost, known.values)))
 
 
 def _stays(rates: Rates, grid: Grid, inside: jax.Array, least: Any) -> jax.Array:

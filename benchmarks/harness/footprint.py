@@ -10,7 +10,7 @@ from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import fixed_point
 from hjbjax.problem.pytree import cast
 from hjbjax.solvers import host_loop
-from hjbjax.solvers.setup import choose, judge, prepare
+from hjbjax.solvers.setup import assumptions_of, choose, prepare
 
 
 def bytes_of(lowered: Any) -> int:
@@ -27,10 +27,10 @@ def of_solve(problem: Any, grid: Any, tol: float, *, method: Any = None, dtype: 
     kind = np.dtype(dtype)
     with jax.enable_x64(kind == np.float64):
         on = Discretisation(*cast((problem, grid), kind), hjb.Upwind(), kind)
-        verdict = judge(on)
+        assumptions = assumptions_of(on)
 
         def begin(on):
-            task = prepare(on, method=inner, tol=tol, verdict=verdict)
+            task = prepare(on, method=inner, tol=tol, assumptions=assumptions)
             return task, fixed_point.begin(task, jax.numpy.zeros(grid.shape, kind))
 
         shapes = jax.eval_shape(begin, on)

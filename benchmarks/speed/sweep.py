@@ -48,21 +48,21 @@ def greedy(problem: Any, grid: Any, value: jax.Array) -> Any:
     return bellman.greedy(Discretisation(problem, grid, SCHEME, value.dtype), value, jnp.zeros((), bool))
 
 
-def sweep(problem: Any, grid: Any, value: jax.Array, pace: jax.Array) -> jax.Array:
+def sweep(problem: Any, grid: Any, value: jax.Array, outflow: jax.Array) -> jax.Array:
     """V + r/(max Q + β) with r = min H − β V."""
-    return value + greedy(problem, grid, value).rate / pace
+    return value + greedy(problem, grid, value).defect / outflow
 
 
 @functools.partial(jax.jit, donate_argnums=0, keep_unused=True)
-def one(old: jax.Array, problem: Any, grid: Any, value: jax.Array, pace: jax.Array) -> jax.Array:
+def one(old: jax.Array, problem: Any, grid: Any, value: jax.Array, outflow: jax.Array) -> jax.Array:
     """A sweep that writes over ``old``, as the peer's does."""
-    return sweep(problem, grid, value, pace)
+    return sweep(problem, grid, value, outflow)
 
 
 @functools.partial(jax.jit, donate_argnums=0, static_argnums=4)
-def several(value: jax.Array, problem: Any, grid: Any, pace: jax.Array, count: int) -> jax.Array:
+def several(value: jax.Array, problem: Any, grid: Any, outflow: jax.Array, count: int) -> jax.Array:
     """Sweeps in one compiled loop."""
-    return jax.lax.fori_loop(0, count, lambda _, value: sweep(problem, grid, value, pace), value)
+    return jax.lax.fori_loop(0, count, lambda _, value: sweep(problem, grid, value, outflow), value)
 
 
 @jax.jit
@@ -127,8 +127,8 @@ def largest_difference(problem: Any, grid: hjb.Grid, points: np.ndarray) -> floa
     jacobi_sweep(np.array(value), wanted, points, float(problem.discount))
     angle, velocity = (np.asarray(axis) for axis in grid.components(KIND))
     fastest = np.abs(9.81 * np.sin(angle)) + np.max(np.abs(points))
-    pace = np.abs(velocity) / grid.spacing(0) + fastest / grid.spacing(1) + problem.discount
-    found = sweep(*cast((problem, grid), KIND), value, jnp.asarray(pace, KIND))
+    outflow = np.abs(velocity) / grid.spacing(0) + fastest / grid.spacing(1) + problem.discount
+    found = sweep(*cast((problem, grid), KIND), value, jnp.asarray(outflow, KIND))
     moved = np.max(np.abs(wanted - value))
     off = float(np.max(np.abs(np.asarray(found) - wanted)) / np.max(np.abs(value)))
     if not off <= AGREE < moved:
@@ -139,11 +139,11 @@ def largest_difference(problem: Any, grid: hjb.Grid, points: np.ndarray) -> floa
 def candidates(problem: Any, grid: hjb.Grid, count: int) -> dict[str, Any]:
     """What is timed at one size, ``count`` sweeps a call."""
     case = cast((problem, grid), KIND)
-    pace, value = paces(*case), started(grid)
+    outflow, value = paces(*case), started(grid)
     again, looping = jnp.copy, [started(grid)]
 
     def looped():
-        looping[0] = several(looping[0], *case, pace, count)
+        looping[0] = several(looping[0], *case, outflow, count)
         return looping[0]
 
     def improvements():
@@ -152,7 +152,7 @@ def candidates(problem: Any, grid: hjb.Grid, count: int) -> dict[str, Any]:
         return found
 
     return {
-        "sweep": turning(lambda old, new: one(old, *case, new, pace), again(value), again(value), count=count),
+        "sweep": turning(lambda old, new: one(old, *case, new, outflow), again(value), again(value), count=count),
         "loop": looped,
         "improve": improvements,
         "copy": turning(copy, again(value), again(value), count=count),

@@ -16,10 +16,10 @@ import numpy as np
 
 from hjbjax.feedback.feedback import check_kept
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_partial, is_traced, node
+from hjbjax.problem.pytree import as_partial, is_traced, pytree_dataclass
 
 
-@node(static=("marched", "timed"))
+@pytree_dataclass(static=("marched", "timed"))
 class Closed:
     """A problem's drift and noise under a feedback; where the feedback is NaN, the state stays where it is.
 

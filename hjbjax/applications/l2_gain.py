@@ -120,26 +120,26 @@ def saturation(solution: Solution, problem: Problem, *, inner: float = 0.5) -> S
     Raises:
       ValueError: no disturbances, a finite set, a share outside (0, 1], or no node with a disturbance.
     """
-    choices = problem.disturbances
-    if choices is None or solution.disturbance is None:
+    admissible = problem.disturbances
+    if admissible is None or solution.disturbance is None:
         raise ValueError("saturation: the problem has no disturbances; give Problem(disturbances=hjb.Box(...))")
-    if isinstance(choices, Finite):
-        raise ValueError(f"saturation: the disturbances are {len(choices.points)} points; wanted a Box or a Ball")
+    if isinstance(admissible, Finite):
+        raise ValueError(f"saturation: the disturbances are {len(admissible.points)} points; wanted a Box or a Ball")
     if not 0 < inner <= 1:
         raise ValueError(f"saturation: got inner = {inner!r}; wanted a share of the box in (0, 1]")
     d = np.asarray(solution.disturbance if solution.times is None else solution.disturbance[0], np.float64)
     inside = solution.grid.inner(inner) & np.all(np.isfinite(d), axis=-1)
     if not inside.any():
         raise ValueError(f"saturation: no node with a disturbance in the inner {inner:g} of the box; enlarge it")
-    size = np.where(inside, _relative(choices, d), -1.0)
+    size = np.where(inside, _relative(admissible, d), -1.0)
     index = np.unravel_index(int(np.argmax(size)), size.shape)
     share = float(np.mean(size[inside] >= 1 - NEAR))
     return Saturation(share, float(size[index]), solution.grid.state([int(i) for i in index]), float(inner))
 
 
-def _relative(choices: Box | Ball, d: np.ndarray) -> np.ndarray:
+def _relative(admissible: Box | Ball, d: np.ndarray) -> np.ndarray:
     """|d| over its bound; inputs that cannot move do not count."""
-    if isinstance(choices, Ball):
-        return np.linalg.norm(d, axis=-1) / np.where(choices.radius > 0, choices.radius, np.inf)
-    lo, hi = np.asarray(choices.lo), np.asarray(choices.hi)
+    if isinstance(admissible, Ball):
+        return np.linalg.norm(d, axis=-1) / np.where(admissible.radius > 0, admissible.radius, np.inf)
+    lo, hi = np.asarray(admissible.lo), np.asarray(admissible.hi)
     return np.max(np.abs(d - (lo + hi) / 2) / np.where(hi > lo, (hi - lo) / 2, np.inf), axis=-1)

@@ -29,12 +29,12 @@ from hjbjax.discretisation.schemes import Upwind
 from hjbjax.discretisation.stencil import Links
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import cast, node
+from hjbjax.problem.pytree import cast, pytree_dataclass
 
 Offset = tuple[int, ...]
 
 
-@node(static=("offsets", "one_way"))
+@pytree_dataclass(static=("offsets", "one_way"))
 class Rates:
     """The generator of the chain under one policy, matrix-free: (𝓛V)(x) = Σ_o c_o(x) (V(x + o) − V(x)).
 

@@ -77,9 +77,9 @@ def policies(problem: Problem, grid: Grid, policy: Any, disturbance: Any) -> tup
     return *(list(np.moveaxis(np.where(active[..., None], action, 0), -1, 0)) for action in (u, d)), active
 
 
-def _entries(action: Any, choices: AdmissibleSet | None, grid: Grid, name: str) -> np.ndarray:
-    wanted = (*grid.shape, 0 if choices is None else choices.dim)
-    entries = np.zeros(wanted) if action is None and choices is None else np.asarray(action, np.float64)
+def _entries(action: Any, admissible: AdmissibleSet | None, grid: Grid, name: str) -> np.ndarray:
+    wanted = (*grid.shape, 0 if admissible is None else admissible.dim)
+    entries = np.zeros(wanted) if action is None and admissible is None else np.asarray(action, np.float64)
     if entries.shape != wanted:
         raise ValueError(f"chain: got a {name} of shape {entries.shape}, wanted {wanted}: one action a node")
     if np.any(np.isinf(entries)):

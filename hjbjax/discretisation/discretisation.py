@@ -15,7 +15,7 @@ import numpy as np
 from hjbjax.discretisation.stencil import Links
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.tracing import components
 
 
@@ -55,7 +55,7 @@ class Scheme(Protocol):
         """The slopes P⁺ and P⁻ along every axis, each (*grid): drift f has the gain f⁺ P⁺ + f⁻ P⁻; zero at a wall."""
 
 
-@node(static=("scheme", "dtype"))
+@pytree_dataclass(static=("scheme", "dtype"))
 class Discretisation:
     """A problem on a grid by a scheme, in one floating-point type and at one time.
 

@@ -48,7 +48,7 @@ class Rounding:
 def slack(on: Discretisation) -> list[Rounding]:
     """What is rounding of the drift along every axis, node by node."""
     problem, grid, dtype = on.problem, on.grid, on.dtype
-    m, k = (0 if choices is None else choices.dim for choices in (problem.controls, problem.disturbances))
+    m, k = (0 if admissible is None else admissible.dim for admissible in (problem.controls, problem.disturbances))
     nothing = ([jnp.zeros((), dtype)] * m, [jnp.zeros((), dtype)] * k)
     found = []
     for entry in on.drift(*nothing):
@@ -156,6 +156,6 @@ def _actions_cost(problem: Problem, n: int, dtype: Any) -> bool:
     """Whether the running cost depends on what a player does."""
     if problem.cost is None:
         return False
-    m, k = (0 if choices is None else choices.dim for choices in (problem.controls, problem.disturbances))
+    m, k = (0 if admissible is None else admissible.dim for admissible in (problem.controls, problem.disturbances))
     time, game = ((None, False),) * problem.time_dependent, ((k, True),) * problem.is_game
     return not dependence.dependence(problem.cost, *time, (n, False), (m, True), *game, dtype=dtype).is_constant

@@ -46,7 +46,7 @@ from hjbjax.discretisation import correlated_noise, slopes, stencil
 from hjbjax.discretisation.discretisation import Differences, Scheme
 from hjbjax.problem import arguments, sets
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 
 Slopes = Sequence[tuple[jax.Array, jax.Array]]
 
@@ -69,7 +69,7 @@ def check(scheme: Any, name: str, grid: Grid, *, stationary: bool = False) -> No
         )
 
 
-@node(static=("central", "subcell"))
+@pytree_dataclass(static=("central", "subcell"))
 class Upwind:
     """First-order upwind differences: the Kushner–Dupuis chain, monotone on every grid.
 
@@ -99,7 +99,7 @@ class Upwind:
         return around.one_sided
 
 
-@node(static=("subcell",))
+@pytree_dataclass(static=("subcell",))
 class Limited:
     """Second order where the solution is smooth: one-sided differences with limited slopes.
 
@@ -150,7 +150,7 @@ def _calm(around: Differences) -> list:
     return calm
 
 
-@node()
+@pytree_dataclass()
 class Eno2:
     """Second order for ``march``: one-sided differences corrected by the smaller of two second differences.
 
@@ -172,7 +172,7 @@ class Eno2:
         return slopes.eno2(around.value, around.on.grid)
 
 
-@node()
+@pytree_dataclass()
 class Weno5:
     """Fifth order where the value is smooth, for ``march``: weighted essentially non-oscillatory slopes.
 

@@ -29,7 +29,7 @@ import numpy as np
 from hjbjax.hamiltonian import pointwise
 from hjbjax.hamiltonian.pointwise import Rule
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.solution.clock import Clock, Stopped
 
 FEWEST = 64  # columns to which meshes are padded, and twice as many from there on: few shapes, few compilations
@@ -52,7 +52,7 @@ class Closing(enum.Enum):
     REST = "the Riccati equation of a rest"
 
 
-@node()
+@pytree_dataclass()
 class Rest:
     """A rest of the Hamiltonian flow and the value near it, w̄ + p̄·y + ½ y'Py with y = x − x̄."""
 
@@ -62,8 +62,8 @@ class Rest:
     matrix: Any
 
 
-@node(static=("rule", "law", "closing", "held", "free", "seams"))
-class TwoPoint:
+@pytree_dataclass(static=("rule", "law", "closing", "held", "free", "seams"))
+class BoundaryValueProblem:
     """One boundary-value problem.
 
     Args:
@@ -179,59 +179,59 @@ class TwoPoint:
         return (weights @ jax.vmap(one)(controls)).at[self.n :].add(discount)
 
 
-def rates(ask: TwoPoint, s: Any, y: Any, theta: Any) -> Any:
+def rates(bvp: BoundaryValueProblem, s: Any, y: Any, theta: Any) -> Any:
     """dy/ds of all arcs together, shape (k·(2n+1),)."""
-    lengths = ask.durations(theta)
+    lengths = bvp.durations(theta)
     begins = jnp.cumsum(lengths) - lengths
-    stacked = y.reshape(ask.count, -1)
-    return (lengths[:, None] * jax.vmap(ask.flow)(begins + s * lengths, stacked, ask.arcs)).reshape(-1)
+    stacked = y.reshape(bvp.count, -1)
+    return (lengths[:, None] * jax.vmap(bvp.flow)(begins + s * lengths, stacked, bvp.arcs)).reshape(-1)
 
 
-def conditions(ask: TwoPoint, first: Any, last: Any, theta: Any) -> Any:
+def conditions(bvp: BoundaryValueProblem, first: Any, last: Any, theta: Any) -> Any:
     """What has to vanish at the ends of the arcs, shape (k·(2n+1) + unknowns,)."""
-    first, last = first.reshape(ask.count, -1), last.reshape(ask.count, -1)
-    times = jnp.cumsum(ask.durations(theta))
+    first, last = first.reshape(bvp.count, -1), last.reshape(bvp.count, -1)
+    times = jnp.cumsum(bvp.durations(theta))
     joints = last[:-1] - first[1:]
-    if ask.seams:
-        joints = joints.at[:, : ask.n].add(ask.shifts[:-1] - ask.shifts[1:])
-    left = [first[0, : ask.n] - ask.start, joints.reshape(-1)]
-    left += [(last[i, axis] - ask.places[i])[None] for i, axis in enumerate(ask.seams)]
-    for i in range(ask.count - 1 if not ask.seams else 0):
-        x, p, _ = ask.split(last[i])
-        before, after = (_energy(ask, times[i], x, p, ask.arcs[i + j]) for j in (0, 1))
+    if bvp.seams:
+        joints = joints.at[:, : bvp.n].add(bvp.shifts[:-1] - bvp.shifts[1:])
+    left = [first[0, : bvp.n] - bvp.start, joints.reshape(-1)]
+    left += [(last[i, axis] - bvp.places[i])[None] for i, axis in enumerate(bvp.seams)]
+    for i in range(bvp.count - 1 if not bvp.seams else 0):
+        x, p, _ = bvp.split(last[i])
+        before, after = (_energy(bvp, times[i], x, p, bvp.arcs[i + j]) for j in (0, 1))
         left.append((before - after)[None])
-    return jnp.concatenate([*left, _closing(ask, times[-1], last[-1], theta)])
+    return jnp.concatenate([*left, _closing(bvp, times[-1], last[-1], theta)])
 
 
-def _energy(ask: TwoPoint, t: Any, x: Any, p: Any, corner: Any) -> Any:
-    controls, weights = ask.weighted(t, x, p, corner)
-    return weights @ jax.vmap(lambda u: ask.hamiltonian(t, x, p, u))(controls)
+def _energy(bvp: BoundaryValueProblem, t: Any, x: Any, p: Any, corner: Any) -> Any:
+    controls, weights = bvp.weighted(t, x, p, corner)
+    return weights @ jax.vmap(lambda u: bvp.hamiltonian(t, x, p, u))(controls)
 
 
-def _closing(ask: TwoPoint, t: Any, z: Any, theta: Any) -> Any:
+def _closing(bvp: BoundaryValueProblem, t: Any, z: Any, theta: Any) -> Any:
     """The conditions at the final time, shape (n + 1 + free or arcs + target,)."""
-    x, p, w = ask.split(z)
-    if ask.closing is Closing.REST:
-        away, rest = x - ask.rest.state, ask.rest
+    x, p, w = bvp.split(z)
+    if bvp.closing is Closing.REST:
+        away, rest = x - bvp.rest.state, bvp.rest
         bent = rest.matrix @ away
         left = [p - rest.costate - bent, (w - rest.value - (rest.costate + bent / 2) @ away)[None]]
-        return jnp.concatenate([*left, (t - ask.horizon)[None]] if ask.count > 1 else left)
-    given = [ask.ends[i] if held else x[i] for i, held in enumerate(ask.held)]
+        return jnp.concatenate([*left, (t - bvp.horizon)[None]] if bvp.count > 1 else left)
+    given = [bvp.ends[i] if held else x[i] for i, held in enumerate(bvp.held)]
     # A value that is only Hölder at a given end must not be differentiated there.
-    end = jax.lax.stop_gradient(ask.ends) if all(ask.held) else jnp.stack(given)
-    psi, slope = jax.value_and_grad(ask.psi, 1)(t, end)
-    if ask.closing is Closing.TARGET:
-        level, (sliding, normal) = jax.value_and_grad(ask.level, (0, 1))(t, x)
+    end = jax.lax.stop_gradient(bvp.ends) if all(bvp.held) else jnp.stack(given)
+    psi, slope = jax.value_and_grad(bvp.psi, 1)(t, end)
+    if bvp.closing is Closing.TARGET:
+        level, (sliding, normal) = jax.value_and_grad(bvp.level, (0, 1))(t, x)
         left = [p - slope - theta[-1] * normal, (w - psi)[None], level[None]]
     else:
-        held = [x[i] - ask.ends[i] if known else p[i] - slope[i] for i, known in enumerate(ask.held)]
+        held = [x[i] - bvp.ends[i] if known else p[i] - slope[i] for i, known in enumerate(bvp.held)]
         left = [jnp.stack(held), (w - psi)[None]]
-    if ask.free:
-        waiting = jax.grad(ask.psi, 0)(t, end) if ask.problem.time_dependent and callable(ask.final) else 0.0
-        waiting += theta[-1] * sliding if ask.closing is Closing.TARGET else 0.0
-        left.append((_energy(ask, t, x, p, ask.arcs[-1]) - ask.problem.discount * psi + waiting)[None])
-    elif ask.count > 1:
-        left.append((t - ask.horizon)[None])
+    if bvp.free:
+        waiting = jax.grad(bvp.psi, 0)(t, end) if bvp.problem.time_dependent and callable(bvp.final) else 0.0
+        waiting += theta[-1] * sliding if bvp.closing is Closing.TARGET else 0.0
+        left.append((_energy(bvp, t, x, p, bvp.arcs[-1]) - bvp.problem.discount * psi + waiting)[None])
+    elif bvp.count > 1:
+        left.append((t - bvp.horizon)[None])
     return jnp.concatenate(left)
 
 
@@ -250,7 +250,9 @@ def _padded(s: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.append(s, np.full(more, s[-1])), np.concatenate([y, np.repeat(y[:, -1:], more, 1)], 1)
 
 
-def collocate(ask: TwoPoint, s: Any, y: Any, theta: Any, *, tol: float, max_nodes: int, clock: Clock) -> Any:
+def collocate(
+    bvp: BoundaryValueProblem, s: Any, y: Any, theta: Any, *, tol: float, max_nodes: int, clock: Clock
+) -> Any:
     """SciPy's answer from a first guess; float64 has to be on.
 
     Every call of the right-hand side looks at the clock; ``Stopped`` brings the last iterate along, (s, y, theta).
@@ -266,7 +268,7 @@ def collocate(ask: TwoPoint, s: Any, y: Any, theta: Any, *, tol: float, max_node
     """
     from scipy.integrate import solve_bvp
 
-    arrays = jax.tree.map(jnp.asarray, ask)
+    arrays = jax.tree.map(jnp.asarray, bvp)
     nothing = np.zeros(0)
     last = (np.asarray(s), np.asarray(y), np.asarray(theta))
 

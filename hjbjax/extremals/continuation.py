@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.extremals import initial_guess, periodic_arcs
-from hjbjax.extremals.boundary_value import Closing, TwoPoint, collocate
+from hjbjax.extremals.boundary_value import BoundaryValueProblem, Closing, collocate
 from hjbjax.extremals.necessary_conditions import Extremal, assemble, unchecked
 from hjbjax.solution.clock import CUT, Clock, Stopped
 from hjbjax.solution.status import Status
@@ -51,7 +51,7 @@ class Limits:
 class Found:
     """What came of a boundary-value problem; ``trouble`` is empty where it is solved."""
 
-    ask: TwoPoint
+    bvp: BoundaryValueProblem
     s: np.ndarray
     y: np.ndarray
     theta: np.ndarray
@@ -71,7 +71,7 @@ class Found:
     @property
     def lengths(self) -> np.ndarray:
         """The durations of the arcs."""
-        return np.asarray(self.ask.durations(np.asarray(self.theta)))
+        return np.asarray(self.bvp.durations(np.asarray(self.theta)))
 
     @property
     def horizon(self) -> float:
@@ -79,14 +79,14 @@ class Found:
         return float(np.sum(self.lengths))
 
 
-def attempt(ask: TwoPoint, s: Any, y: Any, theta: Any, limits: Limits) -> Found:
+def attempt(bvp: BoundaryValueProblem, s: Any, y: Any, theta: Any, limits: Limits) -> Found:
     """One collocation, its ending in our words; ``Stopped`` brings along what was found by then."""
     guess = np.asarray(theta, float)
     try:
-        result = collocate(ask, s, y, guess, tol=limits.tol, max_nodes=limits.max_nodes, clock=limits.clock)
+        result = collocate(bvp, s, y, guess, tol=limits.tol, max_nodes=limits.max_nodes, clock=limits.clock)
     except Stopped as stop:
         mesh, last, sought = stop.reached
-        raise Stopped(stop.status, Found(ask, mesh, last, sought, stop.status)) from None
+        raise Stopped(stop.status, Found(bvp, mesh, last, sought, stop.status)) from None
     sought = np.zeros(0) if result.p is None else result.p
     code = Status.CONVERGED if result.success else ENDINGS[result.status]
     if not (np.all(np.isfinite(result.y)) and np.all(np.isfinite(sought))):
@@ -94,7 +94,7 @@ def attempt(ask: TwoPoint, s: Any, y: Any, theta: Any, limits: Limits) -> Found:
     elif np.max(np.abs(result.y)) > HUGE * (1 + np.max(np.abs(y))):
         code = Status.DIVERGED  # a jump sharper than the mesh can look like a solution
     trouble = "" if code is Status.CONVERGED else f"the boundary-value problem was not solved: {ADVICE[code]}"
-    found = Found(ask, result.x, result.y, sought, code, trouble)
+    found = Found(bvp, result.x, result.y, sought, code, trouble)
     if found.solved and not found.horizon > 0:
         return dataclasses.replace(
             found, code=Status.DIVERGED, trouble=f"the final time came out as {found.horizon:.3g}; give a better guess"
@@ -109,7 +109,9 @@ def carry_on(found: Found, limits: Limits) -> None:
         raise Stopped(code, dataclasses.replace(found, code=code))
 
 
-def smooth(ask: TwoPoint, times: np.ndarray, columns: np.ndarray, limits: Limits, *, trusted: bool) -> Found:
+def smooth(
+    bvp: BoundaryValueProblem, times: np.ndarray, columns: np.ndarray, limits: Limits, *, trusted: bool
+) -> Found:
     """The extremal of a Hamiltonian whose minimiser is continuous.
 
     Args:
@@ -119,57 +121,57 @@ def smooth(ask: TwoPoint, times: np.ndarray, columns: np.ndarray, limits: Limits
       limits: how far to go.
       trusted: whether the guess is of the very problem, so that easier ones would lead away from it.
     """
-    apart = periodic_arcs.split(ask, times, columns)
+    apart = periodic_arcs.split(bvp, times, columns)
     if apart is not None:
-        multiplier = unknowns(ask, times, columns)[int(ask.timed) :]
+        multiplier = unknowns(bvp, times, columns)[int(bvp.timed) :]
         return _arrived(attempt(*apart[:3], np.append(apart[3], multiplier), limits))
-    found = attempt(ask, times / times[-1], columns, unknowns(ask, times, columns), limits)
+    found = attempt(bvp, times / times[-1], columns, unknowns(bvp, times, columns), limits)
     if not found.solved and not trusted:
         found = _continued(found, limits)
-    if ask.closing is Closing.REST:
+    if bvp.closing is Closing.REST:
         found = _settled(found, limits)
     return found
 
 
-def unknowns(ask: TwoPoint, times: np.ndarray, columns: np.ndarray) -> np.ndarray:
+def unknowns(bvp: BoundaryValueProblem, times: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """First guesses of the final time and of ν, whatever the guess makes of p(T) = ψ_x + ν l_x."""
-    theta = [times[-1]] * ask.timed
-    if ask.closing is Closing.TARGET:
-        theta.append(float(_multiplier(ask, times[-1], columns[:, -1])))
+    theta = [times[-1]] * bvp.timed
+    if bvp.closing is Closing.TARGET:
+        theta.append(float(_multiplier(bvp, times[-1], columns[:, -1])))
     return np.array(theta)
 
 
 @jax.jit
-def _multiplier(ask: TwoPoint, t: Any, z: Any) -> Any:
-    x, p, _ = ask.split(z)
-    slope, normal = jax.grad(ask.psi, 1)(t, x), jax.grad(ask.level, 1)(t, x)
+def _multiplier(bvp: BoundaryValueProblem, t: Any, z: Any) -> Any:
+    x, p, _ = bvp.split(z)
+    slope, normal = jax.grad(bvp.psi, 1)(t, x), jax.grad(bvp.level, 1)(t, x)
     return jnp.nan_to_num((p - slope) @ normal / jnp.maximum(normal @ normal, 1e-300))
 
 
 @jax.jit
-def _levels(ask: TwoPoint, s: Any, y: Any, theta: Any) -> Any:
+def _levels(bvp: BoundaryValueProblem, s: Any, y: Any, theta: Any) -> Any:
     """The target's function along every arc, each in its own coordinates: the target knows no unwound angles."""
-    lengths = ask.durations(theta)
+    lengths = bvp.durations(theta)
     begins = jnp.cumsum(lengths) - lengths
-    states = y.reshape(ask.count, -1, len(s))[:, : ask.n]
-    along = jax.vmap(ask.level, (0, 1))
+    states = y.reshape(bvp.count, -1, len(s))[:, : bvp.n]
+    along = jax.vmap(bvp.level, (0, 1))
     return jax.vmap(lambda begin, length, x: along(begin + s * length, x))(begins, lengths, states)
 
 
 def _continued(failed: Found, limits: Limits) -> Found:
     """The same from easier problems; the failure itself where there are none, or they fail, too."""
-    ask = failed.ask
-    if ask.closing not in (Closing.REST, Closing.COST) or ask.free:
+    bvp = failed.bvp
+    if bvp.closing not in (Closing.REST, Closing.COST) or bvp.free:
         return failed
     found = None
     for share in SHARES:
         last = share == 1
-        if ask.closing is Closing.REST:
-            start = ask.rest.state + share * (ask.start - ask.rest.state)
-            easier = dataclasses.replace(ask, start=start)
-            times, columns = initial_guess.into_rest(easier, start, float(ask.horizon), limits.clock)
+        if bvp.closing is Closing.REST:
+            start = bvp.rest.state + share * (bvp.start - bvp.rest.state)
+            easier = dataclasses.replace(bvp, start=start)
+            times, columns = initial_guess.into_rest(easier, start, float(bvp.horizon), limits.clock)
         else:
-            easier = dataclasses.replace(ask, horizon=share * ask.horizon)
+            easier = dataclasses.replace(bvp, horizon=share * bvp.horizon)
             times, columns = initial_guess.straight(easier, float(easier.horizon))
         s, y = (times / times[-1], columns) if found is None else (found.s, found.y)
         found = attempt(easier, s, y, np.zeros(0), limits if last else limits.rough)
@@ -180,29 +182,29 @@ def _continued(failed: Found, limits: Limits) -> Found:
 
 def _arrived(found: Found) -> Found:
     """A path over an infinite horizon, unless it has not come near its rest."""
-    ask = found.ask
-    last = found.y.reshape(ask.count, -1, len(found.s))[-1, : ask.n, -1]
-    if ask.closing is not Closing.REST or not found.solved or _near(ask, last):
+    bvp = found.bvp
+    last = found.y.reshape(bvp.count, -1, len(found.s))[-1, : bvp.n, -1]
+    if bvp.closing is not Closing.REST or not found.solved or _near(bvp, last):
         return found
     trouble = f"the path has not settled at its rest by t = {found.horizon:.3g}; give another guess"
     return dataclasses.replace(found, code=Status.STALLED, trouble=trouble)
 
 
-def _near(ask: TwoPoint, last: np.ndarray) -> bool:
-    return bool(np.linalg.norm(last - ask.rest.state) <= SETTLED * (1 + np.linalg.norm(ask.rest.state)))
+def _near(bvp: BoundaryValueProblem, last: np.ndarray) -> bool:
+    return bool(np.linalg.norm(last - bvp.rest.state) <= SETTLED * (1 + np.linalg.norm(bvp.rest.state)))
 
 
 def _settled(found: Found, limits: Limits) -> Found:
     """An infinite horizon cut where the path is near enough to its rest."""
     for _ in range(EXTENSIONS):
-        ask = found.ask
-        last = found.y[: ask.n, -1]
-        if _near(ask, last) or not found.solved:
+        bvp = found.bvp
+        last = found.y[: bvp.n, -1]
+        if _near(bvp, last) or not found.solved:
             return found
-        more = float(ask.horizon) * (LONGER - 1)
-        times, columns = initial_guess.into_rest(ask, last, more, limits.clock)
-        longer = dataclasses.replace(ask, horizon=float(ask.horizon) * LONGER)
-        t = np.concatenate([found.times, float(ask.horizon) + times[1:]])
+        more = float(bvp.horizon) * (LONGER - 1)
+        times, columns = initial_guess.into_rest(bvp, last, more, limits.clock)
+        longer = dataclasses.replace(bvp, horizon=float(bvp.horizon) * LONGER)
+        t = np.concatenate([found.times, float(bvp.horizon) + times[1:]])
         found = attempt(longer, t / t[-1], np.concatenate([found.y, columns[:, 1:]], 1), np.zeros(0), limits)
     trouble = f"the path has not settled at its rest by t = {found.horizon:.3g}; give horizon, or rest="
     return found if not found.solved else dataclasses.replace(found, code=Status.STALLED, trouble=trouble)
@@ -211,16 +213,16 @@ def _settled(found: Found, limits: Limits) -> Found:
 def report(found: Found) -> Extremal:
     """The extremal, held against the necessary conditions; not so the last iterate of a run that was cut short."""
     if found.code in CUT:
-        return unchecked(found.ask, found.s, found.y, found.lengths, found.code)
-    extremal = assemble(found.ask, found.s, found.y, found.theta, found.code, found.trouble)
+        return unchecked(found.bvp, found.s, found.y, found.lengths, found.code)
+    extremal = assemble(found.bvp, found.s, found.y, found.theta, found.code, found.trouble)
     check = extremal.optimality_check
     if not found.solved:
         return extremal
     if np.min(found.lengths) < -GAP * found.horizon:
         missed = "an arc came out with a negative duration; give another guess"
         return dataclasses.replace(extremal, code=int(Status.STALLED), message=missed)
-    if found.ask.closing is Closing.TARGET:
-        inside = np.asarray(_levels(found.ask, found.s, found.y, found.theta))
+    if found.bvp.closing is Closing.TARGET:
+        inside = np.asarray(_levels(found.bvp, found.s, found.y, found.theta))
         if np.min(inside) < -GAP * (1 + np.max(np.abs(inside))):
             missed = "the path crosses the target before its end, where it would have stopped; give another guess"
             return dataclasses.replace(extremal, code=int(Status.STALLED), message=missed)
@@ -228,6 +230,6 @@ def report(found: Found) -> Extremal:
         missed = f"the Hamiltonian misses its minimum by {check.gap:.3g}: no extremal; give another guess"
         return dataclasses.replace(extremal, code=int(Status.STALLED), message=missed)
     count = len(extremal.switches)
-    jumps = f", {count} switch{'es' * (count != 1)}" if found.ask.rule.jumps else ""
+    jumps = f", {count} switch{'es' * (count != 1)}" if found.bvp.rule.jumps else ""
     said = f"an extremal of cost {extremal.cost:.6g} over {extremal.horizon:.6g}{jumps}, {len(found.s)} nodes"
     return dataclasses.replace(extremal, message=said)

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.extremals.boundary_value import Rest, TwoPoint
+from hjbjax.extremals.boundary_value import BoundaryValueProblem, Rest
 from hjbjax.hamiltonian import pointwise
 from hjbjax.problem.sets import Ball
 
@@ -24,33 +24,33 @@ FREE = 1e-9  # an input this close to an end of its range, relative to its width
 
 
 @jax.jit
-def _rest_rates(ask: TwoPoint, y: Any) -> Any:
+def _rest_rates(bvp: BoundaryValueProblem, y: Any) -> Any:
     """(ẋ, ṗ) at time 0."""
-    return ask.flow(0.0, jnp.append(y, 0.0), ask.arcs[0])[:-1]
+    return bvp.flow(0.0, jnp.append(y, 0.0), bvp.arcs[0])[:-1]
 
 
 _rest_slopes = jax.jit(jax.jacfwd(_rest_rates, 1))
 
 
 @jax.jit
-def _expansion(ask: TwoPoint, x: Any, p: Any) -> dict[str, Any]:
+def _expansion(bvp: BoundaryValueProblem, x: Any, p: Any) -> dict[str, Any]:
     """The minimiser at one state and costate, and H there to second order."""
-    problem = ask.problem
-    u = pointwise.minimiser(problem, ask.rule, 0.0, ask.wrap(x), p)
+    problem = bvp.problem
+    u = pointwise.minimiser(problem, bvp.rule, 0.0, bvp.wrap(x), p)
 
     def energy(x, u):
-        return ask.hamiltonian(0.0, x, p, u)
+        return bvp.hamiltonian(0.0, x, p, u)
 
     def drift(x, u):
-        return jnp.asarray(problem.drift(*problem.arguments(ask.wrap(x), u)), p.dtype)
+        return jnp.asarray(problem.drift(*problem.arguments(bvp.wrap(x), u)), p.dtype)
 
     (xx, xu), (_, uu) = jax.hessian(energy, (0, 1))(x, u)
     by_state, by_control = jax.jacfwd(drift, (0, 1))(x, u)
-    cost = pointwise.running_cost(problem, 0.0, ask.wrap(x), u)
+    cost = pointwise.running_cost(problem, 0.0, bvp.wrap(x), u)
     return {"u": u, "a": by_state, "b": by_control, "xx": xx, "xu": xu, "uu": uu, "cost": cost}
 
 
-def find(ask: TwoPoint, near: np.ndarray, costate: np.ndarray) -> tuple[Rest, float]:
+def find(bvp: BoundaryValueProblem, near: np.ndarray, costate: np.ndarray) -> tuple[Rest, float]:
     """The rest near a state, and the slowest rate of the closed loop there, per unit time.
 
     Raises:
@@ -62,24 +62,24 @@ def find(ask: TwoPoint, near: np.ndarray, costate: np.ndarray) -> tuple[Rest, fl
     n = len(near)
     with np.errstate(all="ignore"):
         found = root(
-            functools.partial(_on_host, _rest_rates, ask), np.append(near, costate),
-            jac=functools.partial(_on_host, _rest_slopes, ask), tol=1e-13,
+            functools.partial(_on_host, _rest_rates, bvp), np.append(near, costate),
+            jac=functools.partial(_on_host, _rest_slopes, bvp), tol=1e-13,
         )  # fmt: skip
-    left = np.max(np.abs(_on_host(_rest_rates, ask, found.x)))
+    left = np.max(np.abs(_on_host(_rest_rates, bvp, found.x)))
     if not left < NEAR * (1 + np.linalg.norm(found.x)):
         raise ValueError(
             f"pontryagin: no rest of the Hamiltonian flow near x = {near.tolist()} (what is left is {left:.2g}); an "
             "infinite horizon ends at one: give rest=, or a horizon"
         )
     x, p = found.x[:n], found.x[n:]
-    at = {name: np.asarray(part) for name, part in _expansion(ask, x, p).items()}
-    beta = float(ask.problem.discount)
+    at = {name: np.asarray(part) for name, part in _expansion(bvp, x, p).items()}
+    beta = float(bvp.problem.discount)
     if beta == 0 and abs(at["cost"]) > NEAR:
         raise ValueError(
             f"pontryagin: the rest x = {x.tolist()} costs {at['cost']:.3g} per unit time, without discount; the cost "
             "of an infinite horizon is infinite: shift the cost, or give a discount or a horizon"
         )
-    free = _free(ask, at["u"])
+    free = _free(bvp, at["u"])
     shifted = at["a"] - beta / 2 * np.eye(n)
     try:
         matrix = solve_continuous_are(
@@ -101,22 +101,22 @@ def find(ask: TwoPoint, near: np.ndarray, costate: np.ndarray) -> tuple[Rest, fl
     return Rest(x, p, np.asarray(value), matrix), slowest
 
 
-def _on_host(function: Any, ask: TwoPoint, y: Any) -> np.ndarray:
-    return np.asarray(function(ask, y))
+def _on_host(function: Any, bvp: BoundaryValueProblem, y: Any) -> np.ndarray:
+    return np.asarray(function(bvp, y))
 
 
-def _free(ask: TwoPoint, u: np.ndarray) -> np.ndarray:
+def _free(bvp: BoundaryValueProblem, u: np.ndarray) -> np.ndarray:
     """The inputs that are not at a bound, as indices.
 
     Raises:
       ValueError: there is none, so nothing steers near the rest.
     """
-    choices: Any = ask.problem.controls
-    if isinstance(choices, Ball):
-        inside = np.full(len(u), np.linalg.norm(u) < choices.radius * (1 - FREE))
+    admissible: Any = bvp.problem.controls
+    if isinstance(admissible, Ball):
+        inside = np.full(len(u), np.linalg.norm(u) < admissible.radius * (1 - FREE))
     else:
-        room = FREE * (np.asarray(choices.hi) - np.asarray(choices.lo))
-        inside = (u > choices.lo + room) & (u < choices.hi - room)
+        room = FREE * (np.asarray(admissible.hi) - np.asarray(admissible.lo))
+        inside = (u > admissible.lo + room) & (u < admissible.hi - room)
     if not inside.any():
         raise ValueError(
             f"pontryagin: at the rest the control {u.tolist()} is at its bound, and the Riccati equation needs room; "

@@ -13,12 +13,12 @@ import jax
 import numpy as np
 
 from hjbjax.extremals import continuation, equilibria, initial_guess, switching
-from hjbjax.extremals.boundary_value import Closing, Law, TwoPoint
+from hjbjax.extremals.boundary_value import BoundaryValueProblem, Closing, Law
 from hjbjax.extremals.necessary_conditions import Extremal
 from hjbjax.hamiltonian.pointwise import rule_of
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_partial, is_traced, node
+from hjbjax.problem.pytree import as_partial, is_traced, pytree_dataclass
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solution.solution import SolveError
 from hjbjax.solution.status import Status
@@ -28,7 +28,7 @@ SETTLED = 12.0  # time constants of the loop near a rest that an infinite horizo
 LONGEST = 20.0  # units of time that the loop of a solution is followed to a target without a guess of the time
 
 
-@node()
+@pytree_dataclass()
 class FreeTime:
     """A final time that is sought.
 
@@ -112,15 +112,15 @@ def pontryagin(
     limits = continuation.Limits(tol, max_nodes, clock)
     with noting_interrupts(clock), jax.enable_x64(True):
         try:
-            ask = _question(problem, start, horizon, terminal, getattr(guess, "grid", grid))
-            if ask.closing is Closing.REST:
-                ask, times, columns = _to_rest(ask, guess, rest, clock)
+            bvp = _question(problem, start, horizon, terminal, getattr(guess, "grid", grid))
+            if bvp.closing is Closing.REST:
+                bvp, times, columns = _to_rest(bvp, guess, rest, clock)
             else:
-                times, columns = _guess(ask, guess, horizon)
-                if not ask.free:
-                    times = times * (float(ask.horizon) / times[-1])
-            solve = switching.switching if ask.rule.jumps else continuation.smooth
-            found = solve(ask, times, columns, limits, trusted=guess is not None)
+                times, columns = _guess(bvp, guess, horizon)
+                if not bvp.free:
+                    times = times * (float(bvp.horizon) / times[-1])
+            solve = switching.switching if bvp.rule.jumps else continuation.smooth
+            found = solve(bvp, times, columns, limits, trusted=guess is not None)
             if clock.interrupted:
                 raise Stopped(Status.INTERRUPTED, dataclasses.replace(found, code=Status.INTERRUPTED))
             extremal = continuation.report(found)
@@ -182,7 +182,9 @@ def _check_grid(grid: Any, n: int) -> None:
         )
 
 
-def _question(problem: Problem, start: np.ndarray, horizon: Any, terminal: Any, grid: Grid | None) -> TwoPoint:
+def _question(
+    problem: Problem, start: np.ndarray, horizon: Any, terminal: Any, grid: Grid | None
+) -> BoundaryValueProblem:
     """The boundary-value problem, all but its rest."""
     n = len(start)
     rule = rule_of(problem, n)
@@ -203,7 +205,7 @@ def _question(problem: Problem, start: np.ndarray, horizon: Any, terminal: Any, 
         why = "depends on time" if problem.time_dependent else "has controls that jump, without a Riccati equation"
         raise ValueError(f"pontryagin: got no horizon, and the problem {why}; give horizon=, or terminal= end states")
     controls: Any = problem.controls
-    return TwoPoint(
+    return BoundaryValueProblem(
         problem=problem,
         grid=grid if grid is not None and any(grid.periodic or ()) else None,
         start=start,
@@ -250,19 +252,21 @@ def _positive(horizon: Any) -> float:
     return float(horizon)
 
 
-def _guess(ask: TwoPoint, guess: Any, horizon: Any) -> tuple[np.ndarray, np.ndarray]:
+def _guess(bvp: BoundaryValueProblem, guess: Any, horizon: Any) -> tuple[np.ndarray, np.ndarray]:
     """Times and columns where the solver starts, for a horizon that ends."""
     if isinstance(guess, Extremal):
-        return initial_guess.earlier(ask, guess)
-    long = float(horizon.guess) if isinstance(horizon, FreeTime) else float(ask.horizon)
+        return initial_guess.earlier(bvp, guess)
+    long = float(horizon.guess) if isinstance(horizon, FreeTime) else float(bvp.horizon)
     if guess is not None:
-        return initial_guess.along_loop(ask, guess, long or LONGEST)
-    return initial_guess.straight(ask, long or 1.0)
+        return initial_guess.along_loop(bvp, guess, long or LONGEST)
+    return initial_guess.straight(bvp, long or 1.0)
 
 
-def _to_rest(ask: TwoPoint, guess: Any, rest: Any, clock: Clock) -> tuple[TwoPoint, np.ndarray, np.ndarray]:
+def _to_rest(
+    bvp: BoundaryValueProblem, guess: Any, rest: Any, clock: Clock
+) -> tuple[BoundaryValueProblem, np.ndarray, np.ndarray]:
     """The boundary-value problem with its rest, and where the solver starts."""
-    n, solution = ask.n, guess if hasattr(guess, "costate_at") else None
+    n, solution = bvp.n, guess if hasattr(guess, "costate_at") else None
     near = np.zeros(n) if rest is None else _numbers(rest, "rest")
     if len(near) != n:
         raise ValueError(f"pontryagin: got rest = {near.tolist()}, wanted shape ({n},), like x0: a state near the rest")
@@ -270,15 +274,15 @@ def _to_rest(ask: TwoPoint, guess: Any, rest: Any, clock: Clock) -> tuple[TwoPoi
         near = solution.grid.state(np.unravel_index(np.nanargmin(solution.value), solution.grid.shape))
     if isinstance(guess, Extremal) and rest is None:
         near = guess.states[-1]
-    found, slowest = equilibria.find(ask, near, np.zeros(n))
+    found, slowest = equilibria.find(bvp, near, np.zeros(n))
     clock.look()
-    ask = dataclasses.replace(ask, rest=found, horizon=SETTLED / slowest)
+    bvp = dataclasses.replace(bvp, rest=found, horizon=SETTLED / slowest)
     if solution is None and guess is None:
-        return ask, *initial_guess.into_rest(ask, ask.start, float(ask.horizon), clock)
+        return bvp, *initial_guess.into_rest(bvp, bvp.start, float(bvp.horizon), clock)
     if solution is None:
-        times, columns = initial_guess.earlier(ask, guess)
+        times, columns = initial_guess.earlier(bvp, guess)
     else:
-        times, columns = initial_guess.along_loop(ask, solution, 2 * float(ask.horizon))
+        times, columns = initial_guess.along_loop(bvp, solution, 2 * float(bvp.horizon))
         # a periodic state may come to rest a period away
-        found, _ = equilibria.find(ask, columns[:n, -1], found.costate)
-    return dataclasses.replace(ask, rest=found, horizon=float(times[-1])), times, columns
+        found, _ = equilibria.find(bvp, columns[:n, -1], found.costate)
+    return dataclasses.replace(bvp, rest=found, horizon=float(times[-1])), times, columns

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.extremals.boundary_value import TwoPoint
+from hjbjax.extremals.boundary_value import BoundaryValueProblem
 from hjbjax.feedback.simulation import simulate
 from hjbjax.hamiltonian import pointwise
 from hjbjax.solution.clock import Clock, Stopped
@@ -23,17 +23,19 @@ FAR = 1e3  # times 1 + |x₀|: a loop that gets there has left for good
 
 
 @jax.jit
-def _rest_loop(ask: TwoPoint, x: Any) -> Any:
+def _rest_loop(bvp: BoundaryValueProblem, x: Any) -> Any:
     """ẋ under the costate p̄ + P(x − x̄)."""
-    p = ask.rest.costate + ask.rest.matrix @ (x - ask.rest.state)
-    return ask.flow(0.0, jnp.concatenate([x, p, jnp.zeros(1, x.dtype)]), ask.arcs[0])[: ask.n]
+    p = bvp.rest.costate + bvp.rest.matrix @ (x - bvp.rest.state)
+    return bvp.flow(0.0, jnp.concatenate([x, p, jnp.zeros(1, x.dtype)]), bvp.arcs[0])[: bvp.n]
 
 
-def into_rest(ask: TwoPoint, start: np.ndarray, duration: float, clock: Clock) -> tuple[np.ndarray, np.ndarray]:
+def into_rest(
+    bvp: BoundaryValueProblem, start: np.ndarray, duration: float, clock: Clock
+) -> tuple[np.ndarray, np.ndarray]:
     """Times and columns (x, p, w) under the Riccati costate; a line to the rest where that loop runs away."""
     from scipy.integrate import solve_ivp
 
-    arrays, rest = jax.tree.map(jnp.asarray, ask), ask.rest
+    arrays, rest = jax.tree.map(jnp.asarray, bvp), bvp.rest
     times, far = np.linspace(0, duration, COLUMNS), FAR * (1 + np.linalg.norm(start))
 
     def away(t, x):
@@ -56,22 +58,22 @@ def into_rest(ask: TwoPoint, start: np.ndarray, duration: float, clock: Clock) -
     return times, np.concatenate([states, rest.costate[:, None] + bent, value[None]])
 
 
-def along_loop(ask: TwoPoint, solution: Any, duration: float) -> tuple[np.ndarray, np.ndarray]:
+def along_loop(bvp: BoundaryValueProblem, solution: Any, duration: float) -> tuple[np.ndarray, np.ndarray]:
     """Times and columns (x, p, w) of the closed loop of a solution, as far as it gets; a line where it gets nowhere."""
     grid, marched = solution.grid, solution.times is not None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # where a guess ends is seen from its times
         try:
-            path = simulate(ask.problem, solution, ask.start, duration, hold=duration / SAMPLES, clamp=True)
+            path = simulate(bvp.problem, solution, bvp.start, duration, hold=duration / SAMPLES, clamp=True)
         except KeyboardInterrupt:
             raise Stopped(Status.INTERRUPTED) from None
     times, states = path.times, path.states
-    if not ask.problem.target and ask.free and any(ask.held):
-        nearest = int(np.argmin(np.linalg.norm((states - ask.ends)[:, np.array(ask.held)], axis=1)))
+    if not bvp.problem.target and bvp.free and any(bvp.held):
+        nearest = int(np.argmin(np.linalg.norm((states - bvp.ends)[:, np.array(bvp.held)], axis=1)))
         if nearest:  # else it starts where it ends, though only in the states that are given there
             times, states = times[: nearest + 1], states[: nearest + 1]
     if len(times) == 1:  # in the target from the first
-        return straight(ask, duration)
+        return straight(bvp, duration)
     kept = np.unique(np.linspace(0, len(times) - 1, 2 * COLUMNS).astype(int))
     times, states = times[kept], states[kept]
     inside = np.asarray(grid.wrap(states))
@@ -80,32 +82,34 @@ def along_loop(ask: TwoPoint, solution: Any, duration: float) -> tuple[np.ndarra
     return times, np.nan_to_num(np.concatenate([states, costates, values[:, None]], axis=1).T, posinf=0.0, neginf=0.0)
 
 
-def straight(ask: TwoPoint, duration: float) -> tuple[np.ndarray, np.ndarray]:
+def straight(bvp: BoundaryValueProblem, duration: float) -> tuple[np.ndarray, np.ndarray]:
     """Times and columns (x, p, w) along a line to the given end states; at rest in x₀ without any."""
     times = np.linspace(0, duration, COLUMNS)
-    held = np.array(ask.held)
-    gap = np.where(held, ask.start - np.where(held, ask.ends, 0), 0) if held.any() else np.zeros(ask.n)
+    held = np.array(bvp.held)
+    gap = np.where(held, bvp.start - np.where(held, bvp.ends, 0), 0) if held.any() else np.zeros(bvp.n)
     length = np.linalg.norm(gap)
-    states = ask.start[:, None] - gap[:, None] * times / duration
+    states = bvp.start[:, None] - gap[:, None] * times / duration
     if held.any():
         costate = gap * duration / length**2 if length else gap
     else:
-        costate = np.asarray(jax.grad(ask.psi, 1)(jnp.asarray(duration), jnp.asarray(ask.start)))
+        costate = np.asarray(jax.grad(bvp.psi, 1)(jnp.asarray(duration), jnp.asarray(bvp.start)))
     costates = np.repeat(np.nan_to_num(costate)[:, None], len(times), 1)
     return times, np.concatenate([states, costates, np.zeros((1, len(times)))])
 
 
-def earlier(ask: TwoPoint, extremal: Any) -> tuple[np.ndarray, np.ndarray]:
+def earlier(bvp: BoundaryValueProblem, extremal: Any) -> tuple[np.ndarray, np.ndarray]:
     """Times and columns (x, p, w) of another extremal, its start moved to x₀."""
-    if np.shape(extremal.states)[1] != ask.n:
-        raise ValueError(f"pontryagin: the guess has {np.shape(extremal.states)[1]} states, wanted {ask.n}")
+    if np.shape(extremal.states)[1] != bvp.n:
+        raise ValueError(f"pontryagin: the guess has {np.shape(extremal.states)[1]} states, wanted {bvp.n}")
     times, kept = np.unique(extremal.times, return_index=True)
     states, costates, values = (part[kept].T for part in (extremal.states, extremal.costates, extremal.values[:, None]))
-    moved = (ask.start - states[:, 0])[:, None] * (1 - times / times[-1]) if times[-1] > 0 else 0.0
+    moved = (bvp.start - states[:, 0])[:, None] * (1 - times / times[-1]) if times[-1] > 0 else 0.0
     return times, np.concatenate([states + moved, costates, values])
 
 
-def sequence(ask: TwoPoint, times: np.ndarray, columns: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
+def sequence(
+    bvp: BoundaryValueProblem, times: np.ndarray, columns: np.ndarray, least: float
+) -> tuple[np.ndarray, np.ndarray]:
     """The values of the jumping inputs in the order met, shape (k, m), and when each sets in, shape (k,).
 
     Args:
@@ -114,48 +118,48 @@ def sequence(ask: TwoPoint, times: np.ndarray, columns: np.ndarray, least: float
       columns: (x, p, w) at these times.
       least: the share of the time that an arc must last; the one before goes on in place of a shorter one.
     """
-    which = np.asarray(_best(ask, times, columns))
+    which = np.asarray(_best(bvp, times, columns))
     begins = np.flatnonzero(np.append(True, which[1:] != which[:-1]))
     lasting = np.diff(np.append(times[begins], times[-1])) >= least * (times[-1] - times[0])
     begins = begins[lasting]
     begins = begins[np.append(True, which[begins[1:]] != which[begins[:-1]])] if len(begins) else np.zeros(1, int)
     starts = np.append(times[0], 0.5 * (times[begins[1:]] + times[begins[1:] - 1]))
-    return values(ask)[which[begins]], starts
+    return values(bvp)[which[begins]], starts
 
 
-def values(ask: TwoPoint) -> np.ndarray:
+def values(bvp: BoundaryValueProblem) -> np.ndarray:
     """The values between which the control jumps, shape (K, m)."""
-    return np.asarray(_corners(ask))
+    return np.asarray(_corners(bvp))
 
 
 @jax.jit
-def _corners(ask: TwoPoint) -> Any:
-    return pointwise.corners(ask.problem, ask.rule)
+def _corners(bvp: BoundaryValueProblem) -> Any:
+    return pointwise.corners(bvp.problem, bvp.rule)
 
 
 @jax.jit
-def _best(ask: TwoPoint, times: Any, columns: Any) -> Any:
+def _best(bvp: BoundaryValueProblem, times: Any, columns: Any) -> Any:
     """The index of the value with the largest weight at every time."""
 
     def one(t, z):
-        x, p, _ = ask.split(z)
-        return jnp.argmax(ask.weighted(t, x, p, ask.arcs[0])[1])
+        x, p, _ = bvp.split(z)
+        return jnp.argmax(bvp.weighted(t, x, p, bvp.arcs[0])[1])
 
     return jax.vmap(one, (0, 1))(times, columns)
 
 
-def size(ask: TwoPoint, times: np.ndarray, columns: np.ndarray) -> float:
+def size(bvp: BoundaryValueProblem, times: np.ndarray, columns: np.ndarray) -> float:
     """The typical size of the Hamiltonian's terms along a guess, where a smoothing starts."""
-    return float(np.mean(_sizes(ask, times, columns))) or 1.0
+    return float(np.mean(_sizes(bvp, times, columns))) or 1.0
 
 
 @jax.jit
-def _sizes(ask: TwoPoint, times: Any, columns: Any) -> Any:
+def _sizes(bvp: BoundaryValueProblem, times: Any, columns: Any) -> Any:
     def one(t, z):
-        x, p, _ = ask.split(z)
-        values = pointwise.corners(ask.problem, ask.rule)
+        x, p, _ = bvp.split(z)
+        values = pointwise.corners(bvp.problem, bvp.rule)
         energies = jax.vmap(
-            lambda value: ask.hamiltonian(t, x, p, pointwise.at_corner(ask.problem, ask.rule, t, ask.wrap(x), p, value))
+            lambda value: bvp.hamiltonian(t, x, p, pointwise.at_corner(bvp.problem, bvp.rule, t, bvp.wrap(x), p, value))
         )(values)
         return jnp.maximum(jnp.max(energies) - jnp.min(energies), jnp.mean(jnp.abs(energies)))
 

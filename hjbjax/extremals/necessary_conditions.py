@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.extremals.boundary_value import TwoPoint
+from hjbjax.extremals.boundary_value import BoundaryValueProblem
 from hjbjax.hamiltonian import pointwise
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import samples
 from hjbjax.solution.screen import encodable
 from hjbjax.solution.status import Status
@@ -17,7 +17,7 @@ EMPTY = 1e-9  # share of the time below which an arc is left out of the path
 BUDGET = 200  # controls with which the minimiser is compared
 
 
-@node()
+@pytree_dataclass()
 class Optimality:
     """How well an extremal meets the necessary conditions, in cost units per unit time.
 
@@ -35,7 +35,7 @@ class Optimality:
     scale: Any
 
 
-@node(host=("message",))
+@pytree_dataclass(host=("message",))
 class Extremal:
     """A path with its costates that meets Pontryagin's conditions; ``plotting`` draws it like any path.
 
@@ -78,60 +78,62 @@ class Extremal:
 
 
 @jax.jit
-def measure(ask: TwoPoint, t: Any, z: Any, corner: Any) -> dict[str, Any]:
+def measure(bvp: BoundaryValueProblem, t: Any, z: Any, corner: Any) -> dict[str, Any]:
     """What the check needs at all times of one arc; ``z`` has shape (2n+1, k+1)."""
-    controls: Any = ask.problem.controls
+    controls: Any = bvp.problem.controls
     tried = jnp.asarray(samples(controls, BUDGET), z.dtype)
 
     def one(t, z):
-        x, p, w = ask.split(z)
-        at, weights = ask.weighted(t, x, p, corner)
+        x, p, w = bvp.split(z)
+        at, weights = bvp.weighted(t, x, p, corner)
         u = weights @ at
-        energy = weights @ jax.vmap(lambda u: ask.hamiltonian(t, x, p, u))(at)
-        least = jnp.min(jax.vmap(lambda u: ask.hamiltonian(t, x, p, u))(tried))
+        energy = weights @ jax.vmap(lambda u: bvp.hamiltonian(t, x, p, u))(at)
+        least = jnp.min(jax.vmap(lambda u: bvp.hamiltonian(t, x, p, u))(tried))
         least = jnp.minimum(
-            least, ask.hamiltonian(t, x, p, pointwise.minimiser(ask.problem, ask.rule, t, ask.wrap(x), p))
+            least, bvp.hamiltonian(t, x, p, pointwise.minimiser(bvp.problem, bvp.rule, t, bvp.wrap(x), p))
         )
-        terms = ask.problem.drift(*ask.problem.arguments(ask.wrap(x), u, t=t)) * p
-        cost = pointwise.running_cost(ask.problem, t, ask.wrap(x), u)
-        now = jnp.exp(-ask.problem.discount * t)
-        moving = now * jax.grad(ask.hamiltonian, 0)(t, x, p, u) if ask.problem.time_dependent else 0.0 * t
+        terms = bvp.problem.drift(*bvp.problem.arguments(bvp.wrap(x), u, t=t)) * p
+        cost = pointwise.running_cost(bvp.problem, t, bvp.wrap(x), u)
+        now = jnp.exp(-bvp.problem.discount * t)
+        moving = now * jax.grad(bvp.hamiltonian, 0)(t, x, p, u) if bvp.problem.time_dependent else 0.0 * t
         size = jnp.maximum(jnp.max(jnp.abs(terms)), jnp.abs(cost))
-        constant = now * (energy - ask.problem.discount * w)
+        constant = now * (energy - bvp.problem.discount * w)
         return {"u": u, "constant": constant, "moving": moving, "gap": energy - least, "size": size}
 
     return jax.vmap(one, (0, 1))(t, z)
 
 
-def assemble(ask: TwoPoint, s: np.ndarray, y: np.ndarray, theta: np.ndarray, code: Status, message: str) -> Extremal:
-    """The extremal from the functions on [0, 1] that solve ``ask``; float64 has to be on."""
+def assemble(
+    bvp: BoundaryValueProblem, s: np.ndarray, y: np.ndarray, theta: np.ndarray, code: Status, message: str
+) -> Extremal:
+    """The extremal from the functions on [0, 1] that solve ``bvp``; float64 has to be on."""
     from scipy.integrate import cumulative_simpson
 
-    arrays = jax.tree.map(jnp.asarray, ask)
-    lengths = np.asarray(ask.durations(jnp.asarray(theta)))
-    begins, stacked = np.cumsum(lengths) - lengths, y.reshape(ask.count, -1, len(s))
+    arrays = jax.tree.map(jnp.asarray, bvp)
+    lengths = np.asarray(bvp.durations(jnp.asarray(theta)))
+    begins, stacked = np.cumsum(lengths) - lengths, y.reshape(bvp.count, -1, len(s))
     parts, moved = [], 0.0
     for number, (begin, length, z, corner) in enumerate(
-        zip(begins, lengths, stacked, np.asarray(ask.arcs), strict=True)
+        zip(begins, lengths, stacked, np.asarray(bvp.arcs), strict=True)
     ):
         t = begin + s * length
         part = {name: np.asarray(each) for name, each in measure(arrays, t, z, corner).items()}
         gone = np.full(len(s), moved)
-        if ask.problem.time_dependent:  # a mesh that crowds may repeat a node
+        if bvp.problem.time_dependent:  # a mesh that crowds may repeat a node
             once, back = np.unique(s, return_index=True, return_inverse=True)[1:]
             gone += length * cumulative_simpson(part["moving"][once], x=s[once], initial=0.0)[back]
         part["constant"], moved = part["constant"] - gone, gone[-1]
         if code is Status.CONVERGED and length <= EMPTY * lengths.sum():  # an arc that begins where it ends
             continue
-        states = z[: ask.n].T + (0.0 if ask.shifts is None else ask.shifts[number])
-        parts.append({**part, "t": t, "z": np.concatenate([states, z[ask.n :].T], 1)})
+        states = z[: bvp.n].T + (0.0 if bvp.shifts is None else bvp.shifts[number])
+        parts.append({**part, "t": t, "z": np.concatenate([states, z[bvp.n :].T], 1)})
 
     def joined(name, last=True):
         """Over all arcs; at a switch the next arc's."""
         rows = [part[name][:-1] for part in parts]
         return np.concatenate([*rows, parts[-1][name][-1:]] if last else rows)
 
-    n, z = ask.n, joined("z")
+    n, z = bvp.n, joined("z")
     every = np.concatenate([part["constant"] for part in parts])
     check = Optimality(
         hamiltonian=joined("constant"),
@@ -145,7 +147,7 @@ def assemble(ask: TwoPoint, s: np.ndarray, y: np.ndarray, theta: np.ndarray, cod
         controls=joined("u", last=False),
         costates=z[:, n : 2 * n],
         values=z[:, -1],
-        switches=np.array([part["t"][0] for part in parts[1:] if not ask.seams]),
+        switches=np.array([part["t"][0] for part in parts[1:] if not bvp.seams]),
         cost=float(z[0, -1]),
         horizon=float(lengths.sum()),
         optimality_check=check,
@@ -154,21 +156,21 @@ def assemble(ask: TwoPoint, s: np.ndarray, y: np.ndarray, theta: np.ndarray, cod
     )
 
 
-def unchecked(ask: TwoPoint, s: np.ndarray, y: np.ndarray, lengths: np.ndarray, code: Status) -> Extremal:
+def unchecked(bvp: BoundaryValueProblem, s: np.ndarray, y: np.ndarray, lengths: np.ndarray, code: Status) -> Extremal:
     """A path with its costates as far as a solve came, without controls, which would have to be compiled for."""
-    begins, n = np.cumsum(lengths) - lengths, ask.n
-    z = np.moveaxis(y.reshape(ask.count, -1, len(s)), 1, 2).copy()
-    if ask.shifts is not None:
-        z[..., :n] += np.asarray(ask.shifts)[:, None]
-    inner = np.append(np.tile(np.arange(len(s)) < len(s) - 1, ask.count)[:-1], True)  # at a switch the next arc's
+    begins, n = np.cumsum(lengths) - lengths, bvp.n
+    z = np.moveaxis(y.reshape(bvp.count, -1, len(s)), 1, 2).copy()
+    if bvp.shifts is not None:
+        z[..., :n] += np.asarray(bvp.shifts)[:, None]
+    inner = np.append(np.tile(np.arange(len(s)) < len(s) - 1, bvp.count)[:-1], True)  # at a switch the next arc's
     times, z = (begins[:, None] + s * lengths[:, None]).ravel()[inner], z.reshape(-1, z.shape[-1])[inner]
     return Extremal(
         times=times,
         states=z[:, :n],
-        controls=np.full((len(times) - 1, np.shape(ask.arcs)[1]), np.nan),
+        controls=np.full((len(times) - 1, np.shape(bvp.arcs)[1]), np.nan),
         costates=z[:, n : 2 * n],
         values=z[:, -1],
-        switches=np.zeros(0) if ask.seams else begins[1:],
+        switches=np.zeros(0) if bvp.seams else begins[1:],
         cost=float(z[0, -1]),
         horizon=float(lengths.sum()),
         optimality_check=Optimality(np.full(len(times), np.nan), np.nan, np.nan, np.nan),

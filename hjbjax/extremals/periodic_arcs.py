@@ -9,15 +9,15 @@ import dataclasses
 
 import numpy as np
 
-from hjbjax.extremals.boundary_value import TwoPoint
+from hjbjax.extremals.boundary_value import BoundaryValueProblem
 
 FINE = 4001  # samples in which a guess is looked through for crossings
 NODES = 33  # of an arc's first mesh
 
 
 def split(
-    ask: TwoPoint, times: np.ndarray, columns: np.ndarray
-) -> tuple[TwoPoint, np.ndarray, np.ndarray, np.ndarray] | None:
+    bvp: BoundaryValueProblem, times: np.ndarray, columns: np.ndarray
+) -> tuple[BoundaryValueProblem, np.ndarray, np.ndarray, np.ndarray] | None:
     """The boundary-value problem in arcs, their mesh, the guess on it, and their durations; None without a crossing.
 
     Args:
@@ -25,11 +25,11 @@ def split(
       times: increasing from 0.
       columns: the guess (x, p, w) at these times.
     """
-    if ask.grid is None:
+    if bvp.grid is None:
         return None
-    cyclic, fine = np.array(ask.grid.periodic), np.linspace(0, times[-1], FINE)
-    lo, period = np.asarray(ask.grid.lo), np.asarray(ask.grid.hi) - np.asarray(ask.grid.lo)
-    states = np.stack([np.interp(fine, times, row) for row in columns[: ask.n]], axis=-1)
+    cyclic, fine = np.array(bvp.grid.periodic), np.linspace(0, times[-1], FINE)
+    lo, period = np.asarray(bvp.grid.lo), np.asarray(bvp.grid.hi) - np.asarray(bvp.grid.lo)
+    states = np.stack([np.interp(fine, times, row) for row in columns[: bvp.n]], axis=-1)
     turns = np.where(cyclic, np.floor((states - lo) / period), 0)
     at = 1 + np.flatnonzero(np.any(np.diff(turns, axis=0) != 0, axis=1))
     steps = turns[at] - turns[at - 1]
@@ -45,15 +45,15 @@ def split(
         for begin, length in zip(starts, lengths, strict=True)
     ]
     for piece, shift in zip(pieces, shifts, strict=True):
-        piece[: ask.n] -= shift[:, None]
-    rest = ask.rest and dataclasses.replace(ask.rest, state=ask.rest.state - shifts[-1])
+        piece[: bvp.n] -= shift[:, None]
+    rest = bvp.rest and dataclasses.replace(bvp.rest, state=bvp.rest.state - shifts[-1])
     apart = dataclasses.replace(
-        ask,
+        bvp,
         grid=None,
-        start=ask.start - shifts[0],
-        ends=ask.ends - np.where(ask.held, shifts[-1], 0),
+        start=bvp.start - shifts[0],
+        ends=bvp.ends - np.where(bvp.held, shifts[-1], 0),
         rest=rest,
-        arcs=np.repeat(ask.arcs, len(starts), 0),
+        arcs=np.repeat(bvp.arcs, len(starts), 0),
         shifts=shifts,
         places=np.where(upward, lo[axes] + period[axes], lo[axes]),
         seams=tuple(int(axis) for axis in axes),

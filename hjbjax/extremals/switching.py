@@ -15,7 +15,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from hjbjax.extremals import initial_guess
-from hjbjax.extremals.boundary_value import Closing, Law, TwoPoint, conditions
+from hjbjax.extremals.boundary_value import BoundaryValueProblem, Closing, Law, conditions
 from hjbjax.extremals.continuation import Found, Limits, attempt, carry_on, report, unknowns
 from hjbjax.extremals.necessary_conditions import EMPTY
 from hjbjax.solution.status import Status
@@ -30,7 +30,9 @@ TRUSTED = 0.02  # share of the time that an arc of an interpolated guess must la
 NODES = 17  # of an arc's first mesh
 
 
-def switching(ask: TwoPoint, times: np.ndarray, columns: np.ndarray, limits: Limits, *, trusted: bool) -> Found:
+def switching(
+    bvp: BoundaryValueProblem, times: np.ndarray, columns: np.ndarray, limits: Limits, *, trusted: bool
+) -> Found:
     """The extremal of a Hamiltonian whose minimiser jumps, from a guess of one arc.
 
     Args:
@@ -40,13 +42,13 @@ def switching(ask: TwoPoint, times: np.ndarray, columns: np.ndarray, limits: Lim
       limits: how far to go.
       trusted: whether the costates of the guess are worth to be asked for the order of the arcs.
     """
-    mixture = dataclasses.replace(ask, law=Law.MIXTURE)
+    mixture = dataclasses.replace(bvp, law=Law.MIXTURE)
     failure = None
-    known = Found(mixture, times / times[-1], columns, unknowns(ask, times, columns), Status.CONVERGED)
+    known = Found(mixture, times / times[-1], columns, unknowns(bvp, times, columns), Status.CONVERGED)
     for blurred in itertools.chain([known] * trusted, _mixtures(mixture, times, columns, limits.rough)):
         least = TRUSTED if blurred is known else 0.0
         carry_on(blurred, limits)
-        found = _sharpened(ask, blurred, limits, least) if blurred.solved else blurred
+        found = _sharpened(bvp, blurred, limits, least) if blurred.solved else blurred
         carry_on(found, limits)
         if found.solved and report(found).status is Status.CONVERGED:
             return found
@@ -56,38 +58,38 @@ def switching(ask: TwoPoint, times: np.ndarray, columns: np.ndarray, limits: Lim
     return failure
 
 
-def _mixtures(ask: TwoPoint, times: np.ndarray, columns: np.ndarray, rough: Limits) -> Iterator[Found]:
+def _mixtures(bvp: BoundaryValueProblem, times: np.ndarray, columns: np.ndarray, rough: Limits) -> Iterator[Found]:
     """Smoothed extremals, the likeliest first; a failure where there are no more."""
-    size, found = initial_guess.size(ask, times, columns), None
-    if ask.free:
-        yield from _walk(dataclasses.replace(ask, epsilon=size), times, columns, rough)
+    size, found = initial_guess.size(bvp, times, columns), None
+    if bvp.free:
+        yield from _walk(dataclasses.replace(bvp, epsilon=size), times, columns, rough)
         return
-    start = (times / times[-1], columns, unknowns(ask, times, columns))
+    start = (times / times[-1], columns, unknowns(bvp, times, columns))
     for share in SMOOTHING:
-        tried = attempt(dataclasses.replace(ask, epsilon=share * size), *start, rough)
+        tried = attempt(dataclasses.replace(bvp, epsilon=share * size), *start, rough)
         if not tried.solved:
             break
         found, start = tried, (tried.s, tried.y, tried.theta)
     yield found or tried
 
 
-def _walk(ask: TwoPoint, times: np.ndarray, columns: np.ndarray, rough: Limits) -> Iterator[Found]:
+def _walk(bvp: BoundaryValueProblem, times: np.ndarray, columns: np.ndarray, rough: Limits) -> Iterator[Found]:
     """Mixtures with given final times, from one that is long enough to where H fits a free one."""
-    columns = np.concatenate([columns[: ask.n], 0 * columns[ask.n :]])  # no costate prefers a control
+    columns = np.concatenate([columns[: bvp.n], 0 * columns[bvp.n :]])  # no costate prefers a control
     for factor in BRIDGES:
-        fixed = dataclasses.replace(ask, free=False, horizon=factor * times[-1])
+        fixed = dataclasses.replace(bvp, free=False, horizon=factor * times[-1])
         found = attempt(fixed, times / times[-1], columns, unknowns(fixed, times, columns), rough)
         if found.solved:
             break
     yield found
-    stride, least = STRIDE, SMOOTHING[-1] * float(ask.epsilon)
+    stride, least = STRIDE, SMOOTHING[-1] * float(bvp.epsilon)
     for _ in range(WALK * found.solved):
-        last = conditions(ask, found.y[:, 0], found.y[:, -1], np.append(found.horizon, found.theta))[-1]
+        last = conditions(bvp, found.y[:, 0], found.y[:, -1], np.append(found.horizon, found.theta))[-1]
         # Where a longer time pays, that is as often the price of smoothing as the truth.
-        if last < 0 and found.ask.epsilon > least:
-            nearer = dataclasses.replace(found.ask, epsilon=FASTER * found.ask.epsilon)
+        if last < 0 and found.bvp.epsilon > least:
+            nearer = dataclasses.replace(found.bvp, epsilon=FASTER * found.bvp.epsilon)
         else:
-            nearer = dataclasses.replace(found.ask, horizon=found.horizon * (stride if last < 0 else 1 / stride))
+            nearer = dataclasses.replace(found.bvp, horizon=found.horizon * (stride if last < 0 else 1 / stride))
         moved = attempt(nearer, found.s, found.y, found.theta, rough)
         if moved.solved:
             found = moved
@@ -96,38 +98,38 @@ def _walk(ask: TwoPoint, times: np.ndarray, columns: np.ndarray, rough: Limits) 
             stride = stride**0.5
 
 
-def _sharpened(ask: TwoPoint, blurred: Found, limits: Limits, least: float) -> Found:
+def _sharpened(bvp: BoundaryValueProblem, blurred: Found, limits: Limits, least: float) -> Found:
     """The arcs in the order that a mixture shows."""
     fine = np.linspace(0, 1, 2001)
     y = np.stack([np.interp(fine, blurred.s, row) for row in blurred.y])
-    order, starts = initial_guess.sequence(blurred.ask, fine * blurred.horizon, y, least)
+    order, starts = initial_guess.sequence(blurred.bvp, fine * blurred.horizon, y, least)
     carry_on(blurred, limits)
     if len(order) > MOST_ARCS:
         trouble = f"{len(order) - 1} switches: the control chatters, or an arc is singular; this is a smoothed extremal"
         return dataclasses.replace(blurred, code=Status.STALLED, trouble=trouble)
-    first = found = _arcs(ask, blurred, order, starts, limits)
+    first = found = _arcs(bvp, blurred, order, starts, limits)
     for _ in range(MOST_ARCS):
         lengths = found.lengths
         kept = lengths > (-EMPTY if found.solved else SHORT) * max(lengths.sum(), 0.0)
         if kept.all() or not kept.any():
             break
         order, starts = _merged(order[kept], (np.cumsum(lengths) - lengths)[kept])
-        found = _arcs(ask, blurred, order, starts, limits)
+        found = _arcs(bvp, blurred, order, starts, limits)
     if not found.solved:
-        found = _with_an_empty_arc(ask, blurred, order, starts, limits) or first
+        found = _with_an_empty_arc(bvp, blurred, order, starts, limits) or first
     if found.solved:
         return found
-    count = len(first.ask.arcs)
+    count = len(first.bvp.arcs)
     return dataclasses.replace(found, trouble=f"with {count} arc{'s' * (count > 1)}, {found.trouble}")
 
 
 def _with_an_empty_arc(
-    ask: TwoPoint, blurred: Found, order: np.ndarray, starts: np.ndarray, limits: Limits
+    bvp: BoundaryValueProblem, blurred: Found, order: np.ndarray, starts: np.ndarray, limits: Limits
 ) -> Found | None:
     """The same after an arc of another value that may stay empty."""
-    for value in initial_guess.values(blurred.ask):
+    for value in initial_guess.values(blurred.bvp):
         if not np.array_equal(value, order[0], equal_nan=True):
-            found = _arcs(ask, blurred, np.concatenate([value[None], order]), np.append(0.0, starts), limits)
+            found = _arcs(bvp, blurred, np.concatenate([value[None], order]), np.append(0.0, starts), limits)
             if found.solved and np.min(found.lengths) > -EMPTY * found.horizon:
                 return found
     return None
@@ -139,16 +141,16 @@ def _merged(order: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return order[new], np.append(0.0, starts[new][1:])
 
 
-def _arcs(ask: TwoPoint, blurred: Found, order: np.ndarray, starts: np.ndarray, limits: Limits) -> Found:
+def _arcs(bvp: BoundaryValueProblem, blurred: Found, order: np.ndarray, starts: np.ndarray, limits: Limits) -> Found:
     """All arcs at once, from a mixture; roughly first, since a failure is cheap on few nodes."""
-    ask = dataclasses.replace(ask, law=Law.ARCS, arcs=order)
+    bvp = dataclasses.replace(bvp, law=Law.ARCS, arcs=order)
     lengths = np.diff(np.append(starts, blurred.horizon))
     s = np.linspace(0, 1, NODES)
     pieces = [
         [np.interp(begin + s * length, blurred.times, row) for row in blurred.y]
         for begin, length in zip(starts, lengths, strict=True)
     ]
-    nu = blurred.theta[len(blurred.theta) - (ask.closing is Closing.TARGET) :]
-    theta = np.concatenate([lengths if ask.timed else [], nu])
-    found = attempt(ask, s, np.concatenate(pieces), theta, limits.rough)
-    return attempt(ask, found.s, found.y, found.theta, limits) if found.solved else found
+    nu = blurred.theta[len(blurred.theta) - (bvp.closing is Closing.TARGET) :]
+    theta = np.concatenate([lengths if bvp.timed else [], nu])
+    found = attempt(bvp, s, np.concatenate(pieces), theta, limits.rough)
+    return attempt(bvp, found.s, found.y, found.theta, limits) if found.solved else found

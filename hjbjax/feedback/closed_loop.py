@@ -30,10 +30,10 @@ import numpy as np
 
 from hjbjax.feedback.loop import Loop, defined
 from hjbjax.feedback.path import Path, PathStatus
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 
 
-@node(static=("max_steps", "held"))
+@pytree_dataclass(static=("max_steps", "held"))
 class Stepping:
     """How the integrator steps.
 
@@ -65,7 +65,7 @@ def integrate(loop: Loop, x0: Any, times: Any, key: Any, stepping: Stepping) -> 
 def unbegun(loop: Loop, x0: np.ndarray, times: np.ndarray) -> tuple[tuple, tuple]:
     """The state before the first interval, but for its code, and room for what all intervals show; NumPy."""
     count, players = len(times) - 1, (loop.problem.controls, loop.problem.disturbances)
-    inputs = [0 if choices is None else choices.dim for choices in players]
+    inputs = [0 if admissible is None else admissible.dim for admissible in players]
     controls, disturbances = (np.zeros((count, size), x0.dtype) for size in inputs)
     state = times[0], np.append(x0, 0.0), np.int32(0), np.int32(0)
     shown = controls, None if loop.opponent is None else disturbances

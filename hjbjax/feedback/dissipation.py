@@ -145,23 +145,27 @@ def dissipation(
 
 def _lanes(problem: Problem, starts: np.ndarray, random: int, key: Any) -> tuple[tuple, list[str]]:
     """Starts, the weight of the worst case and the points of a signal, one row a path; and what they are called."""
-    choices, count = problem.disturbances, random * len(starts)
-    assert choices is not None
+    admissible, count = problem.disturbances, random * len(starts)
+    assert admissible is not None
     strength = np.geomspace(WEAKEST, 1.0, random) if random > 1 else np.ones(random)
-    least = np.clip(0.0, choices.lo, choices.hi) if isinstance(choices, Box) else np.zeros(choices.dim)
-    away = np.asarray(_uniform(choices, key, (count, POINTS))) - least if count else np.zeros((0, POINTS, choices.dim))
+    least = np.clip(0.0, admissible.lo, admissible.hi) if isinstance(admissible, Box) else np.zeros(admissible.dim)
+    away = (
+        np.asarray(_uniform(admissible, key, (count, POINTS))) - least
+        if count
+        else np.zeros((0, POINTS, admissible.dim))
+    )
     points = least + np.repeat(strength, len(starts))[:, None, None] * away
-    still = np.zeros((len(starts), POINTS, choices.dim))
+    still = np.zeros((len(starts), POINTS, admissible.dim))
     weight = np.repeat([1.0, 0.0], [len(starts), count])
     lanes = np.tile(starts, (1 + random, 1)), weight, np.concatenate([still, points])
     return lanes, ["worst case"] * len(starts) + ["random"] * count
 
 
-def _uniform(choices: Any, key: Any, shape: tuple[int, ...]) -> jax.Array:
+def _uniform(admissible: Any, key: Any, shape: tuple[int, ...]) -> jax.Array:
     """Points of a set, shape (*shape, l)."""
-    if isinstance(choices, Box):
-        return jax.random.uniform(key, (*shape, choices.dim), minval=choices.lo, maxval=choices.hi)
-    return choices.radius * jax.random.ball(key, choices.dim, shape=shape)
+    if isinstance(admissible, Box):
+        return jax.random.uniform(key, (*shape, admissible.dim), minval=admissible.lo, maxval=admissible.hi)
+    return admissible.radius * jax.random.ball(key, admissible.dim, shape=shape)
 
 
 def _mixed(look: Callable, weight: Any, points: Any, duration: Any, t: Any, x: Any) -> Any:

@@ -17,11 +17,10 @@ import numpy as np
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Limited
 from hjbjax.discretisation.stencil import Links
-from hjbjax.hamiltonian import players
-from hjbjax.hamiltonian.discrete import Local, optimise
+from hjbjax.hamiltonian.discrete import DiscreteHamiltonian, optimise
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_partial, cast, is_traced, node
+from hjbjax.problem.pytree import as_partial, cast, is_traced, pytree_dataclass
 from hjbjax.solution.interpolation import extended
 from hjbjax.solution.solution import Solution
 
@@ -95,7 +94,7 @@ def _first(answers: list) -> Any:
     return answer
 
 
-@node()
+@pytree_dataclass()
 class Greedy:
     """The feedback of ``greedy_feedback``; called with (x), of a marched solution with (t, x).
 
@@ -245,8 +244,8 @@ def _at(greedy: Greedy, when: tuple, x: Any, p: Any) -> tuple[Any, Any]:
     block = Grid(x - h, x + h, (3,) * n)
     slopes, links = tuple(p), tuple(Links(width, width) for width in h)
     on = Discretisation(problem, block, Limited(), x.dtype, t)
-    here = Local(on, list(x), value, slopes, slopes, bends, links)
-    _, u, d = optimise(here, players.setting(problem, n, x.dtype))
+    hamiltonian = DiscreteHamiltonian(on, list(x), value, slopes, slopes, bends, links)
+    _, u, d = optimise(hamiltonian)
     known = jnp.all(jnp.isfinite(p))
     return tuple(jnp.where(known, _stacked(action, x.dtype, n), jnp.nan) for action in (u, d))  # type: ignore[return-value]
 

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 
 HALVINGS = 30  # of the way back to where the players have an answer: a billionth of an interval
 
 
-@node(static=("clamp",))
+@pytree_dataclass(static=("clamp",))
 class Loop:
     """The closed loop as functions of (t, x).
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box
 from hjbjax.solution.screen import encodable
 
@@ -48,7 +48,7 @@ class Interrupted(KeyboardInterrupt):
         self.path = path
 
 
-@node(host=("message",))
+@pytree_dataclass(host=("message",))
 class Path:
     """A closed loop's history, truncated where it ends.
 

@@ -17,12 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.pytree import as_partial, is_traced, node
+from hjbjax.problem.pytree import as_partial, is_traced, pytree_dataclass
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
 
 
-@node()
+@pytree_dataclass()
 class Filter:
     """A feedback that leaves a nominal one alone where that is safe; called with (x), of a marched tube with (t, x).
 

@@ -11,7 +11,8 @@ import numpy as np
 
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.hamiltonian import discrete, players
+from hjbjax.hamiltonian import discrete
+from hjbjax.hamiltonian.players import find_players
 from hjbjax.iteration import bellman
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
@@ -42,7 +43,7 @@ def values(problem: Problem, grid: Grid, dtype: Any, t: float = 0.0) -> None:
         for axis, step in grid.sides("constrained")
         if index[axis] == (grid.shape[axis] - 1 if step > 0 else 0)
     ]
-    exact = players.setting(altered(problem, cost=None), grid.ndim, np.float64).exact
+    exact = find_players(altered(problem, cost=None), grid.ndim, np.float64).exact
     found = "no action is admissible" if exact else "none of the sampled actions is admissible"
     raise ValueError(
         f"Grid.edges: {found} at {int(stuck.sum())} of {grid.size} nodes, first at node {index}, "
@@ -57,6 +58,6 @@ def values(problem: Problem, grid: Grid, dtype: Any, t: float = 0.0) -> None:
 def _stuck(on: Discretisation) -> jax.Array:
     """The nodes off the target without an admissible action, bool (*grid)."""
     free = altered(on.problem, cost=None)
-    here = discrete.local(on.asking(free), jnp.zeros(on.grid.shape, on.dtype))
-    least = discrete.optimise(here, players.setting(free, on.grid.ndim, on.dtype))[0]
-    return ~jnp.isfinite(least) & ~bellman.conditions(on).held
+    hamiltonian = discrete.around(on.asking(free), jnp.zeros(on.grid.shape, on.dtype))
+    least = discrete.optimise(hamiltonian)[0]
+    return ~jnp.isfinite(least) & ~bellman.obstacles(on).fixed

@@ -17,7 +17,7 @@ from hjbjax.discretisation import chain, cut_cells, edges, stencil
 from hjbjax.discretisation.chain import Rates
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.finiteness import tried_actions
-from hjbjax.hamiltonian import players
+from hjbjax.hamiltonian.players import players_of
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.solution.clock import Clock
@@ -47,7 +47,7 @@ def _also_open(
 ) -> Rates:
     """The jumps that are known to be open and those of the actions ``points``, shape (count, m)."""
     grid, points = on.grid, jnp.asarray(points, on.dtype)
-    mine = players.setting(on.problem, grid.ndim, on.dtype).control
+    mine = players_of(on).control
     outmost = tried_actions.of_a_ball(on, mine) if kinks and known is None else []
     if known is None:
         start = chain.rates(on, list(points[0]))
@@ -149,8 +149,8 @@ def _forced_further(on: Discretisation, inside: jax.Array, found: jax.Array, lea
     """The nodes one jump further from which the control leads to ``found`` and stays ``inside``; if there are more."""
     problem, grid, dtype = on.problem, on.grid, on.dtype
     us, ds = (
-        jnp.asarray(np.zeros((1, 0)) if choices is None else sets.samples(choices, FEW), dtype)
-        for choices in (problem.controls, problem.disturbances)
+        jnp.asarray(np.zeros((1, 0)) if admissible is None else sets.samples(admissible, FEW), dtype)
+        for admissible in (problem.controls, problem.disturbances)
     )
     upper = problem.isaacs == "upper"
     outer, inner = (us, ds) if upper else (ds, us)
@@ -190,10 +190,10 @@ def refuge(on: Discretisation, inside: Any = None, dearest: Any = None) -> jax.A
     """
     problem, grid, dtype = on.problem, on.grid, on.dtype
     u, d = (
-        jnp.asarray(np.zeros((1, 0)) if choices is None else sets.samples(choices, tried_actions.SAMPLES), dtype)
-        for choices in (problem.controls, problem.disturbances)
+        jnp.asarray(np.zeros((1, 0)) if admissible is None else sets.samples(admissible, tried_actions.SAMPLES), dtype)
+        for admissible in (problem.controls, problem.disturbances)
     )
-    mine, start = players.setting(problem, grid.ndim, dtype).control, inside
+    mine, start = players_of(on).control, inside
     if inside is None:
         start = cut_cells.level(on) > 0
 

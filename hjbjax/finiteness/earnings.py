@@ -40,7 +40,7 @@ def earned(task: Task, state: State) -> Earning | None:
     if bounded or problem.is_game or problem.cost is None or int(state.step) < 0:
         return None
     jumps, cost = jax.device_get(_at(task, state.policy.controls))
-    going = np.asarray(task.counted) & ~np.asarray(task.rules.held)
+    going = np.asarray(task.counted) & ~np.asarray(task.obstacles.fixed)
     if not np.all(np.isfinite(cost[going])) or not np.any(cost[going] < 0):
         return None
     values = [np.where(going, rate, 0) for rate in jumps.values]

@@ -72,15 +72,15 @@ class _Finding(NamedTuple):
 def _actions(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     """Representative pairs of control and disturbance, shapes (K, m) and (K, l)."""
     most = 9 if problem.is_game else ACTIONS
-    mine, theirs = (_thinned(choices, most) for choices in (problem.controls, problem.disturbances))
+    mine, theirs = (_thinned(admissible, most) for admissible in (problem.controls, problem.disturbances))
     pairs = list(itertools.product(mine, theirs))
     return np.array([u for u, _ in pairs]), np.array([d for _, d in pairs])
 
 
-def _thinned(choices: sets.AdmissibleSet | None, most: int) -> np.ndarray:
-    if choices is None:
+def _thinned(admissible: sets.AdmissibleSet | None, most: int) -> np.ndarray:
+    if admissible is None:
         return np.zeros((1, 0))
-    points = np.asarray(sets.samples(choices, 9))
+    points = np.asarray(sets.samples(admissible, 9))
     return points[np.unique(np.linspace(0, len(points) - 1, min(most, len(points))).round().astype(int))]
 
 

@@ -15,9 +15,9 @@ import jax.numpy as jnp
 
 from hjbjax.discretisation import chain
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.hamiltonian import discrete, players
+from hjbjax.hamiltonian import discrete
 from hjbjax.iteration import bellman
-from hjbjax.iteration.bellman import Conditions
+from hjbjax.iteration.bellman import Obstacles
 from hjbjax.problem import sets
 
 ROUNDINGS = 8  # units of eps: sin π, in float32 as well, times what it is multiplied with
@@ -44,13 +44,12 @@ def standstill(on: Discretisation) -> Standstill:
     With slopes ±s, s_i = max L/max|f_i|, the Hamiltonian is L + Σ s_i |f_i|: its minimum vanishes at rest alone.
     """
     grid, dtype = on.grid, on.dtype
-    how = players.setting(on.problem, grid.ndim, dtype)
-    least = discrete.optimise(discrete.local(on, jnp.zeros(grid.shape, dtype)), how)[0]
+    least = discrete.optimise(discrete.around(on, jnp.zeros(grid.shape, dtype)))[0]
     speeds, dearest = _scales(on)
     cost = jnp.max(jnp.where(jnp.isfinite(least), jnp.abs(least), 0))  # infinite where a constrained end leaves none
     cost = jnp.where(cost > 0, cost, jnp.where(dearest > 0, dearest, 1))
     speeds = jnp.where(speeds > 0, speeds, 1)
-    effort, u, d = discrete.optimise(discrete.at_rest(on, cost / speeds), how)
+    effort, u, d = discrete.optimise(discrete.at_rest(on, cost / speeds))
     small = ROUNDINGS * jnp.finfo(dtype).eps
     rests = (jnp.abs(effort) <= small * cost) & (jnp.abs(least) <= small * cost)
     for axis, speed in enumerate(_spread(on, u, d)):
@@ -69,9 +68,9 @@ def _scales(on: Discretisation) -> tuple[jax.Array, jax.Array]:
     """The largest speed along every axis, drift or noise, shape (n,), and the largest |L|, over nodes and actions."""
     grid, dtype = on.grid, on.dtype
 
-    def rows(choices: Any) -> jax.Array:
+    def rows(admissible: Any) -> jax.Array:
         return jnp.stack(
-            [jnp.stack(action) if action else jnp.zeros(0, dtype) for action in sets.probes(choices, dtype)]
+            [jnp.stack(action) if action else jnp.zeros(0, dtype) for action in sets.probes(admissible, dtype)]
         )
 
     us, ds = rows(on.problem.controls), rows(on.problem.disturbances)
@@ -91,22 +90,22 @@ def _scales(on: Discretisation) -> tuple[jax.Array, jax.Array]:
     return jax.lax.scan(look, start, pairs)[0]
 
 
-def leaving_pays(on: Discretisation, rules: Conditions, counted: Any, value: jax.Array) -> jax.Array:
+def leaving_pays(on: Discretisation, obstacles: Obstacles, counted: Any, value: jax.Array) -> jax.Array:
     """The held rest nodes at which some action has L + Σ_o c_o (V(x + o) − V(x)) < 0, bool (*grid).
 
     With none of them the value with held rest nodes solves the problem in which they may be left, too.
     """
-    rests = rules.held & counted & ~jnp.asarray(rules.ended)
-    policy = bellman.greedy(on, value, rules.held & ~rests)
+    rests = obstacles.fixed & counted & ~jnp.asarray(obstacles.ended)
+    policy = bellman.greedy(on, value, obstacles.fixed & ~rests)
     u, d = list(policy.controls), list(policy.disturbances)
     leaving = chain.rates(on, u, d).total()
     cost = jnp.max(jnp.abs(on.running_cost(u, d)))
     size = jnp.max(jnp.where(counted, jnp.abs(value), 0))
-    return rests & (policy.rate < -GAIN * jnp.finfo(value.dtype).eps * (leaving * size + cost))
+    return rests & (policy.defect < -GAIN * jnp.finfo(value.dtype).eps * (leaving * size + cost))
 
 
-def released(rules: Conditions, pays: jax.Array) -> Conditions:
+def released(obstacles: Obstacles, pays: jax.Array) -> Obstacles:
     """The conditions with the nodes ``pays`` no longer held: there the run may rest, V ≤ 0, or leave."""
     stop = jnp.where(pays, 0, jnp.inf)
-    stop = stop if rules.stop is None else jnp.minimum(stop, rules.stop)
-    return bellman.Conditions(rules.held & ~pays, rules.given, stop, rules.floor, rules.ended)
+    stop = stop if obstacles.upper is None else jnp.minimum(stop, obstacles.upper)
+    return bellman.Obstacles(obstacles.fixed & ~pays, obstacles.fixed_value, stop, obstacles.lower, obstacles.ended)

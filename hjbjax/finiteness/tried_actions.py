@@ -42,7 +42,7 @@ def with_kinks(on: Discretisation, player: Player, action: list) -> list[list]:
         for base in tuple(found):
             for kink in _kinks(on, player, base, j):
                 moved = [kink if k == j else entry for k, entry in enumerate(base)]
-                found.append(_where(_contains(player.choices, moved), moved, base))
+                found.append(_where(_contains(player.admissible, moved), moved, base))
     return found
 
 
@@ -52,9 +52,9 @@ def of_a_ball(on: Discretisation, player: Player) -> list[list]:
     Each input u_j drives one component f_j of its own. Among the actions with given signs of all f_j, that with the
     largest |f_k| has some inputs S at their kinks, f_S = 0, no others, and all the room they leave in u_k.
     """
-    if not player.exact or on.problem.is_game or not isinstance(player.choices, Ball):
+    if not player.exact or on.problem.is_game or not isinstance(player.admissible, Ball):
         return []
-    none, radius = [jnp.zeros((), on.dtype)] * player.choices.dim, player.choices.radius
+    none, radius = [jnp.zeros((), on.dtype)] * player.admissible.dim, player.admissible.radius
     kinks = [_kinks(on, player, none, j) or [none[j]] for j in range(len(none))]
     found: list[list] = []
     for count in range(len(none)):
@@ -85,10 +85,10 @@ def _where(condition: jax.Array, action: list, otherwise: list) -> list:
     return [jnp.where(condition, new, old) for new, old in zip(action, otherwise, strict=True)]
 
 
-def _contains(choices: Any, action: list) -> Any:
+def _contains(admissible: Any, action: list) -> Any:
     """Where an action with an entry a node lies in a box or a ball."""
-    if isinstance(choices, Ball):
-        return sum(u * u for u in action) <= choices.radius**2
+    if isinstance(admissible, Ball):
+        return sum(u * u for u in action) <= admissible.radius**2
     return functools.reduce(
-        jnp.logical_and, ((u >= choices.lo[j]) & (u <= choices.hi[j]) for j, u in enumerate(action))
+        jnp.logical_and, ((u >= admissible.lo[j]) & (u <= admissible.hi[j]) for j, u in enumerate(action))
     )

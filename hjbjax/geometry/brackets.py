@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem import arguments
-from hjbjax.problem.pytree import as_partial, cast, is_traced, node
+from hjbjax.problem.pytree import as_partial, cast, is_traced, pytree_dataclass
 
 Field = Callable[[Any], Any]
 
@@ -101,7 +101,7 @@ def affine_fields(drift: Callable, inputs: int) -> tuple[Field, Sequence[Field]]
     return _Affine(held, inputs, None), [_Affine(held, inputs, j) for j in range(inputs)]
 
 
-@node(static=("inputs", "j"))
+@pytree_dataclass(static=("inputs", "j"))
 class _Affine:
     """x ↦ f(x, 0), or with j the rate of f(x, u) with u_j; the drift's numbers stay leaves."""
 

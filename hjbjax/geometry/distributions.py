@@ -18,10 +18,10 @@ import jax.numpy as jnp
 
 from hjbjax.geometry.brackets import Field, along, as_fields, decide, floating, stacked
 from hjbjax.problem import arguments
-from hjbjax.problem.pytree import as_partial, is_traced, node
+from hjbjax.problem.pytree import as_partial, is_traced, pytree_dataclass
 
 
-@node()
+@pytree_dataclass()
 class Distribution:
     """The span of vectors at one point, and how clear its rank is.
 

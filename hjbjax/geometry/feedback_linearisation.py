@@ -22,10 +22,10 @@ import numpy as np
 
 from hjbjax.geometry.brackets import Field, along, as_fields, as_state, decide, floating, stacked
 from hjbjax.problem import arguments
-from hjbjax.problem.pytree import as_partial, is_traced, node
+from hjbjax.problem.pytree import as_partial, is_traced, pytree_dataclass
 
 
-@node(static=("states",))
+@pytree_dataclass(static=("states",))
 class RelativeDegree:
     """How often each output is differentiated before an input appears.
 
@@ -68,7 +68,7 @@ class RelativeDegree:
         return _named(degrees, self.states)
 
 
-@node(static=("degrees",))
+@pytree_dataclass(static=("degrees",))
 class Linearisation:
     """u = α(x) + β(x) v, which makes v the r-th derivative of the output; unpacks as (alpha, beta, coordinates).
 

@@ -31,10 +31,10 @@ from hjbjax.geometry.feedback_linearisation import (
     plain,
 )
 from hjbjax.problem import arguments
-from hjbjax.problem.pytree import as_partial, is_traced, node
+from hjbjax.problem.pytree import as_partial, is_traced, pytree_dataclass
 
 
-@node()
+@pytree_dataclass()
 class Linearisability:
     """Whether a system can be linearised by feedback, with the conditions it follows from.
 

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.problem.pytree import as_partial, cast, node
+from hjbjax.problem.pytree import as_partial, cast, pytree_dataclass
 from hjbjax.problem.sets import Ball, Box
 from hjbjax.solution.screen import encodable
 
@@ -26,7 +26,7 @@ STEPS = 80  # its steps; a step that does not climb is halved
 NEAR = 0.01  # closer to the equilibrium than this part of the region's size, V is not compared with zero
 
 
-@node()
+@pytree_dataclass()
 class LyapunovReport:
     """What a search for a violation found.
 

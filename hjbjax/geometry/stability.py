@@ -19,12 +19,12 @@ import numpy as np
 from hjbjax.geometry.brackets import Field, as_fields, decide, stacked
 from hjbjax.geometry.distributions import span
 from hjbjax.geometry.lyapunov import LyapunovReport, lyapunov_check, lyapunov_derivative
-from hjbjax.problem.pytree import as_partial, node
+from hjbjax.problem.pytree import as_partial, pytree_dataclass
 
 __all__ = ["BrockettVerdict", "LyapunovReport", "brockett_check", "lyapunov_check", "lyapunov_derivative"]
 
 
-@node(static=("message",))
+@pytree_dataclass(static=("message",))
 class BrockettVerdict:
     """Whether a system meets Brockett's necessary condition for a continuous stabilising feedback of the state.
 

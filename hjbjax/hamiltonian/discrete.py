@@ -24,9 +24,8 @@ import jax.numpy as jnp
 
 from hjbjax.discretisation import chain, correlated_noise, cut_cells, edges, stencil
 from hjbjax.discretisation.discretisation import Differences, Discretisation
-from hjbjax.hamiltonian import players
 from hjbjax.hamiltonian.piecewise import Kinked, inverse_root, kinked_ball, piecewise_input, piecewise_pair
-from hjbjax.hamiltonian.players import SAMPLES, Player, Setting, shared
+from hjbjax.hamiltonian.players import SAMPLES, Player, players_of, shared
 from hjbjax.hamiltonian.search import UNROLL, Action, best_of, enumerate_actions, refine
 from hjbjax.problem import sets
 from hjbjax.problem.problem import Problem
@@ -38,7 +37,7 @@ INNER = 8  # evaluations written out of a search inside a search: with all 33 XL
 
 
 @dataclasses.dataclass(frozen=True)
-class Local:
+class DiscreteHamiltonian:
     """The Hamiltonian around one value function: coordinates, slopes, and how to evaluate H(u, d).
 
     Attributes:
@@ -65,7 +64,7 @@ class Local:
     slack: tuple[Any, ...] | None = None
     lost: tuple[tuple[Any, Any], ...] | None = None
 
-    def asking(self, problem: Problem) -> "Local":
+    def asking(self, problem: Problem) -> "DiscreteHamiltonian":
         """The Hamiltonian of another problem around the same value."""
         return dataclasses.replace(self, on=self.on.asking(problem))
 
@@ -119,18 +118,18 @@ class Local:
         ) / scale
 
 
-def at_rest(on: Discretisation, slopes: jax.Array) -> Local:
+def at_rest(on: Discretisation, slopes: jax.Array) -> DiscreteHamiltonian:
     """A Hamiltonian with slopes D⁺ = s_i and D⁻ = −s_i everywhere: H = L + Σ s_i |f_i| and what noise adds.
 
     With s > 0, shape (n,), its minimum is zero exactly where an action rests at no cost, if the cost is not negative.
     """
-    here = local(on, jnp.zeros(on.grid.shape, slopes.dtype))
+    hamiltonian = around(on, jnp.zeros(on.grid.shape, slopes.dtype))
     one = jnp.ones(on.grid.shape, slopes.dtype)
     ups, downs, bends = (tuple(sign * slope * one for slope in slopes) for sign in (1, -1, 2))
-    return dataclasses.replace(here, up=ups, down=downs, bends=bends)
+    return dataclasses.replace(hamiltonian, up=ups, down=downs, bends=bends)
 
 
-def local(on: Discretisation, value: jax.Array, lost: jax.Array | None = None) -> Local:
+def around(on: Discretisation, value: jax.Array, lost: jax.Array | None = None) -> DiscreteHamiltonian:
     """Coordinates and differences around ``value``, tied together so that no loop hoists tables out of itself."""
     grid = on.grid
     x, value = jax.lax.optimization_barrier((on.coordinates(), value))
@@ -141,122 +140,134 @@ def local(on: Discretisation, value: jax.Array, lost: jax.Array | None = None) -
     careful = lost is not None or grid.sides("constrained")
     slack = tuple(edges.slack(on)) if careful else None
     beside = None if lost is None else edges.beside(lost, grid)
-    return Local(on, x, value, up, down, bends, links, slack=slack, lost=beside)
+    return DiscreteHamiltonian(on, x, value, up, down, bends, links, slack=slack, lost=beside)
 
 
-def optimise(here: Local, how: Setting, isaacs: str | None = None) -> tuple[jax.Array, Action, Action]:
+def optimise(hamiltonian: DiscreteHamiltonian, isaacs: str | None = None) -> tuple[jax.Array, Action, Action]:
     """min max of H, or max min, as the problem or ``isaacs`` says: the value, the control and the disturbance."""
-    if how.disturbance.choices is None:
-        value, u = best_response(here, how.control, lambda u: (u, []))
+    players = players_of(hamiltonian.on)
+    if players.disturbance.admissible is None:
+        value, u = best_response(hamiltonian, players.control, lambda u: (u, []))
         return value, u, []
-    if how.decoupled:
-        start = _any_action(how.disturbance.choices)
-        _, u = best_response(here, how.control, lambda u: (u, start))
-        value, d = best_response(here, how.disturbance, lambda d: (u, d))
+    if players.decoupled:
+        start = _any_action(players.disturbance.admissible)
+        _, u = best_response(hamiltonian, players.control, lambda u: (u, start))
+        value, d = best_response(hamiltonian, players.disturbance, lambda d: (u, d))
         return value, u, d
-    if (isaacs or here.on.problem.isaacs) == "upper":
-        return _nested(here, how.control, how.disturbance, lambda u, d: (u, d))
-    value, d, u = _nested(here, how.disturbance, how.control, lambda d, u: (u, d))
+    if (isaacs or hamiltonian.on.problem.isaacs) == "upper":
+        return _nested(hamiltonian, players.control, players.disturbance, lambda u, d: (u, d))
+    value, d, u = _nested(hamiltonian, players.disturbance, players.control, lambda d, u: (u, d))
     return value, u, d
 
 
-def best_response(here: Local, player: Player, join: Callable, most: int = UNROLL) -> tuple[jax.Array, Action]:
+def best_response(
+    hamiltonian: DiscreteHamiltonian, player: Player, join: Callable, most: int = UNROLL
+) -> tuple[jax.Array, Action]:
     """One player's optimum against a given action of the other; ``join(mine)`` makes the pair (u, d).
 
     ``most`` is how many evaluations may be written out, where it samples.
     """
-    if player.choices is None:
-        return here.at(*join([])), []
+    if player.admissible is None:
+        return hamiltonian.at(*join([])), []
     if player.exact:
-        action = _exact(here, player, join)
+        action = _exact(hamiltonian, player, join)
     else:
-        start = _admissible(here, player, join)
+        start = _admissible(hamiltonian, player, join)
         _, action, _ = _sampled(
-            here, player, lambda action: (here.at(*join(action)), []), weight=1, most=most, start=start
+            hamiltonian, player, lambda action: (hamiltonian.at(*join(action)), []), weight=1, most=most, start=start
         )
     action = jax.lax.optimization_barrier(action)  # or the search is done twice, for the action and for the value
-    return here.at(*join(action)), action
+    return hamiltonian.at(*join(action)), action
 
 
-def _nested(here: Local, outer: Player, inner: Player, join: Callable) -> tuple[jax.Array, Action, Action]:
+def _nested(
+    hamiltonian: DiscreteHamiltonian, outer: Player, inner: Player, join: Callable
+) -> tuple[jax.Array, Action, Action]:
     def objective(action):
-        return best_response(here, inner, lambda reply: join(action, reply), most=INNER)
+        return best_response(hamiltonian, inner, lambda reply: join(action, reply), most=INNER)
 
-    if outer.choices is None:
+    if outer.admissible is None:
         value, answer = objective([])
         return value, [], answer
-    return _sampled(here, outer, objective, weight=inner.weight)
+    return _sampled(hamiltonian, outer, objective, weight=inner.weight)
 
 
-def _admissible(here: Local, player: Player, join: Callable) -> Action | None:
+def _admissible(hamiltonian: DiscreteHamiltonian, player: Player, join: Callable) -> Action | None:
     """At constrained ends an action of a sampled control that does not leave, where that can be found exactly."""
-    if here.slack is None or player.sign < 0:
+    if hamiltonian.slack is None or player.sign < 0:
         return None
-    free = altered(here.on.problem, cost=None)
-    alone = players.setting(free, here.on.grid.ndim, here.on.dtype).control
-    return _exact(here.asking(free), alone, join) if alone.exact else None
+    free = altered(hamiltonian.on.problem, cost=None)
+    alone = players_of(hamiltonian.asking(free).on).control
+    return _exact(hamiltonian.asking(free), alone, join) if alone.exact else None
 
 
 def _sampled(
-    here: Local, player: Player, objective: Callable, weight: int, most: int = UNROLL, start: Action | None = None
+    hamiltonian: DiscreteHamiltonian,
+    player: Player,
+    objective: Callable,
+    weight: int,
+    most: int = UNROLL,
+    start: Action | None = None,
 ) -> Any:
-    assert player.choices is not None
-    points = jnp.asarray(sets.samples(player.choices, SAMPLES), here.on.dtype)
+    assert player.admissible is not None
+    points = jnp.asarray(sets.samples(player.admissible, SAMPLES), hamiltonian.on.dtype)
     best = enumerate_actions(objective, points, player.sign, weight=weight, most=most)
-    if isinstance(player.choices, Finite):
+    if isinstance(player.admissible, Finite):
         return best
-    project = _projection(player.choices)
+    project = _projection(player.admissible)
     if start is not None:
         best = best_of(objective, [start], player.sign, best)
-    if here.tried is not None:
-        best = best_of(objective, [project(here.tried[0 if player.sign > 0 else 1])], player.sign, best)
-    return refine(objective, best, sets.spacing(player.choices, SAMPLES), project, player.sign, weight=weight)
+    if hamiltonian.tried is not None:
+        best = best_of(objective, [project(hamiltonian.tried[0 if player.sign > 0 else 1])], player.sign, best)
+    return refine(objective, best, sets.spacing(player.admissible, SAMPLES), project, player.sign, weight=weight)
 
 
-def _projection(choices: Box | Ball) -> Callable[[Action], Action]:
-    if isinstance(choices, Box):
-        return lambda action: [jnp.clip(u, choices.lo[j], choices.hi[j]) for j, u in enumerate(action)]
+def _projection(admissible: Box | Ball) -> Callable[[Action], Action]:
+    if isinstance(admissible, Box):
+        return lambda action: [jnp.clip(u, admissible.lo[j], admissible.hi[j]) for j, u in enumerate(action)]
 
     def onto_ball(action):
-        shrink = jnp.minimum(1, choices.radius * inverse_root(sum(u * u for u in action)))
+        shrink = jnp.minimum(1, admissible.radius * inverse_root(sum(u * u for u in action)))
         return [shrink * u for u in action]
 
     return onto_ball
 
 
-def _any_action(choices: AdmissibleSet) -> Action:
-    if isinstance(choices, Ball):
-        return [jnp.zeros(())] * choices.dim
-    first = choices.lo if isinstance(choices, Box) else choices.points[0]
-    return [first[j] for j in range(choices.dim)]
+def _any_action(admissible: AdmissibleSet) -> Action:
+    if isinstance(admissible, Ball):
+        return [jnp.zeros(())] * admissible.dim
+    first = admissible.lo if isinstance(admissible, Box) else admissible.points[0]
+    return [first[j] for j in range(admissible.dim)]
 
 
-def _exact(here: Local, player: Player, join: Callable) -> Action:
+def _exact(hamiltonian: DiscreteHamiltonian, player: Player, join: Callable) -> Action:
     """The exact optimum over a box or a ball; see ``piecewise`` for why the candidates suffice."""
-    choices = player.choices
-    assert isinstance(choices, (Box, Ball))
-    problem, dtype = here.on.problem, here.on.dtype
-    zero = [jnp.zeros((), dtype)] * choices.dim
+    admissible = player.admissible
+    assert isinstance(admissible, (Box, Ball))
+    problem, dtype = hamiltonian.on.problem, hamiltonian.on.dtype
+    zero = [jnp.zeros((), dtype)] * admissible.dim
     u, d = join(zero)
-    arguments = problem.arguments(here.x, u, d, here.on.t)
-    offsets = here.on.drift(u, d, here.x)
+    arguments = problem.arguments(hamiltonian.x, u, d, hamiltonian.on.t)
+    offsets = hamiltonian.on.drift(u, d, hamiltonian.x)
     slopes = [
         components.components(player.derivative(problem, problem.drift, j), *arguments, dtype=dtype)
-        for j in range(choices.dim)
+        for j in range(admissible.dim)
     ]
-    linear, square = zip(*(_cost_coefficients(here, player, arguments, j) for j in range(choices.dim)), strict=True)
+    linear, square = zip(
+        *(_cost_coefficients(hamiltonian, player, arguments, j) for j in range(admissible.dim)), strict=True
+    )
 
     def piece(i: int, group: Sequence[int]) -> Kinked:
         slope = [slopes[j][i] for j in group]
-        return _kinked(here, (u, d), i, offsets[i], slope[0] if len(group) == 1 else slope)
+        return _kinked(hamiltonian, (u, d), i, offsets[i], slope[0] if len(group) == 1 else slope)
 
-    if isinstance(choices, Ball):
-        single = [[piece(i, [j]) for i in player.driven[j]] for j in range(choices.dim)]
-        return kinked_ball(player.sign, choices.radius, linear, [p[0] if p else None for p in single])
+    if isinstance(admissible, Ball):
+        single = [[piece(i, [j]) for i in player.driven[j]] for j in range(admissible.dim)]
+        return kinked_ball(player.sign, admissible.radius, linear, [p[0] if p else None for p in single])
     action = list(zero)
     for group in player.groups:
         pieces = [piece(i, group) for i in shared(player.driven, group)]
-        lo, hi, slope, bend = ([each[j] for j in group] for each in (choices.lo, choices.hi, linear, square))
+        lo, hi, slope, bend = ([each[j] for j in group] for each in (admissible.lo, admissible.hi, linear, square))
         curved = any(player.curved[j] for j in group)
         if len(group) == 1:
             found = [piecewise_input(player.sign, lo[0], hi[0], slope[0], bend[0], pieces, curved=curved)]
@@ -267,30 +278,34 @@ def _exact(here: Local, player: Player, join: Callable) -> Action:
     return action
 
 
-def _cost_coefficients(here: Local, player: Player, arguments: tuple, j: int) -> tuple[Any, Any]:
+def _cost_coefficients(hamiltonian: DiscreteHamiltonian, player: Player, arguments: tuple, j: int) -> tuple[Any, Any]:
     """l_j and q_j of a cost l_j u + q_j u² + ... by differentiation at zero."""
-    cost, none = here.on.problem.cost, jnp.zeros((), here.on.dtype)
+    cost, none = hamiltonian.on.problem.cost, jnp.zeros((), hamiltonian.on.dtype)
     if cost is None:
         return none, none
-    slope = player.derivative(here.on.problem, cost, j)
-    linear = components.scalar(slope, *arguments, dtype=here.on.dtype)
+    slope = player.derivative(hamiltonian.on.problem, cost, j)
+    linear = components.scalar(slope, *arguments, dtype=hamiltonian.on.dtype)
     if not player.curved[j]:
         return linear, none
-    return linear, components.scalar(player.derivative(here.on.problem, slope, j), *arguments, dtype=here.on.dtype) / 2
+    return linear, components.scalar(
+        player.derivative(hamiltonian.on.problem, slope, j), *arguments, dtype=hamiltonian.on.dtype
+    ) / 2
 
 
-def _kinked(here: Local, base: tuple[Action, Action], axis: int, offset: Any, slope: Any) -> Kinked:
+def _kinked(
+    hamiltonian: DiscreteHamiltonian, base: tuple[Action, Action], axis: int, offset: Any, slope: Any
+) -> Kinked:
     u, d = base
-    left = correlated_noise.along_axis(here.on.diffusion(u, d, here.x), here.on.grid, axis)
-    up, down = here.up[axis], here.down[axis]
+    left = correlated_noise.along_axis(hamiltonian.on.diffusion(u, d, hamiltonian.x), hamiltonian.on.grid, axis)
+    up, down = hamiltonian.up[axis], hamiltonian.down[axis]
 
     def gain(f):
-        return here.gain(axis, f, left)
+        return hamiltonian.gain(axis, f, left)
 
-    if left is None or not (here.on.scheme.monotone and here.on.scheme.chain.central):
+    if left is None or not (hamiltonian.on.scheme.monotone and hamiltonian.on.scheme.chain.central):
         return Kinked(gain, offset, slope, (0.0,), (down, up))
-    h_up, h_down = here.links[axis].up, here.links[axis].down
-    edge = stencil.walls(here.on.grid, axis)
+    h_up, h_down = hamiltonian.links[axis].up, hamiltonian.links[axis].down
+    edge = stencil.walls(hamiltonian.on.grid, axis)
     width = jnp.maximum(left, 0)
     middle = (h_down * up + h_up * down) / (h_up + h_down)
     kinks = (jnp.where(edge, 0, -width / h_down), 0.0, jnp.where(edge, 0, width / h_up))

@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite
 from hjbjax.tracing import dependence
@@ -37,7 +38,7 @@ class Player:
       fastest_at_ends: whether no action moves the chain faster than all those at the ends of the set do.
     """
 
-    choices: AdmissibleSet | None
+    admissible: AdmissibleSet | None
     sign: int
     exact: bool
     driven: tuple[tuple[int, ...], ...]
@@ -65,15 +66,15 @@ class Player:
     @property
     def enumerated(self) -> bool:
         """Whether all of the player's actions are tried, since they are finitely many or there are none."""
-        return isinstance(self.choices, (Finite, type(None)))
+        return isinstance(self.admissible, (Finite, type(None)))
 
     @property
     def weight(self) -> int:
         """About how many evaluations of H one optimisation takes."""
-        if self.choices is None:
+        if self.admissible is None:
             return 1
-        if isinstance(self.choices, Finite):
-            return len(self.choices.points)
+        if isinstance(self.admissible, Finite):
+            return len(self.admissible.points)
         if not self.exact:
             return SAMPLES
         return sum(
@@ -82,7 +83,7 @@ class Player:
 
 
 @dataclasses.dataclass(frozen=True)
-class Setting:
+class Players:
     """Both players and how they meet.
 
     Attributes:
@@ -106,12 +107,17 @@ class Setting:
     def exact(self) -> bool:
         """Whether min (max) over the sets is exact, which certificates need."""
         first, second = (self.control, self.disturbance) if self.isaacs == "upper" else (self.disturbance, self.control)
-        if second.choices is not None and not self.decoupled:  # the reply is no polynomial of what it replies to
+        if second.admissible is not None and not self.decoupled:  # the reply is no polynomial of what it replies to
             return first.enumerated and (second.exact or second.enumerated)
         return all(player.exact or player.enumerated for player in (first, second))
 
 
-def setting(problem: Problem, n: int, dtype: Any) -> Setting:
+def players_of(on: Discretisation) -> Players:
+    """The players of a problem on its grid."""
+    return find_players(on.problem, on.grid.ndim, on.dtype)
+
+
+def find_players(problem: Problem, n: int, dtype: Any) -> Players:
     """Read from the problem's functions how the Hamiltonian depends on each player."""
     m = 0 if problem.controls is None else problem.controls.dim
     k = 0 if problem.disturbances is None else problem.disturbances.dim
@@ -129,14 +135,14 @@ def setting(problem: Problem, n: int, dtype: Any) -> Setting:
     separate = not set(drift.driven_by(inputs_u)) & set(drift.driven_by(inputs_d))
     crossed = any(function.crosses(inputs_u, inputs_d) for function in (drift, cost))
     separable = not crossed and noise.is_constant
-    return Setting(
+    return Players(
         mine, theirs, separable, separate and separable, not cost.free_of(inputs_d), not noise.is_constant,
         problem.isaacs,
     )  # fmt: skip
 
 
 def _player(
-    choices: AdmissibleSet | None,
+    admissible: AdmissibleSet | None,
     sign: int,
     inputs: range,
     drift: dependence.Dependence,
@@ -149,14 +155,16 @@ def _player(
     groups = _groups(driven)
     cells = tuple(branches ** len(shared(driven, group)) for group in groups)
     convex = drift.affine_in(inputs) and noise.free_of(inputs)  # so is the rate of leaving a node
-    at_ends = convex or isinstance(choices, (Finite, type(None)))
+    at_ends = convex or isinstance(admissible, (Finite, type(None)))
     suits = convex and cost.separable_quadratic_in(inputs)
-    if isinstance(choices, Box):
+    if isinstance(admissible, Box):
         suits &= all(count <= CELLS.get(len(group), 0) for group, count in zip(groups, cells, strict=True))
-    elif isinstance(choices, Ball):
+    elif isinstance(admissible, Ball):
         apart = all(len(group) == 1 for group in groups) and all(len(components) <= 1 for components in driven)
-        suits &= choices.dim <= 3 and not any(curved) and apart
-    return Player(choices, sign, suits and isinstance(choices, (Box, Ball)), driven, groups, cells, curved, at_ends)
+        suits &= admissible.dim <= 3 and not any(curved) and apart
+    return Player(
+        admissible, sign, suits and isinstance(admissible, (Box, Ball)), driven, groups, cells, curved, at_ends
+    )
 
 
 def _groups(driven: tuple[tuple[int, ...], ...]) -> tuple[tuple[int, ...], ...]:

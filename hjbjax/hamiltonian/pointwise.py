@@ -100,22 +100,22 @@ def at_corner(problem: Problem, rule: Rule, t: Any, x: Any, p: Any, corner: Any)
 
 def minimiser(problem: Problem, rule: Rule, t: Any, x: Any, p: Any) -> Any:
     """u*, shape (m,)."""
-    choices = problem.controls
+    admissible = problem.controls
 
     def energy(u):
         return hamiltonian(problem, t, x, p, u)
 
-    if isinstance(choices, Finite):
-        points = jnp.asarray(choices.points, p.dtype)
+    if isinstance(admissible, Finite):
+        points = jnp.asarray(admissible.points, p.dtype)
         return points[jnp.argmin(jax.vmap(energy)(points))]
     if not rule.exact:
-        return _searched(choices, energy, p.dtype)
-    assert choices is not None
-    zero = jnp.zeros(choices.dim, p.dtype)
+        return _searched(admissible, energy, p.dtype)
+    assert admissible is not None
+    zero = jnp.zeros(admissible.dim, p.dtype)
     slope, square = jax.grad(energy)(zero), jnp.diagonal(jax.hessian(energy)(zero)) / 2
-    if isinstance(choices, Box):
-        return _in_box(jnp.asarray(choices.lo, p.dtype), jnp.asarray(choices.hi, p.dtype), slope, square)
-    return _in_ball(jnp.asarray(choices.radius, p.dtype), slope, square)
+    if isinstance(admissible, Box):
+        return _in_box(jnp.asarray(admissible.lo, p.dtype), jnp.asarray(admissible.hi, p.dtype), slope, square)
+    return _in_ball(jnp.asarray(admissible.radius, p.dtype), slope, square)
 
 
 def _in_box(lo: Any, hi: Any, slope: Any, square: Any) -> Any:
@@ -150,32 +150,32 @@ def _in_ball(radius: Any, slope: Any, square: Any) -> Any:
     return jnp.where(inside, inner, bound)
 
 
-def _searched(choices: Any, energy: Any, dtype: Any) -> Any:
+def _searched(admissible: Any, energy: Any, dtype: Any) -> Any:
     """Samples, a pattern search, and Newton's method in the free inputs.
 
     The last Newton step carries the derivative of the implicit function, which the search has not.
     """
-    count = choices.dim
+    count = admissible.dim
 
     def project(action):
         u = jnp.stack(action)
-        if isinstance(choices, Ball):
-            return list(u * jnp.minimum(1, choices.radius / jnp.maximum(jnp.linalg.norm(u), 1e-300)))
-        return list(jnp.clip(u, choices.lo, choices.hi))
+        if isinstance(admissible, Ball):
+            return list(u * jnp.minimum(1, admissible.radius / jnp.maximum(jnp.linalg.norm(u), 1e-300)))
+        return list(jnp.clip(u, admissible.lo, admissible.hi))
 
     def objective(action):
         return energy(jnp.stack([jnp.asarray(entry, dtype) for entry in action])), []
 
-    best = enumerate_actions(objective, jnp.asarray(samples(choices, BUDGET), dtype), 1)
-    u = jnp.stack(refine(objective, best, spacing(choices, BUDGET), project, 1)[1])
+    best = enumerate_actions(objective, jnp.asarray(samples(admissible, BUDGET), dtype), 1)
+    u = jnp.stack(refine(objective, best, spacing(admissible, BUDGET), project, 1)[1])
     for _ in range(3):
         u = jax.lax.stop_gradient(u)
         gradient, bend = jax.grad(energy)(u), jax.hessian(energy)(u)
-        if isinstance(choices, Ball):
-            free = jnp.full(count, jnp.linalg.norm(u) < choices.radius * (1 - 1e-6))
+        if isinstance(admissible, Ball):
+            free = jnp.full(count, jnp.linalg.norm(u) < admissible.radius * (1 - 1e-6))
         else:
-            room = 1e-6 * (choices.hi - choices.lo)
-            free = (u > choices.lo + room) & (u < choices.hi - room)
+            room = 1e-6 * (admissible.hi - admissible.lo)
+            free = (u > admissible.lo + room) & (u < admissible.hi - room)
         matrix = jnp.where(free[:, None] & free[None, :], bend, jnp.eye(count, dtype=dtype))
         convex = jnp.all(jnp.linalg.eigvalsh(jax.lax.stop_gradient(matrix)) > 0)
         step = jnp.linalg.solve(matrix, jnp.where(free, gradient, 0))

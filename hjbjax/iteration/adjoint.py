@@ -18,7 +18,7 @@ import jax.numpy as jnp
 
 from hjbjax.discretisation import chain
 from hjbjax.iteration import bellman, fixed_point
-from hjbjax.iteration.bellman import Correction
+from hjbjax.iteration.bellman import PolicyEquation
 from hjbjax.iteration.evaluation import Evaluation, Krylov, direct, evaluate, left_over
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import PolicyIteration
@@ -43,10 +43,10 @@ def attach(task: Task, state: State) -> jax.Array:
     evaluation = task.method.evaluation if isinstance(task.method, PolicyIteration) else Krylov()
 
     def solver(weights):
-        return lambda _, right: refined(evaluation, Correction(right, weights), task_kept.grid)
+        return lambda _, right: refined(evaluation, PolicyEquation(right, weights), task_kept.grid)
 
     def matvec(delta):
-        return -left_over(Correction(jnp.zeros_like(delta), equation.weights), task_kept.grid, delta)
+        return -left_over(PolicyEquation(jnp.zeros_like(delta), equation.weights), task_kept.grid, delta)
 
     weights, solvers = equation.weights, _exact_solvers(equation, task_kept.grid)
     if not task_kept.grid.sides("open"):
@@ -66,16 +66,16 @@ def _with_tangent(primals: Any, tangents: Any) -> Any:
     return primals[0], tangents[1]
 
 
-def _exact_solvers(equation: Correction, grid: Grid) -> tuple[Any, Any]:
+def _exact_solvers(equation: PolicyEquation, grid: Grid) -> tuple[Any, Any]:
     """The solves of I − W and of its transpose by factorisation; rows of open ends are no jumps to be turned round."""
 
     def solve(transposed: bool) -> Any:
-        return lambda _, right: direct(Correction(right, equation.weights), grid, transposed=transposed)
+        return lambda _, right: direct(PolicyEquation(right, equation.weights), grid, transposed=transposed)
 
     return solve(False), solve(True)
 
 
-def _ties_to_constraints(task: Task, state: State) -> Correction:
+def _ties_to_constraints(task: Task, state: State) -> PolicyEquation:
     """The linear equation of the policy, in which every node whose value is a constraint's belongs to that.
 
     Where going on is worth as much both branches hold. On a plateau without discount only this one has a derivative:
@@ -83,27 +83,27 @@ def _ties_to_constraints(task: Task, state: State) -> Correction:
     """
     equation = fixed_point.equation(task, state.value, state.policy)
     free = jnp.ones(task.grid.shape, bool)
-    for constraint in (task.rules.stop, task.rules.floor):
+    for constraint in (task.obstacles.upper, task.obstacles.lower):
         if constraint is not None:
             free &= ~_same(state.value, constraint)
-    return Correction(equation.source, equation.weights.scaled(jnp.where(free, 1, 0)), equation.fastest)
+    return PolicyEquation(equation.source, equation.weights.scaled(jnp.where(free, 1, 0)), equation.fastest)
 
 
-def _residual(task: Task, state: State, equation: Correction) -> jax.Array:
+def _residual(task: Task, state: State, equation: PolicyEquation) -> jax.Array:
     """Φ at the frozen value and branches, as a function of the problem and of the grid."""
     value, policy = state.value, state.policy
-    rules = bellman.conditions(task.on)
+    obstacles = bellman.obstacles(task.on)
     u, d = list(policy.controls), list(policy.disturbances)
-    held = jax.lax.stop_gradient(task.rules.held)
+    held = jax.lax.stop_gradient(task.obstacles.fixed)
     lost = jax.lax.stop_gradient(task.lost)
-    rate = bellman.greedy(task.on, value, held, incumbent=policy, lost=lost).rate
-    pace = jax.lax.stop_gradient(chain.rates(task.on, u, d).total() + task.problem.discount)
-    phi = rate / jnp.where(pace > 0, pace, 1)
+    rate = bellman.greedy(task.on, value, held, incumbent=policy, lost=lost).defect
+    outflow = jax.lax.stop_gradient(chain.rates(task.on, u, d).total() + task.problem.discount)
+    phi = rate / jnp.where(outflow > 0, outflow, 1)
     bound = equation.weights.total() == 0  # rows of the constraints hold no weights
-    for constraint in (rules.stop, rules.floor):
+    for constraint in (obstacles.upper, obstacles.lower):
         if constraint is not None:
             phi = jnp.where(bound & _same(value, constraint), constraint - value, phi)
-    return jnp.where(held, rules.given - value, phi)
+    return jnp.where(held, obstacles.fixed_value - value, phi)
 
 
 def _same(value: jax.Array, constraint: jax.Array) -> jax.Array:
@@ -112,7 +112,7 @@ def _same(value: jax.Array, constraint: jax.Array) -> jax.Array:
     return jax.lax.stop_gradient(jnp.abs(value - constraint) <= 64 * jnp.finfo(value.dtype).eps * size)
 
 
-def refined(evaluation: Evaluation, equation: Correction, grid: Grid) -> jax.Array:
+def refined(evaluation: Evaluation, equation: PolicyEquation, grid: Grid) -> jax.Array:
     """δ by iterative refinement, to a small multiple of rounding; NaN where that is not reached.
 
     Sweeps hardly gain where little is discounted and the drift goes round in circles: there Krylov takes over.
@@ -126,7 +126,7 @@ def refined(evaluation: Evaluation, equation: Correction, grid: Grid) -> jax.Arr
         def refine(carry: Any) -> Any:
             delta, left, _, count = carry
             before = jnp.max(jnp.abs(left))
-            delta = delta + evaluate(method, Correction(left, equation.weights), grid)
+            delta = delta + evaluate(method, PolicyEquation(left, equation.weights), grid)
             return delta, left_over(equation, grid, delta), before, count + 1
 
         def unfinished(carry: Any) -> Any:

@@ -19,70 +19,71 @@ import jax.numpy as jnp
 from hjbjax.discretisation import chain, cut_cells, edges, stencil
 from hjbjax.discretisation.chain import Rates
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.hamiltonian import discrete, players
+from hjbjax.hamiltonian import discrete
+from hjbjax.hamiltonian.players import players_of
 from hjbjax.problem import sets
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 
 LEAK = 64  # units of eps of Q: a smaller rate towards a lost node is rounding
 ROUNDING = 8  # units of eps in (Q + β)|V|, below which one action is no better than another
 
 
-@node()
-class Conditions:
-    """What the value obeys beside the equation itself, at every node.
+@pytree_dataclass()
+class Obstacles:
+    """Constraints on the value beside the equation itself, at every node.
 
     Args:
-      held: bool (*grid), where the value is given.
-      given: the value there, (*grid) or a number.
-      stop: ψ at the nodes, or None.
-      floor: g at the nodes, or None.
-      ended: bool (*grid), the held nodes that are targets, where no action is taken any more.
+      fixed: bool (*grid), where the value is given.
+      fixed_value: the value there, (*grid) or a number.
+      upper: ψ at the nodes, or None.
+      lower: g at the nodes, or None.
+      ended: bool (*grid), the fixed nodes that are targets, where no action is taken any more.
       least_exit: the least exit cost on boundaries between the nodes, a number; zero if none is negative.
     """
 
-    held: Any
-    given: Any
-    stop: Any = None
-    floor: Any = None
+    fixed: Any
+    fixed_value: Any
+    upper: Any = None
+    lower: Any = None
     ended: Any = False
     least_exit: Any = 0.0
 
     def impose(self, value: jax.Array) -> jax.Array:
         """``value`` with the given values put in and the constraints respected: max(g, min(ψ, V))."""
-        if self.stop is not None:
-            value = jnp.minimum(value, self.stop)
-        if self.floor is not None:
-            value = jnp.maximum(value, self.floor)
-        return jnp.where(self.held, self.given, value)
+        if self.upper is not None:
+            value = jnp.minimum(value, self.upper)
+        if self.lower is not None:
+            value = jnp.maximum(value, self.lower)
+        return jnp.where(self.fixed, self.fixed_value, value)
 
     def acting(self, value: jax.Array) -> Any:
-        """The nodes at which actions matter, bool (*grid): not held, and no constraint is the active branch."""
-        acts = ~self.held
-        if self.stop is not None:
-            acts &= value < self.stop
-        return acts if self.floor is None else acts & (value > self.floor)
+        """The nodes at which actions matter, bool (*grid): not fixed, and no constraint is the active branch."""
+        acts = ~self.fixed
+        if self.upper is not None:
+            acts &= value < self.upper
+        return acts if self.lower is None else acts & (value > self.lower)
 
 
-@node()
+@pytree_dataclass()
 class Greedy:
-    """The greedy policy of a value function and what it leaves unsolved.
+    """The greedy policy of a value function and the defect of the equation under it.
 
     Args:
-      rate: r = min max H − β V, (*grid), cost per unit time; zero where held.
+      defect: r = min max H − β V, (*grid), cost per unit time; zero where fixed.
       controls: the m components of u, each (*grid).
       disturbances: the components of d, each (*grid).
     """
 
-    rate: jax.Array
+    defect: jax.Array
     controls: tuple[jax.Array, ...]
     disturbances: tuple[jax.Array, ...]
 
 
-@node()
-class Correction:
+@pytree_dataclass()
+class PolicyEquation:
     """The linear equation δ = source + Σ_o weights_o δ(x + o) for a correction δ of the value, in cost units.
 
-    ``fastest`` is the largest Q + β of the policy that it belongs to, per unit time, or what ``correction`` was told.
+    ``fastest`` is the largest Q + β of its policy, per unit time, or what ``policy_equation`` was told.
     """
 
     source: jax.Array
@@ -90,7 +91,7 @@ class Correction:
     fastest: Any = None
 
 
-def conditions(on: Discretisation) -> Conditions:
+def obstacles(on: Discretisation) -> Obstacles:
     """Target, stopping cost and running maximum at the nodes."""
     problem = on.problem
     exit_cost, stop, floor = (
@@ -99,7 +100,7 @@ def conditions(on: Discretisation) -> Conditions:
     )
     held = jnp.zeros(on.grid.shape, bool) if problem.target is None else cut_cells.level(on) <= 0
     given = jnp.zeros((), on.dtype) if exit_cost is None else jnp.where(held, exit_cost, 0)
-    return Conditions(held, given, stop, floor, ended=held)
+    return Obstacles(held, given, stop, floor, ended=held)
 
 
 def greedy(
@@ -114,8 +115,7 @@ def greedy(
 
     To the nodes that are ``lost``, bool (*grid), no drift leads that is only rounding.
     """
-    how = players.setting(on.problem, on.grid.ndim, on.dtype)
-    return _left_over(on, value, held, *discrete.optimise(_around(on, value, incumbent, lost), how))
+    return _left_over(on, value, held, *discrete.optimise(_around(on, value, incumbent, lost)))
 
 
 def kept(on: Discretisation, value: jax.Array, fixed: jax.Array, new: Greedy, old: Greedy) -> Greedy:
@@ -124,34 +124,34 @@ def kept(on: Discretisation, value: jax.Array, fixed: jax.Array, new: Greedy, ol
     From a policy that ends, one improvement after the other then keeps it so: among actions that are worth the same
     the first one found leads to where its value came from, and another one may go round. There is no disturbance.
     """
-    here, u, discount = _around(on, value, None), list(old.controls), on.problem.discount
+    hamiltonian, u, discount = _around(on, value, None), list(old.controls), on.problem.discount
     rates = chain.rates(on, u, [])
     rounding = ROUNDING * jnp.finfo(on.dtype).eps * (rates.total() + discount) * jnp.abs(value)
-    rate = here.at(u, []) - discount * value
-    stays = ~fixed & (rate <= new.rate + rounding)
+    rate = hamiltonian.at(u, []) - discount * value
+    stays = ~fixed & (rate <= new.defect + rounding)
     controls = (jnp.where(stays, before, after) for before, after in zip(old.controls, new.controls, strict=True))
-    return Greedy(jnp.where(stays, rate, new.rate), tuple(controls), ())
+    return Greedy(jnp.where(stays, rate, new.defect), tuple(controls), ())
 
 
 def respond(
     on: Discretisation, value: jax.Array, held: jax.Array, current: Greedy, *, lost: jax.Array | None = None
 ) -> Greedy:
     """The inner player's best answer to the outer player's current policy, in a game."""
-    how = players.setting(on.problem, on.grid.ndim, on.dtype)
-    here = _around(on, value, current, lost)
+    players = players_of(on)
+    hamiltonian = _around(on, value, current, lost)
     u, d = list(current.controls), list(current.disturbances)
     if on.problem.isaacs == "upper":
-        best, d = discrete.best_response(here, how.disturbance, lambda d: (u, d))
+        best, d = discrete.best_response(hamiltonian, players.disturbance, lambda d: (u, d))
     else:
-        best, u = discrete.best_response(here, how.control, lambda u: (u, d))
+        best, u = discrete.best_response(hamiltonian, players.control, lambda u: (u, d))
     return _left_over(on, value, held, best, u, d)
 
 
-def _around(on: Discretisation, value: Any, policy: Greedy | None, lost: Any = None) -> discrete.Local:
-    here = discrete.local(on, value, lost)
+def _around(on: Discretisation, value: Any, policy: Greedy | None, lost: Any = None) -> discrete.DiscreteHamiltonian:
+    hamiltonian = discrete.around(on, value, lost)
     if policy is None:
-        return here
-    return dataclasses.replace(here, tried=(list(policy.controls), list(policy.disturbances)))
+        return hamiltonian
+    return dataclasses.replace(hamiltonian, tried=(list(policy.controls), list(policy.disturbances)))
 
 
 def _left_over(on: Discretisation, value: Any, held: Any, best: Any, u: list, d: list) -> Greedy:
@@ -160,9 +160,9 @@ def _left_over(on: Discretisation, value: Any, held: Any, best: Any, u: list, d:
     return Greedy(rate, *full)
 
 
-def correction(
-    on: Discretisation, value: jax.Array, policy: Greedy, rules: Conditions, *, fastest: Any = None
-) -> Correction:
+def policy_equation(
+    on: Discretisation, value: jax.Array, policy: Greedy, obstacles: Obstacles, *, fastest: Any = None
+) -> PolicyEquation:
     """The linear equation for δ under one policy; the active branch of the constraints is chosen node by node.
 
     ``fastest``, where it is known of the same policy and time, spares a pass over the nodes. Zero spares it, too: then
@@ -173,21 +173,21 @@ def correction(
     leaving = rates.total() + on.problem.discount
     fastest = jnp.max(leaving) if fastest is None else fastest
     moves = leaving > 8 * jnp.finfo(value.dtype).eps * fastest  # a drift that cancels leaves rounding
-    pace = jnp.where(moves, leaving, jnp.where(fastest > 0, fastest, 1))  # where nothing moves the cost piles up
-    source, free = policy.rate / pace, ~rules.held
-    if rules.stop is not None:
-        stops = free & (rules.stop - value < source)
-        source, free = jnp.where(stops, rules.stop - value, source), free & ~stops
-    if rules.floor is not None:
-        floored = ~rules.held & (rules.floor - value > source)
-        source, free = jnp.where(floored, rules.floor - value, source), free & ~floored
-    weights = rates.scaled(jnp.where(free, 1 / pace, 0))
+    outflow = jnp.where(moves, leaving, jnp.where(fastest > 0, fastest, 1))  # where nothing moves the cost piles up
+    source, free = policy.defect / outflow, ~obstacles.fixed
+    if obstacles.upper is not None:
+        stops = free & (obstacles.upper - value < source)
+        source, free = jnp.where(stops, obstacles.upper - value, source), free & ~stops
+    if obstacles.lower is not None:
+        floored = ~obstacles.fixed & (obstacles.lower - value > source)
+        source, free = jnp.where(floored, obstacles.lower - value, source), free & ~floored
+    weights = rates.scaled(jnp.where(free, 1 / outflow, 0))
     if on.scheme.subcell:  # what leads to a held node ends on the target's boundary, where nothing is to be corrected
-        loose = ~rules.held
+        loose = ~obstacles.fixed
         jumps = zip(weights.offsets, weights.values, strict=True)
         cut = tuple(jnp.where(stencil.neighbour(loose, on.grid, offset), w, 0) for offset, w in jumps)
         weights = dataclasses.replace(weights, values=cut)
-    return Correction(source, weights, fastest)
+    return PolicyEquation(source, weights, fastest)
 
 
 def leaks(on: Discretisation, policy: Greedy, held: jax.Array, lost: jax.Array) -> jax.Array:

@@ -24,8 +24,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.iteration.bellman import Conditions, Correction, Greedy
-from hjbjax.problem.pytree import is_traced, node
+from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
+from hjbjax.problem.pytree import is_traced, pytree_dataclass
 
 LOST = 4  # roundings of numbers of the size lift · max(factor, 1) in factor · V + shift
 
@@ -41,9 +41,9 @@ class Certificate(enum.Enum):
     NONE = "without discount and positive running cost the residual bounds nothing"
 
 
-@node()
-class Gap:
-    """How far the bounds are from the value.
+@pytree_dataclass()
+class ErrorBound:
+    """Bounds on V_h − V, and how far they are from V.
 
     Args:
       below, above: what bounds V_h: V + shift where additive, (V + lift) · factor − lift where multiplicative.
@@ -60,18 +60,18 @@ class Gap:
     residual: jax.Array
 
 
-def gap(
+def error_bound(
     kind: Certificate,
     value: jax.Array,
     policy: Greedy,
-    equation: Correction,
-    rules: Conditions,
+    equation: PolicyEquation,
+    obstacles: Obstacles,
     *,
     discount: Any,
     least_cost: Any,
     counted: Any,
     moved: Any,
-) -> Gap:
+) -> ErrorBound:
     """The certificate of ``value``.
 
     Args:
@@ -86,66 +86,69 @@ def gap(
       moved: the size of the last correction, the fallback measure.
     """
     residual = jnp.max(jnp.where(counted, jnp.abs(equation.source), 0))
-    free = counted & ~rules.held
+    free = counted & ~obstacles.fixed
     zero = jnp.zeros_like(residual)
     if kind is Certificate.BY_DISCOUNT:
         other = Certificate.NONE if least_cost is None else Certificate.MULTIPLICATIVE
         known = {"least_cost": least_cost, "counted": counted, "moved": moved}
         rate = jnp.where(discount > 0, discount, 1)
         with_it, without = (
-            gap(each, value, policy, equation, rules, discount=rate, **known) for each in (Certificate.ADDITIVE, other)
+            error_bound(each, value, policy, equation, obstacles, discount=rate, **known)
+            for each in (Certificate.ADDITIVE, other)
         )
         if other is Certificate.NONE:  # bounds that say nothing
-            without = Gap(zero, zero + jnp.inf, zero + jnp.inf, without.error, residual)
+            without = ErrorBound(zero, zero + jnp.inf, zero + jnp.inf, without.error, residual)
         return jax.tree.map(lambda mine, theirs: jnp.where(discount > 0, mine, theirs), with_it, without)
     if kind is Certificate.ADDITIVE:
-        if rules.stop is None and rules.floor is None:
-            below, above = jnp.min(policy.rate) / discount, jnp.max(policy.rate) / discount
+        if obstacles.upper is None and obstacles.lower is None:
+            below, above = jnp.min(policy.defect) / discount, jnp.max(policy.defect) / discount
         else:
-            shift = policy.rate / discount
-            if rules.stop is not None:
-                shift = jnp.minimum(shift, rules.stop - value)
-            if rules.floor is not None:
-                shift = jnp.maximum(shift, rules.floor - value)
-            shift = jnp.where(rules.held, 0, shift)
+            shift = policy.defect / discount
+            if obstacles.upper is not None:
+                shift = jnp.minimum(shift, obstacles.upper - value)
+            if obstacles.lower is not None:
+                shift = jnp.maximum(shift, obstacles.lower - value)
+            shift = jnp.where(obstacles.fixed, 0, shift)
             below, above = jnp.min(shift), jnp.max(shift)
-        return Gap(below, above, zero, jnp.maximum(jnp.abs(below), jnp.abs(above)), residual)
+        return ErrorBound(below, above, zero, jnp.maximum(jnp.abs(below), jnp.abs(above)), residual)
     if kind is Certificate.MULTIPLICATIVE:
         safe = jnp.where(free & (least_cost > 0), least_cost, 1)
-        relative = jnp.where(free, jnp.where(least_cost > 0, policy.rate / safe, jnp.sign(policy.rate) * jnp.inf), 0)
-        rising = relative if rules.stop is None else jnp.where(value < rules.stop, relative, 0)
+        relative = jnp.where(
+            free, jnp.where(least_cost > 0, policy.defect / safe, jnp.sign(policy.defect) * jnp.inf), 0
+        )
+        rising = relative if obstacles.upper is None else jnp.where(value < obstacles.upper, relative, 0)
         rho, eta = jnp.maximum(jnp.max(rising), 0), jnp.maximum(jnp.max(-relative), 0)
         priced = jnp.all(~free | (least_cost > 0))
         sound = priced & (1 - rho > jnp.sqrt(jnp.finfo(rho.dtype).eps))  # a V flat somewhere has r = L up to rounding
         below, above = 1 / (1 + eta), jnp.where(sound, 1 / jnp.where(sound, 1 - rho, 1), jnp.inf)
-        lift = jnp.maximum(-lowest_end(rules, counted), 0)
+        lift = jnp.maximum(-lowest_end(obstacles, counted), 0)
         lifted = jnp.where(counted, value + lift, 0)
         apart = jnp.where(jnp.isinf(above), 0, jnp.maximum(above - 1, 1 - below))  # no 0 · inf
         error = jnp.where(jnp.isinf(above), jnp.inf, jnp.max(lifted) * apart)
         error = jnp.where(jnp.all(lifted >= 0), error, jnp.inf) + 0 * residual  # a NaN stays one
-        return Gap(below, above, jnp.where(priced, lift, jnp.inf), error, residual)
-    return Gap(zero, zero, zero, jnp.maximum(residual, moved), residual)
+        return ErrorBound(below, above, jnp.where(priced, lift, jnp.inf), error, residual)
+    return ErrorBound(zero, zero, zero, jnp.maximum(residual, moved), residual)
 
 
-def lowest_end(rules: Conditions, counted: Any) -> jax.Array:
+def lowest_end(obstacles: Obstacles, counted: Any) -> jax.Array:
     """The least of zero and of what may be paid at the end of a run: exit costs, between nodes as well, and ψ."""
-    lowest = jnp.minimum(jnp.min(jnp.where(counted & rules.held, rules.given, 0)), rules.least_exit)
-    return lowest if rules.stop is None else jnp.minimum(lowest, jnp.min(jnp.where(counted, rules.stop, 0)))
+    lowest = jnp.minimum(jnp.min(jnp.where(counted & obstacles.fixed, obstacles.fixed_value, 0)), obstacles.least_exit)
+    return lowest if obstacles.upper is None else jnp.minimum(lowest, jnp.min(jnp.where(counted, obstacles.upper, 0)))
 
 
-def enclosure(kind: Certificate, measured: Gap, discount: Any = None) -> Any:
+def enclosure(kind: Certificate, bound: ErrorBound, discount: Any = None) -> Any:
     """Both bounds as affine functions of V: rows lower and upper, columns factor and shift, shape (2, 2).
 
     (V + lift) · factor − lift cancels where V is near −lift, as on a target with a negative exit cost; the shift is
     rounded outwards by what that costs. ``None`` without a certificate.
     """
     if kind is Certificate.BY_DISCOUNT:
-        with_it, without = (enclosure(each, measured) for each in (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE))
+        with_it, without = (enclosure(each, bound) for each in (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE))
         return jnp.where(discount > 0, with_it, without)
     if kind not in (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE):
         return None
-    xp: Any = jnp if is_traced(measured) else np
-    below, above, lift = (xp.asarray(number) for number in (measured.below, measured.above, measured.lift))
+    xp: Any = jnp if is_traced(bound) else np
+    below, above, lift = (xp.asarray(number) for number in (bound.below, bound.above, bound.lift))
 
     def line(side: Any, outwards: int) -> Any:
         one = xp.ones_like(side)

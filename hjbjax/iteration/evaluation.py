@@ -38,11 +38,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation import stencil
-from hjbjax.iteration import wavefront
-from hjbjax.iteration.bellman import Correction
+from hjbjax.iteration import gauss_seidel
+from hjbjax.iteration.bellman import PolicyEquation
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 
 OPEN_FRACTION = 1e-8  # of the residual, to which a Krylov method goes with open ends
 
@@ -66,14 +66,14 @@ class Evaluation(Protocol):
     def calls_back(self) -> bool:
         """Whether it runs Python on the host in the middle of a compiled program."""
 
-    def solve(self, equation: Correction, grid: Grid) -> jax.Array:
+    def solve(self, equation: PolicyEquation, grid: Grid) -> jax.Array:
         """δ with δ = s + Σ_o w_o δ(x + o), roughly or not, (*grid), in the type of the equation."""
 
     def bytes_per_node(self, weights: int, word: int) -> int:
         """The memory that it takes a node for ``weights`` jumps of ``word`` bytes each, its input included."""
 
 
-@node(static=("count",))
+@pytree_dataclass(static=("count",))
 class Sweeps:
     """Rough evaluation by Gauss–Seidel: in every order ``count`` times a forward and a backward sweep.
 
@@ -87,17 +87,17 @@ class Sweeps:
     def __post_init__(self):
         arguments.count(self.count, "Sweeps: count")
 
-    def solve(self, equation: Correction, grid: Grid) -> jax.Array:
+    def solve(self, equation: PolicyEquation, grid: Grid) -> jax.Array:
         """Rounds of Gauss–Seidel in single precision."""
         single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), equation)
-        return gauss_seidel(single, grid, self.count).astype(equation.source.dtype)
+        return relaxed(single, grid, self.count).astype(equation.source.dtype)
 
     def bytes_per_node(self, weights: int, word: int) -> int:
         """Weights and source twice in single precision, as they are and sheared."""
         return 4 * (2 * weights + 2) + 2 * word
 
 
-@node(static=("max_steps",))
+@pytree_dataclass(static=("max_steps",))
 class Krylov:
     """Evaluation by BiCGStab, preconditioned by one round of Gauss–Seidel, to a fraction of the residual.
 
@@ -114,14 +114,14 @@ class Krylov:
         arguments.positive(self.fraction, "Krylov: fraction", most=1)
         arguments.count(self.max_steps, "Krylov: max_steps")
 
-    def solve(self, equation: Correction, grid: Grid) -> jax.Array:
+    def solve(self, equation: PolicyEquation, grid: Grid) -> jax.Array:
         """BiCGStab on (I − W) δ = s with one Gauss–Seidel round as preconditioner."""
 
         def matvec(delta):
-            return -left_over(Correction(jnp.zeros_like(delta), equation.weights), grid, delta)
+            return -left_over(PolicyEquation(jnp.zeros_like(delta), equation.weights), grid, delta)
 
         def precondition(residual):
-            return gauss_seidel(Correction(residual, equation.weights), grid, 1)
+            return relaxed(PolicyEquation(residual, equation.weights), grid, 1)
 
         fraction = self.fraction
         if grid.sides("open"):  # at 1e-3 the errors of the solves led a step in time to another solution
@@ -136,13 +136,13 @@ class Krylov:
         return word * (2 * weights + 12)
 
 
-@node()
+@pytree_dataclass()
 class Direct:
     """Exact evaluation by a sparse LU factorisation (SciPy's SuperLU, on the host): small grids and oracles."""
 
     rough, open_ends, calls_back = False, True, True
 
-    def solve(self, equation: Correction, grid: Grid) -> jax.Array:
+    def solve(self, equation: PolicyEquation, grid: Grid) -> jax.Array:
         """By factorisation."""
         return direct(equation, grid)
 
@@ -167,7 +167,7 @@ def check_evaluation(evaluation: Any, name: str) -> None:
         )
 
 
-def evaluate(method: Evaluation, equation: Correction, grid: Grid) -> jax.Array:
+def evaluate(method: Evaluation, equation: PolicyEquation, grid: Grid) -> jax.Array:
     """An approximate solution δ, shape (*grid), in the dtype of the equation."""
     if grid.sides("open") and not method.open_ends:
         raise ValueError(
@@ -179,10 +179,10 @@ def evaluate(method: Evaluation, equation: Correction, grid: Grid) -> jax.Array:
         return delta
     size, left = jnp.max(jnp.abs(equation.source)), jnp.max(jnp.abs(left_over(equation, grid, delta)))
     # an improper policy has no value, and BiCGStab may break down: then relax, which always makes sense
-    return jax.lax.cond(left <= size, lambda: delta, lambda: gauss_seidel(equation, grid, 2))
+    return jax.lax.cond(left <= size, lambda: delta, lambda: relaxed(equation, grid, 2))
 
 
-def left_over(equation: Correction, grid: Grid, delta: jax.Array) -> jax.Array:
+def left_over(equation: PolicyEquation, grid: Grid, delta: jax.Array) -> jax.Array:
     """s + Σ_o w_o δ(x + o) − δ: what a correction leaves."""
     jumps = zip(equation.weights.offsets, equation.weights.values, strict=True)
     if grid.sides("open"):
@@ -192,7 +192,7 @@ def left_over(equation: Correction, grid: Grid, delta: jax.Array) -> jax.Array:
     return sum(terms, start=equation.source - delta)
 
 
-def jacobi(equation: Correction, grid: Grid, sweeps: int) -> jax.Array:
+def jacobi(equation: PolicyEquation, grid: Grid, sweeps: int) -> jax.Array:
     """Damped Jacobi sweeps, ½(I + T): the star stencil alone has an eigenvalue near −1."""
 
     def sweep(_, delta):
@@ -201,7 +201,7 @@ def jacobi(equation: Correction, grid: Grid, sweeps: int) -> jax.Array:
     return jax.lax.fori_loop(0, sweeps, sweep, jnp.zeros_like(equation.source))
 
 
-def gauss_seidel(equation: Correction, grid: Grid, rounds: int) -> jax.Array:
+def relaxed(equation: PolicyEquation, grid: Grid, rounds: int) -> jax.Array:
     """Rounds of wavefront Gauss–Seidel from zero; damped Jacobi where diagonal jumps break the wavefront.
 
     At open ends the correction is continued as a constant: of an equation with a parabola beyond them this is a
@@ -210,10 +210,10 @@ def gauss_seidel(equation: Correction, grid: Grid, rounds: int) -> jax.Array:
     equation = _walled(equation, grid)
     if any(sum(map(abs, offset)) > 1 for offset in equation.weights.offsets):
         return jacobi(equation, grid, 4 * rounds * 2**grid.ndim)
-    return wavefront.gauss_seidel(equation, grid, rounds)
+    return gauss_seidel.sweep(equation, grid, rounds)
 
 
-def _walled(equation: Correction, grid: Grid) -> Correction:
+def _walled(equation: PolicyEquation, grid: Grid) -> PolicyEquation:
     """The equation without weights that lead out of open ends, whose share is the node's own."""
     if not grid.sides("open"):
         return equation
@@ -227,10 +227,10 @@ def _walled(equation: Correction, grid: Grid) -> Correction:
         outside = outside + jnp.where(leaves, w, 0)
     scale = 1 / jnp.where(outside < 1, 1 - outside, 1)
     weights = dataclasses.replace(equation.weights, values=tuple(scale * w for w in inside))
-    return Correction(scale * equation.source, weights)
+    return PolicyEquation(scale * equation.source, weights)
 
 
-def direct(equation: Correction, grid: Grid, *, transposed: bool = False) -> jax.Array:
+def direct(equation: PolicyEquation, grid: Grid, *, transposed: bool = False) -> jax.Array:
     """(I − W)⁻¹ s, or its transpose times s, by SuperLU through a host callback; a batch goes lane after lane.
 
     Numbers travel as 32-bit words: the callback's thread does not know of ``jax.enable_x64``.

@@ -19,15 +19,15 @@ import numpy as np
 
 from hjbjax.discretisation import chain
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
-from hjbjax.hamiltonian import players
+from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import bellman, certificates
-from hjbjax.iteration.bellman import Conditions, Correction, Greedy
-from hjbjax.iteration.certificates import Certificate, Gap
+from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
+from hjbjax.iteration.certificates import Certificate, ErrorBound
 from hjbjax.iteration.evaluation import evaluate
 from hjbjax.iteration.methods import Method, PolicyIteration, ValueIteration
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import altered, is_traced, node
+from hjbjax.problem.pytree import altered, is_traced, pytree_dataclass
 from hjbjax.solution.status import Status
 
 FULL_STEPS = 10  # corrections of a limited scheme before they are halved, which ends limit cycles of the limiter
@@ -41,7 +41,7 @@ PATIENCE = 10  # steps without progress of a residual that is rounding
 ROUNDING = 64  # residuals below this many units in the last place of max|V| are rounding
 
 
-@node(static=("certificate", "has_lost"))
+@pytree_dataclass(static=("certificate", "has_lost"))
 class Task:
     """All that stays the same during a solve.
 
@@ -60,10 +60,10 @@ class Task:
 
     on: Discretisation
     method: Method
-    rules: Conditions
+    obstacles: Obstacles
     counted: jax.Array
     least_cost: jax.Array | None
-    pace: jax.Array | None
+    outflow: jax.Array | None
     tol: Any
     certificate: Certificate
     crossing: Any = None
@@ -100,7 +100,7 @@ class Task:
 
     def impose(self, value: jax.Array) -> jax.Array:
         """``value`` with what is given put in, and with nodes that are lost far above all others."""
-        value = self.rules.impose(value)
+        value = self.obstacles.impose(value)
         if not self.has_lost:
             return value
         largest = jnp.max(jnp.where(self.counted, jnp.abs(value), 0))
@@ -111,12 +111,12 @@ class Task:
         zero = jnp.zeros(self.grid.shape, self.tol.dtype)
         if not self.constrained or self.certificate is Certificate.ADDITIVE:
             return zero
-        floor, stop = self.rules.floor, self.rules.stop
+        floor, stop = self.obstacles.lower, self.obstacles.upper
         start = floor if stop is None else stop if floor is None else jnp.maximum(floor, stop)
         return jnp.asarray(jnp.broadcast_to(start, self.grid.shape), self.tol.dtype)
 
 
-@node()
+@pytree_dataclass()
 class State:
     """Where the iteration stands: a value, its greedy policy, its certificate, and the loop's book-keeping.
 
@@ -127,7 +127,7 @@ class State:
     value: jax.Array
     policy: Greedy
     fastest: jax.Array
-    gap: Gap
+    bound: ErrorBound
     step: jax.Array
     best: jax.Array
     since_best: jax.Array
@@ -144,14 +144,16 @@ def begin(task: Task, guess: Any) -> State:
     xp: Any = jnp if traced else np
     value = jnp.array(guess) if traced else jax.device_put(guess, may_alias=False)
     dtype, shape = guess.dtype, task.grid.shape
-    inputs = [0 if choices is None else choices.dim for choices in (task.problem.controls, task.problem.disturbances)]
+    inputs = [
+        0 if admissible is None else admissible.dim for admissible in (task.problem.controls, task.problem.disturbances)
+    ]
     policy = Greedy(xp.zeros(shape, dtype), *(tuple(xp.zeros(shape, dtype) for _ in range(m)) for m in inputs))
     infinite = xp.asarray(xp.inf, dtype)
-    gap = Gap(-infinite, infinite, xp.zeros((), dtype), infinite, infinite)
+    bound = ErrorBound(-infinite, infinite, xp.zeros((), dtype), infinite, infinite)
     counter = xp.zeros((), xp.int32)
     code = xp.asarray(int(Status.RUNNING), xp.int32)
     history = xp.full(HISTORY, -1, dtype)  # no NaN, which jax_debug_nans would take for a fault
-    return State(value, policy, infinite, gap, counter - 1, xp.stack([infinite] * 2), counter, code, history)
+    return State(value, policy, infinite, bound, counter - 1, xp.stack([infinite] * 2), counter, code, history)
 
 
 def run(task: Task, state: State, until: Any) -> State:
@@ -181,14 +183,14 @@ def advance(task: Task, state: State, start: Any) -> State:
     moved = jnp.max(jnp.abs(jnp.where(task.counted, value - state.value, 0)))
     if task.certificate is Certificate.OPEN and not isinstance(task.method, ValueIteration):
         moved = moved * _held_back(task, state)
-    policy, fastest, measured = _look(task, value, state.policy, moved=moved, first=state.step < 0)
-    measured = dataclasses.replace(measured, error=jnp.where(_unmeasured(task, state), jnp.inf, measured.error))
-    measures = jnp.stack([measured.error, measured.residual])
+    policy, fastest, bound = _look(task, value, state.policy, moved=moved, first=state.step < 0)
+    bound = dataclasses.replace(bound, error=jnp.where(_unmeasured(task, state), jnp.inf, bound.error))
+    measures = jnp.stack([bound.error, bound.residual])
     since = jnp.where(jnp.any(measures < state.best), 0, state.since_best + 1)
-    code = _judge(task, value, measured, state.best, since)
-    history = state.history.at[state.step - start].set(measured.residual)
+    code = _judge(task, value, bound, state.best, since)
+    history = state.history.at[state.step - start].set(bound.residual)
     best = jnp.fmin(state.best, measures)
-    new = State(value, policy, fastest, measured, state.step + 1, best, since, code, history)
+    new = State(value, policy, fastest, bound, state.step + 1, best, since, code, history)
     old = dataclasses.replace(state, step=new.step, since_best=since, code=code, history=history)
     return jax.tree.map(lambda after, before: jnp.where(code == Status.NONFINITE, before, after), new, old)
 
@@ -199,7 +201,7 @@ def broken(task: Task, state: State) -> jax.Array:
     stay = jnp.zeros_like(state.value)
     delta = jax.lax.cond(state.step < 0, lambda: stay, lambda: _correct(task, state))
     value = task.impose(state.value + delta)
-    rate = bellman.greedy(task.on, value, task.rules.held, lost=task.lost).rate
+    rate = bellman.greedy(task.on, value, task.obstacles.fixed, lost=task.lost).defect
     return task.counted & ~(jnp.isfinite(value) & jnp.isfinite(rate))
 
 
@@ -214,9 +216,9 @@ def _shift(task: Task, state: State) -> Any:
     Each correction is then an implicit step in time of length 1/κ. The equation with open ends has several solutions,
     of which the stable one is wanted, and policies that leave may be worth no finite value.
     """
-    assert task.pace is not None
+    assert task.outflow is not None
     dying = jnp.asarray(SHIFT, state.value.dtype) ** -jnp.maximum(state.step, 0)
-    return jnp.where(state.step < SHIFTS, jnp.max(task.pace) * dying, 0)
+    return jnp.where(state.step < SHIFTS, jnp.max(task.outflow) * dying, 0)
 
 
 def _held_back(task: Task, state: State) -> Any:
@@ -228,33 +230,33 @@ def _held_back(task: Task, state: State) -> Any:
 
 def _look(
     task: Task, value: jax.Array, incumbent: Greedy, *, moved: jax.Array, first: jax.Array
-) -> tuple[Greedy, jax.Array, Gap]:
+) -> tuple[Greedy, jax.Array, ErrorBound]:
     problem = task.problem
-    policy = bellman.greedy(task.on, value, task.rules.held, incumbent=incumbent, lost=task.lost)
+    policy = bellman.greedy(task.on, value, task.obstacles.fixed, incumbent=incumbent, lost=task.lost)
     if problem.stopping_cost is not None and not problem.is_game and task.certificate in TO_THE_END:
-        fixed = task.rules.held | first  # nobody has chosen the actions before the first look
+        fixed = task.obstacles.fixed | first  # nobody has chosen the actions before the first look
         policy = bellman.kept(task.on, value, fixed, policy, incumbent)
     left = equation(task, value, policy)
-    measured = certificates.gap(
+    bound = certificates.error_bound(
         task.certificate,
         value,
         policy,
         left,
-        task.rules,
+        task.obstacles,
         discount=problem.discount,
         least_cost=task.least_cost,
         counted=task.counted,
         moved=moved,
     )
     if task.has_lost:
-        leaks = bellman.leaks(task.on, policy, task.rules.held, ~task.counted)
-        measured = dataclasses.replace(measured, error=jnp.where(leaks, jnp.inf, measured.error))
-    return policy, left.fastest, measured
+        leaks = bellman.leaks(task.on, policy, task.obstacles.fixed, ~task.counted)
+        bound = dataclasses.replace(bound, error=jnp.where(leaks, jnp.inf, bound.error))
+    return policy, left.fastest, bound
 
 
-def _judge(task: Task, value: jax.Array, measured: Gap, best: jax.Array, since: jax.Array) -> jax.Array:
-    finite = jnp.isfinite(measured.residual)
-    matters = (since >= PATIENCE) | (measured.residual > GROWTH * best[1])  # else it changes no answer below
+def _judge(task: Task, value: jax.Array, bound: ErrorBound, best: jax.Array, since: jax.Array) -> jax.Array:
+    finite = jnp.isfinite(bound.residual)
+    matters = (since >= PATIENCE) | (bound.residual > GROWTH * best[1])  # else it changes no answer below
     climbs = task.constrained or isinstance(task.method, ValueIteration)
     to_the_end = climbs and task.certificate in (*TO_THE_END, Certificate.OPEN)
     size = jax.lax.cond(
@@ -267,25 +269,25 @@ def _judge(task: Task, value: jax.Array, measured: Gap, best: jax.Array, since: 
     if to_the_end:  # a front moves V by a spacing times its slope a step, whatever the tolerance, past every node
         tol = jnp.where(task.problem.discount > 0, tol, rounding)
         longest = max(longest, 100 + 4 * task.grid.size)
-    patience = jnp.where(measured.residual <= rounding, PATIENCE, longest)
+    patience = jnp.where(bound.residual <= rounding, PATIENCE, longest)
     code = jnp.where(since >= patience, Status.STALLED, Status.RUNNING)
-    grew = measured.residual > GROWTH * jnp.maximum(best[1], rounding)
-    bounded = jnp.isfinite(best[0]) & (measured.error <= GROWTH * best[0])
+    grew = bound.residual > GROWTH * jnp.maximum(best[1], rounding)
+    bounded = jnp.isfinite(best[0]) & (bound.error <= GROWTH * best[0])
     grew &= ~bounded  # a better policy may leave more than one that stops at once
     code = jnp.where(grew, Status.DIVERGED, code)
-    code = jnp.where(measured.error <= tol, Status.CONVERGED, code)
+    code = jnp.where(bound.error <= tol, Status.CONVERGED, code)
     return jnp.where(finite, code, Status.NONFINITE).astype(jnp.int32)
 
 
 def _correct(task: Task, state: State) -> jax.Array:
     if isinstance(task.method, ValueIteration):
-        return state.policy.rate / _pace(task, state)
-    if task.pace is None or task.certificate is Certificate.OPEN:
+        return state.policy.defect / _outflow(task, state)
+    if task.outflow is None or task.certificate is Certificate.OPEN:
         return _evaluated(task, state)
     return jax.lax.cond(  # a tube whose discount is traced: without one its policies have no value of their own
         jnp.asarray(task.problem.discount > 0),
         lambda: _evaluated(task, state),
-        lambda: state.policy.rate / _pace(task, state),
+        lambda: state.policy.defect / _outflow(task, state),
     )
 
 
@@ -302,29 +304,29 @@ def _evaluated(task: Task, state: State) -> jax.Array:
     return evaluate(task.method.evaluation, left, task.grid)
 
 
-def _pace(task: Task, state: State) -> jax.Array:
+def _outflow(task: Task, state: State) -> jax.Array:
     """Q + β for value iteration: of the fastest action, which the policy shows where it is not known beforehand."""
-    assert task.pace is not None
-    how = players.setting(task.problem, task.grid.ndim, state.value.dtype)
-    if how.control.fastest_at_ends and how.disturbance.fastest_at_ends:
-        return task.pace
+    assert task.outflow is not None
+    players = players_of(task.on)
+    if players.control.fastest_at_ends and players.disturbance.fastest_at_ends:
+        return task.outflow
     u, d = list(state.policy.controls), list(state.policy.disturbances)
     chosen = chain.rates(task.on, u, d).total()
-    return jnp.maximum(task.pace, chosen + task.problem.discount)
+    return jnp.maximum(task.outflow, chosen + task.problem.discount)
 
 
-def equation(task: Task, value: jax.Array, policy: Greedy, fastest: Any = None) -> Correction:
+def equation(task: Task, value: jax.Array, policy: Greedy, fastest: Any = None) -> PolicyEquation:
     """The linear equation of a policy; ``fastest``, its largest Q + β, spares a pass where it is known and wanted."""
     if task.certificate is Certificate.ADDITIVE:  # no rate is only rounding: there is a discount
         fastest = jnp.zeros((), value.dtype)
-    return bellman.correction(task.on, value, policy, task.rules, fastest=fastest)
+    return bellman.policy_equation(task.on, value, policy, task.obstacles, fastest=fastest)
 
 
 def _hoffman_karp(task: Task, state: State) -> jax.Array:
     """The inner player's problem against the outer player's frozen policy, to a tenth of the outer residual."""
     assert isinstance(task.method, PolicyIteration)
-    evaluation, replies, held = task.method.evaluation, task.method.replies, task.rules.held
-    target = 0.1 * state.gap.residual
+    evaluation, replies, held = task.method.evaluation, task.method.replies, task.obstacles.fixed
+    target = 0.1 * state.bound.residual
 
     def reply(carry):
         value, policy, _, count = carry

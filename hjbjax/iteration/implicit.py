@@ -17,16 +17,16 @@ import jax.numpy as jnp
 
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import bellman, certificates
-from hjbjax.iteration.bellman import Conditions, Correction, Greedy
+from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.evaluation import Evaluation, evaluate
-from hjbjax.problem.pytree import altered, node
+from hjbjax.problem.pytree import altered, pytree_dataclass
 
 ROUNDING = 16  # residuals below this many units in the last place of max|V| are rounding
 REPLIES = 20  # of the inner player to one policy of the outer one, at most
 
 
-@node()
+@pytree_dataclass()
 class Step:
     """The stationary problem of one step.
 
@@ -37,29 +37,29 @@ class Step:
     """
 
     on: Discretisation
-    rules: Conditions
+    obstacles: Obstacles
     arriving: jax.Array
 
-    def equation(self, value: jax.Array, policy: Greedy) -> Correction:
+    def equation(self, value: jax.Array, policy: Greedy) -> PolicyEquation:
         """The linear equation of a policy at ``value``."""
-        return bellman.correction(self.on, value, policy, self.rules)
+        return bellman.policy_equation(self.on, value, policy, self.obstacles)
 
     def complete(self, policy: Greedy) -> Greedy:
         """A policy of the problem with its rate, V/Δt included."""
-        return dataclasses.replace(policy, rate=jnp.where(self.rules.held, 0, policy.rate + self.arriving))
+        return dataclasses.replace(policy, defect=jnp.where(self.obstacles.fixed, 0, policy.defect + self.arriving))
 
     def improved(self, value: jax.Array) -> Greedy:
         """The greedy policy at ``value``."""
-        return self.complete(bellman.greedy(self.on, value, self.rules.held))
+        return self.complete(bellman.greedy(self.on, value, self.obstacles.fixed))
 
     def reply(self, value: jax.Array, policy: Greedy) -> Greedy:
         """The inner player's answer to the outer player's policy."""
-        return self.complete(bellman.respond(self.on, value, self.rules.held, policy))
+        return self.complete(bellman.respond(self.on, value, self.obstacles.fixed, policy))
 
 
 def advance(
     on: Discretisation,
-    rules: Conditions,
+    obstacles: Obstacles,
     value: jax.Array,
     dt: Any,
     *,
@@ -80,17 +80,17 @@ def advance(
     """
     # not by Problem(...), which refuses a discount beside a running maximum
     shifted = altered(on.problem, discount=on.problem.discount + 1 / dt)
-    step = Step(on.asking(shifted), rules, value / dt)
+    step = Step(on.asking(shifted), obstacles, value / dt)
 
     def look(value):
         policy = step.improved(value)
         equation = step.equation(value, policy)
-        measured = certificates.gap(
-            Certificate.ADDITIVE, value, policy, equation, rules, discount=shifted.discount, least_cost=None,
+        bound = certificates.error_bound(
+            Certificate.ADDITIVE, value, policy, equation, obstacles, discount=shifted.discount, least_cost=None,
             counted=True, moved=0,
         )  # fmt: skip
         rounding = ROUNDING * jnp.finfo(value.dtype).eps * jnp.max(jnp.abs(value))
-        return policy, measured.residual, (measured.error <= tol) | (measured.residual <= rounding)
+        return policy, bound.residual, (bound.error <= tol) | (bound.residual <= rounding)
 
     def unfinished(carry):
         _, _, residual, done, count = carry
@@ -101,7 +101,7 @@ def advance(
         value = _evaluated(step, value, policy, residual, evaluation)
         return value, *look(value), count + 1
 
-    start = rules.impose(value)
+    start = obstacles.impose(value)
     carry = (start, *look(start), jnp.zeros((), jnp.int32))
     value, policy, _, done, _ = jax.lax.while_loop(unfinished, improve, carry)
     return value, policy, done
@@ -112,7 +112,7 @@ def _evaluated(step: Step, value: jax.Array, policy: Greedy, residual: Any, eval
 
     def solved(value, policy):
         delta = evaluate(evaluation, step.equation(value, policy), step.on.grid)
-        return step.rules.impose(value + delta)
+        return step.obstacles.impose(value + delta)
 
     if not step.on.problem.is_game:
         return solved(value, policy)

@@ -5,10 +5,10 @@ from typing import Any
 
 from hjbjax.iteration.evaluation import Evaluation, Sweeps, check_evaluation
 from hjbjax.problem import arguments
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 
 
-@node()
+@pytree_dataclass()
 class ValueIteration:
     """V ← max(g, min(ψ, V + (min max H − β V)/(max_u Q + β))): monotone, converges from every guess.
 
@@ -16,7 +16,7 @@ class ValueIteration:
     """
 
 
-@node(static=("replies",))
+@pytree_dataclass(static=("replies",))
 class PolicyIteration:
     """Improve the policy, evaluate it, repeat; the evaluation is what distinguishes the methods of this family.
 
@@ -33,7 +33,7 @@ class PolicyIteration:
         arguments.count(self.replies, "PolicyIteration: replies")
 
 
-@node(static=("coarsest",))
+@pytree_dataclass(static=("coarsest",))
 class Nested:
     """Solve on coarser grids first, and start each finer one from the interpolated answer.
 
@@ -107,7 +107,7 @@ TABLEAUX = {
 }
 
 
-@node(static=("stages",))
+@pytree_dataclass(static=("stages",))
 class Explicit:
     """Explicit steps by a strong-stability-preserving Runge–Kutta method.
 
@@ -140,7 +140,7 @@ class Explicit:
         return self.fraction / self.tableau.euler
 
 
-@node(static=("max_steps",))
+@pytree_dataclass(static=("max_steps",))
 class Implicit:
     """Implicit Euler steps, each by policy iteration: any length, first order in time.
 

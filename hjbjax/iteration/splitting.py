@@ -18,24 +18,23 @@ import jax.numpy as jnp
 from hjbjax.discretisation import chain
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.hamiltonian import discrete
-from hjbjax.hamiltonian.players import setting
+from hjbjax.hamiltonian.players import find_players
 from hjbjax.hamiltonian.search import Action
 from hjbjax.iteration import bellman
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.tracing import dependence
 
 
 def optimise(on: Discretisation, value: jax.Array) -> tuple[jax.Array, Action, Action]:
     """min max of H around ``value``: the value at every node, the control and the disturbance."""
-    here = discrete.local(on, value)
-    best, players = [], []
+    hamiltonian = discrete.around(on, value)
+    best, actions = [], []
     for part in halves(on):
-        how = setting(part, on.grid.ndim, on.dtype)
-        total, u, d = discrete.optimise(here.asking(part), how)
+        total, u, d = discrete.optimise(hamiltonian.asking(part))
         best.append(total)
-        players.append((u, d))
-    return sum(best[1:], start=best[0]), players[0][0], players[-1][1]
+        actions.append((u, d))
+    return sum(best[1:], start=best[0]), actions[0][0], actions[-1][1]
 
 
 def fastest_rate(on: Discretisation) -> jax.Array:
@@ -57,8 +56,8 @@ def halves(on: Discretisation) -> list[Problem]:
     problem, grid, dtype = on.problem, on.grid, on.dtype
     if not problem.is_game or grid.sides("constrained"):  # what is admissible depends on both players' sum
         return [problem]
-    how = setting(problem, grid.ndim, dtype)
-    if how.decoupled or not how.separable:
+    players = find_players(problem, grid.ndim, dtype)
+    if players.decoupled or not players.separable:
         return [problem]
     m = 0 if problem.controls is None else problem.controls.dim
     assert problem.disturbances is not None
@@ -91,7 +90,7 @@ def _driven(function: Any, problem: Problem, n: int, m: int, k: int, dtype: Any)
     )
 
 
-@node()
+@pytree_dataclass()
 class _Alone:
     """What a function of (t), x, u, d is without the disturbance, f(x, u, 0)."""
 
@@ -102,7 +101,7 @@ class _Alone:
         return self.function(*arguments, self.no_d)
 
 
-@node(static=("driven",))
+@pytree_dataclass(static=("driven",))
 class _Added:
     """What the disturbance adds, f(x, 0, d) − f(x, 0, 0); an exact zero in the components that it does not drive."""
 

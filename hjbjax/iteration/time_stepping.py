@@ -24,13 +24,13 @@ import jax.numpy as jnp
 
 from hjbjax.discretisation import correlated_noise
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.hamiltonian import discrete, players
+from hjbjax.hamiltonian import discrete
 from hjbjax.iteration import bellman, implicit, splitting
-from hjbjax.iteration.bellman import Conditions
+from hjbjax.iteration.bellman import Obstacles
 from hjbjax.iteration.methods import Implicit
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Box
 from hjbjax.solution.status import Status
 
@@ -38,7 +38,7 @@ TRIES = 30  # of a step that is shortened, at most; what its first stage sees do
 NEAR = 1e-3  # of a bound's distance: a disturbance so near its bound sits on it
 
 
-@node(static=("checks_rates", "checks_noise"))
+@pytree_dataclass(static=("checks_rates", "checks_noise"))
 class March:
     """All that stays the same during a march.
 
@@ -56,7 +56,7 @@ class March:
 
     on: Discretisation
     method: Any
-    rules: Conditions | None
+    obstacles: Obstacles | None
     limit: Any
     step: Any
     horizon: Any
@@ -74,9 +74,9 @@ class March:
         """The nodes."""
         return self.on.grid
 
-    def rules_at(self, t: Any) -> Conditions:
+    def obstacles_at(self, t: Any) -> Obstacles:
         """Held nodes and constraints at the time t."""
-        return bellman.conditions(self.on.at(t)) if self.rules is None else self.rules
+        return bellman.obstacles(self.on.at(t)) if self.obstacles is None else self.obstacles
 
     def longest(self, t: Any) -> Any:
         """The longest step that may start at the time t."""
@@ -88,7 +88,7 @@ class March:
         return jnp.minimum(self.step, limit)
 
 
-@node()
+@pytree_dataclass()
 class Front:
     """Where a march stands: V at the time t, the steps so far, how it is going, and what the last step saw."""
 
@@ -99,7 +99,7 @@ class Front:
     seen: "Seen"
 
 
-@node()
+@pytree_dataclass()
 class Seen:
     """What is found out on the way; nothing where nothing is looked for.
 
@@ -134,13 +134,13 @@ def terminal(on: Discretisation, start: Any = None) -> jax.Array:
 
     Without either a stopping cost is paid at the latest then, and a running maximum is g itself; else nothing is paid.
     """
-    rules, problem = bellman.conditions(on), on.problem
+    obstacles, problem = bellman.obstacles(on), on.problem
     if start is not None:
-        return rules.impose(jnp.asarray(start, on.dtype))
+        return obstacles.impose(jnp.asarray(start, on.dtype))
     cost = problem.terminal_cost
     if cost is None:
         cost = problem.running_max if problem.stopping_cost is None else problem.stopping_cost
-    return rules.impose(on.at_nodes(cost))
+    return obstacles.impose(on.at_nodes(cost))
 
 
 def begin(march: March, value: jax.Array) -> Front:
@@ -244,7 +244,7 @@ def _explicit(march: March, value: jax.Array, t: Any, dt: Any) -> tuple[jax.Arra
     dtype, tableau = value.dtype, march.method.tableau
     if len(tableau.means) == 1:
         rate, seen = _rate(march, value, t)
-        return march.rules_at(t - dt).impose(value + dt * rate), seen
+        return march.obstacles_at(t - dt).impose(value + dt * rate), seen
     means, starts, ends = (
         jnp.asarray(table, dtype) for table in (tableau.means, tableau.times[:-1], tableau.times[1:])
     )
@@ -253,7 +253,7 @@ def _explicit(march: March, value: jax.Array, t: Any, dt: Any) -> tuple[jax.Arra
         w, seen = carry
         rate, now = _rate(march, w, t - starts[k] * dt)
         moved = means[k] * value + (1 - means[k]) * (w + tableau.euler * dt * rate)
-        return march.rules_at(t - ends[k] * dt).impose(moved), seen.joined(now)
+        return march.obstacles_at(t - ends[k] * dt).impose(moved), seen.joined(now)
 
     return jax.lax.fori_loop(0, len(tableau.means), stage, (value, _nothing(dtype)))
 
@@ -262,7 +262,7 @@ def _implicit(march: March, value: jax.Array, t: Any, dt: Any) -> tuple[jax.Arra
     """V at t from V at t + Δt, whether the policy iteration came to its end, and what its last policy saw."""
     method = march.method
     value, policy, ok = implicit.advance(
-        march.on.at(t), march.rules_at(t), value, dt, evaluation=method.evaluation,
+        march.on.at(t), march.obstacles_at(t), value, dt, evaluation=method.evaluation,
         tol=method.tol * dt / march.horizon, max_steps=method.max_steps,
     )  # fmt: skip
     return value, ok, _look(march, list(policy.controls), list(policy.disturbances), t)
@@ -285,7 +285,7 @@ def _look(march: March, u: list, d: list, t: Any) -> Seen:
         lacking = correlated_noise.lacking(on, on.diffusion(u, d))
         if lacking is None:
             return seen
-        lacking = jnp.broadcast_to(lacking, on.grid.shape) & ~march.rules_at(t).held
+        lacking = jnp.broadcast_to(lacking, on.grid.shape) & ~march.obstacles_at(t).fixed
         first = jnp.where(jnp.any(lacking), jnp.argmax(lacking), -1).astype(jnp.int32)
         seen = dataclasses.replace(seen, lacking=first, t=jnp.asarray(t, dtype))
     return seen
@@ -297,7 +297,7 @@ def greedy(march: March, value: jax.Array, t: Any) -> tuple[tuple[jax.Array, ...
     if march.method.halves:
         _, u, d = splitting.optimise(on, value)
     else:
-        _, u, d = discrete.optimise(discrete.local(on, value), players.setting(on.problem, on.grid.ndim, on.dtype))
+        _, u, d = discrete.optimise(discrete.around(on, value))
 
     def full(action):
         return tuple(jnp.broadcast_to(jnp.asarray(entry, value.dtype), march.grid.shape) for entry in action)
@@ -307,10 +307,10 @@ def greedy(march: March, value: jax.Array, t: Any) -> tuple[tuple[jax.Array, ...
 
 def _saturates(march: March, value: jax.Array, t: Any) -> jax.Array:
     """Whether the worst disturbance sits on its bound at a watched node."""
-    choices = march.problem.disturbances
-    assert isinstance(choices, Box)
+    admissible = march.problem.disturbances
+    assert isinstance(admissible, Box)
     on_bound: Any = False
     for j, entry in enumerate(greedy(march, value, t)[1]):
-        slack = NEAR * (choices.hi[j] - choices.lo[j])
-        on_bound |= (entry <= choices.lo[j] + slack) | (entry >= choices.hi[j] - slack)
-    return jnp.any(on_bound & march.watched & ~march.rules_at(t).held)
+        slack = NEAR * (admissible.hi[j] - admissible.lo[j])
+        on_bound |= (entry <= admissible.lo[j] + slack) | (entry >= admissible.hi[j] - slack)
+    return jnp.any(on_bound & march.watched & ~march.obstacles_at(t).fixed)

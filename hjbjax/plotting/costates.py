@@ -28,13 +28,13 @@ def costates(extremal: Any, *, solution: Any = None, ax: Any = None, names: Sequ
       >>> costates(extremal)[0].get_ydata().tolist()
       [2.0, 0.0]
     """
-    times, momenta = np.asarray(extremal.times), np.asarray(extremal.costates)
-    count = momenta.shape[1]
+    times, costates = np.asarray(extremal.times), np.asarray(extremal.costates)
+    count = costates.shape[1]
     names = tuple(names or (solution.grid.names if solution is not None else (f"x{i + 1}" for i in range(count))))
     ax = axes_of(ax, wide=True)
     colours = [COLOURS[i % len(COLOURS)] for i in range(count)]
     artists = [
-        ax.plot(times, momenta[:, i], color=colours[i], linewidth=1.4, label=f"λ, {names[i]}")[0] for i in range(count)
+        ax.plot(times, costates[:, i], color=colours[i], linewidth=1.4, label=f"λ, {names[i]}")[0] for i in range(count)
     ]
     if solution is not None:
         where = (times,) * (solution.times is not None) + (np.asarray(solution.grid.wrap(extremal.states)),)

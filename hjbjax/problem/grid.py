@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem import grid_arguments
-from hjbjax.problem.pytree import altered, is_traced, node
+from hjbjax.problem.pytree import altered, is_traced, pytree_dataclass
 from hjbjax.problem.stretching import Stretching
 
 ROUNDINGS = 16  # units of eps of the largest coordinate by which the formula may miss its table
@@ -26,7 +26,7 @@ COINCIDING = 16  # units in the last place of a coordinate, of which a spacing m
 TABLED = 2**24  # points of an axis whose coordinates are kept; a grid that is refused must not allocate them before
 
 
-@node(static=("shape", "periodic", "names", "edges"))
+@pytree_dataclass(static=("shape", "periodic", "names", "edges"))
 class Grid:
     """A grid of nodes on a box in R^n, uniform along every axis that is not stretched.
 

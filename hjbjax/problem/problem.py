@@ -14,11 +14,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.problem.pytree import as_partial, is_traced, node, numbers
+from hjbjax.problem.pytree import as_partial, is_traced, numbers, pytree_dataclass
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite
 
 
-@node(static=("isaacs", "time_dependent", "discounted"))
+@pytree_dataclass(static=("isaacs", "time_dependent", "discounted"))
 class Problem:
     """An optimal control problem or a two-player zero-sum differential game.
 
@@ -159,9 +159,9 @@ def _is_nonzero(discount: Any) -> bool:
 
 
 def _check_sets(controls: Any, disturbances: Any) -> None:
-    for name, choices in (("controls", controls), ("disturbances", disturbances)):
-        if choices is not None and not isinstance(choices, (Box, Ball, Finite)):
-            raise TypeError(f"Problem.{name}: got {choices!r}, wanted a Box, a Ball, a Finite or None")
+    for name, admissible in (("controls", controls), ("disturbances", disturbances)):
+        if admissible is not None and not isinstance(admissible, (Box, Ball, Finite)):
+            raise TypeError(f"Problem.{name}: got {admissible!r}, wanted a Box, a Ball, a Finite or None")
 
 
 def _rate(discount: Any) -> Any:

@@ -21,7 +21,7 @@ REMEMBERED = 256  # answers of one function that are kept, the latest
 
 
 @dataclass_transform(frozen_default=True, eq_default=False)
-def node(*, static: Iterable[str] = (), host: Iterable[str] = ()) -> Callable[[type[T]], type[T]]:
+def pytree_dataclass(*, static: Iterable[str] = (), host: Iterable[str] = ()) -> Callable[[type[T]], type[T]]:
     """Class decorator: a frozen dataclass, registered as a pytree node.
 
     Args:
@@ -29,7 +29,7 @@ def node(*, static: Iterable[str] = (), host: Iterable[str] = ()) -> Callable[[t
       host: names of the fields that do not survive flattening; they need defaults.
 
     Example:
-      >>> @node(static=("shape",))
+      >>> @pytree_dataclass(static=("shape",))
       ... class Block:
       ...     scale: float
       ...     shape: tuple

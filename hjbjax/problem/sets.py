@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.problem.pytree import node, numbers
+from hjbjax.problem.pytree import numbers, pytree_dataclass
 
 
 def _bounded(value: Any, name: str) -> Any:
@@ -25,7 +25,7 @@ def _is_count(value: Any) -> bool:
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and int(value) >= 1
 
 
-@node()
+@pytree_dataclass()
 class Box:
     """The box lo ≤ u ≤ hi.
 
@@ -72,7 +72,7 @@ class Box:
         return Finite((self.lo * (last - rows) + self.hi * rows) / last)
 
 
-@node(static=("dim",))
+@pytree_dataclass(static=("dim",))
 class Ball:
     """The Euclidean ball |u| ≤ radius in R^dim.
 
@@ -99,7 +99,7 @@ class Ball:
         object.__setattr__(self, "dim", int(self.dim))
 
 
-@node()
+@pytree_dataclass()
 class Finite:
     """A finite set; enumerated, in order, the first of equals wins.
 
@@ -129,19 +129,19 @@ class Finite:
 AdmissibleSet: TypeAlias = Box | Ball | Finite
 
 
-def samples(choices: AdmissibleSet, budget: int) -> Any:
+def samples(admissible: AdmissibleSet, budget: int) -> Any:
     """Representative points of a set, shape (K, m) with K about ``budget``; all points of a finite one.
 
     A box gets an odd number of values an input, so that its ends and its middle are among them; a ball its
     centre and directions on spheres, spread by the golden angle in the plane and by axes and diagonals beyond.
     """
-    if isinstance(choices, Finite):
-        return choices.points
-    if isinstance(choices, Box):
-        per_input = max(3, round(budget ** (1 / choices.dim)) // 2 * 2 + 1)
-        return choices.grid(per_input).points
-    unit = _unit_ball(choices.dim, budget)
-    return choices.radius * unit
+    if isinstance(admissible, Finite):
+        return admissible.points
+    if isinstance(admissible, Box):
+        per_input = max(3, round(budget ** (1 / admissible.dim)) // 2 * 2 + 1)
+        return admissible.grid(per_input).points
+    unit = _unit_ball(admissible.dim, budget)
+    return admissible.radius * unit
 
 
 def _unit_ball(dim: int, budget: int) -> np.ndarray:
@@ -157,29 +157,29 @@ def _unit_ball(dim: int, budget: int) -> np.ndarray:
     return np.concatenate([np.zeros((1, dim)), 0.5 * sphere, sphere])
 
 
-def extremes(choices: AdmissibleSet) -> Any:
+def extremes(admissible: AdmissibleSet) -> Any:
     """Points whose convex hull holds the set, shape (K, m): where a convex function of u is at its largest."""
-    if isinstance(choices, Finite):
-        return choices.points
-    if isinstance(choices, Box):
-        return choices.grid(2).points
-    return choices.radius * np.array(list(itertools.product((-1.0, 1.0), repeat=choices.dim)))
+    if isinstance(admissible, Finite):
+        return admissible.points
+    if isinstance(admissible, Box):
+        return admissible.grid(2).points
+    return admissible.radius * np.array(list(itertools.product((-1.0, 1.0), repeat=admissible.dim)))
 
 
-def probes(choices: AdmissibleSet | None, dtype: Any) -> list[list]:
+def probes(admissible: AdmissibleSet | None, dtype: Any) -> list[list]:
     """Actions among which a convex function of u takes its largest value, and a few more for others."""
-    if choices is None:
+    if admissible is None:
         return [[]]
-    points = jnp.asarray(extremes(choices), dtype)
-    if not isinstance(choices, Finite):
-        points = jnp.concatenate([points, jnp.asarray(samples(choices, 9), dtype)])
+    points = jnp.asarray(extremes(admissible), dtype)
+    if not isinstance(admissible, Finite):
+        points = jnp.concatenate([points, jnp.asarray(samples(admissible, 9), dtype)])
     return [[points[k, j] for j in range(points.shape[1])] for k in range(points.shape[0])]
 
 
-def spacing(choices: AdmissibleSet, budget: int) -> list[Any]:
+def spacing(admissible: AdmissibleSet, budget: int) -> list[Any]:
     """The distance between neighbouring ``samples``, one number an input."""
-    if isinstance(choices, Ball):
-        return [choices.radius / 2] * choices.dim
-    assert isinstance(choices, Box)
-    per_input = max(3, round(budget ** (1 / choices.dim)) // 2 * 2 + 1)
-    return [(choices.hi[j] - choices.lo[j]) / (per_input - 1) for j in range(choices.dim)]
+    if isinstance(admissible, Ball):
+        return [admissible.radius / 2] * admissible.dim
+    assert isinstance(admissible, Box)
+    per_input = max(3, round(budget ** (1 / admissible.dim)) // 2 * 2 + 1)
+    return [(admissible.hi[j] - admissible.lo[j]) / (per_input - 1) for j in range(admissible.dim)]

@@ -5,10 +5,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.problem.pytree import is_traced, node
+from hjbjax.problem.pytree import is_traced, pytree_dataclass
 
 
-@node()
+@pytree_dataclass()
 class Sinh:
     """Nodes gathered around one place, ever sparser away from it: smooth, so that schemes keep their order.
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.pytree import is_traced, node
+from hjbjax.problem.pytree import is_traced, pytree_dataclass
 from hjbjax.problem.stretching import Sinh
 from hjbjax.solution import files, screen
 from hjbjax.solution.files import Expected, FileError
@@ -46,7 +46,7 @@ class SolveError(RuntimeError):
         self.solution, self.solutions = solution, tuple(solutions)
 
 
-@node(static=("discrete", "discrete_disturbance"), host=("residuals", "stats", "message"))
+@pytree_dataclass(static=("discrete", "discrete_disturbance"), host=("residuals", "stats", "message"))
 class Solution:
     """A value function on a grid with its policy.
 

@@ -29,7 +29,7 @@ from hjbjax.solvers import faults, memory, nested
 from hjbjax.solvers.host_loop import FIRST_NODES, imposed
 from hjbjax.solvers.nested import Settled
 from hjbjax.solvers.result import closed, describe, finish, unstarted
-from hjbjax.solvers.setup import Verdict, choose, prepare_on_host
+from hjbjax.solvers.setup import Assumptions, choose, prepare_on_host
 from hjbjax.solvers.stationary import as_dtype, check_arguments, check_limits, sharpened
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
@@ -130,7 +130,7 @@ def _rounds(members: Sequence[int], bytes_each: int, limit: int | None) -> list[
 def _solve_together(lanes: dict[int, Discretisation], method: Method, tol: float, clock: Clock) -> list[Solution]:
     """The solutions of problems that run together, by the numbers of their lanes."""
     began, names, asked = clock.elapsed(), list(lanes), list(lanes.values())
-    prepared: list[tuple[Task, Verdict, np.ndarray | None]] = []
+    prepared: list[tuple[Task, Assumptions, np.ndarray | None]] = []
     for name, on in lanes.items():
         try:
             node_checks.values(on.problem, on.grid, on.dtype, clock)
@@ -143,7 +143,9 @@ def _solve_together(lanes: dict[int, Discretisation], method: Method, tol: float
             return [closed(solution, clock) for solution in nothing]
     clock.phase = f"the steps of lanes {names[0]} to {names[-1]}"
     has_lost = any(task.has_lost for task, _, _ in prepared)
-    prepared = [(dataclasses.replace(task, has_lost=has_lost), verdict, reached) for task, verdict, reached in prepared]
+    prepared = [
+        (dataclasses.replace(task, has_lost=has_lost), assumptions, reached) for task, assumptions, reached in prepared
+    ]
     solutions: list[Any] = [None] * len(lanes)
     for members in _grouped(jax.tree.structure(task) for task, _, _ in prepared):  # by certificate, too
         tasks = _stack([prepared[i][0] for i in members])
@@ -160,14 +162,14 @@ def _solve_together(lanes: dict[int, Discretisation], method: Method, tol: float
 
 def _finished(settled: Settled, on: Discretisation, clock: Clock) -> Solution:
     """The solution of one lane, which may go on by itself: off a node where it rests, or to second order."""
-    task, verdict, reached, state, code, history = settled
+    task, assumptions, reached, state, code, history = settled
     apart: dict[str, Any] = {}
     if code in CUT:
         settled = settled._replace(state=imposed(task, state))
-    elif nested.may_go_on(task, verdict, state, code):
+    elif nested.may_go_on(task, assumptions, state, code):
         onwards = code is Status.CONVERGED or task.problem.is_game
         guess = state.value if onwards else None
-        settled = nested.settle(task, verdict, reached, guess, clock)
+        settled = nested.settle(task, assumptions, reached, guess, clock)
         if onwards:
             settled = settled._replace(residuals=np.concatenate([history, settled.residuals]))
     if not on.scheme.monotone and settled.code not in CUT:

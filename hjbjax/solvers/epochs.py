@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation import correlated_noise, edges
-from hjbjax.hamiltonian import discrete, players
+from hjbjax.hamiltonian import discrete
+from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import time_stepping
 from hjbjax.iteration.methods import Explicit, Implicit
 from hjbjax.iteration.time_stepping import Front, March
@@ -42,8 +43,8 @@ _terminal = jax.jit(time_stepping.terminal)
 @jax.jit
 def _greedy(march: March, value: jax.Array, t: Any) -> tuple:
     u, d = time_stepping.greedy(march, value, t)
-    rules = march.rules_at(t)
-    return (u, d), rules.ended, rules.acting(value)
+    obstacles = march.obstacles_at(t)
+    return (u, d), obstacles.ended, obstacles.acting(value)
 
 
 @jax.jit
@@ -52,11 +53,11 @@ def _gap_at(task: March, value: jax.Array, t: Any) -> tuple[jax.Array, jax.Array
 
     None where the players drive components of their own, and where each is upwinded by itself.
     """
-    how = players.setting(task.problem, task.grid.ndim, value.dtype)
-    if how.decoupled or (how.separable and task.method.halves):
+    players = players_of(task.on)
+    if players.decoupled or (players.separable and task.method.halves):
         return jnp.zeros(()), jnp.ones(())
-    here = discrete.local(task.on.at(t), value)
-    return isaacs_gap(here, ~task.rules_at(t).held)
+    hamiltonian = discrete.around(task.on.at(t), value)
+    return isaacs_gap(hamiltonian, ~task.obstacles_at(t).fixed)
 
 
 def _isaacs_gap(task: March, front: Front, code: Status) -> float | None:
@@ -73,7 +74,9 @@ class Slices:
 
     def __init__(self, task: March, kept: np.ndarray):
         problem, shape, dtype = task.problem, task.grid.shape, np.dtype(task.horizon.dtype)
-        sizes = [choices.dim if choices is not None else 0 for choices in (problem.controls, problem.disturbances)]
+        sizes = [
+            admissible.dim if admissible is not None else 0 for admissible in (problem.controls, problem.disturbances)
+        ]
         self.times = np.array(kept)
         self.value = np.empty((len(kept), *shape), dtype)
         self.policy, self.disturbance = (np.empty((len(kept), *shape, size), dtype) for size in sizes)

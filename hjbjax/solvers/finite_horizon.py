@@ -17,7 +17,7 @@ from hjbjax.discretisation import schemes
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.finiteness import admissibility, node_checks
-from hjbjax.hamiltonian import players
+from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import bellman, time_stepping
 from hjbjax.iteration.evaluation import Krylov, Sweeps
 from hjbjax.iteration.methods import Explicit, Implicit, PolicyIteration
@@ -41,7 +41,7 @@ PROBES = 33  # times at which a given step, and constrained ends, are held again
 FEWEST = 100  # steps where no stability limit is known for all of them: implicit, time-dependent, rates by samples
 
 _stable = jax.jit(time_stepping.stable)
-_rules = jax.jit(bellman.conditions)
+_obstacles = jax.jit(bellman.obstacles)
 
 
 @with_settled_functions
@@ -193,7 +193,7 @@ def _times(horizon: Any, times: Any) -> tuple[float, np.ndarray]:
 def _bytes(problem: Problem, grid: Grid, kept: np.ndarray, method: Any, dtype: Any) -> int:
     """Bytes at the peak: kept slices and policies, two slices, slopes, constraints; the matrix if implicit."""
     word = np.dtype(dtype).itemsize
-    actions = sum(choices.dim for choices in (problem.controls, problem.disturbances) if choices is not None)
+    actions = sum(admissible.dim for admissible in (problem.controls, problem.disturbances) if admissible is not None)
     slices = len(kept) * (1 + actions) + 2 + 2 * grid.ndim + 3 + actions
     if isinstance(method, Implicit):
         inner = PolicyIteration(method.evaluation or Krylov())
@@ -233,7 +233,7 @@ def _prepare(on: Discretisation, horizon: float, method: Any, step: float | None
     if step is None:  # rates that are found on the way say nothing of the first steps
         step = horizon / FEWEST if moving or checks[0] or isinstance(method, Implicit) else math.inf
     return March(
-        on, method, None if moving else _rules(on), limit, jnp.asarray(step, dtype),
+        on, method, None if moving else _obstacles(on), limit, jnp.asarray(step, dtype),
         jnp.asarray(horizon, dtype), _watched(on, inner), *checks,
     )  # fmt: skip
 
@@ -241,10 +241,10 @@ def _prepare(on: Discretisation, horizon: float, method: Any, step: float | None
 def _checks(on: Discretisation, method: Any) -> tuple[bool, bool]:
     """Whether steps must look at rates and at correlated noise under the actions that they choose."""
     problem = on.problem
-    how, moving = players.setting(problem, on.grid.ndim, on.dtype), problem.time_dependent
-    sampled = not (how.control.fastest_at_ends and how.disturbance.fastest_at_ends)
+    players, moving = players_of(on), problem.time_dependent
+    sampled = not (players.control.fastest_at_ends and players.disturbance.fastest_at_ends)
     rates = isinstance(method, Explicit) and (sampled or (moving and len(method.tableau.means) > 1))
-    return rates, callable(problem.noise) and (moving or how.steers_noise)
+    return rates, callable(problem.noise) and (moving or players.steers_noise)
 
 
 def _check_step(step: float | None, limit: float) -> None:
@@ -267,8 +267,8 @@ def _watched(on: Discretisation, share: float | None) -> Any:
     """The nodes where a disturbance at its bound is taken for a blow-up; or None."""
     problem, grid = on.problem, on.grid
     if share is None:
-        how = players.setting(problem, grid.ndim, on.dtype).disturbance
-        share = 0.5 if isinstance(how.choices, Box) and all(how.curved) else 0.0
+        players = players_of(on).disturbance
+        share = 0.5 if isinstance(players.admissible, Box) and all(players.curved) else 0.0
     if not arguments.is_number(share) or not 0 <= share <= 1:
         raise ValueError(f"march: inner = {share!r}; wanted the share of the box that is watched, from 0 (none) to 1")
     if share == 0:
@@ -293,8 +293,8 @@ def _march_traced(
     else:
         method = Implicit(method.evaluation or _evaluation(problem, grid), method.tol, method.max_steps)
     on = cast(on, kind)
-    rules = None if problem.time_dependent else bellman.conditions(on)
-    task = March(on, method, rules, jnp.inf, step, horizon, None)
+    obstacles = None if problem.time_dependent else bellman.obstacles(on)
+    task = March(on, method, obstacles, jnp.inf, step, horizon, None)
     value, values, actions, count = time_stepping.terminal(on.at(horizon), start), [], [], 0
     for begin, end in itertools.pairwise([horizon, *kept[::-1].tolist()]):
         steps = max(math.ceil((begin - end) / step - 1e-6), int(begin > end))

@@ -68,7 +68,7 @@ def drive(task: Task, guess: Any, clock: Clock, most: int | None = None) -> tupl
                 residuals.append(np.asarray(state.history)[:steps])
                 clock.count(time.perf_counter() - began, steps, task.grid.size)
                 chunk = int(np.clip(clock.steps_in(CHUNK_SECONDS, task.grid.size), 1, min(HISTORY, 8 * max(chunk, 1))))
-                show(steps - (done < 0), float(state.gap.error))
+                show(steps - (done < 0), float(state.bound.error))
                 done += steps
         except KeyboardInterrupt:  # the second one, or by a handler of the user's own
             clock.interrupted, code = True, Status.INTERRUPTED
@@ -117,7 +117,7 @@ def _first_chunk(task: Task, clock: Clock) -> int:
 
 def imposed(task: Task, state: State) -> State:
     """The state with what is given at its nodes, which a guess that nobody looked at does not have."""
-    return dataclasses.replace(state, value=task.rules.impose(jnp.asarray(state.value)))
+    return dataclasses.replace(state, value=task.obstacles.impose(jnp.asarray(state.value)))
 
 
 @contextlib.contextmanager

@@ -33,7 +33,7 @@ def estimate(problem: Problem, grid: Grid, method: Method, dtype: Any) -> int:
     if isinstance(method, Nested):
         return estimate(problem, grid, method.inner, dtype)
     word, n = np.dtype(dtype).itemsize, grid.ndim
-    actions = sum(choices.dim for choices in (problem.controls, problem.disturbances) if choices is not None)
+    actions = sum(admissible.dim for admissible in (problem.controls, problem.disturbances) if admissible is not None)
     conditions = (problem.target, problem.stopping_cost, problem.running_max, problem.disturbances)
     kept = word * (2 + actions + sum(each is not None for each in conditions) + (is_discounted(problem) is False)) + 2
     look, correction = word * (4 + 2 * actions), 0

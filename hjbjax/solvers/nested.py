@@ -19,7 +19,7 @@ from hjbjax.solution import transfer
 from hjbjax.solution.clock import Clock, Stopped
 from hjbjax.solution.status import Status
 from hjbjax.solvers.host_loop import drive
-from hjbjax.solvers.setup import Verdict, forced_only, held_jit, judge, linear_solve, prepare_jit
+from hjbjax.solvers.setup import Assumptions, assumptions_of, forced_only, held_jit, linear_solve, prepare_jit
 
 VANISHING = (2.0, 0.2, 0.02)  # discounts on the way to none, over one by the time that crossing the box takes
 FURTHER = ((2e-3, 2e-4), (2e-5, 2e-6), (2e-7, 2e-8))  # where parts of the box are that much slower than the fastest
@@ -44,7 +44,7 @@ def start(
     for coarse, fine in itertools.pairwise(grids):
         clock.phase = f"the preparation of {' x '.join(map(str, coarse.shape))} nodes"
         level = on.on_grid(coarse)
-        task = prepare_jit(level, method=method.inner, tol=tol, verdict=judge(level))
+        task = prepare_jit(level, method=method.inner, tol=tol, assumptions=assumptions_of(level))
         state, _, _ = drive(task, warm(task, value, clock), clock)
         if clock.over() is not None:
             return transfer.prolong(np.asarray(state.value), coarse, on.grid), []
@@ -54,13 +54,13 @@ def start(
 
 def levels(on: Discretisation, method: Nested, clock: Clock) -> list[Grid]:
     """The grids of a nested solve, coarsest first; a coarser grid that loses the target or rest point is left out."""
-    grids, verdict = [on.grid], judge(on)
-    needs_held = on.problem.target is not None or verdict.may_rest
+    grids, assumptions = [on.grid], assumptions_of(on)
+    needs_held = on.problem.target is not None or assumptions.may_rest
     while (smaller := transfer.coarser(grids[0])) is not None and smaller.size >= method.coarsest:
         if clock.over() is not None:
             break
         clock.phase = f"the choice of coarser grids, {' x '.join(map(str, smaller.shape))} nodes"
-        if needs_held and not held_jit(on.on_grid(smaller), verdict=verdict).any():
+        if needs_held and not held_jit(on.on_grid(smaller), assumptions=assumptions).any():
             break
         grids.insert(0, smaller)
     return grids
@@ -96,21 +96,21 @@ class Settled(NamedTuple):
     """A task that was driven to its end, as it came to be on the way, and how it ended."""
 
     task: Task
-    verdict: Verdict
+    assumptions: Assumptions
     reached: np.ndarray | None
     state: State
     code: Status
     residuals: np.ndarray
 
 
-def may_go_on(task: Task, verdict: Verdict, state: State, code: Status) -> bool:
+def may_go_on(task: Task, assumptions: Assumptions, state: State, code: Status) -> bool:
     """Whether what ended so may have to go on: rest nodes that it had better leave, a game or a way that failed."""
     if code is Status.CONVERGED:
-        return verdict.may_rest and float(np.min(np.asarray(state.value), initial=0)) < 0
+        return assumptions.may_rest and float(np.min(np.asarray(state.value), initial=0)) < 0
     return code in FAILED and (task.problem.is_game or _needs_a_way(task))
 
 
-def settle(task: Task, verdict: Verdict, reached: np.ndarray | None, guess: Any, clock: Clock) -> Settled:
+def settle(task: Task, assumptions: Assumptions, reached: np.ndarray | None, guess: Any, clock: Clock) -> Settled:
     """Solve with the nodes where the system can rest held; those that it had better leave are released, and again.
 
     Held, their value is an upper bound of the one sought, from which the iteration only descends: a released node that
@@ -134,23 +134,23 @@ def settle(task: Task, verdict: Verdict, reached: np.ndarray | None, guess: Any,
         try:
             fewer, forced = forced_only(task, clock)
         except Stopped as stop:
-            return Settled(task, verdict, reached, state, stop.status, residuals)
+            return Settled(task, assumptions, reached, state, stop.status, residuals)
         if forced is not None and not forced.all():
             task, reached = fewer, forced
             state, code, residuals = drive(task, warm(task, None, clock), clock)
-    while code is Status.CONVERGED and may_go_on(task, verdict, state, code):
+    while code is Status.CONVERGED and may_go_on(task, assumptions, state, code):
         pays = _leaving_pays(task, state.value)
         if not np.any(np.asarray(pays)):
             break
-        verdict = dataclasses.replace(verdict, certificate=Certificate.NONE)
+        assumptions = dataclasses.replace(assumptions, certificate=Certificate.NONE)
         task = dataclasses.replace(
-            task, rules=resting.released(task.rules, pays), certificate=Certificate.NONE, least_cost=None
+            task, obstacles=resting.released(task.obstacles, pays), certificate=Certificate.NONE, least_cost=None
         )
         state, code, more = drive(task, state.value, clock)
         residuals = np.concatenate([residuals, more])
-    return Settled(task, verdict, reached, state, code, residuals)
+    return Settled(task, assumptions, reached, state, code, residuals)
 
 
 @jax.jit
 def _leaving_pays(task: Task, value: jax.Array) -> jax.Array:
-    return resting.leaving_pays(task.on.chain, task.rules, task.counted, value)
+    return resting.leaving_pays(task.on.chain, task.obstacles, task.counted, value)

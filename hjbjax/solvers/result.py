@@ -10,7 +10,8 @@ import numpy as np
 from hjbjax.discretisation import correlated_noise, edges
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.finiteness import earnings
-from hjbjax.hamiltonian import discrete, players
+from hjbjax.hamiltonian import discrete
+from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import certificates, fixed_point
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.fixed_point import State, Task
@@ -24,7 +25,7 @@ from hjbjax.solution.clock import CUT, Clock
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
 from hjbjax.solvers.nested import Settled
-from hjbjax.solvers.setup import Verdict, warn
+from hjbjax.solvers.setup import Assumptions, warn
 
 GAP = 0.05  # of what the actions matter; where Isaacs' condition holds, upwinding left up to .019 on 21 nodes
 MOST = 2 / 3  # of an end's nodes: whatever has a velocity leaves by half of those where its position ends
@@ -35,7 +36,7 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
 
     The Isaacs gap is a program of its own, and nothing is compiled after a ``cut``.
     """
-    task, verdict, reached, state, code, residuals = settled
+    task, assumptions, reached, state, code, residuals = settled
     stopped = cut or code in CUT
     if not stopped:
         _refuse_noise(task, state, grid)
@@ -45,12 +46,12 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
     unanswered = stopped or code in (Status.DIVERGED, Status.NONFINITE)
     leaving = None if unanswered else _leaving(task, state, grid)
     state = jax.device_get(state)
-    solution = assemble(task, state, verdict)
+    solution = assemble(task, state, assumptions)
     lost = ~np.asarray(task.counted)
     arrays = {name: getattr(solution, name) for name in ("value", "policy", "disturbance")}
     arrays = {name: None if array is None else np.require(array, requirements="W") for name, array in arrays.items()}
     arrays["value"][lost] = np.inf
-    idle = lost | np.asarray(task.rules.ended) | (int(state.step) < 0)  # nobody looked for a policy yet
+    idle = lost | np.asarray(task.obstacles.ended) | (int(state.step) < 0)  # nobody looked for a policy yet
     for array in (arrays["policy"], arrays["disturbance"]):
         if array is not None:
             array[idle] = np.nan
@@ -71,7 +72,7 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
             "scheme": repr(task.scheme),
             "device": str(jax.devices()[0].device_kind),
             "dtype": str(state.value.dtype),
-            "certificate": verdict.sentence,
+            "certificate": assumptions.sentence,
             "versions": {"jax": jax.__version__, "numpy": np.__version__},
         },
     )
@@ -80,7 +81,7 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
 def unstarted(on: Discretisation, value: Any, code: Status) -> Solution:
     """The solution of a run that ended before its first step: the value it was to start from, and no policy."""
     problem, value = on.problem, np.asarray(value, on.dtype)
-    inputs = [0 if choices is None else choices.dim for choices in (problem.controls, problem.disturbances)]
+    inputs = [0 if admissible is None else admissible.dim for admissible in (problem.controls, problem.disturbances)]
     nan = np.array(np.nan, value.dtype)  # one number seen everywhere: on 85 million nodes an array of it takes seconds
     policy, disturbance = (np.broadcast_to(nan, (*value.shape, m)) for m in inputs)
     return Solution(
@@ -107,7 +108,7 @@ def closed(solution: Solution, clock: Clock) -> Solution:
     return dataclasses.replace(solution, message=f"{solution.message} It came as far as {clock.phase}.")
 
 
-def assemble(task: Task, state: State, verdict: Verdict) -> Solution:
+def assemble(task: Task, state: State, assumptions: Assumptions) -> Solution:
     """The solution as it stands in the state; pure."""
     problem = task.problem
     controls, disturbances = state.policy.controls, state.policy.disturbances
@@ -118,7 +119,7 @@ def assemble(task: Task, state: State, verdict: Verdict) -> Solution:
         disturbance=xp.stack(disturbances, axis=-1) if problem.is_game else None,
         code=state.code,
         steps=state.step,
-        enclosure=certificates.enclosure(verdict.certificate, state.gap, problem.discount),
+        enclosure=certificates.enclosure(assumptions.certificate, state.bound, problem.discount),
         grid=task.grid,
         discrete=isinstance(problem.controls, Finite),
         discrete_disturbance=isinstance(problem.disturbances, Finite),
@@ -127,9 +128,9 @@ def assemble(task: Task, state: State, verdict: Verdict) -> Solution:
 
 def _leaving(task: Task, state: State, grid: Grid) -> np.ndarray:
     """At how many nodes of each end the optimal drift is cut off, with a warning where those are most of them."""
-    value, policy, rules, counted = jax.device_get((state.value, state.policy, task.rules, task.counted))
+    value, policy, obstacles, counted = jax.device_get((state.value, state.policy, task.obstacles, task.counted))
     u, d = (list(players) for players in (policy.controls, policy.disturbances))
-    cut, ends = edges.cut(task.problem, task.grid, value, u, d, counted & rules.acting(value))
+    cut, ends = edges.cut(task.problem, task.grid, value, u, d, counted & obstacles.acting(value))
     warn_of_cuts(cut, ends, grid)
     return cut
 
@@ -154,14 +155,13 @@ def _lacking(task: Task, controls: tuple, disturbances: tuple) -> jax.Array:
     lacking = correlated_noise.lacking(task.on, task.on.diffusion(list(controls), list(disturbances)))
     if lacking is None:
         return jnp.full((), -1)
-    lacking = jnp.broadcast_to(lacking, task.grid.shape) & task.counted & ~task.rules.held
+    lacking = jnp.broadcast_to(lacking, task.grid.shape) & task.counted & ~task.obstacles.fixed
     return jnp.where(jnp.any(lacking), jnp.argmax(lacking), -1)
 
 
 def _refuse_noise(task: Task, state: State, grid: Grid) -> None:
     """Refuse noise that depends on the action where the one found lies between those that were tried before."""
-    problem, dtype = task.problem, task.tol.dtype
-    if not callable(problem.noise) or not players.setting(problem, grid.ndim, dtype).steers_noise:
+    if not callable(task.problem.noise) or not players_of(task.on).steers_noise:
         return
     policy = state.policy
     first = int(_lacking(task, policy.controls, policy.disturbances))
@@ -169,7 +169,7 @@ def _refuse_noise(task: Task, state: State, grid: Grid) -> None:
         return
     index = tuple(int(i) for i in np.unravel_index(first, grid.shape))
     x, u, d = grid.state(index), *([float(a[index]) for a in each] for each in (policy.controls, policy.disturbances))
-    sigma = np.asarray(problem.diffusion(x, np.array(u), np.array(d), 0.0), dtype=float)
+    sigma = np.asarray(task.problem.diffusion(x, np.array(u), np.array(d), 0.0), dtype=float)
     played = "".join(f", {letter} = {action}" for letter, action in (("u", u), ("d", d)) if action)
     raise ValueError(
         "noise: correlated noise that the chain cannot represent with non-negative probabilities under the policy "
@@ -178,19 +178,18 @@ def _refuse_noise(task: Task, state: State, grid: Grid) -> None:
     )
 
 
-def isaacs_gap(here: discrete.Local, free: Any) -> tuple[jax.Array, jax.Array]:
+def isaacs_gap(hamiltonian: discrete.DiscreteHamiltonian, free: Any) -> tuple[jax.Array, jax.Array]:
     """The largest min max − max min over the ``free`` nodes, and how much the actions matter there, per unit time.
 
     What actions matter is the largest difference of H between two pairs of them, of nine representatives a player.
     """
-    problem, grid, dtype = here.on.problem, here.on.grid, here.on.dtype
-    how = players.setting(problem, grid.ndim, dtype)
-    upper, lower = (discrete.optimise(here, how, isaacs=which)[0] for which in ("upper", "lower"))
+    problem, dtype = hamiltonian.on.problem, hamiltonian.on.dtype
+    upper, lower = (discrete.optimise(hamiltonian, isaacs=which)[0] for which in ("upper", "lower"))
     sets_of = (problem.controls, problem.disturbances)
-    mine, theirs = (jnp.asarray(_representatives(choices), dtype) for choices in sets_of)
+    mine, theirs = (jnp.asarray(_representatives(admissible), dtype) for admissible in sets_of)
 
     def compare(extremes: Any, pair: Any) -> tuple[Any, None]:
-        total = here.at(list(mine[pair[0]]), list(theirs[pair[1]]))
+        total = hamiltonian.at(list(mine[pair[0]]), list(theirs[pair[1]]))
         total = jnp.where(jnp.isfinite(total), total, upper)  # an action that an end of the box rules out
         return (jnp.minimum(extremes[0], total), jnp.maximum(extremes[1], total)), None
 
@@ -200,11 +199,11 @@ def isaacs_gap(here: discrete.Local, free: Any) -> tuple[jax.Array, jax.Array]:
     return jnp.max(jnp.where(free, upper - lower, 0)), jnp.max(jnp.where(free, most - least + size, 0))
 
 
-def _representatives(choices: Any) -> Any:
+def _representatives(admissible: Any) -> Any:
     """At most nine actions of a player, shape (K, m), the first and the last of its samples among them."""
-    if choices is None:
+    if admissible is None:
         return np.zeros((1, 0))
-    points = sets.samples(choices, 9)
+    points = sets.samples(admissible, 9)
     return points[np.unique(np.linspace(0, len(points) - 1, 9).round().astype(int))]
 
 
@@ -220,8 +219,8 @@ def warn_of_gap(gap: float, matter: float, isaacs: str) -> None:
 
 @jax.jit
 def _gap_at(task: Task, value: jax.Array) -> tuple[jax.Array, jax.Array]:
-    here = discrete.local(task.on, value, task.lost)
-    return isaacs_gap(here, task.counted & ~task.rules.held)
+    hamiltonian = discrete.around(task.on, value, task.lost)
+    return isaacs_gap(hamiltonian, task.counted & ~task.obstacles.fixed)
 
 
 def _isaacs_gap(task: Task, state: State) -> float | None:
@@ -250,7 +249,7 @@ def _not_finite(task: Task, state: State, grid: Grid) -> str:
     step = int(state.step)
     when = "at the guess" if step == 0 else f"in step {step}"
     kept = "the last finite value is kept"
-    discount, left = float(np.asarray(task.problem.discount)), float(np.max(np.abs(state.policy.rate)))
+    discount, left = float(np.asarray(task.problem.discount)), float(np.max(np.abs(state.policy.defect)))
     if 0 < discount < 1 and left > discount * float(np.finfo(np.float32).max):  # sweeps run in single precision
         return (
             f"Infinity appeared {when} and {kept}: discount = {discount:.3g} is so small that what is left, "

@@ -13,7 +13,7 @@ import numpy as np
 from hjbjax.discretisation import cut_cells
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.finiteness import attainability, resting
-from hjbjax.hamiltonian import players
+from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import bellman
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.evaluation import Direct, Krylov, Sweeps
@@ -72,39 +72,39 @@ def linear_solve(grid: Grid) -> Direct | Krylov:
     return Direct() if grid.ndim == 1 else Krylov()
 
 
-def prepare(on: Discretisation, *, method: Method, tol: Any, verdict: "Verdict") -> Task:
+def prepare(on: Discretisation, *, method: Method, tol: Any, assumptions: "Assumptions") -> Task:
     """The task of a solve, all arrays in its type; pure, so that it may be traced, batched and differentiated."""
     on = cast(on, on.dtype)
-    rules, still = _rules(on, verdict)
-    undecided = verdict.certificate is Certificate.BY_DISCOUNT and is_constrained(on.problem)
-    pace = None
-    if isinstance(method, ValueIteration) or undecided or verdict.certificate is Certificate.OPEN:
+    obstacles, still = _obstacles(on, assumptions)
+    undecided = assumptions.certificate is Certificate.BY_DISCOUNT and is_constrained(on.problem)
+    outflow = None
+    if isinstance(method, ValueIteration) or undecided or assumptions.certificate is Certificate.OPEN:
         rate = bellman.fastest_rate(on) + on.problem.discount
-        pace = jnp.where(rate > 0, rate, 1)
-    priced = verdict.costs_certify and still is not None
+        outflow = jnp.where(rate > 0, rate, 1)
+    priced = assumptions.costs_certify and still is not None
     return Task(
-        on, method, rules, jnp.ones(on.grid.shape, bool), still.least if priced and still else None, pace,
-        jnp.asarray(tol, on.dtype), verdict.certificate, still.crossing if priced and still else None,
+        on, method, obstacles, jnp.ones(on.grid.shape, bool), still.least if priced and still else None, outflow,
+        jnp.asarray(tol, on.dtype), assumptions.certificate, still.crossing if priced and still else None,
     )  # fmt: skip
 
 
-def _rules(on: Discretisation, verdict: "Verdict") -> tuple[bellman.Conditions, resting.Standstill | None]:
-    """The conditions, rest points among them, and what was found out about resting where it was needed."""
-    rules, problem = bellman.conditions(on), on.problem
+def _obstacles(on: Discretisation, assumptions: "Assumptions") -> tuple[bellman.Obstacles, resting.Standstill | None]:
+    """The obstacles, rest points among them, and what was found out about resting where it was needed."""
+    obstacles, problem = bellman.obstacles(on), on.problem
     if on.scheme.subcell and problem.exit_cost is not None:
         links = cut_cells.links(on)
         met = [jnp.min(jnp.where(*meets, 0)) for link in links for meets in (link.meets_up, link.meets_down) if meets]
-        rules = dataclasses.replace(rules, least_exit=jnp.minimum(jnp.min(jnp.stack(met)), 0))
-    if not (verdict.may_rest or verdict.costs_certify):
-        return rules, None
+        obstacles = dataclasses.replace(obstacles, least_exit=jnp.minimum(jnp.min(jnp.stack(met)), 0))
+    if not (assumptions.may_rest or assumptions.costs_certify):
+        return obstacles, None
     still = resting.standstill(on)
-    if not verdict.may_rest:
-        return rules, still
-    return dataclasses.replace(rules, held=rules.held | (still.rests & (problem.discount == 0))), still
+    if not assumptions.may_rest:
+        return obstacles, still
+    return dataclasses.replace(obstacles, fixed=obstacles.fixed | (still.rests & (problem.discount == 0))), still
 
 
 @dataclasses.dataclass(frozen=True)
-class Verdict:
+class Assumptions:
     """What is known of a problem before its numbers are looked at.
 
     Attributes:
@@ -127,67 +127,69 @@ class Verdict:
         return self.certificate.value + "; for the refined sample of actions"
 
 
-def judge(on: Discretisation) -> Verdict:
-    """Read the verdict from the problem's structure, which knows whether there is a discount unless that is traced."""
+def assumptions_of(on: Discretisation) -> Assumptions:
+    """The assumptions from the structure of the problem; a discount that is traced leaves the certificate open."""
     if on.grid.sides("open"):
-        return dataclasses.replace(judge(on.on_grid(on.grid.walled)), certificate=Certificate.OPEN)
+        return dataclasses.replace(assumptions_of(on.on_grid(on.grid.walled)), certificate=Certificate.OPEN)
     problem = on.problem
-    how, discounted = players.setting(problem, on.grid.ndim, on.dtype), is_discounted(problem)
+    players, discounted = players_of(on), is_discounted(problem)
     if discounted:
-        return Verdict(Certificate.ADDITIVE, how.exact, may_rest=False)
-    fits = problem.running_max is None and problem.cost is not None and not how.disturbance_costs
+        return Assumptions(Certificate.ADDITIVE, players.exact, may_rest=False)
+    fits = problem.running_max is None and problem.cost is not None and not players.disturbance_costs
     kind = Certificate.MULTIPLICATIVE if fits else Certificate.NONE
     may_rest = not is_constrained(problem) and problem.cost is not None
-    return Verdict(Certificate.BY_DISCOUNT if discounted is None else kind, how.exact, may_rest, fits)
+    return Assumptions(Certificate.BY_DISCOUNT if discounted is None else kind, players.exact, may_rest, fits)
 
 
-prepare_jit = jax.jit(prepare, static_argnames="verdict")
+prepare_jit = jax.jit(prepare, static_argnames="assumptions")
 
 
-@functools.partial(jax.jit, static_argnames="verdict")
-def held_jit(on: Discretisation, *, verdict: Verdict) -> jax.Array:
+@functools.partial(jax.jit, static_argnames="assumptions")
+def held_jit(on: Discretisation, *, assumptions: Assumptions) -> jax.Array:
     """The nodes at which the value is given, bool (*grid)."""
-    return _rules(cast(on, on.dtype), verdict)[0].held
+    return _obstacles(cast(on, on.dtype), assumptions)[0].fixed
 
 
 def prepare_on_host(
     on: Discretisation, *, method: Method, tol: float, clock: Clock | None = None
-) -> tuple[Task, Verdict, np.ndarray | None]:
+) -> tuple[Task, Assumptions, np.ndarray | None]:
     """``prepare`` with the checks that need values: a finite solution exists, and where.
 
     It looks at the clock on the way and may raise ``Stopped``.
 
     Returns:
-      The task, the verdict, and the nodes that reach the target (None where there is nothing to reach).
+      The task, the assumptions, and the nodes that reach the target (None where there is nothing to reach).
 
     Raises:
       ValueError: there is no finite solution.
     """
     clock, problem, grid = clock or Clock(), on.problem, on.grid
     clock.enter(f"the preparation of {' x '.join(map(str, grid.shape))} nodes")
-    verdict = judge(on)
-    task = prepare_jit(on, method=method, tol=tol, verdict=verdict)
-    priced = verdict.certificate is Certificate.MULTIPLICATIVE
+    assumptions = assumptions_of(on)
+    task = prepare_jit(on, method=method, tol=tol, assumptions=assumptions)
+    priced = assumptions.certificate is Certificate.MULTIPLICATIVE
     if (priced and not _costs_suit(task)) or problem.cost is None:
         task = _with_refuge(task)
-        verdict = dataclasses.replace(verdict, may_rest=not is_constrained(problem) and not problem.discount > 0)
+        assumptions = dataclasses.replace(
+            assumptions, may_rest=not is_constrained(problem) and not problem.discount > 0
+        )
     if priced and problem.is_game and not _costs_suit(task) and isinstance(method, PolicyIteration):
         # policies that go on for ever at no cost have any value: the one sought is the limit of those of long horizons
-        task = prepare_jit(on, method=ValueIteration(), tol=tol, verdict=verdict)
+        task = prepare_jit(on, method=ValueIteration(), tol=tol, assumptions=assumptions)
     if priced and not _costs_suit(task):
-        verdict = dataclasses.replace(verdict, certificate=Certificate.NONE)
+        assumptions = dataclasses.replace(assumptions, certificate=Certificate.NONE)
         task = dataclasses.replace(task, certificate=Certificate.NONE, least_cost=None)
-    held = np.asarray(task.rules.held)
+    held = np.asarray(task.obstacles.fixed)
     undiscounted = problem.discount == 0
-    checks.ill_posed(problem, bool(verdict.may_rest and held.any()), grid)
+    checks.ill_posed(problem, bool(assumptions.may_rest and held.any()), grid)
     if problem.is_game or is_constrained(problem) or not held.any():
-        return task, verdict, None
+        return task, assumptions, None
     reached = attainability.reached(task.on, held, surely=undiscounted, least=_least_rate(task), clock=clock)
     if not reached.all():
         _warn_unreached(reached, undiscounted)
         if undiscounted:
             task = _without(task, reached)
-    return task, verdict, reached
+    return task, assumptions, reached
 
 
 def forced_only(task: Task, clock: Clock) -> tuple[Task, np.ndarray | None]:
@@ -196,7 +198,7 @@ def forced_only(task: Task, clock: Clock) -> tuple[Task, np.ndarray | None]:
     Returns:
       The task and the nodes that are left; ``None`` where that is no question.
     """
-    held = np.asarray(task.rules.held)
+    held = np.asarray(task.obstacles.fixed)
     if not task.problem.is_game or task.constrained or np.asarray(task.problem.discount) > 0 or not held.any():
         return task, None
     reached = attainability.forced(task.on, held, least=_least_rate(task), clock=clock)
@@ -210,30 +212,30 @@ def _with_refuge(task: Task) -> Task:
     """The task with the nodes held at zero among which a run may go on for ever and pay nothing, as where it rests."""
     if task.problem.is_game or task.constrained or np.asarray(task.problem.discount) > 0:
         return task
-    free = ~np.broadcast_to(np.asarray(task.rules.ended), task.grid.shape)
+    free = ~np.broadcast_to(np.asarray(task.obstacles.ended), task.grid.shape)
     least = np.zeros(task.grid.shape) if task.least_cost is None else np.asarray(task.least_cost)
     small = resting.ROUNDINGS * np.finfo(task.tol.dtype).eps * np.max(np.abs(least))
     if np.any(least[free] < -small):
         return task
     found = attainability.refuge(task.on, jnp.asarray((least <= small) & free), jnp.asarray(small, task.tol.dtype))
-    return dataclasses.replace(task, rules=dataclasses.replace(task.rules, held=task.rules.held | found))
+    return dataclasses.replace(task, obstacles=dataclasses.replace(task.obstacles, fixed=task.obstacles.fixed | found))
 
 
 def _costs_suit(task: Task) -> bool:
     """Whether the running cost is positive wherever the value is not given."""
-    return bool(np.all(np.asarray(task.least_cost)[~np.asarray(task.rules.held)] > 0))
+    return bool(np.all(np.asarray(task.least_cost)[~np.asarray(task.obstacles.fixed)] > 0))
 
 
-def prepare_traced(on: Discretisation, *, method: Method, tol: Any) -> tuple[Task, Verdict]:
+def prepare_traced(on: Discretisation, *, method: Method, tol: Any) -> tuple[Task, Assumptions]:
     """``prepare`` with what of the host's checks runs inside a JAX transformation: nodes without a finite value."""
-    verdict, problem = judge(on), on.problem
-    task = prepare(on, method=method, tol=tol, verdict=verdict)
-    ends = problem.target is not None or verdict.may_rest
+    assumptions, problem = assumptions_of(on), on.problem
+    task = prepare(on, method=method, tol=tol, assumptions=assumptions)
+    ends = problem.target is not None or assumptions.may_rest
     if problem.is_game or is_constrained(problem) or is_discounted(problem) or not ends:
-        return task, verdict
+        return task, assumptions
     known = jax.lax.stop_gradient(task)
-    reached = attainability.surely_reached(known.on, known.rules.held, least=_least_rate(known))
-    return _without(task, reached | (known.problem.discount > 0)), verdict
+    reached = attainability.surely_reached(known.on, known.obstacles.fixed, least=_least_rate(known))
+    return _without(task, reached | (known.problem.discount > 0)), assumptions
 
 
 def _least_rate(task: Task) -> Any:
@@ -245,8 +247,8 @@ def _least_rate(task: Task) -> Any:
 
 def _without(task: Task, reached: Any) -> Task:
     """The nodes with an infinite value are held above all others, so that no optimal action goes there."""
-    rules = dataclasses.replace(task.rules, held=task.rules.held | ~jnp.asarray(reached))
-    return dataclasses.replace(task, rules=rules, counted=task.counted & jnp.asarray(reached), has_lost=True)
+    obstacles = dataclasses.replace(task.obstacles, fixed=task.obstacles.fixed | ~jnp.asarray(reached))
+    return dataclasses.replace(task, obstacles=obstacles, counted=task.counted & jnp.asarray(reached), has_lost=True)
 
 
 def _warn_unreached(reached: np.ndarray, undiscounted: bool) -> None:

@@ -135,10 +135,10 @@ def _solve_on_host(on: Discretisation, method: Method, tol: float, guess: Any, c
         admissibility.values(problem, grid, on.dtype)
         known = None if start is None else jnp.asarray(start)
         start, shapes = nested.start(on.chain, method, tol, known, clock)
-        task, verdict, reached = prepare_on_host(on.chain, method=inner, tol=tol, clock=clock)
+        task, assumptions, reached = prepare_on_host(on.chain, method=inner, tol=tol, clock=clock)
     except Stopped as stop:
         return unstarted(on, np.zeros(grid.shape) if start is None else np.array(start), stop.status)
-    settled = nested.settle(task, verdict, reached, start, clock)
+    settled = nested.settle(task, assumptions, reached, start, clock)
     about: dict[str, Any] = {"levels": [*shapes, grid.shape]}
     if not on.scheme.monotone:
         settled, apart = sharpened(settled, on.scheme, clock)
@@ -162,10 +162,10 @@ def sharpened(settled: Settled, scheme: Scheme, clock: Clock) -> tuple[Settled, 
     better, ended, more = drive(higher, state.value, clock)
     if int(better.step) < 0:  # it was stopped before its first look, and the monotone answer stands
         return settled._replace(code=ended), {}
-    verdict = dataclasses.replace(settled.verdict, certificate=Certificate.RESIDUAL)
+    assumptions = dataclasses.replace(settled.assumptions, certificate=Certificate.RESIDUAL)
     counted = np.asarray(task.counted)
     apart = np.abs(np.asarray(better.value)[counted] - np.asarray(state.value)[counted])
-    sharp = Settled(higher, verdict, settled.reached, better, ended, more)
+    sharp = Settled(higher, assumptions, settled.reached, better, ended, more)
     return sharp, {"from_monotone": float(np.max(apart, initial=0))}
 
 
@@ -177,14 +177,14 @@ def _solve_traced(on: Discretisation, method: Any, tol: Any, guess: Any, max_ste
     method = method or choose(on.problem, on.grid, traced=True)
     if isinstance(method, Nested):
         raise ValueError("solve: Nested(...) runs at host level only; inside jit, vmap and grad use its inner method")
-    task, verdict = prepare_traced(on, method=method, tol=tol)
+    task, assumptions = prepare_traced(on, method=method, tol=tol)
     frozen = jax.lax.stop_gradient(task)
     start = frozen.start() if guess is None else jax.lax.stop_gradient(jnp.asarray(guess, on.dtype))
     state = fixed_point.run(frozen, fixed_point.begin(frozen, start), max_steps or TRACED_STEPS)
     wrong = jnp.zeros((), bool)
-    if verdict.may_rest:
+    if assumptions.may_rest:
         state, wrong = _doubted(frozen, state)
-    solution, value = assemble(task, state, verdict), adjoint.attach(task, state)
+    solution, value = assemble(task, state, assumptions), adjoint.attach(task, state)
     wrong |= state.code == Status.NONFINITE
     value = value * jnp.where(wrong, jnp.nan, 1).astype(value.dtype)  # a derivative drops the code, and is NaN, too
     return altered(solution, value=jnp.where(task.counted, value, jnp.inf) if task.has_lost else value)
@@ -192,15 +192,15 @@ def _solve_traced(on: Discretisation, method: Any, tol: Any, guess: Any, max_ste
 
 def _doubted(task: Task, state: State) -> tuple[State, jax.Array]:
     """The state, stalled and without bounds where leaving a held rest node would pay: the host alone goes on then."""
-    pays = resting.leaving_pays(task.on.chain, task.rules, task.counted, state.value)
+    pays = resting.leaving_pays(task.on.chain, task.obstacles, task.counted, state.value)
     wrong = jnp.any(pays) & (state.code == Status.CONVERGED) & (task.problem.discount == 0)
-    gap, infinite = state.gap, jnp.asarray(jnp.inf, state.value.dtype)
+    gap, infinite = state.bound, jnp.asarray(jnp.inf, state.value.dtype)
     gap = dataclasses.replace(
         gap, below=jnp.where(wrong, 0, gap.below), above=jnp.where(wrong, infinite, gap.above),
         lift=jnp.where(wrong, infinite, gap.lift), error=jnp.where(wrong, infinite, gap.error),
     )  # fmt: skip
     code = jnp.where(wrong, Status.STALLED, state.code).astype(state.code.dtype)
-    return dataclasses.replace(state, gap=gap, code=code), wrong
+    return dataclasses.replace(state, bound=gap, code=code), wrong
 
 
 def as_dtype(dtype: Any) -> np.dtype:

@@ -234,8 +234,8 @@ def _traced(
     return verdicts[0], indices.beyond(closed, names), indices.calls_back(closed)
 
 
-def _dim(choices: sets.AdmissibleSet | None) -> int:
-    return 0 if choices is None else choices.dim
+def _dim(admissible: sets.AdmissibleSet | None) -> int:
+    return 0 if admissible is None else admissible.dim
 
 
 def _check_arity(problem: Problem, name: str) -> None:

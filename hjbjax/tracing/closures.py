@@ -182,8 +182,8 @@ def _trace(problem: Problem, name: str, n: int, dtype: Any) -> Any:
     function = getattr(problem, name)
     leaves, structure = jax.tree.flatten(function)
     sizes = {
-        letter: 0 if choices is None else choices.dim
-        for letter, choices in (("u", problem.controls), ("d", problem.disturbances))
+        letter: 0 if admissible is None else admissible.dim
+        for letter, admissible in (("u", problem.controls), ("d", problem.disturbances))
     }
     shapes = {"x": (n,), "u": (sizes["u"],), "d": (sizes["d"],), "t": ()}
     letters = problem.arguments("x", "u", "d", "t") if name in OF_ACTION else problem.state_arguments("x", "t")

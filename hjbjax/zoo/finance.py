@@ -12,12 +12,12 @@ import numpy as np
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import is_traced, node
+from hjbjax.problem.pytree import is_traced, pytree_dataclass
 from hjbjax.problem.sets import Box
 from hjbjax.zoo.ingredients import OutsideCube, answer, positive
 
 
-@node()
+@pytree_dataclass()
 class Merton:
     """Consume and invest for ever with the utility C^{1−γ}/(1−γ); the cost is minus the utility.
 

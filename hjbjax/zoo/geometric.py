@@ -12,11 +12,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.zoo.ingredients import positive
 
 
-@node()
+@pytree_dataclass()
 class OneWay:
     """Example 4.1, ẋ₁ = u, ẋ₂ = x₁²: brackets span the plane, and x₂ never falls.
 
@@ -37,7 +37,7 @@ class OneWay:
         return x[1] - self.speed * jnp.abs(x[0]) ** 3 / 3
 
 
-@node()
+@pytree_dataclass()
 class Angle:
     """ẋ = u on the line with the output (cos x, sin x): observable locally and not globally, as in Example 4.2.
 
@@ -53,7 +53,7 @@ class Angle:
         return jnp.stack([jnp.cos(x[0]), jnp.sin(x[0])])
 
 
-@node()
+@pytree_dataclass()
 class Unicycle:
     """A wheel that rolls and turns on the spot but does not slip, state (x, y, θ), control (forward, turn)."""
 
@@ -62,7 +62,7 @@ class Unicycle:
         return jnp.stack([u[0] * jnp.cos(x[2]), u[0] * jnp.sin(x[2]), u[1]])
 
 
-@node(static=("trailers",))
+@pytree_dataclass(static=("trailers",))
 class CarWithTrailers:
     """A unicycle that pulls n trailers, each hooked to the middle of the axle before it.
 
@@ -96,7 +96,7 @@ class CarWithTrailers:
         return jnp.stack(rates)
 
 
-@node()
+@pytree_dataclass()
 class Pomet:
     """Example 6.1: a system that no continuous feedback of the state alone can stabilise, and one of (t, x) that does.
 

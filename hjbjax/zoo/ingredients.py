@@ -10,7 +10,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.problem.pytree import as_partial, is_traced, node
+from hjbjax.problem.pytree import as_partial, is_traced, pytree_dataclass
 
 
 def unit_cost(x: Any, u: Any) -> Any:
@@ -18,7 +18,7 @@ def unit_cost(x: Any, u: Any) -> Any:
     return jnp.ones((), jnp.result_type(x))
 
 
-@node()
+@pytree_dataclass()
 class QuadraticCost:
     """The running cost q·|x|² + r·|u|².
 
@@ -40,7 +40,7 @@ class QuadraticCost:
         return jnp.sum(self.state * (x * x)) + jnp.sum(self.control * (u * u))
 
 
-@node()
+@pytree_dataclass()
 class QuadraticValue:
     """x'Px + c."""
 
@@ -53,7 +53,7 @@ class QuadraticValue:
         return x @ jnp.asarray(self.matrix) @ x + self.constant
 
 
-@node(static=("dim",))
+@pytree_dataclass(static=("dim",))
 class Disc:
     """The Euclidean ball around the origin in the first ``dim`` states; radius 0 is the origin alone."""
 
@@ -66,7 +66,7 @@ class Disc:
         return jnp.sum(place * place) - self.radius * self.radius
 
 
-@node()
+@pytree_dataclass()
 class OutsideCube:
     """The complement of the open cube |x_i| < half_width: the faces of a box of that size, and beyond."""
 
@@ -78,7 +78,7 @@ class OutsideCube:
         return self.half_width * (1 - 1e-6) - jnp.max(jnp.abs(x))
 
 
-@node()
+@pytree_dataclass()
 class OutsideBall:
     """The complement of the open ball |x| < radius."""
 
@@ -89,7 +89,7 @@ class OutsideBall:
         return self.radius * (1 - 1e-6) - jnp.sqrt(jnp.sum(x * x))
 
 
-@node()
+@pytree_dataclass()
 class Arrival:
     """(1 − e^{−βT})/β for the time T = ``system.arrival_time``: S of (8.14) for β = 1, T itself for β = 0."""
 

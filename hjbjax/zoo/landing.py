@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Box
 from hjbjax.zoo.ingredients import answer, positive
 
@@ -25,7 +25,7 @@ NEWTON = 6  # steps for the square root of E, which is nearly linear in q: quadr
 EXACT = 2  # of them, the last ones, carry derivatives: the first and the second
 
 
-@node()
+@pytree_dataclass()
 class Lander:
     """A rocket above the ground, state (h, v, m), its thrust u upwards.
 

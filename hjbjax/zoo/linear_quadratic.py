@@ -15,13 +15,13 @@ import numpy as np
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import is_traced, node
+from hjbjax.problem.pytree import is_traced, pytree_dataclass
 from hjbjax.problem.sets import Box
 from hjbjax.zoo.ingredients import Disc, OutsideCube, QuadraticCost, QuadraticValue, answer, noise_or_none, positive
 from hjbjax.zoo.minimum_time import DoubleIntegrator
 
 
-@node()
+@pytree_dataclass()
 class LinearScalar:
     """The scalar system ẋ = ax + u, or ẋ = ax + u + d with an opponent.
 
@@ -40,7 +40,7 @@ class LinearScalar:
         return self.rate * x + u + d
 
 
-@node()
+@pytree_dataclass()
 class GameCost:
     """The cost x² + u² − γ²d² of the attenuation level γ."""
 
@@ -51,7 +51,7 @@ class GameCost:
         return jnp.sum(x * x) + jnp.sum(u * u) - self.gamma * self.gamma * jnp.sum(d * d)
 
 
-@node()
+@pytree_dataclass()
 class ScalarQuadratic:
     """The value p|x|² + c, with p the stabilising root of state + (2a − β)p − (weight)p² = 0 and c = σ²p/β.
 

@@ -24,12 +24,12 @@ import numpy as np
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_partial, node
+from hjbjax.problem.pytree import as_partial, pytree_dataclass
 from hjbjax.problem.sets import Box
 from hjbjax.zoo.ingredients import QuadraticCost, positive
 
 
-@node(static=("links",))
+@pytree_dataclass(static=("links",))
 class Manipulator:
     """A planar arm, state (q, w) in R^2n, one torque a joint.
 

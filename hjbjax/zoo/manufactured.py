@@ -12,12 +12,12 @@ import jax.numpy as jnp
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Box
 from hjbjax.zoo.ingredients import answer
 
 
-@node()
+@pytree_dataclass()
 class Smooth:
     """A nonlinear problem with the value V = cosh x₁ − 1 + x₂² + ¼x₁²x₂².
 

@@ -17,12 +17,12 @@ import numpy as np
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Box
 from hjbjax.zoo.ingredients import QuadraticCost, QuadraticValue, positive
 
 
-@node(static=("as_printed",))
+@pytree_dataclass(static=("as_printed",))
 class Pendulum:
     """A pendulum with a torque at its pivot, state (θ, θ̇), θ = 0 upright.
 
@@ -61,7 +61,7 @@ class Pendulum:
         return jnp.stack([-(self.g * x[0] + 3 * x[1] + 2 * x[0]) / self.gain])
 
 
-@node()
+@pytree_dataclass()
 class VanDerPol:
     """The Van der Pol oscillator, state (x, ẋ): a limit cycle that the control has to leave.
 
@@ -76,7 +76,7 @@ class VanDerPol:
         return jnp.stack([x[1], self.stiffness * (1 - x[0] * x[0]) * x[1] - x[0] + u[0]])
 
 
-@node()
+@pytree_dataclass()
 class BallAndBeam:
     """A ball that rolls on a beam, state (r, ṙ, θ, θ̇), control θ̈; the model of Hauser, Sastry and Kokotović (1992).
 
@@ -99,7 +99,7 @@ class BallAndBeam:
         return x[0]
 
 
-@node()
+@pytree_dataclass()
 class FlexibleJoint:
     """A link driven through a spring, state (q₁, q̇₁, q₂, q̇₂), q₁ of the link from hanging, q₂ of the motor.
 

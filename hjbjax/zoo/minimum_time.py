@@ -16,12 +16,12 @@ import jax.numpy as jnp
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Ball, Box
 from hjbjax.zoo.ingredients import Arrival, Disc, answer, positive, unit_cost
 
 
-@node()
+@pytree_dataclass()
 class DoubleIntegrator:
     """A mass on a line under a force, state (position, velocity).
 
@@ -51,7 +51,7 @@ class DoubleIntegrator:
         return -0.5 * self.mass * velocity * jnp.abs(velocity)
 
 
-@node()
+@pytree_dataclass()
 class Boat:
     """A boat in a constant current, state (x₁, x₂), control a velocity in the unit disc.
 

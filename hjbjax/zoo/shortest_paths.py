@@ -14,12 +14,12 @@ import numpy as np
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Ball, Box, Finite
 from hjbjax.zoo.ingredients import Arrival, Disc, answer, positive, unit_cost
 
 
-@node(static=("norm",))
+@pytree_dataclass(static=("norm",))
 class SingleIntegrator:
     """A point that moves at will, ẋ = s·u, with u in the unit ball of the norm dual to ``norm``.
 
@@ -45,7 +45,7 @@ class SingleIntegrator:
         return (jnp.sqrt(jnp.sum(x * x)) if self.norm == 2 else jnp.max(jnp.abs(x))) / self.speed
 
 
-@node()
+@pytree_dataclass()
 class Dubins:
     """A car at constant speed, state (x, y, heading), control the rate of turn.
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Box
 from hjbjax.zoo.ingredients import OutsideBall, OutsideCube, answer, noise_or_none, positive, unit_cost
 
@@ -25,7 +25,7 @@ def no_drift(x: Any, u: Any) -> Any:
     return jnp.zeros_like(x)
 
 
-@node(static=("dim",))
+@pytree_dataclass(static=("dim",))
 class CubeExit:
     """The discounted time for which σ dw stays in the cube |x_i| < R; one and two dimensions.
 
@@ -71,7 +71,7 @@ def _sinhc(z: Any) -> Any:
     return jnp.where(z == 0, 1.0, -jnp.expm1(-2 * small) / (2 * small))
 
 
-@node(static=("dim",))
+@pytree_dataclass(static=("dim",))
 class BallExit:
     """The mean time for which σ dw stays in the ball |x| < R: (R² − |x|²)/(nσ²)."""
 
@@ -157,7 +157,7 @@ def brownian_ball_exact(*, dim: int = 2, noise: Any = 1.0, radius: Any = 1.0) ->
     return answer(BallExit(noise, radius, dim).value)
 
 
-@node()
+@pytree_dataclass()
 class BangBang:
     """Hold dx = u dt + ε dw, |u| ≤ 1, near zero at the cost x² discounted at the rate λ: u = −sgn x.
 

@@ -14,7 +14,7 @@ from hjbjax import zoo
 from hjbjax.applications import hinf
 from hjbjax.applications.hinf import Trial
 from hjbjax.feedback.path import PathStatus
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Ball, Box, Finite
 
 
@@ -130,7 +130,7 @@ def test_the_level_of_an_integrator():
     assert all(trial.growth > 0.1 for trial in level.trials if not trial.feasible)
 
 
-@node()
+@pytree_dataclass()
 class Scalar:
     """ẋ = a x + u + e d, z = (c x, u), all numbers leaves."""
 

@@ -14,7 +14,7 @@ from hjbjax.applications import exit_problems, probabilities
 from hjbjax.discretisation import chain
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import time_stepping
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 
 UNIT = hjb.Box([-1.0], [1.0])
 SIGMA = 0.7
@@ -58,7 +58,7 @@ def ruin(x, mu, length=1.0):
     return np.expm1(-mu * DEADLY * x) / np.expm1(-mu * DEADLY * length)
 
 
-@node()
+@pytree_dataclass()
 class Edge:
     """The half of the space beyond x₀ = place, on the side of the sign."""
 

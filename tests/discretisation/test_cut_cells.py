@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import hjbjax as hjb
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 
 
-@node()
+@pytree_dataclass()
 class Disc:
     """A disc as a target, by its signed distance."""
 

@@ -358,15 +358,15 @@ SETS = {"box": hjb.Box([-1.0, -0.5], [0.7, 1.0]), "ball": hjb.Ball(0.9, 2)}
 
 @pytest.mark.parametrize("choices", SETS)
 @pytest.mark.parametrize(("functions", "exactly"), [(QUADRATIC, True), (AFFINE, True), (COUPLED, False)])
-def test_no_sample_beats_the_minimiser(choices, functions, exactly):
-    problem = hjb.Problem(*functions, SETS[choices])
+def test_no_sample_beats_the_minimiser(admissible, functions, exactly):
+    problem = hjb.Problem(*functions, SETS[admissible])
     rule = pointwise.rule_of(problem, 2)
     assert rule.exact == exactly
-    assert rule.jumps == (choices == "box" and functions is AFFINE)
+    assert rule.jumps == (admissible == "box" and functions is AFFINE)
     rng = np.random.default_rng(0)
     with jax.enable_x64(True):
         tried = rng.uniform(-1, 1, (4000, 2))
-        if choices == "ball":
+        if admissible == "ball":
             tried *= 0.9 / np.maximum(1, np.linalg.norm(tried, axis=1, keepdims=True))
         else:
             tried = np.clip(tried, *(np.asarray(end) for end in (SETS["box"].lo, SETS["box"].hi)))
@@ -380,7 +380,7 @@ def test_no_sample_beats_the_minimiser(choices, functions, exactly):
         for x, p in rng.normal(size=(25, 2, 2)):
             u, least, sampled = compare(x, p)
             assert least <= sampled + 1e-12
-            if choices == "ball":
+            if admissible == "ball":
                 assert np.linalg.norm(u) <= 0.9 * (1 + 1e-9)
             else:
                 assert np.all((u >= SETS["box"].lo) & (u <= SETS["box"].hi))

@@ -9,7 +9,7 @@ from hjbjax.feedback.path import PathStatus
 from hjbjax.feedback.simulation import simulate
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Ball, Box, Finite
 from hjbjax.problem.stretching import Sinh
 from hjbjax.solution.interpolation import extended
@@ -18,7 +18,7 @@ from hjbjax.solution.solution import Solution
 GRID = Grid([-1.5, -1.5], [1.5, 1.5], (31, 31))
 
 
-@node()
+@pytree_dataclass()
 class Disc:
     """A disc as target, or all that is outside of it (side = −1)."""
 
@@ -104,9 +104,9 @@ def test_a_game_with_enumerated_controls_across_a_seam_on_a_stretched_axis_ends_
     policy[..., 1] *= -np.sign(x[..., 1])
     worst = np.stack([0 * first, 0.25 * np.sign(x[..., 1])], -1)
     policy[inside], worst[inside] = np.nan, np.nan
-    choices = Finite([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0], [0.0, 0.0]])
+    admissible = Finite([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0], [0.0, 0.0]])
     problem = Problem(
-        lambda x, u, d: u + d, lambda x, u, d: 1.0, choices, disturbances=Box([-0.25] * 2, [0.25] * 2), target=level
+        lambda x, u, d: u + d, lambda x, u, d: 1.0, admissible, disturbances=Box([-0.25] * 2, [0.25] * 2), target=level
     )
     solution = Solution(grid, 0 * first, policy, worst, discrete=True)
     for x0, wanted in (([0.7, 0.05], 0.2), ([0.3, -0.05], 0.2), ([0.0, 0.65], 0.6), ([0.95, -0.65], 0.6)):
@@ -114,7 +114,7 @@ def test_a_game_with_enumerated_controls_across_a_seam_on_a_stretched_axis_ends_
         assert path.status == PathStatus.TARGET, path.message
         assert path.reached == pytest.approx(wanted, abs=0.02)
         assert abs(float(level(path.states[-1]))) < 1e-6
-        assert {tuple(u) for u in path.controls} <= {tuple(u) for u in choices.points}
+        assert {tuple(u) for u in path.controls} <= {tuple(u) for u in admissible.points}
 
 
 def test_a_target_that_moves_is_met_by_a_marched_feedback_on_a_line():

@@ -12,7 +12,7 @@ from hjbjax.feedback.path import PathStatus
 from hjbjax.feedback.simulation import rollout, simulate
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Box
 
 ROOT3 = math.sqrt(3.0)
@@ -21,7 +21,7 @@ GAIN = np.array([[1.0, ROOT3]])
 TRACES = []
 
 
-@node()
+@pytree_dataclass()
 class Answer:
     """What simulate asks of a Solution: policy and disturbance at the nodes, looked up between them."""
 

@@ -10,7 +10,7 @@ from questions import GRID, U, accepted, in_disc, refused
 from hjbjax import Box, Finite, Grid, Problem
 from hjbjax.discretisation import correlated_noise
 from hjbjax.finiteness import node_checks
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,7 @@ def test_a_target_that_covers_the_grid():
 def test_another_parameter_value_does_not_trace_again():
     count = 0
 
-    @node()
+    @pytree_dataclass()
     class Counted:
         rate: object
 

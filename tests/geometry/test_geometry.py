@@ -24,7 +24,7 @@ from systems import SEEDS
 
 import hjbjax as hjb
 from hjbjax import geometry, zoo
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 
 
 @pytest.fixture(autouse=True)
@@ -33,7 +33,7 @@ def float64():
         yield
 
 
-@node()
+@pytree_dataclass()
 class Wave:
     """x ↦ a ∘ sin(B x + c): smooth, and no two commute."""
 
@@ -233,7 +233,7 @@ def test_the_switching_of_figure_6_ends_at_the_bracket(system, start):
     assert np.polyfit(np.log(taus), np.log(printed), 1)[0] == pytest.approx(2, abs=0.15)
 
 
-@node()
+@pytree_dataclass()
 class Switching:
     """The k-th control from kτ to (k + 1)τ; asked at the ends of the intervals alone."""
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import hjbjax as hjb
 from hjbjax import geometry, zoo
 from hjbjax.geometry import stability
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 
 
 @pytest.fixture(autouse=True)
@@ -188,7 +188,7 @@ def test_a_narrow_violation_is_climbed_to(a, b):
         assert report.rate >= 0.99 * peak
 
 
-@node()
+@pytree_dataclass()
 class Bump:
     a: object
     b: object

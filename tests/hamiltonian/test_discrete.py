@@ -12,10 +12,11 @@ from systems import SEEDS, random_game, random_grid, random_problem, random_sigm
 from hjbjax.discretisation import chain
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.hamiltonian import discrete, players
+from hjbjax.hamiltonian import discrete
+from hjbjax.hamiltonian.players import SAMPLES, find_players
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Ball, Box, Finite, samples
 
 CASES = [(1, "diagonal"), (2, "none"), (2, "matrix"), (2, "function"), (3, "diagonal"), (3, "matrix"), (4, "matrix")]
@@ -33,7 +34,7 @@ def _float64():
 def both_forms(problem, grid, value, u, d, scheme):
     on, other = Discretisation(problem, grid, scheme, value.dtype), d if problem.is_game else None
     rates, cost = chain.rates(on, u, other), on.running_cost(u, other)
-    return discrete.local(on, value).at(u, d), cost + rates.apply(grid, value)
+    return discrete.around(on, value).at(u, d), cost + rates.apply(grid, value)
 
 
 @pytest.mark.parametrize("scheme", SCHEMES, ids=["plain", "central"])
@@ -52,7 +53,7 @@ def test_differences_and_rates_are_two_forms_of_one_operator(n, kind, scheme, se
 # --- exact minima over continua ---
 
 
-@node()
+@pytree_dataclass()
 class Coupled:
     """Two inputs in three components: u₀ drives two of them, u₁ the third; the cost is separable."""
 
@@ -82,13 +83,13 @@ class Coupled:
 
 @functools.partial(jax.jit, static_argnames="scheme")
 def best_and_scan(problem, grid, value, scan, scheme):
-    how = players.setting(problem, grid.ndim, value.dtype)
-    assert how.exact
-    here = discrete.local(Discretisation(problem, grid, scheme, value.dtype), value)
-    best, u, _ = discrete.optimise(here, how)
-    table = jax.lax.map(lambda point: here.at([point[j] for j in range(scan.shape[1])], []), scan)
+    players = find_players(problem, grid.ndim, value.dtype)
+    assert players.exact
+    hamiltonian = discrete.around(Discretisation(problem, grid, scheme, value.dtype), value)
+    best, u, _ = discrete.optimise(hamiltonian)
+    table = jax.lax.map(lambda point: hamiltonian.at([point[j] for j in range(scan.shape[1])], []), scan)
     full = [jnp.broadcast_to(component, grid.shape) for component in u]
-    return best, jnp.stack(full), jnp.min(table, axis=0), here.at(full, [])
+    return best, jnp.stack(full), jnp.min(table, axis=0), hamiltonian.at(full, [])
 
 
 def check_minimum(problem, grid, value, scan, scheme):
@@ -153,15 +154,15 @@ def test_a_ball_is_minimised_exactly(kind, scheme, seed):
     ],
 )
 def test_what_is_exact_is_read_from_the_functions(drift, cost, controls, exact):
-    how = players.setting(Problem(drift, cost, controls, discount=1.0), 2, np.float64)
-    assert how.exact == exact
+    players = find_players(Problem(drift, cost, controls, discount=1.0), 2, np.float64)
+    assert players.exact == exact
 
 
 def test_noise_that_depends_on_the_control_is_not_exact():
     steered = Problem(lambda x, u: u, None, UNIT, noise=lambda x, u: u, discount=1.0)
     given_by_state = Problem(lambda x, u: u, None, UNIT, noise=lambda x, u: x, discount=1.0)
-    assert not players.setting(steered, 1, np.float64).exact
-    assert players.setting(given_by_state, 1, np.float64).exact
+    assert not find_players(steered, 1, np.float64).exact
+    assert find_players(given_by_state, 1, np.float64).exact
 
 
 @pytest.mark.parametrize("scheme", SCHEMES, ids=["plain", "central"])
@@ -179,13 +180,13 @@ def test_samples_and_search_come_close_where_the_minimum_is_not_exact(scheme, se
 
 @functools.partial(jax.jit, static_argnames="scheme")
 def sampled_and_scan(problem, grid, value, scheme):
-    here = discrete.local(Discretisation(problem, grid, scheme, value.dtype), value)
-    best = discrete.optimise(here, players.setting(problem, grid.ndim, value.dtype))[0]
+    hamiltonian = discrete.around(Discretisation(problem, grid, scheme, value.dtype), value)
+    best = discrete.optimise(hamiltonian)[0]
 
     def lowest(points):
-        return jnp.min(jax.lax.map(lambda point: here.at(list(point), []), points), axis=0)
+        return jnp.min(jax.lax.map(lambda point: hamiltonian.at(list(point), []), points), axis=0)
 
-    return best, lowest(problem.controls.grid(81).points), lowest(samples(problem.controls, players.SAMPLES))
+    return best, lowest(problem.controls.grid(81).points), lowest(samples(problem.controls, SAMPLES))
 
 
 # --- finite sets and games ---
@@ -193,17 +194,17 @@ def sampled_and_scan(problem, grid, value, scheme):
 
 @functools.partial(jax.jit, static_argnames=("scheme", "isaacs"))
 def optimum(problem, grid, value, scheme, isaacs=None):
-    here = discrete.local(Discretisation(problem, grid, scheme, value.dtype), value)
-    return discrete.optimise(here, players.setting(problem, grid.ndim, value.dtype), isaacs=isaacs)
+    hamiltonian = discrete.around(Discretisation(problem, grid, scheme, value.dtype), value)
+    return discrete.optimise(hamiltonian, isaacs=isaacs)
 
 
 @functools.partial(jax.jit, static_argnames="scheme")
 def table_of(problem, grid, value, controls, disturbances, scheme):
     """H for every pair, shape (K, L, *grid)."""
-    here = discrete.local(Discretisation(problem, grid, scheme, value.dtype), value)
+    hamiltonian = discrete.around(Discretisation(problem, grid, scheme, value.dtype), value)
 
     def at(u, d):
-        return here.at(list(u), list(d))
+        return hamiltonian.at(list(u), list(d))
 
     return jax.lax.map(lambda u: jax.lax.map(lambda d: at(u, d), disturbances), controls)
 
@@ -259,9 +260,9 @@ def test_lower_is_at_most_upper(seed):
 @jax.jit
 def replies(problem, grid, value, u, d):
     """max over d of H(u, d) and min over u of H(u, d), over scans, at given actions of the other."""
-    here = discrete.local(Discretisation(problem, grid, Upwind(), value.dtype), value)
-    against_u = jax.lax.map(lambda point: here.at(u, list(point)), problem.disturbances.grid(301).points)
-    against_d = jax.lax.map(lambda point: here.at(list(point), d), problem.controls.grid(301).points)
+    hamiltonian = discrete.around(Discretisation(problem, grid, Upwind(), value.dtype), value)
+    against_u = jax.lax.map(lambda point: hamiltonian.at(u, list(point)), problem.disturbances.grid(301).points)
+    against_d = jax.lax.map(lambda point: hamiltonian.at(list(point), d), problem.controls.grid(301).points)
     return jnp.max(against_u, axis=0), jnp.min(against_d, axis=0)
 
 
@@ -299,9 +300,9 @@ def test_a_squared_difference_has_a_gap_everywhere(slope):
 )
 def test_players_that_do_not_touch_each_other_are_told(drift, cost, noise, decoupled):
     problem = Problem(drift, cost, UNIT, disturbances=UNIT, noise=noise, discount=1.0)
-    how = players.setting(problem, 2, np.float64)
-    assert how.decoupled == decoupled
-    assert how.disturbance_costs == (cost is not None)
+    players = find_players(problem, 2, np.float64)
+    assert players.decoupled == decoupled
+    assert players.disturbance_costs == (cost is not None)
 
 
 @pytest.mark.parametrize("isaacs", ["upper", "lower"])
@@ -335,9 +336,9 @@ def test_one_player_at_a_time():
 def test_a_reply_meets_the_others_action():
     problem = Problem(lambda x, u, d: 0 * x, lambda x, u, d: u[0] * d[0], UNIT, disturbances=UNIT, discount=1.0)
     grid = Grid([0.0], [1.0], (3,))
-    how = players.setting(problem, 1, np.float64)
-    here = discrete.local(Discretisation(problem, grid, Upwind(), jnp.zeros(3).dtype), jnp.zeros(3))
+    players = find_players(problem, 1, np.float64)
+    hamiltonian = discrete.around(Discretisation(problem, grid, Upwind(), jnp.zeros(3).dtype), jnp.zeros(3))
     fixed = [jnp.array([-1.0, 0.5, 1.0])]
-    value, action = discrete.best_response(here, how.disturbance, lambda d: (fixed, d))
+    value, action = discrete.best_response(hamiltonian, players.disturbance, lambda d: (fixed, d))
     assert np.allclose(value, [1.0, 0.5, 1.0], rtol=1e-14)
     assert np.allclose(action[0], [-1.0, 1.0, 1.0], rtol=1e-14)

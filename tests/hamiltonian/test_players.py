@@ -7,8 +7,8 @@ import pytest
 
 import hjbjax as hjb
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.hamiltonian import players
-from hjbjax.solvers.setup import judge
+from hjbjax.hamiltonian.players import find_players
+from hjbjax.solvers.setup import assumptions_of
 
 LINE = hjb.Grid([-2.0], [2.0], (21,))
 UNIT = hjb.Box([-1.0], [1.0])
@@ -106,7 +106,8 @@ def test_the_certificate_says_where_the_first_player_is_sampled(drift, cost, con
     else:
         problem = hjb.Problem(drift, cost, controls, disturbances=disturbances, isaacs=isaacs, discount=1.0)
     grid = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (7, 7))
-    assert judge(Discretisation(problem, grid, hjb.Upwind(), np.float64)).sentence.endswith(SAMPLED) is not exact
+    assumed = assumptions_of(Discretisation(problem, grid, hjb.Upwind(), np.float64))
+    assert assumed.sentence.endswith(SAMPLED) is not exact
 
 
 def test_a_player_whose_part_is_no_polynomial_leaves_the_other_exact():
@@ -114,10 +115,10 @@ def test_a_player_whose_part_is_no_polynomial_leaves_the_other_exact():
         lambda x, u, d: jnp.stack([jnp.sin(u[0]), d[0]]), lambda x, u, d: jnp.abs(u[0]) - d[0] ** 2,
         UNIT, disturbances=UNIT, discount=1.0,
     )  # fmt: skip
-    how = players.setting(problem, 2, np.float64)
-    assert how.decoupled
-    assert how.disturbance.exact
-    assert not how.control.exact
+    players = find_players(problem, 2, np.float64)
+    assert players.decoupled
+    assert players.disturbance.exact
+    assert not players.control.exact
 
 
 # --- which disturbance may blow up ---

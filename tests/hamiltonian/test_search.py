@@ -11,7 +11,8 @@ from systems import SEEDS
 
 import hjbjax as hjb
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.hamiltonian import discrete, players
+from hjbjax.hamiltonian import discrete
+from hjbjax.hamiltonian.players import find_players
 from hjbjax.hamiltonian.search import UNROLL, enumerate_actions, refine
 
 NODES = 6
@@ -137,11 +138,11 @@ def test_a_search_inside_a_search_is_compiled_in_few_places():
         discount=1.0,
     )
     grid = hjb.Grid([-1.0], [1.0], (11,))
-    how = players.setting(problem, 1, jnp.float32)
-    assert not how.control.exact
-    assert not how.disturbance.exact
+    players = find_players(problem, 1, jnp.float32)
+    assert not players.control.exact
+    assert not players.disturbance.exact
 
     def best(value):
-        return discrete.optimise(discrete.local(Discretisation(problem, grid, hjb.Upwind(), value.dtype), value), how)
+        return discrete.optimise(discrete.around(Discretisation(problem, grid, hjb.Upwind(), value.dtype), value))
 
     assert len(jax.jit(best).lower(jnp.zeros(11)).as_text().splitlines()) < 1500

@@ -14,10 +14,10 @@ from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.hamiltonian import discrete
 from hjbjax.iteration import bellman
-from hjbjax.iteration.bellman import Conditions
+from hjbjax.iteration.bellman import Obstacles
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Ball, Box, Finite
 
 UNIT = Box([-1.0], [1.0])
@@ -36,23 +36,23 @@ def upwind(problem, grid):
 
 
 @functools.partial(jax.jit, static_argnames="scheme")
-def operator(problem, grid, value, rules, scheme=Upwind()):
+def operator(problem, grid, value, obstacles, scheme=Upwind()):
     """One step of value iteration; and βΔt, by which it contracts."""
     on = Discretisation(problem, grid, scheme, value.dtype)
-    pace = bellman.fastest_rate(on) + problem.discount
-    greedy = bellman.greedy(on, value, rules.held)
-    return rules.impose(value + greedy.rate / pace), problem.discount / jnp.max(pace)
+    outflow = bellman.fastest_rate(on) + problem.discount
+    greedy = bellman.greedy(on, value, obstacles.fixed)
+    return obstacles.impose(value + greedy.defect / outflow), problem.discount / jnp.max(outflow)
 
 
 def random_rules(rng, grid):
     """A target, an obstacle above and one below, at times crossing."""
     held = rng.random(grid.shape) < 0.1
     stop, floor = rng.normal(1.0, 1.0, grid.shape), rng.normal(-1.5, 1.0, grid.shape)
-    return Conditions(held, np.where(held, rng.normal(size=grid.shape), 0), stop, floor)
+    return Obstacles(held, np.where(held, rng.normal(size=grid.shape), 0), stop, floor)
 
 
 def free_rules(grid):
-    return Conditions(np.zeros(grid.shape, bool), np.zeros(grid.shape))
+    return Obstacles(np.zeros(grid.shape, bool), np.zeros(grid.shape))
 
 
 def random_question(rng, kind, n=2):
@@ -68,10 +68,13 @@ def random_question(rng, kind, n=2):
 def test_order_is_kept(kind, seed):
     rng = np.random.default_rng(seed)
     problem, grid = random_question(rng, kind)
-    rules, value = random_rules(rng, grid), rng.normal(size=grid.shape)
+    obstacles, value = random_rules(rng, grid), rng.normal(size=grid.shape)
     more = value + rng.random(grid.shape) * rng.choice([0.0, 1.0], grid.shape)
     for scheme in (Upwind(central=False), Upwind()):
-        below, above = operator(problem, grid, value, rules, scheme)[0], operator(problem, grid, more, rules, scheme)[0]
+        below, above = (
+            operator(problem, grid, value, obstacles, scheme)[0],
+            operator(problem, grid, more, obstacles, scheme)[0],
+        )
         assert jnp.all(below <= above + 1e-12)
 
 
@@ -81,8 +84,8 @@ def test_order_is_kept(kind, seed):
 def test_contraction(kind, seed):
     rng = np.random.default_rng(seed)
     problem, grid = random_question(rng, kind)
-    rules, value, other = random_rules(rng, grid), *rng.normal(size=(2, *grid.shape))
-    (first, shrink), (second, _) = operator(problem, grid, value, rules), operator(problem, grid, other, rules)
+    obstacles, value, other = random_rules(rng, grid), *rng.normal(size=(2, *grid.shape))
+    (first, shrink), (second, _) = operator(problem, grid, value, obstacles), operator(problem, grid, other, obstacles)
     assert jnp.max(jnp.abs(first - second)) <= (1 - shrink) * np.max(np.abs(value - other)) + 1e-12
 
 
@@ -92,14 +95,14 @@ def test_contraction(kind, seed):
 def test_a_constant_shifts_the_rate_by_the_discount(kind, seed):
     rng = np.random.default_rng(seed)
     problem, grid = random_question(rng, kind)
-    rules, value, shift = free_rules(grid), rng.normal(size=grid.shape), rng.normal()
-    before, after = (_rate(problem, grid, v, rules.held) for v in (value, value + shift))
+    obstacles, value, shift = free_rules(grid), rng.normal(size=grid.shape), rng.normal()
+    before, after = (_rate(problem, grid, v, obstacles.fixed) for v in (value, value + shift))
     assert np.allclose(after, before - problem.discount * shift, rtol=0, atol=1e-10 * (1 + np.max(np.abs(before))))
 
 
 @jax.jit
 def _rate(problem, grid, value, held):
-    return bellman.greedy(upwind(problem, grid), value, held).rate
+    return bellman.greedy(upwind(problem, grid), value, held).defect
 
 
 @given(seed=SEEDS)
@@ -113,7 +116,7 @@ def test_a_larger_control_set_never_costs_more(seed):
     assert np.all(np.asarray(_rate(wider, grid, value, held)) <= np.asarray(_rate(problem, grid, value, held)) + 1e-12)
 
 
-@node(static=("order",))
+@pytree_dataclass(static=("order",))
 class Turned:
     """The same physics with the axes in another order, or mirrored."""
 
@@ -183,27 +186,27 @@ def test_conditions_are_read_at_the_nodes():
         discount=1.0,
     )
     grid = Grid([-1.0], [1.0], (5,))
-    rules = bellman.conditions(upwind(problem, grid))
-    assert rules.held.tolist() == [False, True, True, True, False]
-    assert rules.given.tolist() == [0.0, -5.0, 0.0, 5.0, 0.0]
-    assert rules.stop.tolist() == [3.0] * 5
-    assert rules.floor is None
-    assert rules.impose(jnp.array([4.0, 4.0, -9.0, 4.0, -9.0])).tolist() == [3.0, -5.0, 0.0, 5.0, -9.0]
+    obstacles = bellman.obstacles(upwind(problem, grid))
+    assert obstacles.fixed.tolist() == [False, True, True, True, False]
+    assert obstacles.fixed_value.tolist() == [0.0, -5.0, 0.0, 5.0, 0.0]
+    assert obstacles.upper.tolist() == [3.0] * 5
+    assert obstacles.lower is None
+    assert obstacles.impose(jnp.array([4.0, 4.0, -9.0, 4.0, -9.0])).tolist() == [3.0, -5.0, 0.0, 5.0, -9.0]
 
 
 def test_the_floor_wins_over_stopping_and_the_target_over_both():
     held = jnp.array([False, False, True])
-    rules = Conditions(
-        held, jnp.array([0.0, 0.0, 9.0]), stop=jnp.array([1.0, 1.0, 1.0]), floor=jnp.array([2.0, -1.0, 2.0])
+    obstacles = Obstacles(
+        held, jnp.array([0.0, 0.0, 9.0]), upper=jnp.array([1.0, 1.0, 1.0]), lower=jnp.array([2.0, -1.0, 2.0])
     )
-    assert rules.impose(jnp.array([5.0, 5.0, 5.0])).tolist() == [2.0, 1.0, 9.0]
-    assert rules.impose(jnp.array([-5.0, -5.0, -5.0])).tolist() == [2.0, -1.0, 9.0]
+    assert obstacles.impose(jnp.array([5.0, 5.0, 5.0])).tolist() == [2.0, 1.0, 9.0]
+    assert obstacles.impose(jnp.array([-5.0, -5.0, -5.0])).tolist() == [2.0, -1.0, 9.0]
 
 
 @jax.jit
-def _equation(problem, grid, value, rules):
-    policy = bellman.greedy(upwind(problem, grid), value, rules.held)
-    return policy, bellman.correction(upwind(problem, grid), value, policy, rules)
+def _equation(problem, grid, value, obstacles):
+    policy = bellman.greedy(upwind(problem, grid), value, obstacles.fixed)
+    return policy, bellman.policy_equation(upwind(problem, grid), value, policy, obstacles)
 
 
 @pytest.mark.parametrize("kind", [*NOISES, "game"])
@@ -212,24 +215,24 @@ def _equation(problem, grid, value, rules):
 def test_the_source_is_the_residual_and_the_weights_are_the_chain(kind, seed):
     rng = np.random.default_rng(seed)
     problem, grid = random_question(rng, kind)
-    rules, value = random_rules(rng, grid), rng.normal(size=grid.shape)
-    policy, equation = jax.device_get(_equation(problem, grid, value, rules))
+    obstacles, value = random_rules(rng, grid), rng.normal(size=grid.shape)
+    policy, equation = jax.device_get(_equation(problem, grid, value, obstacles))
     u, d = (np.stack(side, axis=-1) if side else None for side in (policy.controls, policy.disturbances))
     generator = chain.generator(problem, grid, u, disturbance=d).toarray()
-    pace = -np.diag(generator).reshape(grid.shape) + problem.discount
-    step = policy.rate / pace
-    expected = np.maximum(np.minimum(step, rules.stop - value), rules.floor - value)
-    assert np.allclose(equation.source, np.where(rules.held, 0, expected), rtol=0, atol=1e-12)
-    assert np.all(policy.rate[rules.held] == 0)
-    active = ~rules.held & (step <= rules.stop - value) & (step >= rules.floor - value)
-    total = np.where(active, -np.diag(generator).reshape(grid.shape) / pace, 0)
+    outflow = -np.diag(generator).reshape(grid.shape) + problem.discount
+    step = policy.defect / outflow
+    expected = np.maximum(np.minimum(step, obstacles.upper - value), obstacles.lower - value)
+    assert np.allclose(equation.source, np.where(obstacles.fixed, 0, expected), rtol=0, atol=1e-12)
+    assert np.all(policy.defect[obstacles.fixed] == 0)
+    active = ~obstacles.fixed & (step <= obstacles.upper - value) & (step >= obstacles.lower - value)
+    total = np.where(active, -np.diag(generator).reshape(grid.shape) / outflow, 0)
     assert np.allclose(equation.weights.total(), total, rtol=1e-12)
     assert all(np.all(w >= 0) for w in equation.weights.values)
 
 
 @jax.jit
-def _told(problem, grid, value, policy, rules, fastest):
-    return bellman.correction(upwind(problem, grid), value, policy, rules, fastest=fastest)
+def _told(problem, grid, value, policy, obstacles, fastest):
+    return bellman.policy_equation(upwind(problem, grid), value, policy, obstacles, fastest=fastest)
 
 
 @pytest.mark.parametrize("kind", ["none", "matrix"])
@@ -238,13 +241,13 @@ def _told(problem, grid, value, policy, rules, fastest):
 def test_an_equation_tells_the_fastest_rate_and_may_be_told_it(kind, seed):
     rng = np.random.default_rng(seed)
     problem, grid = random_question(rng, kind)
-    rules, value = random_rules(rng, grid), rng.normal(size=grid.shape)
-    policy, equation = jax.device_get(_equation(problem, grid, value, rules))
+    obstacles, value = random_rules(rng, grid), rng.normal(size=grid.shape)
+    policy, equation = jax.device_get(_equation(problem, grid, value, obstacles))
     generator = chain.generator(problem, grid, np.stack(policy.controls, axis=-1)).toarray()
     assert equation.fastest == pytest.approx(np.max(-np.diag(generator)) + problem.discount, rel=1e-12)
-    again = _told(problem, grid, value, policy, rules, equation.fastest)
+    again = _told(problem, grid, value, policy, obstacles, equation.fastest)
     np.testing.assert_allclose(again.source, equation.source, rtol=1e-12, atol=1e-15)
-    slow = _told(problem, grid, value, policy, rules, np.inf)
+    slow = _told(problem, grid, value, policy, obstacles, np.inf)
     assert not np.any(slow.weights.total())  # where all drift counts as rounding, nothing moves
 
 
@@ -252,11 +255,11 @@ def test_every_rate_counts_where_none_is_rounding():
     problem = Problem(lambda x, u: jnp.where(x > 0.6, 1e6, 1e-10), None, Finite(np.zeros((1, 1))), discount=1e-9)
     grid = Grid([0.0], [1.0], (5,))
     policy = bellman.Greedy(jnp.ones(5), (jnp.zeros(5),), ())
-    rules, leaving = free_rules(grid), np.array([4e-10, 4e-10, 4e-10, 4e6, 0]) + 1e-9
-    found = _told(problem, grid, jnp.zeros(5), policy, rules, 0.0)
+    obstacles, leaving = free_rules(grid), np.array([4e-10, 4e-10, 4e-10, 4e6, 0]) + 1e-9
+    found = _told(problem, grid, jnp.zeros(5), policy, obstacles, 0.0)
     np.testing.assert_allclose(found.source, 1 / leaving, rtol=1e-12)
     np.testing.assert_allclose(found.weights.total(), 1 - 1e-9 / leaving, rtol=1e-7)
-    slow = _told(problem, grid, jnp.zeros(5), policy, rules, 4e6)  # beside this one the others are rounding
+    slow = _told(problem, grid, jnp.zeros(5), policy, obstacles, 4e6)  # beside this one the others are rounding
     np.testing.assert_allclose(slow.source[:3], 1 / 4e6, rtol=1e-12)
 
 
@@ -268,14 +271,14 @@ def test_the_correction_of_a_policy_is_its_value(n, seed):
     rng = np.random.default_rng(seed)
     grid = random_grid(rng, n)
     problem = random_problem(rng, grid, "diagonal")
-    value, rules = rng.normal(size=grid.shape), free_rules(grid)
-    policy, equation = jax.device_get(_equation(problem, grid, value, rules))
+    value, obstacles = rng.normal(size=grid.shape), free_rules(grid)
+    policy, equation = jax.device_get(_equation(problem, grid, value, obstacles))
     u = np.stack(policy.controls, axis=-1)
     generator = chain.generator(problem, grid, u).toarray()
     running = jax.vmap(problem.cost)(grid.nodes().reshape(grid.size, n), u.reshape(grid.size, 1))
     exact = np.linalg.solve(problem.discount * np.eye(grid.size) - generator, np.asarray(running))
-    pace = -np.diag(generator) + problem.discount
-    weights = np.eye(grid.size) - (problem.discount * np.eye(grid.size) - generator) / pace[:, None]
+    outflow = -np.diag(generator) + problem.discount
+    weights = np.eye(grid.size) - (problem.discount * np.eye(grid.size) - generator) / outflow[:, None]
     delta = np.linalg.solve(np.eye(grid.size) - weights, equation.source.ravel())
     assert np.allclose(value.ravel() + delta, exact, rtol=0, atol=1e-9 * (1 + np.max(np.abs(exact))))
 
@@ -317,7 +320,7 @@ def test_the_inner_player_replies_to_the_outer_one(isaacs, seed):
     kept, changed = ("controls", "disturbances") if isaacs == "upper" else ("disturbances", "controls")
     assert np.array_equal(getattr(first, kept)[0], getattr(reply, kept)[0])
     expected = np.max(tried, axis=0) if isaacs == "upper" else np.min(tried, axis=0)
-    assert np.allclose(reply.rate, expected, rtol=0, atol=1e-11 * (1 + np.max(np.abs(expected))))
+    assert np.allclose(reply.defect, expected, rtol=0, atol=1e-11 * (1 + np.max(np.abs(expected))))
     assert set(np.unique(getattr(reply, changed)[0])) <= set((theirs if isaacs == "upper" else mine).points.ravel())
 
 
@@ -332,6 +335,6 @@ def _replies(problem, grid, value, other):
         point = (problem.disturbances if problem.isaacs == "upper" else problem.controls).points[k, 0]
         sides = {"controls": first.controls, "disturbances": first.disturbances}
         sides[name] = (jnp.broadcast_to(point, grid.shape),)
-        here = discrete.local(upwind(problem, grid), value)
+        here = discrete.around(upwind(problem, grid), value)
         tried.append(here.at(list(sides["controls"]), list(sides["disturbances"])) - problem.discount * value)
     return first, reply, jnp.stack(tried)

@@ -15,7 +15,7 @@ from hjbjax.discretisation import chain
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.iteration import bellman, certificates
-from hjbjax.iteration.bellman import Conditions
+from hjbjax.iteration.bellman import Obstacles
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
@@ -34,21 +34,21 @@ def _float64():
 
 
 @functools.partial(jax.jit, static_argnames="kind")
-def measured(kind, problem, grid, value, rules, least_cost, counted, moved):
+def measured(kind, problem, grid, value, obstacles, least_cost, counted, moved):
     on = Discretisation(problem, grid, Upwind(), value.dtype)
-    policy = bellman.greedy(on, value, rules.held)
-    equation = bellman.correction(on, value, policy, rules)
+    policy = bellman.greedy(on, value, obstacles.fixed)
+    equation = bellman.policy_equation(on, value, policy, obstacles)
     settings_ = {"discount": problem.discount, "least_cost": least_cost, "counted": counted, "moved": moved}
-    return certificates.gap(kind, value, policy, equation, rules, **settings_), equation
+    return certificates.error_bound(kind, value, policy, equation, obstacles, **settings_), equation
 
 
-def bounds_of(kind, problem, grid, value, rules, least_cost=None, counted=None):
+def bounds_of(kind, problem, grid, value, obstacles, least_cost=None, counted=None):
     counted = np.ones(grid.shape, bool) if counted is None else counted
-    gap, _ = jax.device_get(measured(kind, problem, grid, value, rules, least_cost, counted, np.inf))
+    gap, _ = jax.device_get(measured(kind, problem, grid, value, obstacles, least_cost, counted, np.inf))
     return gap, Solution(grid, value, None, enclosure=certificates.enclosure(kind, gap, problem.discount)).bounds
 
 
-def exact_solution(problem, grid, rules, start=0.0):
+def exact_solution(problem, grid, obstacles, start=0.0):
     """Dense solves: Howard's iteration of who pays, inside that of who may lift the value to the floor.
 
     Newton's method on max(g, min(ψ, T V)) at once, where one maximises and the other minimises, may cycle: so this is
@@ -62,25 +62,35 @@ def exact_solution(problem, grid, rules, start=0.0):
         for u in POINTS
     ]
     floored = np.zeros(size, bool)
-    value = np.where(np.ravel(rules.held), np.ravel(rules.given), np.ravel(start if rules.stop is None else rules.stop))
+    value = np.where(
+        np.ravel(obstacles.fixed),
+        np.ravel(obstacles.fixed_value),
+        np.ravel(start if obstacles.upper is None else obstacles.upper),
+    )
     for _ in range(200):
-        value, ahead = _without_floor(np.array(generators), np.array(costs), problem.discount, rules, floored, value)
-        if rules.floor is None:
+        value, ahead = _without_floor(
+            np.array(generators), np.array(costs), problem.discount, obstacles, floored, value
+        )
+        if obstacles.lower is None:
             return value.reshape(grid.shape)
-        gain, slack = np.ravel(rules.floor) - value - ahead, 1e-12 * (1 + np.max(np.abs(value)))
-        after = ~np.ravel(rules.held) & np.where(floored, gain >= -slack, gain > slack)
+        gain, slack = np.ravel(obstacles.lower) - value - ahead, 1e-12 * (1 + np.max(np.abs(value)))
+        after = ~np.ravel(obstacles.fixed) & np.where(floored, gain >= -slack, gain > slack)
         if np.array_equal(after, floored):
             return value.reshape(grid.shape)
         floored = after
     raise AssertionError("the oracle does not converge")
 
 
-def _without_floor(generators, costs, discount, rules, floored, value):
+def _without_floor(generators, costs, discount, obstacles, floored, value):
     """Howard's iteration over actions and stopping where the floor is held, and what min(ψ, T V) − V is left."""
     size, here = len(value), np.arange(len(value))
-    held = np.ravel(rules.held) | floored
-    given = np.where(np.ravel(rules.held), np.ravel(rules.given), 0 if rules.floor is None else np.ravel(rules.floor))
-    stop = np.full(size, np.inf) if rules.stop is None else np.ravel(rules.stop)
+    held = np.ravel(obstacles.fixed) | floored
+    given = np.where(
+        np.ravel(obstacles.fixed),
+        np.ravel(obstacles.fixed_value),
+        0 if obstacles.lower is None else np.ravel(obstacles.lower),
+    )
+    stop = np.full(size, np.inf) if obstacles.upper is None else np.ravel(obstacles.upper)
     choice = np.full(size, -1)
     for _ in range(200):
         rates = costs + generators @ value - discount * value
@@ -88,8 +98,8 @@ def _without_floor(generators, costs, discount, rules, floored, value):
         new = np.argmin(rates, axis=0)
         better = rates[new, here] < rates[choice, here] - 1e-11 * (1 + np.max(np.abs(value)))
         choice = np.where((choice < 0) | better, new, choice)
-        pace = discount - generators[choice, here, here]
-        step = rates[choice, here] / np.where(pace > 0, pace, 1)
+        outflow = discount - generators[choice, here, here]
+        step = rates[choice, here] / np.where(outflow > 0, outflow, 1)
         ends = held | (stop - value < step - 1e-12)
         matrix = np.where(ends[:, None], np.eye(size), discount * np.eye(size) - generators[choice, here])
         after = np.linalg.solve(matrix, np.where(held, given, np.where(ends, stop, costs[choice, here])))
@@ -103,12 +113,12 @@ def _without_floor(generators, costs, discount, rules, floored, value):
 def discounted(rng, kind, n, with_rules):
     grid = random_grid(rng, n)
     problem = random_problem(rng, grid, kind, Finite(POINTS), discount=rng.uniform(0.2, 2))
-    rules = Conditions(np.zeros(grid.shape, bool), np.zeros(grid.shape))
+    obstacles = Obstacles(np.zeros(grid.shape, bool), np.zeros(grid.shape))
     if with_rules:
         held = rng.random(grid.shape) < 0.15
         stop, floor = rng.uniform(-0.5, 2, grid.shape), rng.uniform(-2, 0.5, grid.shape)
-        rules = Conditions(held, np.where(held, rng.normal(size=grid.shape), 0), stop, floor)
-    return problem, grid, rules
+        obstacles = Obstacles(held, np.where(held, rng.normal(size=grid.shape), 0), stop, floor)
+    return problem, grid, obstacles
 
 
 @pytest.mark.parametrize("with_rules", [False, True])
@@ -117,11 +127,11 @@ def discounted(rng, kind, n, with_rules):
 @laws
 def test_the_discounted_bound_contains_the_exact_solution(n, kind, with_rules, seed):
     rng = np.random.default_rng(seed)
-    problem, grid, rules = discounted(rng, kind, n, with_rules)
-    exact = exact_solution(problem, grid, rules)
+    problem, grid, obstacles = discounted(rng, kind, n, with_rules)
+    exact = exact_solution(problem, grid, obstacles)
     noise = rng.choice([0.0, 1e-6, 1.0]) * rng.normal(size=grid.shape)
-    value = np.asarray(rules.impose(exact + noise))
-    gap, (lower, upper) = bounds_of(Certificate.ADDITIVE, problem, grid, value, rules)
+    value = np.asarray(obstacles.impose(exact + noise))
+    gap, (lower, upper) = bounds_of(Certificate.ADDITIVE, problem, grid, value, obstacles)
     slack = 1e-9 * (1 + np.max(np.abs(exact)))
     assert np.all(lower <= exact + slack)
     assert np.all(exact <= upper + slack)
@@ -134,8 +144,8 @@ def test_the_discounted_bound_is_sharp():
     """A constant off by δ leaves r = −βδ: the bound is δ and no more."""
     problem = Problem(lambda x, u: u, lambda x, u: 1.0 + 0 * x[0], Finite(POINTS), discount=0.5)
     grid = Grid([0.0], [1.0], (5,))
-    rules = Conditions(np.zeros(5, bool), np.zeros(5))
-    gap, (lower, upper) = bounds_of(Certificate.ADDITIVE, problem, grid, np.full(5, 2.25), rules)
+    obstacles = Obstacles(np.zeros(5, bool), np.zeros(5))
+    gap, (lower, upper) = bounds_of(Certificate.ADDITIVE, problem, grid, np.full(5, 2.25), obstacles)
     assert np.allclose(lower, 2.0, rtol=1e-14)
     assert np.allclose(upper, 2.0, rtol=1e-14)
     assert np.isclose(gap.error, 0.25, rtol=1e-14)
@@ -156,17 +166,22 @@ def test_the_undiscounted_bound_contains_the_exact_solution(n, kind, seed):
     )
     held = np.zeros(grid.shape, bool)
     held[0] = held[-1] = True
-    rules = Conditions(held, np.where(held, rng.uniform(0, 1, grid.shape), 0))
+    obstacles = Obstacles(held, np.where(held, rng.uniform(0, 1, grid.shape), 0))
     steps = np.minimum(np.arange(len(held)), np.arange(len(held))[::-1])  # steep: its greedy policy is proper
     start = np.broadcast_to(1e3 * steps.reshape(-1, *[1] * (n - 1)), grid.shape)
-    exact = exact_solution(problem, grid, rules, start)
+    exact = exact_solution(problem, grid, obstacles, start)
     assert np.all(exact >= 0)
     least = 0.3 + (grid.nodes() - grid.lo) @ slope
     deep = rng.choice([0.0, 5.0])  # exits that pay move the whole value
-    exact, rules = exact - deep, dataclasses.replace(rules, given=np.where(held, rules.given - deep, 0))
+    exact, obstacles = (
+        exact - deep,
+        dataclasses.replace(obstacles, fixed_value=np.where(held, obstacles.fixed_value - deep, 0)),
+    )
     for noise in (0.0, 1e-6, 0.2):
-        value = np.where(held, rules.given, (exact + deep) * (1 + noise * rng.uniform(-1, 1, grid.shape)) - deep)
-        gap, (lower, upper) = bounds_of(Certificate.MULTIPLICATIVE, problem, grid, value, rules, least)
+        value = np.where(
+            held, obstacles.fixed_value, (exact + deep) * (1 + noise * rng.uniform(-1, 1, grid.shape)) - deep
+        )
+        gap, (lower, upper) = bounds_of(Certificate.MULTIPLICATIVE, problem, grid, value, obstacles, least)
         assert (gap.lift > 0) == (deep > 0)
         slack = 1e-8 * (1 + np.max(np.abs(exact)))
         assert np.all(lower <= exact + slack)
@@ -185,7 +200,7 @@ def _toll(slope, lo, x, u):
 
 def test_before_the_first_look_nothing_is_known():
     infinite = np.asarray(np.inf)
-    unlooked = certificates.Gap(-infinite, infinite, np.zeros(()), infinite, infinite)
+    unlooked = certificates.ErrorBound(-infinite, infinite, np.zeros(()), infinite, infinite)
     for kind in (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE):
         value = np.array([0.0, 2.0, np.inf])
         solution = Solution(Grid([0.0], [1.0], (3,)), value, None, enclosure=certificates.enclosure(kind, unlooked))
@@ -198,42 +213,44 @@ def minimum_time():
     problem = Problem(lambda x, u: u, lambda x, u: 1.0 + 0 * x[0], Finite(POINTS))
     grid = Grid([0.0], [1.0], (5,))
     held = np.array([True, False, False, False, True])
-    return problem, grid, Conditions(held, np.zeros(5)), np.array([0.0, 0.25, 0.5, 0.25, 0.0])
+    return problem, grid, Obstacles(held, np.zeros(5)), np.array([0.0, 0.25, 0.5, 0.25, 0.0])
 
 
 def test_minimum_time_by_hand():
-    problem, grid, rules, exact = minimum_time()
+    problem, grid, obstacles, exact = minimum_time()
     for factor in (1.0, 1.1, 0.8):
-        gap, (lower, upper) = bounds_of(Certificate.MULTIPLICATIVE, problem, grid, factor * exact, rules, np.ones(5))
+        gap, (lower, upper) = bounds_of(
+            Certificate.MULTIPLICATIVE, problem, grid, factor * exact, obstacles, np.ones(5)
+        )
         assert np.allclose(lower if factor > 1 else upper, exact, rtol=1e-12)  # sharp on a multiple of the answer
         assert np.isclose(gap.error, 0.5 * max(factor - 1, 1 - factor), atol=1e-12)
 
 
 def test_no_bound_where_the_theorem_says_nothing():
-    problem, grid, rules, exact = minimum_time()
-    negative, _ = bounds_of(Certificate.MULTIPLICATIVE, problem, grid, exact - 0.3, rules, np.ones(5))
+    problem, grid, obstacles, exact = minimum_time()
+    negative, _ = bounds_of(Certificate.MULTIPLICATIVE, problem, grid, exact - 0.3, obstacles, np.ones(5))
     assert np.isinf(negative.error)
-    low = np.where(rules.held, 0, 1e-6)
-    steep, (_, upper) = bounds_of(Certificate.MULTIPLICATIVE, problem, grid, low, rules, np.ones(5))
+    low = np.where(obstacles.fixed, 0, 1e-6)
+    steep, (_, upper) = bounds_of(Certificate.MULTIPLICATIVE, problem, grid, low, obstacles, np.ones(5))
     assert np.all(upper >= exact)
-    flat, (_, upper) = bounds_of(Certificate.MULTIPLICATIVE, problem, grid, 0 * exact, rules, np.ones(5))
+    flat, (_, upper) = bounds_of(Certificate.MULTIPLICATIVE, problem, grid, 0 * exact, obstacles, np.ones(5))
     assert np.isinf(flat.above)  # r = L
     assert np.all(np.isinf(upper))  # not 0 · inf
     assert np.isfinite(steep.below)
-    free, _ = bounds_of(Certificate.MULTIPLICATIVE, problem, grid, 0.9 * exact, rules, np.array([1.0, 1, 0, 1, 1]))
+    free, _ = bounds_of(Certificate.MULTIPLICATIVE, problem, grid, 0.9 * exact, obstacles, np.array([1.0, 1, 0, 1, 1]))
     assert np.isinf(free.error)
     assert certificates.enclosure(Certificate.NONE, free) is None
 
 
 def test_where_the_value_is_flat_rounding_certifies_nothing():
     """r = L at a node that no action improves; a least cost that is larger by rounding leaves 1 − ρ = 2e-16."""
-    problem, grid, rules, exact = minimum_time()
+    problem, grid, obstacles, exact = minimum_time()
     least = np.full(5, 1 + np.finfo(float).eps)
-    flat, (_, upper) = bounds_of(Certificate.MULTIPLICATIVE, problem, grid, 0 * exact, rules, least)
+    flat, (_, upper) = bounds_of(Certificate.MULTIPLICATIVE, problem, grid, 0 * exact, obstacles, least)
     assert np.isinf(flat.above)
     assert np.isinf(flat.error)
     assert np.all(np.isinf(upper))
-    single = cast((problem, grid, np.zeros(5), rules, np.full(5, 1 + 1e-6)), np.float32)
+    single = cast((problem, grid, np.zeros(5), obstacles, np.full(5, 1 + 1e-6)), np.float32)
     flat, _ = bounds_of(Certificate.MULTIPLICATIVE, *single)
     assert flat.above.dtype == np.float32
     assert np.isinf(flat.error)
@@ -246,7 +263,7 @@ def test_lifted_bounds_are_rounded_outwards(seed):
     lift = float(10.0 ** rng.uniform(-9, 9) * rng.choice([0.0, 1.0], p=[0.1, 0.9]))
     below, above = float(rng.choice([1.0, rng.uniform(0, 1)])), float(10.0 ** rng.choice([0.0, rng.uniform(0, 7.8)]))
     value = np.append(-lift, -lift * (1 - 10.0 ** rng.uniform(-16, 0, 20)))
-    gap = certificates.Gap(*(np.asarray(number) for number in (below, above, lift, 0.0, 0.0)))
+    gap = certificates.ErrorBound(*(np.asarray(number) for number in (below, above, lift, 0.0, 0.0)))
     enclosure = certificates.enclosure(Certificate.MULTIPLICATIVE, gap)
     lower, upper = Solution(Grid([0.0], [1.0], (21,)), value, None, enclosure=enclosure).bounds
     for v, low, high in zip(value, lower, upper, strict=True):
@@ -259,27 +276,27 @@ def test_lifted_bounds_are_rounded_outwards(seed):
 
 @pytest.mark.parametrize("kind", list(Certificate))
 def test_a_nan_certifies_nothing(kind):
-    problem, grid, rules, exact = minimum_time()
-    gap, _ = bounds_of(kind, problem, grid, np.where(np.arange(5) == 2, np.nan, exact), rules, np.ones(5))
+    problem, grid, obstacles, exact = minimum_time()
+    gap, _ = bounds_of(kind, problem, grid, np.where(np.arange(5) == 2, np.nan, exact), obstacles, np.ones(5))
     assert not gap.residual <= 1e300
     assert not gap.error <= 1e300
 
 
 def test_without_a_certificate_the_last_step_counts_too():
-    problem, grid, rules, exact = minimum_time()
+    problem, grid, obstacles, exact = minimum_time()
     counted = np.ones(5, bool)
-    gap, equation = measured(Certificate.NONE, problem, grid, 1.5 * exact, rules, None, counted, 0.0)
+    gap, equation = measured(Certificate.NONE, problem, grid, 1.5 * exact, obstacles, None, counted, 0.0)
     assert np.isclose(gap.residual, np.max(np.abs(equation.source)), rtol=1e-14)
     assert gap.error == gap.residual
-    later, _ = measured(Certificate.NONE, problem, grid, 1.5 * exact, rules, None, counted, 7.0)
+    later, _ = measured(Certificate.NONE, problem, grid, 1.5 * exact, obstacles, None, counted, 7.0)
     assert later.error == 7.0
 
 
 def test_nodes_that_do_not_count_do_not_spoil_the_bound():
-    problem, grid, rules, exact = minimum_time()
+    problem, grid, obstacles, exact = minimum_time()
     value = np.where(np.arange(5) == 3, 1e6, exact)
     counted = np.array([True, True, False, False, True])
-    gap, _ = bounds_of(Certificate.MULTIPLICATIVE, problem, grid, value, rules, np.ones(5), counted)
+    gap, _ = bounds_of(Certificate.MULTIPLICATIVE, problem, grid, value, obstacles, np.ones(5), counted)
     assert np.isclose(gap.error, 0, atol=1e-12)
 
 
@@ -295,12 +312,12 @@ def test_without_cost_and_discount_constraints_supply_the_value(seed):
     grid = random_grid(rng, 1)
     problem = Problem(lambda x, u: u, None, Finite(POINTS))
     stop, floor = rng.uniform(0, 1, 7), rng.uniform(-1, 0.5, 7)
-    rules = Conditions(np.zeros(7, bool), np.zeros(7), stop, floor)
+    obstacles = Obstacles(np.zeros(7, bool), np.zeros(7), stop, floor)
     value = np.maximum(floor, stop)
     for _ in range(20):  # ends after at most as many steps as there are nodes
         best = np.minimum(value, np.minimum(np.r_[value[1:], value[-1]], np.r_[value[0], value[:-1]]))
         value = np.maximum(floor, np.minimum(stop, best))
-    gap, _ = bounds_of(Certificate.NONE, problem, grid, value, rules)
+    gap, _ = bounds_of(Certificate.NONE, problem, grid, value, obstacles)
     assert gap.residual <= 1e-14
-    worse, _ = bounds_of(Certificate.NONE, problem, grid, value + np.where(np.arange(7) == 3, 0.5, 0), rules)
+    worse, _ = bounds_of(Certificate.NONE, problem, grid, value + np.where(np.arange(7) == 3, 0.5, 0), obstacles)
     assert worse.residual >= 0.01

@@ -13,8 +13,8 @@ from systems import SEEDS
 
 import hjbjax as hjb
 from hjbjax.discretisation.chain import Rates
-from hjbjax.iteration.bellman import Correction
-from hjbjax.iteration.evaluation import Direct, Krylov, Sweeps, evaluate, gauss_seidel, jacobi, left_over
+from hjbjax.iteration.bellman import PolicyEquation
+from hjbjax.iteration.evaluation import Direct, Krylov, Sweeps, evaluate, jacobi, left_over, relaxed
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -25,7 +25,7 @@ def _float64():
 
 @functools.partial(jax.jit, static_argnames="rounds")
 def sweeps(equation, grid, rounds):
-    return gauss_seidel(equation, grid, rounds)
+    return relaxed(equation, grid, rounds)
 
 
 left_over = jax.jit(left_over)
@@ -101,7 +101,7 @@ def test_an_equation_without_a_solution_is_relaxed(method):
     grid = make_grid(1, (False,), (2,))
     ones = jnp.ones(2)
     weights = Rates(((1,), (-1,)), (jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0])))
-    assert np.all(np.isfinite(solved(Correction(ones, weights), grid, method)))
+    assert np.all(np.isfinite(solved(PolicyEquation(ones, weights), grid, method)))
 
 
 def test_single_precision_goes_through_the_direct_solve():

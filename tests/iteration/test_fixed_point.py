@@ -10,7 +10,7 @@ import pytest
 import hjbjax as hjb
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import fixed_point
-from hjbjax.iteration.certificates import Gap
+from hjbjax.iteration.certificates import ErrorBound
 from hjbjax.solution.status import Status
 from hjbjax.solvers.setup import prepare_on_host
 
@@ -46,8 +46,8 @@ def test_every_rule_of_a_verdict():
     task, _, _ = prepare_on_host(on, method=hjb.PolicyIteration(), tol=1e-3)
 
     @jax.jit
-    def judge(residual, error, best, nearest, since):
-        measured = Gap(-error, error, jnp.zeros(()), error, residual)
+    def assumptions_of(residual, error, best, nearest, since):
+        measured = ErrorBound(-error, error, jnp.zeros(()), error, residual)
         return fixed_point._judge(task, jnp.full(11, -LARGE), measured, jnp.stack([nearest, best]), since)
 
     residuals = (0.0, 0.9 * ROUNDING, 1.1 * ROUNDING, 1.0, 0.9e6 * ROUNDING, 1.1e6 * ROUNDING, 1e7, np.inf, np.nan)
@@ -55,7 +55,7 @@ def test_every_rule_of_a_verdict():
     for residual, error, *before in itertools.product(
         residuals, (1e-4, 1.0, np.nan), (0.0, ROUNDING / 10, 2.0, np.inf), (1e-7, 1.0, np.inf), (0, 9, 10, 143, 144)
     ):
-        found = Status(int(judge(residual, error, *before)))
+        found = Status(int(assumptions_of(residual, error, *before)))
         assert found is expected(residual, error, *before, 1e-3), (residual, error, *before)
         seen.add(found)
     assert len(seen) == 5

@@ -9,13 +9,13 @@ import pytest
 
 import hjbjax as hjb
 from hjbjax import zoo
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 
 PLAIN = hjb.Upwind(central=False)
 NOISE = 0.5**0.5
 
 
-@node()
+@pytree_dataclass()
 class Line:
     """f₀ = ½ sin x, c = 1.2 + .3 sin x and V = 1 − cos x + ¼x⁴: the cost q + u² with q = βV − f₀V' + ¼(cV')²."""
 
@@ -36,7 +36,7 @@ class Line:
         return 1 - jnp.cos(x[0]) + 0.25 * x[0] ** 4
 
 
-@node()
+@pytree_dataclass()
 class Space:
     """Three states, three inputs with gain 1, V = Σ(cosh x_i − 1) + ¼x₁²x₂² + ¼x₂x₃."""
 

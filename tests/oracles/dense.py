@@ -100,12 +100,12 @@ def _supports(chain):
     """Actions (K, S, m) that between them make every set of jumps that some action makes."""
     tried = candidates(chain, np.zeros(chain.size), chain.model.controls, chain.model.G, chain.model.l,
                        chain.model.s, chain.model.b)  # fmt: skip
-    choices, gain = chain.model.controls, chain.model.G
-    if choices.kind in ("none", "finite"):
+    admissible, gain = chain.model.controls, chain.model.G
+    if admissible.kind in ("none", "finite"):
         return tried
-    if choices.kind == "ball":  # the part of a disc that a line cuts off may hold no other candidate
+    if admissible.kind == "ball":  # the part of a disc that a line cuts off may hold no other candidate
         length = np.linalg.norm(gain, axis=-1, keepdims=True)
-        outmost = np.moveaxis(choices.radius * gain / np.where(length > 0, length, 1), 1, 0)
+        outmost = np.moveaxis(admissible.radius * gain / np.where(length > 0, length, 1), 1, 0)
         tried = np.concatenate([tried, outmost, -outmost])
     if tried.shape[-1] == 1:
         ordered = np.sort(tried, axis=0)
@@ -232,26 +232,28 @@ def _inner(chain, value, u, d, stopped):
     raise AssertionError("the oracle's inner iteration does not end")
 
 
-def _pace(chain):
+def _outflow(chain):
     """The largest Q at every node: rates are convex in the drift, so that ends and corners of the sets suffice."""
     model, corners = chain.model, []
-    for choices in (model.controls, model.disturbances):
-        if choices is None or choices.kind == "none":
+    for admissible in (model.controls, model.disturbances):
+        if admissible is None or admissible.kind == "none":
             corners.append([None])
-        elif choices.kind == "finite":
-            corners.append(list(choices.points))
+        elif admissible.kind == "finite":
+            corners.append(list(admissible.points))
         else:  # the corners of a square around a disc lie beyond it, which does no harm
-            lo, hi = (choices.lo, choices.hi) if choices.kind == "box" else (-choices.radius, choices.radius)
-            picks = itertools.product((False, True), repeat=choices.dim)
-            corners.append([np.where(pick, np.broadcast_to(hi, choices.dim), lo) for pick in picks])
+            lo, hi = (
+                (admissible.lo, admissible.hi) if admissible.kind == "box" else (-admissible.radius, admissible.radius)
+            )
+            picks = itertools.product((False, True), repeat=admissible.dim)
+            corners.append([np.where(pick, np.broadcast_to(hi, admissible.dim), lo) for pick in picks])
     rates = []
     for u, d in itertools.product(*corners):
         u = np.zeros((chain.size, 0)) if u is None else np.broadcast_to(u, (chain.size, len(u)))
         rates.append(
             np.sum(chain.rates(chain.drift(u, None if d is None else np.broadcast_to(d, (chain.size, len(d))))), axis=0)
         )
-    pace = np.max(np.stack(rates), axis=0)
-    return np.where(pace > 0, pace, 1)
+    outflow = np.max(np.stack(rates), axis=0)
+    return np.where(outflow > 0, outflow, 1)
 
 
 def _iterate(chain):
@@ -260,10 +262,10 @@ def _iterate(chain):
     held, given, stop = _obstacles(model, chain.size)
     floor = np.full(chain.size, -np.inf) if model.floor is None else model.floor
     value = np.maximum(stop, floor) if model.stop is not None else floor
-    value, pace = np.where(held, given, value), _pace(chain)
+    value, outflow = np.where(held, given, value), _outflow(chain)
     scale = np.max(np.abs(value))
     for _ in range(30_000):
-        new = np.maximum(floor, np.minimum(stop, value + optimum(chain, value)[0] / pace))
+        new = np.maximum(floor, np.minimum(stop, value + optimum(chain, value)[0] / outflow))
         new = np.where(held, given, new)
         change = np.max(np.abs(new - value))
         value = new

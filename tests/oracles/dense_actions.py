@@ -9,7 +9,7 @@ import itertools
 import numpy as np
 
 
-def candidates(chain, value, choices, gain, linear, square, offset):
+def candidates(chain, value, admissible, gain, linear, square, offset):
     """Actions (K, S, m) among which the Hamiltonian, as it depends on this player, has its least and largest value.
 
     Args:
@@ -19,25 +19,27 @@ def candidates(chain, value, choices, gain, linear, square, offset):
       linear, square: (m,), what they add to the cost.
       offset: (S, n), the drift without them.
     """
-    size, m = chain.size, choices.dim
-    if choices.kind == "none":
+    size, m = chain.size, admissible.dim
+    if admissible.kind == "none":
         return np.zeros((1, size, 0))
-    if choices.kind == "finite":
-        return np.repeat(choices.points[:, None, :], size, axis=1)
+    if admissible.kind == "finite":
+        return np.repeat(admissible.points[:, None, :], size, axis=1)
     slopes = [chain.slopes(value, i) for i in range(chain.n)]
     gradients = [
         linear + sum(p[:, None] * gain[:, i] for i, p in enumerate(pick)) for pick in itertools.product(*slopes)
     ]
     lines = [(gain[:, i], kink - offset[:, i]) for i in range(chain.n) for kink in chain.kinks(i)]
     if m == 1:
-        found = _on_a_line(choices, gradients, lines, square, size)
+        found = _on_a_line(admissible, gradients, lines, square, size)
     else:
-        found = _in_the_plane(choices, gradients, lines, square, size)
-    return choices.nearest(np.stack(found))
+        found = _in_the_plane(admissible, gradients, lines, square, size)
+    return admissible.nearest(np.stack(found))
 
 
-def _on_a_line(choices, gradients, lines, square, size):
-    low, high = (-choices.radius, choices.radius) if choices.kind == "ball" else (choices.lo[0], choices.hi[0])
+def _on_a_line(admissible, gradients, lines, square, size):
+    low, high = (
+        (-admissible.radius, admissible.radius) if admissible.kind == "ball" else (admissible.lo[0], admissible.hi[0])
+    )
     found = [np.full((size, 1), low), np.full((size, 1), high)]
     found += [_ratio(c[:, None], g) for g, c in lines]
     if square[0] != 0:
@@ -49,16 +51,16 @@ def _ratio(p, q):
     return np.where(q != 0, p / np.where(q != 0, q, 1), 0)
 
 
-def _in_the_plane(choices, gradients, lines, square, size):
+def _in_the_plane(admissible, gradients, lines, square, size):
     """Corners of all pieces, and stationary points inside pieces, along kinks and along the boundary."""
     found = [np.zeros((size, 2))]
     lines = [(g, c) for g, c in lines if np.any(g)]
-    if choices.kind == "box":
-        ends = itertools.product(range(2), (choices.lo, choices.hi))
+    if admissible.kind == "box":
+        ends = itertools.product(range(2), (admissible.lo, admissible.hi))
         lines += [(np.tile(np.eye(2)[j], (size, 1)), np.full(size, end[j])) for j, end in ends]
     else:
         assert square[0] == square[1] >= 0
-        found += [-choices.radius * g / _length(g) for g in gradients]
+        found += [-admissible.radius * g / _length(g) for g in gradients]
     for (g, c), (g2, c2) in itertools.combinations(lines, 2):
         det = g[:, 0] * g2[:, 1] - g[:, 1] * g2[:, 0]
         point = np.stack([c * g2[:, 1] - c2 * g[:, 1], g[:, 0] * c2 - g2[:, 0] * c], axis=-1)
@@ -68,8 +70,8 @@ def _in_the_plane(choices, gradients, lines, square, size):
     for g, c in lines:
         foot = _ratio(g * c[:, None], np.sum(g * g, axis=-1, keepdims=True))
         along = np.stack([-g[:, 1], g[:, 0]], axis=-1) / _length(g)
-        if choices.kind == "ball":
-            reach = np.sqrt(np.maximum(choices.radius**2 - np.sum(foot * foot, axis=-1, keepdims=True), 0))
+        if admissible.kind == "ball":
+            reach = np.sqrt(np.maximum(admissible.radius**2 - np.sum(foot * foot, axis=-1, keepdims=True), 0))
             found += [foot + reach * along, foot - reach * along]
         bend = np.sum(square * along * along, axis=-1)
         if np.any(bend > 0):
@@ -164,8 +166,10 @@ def _outer(chain, value):
     return tried
 
 
-def _interval(choices):
-    return (-choices.radius, choices.radius) if choices.kind == "ball" else (choices.lo[0], choices.hi[0])
+def _interval(admissible):
+    return (
+        (-admissible.radius, admissible.radius) if admissible.kind == "ball" else (admissible.lo[0], admissible.hi[0])
+    )
 
 
 def optimum(chain, value):

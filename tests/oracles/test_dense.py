@@ -62,17 +62,17 @@ def test_a_tube_and_what_must_be_avoided():
 def test_no_action_is_better_than_the_best(family, seed):
     rng = np.random.default_rng(seed)
     model = draw(family, rng).model
-    chain, value, choices = (
+    chain, value, admissible = (
         dense.Chain(model),
         rng.normal(size=len(model.q)) * np.max(np.abs(model.q) + 1),
         model.controls,
     )
     best, _ = dense.best_control(chain, value)
-    if choices.kind in ("box", "ball"):
-        spread = rng.uniform(-2, 2, (400, 1, choices.dim))
-        tried = choices.nearest(spread * (choices.hi if choices.kind == "box" else choices.radius))
-        drawn = chain.hamiltonian(value, np.broadcast_to(tried, (400, chain.size, choices.dim)))
-        size = dense._noise(chain, value, np.broadcast_to(tried[0], (chain.size, choices.dim)), None, 1.0)
+    if admissible.kind in ("box", "ball"):
+        spread = rng.uniform(-2, 2, (400, 1, admissible.dim))
+        tried = admissible.nearest(spread * (admissible.hi if admissible.kind == "box" else admissible.radius))
+        drawn = chain.hamiltonian(value, np.broadcast_to(tried, (400, chain.size, admissible.dim)))
+        size = dense._noise(chain, value, np.broadcast_to(tried[0], (chain.size, admissible.dim)), None, 1.0)
         assert np.all(best <= np.min(drawn, axis=0) + 1e-9 * size)
 
 

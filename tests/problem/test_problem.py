@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from hjbjax import Ball, Box, Problem
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 
 U, D = Box([-1.0], [1.0]), Ball(1.0, 1)
 
 
-@node()
+@pytree_dataclass()
 class Pendulum:
     """A parametrised system, as a user would write one."""
 

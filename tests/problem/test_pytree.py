@@ -8,10 +8,19 @@ import numpy as np
 import pytest
 
 from hjbjax import Ball, Box, Finite, Grid, Problem
-from hjbjax.problem.pytree import REMEMBERED, altered, as_partial, cast, is_traced, node, numbers, remembered
+from hjbjax.problem.pytree import (
+    REMEMBERED,
+    altered,
+    as_partial,
+    cast,
+    is_traced,
+    numbers,
+    pytree_dataclass,
+    remembered,
+)
 
 
-@node(static=("kind",), host=("history", "note"))
+@pytree_dataclass(static=("kind",), host=("history", "note"))
 class Record:
     """Leaves, a static field and two host fields."""
 
@@ -26,7 +35,7 @@ class Record:
             raise ValueError("scale")
 
 
-@node()
+@pytree_dataclass()
 class Spring:
     """A system whose parameters are leaves."""
 
@@ -111,13 +120,13 @@ def test_static_fields_recompile_and_leaves_do_not():
 def test_a_decorator_refuses_fields_that_are_not_there_and_host_fields_without_default():
     with pytest.raises(TypeError, match="has no field shap"):
 
-        @node(static=("shap",))
+        @pytree_dataclass(static=("shap",))
         class Typo:
             shape: tuple
 
     with pytest.raises(TypeError, match="note: a host field .* needs a default"):
 
-        @node(host=("note",))
+        @pytree_dataclass(host=("note",))
         class NoDefault:
             note: str
 

@@ -18,7 +18,7 @@ from hjbjax.applications import convergence, hinf, perturbations
 from hjbjax.extremals import boundary_value, continuation, equilibria
 from hjbjax.feedback import simulation
 from hjbjax.finiteness import node_checks
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solvers import batch, epochs, host_loop
 
@@ -409,7 +409,7 @@ def test_a_march_that_has_arrived_is_not_out_of_time(monkeypatch):
 # --- batches ---
 
 
-@node()
+@pytree_dataclass()
 class Pull:
     """ẋ = u − k x."""
 

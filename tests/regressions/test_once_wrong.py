@@ -8,7 +8,7 @@ from refusals import GRID, problem, refusal
 
 import hjbjax as hjb
 from hjbjax import zoo
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 
 
 @pytest.mark.parametrize("tol", ["1e-3", None])
@@ -37,7 +37,7 @@ def test_rest_where_every_action_costs_the_same():
     assert hjb.solve(problem(discount=0.0), odd, tol=1e-2).value[4, 5] == 0.0
 
 
-@node()
+@pytree_dataclass()
 class Burst:
     """A cost that is NaN for one control."""
 

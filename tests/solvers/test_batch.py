@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 
 GRID = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (13, 11))
 MANY = np.linspace(-1.0, 1.0, 41)  # more than the checks try: they pass over the fourth
 HIDDEN = MANY[3]
 
 
-@node()
+@pytree_dataclass()
 class Oscillator:
     """ẍ = −k x + u, with running cost w |x|² + u²."""
 
@@ -128,7 +128,7 @@ def lost(rate):
     return hjb.Problem(Current(rate).drift, lambda x, u: 1.0, hjb.Box([-1.0], [1.0]), target=lambda x: x[0] + 1 - 1e-9)
 
 
-@node()
+@pytree_dataclass()
 class Current:
     """ẋ = u + r (1 + sgn x)/2."""
 

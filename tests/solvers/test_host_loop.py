@@ -12,7 +12,7 @@ import pytest
 
 import hjbjax as hjb
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.solvers import host_loop
 from hjbjax.solvers.setup import prepare_on_host
 
@@ -28,7 +28,7 @@ def cost(x, u):
     return x @ x + 0.1 * u @ u
 
 
-@node()
+@pytree_dataclass()
 class Level:
     """A constant cost, large if wanted."""
 

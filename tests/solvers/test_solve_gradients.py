@@ -8,12 +8,12 @@ import pytest
 import hjbjax as hjb
 from hjbjax import zoo
 from hjbjax.iteration import adjoint
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 
 TRACES = []
 
 
-@node()
+@pytree_dataclass()
 class Cart:
     """A damped mass whose every number is a leaf; counts how often it is traced."""
 
@@ -25,7 +25,7 @@ class Cart:
         return jnp.stack([x[1], (u[0] - self.damping * x[1]) / self.mass])
 
 
-@node()
+@pytree_dataclass()
 class Weights:
     scale: float = 1.0
 
@@ -173,7 +173,7 @@ def test_fixed_steps_under_jit_report_that_they_ran_out():
     assert hjb.Status(int(result.code)) is not hjb.Status.CONVERGED
 
 
-@node()
+@pytree_dataclass()
 class Wavy:
     """A drift and a cost that are not affine and quadratic in u, so that actions are sampled."""
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from hjbjax.discretisation import stencil
 from hjbjax.discretisation.chain import Rates
-from hjbjax.iteration.bellman import Correction
+from hjbjax.iteration.bellman import PolicyEquation
 from hjbjax.problem.grid import Grid
 
 SHAPES = {1: (9,), 2: (6, 5), 3: (4, 3, 5), 4: (3, 4, 2, 3)}
@@ -36,5 +36,5 @@ def random_equation(rng, grid, leak=0.1, diagonal=False):
     weights = [w * scale for w in weights]
     source = rng.normal(size=grid.shape)
     dense = stencil.sparse(offsets, [-w for w in weights], np.ones(grid.shape), grid).toarray()
-    equation = Correction(jnp.asarray(source), Rates(tuple(offsets), tuple(map(jnp.asarray, weights))))
+    equation = PolicyEquation(jnp.asarray(source), Rates(tuple(offsets), tuple(map(jnp.asarray, weights))))
     return equation, dense, np.linalg.solve(dense, source.ravel()).reshape(grid.shape)

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Box
 
 SHAPES = {1: (7,), 2: (5, 4), 3: (4, 3, 3), 4: (3, 4, 2, 3)}
@@ -14,7 +14,7 @@ PERIODIC = {1: (False,), 2: (True, False), 3: (False, True, False), 4: (False, T
 SEEDS = st.integers(0, 2**32 - 1)
 
 
-@node()
+@pytree_dataclass()
 class System:
     """dx = (s ∘ sin(A x + b) + G u + E d) dt + σ dw with cost c·cos(x) + l·u + q·u² + k·d."""
 

@@ -8,7 +8,7 @@ from questions import GRID, U, accepted, drift, in_disc, refused
 
 from hjbjax import Grid, Problem
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.problem.pytree import node
+from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.tracing import checks
 
 # --- shapes ---
@@ -76,7 +76,7 @@ def test_arguments_of_games_and_time():
     accepted(drift=lambda t, x, u, d: jnp.stack([t + d[0], u[0]]), disturbances=U, time_dependent=True)
 
 
-@node()
+@pytree_dataclass()
 class Damped:
     rate: object
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hjbjax.problem.pytree import as_partial, node
+from hjbjax.problem.pytree import as_partial, pytree_dataclass
 from hjbjax.tracing import dependence
 
 MATRIX = np.array([[1.0, 2.0], [0.5, -1.0]])
@@ -158,7 +158,7 @@ def test_a_control_without_entries():
     assert found(lambda x, u: x + jnp.sum(u), ((3, False), (0, True))).is_constant
 
 
-@node()
+@pytree_dataclass()
 class Power:
     """(u₀ − ½)^p with p a number of the problem: what it is decides what can be proved."""
 

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 
 from hjbjax.discretisation import stencil
-from hjbjax.iteration.bellman import Correction
+from hjbjax.iteration.bellman import PolicyEquation
 from hjbjax.problem.grid import Grid
 
 Weights = list[tuple[jax.Array, ...]]  # for each axis, as ``_towards`` gives them
@@ -29,7 +29,7 @@ SLAB = 64  # slices
 FOLDS = 4  # up to so many comparisons take the place of a division, which XLA would not fuse
 
 
-def gauss_seidel(equation: Correction, grid: Grid, rounds: int) -> jax.Array:
+def sweep(equation: PolicyEquation, grid: Grid, rounds: int) -> jax.Array:
     """Sweeps from zero, in every order ``rounds`` times forward and backward; for jumps along the axes alone.
 
     The orders are one loop, so that one program serves them all and its operands are arrays in memory: a fused
@@ -98,7 +98,7 @@ def _in_slabs(source: jax.Array, weights: Weights, planes: jax.Array, grid: Grid
     return planes
 
 
-def _towards(equation: Correction, grid: Grid, axis: int, flips: list[jax.Array]) -> tuple[jax.Array, ...]:
+def _towards(equation: PolicyEquation, grid: Grid, axis: int, flips: list[jax.Array]) -> tuple[jax.Array, ...]:
     """The sheared weights (up, down) along an axis, or (up − down,) where at most one of the two is positive."""
     table = dict(zip(equation.weights.offsets, equation.weights.values, strict=True))
     up, down = (table[stencil.unit(grid, axis, step)] for step in (1, -1))

@@ -12,7 +12,7 @@ from equations import LAYOUTS, SHAPES, ids, make_grid, random_equation
 from hypothesis import given, settings
 from systems import SEEDS
 
-from hjbjax.iteration import wavefront
+from hjbjax.iteration import gauss_seidel
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -54,7 +54,7 @@ def by_a_loop(dense, source, grid, rounds, slab=None):
 
 @functools.partial(jax.jit, static_argnames="rounds")
 def sweeps(equation, grid, rounds):
-    return wavefront.gauss_seidel(equation, grid, rounds)
+    return gauss_seidel.sweep(equation, grid, rounds)
 
 
 @pytest.mark.parametrize(
@@ -73,23 +73,23 @@ def test_equals_a_loop_over_the_nodes(shape, periodic, seed):
 
 @pytest.mark.parametrize(("shape", "periodic", "rounds"), [((7, 5), "", 1), ((8, 4), "01", 3), ((5, 3, 4), "2", 2)])
 def test_slabs_equal_a_loop_over_the_nodes(shape, periodic, rounds, monkeypatch):
-    monkeypatch.setattr(wavefront, "SLAB", 2)
+    monkeypatch.setattr(gauss_seidel, "SLAB", 2)
     flags = tuple(str(axis) in periodic for axis in range(len(shape)))
     grid = make_grid(len(shape), flags, shape)
     equation, dense, _ = random_equation(np.random.default_rng(0), grid)
-    monkeypatch.setattr(wavefront, "CACHE", 8 * grid.size * (2 + 2 * grid.ndim) - 1)  # less than all takes
-    found = jax.jit(lambda equation: wavefront.gauss_seidel(equation, grid, rounds))(equation)
+    monkeypatch.setattr(gauss_seidel, "CACHE", 8 * grid.size * (2 + 2 * grid.ndim) - 1)  # less than all takes
+    found = jax.jit(lambda equation: gauss_seidel.sweep(equation, grid, rounds))(equation)
     in_slabs, in_turns = (by_a_loop(dense, np.ravel(equation.source), grid, rounds, slab) for slab in (2, None))
     assert np.allclose(found, in_slabs, rtol=0, atol=1e-12)
     assert not np.allclose(found, in_turns, rtol=0, atol=1e-3)
 
 
-@pytest.mark.parametrize("cache", [wavefront.CACHE, 2**11])  # the second is less than all takes, and a slab fits
+@pytest.mark.parametrize("cache", [gauss_seidel.CACHE, 2**11])  # the second is less than all takes, and a slab fits
 def test_one_signed_weight_does_for_two_of_which_one_is_zero(cache, monkeypatch):
     grid = make_grid(3, (True, False, True))
-    monkeypatch.setattr(wavefront, "SLAB", 1)
-    monkeypatch.setattr(wavefront, "CACHE", cache)
-    sweep = jax.jit(lambda equation: wavefront.gauss_seidel(equation, grid, 2))
+    monkeypatch.setattr(gauss_seidel, "SLAB", 1)
+    monkeypatch.setattr(gauss_seidel, "CACHE", cache)
+    sweep = jax.jit(lambda equation: gauss_seidel.sweep(equation, grid, 2))
     for seed in range(8):
         rng = np.random.default_rng(seed)
         equation, _, _ = random_equation(rng, grid)
@@ -105,7 +105,7 @@ def test_one_signed_weight_does_for_two_of_which_one_is_zero(cache, monkeypatch)
 @pytest.mark.parametrize(("n", "flags"), LAYOUTS, ids=ids)
 def test_a_shear_puts_hyperplanes_into_slices_and_can_be_undone(n, flags):
     values = np.random.default_rng(0).normal(size=SHAPES[n])
-    shear = jax.jit(wavefront._sheared, static_argnames="back")
+    shear = jax.jit(gauss_seidel._sheared, static_argnames="back")
     for flips in itertools.product((0, 1), repeat=n - 1):
         sheared = np.asarray(shear(values, list(flips)))
         flipped = np.flip(values, [axis + 1 for axis, flip in enumerate(flips) if flip])

@@ -58,7 +58,7 @@ def _verdicts(family, count, failures):
         try:
             verdict = agreement.compare(random_problems.draw(family, rng), rng)
         except Exception as error:  # a crash is a failure of this problem, and the others go on
-            verdict = agreement.Assumptions("uncertified", (f"{type(error).__name__}: {error}",))
+            verdict = agreement.Verdict("uncertified", (f"{type(error).__name__}: {error}",))
         found.append(verdict)
         failures.extend((family.name, seed, complaint) for complaint in verdict.complaints[:1])
 

@@ -12,7 +12,7 @@ SLACK = 16  # times what rounding may do to a residual: the package rounds as th
 
 
 @dataclasses.dataclass(frozen=True)
-class Assumptions:
+class Verdict:
     """How one problem went.
 
     Attributes:
@@ -48,7 +48,7 @@ def compare(case, rng):
                 dtype="float32" if case.family.single else None, max_steps=100_000,
             )  # fmt: skip
         except ValueError as error:
-            return Assumptions("refused", (f"refused: {str(error).splitlines()[0]}",))
+            return Verdict("refused", (f"refused: {str(error).splitlines()[0]}",))
     return _judged(solution, answer, finite, rounding, tol, lower=case.family.lower)
 
 
@@ -58,8 +58,8 @@ def _refused(case):
             warnings.simplefilter("ignore")
             solution = hjb.solve(case.problem, case.grid, throw=False, progress=False, max_steps=1000)
     except ValueError:
-        return Assumptions("refused", ())
-    return Assumptions("refused", (f"not refused but {solution.status.name}: {case.refusal}",))
+        return Verdict("refused", ())
+    return Verdict("refused", (f"not refused but {solution.status.name}: {case.refusal}",))
 
 
 def _judged(solution, answer, finite, rounding, tol, *, lower):
@@ -67,7 +67,7 @@ def _judged(solution, answer, finite, rounding, tol, *, lower):
     value = np.asarray(solution.value, float).ravel()
     complaints = []
     if np.any(np.isnan(value)):
-        return Assumptions("uncertified", ("NaN",))
+        return Verdict("uncertified", ("NaN",))
     if np.any(np.isinf(value) != ~finite):
         wrong = np.isinf(value) != ~finite
         nodes = f"{np.sum(np.isinf(value))} nodes, the oracle at {np.sum(~finite)}"
@@ -81,7 +81,7 @@ def _judged(solution, answer, finite, rounding, tol, *, lower):
     if solution.enclosure is None:
         if converged and beyond > tol:
             complaints.append(f"converged without certificate, off by {beyond / tol:.3g} tol")
-        return Assumptions("uncertified", tuple(complaints), np.nan, np.max(off, initial=0) / tol, unfinished)
+        return Verdict("uncertified", tuple(complaints), np.nan, np.max(off, initial=0) / tol, unfinished)
     sampled = "refined sample" in solution.stats.get("certificate", "")
     low, high = (np.where(finite, np.asarray(bound, float).ravel(), 0) for bound in solution.bounds)
     far = np.maximum(np.abs(low), np.abs(high))  # an unfinished solve may be far off, and rounds what it bounds
@@ -96,4 +96,4 @@ def _judged(solution, answer, finite, rounding, tol, *, lower):
         complaints.append("converged above its tolerance")
     ratio = beyond / solution.error if solution.error > 0 and np.isfinite(solution.error) else np.nan
     kind = "sampled" if sampled else "certified"
-    return Assumptions(kind, tuple(complaints), ratio, np.max(off, initial=0) / tol, unfinished)
+    return Verdict(kind, tuple(complaints), ratio, np.max(off, initial=0) / tol, unfinished)

@@ -43,17 +43,16 @@ def settled(problem: Problem, n: int, dtype: Any = None) -> Problem:
       dtype: the floating-point type inside a JAX transformation; ``None`` is that of ``float`` there.
     """
     names = [name for name in (*OF_ACTION, *OF_STATE) if callable(getattr(problem, name))]
-    names = [name for name in names if not _is_fixed(getattr(problem, name))]
-    if not names:
-        return problem
+    fixed = {name: _remembering(getattr(problem, name)) for name in names if _is_fixed(getattr(problem, name))}
+    asked = [name for name in names if name not in fixed]
     if not is_traced(problem):
         with jax.core.eval_context(), jax.enable_x64(True):
-            found = {name: _trace(problem, name, n, np.dtype(np.float64)) for name in names}
-        if not any(closed is not None and is_traced(closed.consts) for closed in found.values()):
-            return altered(problem, **{name: _marked(getattr(problem, name), found[name]) for name in names})
+            found = {name: _traced(problem, name, n, np.dtype(np.float64)) for name in asked}
+        if not any(is_traced(closed.consts) for _, closed in found.values() if closed is not None):
+            return altered(problem, **fixed, **{name: _marked(*pair) for name, pair in found.items()})
     kind = jnp.result_type(float) if dtype is None else jnp.dtype(dtype)
-    found = {name: _trace(problem, name, n, kind) for name in names}
-    return altered(problem, **{name: _settled(getattr(problem, name), found[name]) for name in names})
+    found = {name: _traced(problem, name, n, kind) for name in asked}
+    return altered(problem, **fixed, **{name: _opened(*pair) for name, pair in found.items()})
 
 
 def with_settled_functions(front_door: Callable) -> Callable:
@@ -93,14 +92,52 @@ def _all_settled(asked: Any, n: int, dtype: Any) -> Any:
 
 
 class Marked:
-    """A function that equals another only if both compute the same thing."""
+    """A function with a mark of what it computes, which it equals another by, and with the jaxprs of its traces.
 
-    def __init__(self, function: Callable, mark: Any):
+    Python runs the function once for every kind of arguments: a solve looks at it in half a dozen places (checks,
+    dependence on the control, the chain, slopes of the drift in u), and each would trace it anew.
+    """
+
+    def __init__(self, function: Callable, mark: Any = None):
         self.__wrapped__, self.mark = function, mark  # the name under which ``inspect`` finds the signature
+        self._jaxprs: dict[Any, tuple[jex.ClosedJaxpr, Any] | None] = {}
 
     def __call__(self, *arguments: Any, **options: Any) -> Any:
-        """What the function returns."""
-        return self.__wrapped__(*arguments, **options)
+        """What the function returns; under a trace by its jaxpr."""
+        if not is_traced(arguments, options):
+            return self.__wrapped__(*arguments, **options)
+        found = self.jaxpr(options, arguments)
+        if found is None:
+            return self.__wrapped__(*arguments, **options)
+        closed, structure = found
+        leaves = jax.tree.leaves((options, arguments))
+        return jax.tree.unflatten(structure, jax.core.eval_jaxpr(closed.jaxpr, closed.consts, *leaves))
+
+    def jaxpr(self, options: dict, arguments: tuple) -> tuple[jex.ClosedJaxpr, Any] | None:
+        """The jaxpr of the leaves of (options, arguments) and the tree of its results; None where there is none.
+
+        There is none where the function cannot be traced for all numbers, so that the reason shows where it is called.
+        """
+        leaves, structure = jax.tree.flatten((options, arguments))
+        kinds = tuple(map(_kind, leaves))
+        key = (structure, kinds, jax.config.jax_enable_x64)  # type: ignore[attr-defined]
+        if key in self._jaxprs:
+            return self._jaxprs[key]
+
+        def of_leaves(*leaves: Any) -> Any:
+            options, arguments = jax.tree.unflatten(structure, leaves)
+            return self.__wrapped__(*arguments, **options)
+
+        shapes = [jax.ShapeDtypeStruct(shape, dtype, weak_type=weak) for shape, dtype, weak in kinds]
+        try:
+            closed, results = jax.make_jaxpr(of_leaves, return_shape=True)(*shapes)
+        except Exception:
+            self._jaxprs[key] = None
+            return None
+        found = closed, jax.tree.structure(results)
+        if not is_traced(closed.consts):  # else it belongs to one transformation, which ends
+            self._jaxprs[key] = found
+        return found
 
     def __eq__(self, other: Any) -> bool:
         return isinstance(other, Marked) and self.mark == other.mark and self.__wrapped__ == other.__wrapped__
@@ -112,8 +149,8 @@ class Marked:
 class Opened:
     """A traced function of what it closed over, of the leaves it held, and of its arguments."""
 
-    def __init__(self, jaxpr: Any, count: int):
-        self.jaxpr, self.count = jaxpr, count
+    def __init__(self, jaxpr: Any):
+        self.jaxpr = jaxpr
 
     def __call__(self, known: tuple, *arguments: Any) -> Any:
         """What the function returned, with ``known`` the numbers it closed over and its leaves."""
@@ -126,12 +163,18 @@ class Opened:
         return [jnp.asarray(value, var.aval.dtype) for value, var in zip(values, variables, strict=True)]
 
 
-def _settled(function: Any, closed: Any) -> Any:
+def _kind(leaf: Any) -> tuple[tuple[int, ...], Any, bool]:
+    """Shape, type and weakness of a number or of its place holder: what a jaxpr depends on."""
+    aval = leaf if isinstance(leaf, jax.ShapeDtypeStruct) else jax.typeof(leaf)
+    return aval.shape, aval.dtype, bool(aval.weak_type)
+
+
+def _opened(function: jax.tree_util.Partial, closed: jex.ClosedJaxpr | None) -> jax.tree_util.Partial:
     """A function inside a JAX transformation: with a mark, or with what it closed over as leaves."""
     if closed is None or not is_traced(closed.consts):
         return _marked(function, closed)
-    leaves = jax.tree.leaves(function)
-    return jax.tree_util.Partial(Opened(closed.jaxpr, len(leaves)), (tuple(closed.consts), leaves))
+    leaves = jax.tree.leaves((function.keywords, function.args))
+    return jax.tree_util.Partial(Opened(closed.jaxpr), (tuple(closed.consts), leaves))
 
 
 def _is_fixed(thing: Any, depth: int = 8) -> bool:
@@ -177,10 +220,15 @@ def _is_library(thing: Any) -> bool:
     return fixed and isinstance(home, str) and home.split(".")[0] in LIBRARIES
 
 
-def _trace(problem: Problem, name: str, n: int, dtype: Any) -> Any:
-    """The jaxpr of a function of leaves and arguments; None where it cannot be traced: the checks will say why."""
-    function = getattr(problem, name)
-    leaves, structure = jax.tree.flatten(function)
+def _remembering(function: jax.tree_util.Partial) -> jax.tree_util.Partial:
+    """The function with a memory for its jaxprs, and no mark yet."""
+    inner = function.func.__wrapped__ if isinstance(function.func, Marked) else function.func
+    return jax.tree_util.Partial(Marked(inner), *function.args, **function.keywords)
+
+
+def _traced(problem: Problem, name: str, n: int, dtype: Any) -> tuple[jax.tree_util.Partial, jex.ClosedJaxpr | None]:
+    """A function and its jaxpr in leaves and arguments; None where it cannot be traced: the checks will say why."""
+    function = _remembering(getattr(problem, name))
     sizes = {
         letter: 0 if admissible is None else admissible.dim
         for letter, admissible in (("u", problem.controls), ("d", problem.disturbances))
@@ -188,21 +236,16 @@ def _trace(problem: Problem, name: str, n: int, dtype: Any) -> Any:
     shapes = {"x": (n,), "u": (sizes["u"],), "d": (sizes["d"],), "t": ()}
     letters = problem.arguments("x", "u", "d", "t") if name in OF_ACTION else problem.state_arguments("x", "t")
     arguments = [jax.ShapeDtypeStruct(shapes[letter], dtype) for letter in letters]
-
-    def of_leaves(leaves: list, *arguments: Any) -> Any:
-        return jax.tree.unflatten(structure, leaves)(*arguments)
-
-    try:
-        return jax.make_jaxpr(of_leaves)(leaves, *arguments)
-    except Exception:
-        return None
+    assert isinstance(function.func, Marked)
+    found = function.func.jaxpr(function.keywords, (*function.args, *arguments))
+    return function, None if found is None else found[0]
 
 
-def _marked(function: Any, closed: Any) -> Any:
+def _marked(function: jax.tree_util.Partial, closed: jex.ClosedJaxpr | None) -> jax.tree_util.Partial:
     """The function with the mark of its trace; where there is none it equals no other."""
-    inner = function.func.__wrapped__ if isinstance(function.func, Marked) else function.func
-    mark = object() if closed is None else fingerprint(closed)
-    return jax.tree_util.Partial(Marked(inner, mark), *function.args, **function.keywords)
+    assert isinstance(function.func, Marked)
+    function.func.mark = object() if closed is None else fingerprint(closed)
+    return function
 
 
 def fingerprint(closed: jex.ClosedJaxpr) -> bytes:

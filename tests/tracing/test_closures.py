@@ -121,14 +121,12 @@ def test_what_did_not_change_is_traced_once_and_not_compiled_again():
 
 def test_library_code_and_arguments_are_not_even_traced():
     plain = hjb.Problem(steer, lambda x, u: jnp.sum(x * x) + np.pi, UNIT)
-    found = closures.settled(plain, 1).drift.func
-    assert found.__wrapped__ is plain.drift.func
-    assert found.mark is None
-    assert not found._jaxprs
-    assert closures.settled(plain, 1).cost is plain.cost
-    problem, _ = hjb.zoo.pendulum()
-    assert closures.settled(problem, 2).drift is problem.drift
-    assert closures.settled(problem, 2).cost is problem.cost
+    for problem, n in ((plain, 1), (hjb.zoo.pendulum()[0], 2)):
+        for name in ("drift", "cost"):
+            found, asked = (getattr(each, name).func for each in (closures.settled(problem, n), problem))
+            assert found.__wrapped__ is asked
+            assert found.mark is None
+            assert not found._jaxprs
 
 
 def test_what_cannot_be_traced_is_left_to_the_checks():

@@ -18,7 +18,8 @@ from hjbjax.feedback.simulation import simulate
 from hjbjax.geometry import stability
 from hjbjax.geometry.lyapunov import lyapunov_check
 from hjbjax.iteration.evaluation import Direct, Krylov, Sweeps
-from hjbjax.iteration.methods import Explicit, Implicit, Nested, PolicyIteration, Tableau, ValueIteration
+from hjbjax.iteration.methods import Nested, PolicyIteration, ValueIteration
+from hjbjax.iteration.time_methods import Explicit, Implicit, Tableau
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import Ball, Box, Finite

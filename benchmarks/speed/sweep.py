@@ -25,6 +25,7 @@ from benchmarks.harness import thresholds
 from benchmarks.harness.footprint import bytes_of
 from benchmarks.harness.report import RESULTS, attempt, publish, table, without
 from benchmarks.harness.timing import interleaved
+from hjbjax.discretisation import chain
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import bellman, fixed_point
 from hjbjax.problem.pytree import cast
@@ -80,7 +81,7 @@ def copy(old: jax.Array, value: jax.Array) -> jax.Array:
 @jax.jit
 def paces(problem: Any, grid: Any) -> jax.Array:
     """max_u Q + β at the nodes."""
-    return bellman.fastest_rate(Discretisation(problem, grid, SCHEME, KIND)) + problem.discount
+    return chain.fastest_rate(Discretisation(problem, grid, SCHEME, KIND)) + problem.discount
 
 
 def started(grid: hjb.Grid) -> jax.Array:

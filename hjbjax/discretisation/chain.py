@@ -27,6 +27,7 @@ from hjbjax.discretisation.cut_cells import links
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.discretisation.stencil import Links
+from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import cast, pytree_dataclass
@@ -115,6 +116,18 @@ def rates(on: Discretisation, u: list, d: list | None = None) -> Rates:
             _add_diagonal_jumps(table, entry, grid, i, j)
     values = tuple(jnp.broadcast_to(jnp.asarray(rate, on.dtype), grid.shape) for rate in table.values())
     return Rates(tuple(table), values, one_way=on.problem.noise is None)
+
+
+def fastest_rate(on: Discretisation) -> jax.Array:
+    """max over the actions of Q at every node, (*grid): with Δt = 1/(Q + β) value iteration is monotone.
+
+    Q is convex in u for a drift affine in u, so that corners of the sets suffice; samples are added for others.
+    """
+    result = jnp.zeros(on.grid.shape, on.dtype)
+    for u in sets.probes(on.problem.controls, on.dtype):
+        for d in sets.probes(on.problem.disturbances, on.dtype):
+            result = jnp.maximum(result, rates(on, u, d).total())
+    return result
 
 
 def _inside(rate: Any, grid: Grid, axis: int, step: int) -> Any:

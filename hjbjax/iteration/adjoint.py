@@ -17,11 +17,10 @@ import jax
 import jax.numpy as jnp
 
 from hjbjax.discretisation import chain
-from hjbjax.iteration import bellman, fixed_point
+from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import PolicyEquation
 from hjbjax.iteration.evaluation import Evaluation, Krylov, direct, evaluate, left_over
 from hjbjax.iteration.fixed_point import State, Task
-from hjbjax.iteration.methods import PolicyIteration
 from hjbjax.problem.grid import Grid
 
 STEPS = 200  # refinements of the linear solve in each of its two stages, at most
@@ -40,7 +39,7 @@ def attach(task: Task, state: State) -> jax.Array:
     task_kept, state = jax.lax.stop_gradient((task, state))
     value = state.value
     equation = jax.lax.stop_gradient(_ties_to_constraints(task_kept, state))
-    evaluation = task.method.evaluation if isinstance(task.method, PolicyIteration) else Krylov()
+    evaluation = task.method.evaluation or Krylov()
 
     def solver(weights):
         return lambda _, right: refined(evaluation, PolicyEquation(right, weights), task_kept.grid)
@@ -81,7 +80,7 @@ def _ties_to_constraints(task: Task, state: State) -> PolicyEquation:
     Where going on is worth as much both branches hold. On a plateau without discount only this one has a derivative:
     a policy may go round on it for ever.
     """
-    equation = fixed_point.equation(task, state.value, state.policy)
+    equation = task.equation(state.value, state.policy)
     free = jnp.ones(task.grid.shape, bool)
     for constraint in (task.obstacles.upper, task.obstacles.lower):
         if constraint is not None:
@@ -139,7 +138,7 @@ def refined(evaluation: Evaluation, equation: PolicyEquation, grid: Grid) -> jax
         return jax.lax.while_loop(unfinished, refine, start)[0]
 
     delta = jnp.zeros_like(equation.source)
-    if not isinstance(evaluation, Krylov):
+    if evaluation.rough:
         delta = stage(evaluation, delta, SLOW)
         evaluation = Krylov()
     delta = stage(evaluation, delta, jnp.inf)

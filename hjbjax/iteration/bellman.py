@@ -21,7 +21,6 @@ from hjbjax.discretisation.chain import Rates
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.hamiltonian import discrete
 from hjbjax.hamiltonian.players import players_of
-from hjbjax.problem import sets
 from hjbjax.problem.pytree import pytree_dataclass
 
 LEAK = 64  # units of eps of Q: a smaller rate towards a lost node is rounding
@@ -204,15 +203,3 @@ def leaks(on: Discretisation, policy: Greedy, held: jax.Array, lost: jax.Array) 
         leaking = leaking + leak
     limit = LEAK * jnp.finfo(on.dtype).eps * rates.total()
     return jnp.any(~lost & ~held & (leaking > limit))
-
-
-def fastest_rate(on: Discretisation) -> jax.Array:
-    """max over the actions of Q at every node, (*grid): with Δt = 1/(Q + β) value iteration is monotone.
-
-    Q is convex in u for a drift affine in u, so that corners of the sets suffice; samples are added for others.
-    """
-    result = jnp.zeros(on.grid.shape, on.dtype)
-    for u in sets.probes(on.problem.controls, on.dtype):
-        for d in sets.probes(on.problem.disturbances, on.dtype):
-            result = jnp.maximum(result, chain.rates(on, u, d).total())
-    return result

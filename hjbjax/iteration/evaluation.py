@@ -160,9 +160,18 @@ def check_evaluation(evaluation: Any, name: str) -> None:
     if isinstance(evaluation, type) or not isinstance(evaluation, Evaluation):
         wanted = "hjb.Sweeps(...), hjb.Krylov(...) or hjb.Direct()"
         raise TypeError(f"{name} is {arguments.shown(evaluation)}; wanted {wanted}")
-    if any(leaf is evaluation for leaf in jax.tree.leaves(evaluation)):
+    check_pytree(evaluation, name)
+
+
+def check_pytree(value: object, name: str) -> None:
+    """Refuse, by ``name``, a class of the user's own that JAX takes for a leaf.
+
+    Raises:
+      TypeError: with the decorators that mend it.
+    """
+    if any(leaf is value for leaf in jax.tree.leaves(value)):
         raise TypeError(
-            f"{name}: {type(evaluation).__name__} is no pytree, which compiled programs want; decorate the class with "
+            f"{name}: {type(value).__name__} is no pytree, which compiled programs want; decorate the class with "
             "jax.tree_util.register_static, or register_dataclass if it holds numbers"
         )
 

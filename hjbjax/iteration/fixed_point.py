@@ -20,14 +20,15 @@ import numpy as np
 from hjbjax.discretisation import chain
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.hamiltonian.players import players_of
-from hjbjax.iteration import bellman, certificates
+from hjbjax.iteration import bellman, certificates, hoffman_karp
 from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
 from hjbjax.iteration.certificates import Certificate, ErrorBound
-from hjbjax.iteration.evaluation import evaluate
-from hjbjax.iteration.methods import Method, PolicyIteration, ValueIteration
+from hjbjax.iteration.evaluation import Evaluation, evaluate
+from hjbjax.iteration.methods import Method
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, is_traced, pytree_dataclass
+from hjbjax.problem.types import Field, Scalar
 from hjbjax.solution.status import Status
 
 FULL_STEPS = 10  # corrections of a limited scheme before they are halved, which ends limit cycles of the limiter
@@ -35,7 +36,6 @@ SHIFT = 1.2  # by which the time of a pseudo-step grows; at 2 other solutions of
 SHIFTS = 150  # steps after which there is no shift any more: 1.2¹⁵⁰ is 10¹²
 HISTORY = 256  # steps whose residuals one chunk can record
 GROWTH = 1e6  # a residual that has grown by this factor over its smallest has diverged
-CLIMB = 100_000  # steps of value iteration without progress: without discount V climbs by L Δt a step for long
 TO_THE_END = (Certificate.NONE, Certificate.BY_DISCOUNT)  # of tubes: V falls or climbs until nothing moves
 PATIENCE = 10  # steps without progress of a residual that is rounding
 ROUNDING = 64  # residuals below this many units in the last place of max|V| are rounding
@@ -105,6 +105,20 @@ class Task:
             return value
         largest = jnp.max(jnp.where(self.counted, jnp.abs(value), 0))
         return jnp.where(self.counted, value, largest / jnp.sqrt(jnp.finfo(value.dtype).eps))
+
+    def equation(self, value: Field, policy: Greedy, fastest: Any = None) -> PolicyEquation:
+        """The linear equation of a policy; ``fastest``, its largest Q + β, spares a pass where it is known."""
+        if self.certificate is Certificate.ADDITIVE:  # no rate is only rounding: there is a discount
+            fastest = jnp.zeros((), value.dtype)
+        return bellman.policy_equation(self.on, value, policy, self.obstacles, fastest=fastest)
+
+    def reply(self, value: Field, policy: Greedy) -> Greedy:
+        """The inner player's best answer to the outer player's policy."""
+        return bellman.respond(self.on, value, self.obstacles.fixed, policy, lost=self.lost)
+
+    def residual(self, equation: PolicyEquation) -> Scalar:
+        """The largest |source| at the nodes that count, in cost units."""
+        return jnp.max(jnp.where(self.counted, jnp.abs(equation.source), 0))
 
     def start(self) -> jax.Array:
         """Where to start without a guess: zero, or without discount ψ, above all fixed points, or g, below them."""
@@ -176,12 +190,12 @@ def run(task: Task, state: State, until: Any) -> State:
 def advance(task: Task, state: State, start: Any) -> State:
     """One step; a step that ends in numbers that are not finite is taken back."""
     stay = jnp.zeros_like(state.value)
-    delta = jax.lax.cond(state.step < 0, lambda: stay, lambda: _correct(task, state))
+    delta = jax.lax.cond(state.step < 0, lambda: stay, lambda: _correction(task, state))
     if not task.scheme.monotone:
         delta = jnp.where(state.step < FULL_STEPS, 1.0, 0.5).astype(delta.dtype) * delta
     value = task.impose(state.value + delta)
     moved = jnp.max(jnp.abs(jnp.where(task.counted, value - state.value, 0)))
-    if task.certificate is Certificate.OPEN and not isinstance(task.method, ValueIteration):
+    if task.certificate is Certificate.OPEN and not task.method.relaxes:
         moved = moved * _held_back(task, state)
     policy, fastest, bound = _look(task, value, state.policy, moved=moved, first=state.step < 0)
     bound = dataclasses.replace(bound, error=jnp.where(_unmeasured(task, state), jnp.inf, bound.error))
@@ -199,7 +213,7 @@ def broken(task: Task, state: State) -> jax.Array:
     """Where value or rate are not finite in the step that a NONFINITE state took back, bool (*grid)."""
     state = dataclasses.replace(state, step=state.step - 1)
     stay = jnp.zeros_like(state.value)
-    delta = jax.lax.cond(state.step < 0, lambda: stay, lambda: _correct(task, state))
+    delta = jax.lax.cond(state.step < 0, lambda: stay, lambda: _correction(task, state))
     value = task.impose(state.value + delta)
     rate = bellman.greedy(task.on, value, task.obstacles.fixed, lost=task.lost).defect
     return task.counted & ~(jnp.isfinite(value) & jnp.isfinite(rate))
@@ -236,7 +250,7 @@ def _look(
     if problem.stopping_cost is not None and not problem.is_game and task.certificate in TO_THE_END:
         fixed = task.obstacles.fixed | first  # nobody has chosen the actions before the first look
         policy = bellman.kept(task.on, value, fixed, policy, incumbent)
-    left = equation(task, value, policy)
+    left = task.equation(value, policy)
     bound = certificates.error_bound(
         task.certificate,
         value,
@@ -257,7 +271,7 @@ def _look(
 def _judge(task: Task, value: jax.Array, bound: ErrorBound, best: jax.Array, since: jax.Array) -> jax.Array:
     finite = jnp.isfinite(bound.residual)
     matters = (since >= PATIENCE) | (bound.residual > GROWTH * best[1])  # else it changes no answer below
-    climbs = task.constrained or isinstance(task.method, ValueIteration)
+    climbs = task.constrained or task.method.relaxes
     to_the_end = climbs and task.certificate in (*TO_THE_END, Certificate.OPEN)
     size = jax.lax.cond(
         matters | to_the_end,
@@ -265,7 +279,7 @@ def _judge(task: Task, value: jax.Array, bound: ErrorBound, best: jax.Array, sin
         lambda: jnp.zeros_like(best[1]),
     )
     rounding, tol = ROUNDING * jnp.finfo(value.dtype).eps * size, task.tol
-    longest = CLIMB if isinstance(task.method, ValueIteration) else 100 + 4 * sum(task.grid.shape)
+    longest = task.method.patience(task.grid)
     if to_the_end:  # a front moves V by a spacing times its slope a step, whatever the tolerance, past every node
         tol = jnp.where(task.problem.discount > 0, tol, rounding)
         longest = max(longest, 100 + 4 * task.grid.size)
@@ -279,29 +293,48 @@ def _judge(task: Task, value: jax.Array, bound: ErrorBound, best: jax.Array, sin
     return jnp.where(finite, code, Status.NONFINITE).astype(jnp.int32)
 
 
-def _correct(task: Task, state: State) -> jax.Array:
-    if isinstance(task.method, ValueIteration):
-        return state.policy.defect / _outflow(task, state)
-    if task.outflow is None or task.certificate is Certificate.OPEN:
-        return _evaluated(task, state)
+@dataclasses.dataclass(frozen=True)
+class Look:
+    """A solve at one of its values, as a method sees it."""
+
+    task: Task
+    state: State
+
+    @property
+    def grid(self) -> Grid:
+        """The nodes."""
+        return self.task.grid
+
+    def equation(self) -> PolicyEquation:
+        """The linear equation of the greedy policy, whose rates are known."""
+        return self.task.equation(self.state.value, self.state.policy, self.state.fastest)
+
+    def relaxed(self) -> jax.Array:
+        """r/(Q + β): one relaxation of every node."""
+        return self.state.policy.defect / _outflow(self.task, self.state)
+
+    def evaluated(self, evaluation: Evaluation, replies: int) -> jax.Array:
+        """The correction of policy iteration: by the linear equation of the policy, in a game by the inner problem."""
+        task, state = self.task, self.state
+        if task.certificate is Certificate.OPEN:  # in a game, too: steps in time improve both players at once
+            later = altered(task.problem, discount=task.problem.discount + _shift(task, state))
+            return evaluate(evaluation, task.asking(later).equation(state.value, state.policy), task.grid)
+        if task.problem.is_game:
+            value = hoffman_karp.evaluated(
+                task, state.value, state.policy, evaluation, residual=state.bound.residual, replies=replies
+            )
+            return value - state.value
+        return evaluate(evaluation, self.equation(), task.grid)
+
+
+def _correction(task: Task, state: State) -> jax.Array:
+    """δ of the method, cost units, (*grid)."""
+    look = Look(task, state)
+    if task.method.relaxes or task.outflow is None or task.certificate is Certificate.OPEN:
+        return task.method.correct(look)
     return jax.lax.cond(  # a tube whose discount is traced: without one its policies have no value of their own
-        jnp.asarray(task.problem.discount > 0),
-        lambda: _evaluated(task, state),
-        lambda: state.policy.defect / _outflow(task, state),
+        jnp.asarray(task.problem.discount > 0), lambda: task.method.correct(look), look.relaxed
     )
-
-
-def _evaluated(task: Task, state: State) -> jax.Array:
-    """The correction of policy iteration: by the linear equation of the policy, in a game by the inner problem."""
-    assert isinstance(task.method, PolicyIteration)
-    if task.certificate is Certificate.OPEN:  # in a game, too: steps in time improve both players at once
-        later = altered(task.problem, discount=task.problem.discount + _shift(task, state))
-        left = equation(task.asking(later), state.value, state.policy)
-        return evaluate(task.method.evaluation, left, task.grid)
-    if task.problem.is_game:
-        return _hoffman_karp(task, state)
-    left = equation(task, state.value, state.policy, state.fastest)
-    return evaluate(task.method.evaluation, left, task.grid)
 
 
 def _outflow(task: Task, state: State) -> jax.Array:
@@ -313,30 +346,3 @@ def _outflow(task: Task, state: State) -> jax.Array:
     u, d = list(state.policy.controls), list(state.policy.disturbances)
     chosen = chain.rates(task.on, u, d).total()
     return jnp.maximum(task.outflow, chosen + task.problem.discount)
-
-
-def equation(task: Task, value: jax.Array, policy: Greedy, fastest: Any = None) -> PolicyEquation:
-    """The linear equation of a policy; ``fastest``, its largest Q + β, spares a pass where it is known and wanted."""
-    if task.certificate is Certificate.ADDITIVE:  # no rate is only rounding: there is a discount
-        fastest = jnp.zeros((), value.dtype)
-    return bellman.policy_equation(task.on, value, policy, task.obstacles, fastest=fastest)
-
-
-def _hoffman_karp(task: Task, state: State) -> jax.Array:
-    """The inner player's problem against the outer player's frozen policy, to a tenth of the outer residual."""
-    assert isinstance(task.method, PolicyIteration)
-    evaluation, replies, held = task.method.evaluation, task.method.replies, task.obstacles.fixed
-    target = 0.1 * state.bound.residual
-
-    def reply(carry):
-        value, policy, _, count = carry
-        value = task.impose(value + evaluate(evaluation, equation(task, value, policy), task.grid))
-        policy = bellman.respond(task.on, value, held, policy, lost=task.lost)
-        left = jnp.max(jnp.where(task.counted, jnp.abs(equation(task, value, policy).source), 0))
-        return value, policy, left, count + 1
-
-    def unfinished(carry):
-        return (carry[2] > target) & (carry[3] < replies)
-
-    start = (state.value, state.policy, jnp.asarray(jnp.inf, state.value.dtype), jnp.zeros((), jnp.int32))
-    return jax.lax.while_loop(unfinished, reply, start)[0] - state.value

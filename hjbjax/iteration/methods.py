@@ -1,11 +1,97 @@
-"""The methods of a stationary solve and those of a march, as values: what is done, and not how."""
+"""The methods of a stationary solve, as values, and how to write one of your own.
 
-import dataclasses
-from typing import Any
+Every method repeats one step: at V the greedy policy leaves a defect, and a correction δ is added. A method says which.
+One of damped Jacobi sweeps:
 
-from hjbjax.iteration.evaluation import Evaluation, Sweeps, check_evaluation
+    >>> import dataclasses
+    >>> import jax
+    >>> import hjbjax as hjb
+    >>> @jax.tree_util.register_static
+    ... @dataclasses.dataclass(frozen=True)
+    ... class Jacobi:
+    ...     sweeps: int = 8
+    ...     relaxes, evaluation, coarsest = False, hjb.Sweeps(), None
+    ...
+    ...     @property
+    ...     def inner(self):
+    ...         return self
+    ...
+    ...     def correct(self, step):
+    ...         from hjbjax.iteration.evaluation import jacobi
+    ...
+    ...         return jacobi(step.equation(), step.grid, self.sweeps)
+    ...
+    ...     def patience(self, grid):
+    ...         return 100_000
+    ...
+    ...     def described(self, game):
+    ...         return repr(self)
+    >>> problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), discount=1.0)
+    >>> hjb.solve(problem, hjb.Grid([-1.0], [1.0], (41,)), method=Jacobi()).status.name
+    'CONVERGED'
+
+What it returns is traced, and the method goes into compiled programs as a pytree, here one without numbers. The loop
+looks after the rest: the certificate, the constraints, and steps that lead nowhere.
+"""
+
+from typing import Protocol, runtime_checkable
+
+import jax
+
+from hjbjax.iteration.bellman import PolicyEquation
+from hjbjax.iteration.evaluation import Evaluation, Sweeps, check_evaluation, check_pytree
 from hjbjax.problem import arguments
+from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import pytree_dataclass
+
+CLIMB = 100_000  # steps of value iteration without progress: without discount V climbs by L Δt a step for long
+
+
+class Step(Protocol):
+    """A solve at one of its values, as a method sees it."""
+
+    @property
+    def grid(self) -> Grid:
+        """The nodes."""
+
+    def equation(self) -> PolicyEquation:
+        """The linear equation of the greedy policy for a correction δ, in cost units."""
+
+    def relaxed(self) -> jax.Array:
+        """r/(Q + β), with the rate of the fastest action: one relaxation of every node, (*grid)."""
+
+    def evaluated(self, evaluation: Evaluation, replies: int) -> jax.Array:
+        """The correction that makes V the value of its greedy policy, roughly; in a game of the outer player's."""
+
+
+@runtime_checkable
+class Method(Protocol):
+    """How V is corrected, as a value: frozen and hashable or a pytree."""
+
+    @property
+    def relaxes(self) -> bool:
+        """Whether it takes the largest rate for the matrix: V then climbs or falls to its fixed point step by step."""
+
+    @property
+    def evaluation(self) -> Evaluation | None:
+        """How the equation of a policy is solved; also for derivatives. None where it never is."""
+
+    @property
+    def inner(self) -> "Method":
+        """What runs on one grid: the method itself, if it knows nothing of coarser grids."""
+
+    @property
+    def coarsest(self) -> int | None:
+        """The nodes of the coarsest grid; None for a method of one grid."""
+
+    def correct(self, step: Step) -> jax.Array:
+        """δ, (*grid), in cost units."""
+
+    def patience(self, grid: Grid) -> int:
+        """The steps without progress after which the solve has stalled."""
+
+    def described(self, game: bool) -> str:
+        """The method as one would write it, without what only matters in a game."""
 
 
 @pytree_dataclass()
@@ -14,6 +100,25 @@ class ValueIteration:
 
     The error falls by 1/(1 + βΔt) a step: many cheap steps. For reference, for games, and where memory rules.
     """
+
+    relaxes, evaluation, coarsest = True, None, None
+
+    @property
+    def inner(self) -> "ValueIteration":
+        """The method itself."""
+        return self
+
+    def correct(self, step: Step) -> jax.Array:
+        """One relaxation of every node."""
+        return step.relaxed()
+
+    def patience(self, grid: Grid) -> int:
+        """Long: a value that climbs by L Δt a step shows no progress for long."""
+        return CLIMB
+
+    def described(self, game: bool) -> str:
+        """As it is written."""
+        return "ValueIteration()"
 
 
 @pytree_dataclass(static=("replies",))
@@ -27,10 +132,28 @@ class PolicyIteration:
 
     evaluation: Evaluation = Sweeps()
     replies: int = 20
+    relaxes, coarsest = False, None
 
     def __post_init__(self):
         check_evaluation(self.evaluation, "PolicyIteration: evaluation")
         arguments.count(self.replies, "PolicyIteration: replies")
+
+    @property
+    def inner(self) -> "PolicyIteration":
+        """The method itself."""
+        return self
+
+    def correct(self, step: Step) -> jax.Array:
+        """The way to the value of the greedy policy."""
+        return step.evaluated(self.evaluation, self.replies)
+
+    def patience(self, grid: Grid) -> int:
+        """A good policy moves one cell an improvement, and a wave may cross the box four times."""
+        return 100 + 4 * sum(grid.shape)
+
+    def described(self, game: bool) -> str:
+        """As it is written, without the replies where there is no opponent."""
+        return f"PolicyIteration({self.evaluation!r}{f', replies={self.replies}' if game else ''})"
 
 
 @pytree_dataclass(static=("coarsest",))
@@ -45,118 +168,45 @@ class Nested:
       coarsest: do not go on to grids with fewer nodes than this.
     """
 
-    inner: PolicyIteration | ValueIteration = PolicyIteration()
+    inner: Method = PolicyIteration()
     coarsest: int = 2000
 
     def __post_init__(self):
-        wanted = "hjb.PolicyIteration(...) or hjb.ValueIteration()"
-        arguments.one_of(self.inner, "Nested: inner", (PolicyIteration, ValueIteration), wanted)
+        check_method(self.inner, "Nested: inner")
+        if self.inner.coarsest is not None:
+            raise TypeError(f"Nested: inner is {self.inner!r}; wanted what runs on one grid")
         arguments.count(self.coarsest, "Nested: coarsest")
 
+    @property
+    def relaxes(self) -> bool:
+        """As on every level."""
+        return self.inner.relaxes
 
-Method = ValueIteration | PolicyIteration | Nested
+    @property
+    def evaluation(self) -> Evaluation | None:
+        """As on every level."""
+        return self.inner.evaluation
+
+    def correct(self, step: Step) -> jax.Array:
+        """As on every level."""
+        return self.inner.correct(step)
+
+    def patience(self, grid: Grid) -> int:
+        """As on every level."""
+        return self.inner.patience(grid)
+
+    def described(self, game: bool) -> str:
+        """As it is written, with what runs on each level."""
+        return f"Nested({self.inner.described(game)})"
 
 
-# --- in time ---
-
-
-@dataclasses.dataclass(frozen=True)
-class Tableau:
-    """An explicit Runge–Kutta method made of Euler steps: W ← a_k V + (1 − a_k) (W + c Δt F(W)), from W = V on.
-
-    Such a method is strong-stability preserving with steps 1/c times as long as Euler's. Its order is for who writes it
-    to know.
-
-    Args:
-      means: a_k, the share of V in the result of every stage, from 0 to below 1.
-      euler: c, the length of the Euler steps over that of the whole one.
+def check_method(method: object, name: str) -> None:
+    """Refuse, by ``name``, what corrects no value.
 
     Raises:
-      ValueError: shares or a length out of range, or stages that do not end at the end of the step.
-
-    Example:
-      >>> Tableau((0.0, 0.0, 1 / 3), 1 / 2).times  # of second order, with steps twice as long as Euler's
-      (0.0, 0.5, 1.0, 1.0)
+      TypeError: with the methods that there are.
     """
-
-    means: tuple[float, ...]
-    euler: float = 1.0
-
-    def __post_init__(self):
-        object.__setattr__(self, "means", tuple(map(float, self.means)))
-        if not self.means or not all(0 <= share < 1 for share in self.means):
-            raise ValueError(f"Tableau: got means = {self.means!r}, wanted one number a stage, from 0 to below 1")
-        arguments.positive(self.euler, "Tableau: euler", most=1)
-        if self.times[-1] != 1:
-            raise ValueError(f"Tableau: the last stage ends at {self.times[-1]:g} of a step, wanted 1: see .times")
-
-    @property
-    def times(self) -> tuple[float, ...]:
-        """Where each stage evaluates F, and where the last one ends, in steps."""
-        found = [0.0]
-        for share in self.means:
-            found.append(round((1 - share) * (found[-1] + self.euler), 12))
-        return tuple(found)
-
-
-TABLEAUX = {
-    1: Tableau((0.0,)),
-    2: Tableau((0.0, 1 / 2)),
-    3: Tableau((0.0, 3 / 4, 1 / 3)),
-    4: Tableau((0.0, 0.0, 2 / 3, 0.0), 1 / 2),
-}
-
-
-@pytree_dataclass(static=("stages",))
-class Explicit:
-    """Explicit steps by a strong-stability-preserving Runge–Kutta method.
-
-    Args:
-      stages: 1 (Euler), 2 or 3, which is also the order in time; 4, of order 3 with steps twice as long, which takes
-        two thirds of the evaluations of 3; a ``Tableau`` of your own; or ``None`` for what goes with the scheme: 1 for
-        ``Upwind``, 3 for ``Weno5``, else 2.
-      fraction: the length of a step over the stability limit, 1/(max Q + β) or twice that with 4 stages; at most 1.
-    """
-
-    stages: int | Tableau | None = None
-    fraction: Any = 0.9
-    halves = True  # players who meet in a component are upwinded each by itself, see ``splitting``
-
-    def __post_init__(self):
-        named = not isinstance(self.stages, bool) and self.stages in (None, *TABLEAUX)
-        if not named and not isinstance(self.stages, Tableau):
-            raise ValueError(f"Explicit: got stages = {self.stages!r}, wanted 1, 2, 3, 4, a Tableau or None")
-        arguments.positive(self.fraction, "Explicit: fraction", most=1)
-
-    @property
-    def tableau(self) -> Tableau:
-        """The method of the stages; they must be known."""
-        assert self.stages is not None
-        return self.stages if isinstance(self.stages, Tableau) else TABLEAUX[self.stages]
-
-    @property
-    def courant(self) -> Any:
-        """The length of a step times max Q + β."""
-        return self.fraction / self.tableau.euler
-
-
-@pytree_dataclass(static=("max_steps",))
-class Implicit:
-    """Implicit Euler steps, each by policy iteration: any length, first order in time.
-
-    Args:
-      evaluation: how a policy is evaluated; ``None`` is ``Krylov()`` with noise and ``Sweeps()`` without.
-      tol: bound on what the policy iterations leave over the whole march, in cost units.
-      max_steps: policy improvements in one step, at most.
-    """
-
-    evaluation: Evaluation | None = None
-    tol: Any = 1e-6
-    max_steps: int = 100
-    halves = False  # a chain has one drift, the sum of both players'
-
-    def __post_init__(self):
-        if self.evaluation is not None:
-            check_evaluation(self.evaluation, "Implicit: evaluation")
-        arguments.positive(self.tol, "Implicit: tol", "in the units of the cost")
-        arguments.count(self.max_steps, "Implicit: max_steps")
+    if isinstance(method, type) or not isinstance(method, Method):
+        wanted = "hjb.PolicyIteration(...) or hjb.ValueIteration()"
+        raise TypeError(f"{name} is {arguments.shown(method)}; wanted {wanted}")
+    check_pytree(method, name)

@@ -1,19 +1,8 @@
 """Many steps in time: V_t + min max H − β V = 0 from the horizon back to 0, with targets and constraints.
 
-Explicit: strong-stability-preserving Runge–Kutta methods of Shu and Osher, with F = min max H − β V,
-
-    W ← a_k V + (1 − a_k) (W + c Δt F(W)),    a = (0), (0, ½), (0, ¾, ⅓) with c = 1; (0, 0, ⅔, 0) with c = ½,
-
-each stage a mean of Euler steps, so that what one Euler step keeps, they keep: V ← max(g, min(ψ, ·)) and the given
-values after every stage, and for the monotone chain the order of two values and the range of the data, as long as
-c Δt (max Q + β) ≤ 1 with Q the rate at which the chain leaves a node. Order 1, 2, 3 and 3 in time. Where the fastest
-action is not at an end of its set, or Q changes within a step, Q is looked at under the actions that every stage chose,
-and a step that was too long for it is done again in shorter ones.
-
-Implicit (Euler): min{ max{ (β + 1/Δt) W − V/Δt − min max H(W), W − ψ }, W − g } = 0, a discounted stationary problem
-for W by policy iteration, any Δt, order 1. Against the other player's own solved problem, as in ``iteration``.
-
-Steps end on the kept times exactly: those that are left are of equal length.
+A method of ``time_methods`` makes one step. Where the fastest action is not at an end of its set, or the rate Q of
+leaving a node changes within a step, Q is looked at under the actions that every stage chose, and a step that was too
+long for it is done again in shorter ones. Steps end on the kept times exactly: those that are left are of equal length.
 """
 
 import dataclasses
@@ -24,14 +13,15 @@ import jax.numpy as jnp
 
 from hjbjax.discretisation import correlated_noise
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.hamiltonian import discrete
-from hjbjax.iteration import bellman, implicit, splitting
+from hjbjax.hamiltonian import discrete, splitting
+from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import Obstacles
-from hjbjax.iteration.methods import Implicit
+from hjbjax.iteration.time_methods import TimeMethod
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Box
+from hjbjax.problem.types import Field, Number
 from hjbjax.solution.status import Status
 
 TRIES = 30  # of a step that is shortened, at most; what its first stage sees does not depend on its length
@@ -46,7 +36,7 @@ class March:
       on: the problem on its grid, with the slopes of a scheme.
       method: ``Explicit`` with its stages, or ``Implicit`` with its evaluation.
       rules: held nodes and constraints; ``None`` where they depend on the time.
-      limit: the longest stable step of an explicit method; ``None`` where it depends on the time, and if implicit.
+      limit: the longest stable step, inf if all are; ``None`` where it depends on the time.
       step: the longest step wanted; inf where the limit alone counts.
       horizon: the time at which the terminal cost is paid.
       watched: bool (*grid), nodes where a disturbance at its bound means that the value blows up; or ``None``.
@@ -55,7 +45,7 @@ class March:
     """
 
     on: Discretisation
-    method: Any
+    method: TimeMethod
     obstacles: Obstacles | None
     limit: Any
     step: Any
@@ -74,18 +64,42 @@ class March:
         """The nodes."""
         return self.on.grid
 
-    def obstacles_at(self, t: Any) -> Obstacles:
+    def obstacles_at(self, t: Number) -> Obstacles:
         """Held nodes and constraints at the time t."""
         return bellman.obstacles(self.on.at(t)) if self.obstacles is None else self.obstacles
 
     def longest(self, t: Any) -> Any:
         """The longest step that may start at the time t."""
-        if isinstance(self.method, Implicit):
-            return self.step
         limit = self.limit
         if limit is None:
             limit = self.method.courant * stable(self.on.at(t))
         return jnp.minimum(self.step, limit)
+
+    def rate(self, value: Field, t: Number) -> tuple[Field, "Seen"]:
+        """F = min max H − β V, cost per unit time, and what the optimal actions show."""
+        best, u, d = splitting.optimise(self.on.at(t), value)
+        return best - self.problem.discount * value, self.look(u, d, t)
+
+    def look(self, u: list, d: list, t: Number) -> "Seen":
+        """How fast the chain leaves a node under these actions, and where it cannot represent the noise."""
+        on, dtype = self.on.at(t), self.on.dtype
+        seen = self.nothing_seen()
+        if self.checks_rates:
+            fastest = jnp.max(splitting.rate(on, u, d)) + jnp.asarray(on.problem.discount, dtype)
+            seen = dataclasses.replace(seen, fastest=fastest)
+        if self.checks_noise:
+            lacking = correlated_noise.lacking(on, on.diffusion(u, d))
+            if lacking is None:
+                return seen
+            lacking = jnp.broadcast_to(lacking, on.grid.shape) & ~self.obstacles_at(t).fixed
+            first = jnp.where(jnp.any(lacking), jnp.argmax(lacking), -1).astype(jnp.int32)
+            seen = dataclasses.replace(seen, lacking=first, t=jnp.asarray(t, dtype))
+        return seen
+
+    def nothing_seen(self) -> "Seen":
+        """No rate, and no node without a chain."""
+        dtype = self.on.dtype
+        return Seen(jnp.zeros((), dtype), jnp.full((), -1, jnp.int32), jnp.zeros((), dtype))
 
 
 @pytree_dataclass()
@@ -146,13 +160,8 @@ def terminal(on: Discretisation, start: Any = None) -> jax.Array:
 def begin(march: March, value: jax.Array) -> Front:
     """The front at the horizon."""
     zero = jnp.zeros((), jnp.int32)
-    return Front(
-        value, jnp.asarray(march.horizon, value.dtype), zero, zero + int(Status.RUNNING), _nothing(value.dtype)
-    )
-
-
-def _nothing(dtype: Any) -> Seen:
-    return Seen(jnp.zeros((), dtype), jnp.full((), -1, jnp.int32), jnp.zeros((), dtype))
+    t = jnp.asarray(march.horizon, value.dtype)
+    return Front(value, t, zero, zero + int(Status.RUNNING), march.nothing_seen())
 
 
 def run(march: March, front: Front, until: Any, most: Any) -> Front:
@@ -173,17 +182,15 @@ def advance(march: March, front: Front, until: Any) -> Front:
     """One step towards ``until``; what is left is cut into equal steps."""
     dtype = front.value.dtype
     until, left = jnp.asarray(until, dtype), front.t - until
-    longest, ok = march.longest(front.t), jnp.ones((), bool)
+    longest = march.longest(front.t)
     if march.checks_rates:  # a step like the last one rather than one that is done again
         longest = jnp.minimum(longest, march.method.courant / front.seen.fastest)
     count = jnp.maximum(jnp.ceil(left / longest - 1e-4), 1)
     t = until + left * ((count - 1) / count)
-    if isinstance(march.method, Implicit):
-        value, ok, seen = _implicit(march, front.value, t, front.t - t)
-    elif march.checks_rates:
+    if march.checks_rates:
         value, t, ok, seen = _short_enough(march, front, until, count)
     else:
-        value, seen = _explicit(march, front.value, front.t, front.t - t)
+        value, ok, seen = march.method.step(march, front.value, front.t, t, front.t - t)
     low, high = jnp.min(value), jnp.max(value)
     code = jnp.where(ok, Status.RUNNING, Status.STALLED)
     if march.watched is not None:
@@ -212,9 +219,10 @@ def _short_enough(march: March, front: Front, until: Any, count: Any) -> tuple[j
         count, tries, _, seen = carry
         more = jnp.maximum(jnp.ceil(left * seen.fastest / march.method.courant - 1e-4), count + 1)
         count = jnp.where(tries > 0, more, count)
-        return count, tries + 1, *_explicit(march, front.value, front.t, front.t - end(count))
+        value, _, seen = march.method.step(march, front.value, front.t, end(count), front.t - end(count))
+        return count, tries + 1, value, seen
 
-    nothing = _nothing(front.value.dtype)
+    nothing = march.nothing_seen()
     endless = dataclasses.replace(nothing, fastest=jnp.full_like(nothing.fastest, jnp.inf))
     start = (count, jnp.zeros((), jnp.int32), front.value, endless)
     carry = jax.lax.while_loop(too_long, attempt, start)
@@ -227,68 +235,9 @@ def repeat(march: March, value: jax.Array, start: float, end: float, count: int)
 
     def step(value, k):
         t = jnp.asarray(start, value.dtype) - k * dt
-        if isinstance(march.method, Implicit):
-            return _implicit(march, value, t - dt, jnp.asarray(dt, value.dtype))[0], None
-        return explicit(march, value, t, dt), None
+        return march.method.step(march, value, t, t - dt, jnp.asarray(dt, value.dtype))[0], None
 
     return jax.lax.scan(step, value, jnp.arange(count).astype(value.dtype))[0]
-
-
-def explicit(march: March, value: jax.Array, t: Any, dt: Any) -> jax.Array:
-    """V at t − Δt from V at t."""
-    return _explicit(march, value, t, dt)[0]
-
-
-def _explicit(march: March, value: jax.Array, t: Any, dt: Any) -> tuple[jax.Array, Seen]:
-    """V at t − Δt, and what the stages saw."""
-    dtype, tableau = value.dtype, march.method.tableau
-    if len(tableau.means) == 1:
-        rate, seen = _rate(march, value, t)
-        return march.obstacles_at(t - dt).impose(value + dt * rate), seen
-    means, starts, ends = (
-        jnp.asarray(table, dtype) for table in (tableau.means, tableau.times[:-1], tableau.times[1:])
-    )
-
-    def stage(k, carry):
-        w, seen = carry
-        rate, now = _rate(march, w, t - starts[k] * dt)
-        moved = means[k] * value + (1 - means[k]) * (w + tableau.euler * dt * rate)
-        return march.obstacles_at(t - ends[k] * dt).impose(moved), seen.joined(now)
-
-    return jax.lax.fori_loop(0, len(tableau.means), stage, (value, _nothing(dtype)))
-
-
-def _implicit(march: March, value: jax.Array, t: Any, dt: Any) -> tuple[jax.Array, jax.Array, Seen]:
-    """V at t from V at t + Δt, whether the policy iteration came to its end, and what its last policy saw."""
-    method = march.method
-    value, policy, ok = implicit.advance(
-        march.on.at(t), march.obstacles_at(t), value, dt, evaluation=method.evaluation,
-        tol=method.tol * dt / march.horizon, max_steps=method.max_steps,
-    )  # fmt: skip
-    return value, ok, _look(march, list(policy.controls), list(policy.disturbances), t)
-
-
-def _rate(march: March, value: jax.Array, t: Any) -> tuple[jax.Array, Seen]:
-    """F = min max H − β V, cost per unit time, and what the optimal actions show."""
-    best, u, d = splitting.optimise(march.on.at(t), value)
-    return best - march.problem.discount * value, _look(march, u, d, t)
-
-
-def _look(march: March, u: list, d: list, t: Any) -> Seen:
-    """How fast the chain leaves a node under these actions, and where it cannot represent the noise."""
-    on, dtype = march.on.at(t), march.on.dtype
-    seen = _nothing(dtype)
-    if march.checks_rates:
-        fastest = jnp.max(splitting.rate(on, u, d)) + jnp.asarray(on.problem.discount, dtype)
-        seen = dataclasses.replace(seen, fastest=fastest)
-    if march.checks_noise:
-        lacking = correlated_noise.lacking(on, on.diffusion(u, d))
-        if lacking is None:
-            return seen
-        lacking = jnp.broadcast_to(lacking, on.grid.shape) & ~march.obstacles_at(t).fixed
-        first = jnp.where(jnp.any(lacking), jnp.argmax(lacking), -1).astype(jnp.int32)
-        seen = dataclasses.replace(seen, lacking=first, t=jnp.asarray(t, dtype))
-    return seen
 
 
 def greedy(march: March, value: jax.Array, t: Any) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, ...]]:

@@ -18,7 +18,7 @@ from hjbjax.discretisation.schemes import Upwind
 from hjbjax.finiteness import admissibility, node_checks
 from hjbjax.iteration import fixed_point
 from hjbjax.iteration.fixed_point import State, Task
-from hjbjax.iteration.methods import Method, Nested
+from hjbjax.iteration.methods import Method
 from hjbjax.problem.arguments import shown
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
@@ -28,7 +28,7 @@ from hjbjax.solution.status import Status
 from hjbjax.solvers import faults, memory, nested
 from hjbjax.solvers.host_loop import FIRST_NODES, imposed
 from hjbjax.solvers.nested import Settled
-from hjbjax.solvers.result import closed, describe, finish, unstarted
+from hjbjax.solvers.result import closed, finish, unstarted
 from hjbjax.solvers.setup import Assumptions, choose, prepare_on_host
 from hjbjax.solvers.stationary import as_dtype, check_arguments, check_limits, sharpened
 from hjbjax.tracing import checks
@@ -88,8 +88,7 @@ def solve_batch(
     with noting_interrupts(clock), jax.enable_x64(kind == np.float64):
         for members in _alike(lanes):
             first = lanes[members[0]]
-            chosen = method or choose(first, grid, traced=False)
-            chosen = chosen.inner if isinstance(chosen, Nested) else chosen
+            chosen = (method or choose(first, grid, traced=False)).inner
             checks.shapes(first, grid, scheme)
             on = Discretisation(first, grid, scheme, kind)
             needed = memory.require(first, grid, chosen, kind, max_memory)
@@ -156,7 +155,7 @@ def _solve_together(lanes: dict[int, Discretisation], method: Method, tol: float
             solutions[i] = _finished(Settled(*prepared[i], state, code, history), asked[i], clock)
     about = {"seconds": clock.elapsed() - began, "lanes": len(lanes), "tol": tol}
     for on, solution in zip(asked, solutions, strict=True):
-        solution.stats.update(method=describe(method, on.problem), **about)
+        solution.stats.update(method=method.described(on.problem.is_game), **about)
     return solutions
 
 

@@ -15,7 +15,6 @@ from hjbjax.discretisation import correlated_noise, edges
 from hjbjax.hamiltonian import discrete
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import time_stepping
-from hjbjax.iteration.methods import Explicit, Implicit
 from hjbjax.iteration.time_stepping import Front, March
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.sets import Finite
@@ -177,7 +176,7 @@ def assemble(task: March, grid: Grid, slices: Slices, front: Front, code: Status
         discrete_disturbance=isinstance(problem.disturbances, Finite),
         message=_message(task, front, code),
         stats={
-            "method": _describe(task.method),
+            "method": task.method.described(),
             "scheme": repr(task.on.scheme),
             "device": str(jax.devices()[0].device_kind),
             "dtype": str(slices.value.dtype),
@@ -194,7 +193,7 @@ def _message(task: March, front: Front, code: Status) -> str:
     what = ADVICE.get(code, code.message)
     if code is Status.STALLED and int(front.seen.lacking) >= 0:
         what = _unrepresentable(task, front)
-    elif code is Status.STALLED and isinstance(task.method, Explicit):
+    elif code is Status.STALLED and task.method.limited:
         what = f"No step is short enough for rates up to {float(front.seen.fastest):.3g}; use method=hjb.Implicit()."
     return f"The march stopped at t = {t:.6g} on its way from {horizon:g}. {what}"
 
@@ -212,10 +211,3 @@ def _unrepresentable(task: March, front: Front) -> str:
         f"t = {float(t):.6g}, node {index}, x = {np.asarray(x).tolist()}{''.join(', ' + each for each in played)}.\n"
         + correlated_noise.advice(sigma @ sigma.T, grid, everywhere=False)
     )
-
-
-def _describe(method: Explicit | Implicit) -> str:
-    """The method as one would write it."""
-    if isinstance(method, Explicit):
-        return f"Explicit(stages={method.stages}, fraction={float(method.fraction):g})"
-    return f"Implicit({method.evaluation!r}, tol={float(method.tol):g})"

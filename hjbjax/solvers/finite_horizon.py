@@ -20,7 +20,8 @@ from hjbjax.finiteness import admissibility, node_checks
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import bellman, time_stepping
 from hjbjax.iteration.evaluation import Krylov, Sweeps
-from hjbjax.iteration.methods import Explicit, Implicit, PolicyIteration
+from hjbjax.iteration.methods import PolicyIteration
+from hjbjax.iteration.time_methods import Explicit, Implicit
 from hjbjax.iteration.time_stepping import March
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
@@ -158,9 +159,9 @@ def _check(problem: Any, grid: Any, scheme: Any, method: Any, step: Any, time_li
     if not isinstance(problem, Problem) or not isinstance(grid, Grid):
         raise TypeError(f"march: got {type(problem).__name__}, {type(grid).__name__}; wanted a Problem and a Grid")
     schemes.check(scheme, "march: scheme", grid)
-    if not isinstance(method, (Explicit, Implicit)):
+    if isinstance(method, type) or not all(hasattr(method, name) for name in ("filled", "step", "described")):
         raise TypeError(f"march: method is {method!r}; wanted hjb.Explicit(...) or hjb.Implicit(...)")
-    if isinstance(method, Implicit) and not scheme.monotone:
+    if method.monotone_only and not scheme.monotone:
         raise ValueError(f"march: Implicit(...) solves with the matrix of a chain; got {scheme!r}, wanted Upwind(...)")
     if step is not None:
         arguments.positive(step, "march: step", "in units of time")
@@ -195,7 +196,7 @@ def _bytes(problem: Problem, grid: Grid, kept: np.ndarray, method: Any, dtype: A
     word = np.dtype(dtype).itemsize
     actions = sum(admissible.dim for admissible in (problem.controls, problem.disturbances) if admissible is not None)
     slices = len(kept) * (1 + actions) + 2 + 2 * grid.ndim + 3 + actions
-    if isinstance(method, Implicit):
+    if not method.limited:
         inner = PolicyIteration(method.evaluation or Krylov())
         slices += memory.estimate(problem, grid, inner, dtype) // (word * grid.size)
     return word * slices * grid.size
@@ -214,9 +215,9 @@ def _prepare(on: Discretisation, horizon: float, method: Any, step: float | None
     on, dtype = cast(on, on.dtype), on.dtype
     problem, grid = on.problem, on.grid
     moving = problem.time_dependent
-    limit: Any = None
-    if isinstance(method, Explicit):
-        method = Explicit(method.stages or on.scheme.stages, jnp.asarray(method.fraction, dtype))
+    limit: Any = jnp.asarray(jnp.inf, dtype)
+    method = method.filled(on, _evaluation(problem, grid))
+    if method.limited:
         probes = np.linspace(horizon, 0.0, PROBES) if moving else [horizon]
         if step is not None or not moving:
             limits = [_stable(on.at(jnp.asarray(t, dtype))) for t in probes]
@@ -226,12 +227,9 @@ def _prepare(on: Discretisation, horizon: float, method: Any, step: float | None
             limit = None
         else:
             limit = jnp.asarray(limit * (method.courant if step is None else 1 / method.tableau.euler), dtype)
-    else:
-        evaluation = method.evaluation or _evaluation(problem, grid)
-        method = Implicit(evaluation, jnp.asarray(method.tol, dtype), method.max_steps)
     checks = _checks(on, method)
     if step is None:  # rates that are found on the way say nothing of the first steps
-        step = horizon / FEWEST if moving or checks[0] or isinstance(method, Implicit) else math.inf
+        step = horizon / FEWEST if moving or checks[0] or not method.limited else math.inf
     return March(
         on, method, None if moving else _obstacles(on), limit, jnp.asarray(step, dtype),
         jnp.asarray(horizon, dtype), _watched(on, inner), *checks,
@@ -243,7 +241,7 @@ def _checks(on: Discretisation, method: Any) -> tuple[bool, bool]:
     problem = on.problem
     players, moving = players_of(on), problem.time_dependent
     sampled = not (players.control.fastest_at_ends and players.disturbance.fastest_at_ends)
-    rates = isinstance(method, Explicit) and (sampled or (moving and len(method.tableau.means) > 1))
+    rates = method.limited and (sampled or (moving and len(method.tableau.means) > 1))
     return rates, callable(problem.noise) and (moving or players.steers_noise)
 
 
@@ -258,8 +256,7 @@ def _check_step(step: float | None, limit: float) -> None:
 def _evaluation(problem: Problem, grid: Grid) -> Any:
     if grid.sides("open"):
         chosen = choose(problem, grid, traced=False)
-        assert isinstance(chosen, PolicyIteration)
-        return chosen.evaluation
+        return chosen.evaluation or Krylov()
     return Sweeps() if problem.noise is None else Krylov()
 
 
@@ -288,11 +285,7 @@ def _march_traced(
             "most 1/(max Q + β) of every problem that comes"
         )
     kind, problem, grid = on.dtype, on.problem, on.grid
-    if isinstance(method, Explicit):
-        method = Explicit(method.stages or on.scheme.stages, method.fraction)
-    else:
-        method = Implicit(method.evaluation or _evaluation(problem, grid), method.tol, method.max_steps)
-    on = cast(on, kind)
+    on, method = cast(on, kind), method.filled(on, _evaluation(problem, grid))
     obstacles = None if problem.time_dependent else bellman.obstacles(on)
     task = March(on, method, obstacles, jnp.inf, step, horizon, None)
     value, values, actions, count = time_stepping.terminal(on.at(horizon), start), [], [], 0

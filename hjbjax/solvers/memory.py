@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from hjbjax.iteration.methods import Method, Nested, PolicyIteration
+from hjbjax.iteration.methods import Method
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_discounted
@@ -30,14 +30,12 @@ def estimate(problem: Problem, grid: Grid, method: Method, dtype: Any) -> int:
     need the weights (one an axis without noise, two with it) and the source twice, as they are and sheared, in single
     precision; a Krylov method its vectors.
     """
-    if isinstance(method, Nested):
-        return estimate(problem, grid, method.inner, dtype)
     word, n = np.dtype(dtype).itemsize, grid.ndim
     actions = sum(admissible.dim for admissible in (problem.controls, problem.disturbances) if admissible is not None)
     conditions = (problem.target, problem.stopping_cost, problem.running_max, problem.disturbances)
     kept = word * (2 + actions + sum(each is not None for each in conditions) + (is_discounted(problem) is False)) + 2
     look, correction = word * (4 + 2 * actions), 0
-    if isinstance(method, PolicyIteration):
+    if method.evaluation is not None and not method.relaxes:
         weights = 2 * n * n if np.ndim(problem.noise) == 2 or callable(problem.noise) else 2 * n
         if problem.noise is None and method.evaluation.rough:
             weights = n  # one way an axis, since sweeps may keep the two as one

@@ -12,7 +12,7 @@ from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.finiteness import resting
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.fixed_point import State, Task
-from hjbjax.iteration.methods import Method, Nested, PolicyIteration
+from hjbjax.iteration.methods import Method, PolicyIteration
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import altered
 from hjbjax.solution import transfer
@@ -35,7 +35,7 @@ def start(
     Where the clock says stop on the way, the answer so far on the finest grid, interpolated by NumPy, which compiles
     nothing; None if there is none.
     """
-    if guess is not None or not isinstance(method, Nested):
+    if guess is not None or method.coarsest is None:
         return guess, []
     grids = levels(on, method, clock)
     value = None
@@ -52,8 +52,9 @@ def start(
     return value, [coarse.shape for coarse in grids[:-1]]
 
 
-def levels(on: Discretisation, method: Nested, clock: Clock) -> list[Grid]:
+def levels(on: Discretisation, method: Method, clock: Clock) -> list[Grid]:
     """The grids of a nested solve, coarsest first; a coarser grid that loses the target or rest point is left out."""
+    assert method.coarsest is not None
     grids, assumptions = [on.grid], assumptions_of(on)
     needs_held = on.problem.target is not None or assumptions.may_rest
     while (smaller := transfer.coarser(grids[0])) is not None and smaller.size >= method.coarsest:
@@ -126,7 +127,7 @@ def settle(task: Task, assumptions: Assumptions, reached: np.ndarray | None, gue
                 break
             value = _vanishing(task, value, discounts, clock)
             state, code, residuals = drive(task, value, clock)
-    evaluation = getattr(task.method, "evaluation", None)
+    evaluation = task.method.evaluation
     if code is Status.STALLED and evaluation is not None and evaluation.rough:
         task = dataclasses.replace(task, method=PolicyIteration(linear_solve(task.grid)))
         state, code, residuals = drive(task, state.value, clock)

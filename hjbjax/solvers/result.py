@@ -15,10 +15,8 @@ from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import certificates, fixed_point
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.fixed_point import State, Task
-from hjbjax.iteration.methods import Method, Nested, PolicyIteration
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import is_traced
 from hjbjax.problem.sets import Finite
 from hjbjax.solution.clock import CUT, Clock
@@ -284,13 +282,3 @@ def _message(code: Status, task: Task, state: State, grid: Grid) -> str:
     if code is Status.CONVERGED and task.certificate is Certificate.RESIDUAL:
         return f"Residual of the second-order equation and last step are at most {tol:.2g} in cost units."
     return code.message
-
-
-def describe(method: Method, problem: Problem) -> str:
-    """The method as one would write it, without what the problem does not use."""
-    if isinstance(method, Nested):
-        return f"Nested({describe(method.inner, problem)})"
-    if isinstance(method, PolicyIteration):
-        game = f", replies={method.replies}" if problem.is_game else ""
-        return f"PolicyIteration({method.evaluation!r}{game})"
-    return repr(method)

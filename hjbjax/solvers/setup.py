@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import cut_cells
+from hjbjax.discretisation import chain, cut_cells
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.finiteness import attainability, resting
 from hjbjax.hamiltonian.players import players_of
@@ -78,8 +78,8 @@ def prepare(on: Discretisation, *, method: Method, tol: Any, assumptions: "Assum
     obstacles, still = _obstacles(on, assumptions)
     undecided = assumptions.certificate is Certificate.BY_DISCOUNT and is_constrained(on.problem)
     outflow = None
-    if isinstance(method, ValueIteration) or undecided or assumptions.certificate is Certificate.OPEN:
-        rate = bellman.fastest_rate(on) + on.problem.discount
+    if method.relaxes or undecided or assumptions.certificate is Certificate.OPEN:
+        rate = chain.fastest_rate(on) + on.problem.discount
         outflow = jnp.where(rate > 0, rate, 1)
     priced = assumptions.costs_certify and still is not None
     return Task(
@@ -173,7 +173,7 @@ def prepare_on_host(
         assumptions = dataclasses.replace(
             assumptions, may_rest=not is_constrained(problem) and not problem.discount > 0
         )
-    if priced and problem.is_game and not _costs_suit(task) and isinstance(method, PolicyIteration):
+    if priced and problem.is_game and not _costs_suit(task) and not method.relaxes:
         # policies that go on for ever at no cost have any value: the one sought is the limit of those of long horizons
         task = prepare_jit(on, method=ValueIteration(), tol=tol, assumptions=assumptions)
     if priced and not _costs_suit(task):

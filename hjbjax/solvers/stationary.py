@@ -19,7 +19,7 @@ from hjbjax.finiteness import admissibility, node_checks, resting
 from hjbjax.iteration import adjoint, fixed_point
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.fixed_point import State, Task
-from hjbjax.iteration.methods import Method, Nested, PolicyIteration, ValueIteration
+from hjbjax.iteration.methods import Method, check_method
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_discounted
@@ -31,7 +31,7 @@ from hjbjax.solution.status import Status
 from hjbjax.solvers import faults, memory, nested
 from hjbjax.solvers.host_loop import drive
 from hjbjax.solvers.nested import Settled
-from hjbjax.solvers.result import assemble, closed, describe, finish, unstarted
+from hjbjax.solvers.result import assemble, closed, finish, unstarted
 from hjbjax.solvers.setup import choose, is_constrained, prepare_on_host, prepare_traced
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
@@ -107,7 +107,7 @@ def solve(
         needed = memory.require(problem, grid, method, kind, max_memory)
         with faults.explained(clock, needed, lambda kept: _partial(on, kept)):
             solution = closed(_solve_on_host(on, method, tol, guess, clock), clock)
-    solution.stats.setdefault("method", describe(method, problem))
+    solution.stats.setdefault("method", method.described(problem.is_game))
     solution.stats.update(
         seconds=clock.stepping, compile_seconds=clock.elapsed() - clock.stepping,
         bytes=needed, tol=tol,
@@ -128,14 +128,13 @@ def _partial(on: Discretisation, kept: Any) -> Solution:
 def _solve_on_host(on: Discretisation, method: Method, tol: float, guess: Any, clock: Clock) -> Solution:
     """Checks, coarser grids, preparation and steps, in this order, as far as the clock lets them come."""
     problem, grid, start = on.problem, on.grid, None if guess is None else np.asarray(guess, on.dtype)
-    inner = method.inner if isinstance(method, Nested) else method
     try:
         checks.shapes(problem, grid, on.scheme)
         node_checks.values(problem, grid, on.dtype, clock)
         admissibility.values(problem, grid, on.dtype)
         known = None if start is None else jnp.asarray(start)
         start, shapes = nested.start(on.chain, method, tol, known, clock)
-        task, assumptions, reached = prepare_on_host(on.chain, method=inner, tol=tol, clock=clock)
+        task, assumptions, reached = prepare_on_host(on.chain, method=method.inner, tol=tol, clock=clock)
     except Stopped as stop:
         return unstarted(on, np.zeros(grid.shape) if start is None else np.array(start), stop.status)
     settled = nested.settle(task, assumptions, reached, start, clock)
@@ -144,8 +143,8 @@ def _solve_on_host(on: Discretisation, method: Method, tol: float, guess: Any, c
         settled, apart = sharpened(settled, on.scheme, clock)
         about |= apart
     solution = finish(settled, grid)
-    if type(getattr(settled.task.method, "evaluation", None)) is not type(getattr(inner, "evaluation", None)):
-        about["method"] = describe(settled.task.method, problem)
+    if type(settled.task.method.evaluation) is not type(method.evaluation):
+        about["method"] = settled.task.method.described(problem.is_game)
     solution.stats.update(about)
     return solution
 
@@ -175,7 +174,7 @@ def _solve_traced(on: Discretisation, method: Any, tol: Any, guess: Any, max_ste
         name = type(on.scheme).__name__
         raise ValueError(f"solve: {name}() runs at host level only; inside jit, vmap and grad use Upwind()")
     method = method or choose(on.problem, on.grid, traced=True)
-    if isinstance(method, Nested):
+    if method.coarsest is not None:
         raise ValueError("solve: Nested(...) runs at host level only; inside jit, vmap and grad use its inner method")
     task, assumptions = prepare_traced(on, method=method, tol=tol)
     frozen = jax.lax.stop_gradient(task)
@@ -225,8 +224,7 @@ def check_arguments(problem: Any, grid: Any, method: Any, scheme: Any, tol: Any,
     if not isinstance(problem, Problem) or not isinstance(grid, Grid):
         raise TypeError(f"solve: got {type(problem).__name__}, {type(grid).__name__}; wanted a Problem and a Grid")
     if method is not None:
-        kinds = (ValueIteration, PolicyIteration, Nested)
-        arguments.one_of(method, "solve: method", kinds, "hjb.PolicyIteration(...) or hjb.ValueIteration()")
+        check_method(method, "solve: method")
     schemes.check(scheme, "solve: scheme", grid, stationary=True)
     arguments.positive(tol, "solve: tol", "in the units of the cost")
     if guess is not None and is_constrained(problem) and is_discounted(problem) is False:

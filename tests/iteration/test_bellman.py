@@ -39,7 +39,7 @@ def upwind(problem, grid):
 def operator(problem, grid, value, obstacles, scheme=Upwind()):
     """One step of value iteration; and βΔt, by which it contracts."""
     on = Discretisation(problem, grid, scheme, value.dtype)
-    outflow = bellman.fastest_rate(on) + problem.discount
+    outflow = chain.fastest_rate(on) + problem.discount
     greedy = bellman.greedy(on, value, obstacles.fixed)
     return obstacles.impose(value + greedy.defect / outflow), problem.discount / jnp.max(outflow)
 
@@ -304,7 +304,7 @@ def test_no_action_is_faster_than_the_fastest_rate(controls, seed):
 
 @jax.jit
 def _fastest(problem, grid):
-    return bellman.fastest_rate(upwind(problem, grid))
+    return chain.fastest_rate(upwind(problem, grid))
 
 
 @pytest.mark.parametrize("isaacs", ["upper", "lower"])

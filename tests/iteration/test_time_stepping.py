@@ -9,7 +9,8 @@ import pytest
 
 import hjbjax as hjb
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.iteration import splitting, time_stepping
+from hjbjax.hamiltonian import splitting
+from hjbjax.iteration import time_stepping
 
 UNIT = hjb.Box([-1.0], [1.0])
 LINE = hjb.Grid([-1.0], [1.0], (41,))

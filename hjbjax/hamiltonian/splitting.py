@@ -18,9 +18,8 @@ import jax.numpy as jnp
 from hjbjax.discretisation import chain
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.hamiltonian import discrete
-from hjbjax.hamiltonian.players import find_players
+from hjbjax.hamiltonian.players import players_of
 from hjbjax.hamiltonian.search import Action
-from hjbjax.iteration import bellman
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.tracing import dependence
@@ -39,7 +38,7 @@ def optimise(on: Discretisation, value: jax.Array) -> tuple[jax.Array, Action, A
 
 def fastest_rate(on: Discretisation) -> jax.Array:
     """max over the actions of the rate at which value flows out of each node, (*grid), per unit time."""
-    rates = [bellman.fastest_rate(on.asking(part)) for part in halves(on)]
+    rates = [chain.fastest_rate(on.asking(part)) for part in halves(on)]
     return rates[0] if len(rates) == 1 else rates[0] + rates[1]
 
 
@@ -56,7 +55,7 @@ def halves(on: Discretisation) -> list[Problem]:
     problem, grid, dtype = on.problem, on.grid, on.dtype
     if not problem.is_game or grid.sides("constrained"):  # what is admissible depends on both players' sum
         return [problem]
-    players = find_players(problem, grid.ndim, dtype)
+    players = players_of(on)
     if players.decoupled or not players.separable:
         return [problem]
     m = 0 if problem.controls is None else problem.controls.dim

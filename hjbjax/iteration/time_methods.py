@@ -1,0 +1,339 @@
+"""Methods in time, as values, and how to write one of your own: V at t − Δt from V at t.
+
+Explicit: strong-stability-preserving Runge–Kutta methods of Shu and Osher, with F = min max H − β V,
+
+    W ← a_k V + (1 − a_k) (W + c Δt F(W)),    a = (0), (0, ½), (0, ¾, ⅓) with c = 1; (0, 0, ⅔, 0) with c = ½,
+
+each stage a mean of Euler steps, so that what one Euler step keeps, they keep: V ← max(g, min(ψ, ·)) and the given
+values after every stage, and for the monotone chain the order of two values and the range of the data, as long as
+c Δt (max Q + β) ≤ 1 with Q the rate at which the chain leaves a node. Order 1, 2, 3 and 3 in time. A ``Tableau`` of
+one's own goes into ``Explicit(stages=...)``.
+
+Implicit (Euler): with V at t known, W = V(·, t − Δt) solves the stationary problem
+
+    min{ max{ (β + 1/Δt) W − V/Δt − min max H(W), W − ψ }, W − g } = 0,
+
+that is, with discount β + 1/Δt and V/Δt added to the running cost: any Δt, monotone, order 1. A step ends when the
+additive certificate of that problem is small enough, or the residual is rounding.
+"""
+
+import dataclasses
+import math
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+
+from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.iteration import bellman, certificates, hoffman_karp
+from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
+from hjbjax.iteration.certificates import Certificate
+from hjbjax.iteration.evaluation import Evaluation, check_evaluation, evaluate
+from hjbjax.problem import arguments
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.pytree import altered, is_traced, pytree_dataclass
+from hjbjax.problem.types import DType, Field, Number, Numbers, Scalar
+
+ROUNDING = 16  # residuals below this many units in the last place of max|V| are rounding
+REPLIES = 20  # of the inner player to one policy of the outer one, at most
+
+
+class Marching(Protocol):
+    """A march, as its method sees it."""
+
+    @property
+    def on(self) -> Discretisation:
+        """The problem on its grid."""
+
+    @property
+    def horizon(self) -> Scalar:
+        """The time at which the terminal cost is paid."""
+
+    def obstacles_at(self, t: Number) -> Obstacles:
+        """Fixed nodes and constraints at the time t."""
+
+    def rate(self, value: Field, t: Number) -> tuple[Field, Any]:
+        """F = min max H − β V, cost per unit time, and what the optimal actions show."""
+
+    def look(self, u: list, d: list, t: Number) -> Any:
+        """What these actions show: the fastest rate, and noise that the chain cannot represent."""
+
+    def nothing_seen(self) -> Any:
+        """What is shown before anything was looked at."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Tableau:
+    """An explicit Runge–Kutta method made of Euler steps: W ← a_k V + (1 − a_k) (W + c Δt F(W)), from W = V on.
+
+    Such a method is strong-stability preserving with steps 1/c times as long as Euler's. Its order is for who writes it
+    to know.
+
+    Args:
+      means: a_k, the share of V in the result of every stage, from 0 to below 1.
+      euler: c, the length of the Euler steps over that of the whole one.
+
+    Raises:
+      ValueError: shares or a length out of range, or stages that do not end at the end of the step.
+
+    Example:
+      >>> Tableau((0.0, 0.0, 1 / 3), 1 / 2).times  # of second order, with steps twice as long as Euler's
+      (0.0, 0.5, 1.0, 1.0)
+    """
+
+    means: tuple[float, ...]
+    euler: float = 1.0
+
+    def __post_init__(self):
+        object.__setattr__(self, "means", tuple(map(float, self.means)))
+        if not self.means or not all(0 <= share < 1 for share in self.means):
+            raise ValueError(f"Tableau: got means = {self.means!r}, wanted one number a stage, from 0 to below 1")
+        arguments.positive(self.euler, "Tableau: euler", most=1)
+        if self.times[-1] != 1:
+            raise ValueError(f"Tableau: the last stage ends at {self.times[-1]:g} of a step, wanted 1: see .times")
+
+    @property
+    def times(self) -> tuple[float, ...]:
+        """Where each stage evaluates F, and where the last one ends, in steps."""
+        found = [0.0]
+        for share in self.means:
+            found.append(round((1 - share) * (found[-1] + self.euler), 12))
+        return tuple(found)
+
+
+TABLEAUX = {
+    1: Tableau((0.0,)),
+    2: Tableau((0.0, 1 / 2)),
+    3: Tableau((0.0, 3 / 4, 1 / 3)),
+    4: Tableau((0.0, 0.0, 2 / 3, 0.0), 1 / 2),
+}
+
+
+class TimeMethod(Protocol):
+    """How V is carried from t to t − Δt, as a value: frozen and hashable or a pytree."""
+
+    @property
+    def halves(self) -> bool:
+        """If it steps with each player's drift upwinded by itself, see ``splitting``."""
+
+    @property
+    def limited(self) -> bool:
+        """If steps longer than 1/(max Q + β) over ``courant`` are unstable."""
+
+    @property
+    def courant(self) -> Number:
+        """The length of its steps times max Q + β."""
+
+    @property
+    def tableau(self) -> Tableau:
+        """Its stages: how often, and after what time, a step looks at the rates."""
+
+    @property
+    def monotone_only(self) -> bool:
+        """If it wants the matrix of a chain, and so a monotone scheme."""
+
+    def filled(self, on: Discretisation, evaluation: Evaluation | None = None) -> "TimeMethod":
+        """The method with what was left open, by the scheme and by the ``evaluation`` that suits the problem."""
+
+    def step(self, march: Marching, value: Field, t: Number, end: Number, dt: Number) -> tuple[Field, Scalar, Any]:
+        """V at ``end`` = t − Δt from V at t, if that came to its end, and what was seen on the way."""
+
+    def described(self) -> str:
+        """The method as one would write it."""
+
+
+@pytree_dataclass(static=("stages",))
+class Explicit:
+    """Explicit steps by a strong-stability-preserving Runge–Kutta method.
+
+    Args:
+      stages: 1 (Euler), 2 or 3, which is also the order in time; 4, of order 3 with steps twice as long, which takes
+        two thirds of the evaluations of 3; a ``Tableau`` of your own; or ``None`` for what goes with the scheme: 1 for
+        ``Upwind``, 3 for ``Weno5``, else 2.
+      fraction: the length of a step over the stability limit, 1/(max Q + β) or twice that with 4 stages; at most 1.
+    """
+
+    stages: int | Tableau | None = None
+    fraction: Any = 0.9
+    halves = True  # players who meet in a component are upwinded each by itself, see ``splitting``
+    limited, monotone_only = True, False
+
+    def __post_init__(self):
+        named = not isinstance(self.stages, bool) and self.stages in (None, *TABLEAUX)
+        if not named and not isinstance(self.stages, Tableau):
+            raise ValueError(f"Explicit: got stages = {self.stages!r}, wanted 1, 2, 3, 4, a Tableau or None")
+        arguments.positive(self.fraction, "Explicit: fraction", most=1)
+
+    @property
+    def tableau(self) -> Tableau:
+        """The method of the stages; they must be known."""
+        assert self.stages is not None
+        return self.stages if isinstance(self.stages, Tableau) else TABLEAUX[self.stages]
+
+    @property
+    def courant(self) -> Any:
+        """The length of a step times max Q + β."""
+        return self.fraction / self.tableau.euler
+
+    def filled(self, on: Discretisation, evaluation: Evaluation | None = None) -> "Explicit":
+        """The method with the stages that go with the scheme, if none were asked for; its numbers in the type."""
+        return Explicit(self.stages or on.scheme.stages, _as(self.fraction, on.dtype))
+
+    def step(self, march: Marching, value: Field, t: Number, end: Number, dt: Number) -> tuple[Field, Scalar, Any]:
+        """V at ``end`` = t − Δt from V at t by the stages of the tableau, true, and what the stages saw."""
+        dtype, tableau, fine = value.dtype, self.tableau, jnp.ones((), bool)
+        if len(tableau.means) == 1:
+            rate, seen = march.rate(value, t)
+            return march.obstacles_at(t - dt).impose(value + dt * rate), fine, seen
+        means, starts, ends = (
+            jnp.asarray(table, dtype) for table in (tableau.means, tableau.times[:-1], tableau.times[1:])
+        )
+
+        def stage(k, carry):
+            w, seen = carry
+            rate, now = march.rate(w, t - starts[k] * dt)
+            moved = means[k] * value + (1 - means[k]) * (w + tableau.euler * dt * rate)
+            return march.obstacles_at(t - ends[k] * dt).impose(moved), seen.joined(now)
+
+        # a loop, so that the slopes are compiled once and not once a stage
+        value, seen = jax.lax.fori_loop(0, len(tableau.means), stage, (value, march.nothing_seen()))
+        return value, fine, seen
+
+    def described(self) -> str:
+        """The method as one would write it."""
+        return f"Explicit(stages={self.stages}, fraction={float(self.fraction):g})"
+
+
+@pytree_dataclass(static=("max_steps",))
+class Implicit:
+    """Implicit Euler steps, each by policy iteration: any length, first order in time.
+
+    Args:
+      evaluation: how a policy is evaluated; ``None`` is ``Krylov()`` with noise and ``Sweeps()`` without.
+      tol: bound on what the policy iterations leave over the whole march, in cost units.
+      max_steps: policy improvements in one step, at most.
+    """
+
+    evaluation: Evaluation | None = None
+    tol: Any = 1e-6
+    max_steps: int = 100
+    halves = False  # a chain has one drift, the sum of both players'
+    limited, monotone_only = False, True
+    courant, tableau = math.inf, TABLEAUX[1]
+
+    def __post_init__(self):
+        if self.evaluation is not None:
+            check_evaluation(self.evaluation, "Implicit: evaluation")
+        arguments.positive(self.tol, "Implicit: tol", "in the units of the cost")
+        arguments.count(self.max_steps, "Implicit: max_steps")
+
+    def filled(self, on: Discretisation, evaluation: Evaluation | None = None) -> "Implicit":
+        """The method with an evaluation, if none was asked for; its numbers in the type of the march."""
+        return Implicit(self.evaluation or evaluation, _as(self.tol, on.dtype), self.max_steps)
+
+    def step(self, march: Marching, value: Field, t: Number, end: Number, dt: Number) -> tuple[Field, Scalar, Any]:
+        """V at ``end`` from V at t, if the policy iteration came to its end, and what its last policy saw."""
+        question = ImplicitStep.of(march.on.at(end), march.obstacles_at(end), value, dt)
+        assert self.evaluation is not None
+        # what a step leaves adds up over the march, so that each has its share of the tolerance
+        tol = self.tol * dt / march.horizon
+        value, policy, ok = question.solve(value, self.evaluation, tol, self.max_steps)
+        return value, ok, march.look(list(policy.controls), list(policy.disturbances), end)
+
+    def described(self) -> str:
+        """The method as one would write it."""
+        return f"Implicit({self.evaluation!r}, tol={float(self.tol):g})"
+
+
+def _as(number: Numbers, dtype: DType) -> Numbers:
+    """A number in the type of a march; one that is traced keeps its own."""
+    return number if is_traced(number) else jnp.asarray(number, dtype)
+
+
+@pytree_dataclass()
+class ImplicitStep:
+    """The stationary problem of one implicit step.
+
+    Args:
+      on: the problem with discount β + 1/Δt on its grid at the time of W.
+      obstacles: fixed nodes and constraints at that time.
+      arriving: V/Δt, what is added to the running cost.
+    """
+
+    on: Discretisation
+    obstacles: Obstacles
+    arriving: jax.Array
+
+    @classmethod
+    def of(cls, on: Discretisation, obstacles: Obstacles, value: Field, dt: Number) -> "ImplicitStep":
+        """The problem whose solution is V a time Δt before that of ``value``, on the chain of that earlier time."""
+        # not by Problem(...), which refuses a discount beside a running maximum
+        shifted = altered(on.problem, discount=on.problem.discount + 1 / dt)
+        return cls(on.asking(shifted), obstacles, value / dt)
+
+    @property
+    def grid(self) -> Grid:
+        """The nodes."""
+        return self.on.grid
+
+    def equation(self, value: Field, policy: Greedy) -> PolicyEquation:
+        """The linear equation of a policy at ``value``."""
+        return bellman.policy_equation(self.on, value, policy, self.obstacles)
+
+    def reply(self, value: Field, policy: Greedy) -> Greedy:
+        """The inner player's answer to the outer player's policy."""
+        return self._complete(bellman.respond(self.on, value, self.obstacles.fixed, policy))
+
+    def impose(self, value: Field) -> Field:
+        """``value`` with the fixed values put in and the constraints respected."""
+        return self.obstacles.impose(value)
+
+    def residual(self, equation: PolicyEquation) -> Scalar:
+        """The largest |source|, in cost units."""
+        return jnp.max(jnp.abs(equation.source))
+
+    def solve(
+        self, value: Field, evaluation: Evaluation, tol: Number, max_steps: int
+    ) -> tuple[jax.Array, Greedy, jax.Array]:
+        """W, its policy, and if it is known to ``tol`` or to rounding.
+
+        Args:
+          value: where to start.
+          evaluation: how a policy is evaluated.
+          tol: bound on the algebraic error of the step, cost units.
+          max_steps: policy improvements, at most.
+        """
+
+        def look(value):
+            policy = self._complete(bellman.greedy(self.on, value, self.obstacles.fixed))
+            equation = self.equation(value, policy)
+            bound = certificates.error_bound(
+                Certificate.ADDITIVE, value, policy, equation, self.obstacles, discount=self.on.problem.discount,
+                least_cost=None, counted=True, moved=0,
+            )  # fmt: skip
+            rounding = ROUNDING * jnp.finfo(value.dtype).eps * jnp.max(jnp.abs(value))
+            return policy, bound.residual, (bound.error <= tol) | (bound.residual <= rounding)
+
+        def unfinished(carry):
+            _, _, residual, done, count = carry
+            return ~done & (count < max_steps) & jnp.isfinite(residual)
+
+        def improve(carry):
+            value, policy, residual, _, count = carry
+            value = self._evaluated(value, policy, residual, evaluation)
+            return value, *look(value), count + 1
+
+        start = self.impose(value)
+        carry = (start, *look(start), jnp.zeros((), jnp.int32))
+        value, policy, _, done, _ = jax.lax.while_loop(unfinished, improve, carry)
+        return value, policy, done
+
+    def _complete(self, policy: Greedy) -> Greedy:
+        """A policy of the problem with its defect, V/Δt included."""
+        return dataclasses.replace(policy, defect=jnp.where(self.obstacles.fixed, 0, policy.defect + self.arriving))
+
+    def _evaluated(self, value: Field, policy: Greedy, residual: Number, evaluation: Evaluation) -> Field:
+        """The value of the policy, roughly; in a game of the outer player's."""
+        if self.on.problem.is_game:
+            return hoffman_karp.evaluated(self, value, policy, evaluation, residual=residual, replies=REPLIES)
+        return self.impose(value + evaluate(evaluation, self.equation(value, policy), self.grid))

@@ -132,7 +132,7 @@ class Linearisation:
         return np.linalg.eigvals(kernel @ rates @ kernel.T)
 
     def message(self, states: int) -> str:
-        """What the feedback reaches of ``states`` coordinates; it names the zero dynamics where there are any."""
+        """The relative degree out of ``states`` in words; it names the zero dynamics where there are any."""
         return _verdict(self._known_degrees(states, float), states)
 
     def _ladder(self, x: State) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -36,7 +36,7 @@ from hjbjax.problem.types import Array, Number, State
 
 @pytree_dataclass()
 class Linearisability:
-    """Whether a system can be linearised by feedback, with the conditions it follows from.
+    """The verdict on linearisation by feedback, with the conditions it follows from.
 
     Args:
       ranks: the dimensions of G_0, G_1, … at the state, up to the first that is n or to G_{n−1}.
@@ -81,7 +81,7 @@ def is_feedback_linearisable(
     samples: int = 16,
     tolerance: Number | None = None,
 ) -> Linearisability:
-    """Whether a change of coordinates and a feedback make ẋ = f + g u linear and controllable near a state (§5).
+    """Linearisability near a state: ẋ = f + g u made linear and controllable by coordinates and a feedback (§5).
 
     Args:
       f: the drift.

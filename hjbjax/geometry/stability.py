@@ -26,7 +26,7 @@ __all__ = ["BrockettVerdict", "LyapunovReport", "brockett_check", "lyapunov_chec
 
 @pytree_dataclass(static=("message",))
 class BrockettVerdict:
-    """Whether a system meets Brockett's necessary condition for a continuous stabilising feedback of the state.
+    """The verdict of Brockett's necessary condition for a continuous stabilising feedback of the state.
 
     Args:
       satisfied: ``False`` rules such a feedback out, ``True`` does not promise one; ``None`` is undecided.

@@ -105,6 +105,7 @@ def pontryagin(
         raise ValueError("pontryagin: got traced values; it runs at the host: call it outside of jit, vmap and grad")
     _check_problem(problem, tol, max_nodes)
     start = _state_of_numbers(x0, "x0")
+    # checked with ψ in place of the terminal cost, so that a ψ of the wrong shape is refused before anything compiles
     paid = dataclasses.replace(problem, terminal_cost=terminal) if callable(terminal) else problem
     checks.of_one_state(paid, len(start), "the length of x0")
     _check_guess(guess, len(start), horizon)
@@ -199,6 +200,7 @@ def _pose(
     rule = rule_of(problem, n)
     held, ends, final = _ends(terminal, n)
     closing = Closing.STATE if any(held) else Closing.COST
+    # where the call says neither when nor how the path ends, the problem does: on its target, or never
     if horizon is None and terminal is None:
         closing = Closing.REST if problem.target is None else Closing.TARGET
     free = isinstance(horizon, FreeTime) or (horizon is None and closing is not Closing.REST)
@@ -210,6 +212,7 @@ def _pose(
         closing = Closing.TARGET
     if final is None:
         final = problem.exit_cost if closing is Closing.TARGET else problem.terminal_cost
+    # a rest is one of an autonomous flow, and the Riccati equation divides by H_uu, which is 0 where the control jumps
     if closing is Closing.REST and (problem.time_dependent or rule.jumps):
         why = "depends on time" if problem.time_dependent else "has controls that jump, without a Riccati equation"
         raise ValueError(f"pontryagin: got no horizon, and the problem {why}; give horizon=, or terminal= end states")
@@ -306,6 +309,6 @@ def _to_rest(
         times, columns = initial_guess.from_extremal(bvp, guess)
     else:
         times, columns = initial_guess.along_loop(bvp, guess, 2 * float(bvp.horizon))
-        # a periodic state may come to rest a period away
+        # a periodic state may come to rest a period away; the costate of the rest is the same there
         found, _ = equilibria.find(bvp, columns[:n, -1], found.costate)
     return dataclasses.replace(bvp, rest=found, horizon=float(times[-1])), times, columns

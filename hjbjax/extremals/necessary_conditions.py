@@ -124,7 +124,9 @@ def assemble(
         gone = np.full(len(s), moved)
         if bvp.problem.time_dependent:  # a mesh that crowds may repeat a node
             once, back = np.unique(s, return_index=True, return_inverse=True)[1:]
+            # Simpson's rule, of order 4 like the collocation: a cruder one would be all that the check sees
             gone += length * cumulative_simpson(part["moving"][once], x=s[once], initial=0.0)[back]
+        # each arc goes on from what the arcs before it have gathered
         part["constant"], moved = part["constant"] - gone, gone[-1]
         if code is Status.CONVERGED and length <= EMPTY * lengths.sum():  # an arc that begins where it ends
             continue

@@ -168,7 +168,7 @@ def decide(
         try:
             answer = _compiled_rule(rule, tuple(static.items()))(cast(functions, np.float64), state, allowed)
         except jax.errors.JAXTypeError as error:
-            # an ``if`` on a state, or a NumPy function of one: the messages of JAX do not say which function it was
+            # an ``if`` on a state, or a NumPy function of one
             raise ValueError("a field cannot be traced: use jnp.where instead of if, jnp instead of numpy") from error
         # what a field closes over may be traced though neither field nor state is; such answers stay in their trace
         answer = jax.tree.map(lambda leaf: leaf if is_traced(leaf) else np.asarray(leaf), answer)

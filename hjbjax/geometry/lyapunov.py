@@ -184,7 +184,7 @@ def _starts(dim: int, samples: int) -> np.ndarray:
     steps = root ** -np.arange(1.0, dim + 1)
     # any number of points fills the cube evenly; Sobol's sequence wants a power of two
     inner = (0.5 + np.arange(1, samples + 1)[:, None] * steps) % 1
-    # dV/dt of a polynomial is often worst in a corner; with 11 axes there are 2048, and from 12 on more than samples
+    # dV/dt is often worst in a corner, as in the example above; with 12 axes there would be as many as samples, 4096
     return np.concatenate([inner, np.array(list(itertools.product((0.0, 1.0), repeat=dim)))]) if dim <= 10 else inner
 
 
@@ -205,9 +205,8 @@ def _search(functions: Functions, place: Place, starts: Array, tolerance: float)
 
     def relative(z):  # dV/dt over the size of its terms
         rate, terms = rates(z)
-        return rate / jnp.where(
-            terms > 0, terms, 1
-        )  # over 1 at the equilibrium, where 0/0 would be NaN in the slope too
+        # over 1 at the equilibrium, where 0/0 would be NaN, and its slope as well
+        return rate / jnp.where(terms > 0, terms, 1)
 
     def low(z):
         x = at(z)[1]

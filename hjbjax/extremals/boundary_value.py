@@ -19,8 +19,10 @@ for every value in the order found, all arcs on s ∈ [0, 1] at once, their dura
 the switches: on an arc everything is smooth, so the switching times have the accuracy of the collocation (order 4).
 """
 
+import dataclasses
 import enum
-from typing import Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -28,15 +30,41 @@ import numpy as np
 
 from hjbjax.hamiltonian import pointwise
 from hjbjax.hamiltonian.pointwise import Rule
+from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import pytree_dataclass
+from hjbjax.problem.types import Array, Control, Costate, Number, State
 from hjbjax.solution.clock import Clock, Stopped
 
+if TYPE_CHECKING:
+    from scipy.optimize import OptimizeResult
+
 FEWEST = 64  # columns to which meshes are padded, and twice as many from there on: few shapes, few compilations
+ROUGH, COARSE = 1e-3, 1000  # tolerance and nodes on the way
+
+
+@dataclasses.dataclass(frozen=True)
+class Limits:
+    """The limits of a collocation: its accuracy, its nodes and its time.
+
+    Args:
+      tol: on the relative residual of the equations and on the conditions.
+      max_nodes: of the mesh.
+      clock: when it is over.
+    """
+
+    tol: float
+    max_nodes: int
+    clock: Clock
+
+    @property
+    def rough(self) -> "Limits":
+        """Limits of problems on the way to the one asked for."""
+        return Limits(max(ROUGH, self.tol), min(COARSE, self.max_nodes), self.clock)
 
 
 class Law(enum.Enum):
-    """Where the control comes from."""
+    """The law by which the control follows from state and costate."""
 
     MINIMUM = "the minimum of the Hamiltonian"
     MIXTURE = "weights over the values between which it jumps"
@@ -44,7 +72,7 @@ class Law(enum.Enum):
 
 
 class Closing(enum.Enum):
-    """What holds at the final time."""
+    """The conditions that hold at the final time."""
 
     COST = "a terminal cost"
     STATE = "given states, and a terminal cost for the others"
@@ -56,15 +84,15 @@ class Closing(enum.Enum):
 class Rest:
     """A rest of the Hamiltonian flow and the value near it, w̄ + p̄·y + ½ y'Py with y = x − x̄."""
 
-    state: Any
-    costate: Any
-    value: Any
-    matrix: Any
+    state: State
+    costate: Costate
+    value: Array
+    matrix: Array
 
 
 @pytree_dataclass(static=("rule", "law", "closing", "held", "free", "seams"))
 class BoundaryValueProblem:
-    """One boundary-value problem.
+    """A boundary-value problem of Pontryagin's principle.
 
     Args:
       problem: the system and its costs.
@@ -88,21 +116,21 @@ class BoundaryValueProblem:
     """
 
     problem: Problem
-    grid: Any
-    start: Any
-    horizon: Any
-    final: Any
-    ends: Any
-    rest: Any
-    arcs: Any
-    epsilon: Any
+    grid: Grid | None
+    start: State
+    horizon: Number
+    final: Callable | Number | None
+    ends: State
+    rest: Rest | None
+    arcs: Array
+    epsilon: Number
     rule: Rule
     law: Law
     closing: Closing
     held: tuple[bool, ...]
     free: bool
-    shifts: Any = None
-    places: Any = None
+    shifts: Array | None = None
+    places: Array | None = None
     seams: tuple[int, ...] = ()
 
     @property
@@ -117,43 +145,45 @@ class BoundaryValueProblem:
 
     @property
     def timed(self) -> bool:
-        """Whether durations are sought."""
+        """Whether the durations of the arcs are sought."""
         return self.free or self.count > 1
 
     @property
     def unknowns(self) -> int:
-        """How many numbers are sought beside the functions: durations, and ν."""
+        """The number of numbers that are sought beside the functions: durations, and ν."""
         return self.count * self.timed + (self.closing is Closing.TARGET)
 
-    def durations(self, theta: Any) -> Any:
+    def durations(self, theta: Array) -> Array:
         """The lengths of the arcs, shape (k,)."""
         return theta[: self.count] if self.timed else jnp.reshape(jnp.asarray(self.horizon, theta.dtype), 1)
 
-    def wrap(self, x: Any) -> Any:
+    def wrap(self, x: State) -> State:
         """The state with its periodic entries in the box."""
         return x if self.grid is None else self.grid.wrap(x)
 
-    def split(self, z: Any) -> tuple[Any, Any, Any]:
-        """State, costate and cost to go of one arc."""
+    def split(self, z: Array) -> tuple[State, Costate, Array]:
+        """State, costate and cost to go of one arc at one moment, from (x, p, w) of shape (2n+1,)."""
         return z[: self.n], z[self.n : 2 * self.n], z[2 * self.n]
 
-    def hamiltonian(self, t: Any, x: Any, p: Any, u: Any) -> Any:
-        """H at one moment."""
+    def hamiltonian(self, t: Number, x: State, p: Costate, u: Control) -> jax.Array:
+        """H(t, x, p, u), a number."""
         return pointwise.hamiltonian(self.problem, t, self.wrap(x), p, u)
 
-    def psi(self, t: Any, x: Any) -> Any:
-        """The cost at the end."""
+    def psi(self, t: Number, x: State) -> jax.Array:
+        """ψ(t, x), the cost at the end."""
         final = self.final
         if callable(final):
             final = final(*self.problem.state_arguments(self.wrap(x), t))
         return jnp.asarray(0.0 if final is None else final, x.dtype)
 
-    def level(self, t: Any, x: Any) -> Any:
-        """The target's function, ≤ 0 inside."""
-        return jnp.asarray(self.problem.target(*self.problem.state_arguments(self.wrap(x), t)), x.dtype)
+    def level(self, t: Number, x: State) -> jax.Array:
+        """l(t, x), the target's function, ≤ 0 inside."""
+        target = self.problem.target
+        assert target is not None
+        return jnp.asarray(target(*self.problem.state_arguments(self.wrap(x), t)), x.dtype)
 
-    def weighted(self, t: Any, x: Any, p: Any, corner: Any) -> tuple[Any, Any]:
-        """The controls in use, shape (K, m), and their weights."""
+    def mixture(self, t: Number, x: State, p: Costate, corner: Array) -> tuple[jax.Array, jax.Array]:
+        """The controls in use, shape (K, m), and their weights, shape (K,); one of weight 1 but in a mixture."""
         x = self.wrap(x)
         if self.law is Law.MINIMUM:
             return pointwise.minimiser(self.problem, self.rule, t, x, p)[None], jnp.ones(1, p.dtype)
@@ -162,60 +192,74 @@ class BoundaryValueProblem:
         values = jnp.asarray(pointwise.corners(self.problem, self.rule), p.dtype)
         at = jax.vmap(lambda value: pointwise.at_corner(self.problem, self.rule, t, x, p, value))(values)
         energies = jax.vmap(lambda u: pointwise.hamiltonian(self.problem, t, x, p, u))(at)
+        # the gradient of −ε log Σ exp(−H_k/ε) is Σ w_k ∇H_k with these weights, so that weighted flows are Hamiltonian;
+        # ``softmax`` takes the largest exponent out, without which e^{−H/ε} overflows as ε falls
         return at, jax.nn.softmax(-energies / self.epsilon)
 
-    def flow(self, t: Any, z: Any, corner: Any) -> Any:
-        """(ẋ, ṗ, ẇ) at one moment."""
+    def flow(self, t: Number, z: Array, corner: Array) -> jax.Array:
+        """(ẋ, ṗ, ẇ) at one moment, shape (2n+1,)."""
         x, p, w = self.split(z)
-        controls, weights = self.weighted(t, x, p, corner)
+        controls, weights = self.mixture(t, x, p, corner)
 
+        # u is held while H is differentiated in x: its own slope meets H_u = 0, or a bound that does not move
         def one(u):
             here = self.wrap(x)
             drift = jnp.asarray(self.problem.drift(*self.problem.arguments(here, u, t=t)), p.dtype)
             slope = jax.grad(self.hamiltonian, 1)(t, x, p, u)
             return jnp.concatenate([drift, -slope, -pointwise.running_cost(self.problem, t, here, u)[None]])
 
+        # βp and βw, once and not in every part of a mixture: the weights add up to 1
         discount = jnp.asarray(self.problem.discount, p.dtype) * jnp.append(p, w)
         return (weights @ jax.vmap(one)(controls)).at[self.n :].add(discount)
 
 
-def rates(bvp: BoundaryValueProblem, s: Any, y: Any, theta: Any) -> Any:
+def rates(bvp: BoundaryValueProblem, s: Number, y: Array, theta: Array) -> jax.Array:
     """dy/ds of all arcs together, shape (k·(2n+1),)."""
-    lengths = bvp.durations(theta)
+    lengths = jnp.asarray(bvp.durations(theta))
     begins = jnp.cumsum(lengths) - lengths
-    stacked = y.reshape(bvp.count, -1)
+    stacked = y.reshape(bvp.count, -1)  # (k, 2n+1)
+    # dz/ds = T_i dz/dt at the time t_i + s T_i, all arcs at one s
     return (lengths[:, None] * jax.vmap(bvp.flow)(begins + s * lengths, stacked, bvp.arcs)).reshape(-1)
 
 
-def conditions(bvp: BoundaryValueProblem, first: Any, last: Any, theta: Any) -> Any:
-    """What has to vanish at the ends of the arcs, shape (k·(2n+1) + unknowns,)."""
+def conditions(bvp: BoundaryValueProblem, first: Array, last: Array, theta: Array) -> jax.Array:
+    """Residuals of the conditions at the ends of the arcs, shape (k·(2n+1) + unknowns,)."""
+    # n at the start, (k − 1)(2n + 1) joints, one for each of the k − 1 switches or seams, the others at the end
     first, last = first.reshape(bvp.count, -1), last.reshape(bvp.count, -1)
     times = jnp.cumsum(bvp.durations(theta))
-    joints = last[:-1] - first[1:]
-    if bvp.seams:
+    joints = jnp.asarray(last[:-1] - first[1:])
+    if bvp.seams:  # every arc has the coordinates of the box, and it is the unwound path that is continuous
+        assert bvp.shifts is not None
         joints = joints.at[:, : bvp.n].add(bvp.shifts[:-1] - bvp.shifts[1:])
     left = [first[0, : bvp.n] - bvp.start, joints.reshape(-1)]
-    left += [(last[i, axis] - bvp.places[i])[None] for i, axis in enumerate(bvp.seams)]
+    if bvp.places is not None:
+        left += [jnp.asarray(last[i, axis] - bvp.places[i])[None] for i, axis in enumerate(bvp.seams)]
     for i in range(bvp.count - 1 if not bvp.seams else 0):
         x, p, _ = bvp.split(last[i])
+        # at a switch both values are minimisers, which fixes its time; x, p and w are the same on either side
         before, after = (_energy(bvp, times[i], x, p, bvp.arcs[i + j]) for j in (0, 1))
         left.append((before - after)[None])
     return jnp.concatenate([*left, _closing(bvp, times[-1], last[-1], theta)])
 
 
-def _energy(bvp: BoundaryValueProblem, t: Any, x: Any, p: Any, corner: Any) -> Any:
-    controls, weights = bvp.weighted(t, x, p, corner)
+def _energy(bvp: BoundaryValueProblem, t: Number, x: State, p: Costate, corner: Array) -> jax.Array:
+    """H under the law of the control, which weighs the values of a mixture."""
+    controls, weights = bvp.mixture(t, x, p, corner)
     return weights @ jax.vmap(lambda u: bvp.hamiltonian(t, x, p, u))(controls)
 
 
-def _closing(bvp: BoundaryValueProblem, t: Any, z: Any, theta: Any) -> Any:
-    """The conditions at the final time, shape (n + 1 + free or arcs + target,)."""
+def _closing(bvp: BoundaryValueProblem, t: Number, z: Array, theta: Array) -> jax.Array:
+    """Residuals of the conditions at the final time, shape (n + 1 + free or arcs + target,)."""
     x, p, w = bvp.split(z)
     if bvp.closing is Closing.REST:
-        away, rest = x - bvp.rest.state, bvp.rest
+        rest = bvp.rest
+        assert rest is not None
+        away = x - rest.state
         bent = rest.matrix @ away
+        # p = p̄ + P(x − x̄), and w by the quadratic form of which that is the slope
         left = [p - rest.costate - bent, (w - rest.value - (rest.costate + bent / 2) @ away)[None]]
-        return jnp.concatenate([*left, (t - bvp.horizon)[None]] if bvp.count > 1 else left)
+        return jnp.concatenate([*left, jnp.reshape(t - bvp.horizon, 1)] if bvp.count > 1 else left)
+    # ψ and its slope at the end that is given, where the iterate need not be yet
     given = [bvp.ends[i] if held else x[i] for i, held in enumerate(bvp.held)]
     # A value that is only Hölder at a given end must not be differentiated there.
     end = jax.lax.stop_gradient(bvp.ends) if all(bvp.held) else jnp.stack(given)
@@ -224,25 +268,29 @@ def _closing(bvp: BoundaryValueProblem, t: Any, z: Any, theta: Any) -> Any:
         level, (sliding, normal) = jax.value_and_grad(bvp.level, (0, 1))(t, x)
         left = [p - slope - theta[-1] * normal, (w - psi)[None], level[None]]
     else:
+        # a state is given, or free, and then its costate is
         held = [x[i] - bvp.ends[i] if known else p[i] - slope[i] for i, known in enumerate(bvp.held)]
         left = [jnp.stack(held), (w - psi)[None]]
-    if bvp.free:
+    if bvp.free:  # H = βψ − ψ_t − ν l_t: nothing is gained by stopping a moment later
         waiting = jax.grad(bvp.psi, 0)(t, end) if bvp.problem.time_dependent and callable(bvp.final) else 0.0
         waiting += theta[-1] * sliding if bvp.closing is Closing.TARGET else 0.0
         left.append((_energy(bvp, t, x, p, bvp.arcs[-1]) - bvp.problem.discount * psi + waiting)[None])
-    elif bvp.count > 1:
-        left.append((t - bvp.horizon)[None])
+    elif bvp.count > 1:  # the durations are sought, and only their sum is given
+        left.append(jnp.reshape(t - bvp.horizon, 1))
     return jnp.concatenate(left)
 
 
+# Exact slopes: SciPy's differences take k·(2n+1) evaluations of the right-hand side, and have half of the digits.
+# vmapped over the nodes of the mesh, the last axis of y.
 _rates = jax.jit(jax.vmap(rates, (None, 0, 1, None), 1))
 _slopes = jax.jit(jax.vmap(jax.jacfwd(rates, (2, 3)), (None, 0, 1, None), 2))
 _conditions = jax.jit(conditions)
 _condition_slopes = jax.jit(jax.jacfwd(conditions, (1, 2, 3)))
 
 
-def _padded(s: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The mesh with its last column repeated."""
+def _pad_mesh(s: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh and its columns with the last one repeated, up to the next width that is compiled for."""
+    # repeated and not zero: drift and cost need not be defined at the origin
     width = FEWEST
     while width < len(s):
         width *= 2
@@ -250,25 +298,21 @@ def _padded(s: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.append(s, np.full(more, s[-1])), np.concatenate([y, np.repeat(y[:, -1:], more, 1)], 1)
 
 
-def collocate(
-    bvp: BoundaryValueProblem, s: Any, y: Any, theta: Any, *, tol: float, max_nodes: int, clock: Clock
-) -> Any:
+def collocate(bvp: BoundaryValueProblem, s: Array, y: Array, theta: Array, limits: Limits) -> "OptimizeResult":
     """SciPy's answer from a first guess; float64 has to be on.
 
     Every call of the right-hand side looks at the clock; ``Stopped`` brings the last iterate along, (s, y, theta).
 
     Args:
-      ask: the boundary-value problem.
+      bvp: the boundary-value problem.
       s: the first mesh on [0, 1].
       y: the first guess on it, shape (k·(2n+1), len(s)).
       theta: the first guess of what else is sought.
-      tol: on the relative residual of the equations and on the conditions.
-      max_nodes: of the mesh.
-      clock: whether to go on.
+      limits: how far to go.
     """
     from scipy.integrate import solve_bvp
 
-    arrays = jax.tree.map(jnp.asarray, bvp)
+    arrays = jax.tree.map(jnp.asarray, bvp)  # once, and not in every call: leaves that are NumPy's are copied each time
     nothing = np.zeros(0)
     last = (np.asarray(s), np.asarray(y), np.asarray(theta))
 
@@ -276,12 +320,13 @@ def collocate(
         nonlocal last
         if s[0] == 0 and s[-1] == 1:  # else between the nodes of the mesh
             last = (np.array(s), np.array(y), np.array(theta))
-        clock.look()
-        return np.asarray(_rates(arrays, *_padded(s, y), theta))[:, : len(s)]
+        limits.clock.look()
+        return np.asarray(_rates(arrays, *_pad_mesh(s, y), theta))[:, : len(s)]
 
     def function_slopes(s, y, theta=nothing):
-        clock.look()
-        by_state, by_theta = (np.array(part)[..., : len(s)] for part in _slopes(arrays, *_padded(s, y), theta))
+        limits.clock.look()
+        # copies: SciPy adds to the slopes at the middles of the mesh in place, and arrays of JAX are read-only
+        by_state, by_theta = (np.array(part)[..., : len(s)] for part in _slopes(arrays, *_pad_mesh(s, y), theta))
         return (by_state, by_theta) if len(theta) else by_state
 
     def ends(first, last, theta=nothing):
@@ -295,7 +340,7 @@ def collocate(
         with np.errstate(all="ignore"):  # what is not finite is looked for in the answer
             return solve_bvp(
                 function, ends, s, y, p=theta if len(theta) else None, fun_jac=function_slopes, bc_jac=end_slopes,
-                tol=tol, max_nodes=max_nodes,
+                tol=limits.tol, max_nodes=limits.max_nodes,
             )  # fmt: skip
     except Stopped as stop:
         raise Stopped(stop.status, last) from None

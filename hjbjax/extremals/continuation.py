@@ -6,20 +6,19 @@ held against the necessary conditions before it counts as converged.
 """
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.extremals import initial_guess, periodic_arcs
-from hjbjax.extremals.boundary_value import BoundaryValueProblem, Closing, collocate
-from hjbjax.extremals.necessary_conditions import Extremal, assemble, unchecked
-from hjbjax.solution.clock import CUT, Clock, Stopped
+from hjbjax.extremals.boundary_value import BoundaryValueProblem, Closing, Limits, collocate
+from hjbjax.extremals.necessary_conditions import Extremal, assemble, last_iterate
+from hjbjax.problem.types import Array, Number, State
+from hjbjax.solution.clock import CUT, Stopped
 from hjbjax.solution.status import Status
 
 SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)  # of the way, in a continuation
-ROUGH, COARSE = 1e-3, 1000  # tolerance and nodes on the way
 HUGE = 1e6  # times the guess: what grows so much has no limit
 SETTLED = 1e-3  # how far from a rest its quadratic value is trusted, relative to 1 + |x̄|; what is left is its cube
 LONGER, EXTENSIONS = 1.5, 6  # factor, and how often, an infinite horizon is lengthened
@@ -34,22 +33,17 @@ ADVICE = {
 
 
 @dataclasses.dataclass(frozen=True)
-class Limits:
-    """How far a solve goes, and how long."""
+class Outcome:
+    """The last iterate of a boundary-value problem and how its solve ended.
 
-    tol: float
-    max_nodes: int
-    clock: Clock
-
-    @property
-    def rough(self) -> "Limits":
-        """For problems on the way to the one asked for."""
-        return Limits(max(ROUGH, self.tol), min(COARSE, self.max_nodes), self.clock)
-
-
-@dataclasses.dataclass(frozen=True)
-class Found:
-    """What came of a boundary-value problem; ``trouble`` is empty where it is solved."""
+    Args:
+      bvp: the boundary-value problem.
+      s: the mesh on [0, 1].
+      y: (x, p, w) of all arcs on it, shape (k·(2n+1), len(s)).
+      theta: the durations, if they are sought, and ν.
+      code: how it ended.
+      trouble: why it was not solved, in words; empty where it was.
+    """
 
     bvp: BoundaryValueProblem
     s: np.ndarray
@@ -60,7 +54,7 @@ class Found:
 
     @property
     def solved(self) -> bool:
-        """Whether it may go on."""
+        """Whether the collocation converged."""
         return self.code is Status.CONVERGED
 
     @property
@@ -79,14 +73,15 @@ class Found:
         return float(np.sum(self.lengths))
 
 
-def attempt(bvp: BoundaryValueProblem, s: Any, y: Any, theta: Any, limits: Limits) -> Found:
+def attempt(bvp: BoundaryValueProblem, s: Array, y: Array, theta: Array, limits: Limits) -> Outcome:
     """One collocation, its ending in our words; ``Stopped`` brings along what was found by then."""
     guess = np.asarray(theta, float)
     try:
-        result = collocate(bvp, s, y, guess, tol=limits.tol, max_nodes=limits.max_nodes, clock=limits.clock)
+        result = collocate(bvp, s, y, guess, limits)
     except Stopped as stop:
         mesh, last, sought = stop.reached
-        raise Stopped(stop.status, Found(bvp, mesh, last, sought, stop.status)) from None
+        raise Stopped(stop.status, Outcome(bvp, mesh, last, sought, stop.status)) from None
+    # None is SciPy's answer where no number is sought
     sought = np.zeros(0) if result.p is None else result.p
     code = Status.CONVERGED if result.success else ENDINGS[result.status]
     if not (np.all(np.isfinite(result.y)) and np.all(np.isfinite(sought))):
@@ -94,7 +89,8 @@ def attempt(bvp: BoundaryValueProblem, s: Any, y: Any, theta: Any, limits: Limit
     elif np.max(np.abs(result.y)) > HUGE * (1 + np.max(np.abs(y))):
         code = Status.DIVERGED  # a jump sharper than the mesh can look like a solution
     trouble = "" if code is Status.CONVERGED else f"the boundary-value problem was not solved: {ADVICE[code]}"
-    found = Found(bvp, result.x, result.y, sought, code, trouble)
+    found = Outcome(bvp, result.x, result.y, sought, code, trouble)
+    # run backwards, an extremal may meet its end conditions as well; ``not >`` refuses NaN, too
     if found.solved and not found.horizon > 0:
         return dataclasses.replace(
             found, code=Status.DIVERGED, trouble=f"the final time came out as {found.horizon:.3g}; give a better guess"
@@ -102,7 +98,7 @@ def attempt(bvp: BoundaryValueProblem, s: Any, y: Any, theta: Any, limits: Limit
     return found
 
 
-def carry_on(found: Found, limits: Limits) -> None:
+def carry_on(found: Outcome, limits: Limits) -> None:
     """Look at the clock with something to hand back: between two programs that have to be compiled."""
     code = limits.clock.over()
     if code is not None:
@@ -111,11 +107,11 @@ def carry_on(found: Found, limits: Limits) -> None:
 
 def smooth(
     bvp: BoundaryValueProblem, times: np.ndarray, columns: np.ndarray, limits: Limits, *, trusted: bool
-) -> Found:
+) -> Outcome:
     """The extremal of a Hamiltonian whose minimiser is continuous.
 
     Args:
-      ask: the boundary-value problem.
+      bvp: the boundary-value problem.
       times: increasing from 0.
       columns: the guess at these times, shape (2n+1, len(times)).
       limits: how far to go.
@@ -123,13 +119,15 @@ def smooth(
     """
     apart = periodic_arcs.split(bvp, times, columns)
     if apart is not None:
+        # ν alone: in place of one final time, if it is sought, there are the durations of all arcs
         multiplier = unknowns(bvp, times, columns)[int(bvp.timed) :]
-        return _arrived(attempt(*apart[:3], np.append(apart[3], multiplier), limits))
+        return _refuse_unsettled(attempt(*apart[:3], np.append(apart[3], multiplier), limits))
     found = attempt(bvp, times / times[-1], columns, unknowns(bvp, times, columns), limits)
+    # the direct attempt first: a continuation costs up to five solves
     if not found.solved and not trusted:
-        found = _continued(found, limits)
+        found = _by_continuation(found, limits)
     if bvp.closing is Closing.REST:
-        found = _settled(found, limits)
+        found = _lengthen(found, limits)
     return found
 
 
@@ -142,14 +140,16 @@ def unknowns(bvp: BoundaryValueProblem, times: np.ndarray, columns: np.ndarray) 
 
 
 @jax.jit
-def _multiplier(bvp: BoundaryValueProblem, t: Any, z: Any) -> Any:
+def _multiplier(bvp: BoundaryValueProblem, t: Number, z: Array) -> jax.Array:
+    """The ν by which p − ψ_x − ν l_x is least at the end of a guess."""
     x, p, _ = bvp.split(z)
     slope, normal = jax.grad(bvp.psi, 1)(t, x), jax.grad(bvp.level, 1)(t, x)
+    # a target's function may be flat, or not differentiable, at an end that is not on its edge: then ν = 0
     return jnp.nan_to_num((p - slope) @ normal / jnp.maximum(normal @ normal, 1e-300))
 
 
 @jax.jit
-def _levels(bvp: BoundaryValueProblem, s: Any, y: Any, theta: Any) -> Any:
+def _levels(bvp: BoundaryValueProblem, s: Array, y: Array, theta: Array) -> jax.Array:
     """The target's function along every arc, each in its own coordinates: the target knows no unwound angles."""
     lengths = bvp.durations(theta)
     begins = jnp.cumsum(lengths) - lengths
@@ -158,21 +158,24 @@ def _levels(bvp: BoundaryValueProblem, s: Any, y: Any, theta: Any) -> Any:
     return jax.vmap(lambda begin, length, x: along(begin + s * length, x))(begins, lengths, states)
 
 
-def _continued(failed: Found, limits: Limits) -> Found:
-    """The same from easier problems; the failure itself where there are none, or they fail, too."""
+def _by_continuation(failed: Outcome, limits: Limits) -> Outcome:
+    """The problem's solution by way of easier ones; the failure itself where there are none, or they fail, too."""
     bvp = failed.bvp
+    # given end states and targets have no easier problem that surely has a solution: less time may be too little
     if bvp.closing not in (Closing.REST, Closing.COST) or bvp.free:
         return failed
     found = None
     for share in SHARES:
         last = share == 1
-        if bvp.closing is Closing.REST:
+        if bvp.closing is Closing.REST:  # near the rest the Riccati costate is right up to the square of the distance
+            assert bvp.rest is not None
             start = bvp.rest.state + share * (bvp.start - bvp.rest.state)
             easier = dataclasses.replace(bvp, start=start)
             times, columns = initial_guess.into_rest(easier, start, float(bvp.horizon), limits.clock)
-        else:
+        else:  # over a short horizon the costate hardly leaves ψ_x, of which the line's is made
             easier = dataclasses.replace(bvp, horizon=share * bvp.horizon)
-            times, columns = initial_guess.straight(easier, float(easier.horizon))
+            times, columns = initial_guess.straight_line(easier, float(easier.horizon))
+        # on s ∈ [0, 1] the last solution is a guess of the next one as it is
         s, y = (times / times[-1], columns) if found is None else (found.s, found.y)
         found = attempt(easier, s, y, np.zeros(0), limits if last else limits.rough)
         if not found.solved:
@@ -180,28 +183,31 @@ def _continued(failed: Found, limits: Limits) -> Found:
     return found or failed
 
 
-def _arrived(found: Found) -> Found:
-    """A path over an infinite horizon, unless it has not come near its rest."""
+def _refuse_unsettled(found: Outcome) -> Outcome:
+    """The outcome, as a failure where an infinite horizon has not come near its rest."""
     bvp = found.bvp
     last = found.y.reshape(bvp.count, -1, len(found.s))[-1, : bvp.n, -1]
-    if bvp.closing is not Closing.REST or not found.solved or _near(bvp, last):
+    if bvp.closing is not Closing.REST or not found.solved or _is_near_rest(bvp, last):
         return found
     trouble = f"the path has not settled at its rest by t = {found.horizon:.3g}; give another guess"
     return dataclasses.replace(found, code=Status.STALLED, trouble=trouble)
 
 
-def _near(bvp: BoundaryValueProblem, last: np.ndarray) -> bool:
+def _is_near_rest(bvp: BoundaryValueProblem, last: State) -> bool:
+    """Whether the last state is so near to the rest that its quadratic value may be trusted."""
+    assert bvp.rest is not None
     return bool(np.linalg.norm(last - bvp.rest.state) <= SETTLED * (1 + np.linalg.norm(bvp.rest.state)))
 
 
-def _settled(found: Found, limits: Limits) -> Found:
-    """An infinite horizon cut where the path is near enough to its rest."""
+def _lengthen(found: Outcome, limits: Limits) -> Outcome:
+    """The outcome of an infinite horizon, lengthened until the path is near enough to its rest."""
     for _ in range(EXTENSIONS):
         bvp = found.bvp
         last = found.y[: bvp.n, -1]
-        if _near(bvp, last) or not found.solved:
+        if _is_near_rest(bvp, last) or not found.solved:
             return found
         more = float(bvp.horizon) * (LONGER - 1)
+        # the path so far, and from its end the loop under the Riccati costate
         times, columns = initial_guess.into_rest(bvp, last, more, limits.clock)
         longer = dataclasses.replace(bvp, horizon=float(bvp.horizon) * LONGER)
         t = np.concatenate([found.times, float(bvp.horizon) + times[1:]])
@@ -210,22 +216,25 @@ def _settled(found: Found, limits: Limits) -> Found:
     return found if not found.solved else dataclasses.replace(found, code=Status.STALLED, trouble=trouble)
 
 
-def report(found: Found) -> Extremal:
+def report(found: Outcome) -> Extremal:
     """The extremal, held against the necessary conditions; not so the last iterate of a run that was cut short."""
     if found.code in CUT:
-        return unchecked(found.bvp, found.s, found.y, found.lengths, found.code)
+        return last_iterate(found.bvp, found.s, found.y, found.lengths, found.code)
     extremal = assemble(found.bvp, found.s, found.y, found.theta, found.code, found.trouble)
     check = extremal.optimality_check
     if not found.solved:
         return extremal
+    # durations are sought without a sign, and an arc run backwards meets all equations
     if np.min(found.lengths) < -GAP * found.horizon:
         missed = "an arc came out with a negative duration; give another guess"
         return dataclasses.replace(extremal, code=int(Status.STALLED), message=missed)
+    # the equations know only the end: that the path is outside until then has to be seen
     if found.bvp.closing is Closing.TARGET:
         inside = np.asarray(_levels(found.bvp, found.s, found.y, found.theta))
         if np.min(inside) < -GAP * (1 + np.max(np.abs(inside))):
             missed = "the path crosses the target before its end, where it would have stopped; give another guess"
             return dataclasses.replace(extremal, code=int(Status.STALLED), message=missed)
+    # Pontryagin's principle wants the global minimum, and a search may have followed a local one
     if not check.gap <= GAP * (1 + check.scale):
         missed = f"the Hamiltonian misses its minimum by {check.gap:.3g}: no extremal; give another guess"
         return dataclasses.replace(extremal, code=int(Status.STALLED), message=missed)

@@ -9,7 +9,7 @@ so the closed loop is ẏ = (A − B H_uu⁻¹(B'P + H_ux)) y, and a path that h
 """
 
 import functools
-from typing import Any
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -17,15 +17,17 @@ import numpy as np
 
 from hjbjax.extremals.boundary_value import BoundaryValueProblem, Rest
 from hjbjax.hamiltonian import pointwise
-from hjbjax.problem.sets import Ball
+from hjbjax.problem.sets import Ball, Box
+from hjbjax.problem.types import Array, Costate, State
 
 NEAR = 1e-8  # what counts as at rest, relative to 1 + |x̄| + |p̄|
 FREE = 1e-9  # an input this close to an end of its range, relative to its width, is at a bound
 
 
 @jax.jit
-def _rest_rates(bvp: BoundaryValueProblem, y: Any) -> Any:
-    """(ẋ, ṗ) at time 0."""
+def _rest_rates(bvp: BoundaryValueProblem, y: Array) -> jax.Array:
+    """(ẋ, ṗ) at (x, p), shape (2n,), at time 0: an infinite horizon knows no other."""
+    # w = 0 is as good as any: neither ẋ nor ṗ depends on the cost to go
     return bvp.flow(0.0, jnp.append(y, 0.0), bvp.arcs[0])[:-1]
 
 
@@ -33,8 +35,8 @@ _rest_slopes = jax.jit(jax.jacfwd(_rest_rates, 1))
 
 
 @jax.jit
-def _expansion(bvp: BoundaryValueProblem, x: Any, p: Any) -> dict[str, Any]:
-    """The minimiser at one state and costate, and H there to second order."""
+def _expansion(bvp: BoundaryValueProblem, x: State, p: Costate) -> dict[str, jax.Array]:
+    """The minimiser at one state and costate, and H there to second order; the drift, to first."""
     problem = bvp.problem
     u = pointwise.minimiser(problem, bvp.rule, 0.0, bvp.wrap(x), p)
 
@@ -44,13 +46,14 @@ def _expansion(bvp: BoundaryValueProblem, x: Any, p: Any) -> dict[str, Any]:
     def drift(x, u):
         return jnp.asarray(problem.drift(*problem.arguments(bvp.wrap(x), u)), p.dtype)
 
+    # at fixed u: the Riccati equation completes the square in u itself
     (xx, xu), (_, uu) = jax.hessian(energy, (0, 1))(x, u)
     by_state, by_control = jax.jacfwd(drift, (0, 1))(x, u)
     cost = pointwise.running_cost(problem, 0.0, bvp.wrap(x), u)
     return {"u": u, "a": by_state, "b": by_control, "xx": xx, "xu": xu, "uu": uu, "cost": cost}
 
 
-def find(bvp: BoundaryValueProblem, near: np.ndarray, costate: np.ndarray) -> tuple[Rest, float]:
+def find(bvp: BoundaryValueProblem, near: State, costate: Costate) -> tuple[Rest, float]:
     """The rest near a state, and the slowest rate of the closed loop there, per unit time.
 
     Raises:
@@ -60,6 +63,7 @@ def find(bvp: BoundaryValueProblem, near: np.ndarray, costate: np.ndarray) -> tu
     from scipy.optimize import root
 
     n = len(near)
+    # Powell's hybrid method with exact slopes; its tol is on the step, and what it reaches is checked below
     with np.errstate(all="ignore"):
         found = root(
             functools.partial(_on_host, _rest_rates, bvp), np.append(near, costate),
@@ -74,12 +78,14 @@ def find(bvp: BoundaryValueProblem, near: np.ndarray, costate: np.ndarray) -> tu
     x, p = found.x[:n], found.x[n:]
     at = {name: np.asarray(part) for name, part in _expansion(bvp, x, p).items()}
     beta = float(bvp.problem.discount)
+    # any cost of the rest, however small, is paid for ever
     if beta == 0 and abs(at["cost"]) > NEAR:
         raise ValueError(
             f"pontryagin: the rest x = {x.tolist()} costs {at['cost']:.3g} per unit time, without discount; the cost "
             "of an infinite horizon is infinite: shift the cost, or give a discount or a horizon"
         )
     free = _free(bvp, at["u"])
+    # e^{−βt} goes into the state as e^{−βt/2}, which shifts A by −½β and leaves an equation without discount
     shifted = at["a"] - beta / 2 * np.eye(n)
     try:
         matrix = solve_continuous_are(
@@ -90,6 +96,7 @@ def find(bvp: BoundaryValueProblem, near: np.ndarray, costate: np.ndarray) -> tu
             f"pontryagin: the Riccati equation at the rest x = {x.tolist()} has no stabilising solution ({error}); "
             "give a horizon, or terminal="
         ) from None
+    # under A and not A − ½βI: a discounted value may be finite along paths that run away, and they end at no rest
     gain = np.linalg.solve(at["uu"][np.ix_(free, free)], at["b"][:, free].T @ matrix + at["xu"][:, free].T)
     slowest = -float(np.max(np.linalg.eigvals(at["a"] - at["b"][:, free] @ gain).real))
     if not slowest > 0:
@@ -101,7 +108,10 @@ def find(bvp: BoundaryValueProblem, near: np.ndarray, costate: np.ndarray) -> tu
     return Rest(x, p, np.asarray(value), matrix), slowest
 
 
-def _on_host(function: Any, bvp: BoundaryValueProblem, y: Any) -> np.ndarray:
+def _on_host(
+    function: Callable[[BoundaryValueProblem, Array], jax.Array], bvp: BoundaryValueProblem, y: Array
+) -> np.ndarray:
+    """The answer of a compiled function as an array of NumPy, for SciPy."""
     return np.asarray(function(bvp, y))
 
 
@@ -111,10 +121,11 @@ def _free(bvp: BoundaryValueProblem, u: np.ndarray) -> np.ndarray:
     Raises:
       ValueError: there is none, so nothing steers near the rest.
     """
-    admissible: Any = bvp.problem.controls
-    if isinstance(admissible, Ball):
+    admissible = bvp.problem.controls
+    if isinstance(admissible, Ball):  # one constraint for all inputs: on the sphere none is free
         inside = np.full(len(u), np.linalg.norm(u) < admissible.radius * (1 - FREE))
     else:
+        assert isinstance(admissible, Box)  # enumerated controls jump, and have no rest with a Riccati equation
         room = FREE * (np.asarray(admissible.hi) - np.asarray(admissible.lo))
         inside = (u > admissible.lo + room) & (u < admissible.hi - room)
     if not inside.any():

@@ -7,20 +7,21 @@ the value from above, and the value is that of the best one.
 """
 
 import dataclasses
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import jax
 import numpy as np
 
 from hjbjax.extremals import continuation, equilibria, initial_guess, switching
-from hjbjax.extremals.boundary_value import BoundaryValueProblem, Closing, Law
+from hjbjax.extremals.boundary_value import BoundaryValueProblem, Closing, Law, Limits
 from hjbjax.extremals.necessary_conditions import Extremal
 from hjbjax.hamiltonian.pointwise import rule_of
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, is_traced, pytree_dataclass
+from hjbjax.problem.types import Array, Number, State
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
-from hjbjax.solution.solution import SolveError
+from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
 from hjbjax.tracing import checks
 
@@ -39,7 +40,7 @@ class FreeTime:
       ValueError: the guess is not a positive number.
     """
 
-    guess: Any = 1.0
+    guess: Number = 1.0
 
     def __post_init__(self):
         if np.ndim(self.guess) or not (np.isfinite(self.guess) and self.guess > 0):
@@ -48,12 +49,12 @@ class FreeTime:
 
 def pontryagin(
     problem: Problem,
-    x0: Any,
+    x0: State | Sequence[float],
     *,
-    horizon: Any = None,
-    terminal: Any = None,
-    guess: Any = None,
-    rest: Any = None,
+    horizon: Number | FreeTime | None = None,
+    terminal: Callable | Array | Sequence[float] | None = None,
+    guess: Solution | Extremal | None = None,
+    rest: State | Sequence[float] | None = None,
     grid: Grid | None = None,
     tol: float = 1e-8,
     max_nodes: int = 5000,
@@ -102,28 +103,32 @@ def pontryagin(
     """
     if is_traced(problem, x0, guess, terminal):
         raise ValueError("pontryagin: got traced values; it runs at the host: call it outside of jit, vmap and grad")
-    _check(problem, tol, max_nodes)
-    start = _numbers(x0, "x0")
+    _check_problem(problem, tol, max_nodes)
+    start = _state_of_numbers(x0, "x0")
+    # checked with ψ in place of the terminal cost, so that a ψ of the wrong shape is refused before anything compiles
     paid = dataclasses.replace(problem, terminal_cost=terminal) if callable(terminal) else problem
     checks.of_one_state(paid, len(start), "the length of x0")
     _check_guess(guess, len(start), horizon)
     _check_grid(grid, len(start))
     clock = Clock()
-    limits = continuation.Limits(tol, max_nodes, clock)
+    limits = Limits(tol, max_nodes, clock)
+    # float64 whatever the session has: a residual of 1e-8 is below the rounding of float32
     with noting_interrupts(clock), jax.enable_x64(True):
         try:
-            bvp = _question(problem, start, horizon, terminal, getattr(guess, "grid", grid))
+            bvp = _pose(problem, start, horizon, terminal, guess.grid if isinstance(guess, Solution) else grid)
             if bvp.closing is Closing.REST:
                 bvp, times, columns = _to_rest(bvp, guess, rest, clock)
             else:
                 times, columns = _guess(bvp, guess, horizon)
-                if not bvp.free:
+                if not bvp.free:  # a loop that reached its end sooner, or an extremal of another horizon
                     times = times * (float(bvp.horizon) / times[-1])
             solve = switching.switching if bvp.rule.jumps else continuation.smooth
             found = solve(bvp, times, columns, limits, trusted=guess is not None)
+            # Ctrl-C after the last evaluation, which is where the clock is looked at
             if clock.interrupted:
                 raise Stopped(Status.INTERRUPTED, dataclasses.replace(found, code=Status.INTERRUPTED))
             extremal = continuation.report(found)
+            # the report compiles, too: an interrupt meanwhile is told, and the extremal is whole
             if clock.interrupted:
                 extremal = dataclasses.replace(extremal, code=int(Status.INTERRUPTED))
         except Stopped as stop:
@@ -135,7 +140,7 @@ def pontryagin(
     return extremal
 
 
-def _check(problem: Any, tol: Any, max_nodes: Any) -> None:
+def _check_problem(problem: object, tol: float, max_nodes: int) -> None:
     if not isinstance(problem, Problem):
         raise TypeError(f"pontryagin: got problem = {problem!r}, wanted a Problem")
     for name, why in (
@@ -154,16 +159,17 @@ def _check(problem: Any, tol: Any, max_nodes: Any) -> None:
         raise ValueError(f"pontryagin: got max_nodes = {max_nodes!r}, wanted a positive integer")
 
 
-def _check_guess(guess: Any, n: int, horizon: Any) -> None:
-    if guess is not None and not (hasattr(guess, "costate_at") or isinstance(guess, Extremal)):
+def _check_guess(guess: object, n: int, horizon: object) -> None:
+    if guess is not None and not isinstance(guess, (Solution, Extremal)):
         raise TypeError(f"pontryagin: got guess = {guess!r}, wanted a Solution, an Extremal or None")
-    if not hasattr(guess, "costate_at"):
+    if not isinstance(guess, Solution):
         return
     if guess.grid.ndim != n:
         raise ValueError(
             f"pontryagin: got a guess on a grid of {guess.grid.ndim} axes, wanted {n}, the length of x0; "
             "give the Solution of this problem, or no guess"
         )
+    # its closed loop is followed for as long as it takes, and past its last time it has no feedback
     if guess.times is not None and horizon is None:
         raise ValueError(
             "pontryagin: got a marched Solution as the guess, and no horizon: its feedback is known up to "
@@ -171,7 +177,7 @@ def _check_guess(guess: Any, n: int, horizon: Any) -> None:
         )
 
 
-def _check_grid(grid: Any, n: int) -> None:
+def _check_grid(grid: object, n: int) -> None:
     if grid is None:
         return
     if not isinstance(grid, Grid):
@@ -182,14 +188,19 @@ def _check_grid(grid: Any, n: int) -> None:
         )
 
 
-def _question(
-    problem: Problem, start: np.ndarray, horizon: Any, terminal: Any, grid: Grid | None
+def _pose(
+    problem: Problem,
+    start: np.ndarray,
+    horizon: Number | FreeTime | None,
+    terminal: Callable | Array | Sequence[float] | None,
+    grid: Grid | None,
 ) -> BoundaryValueProblem:
-    """The boundary-value problem, all but its rest."""
+    """The boundary-value problem that the arguments of ``pontryagin`` pose, all but its rest."""
     n = len(start)
     rule = rule_of(problem, n)
     held, ends, final = _ends(terminal, n)
     closing = Closing.STATE if any(held) else Closing.COST
+    # where the call says neither when nor how the path ends, the problem does: on its target, or never
     if horizon is None and terminal is None:
         closing = Closing.REST if problem.target is None else Closing.TARGET
     free = isinstance(horizon, FreeTime) or (horizon is None and closing is not Closing.REST)
@@ -201,20 +212,23 @@ def _question(
         closing = Closing.TARGET
     if final is None:
         final = problem.exit_cost if closing is Closing.TARGET else problem.terminal_cost
+    # a rest is one of an autonomous flow, and the Riccati equation divides by H_uu, which is 0 where the control jumps
     if closing is Closing.REST and (problem.time_dependent or rule.jumps):
         why = "depends on time" if problem.time_dependent else "has controls that jump, without a Riccati equation"
         raise ValueError(f"pontryagin: got no horizon, and the problem {why}; give horizon=, or terminal= end states")
-    controls: Any = problem.controls
+    assert problem.controls is not None
+    given = None if isinstance(horizon, FreeTime) else horizon
     return BoundaryValueProblem(
         problem=problem,
+        # wrapping is traced into every evaluation, and does nothing without a periodic axis
         grid=grid if grid is not None and any(grid.periodic or ()) else None,
         start=start,
-        horizon=0.0 if free or horizon is None else _positive(horizon),
+        horizon=0.0 if given is None else _fixed_horizon(given),
         final=final,
         ends=ends,
         rest=None,
-        arcs=np.full((1, controls.dim), np.nan),
-        epsilon=1.0,
+        arcs=np.full((1, problem.controls.dim), np.nan),  # one arc that prescribes no value
+        epsilon=1.0,  # of no meaning before there is a mixture, whose first ε is the size of H
         rule=rule,
         law=Law.MINIMUM,
         closing=closing,
@@ -223,7 +237,8 @@ def _question(
     )
 
 
-def _numbers(value: Any, name: str) -> np.ndarray:
+def _state_of_numbers(value: object, name: str) -> np.ndarray:
+    """One finite number a state in float64; NaN is admissible in ``terminal`` alone."""
     try:
         array = np.asarray(value, np.float64)
     except (TypeError, ValueError):
@@ -233,56 +248,67 @@ def _numbers(value: Any, name: str) -> np.ndarray:
     return array
 
 
-def _ends(terminal: Any, n: int) -> tuple[tuple[bool, ...], np.ndarray, Any]:
-    """Which end states are given, their values, and the terminal cost."""
+def _ends(
+    terminal: Callable | Array | Sequence[float] | None, n: int
+) -> tuple[tuple[bool, ...], np.ndarray, Callable | None]:
+    """A mask of the end states that are given, their values, and the terminal cost."""
     if terminal is None or callable(terminal):
         return (False,) * n, np.zeros(n), None if terminal is None else as_partial(terminal)
-    ends = _numbers(terminal, "terminal")
+    ends = _state_of_numbers(terminal, "terminal")
     if len(ends) != n or np.any(np.isinf(ends)) or np.all(np.isnan(ends)):
         raise ValueError(
             f"pontryagin: got terminal = {ends.tolist()}, wanted {n} numbers, NaN for a state that is free at the end, "
             "and at least one that is not"
         )
+    # the 0 of a free state is read nowhere
     return tuple(bool(given) for given in ~np.isnan(ends)), np.nan_to_num(ends), None
 
 
-def _positive(horizon: Any) -> float:
+def _fixed_horizon(horizon: Number) -> float:
+    """A horizon that is given, checked."""
     if isinstance(horizon, (bool, str)) or np.ndim(horizon) or not (np.isfinite(horizon) and horizon > 0):
         raise ValueError(f"pontryagin: got horizon = {horizon!r}, wanted a finite number > 0, FreeTime() or None")
     return float(horizon)
 
 
-def _guess(bvp: BoundaryValueProblem, guess: Any, horizon: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Times and columns where the solver starts, for a horizon that ends."""
+def _guess(
+    bvp: BoundaryValueProblem, guess: Solution | Extremal | None, horizon: Number | FreeTime | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Times and columns (x, p, w) where the solver starts, for a horizon that ends."""
     if isinstance(guess, Extremal):
-        return initial_guess.earlier(bvp, guess)
+        return initial_guess.from_extremal(bvp, guess)
     long = float(horizon.guess) if isinstance(horizon, FreeTime) else float(bvp.horizon)
+    # a free horizon is 0 in the problem, and without a guess of it the loop says how long it takes
     if guess is not None:
         return initial_guess.along_loop(bvp, guess, long or LONGEST)
-    return initial_guess.straight(bvp, long or 1.0)
+    return initial_guess.straight_line(bvp, long or 1.0)
 
 
 def _to_rest(
-    bvp: BoundaryValueProblem, guess: Any, rest: Any, clock: Clock
+    bvp: BoundaryValueProblem,
+    guess: Solution | Extremal | None,
+    rest: State | Sequence[float] | None,
+    clock: Clock,
 ) -> tuple[BoundaryValueProblem, np.ndarray, np.ndarray]:
     """The boundary-value problem with its rest, and where the solver starts."""
-    n, solution = bvp.n, guess if hasattr(guess, "costate_at") else None
-    near = np.zeros(n) if rest is None else _numbers(rest, "rest")
+    n = bvp.n
+    near: State = np.zeros(n) if rest is None else _state_of_numbers(rest, "rest")
     if len(near) != n:
         raise ValueError(f"pontryagin: got rest = {near.tolist()}, wanted shape ({n},), like x0: a state near the rest")
-    if solution is not None and rest is None:
-        near = solution.grid.state(np.unravel_index(np.nanargmin(solution.value), solution.grid.shape))
+    if isinstance(guess, Solution) and rest is None:  # from the least node no path has much left to pay
+        least = np.unravel_index(np.nanargmin(guess.value), guess.grid.shape)
+        near = guess.grid.state([int(index) for index in least])
     if isinstance(guess, Extremal) and rest is None:
         near = guess.states[-1]
     found, slowest = equilibria.find(bvp, near, np.zeros(n))
-    clock.look()
+    clock.look()  # the search for the rest compiles, and SciPy's root finder looks at no clock
     bvp = dataclasses.replace(bvp, rest=found, horizon=SETTLED / slowest)
-    if solution is None and guess is None:
+    if guess is None:
         return bvp, *initial_guess.into_rest(bvp, bvp.start, float(bvp.horizon), clock)
-    if solution is None:
-        times, columns = initial_guess.earlier(bvp, guess)
+    if isinstance(guess, Extremal):
+        times, columns = initial_guess.from_extremal(bvp, guess)
     else:
-        times, columns = initial_guess.along_loop(bvp, solution, 2 * float(bvp.horizon))
-        # a periodic state may come to rest a period away
+        times, columns = initial_guess.along_loop(bvp, guess, 2 * float(bvp.horizon))
+        # a periodic state may come to rest a period away; the costate of the rest is the same there
         found, _ = equilibria.find(bvp, columns[:n, -1], found.costate)
     return dataclasses.replace(bvp, rest=found, horizon=float(times[-1])), times, columns

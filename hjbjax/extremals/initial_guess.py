@@ -5,7 +5,7 @@ Riccati costate, whose control is clipped where it has to be. Otherwise a line b
 """
 
 import warnings
-from typing import Any
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,9 @@ import numpy as np
 from hjbjax.extremals.boundary_value import BoundaryValueProblem
 from hjbjax.feedback.simulation import simulate
 from hjbjax.hamiltonian import pointwise
+from hjbjax.problem.types import Array, State
 from hjbjax.solution.clock import Clock, Stopped
+from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
 
 COLUMNS = 101  # of a guess; the solver adds nodes where it wants them
@@ -22,20 +24,41 @@ SAMPLES = 400  # intervals in which the control of a simulated guess is held: a 
 FAR = 1e3  # times 1 + |x₀|: a loop that gets there has left for good
 
 
+class PathWithCostates(Protocol):
+    """A path with its costates and its cost to go, such as an ``Extremal``."""
+
+    @property
+    def times(self) -> Array:
+        """Increasing, shape (k+1,)."""
+
+    @property
+    def states(self) -> Array:
+        """x at these times, shape (k+1, n)."""
+
+    @property
+    def costates(self) -> Array:
+        """p at these times, shape (k+1, n)."""
+
+    @property
+    def values(self) -> Array:
+        """The cost to go from these times on, shape (k+1,)."""
+
+
 @jax.jit
-def _rest_loop(bvp: BoundaryValueProblem, x: Any) -> Any:
+def _rest_loop(bvp: BoundaryValueProblem, x: State) -> jax.Array:
     """ẋ under the costate p̄ + P(x − x̄)."""
+    assert bvp.rest is not None
+    # by the flow of the problem and not as a linear feedback: its control is clipped where the set ends
     p = bvp.rest.costate + bvp.rest.matrix @ (x - bvp.rest.state)
     return bvp.flow(0.0, jnp.concatenate([x, p, jnp.zeros(1, x.dtype)]), bvp.arcs[0])[: bvp.n]
 
 
-def into_rest(
-    bvp: BoundaryValueProblem, start: np.ndarray, duration: float, clock: Clock
-) -> tuple[np.ndarray, np.ndarray]:
+def into_rest(bvp: BoundaryValueProblem, start: State, duration: float, clock: Clock) -> tuple[np.ndarray, np.ndarray]:
     """Times and columns (x, p, w) under the Riccati costate; a line to the rest where that loop runs away."""
     from scipy.integrate import solve_ivp
 
     arrays, rest = jax.tree.map(jnp.asarray, bvp), bvp.rest
+    assert rest is not None
     times, far = np.linspace(0, duration, COLUMNS), FAR * (1 + np.linalg.norm(start))
 
     def away(t, x):
@@ -48,47 +71,54 @@ def into_rest(
     away.terminal = True  # type: ignore[attr-defined]
     with np.errstate(all="ignore"):
         path = solve_ivp(flow, (0, duration), start, t_eval=times, events=away, rtol=1e-5)
-    states = path.y
+    states = path.y  # (n, COLUMNS), or fewer where the loop ran away
     if states.shape[1] < len(times) or not np.all(np.isfinite(states)):
-        decay = np.exp(-5 * times / duration)
+        decay = np.exp(-5 * times / duration)  # to e⁻⁵, 0.7 % of the way, at the end
         states = rest.state[:, None] + (start - rest.state)[:, None] * decay
+    # p̄ + P(x − x̄) and w̄ + p̄·y + ½ y'Py along the path, as the end condition has them
     off = states - rest.state[:, None]
     bent = rest.matrix @ off
     value = rest.value + rest.costate @ off + 0.5 * np.sum(off * bent, axis=0)
     return times, np.concatenate([states, rest.costate[:, None] + bent, value[None]])
 
 
-def along_loop(bvp: BoundaryValueProblem, solution: Any, duration: float) -> tuple[np.ndarray, np.ndarray]:
+def along_loop(bvp: BoundaryValueProblem, solution: Solution, duration: float) -> tuple[np.ndarray, np.ndarray]:
     """Times and columns (x, p, w) of the closed loop of a solution, as far as it gets; a line where it gets nowhere."""
     grid, marched = solution.grid, solution.times is not None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # where a guess ends is seen from its times
+        # clamped: off the grid the control of its nearest point is a guess, too
         try:
             path = simulate(bvp.problem, solution, bvp.start, duration, hold=duration / SAMPLES, clamp=True)
         except KeyboardInterrupt:
             raise Stopped(Status.INTERRUPTED) from None
     times, states = path.times, path.states
+    # with given end states and a free time the loop does not stop by itself: cut where it comes nearest to them
     if not bvp.problem.target and bvp.free and any(bvp.held):
         nearest = int(np.argmin(np.linalg.norm((states - bvp.ends)[:, np.array(bvp.held)], axis=1)))
         if nearest:  # else it starts where it ends, though only in the states that are given there
             times, states = times[: nearest + 1], states[: nearest + 1]
     if len(times) == 1:  # in the target from the first
-        return straight(bvp, duration)
+        return straight_line(bvp, duration)
+    # of the 400 intervals every second or so: a first mesh that is too fine is never made coarser
     kept = np.unique(np.linspace(0, len(times) - 1, 2 * COLUMNS).astype(int))
     times, states = times[kept], states[kept]
-    inside = np.asarray(grid.wrap(states))
+    inside = np.asarray(grid.wrap(states))  # the path is unwound, the nodes are not
     where = (times, inside) if marched else (inside,)
     costates, values = solution.costate_at(*where, clamp=True), solution.value_at(*where, clamp=True)
+    # V is infinite, and DV undefined, at nodes from where the target is out of reach
     return times, np.nan_to_num(np.concatenate([states, costates, values[:, None]], axis=1).T, posinf=0.0, neginf=0.0)
 
 
-def straight(bvp: BoundaryValueProblem, duration: float) -> tuple[np.ndarray, np.ndarray]:
+def straight_line(bvp: BoundaryValueProblem, duration: float) -> tuple[np.ndarray, np.ndarray]:
     """Times and columns (x, p, w) along a line to the given end states; at rest in x₀ without any."""
     times = np.linspace(0, duration, COLUMNS)
     held = np.array(bvp.held)
+    # from the end to x₀ in the given states alone; the others stay
     gap = np.where(held, bvp.start - np.where(held, bvp.ends, 0), 0) if held.any() else np.zeros(bvp.n)
     length = np.linalg.norm(gap)
     states = bvp.start[:, None] - gap[:, None] * times / duration
+    # along the line and p·ẋ = −1, as H = 1 + p·ẋ = 0 has it for least time
     if held.any():
         costate = gap * duration / length**2 if length else gap
     else:
@@ -97,32 +127,36 @@ def straight(bvp: BoundaryValueProblem, duration: float) -> tuple[np.ndarray, np
     return times, np.concatenate([states, costates, np.zeros((1, len(times)))])
 
 
-def earlier(bvp: BoundaryValueProblem, extremal: Any) -> tuple[np.ndarray, np.ndarray]:
+def from_extremal(bvp: BoundaryValueProblem, extremal: PathWithCostates) -> tuple[np.ndarray, np.ndarray]:
     """Times and columns (x, p, w) of another extremal, its start moved to x₀."""
     if np.shape(extremal.states)[1] != bvp.n:
         raise ValueError(f"pontryagin: the guess has {np.shape(extremal.states)[1]} states, wanted {bvp.n}")
+    # empty arcs leave a time twice, and a mesh has to rise
     times, kept = np.unique(extremal.times, return_index=True)
     states, costates, values = (part[kept].T for part in (extremal.states, extremal.costates, extremal.values[:, None]))
+    # the shift of the start fades out linearly, so that the end stays where it met its conditions
     moved = (bvp.start - states[:, 0])[:, None] * (1 - times / times[-1]) if times[-1] > 0 else 0.0
     return times, np.concatenate([states + moved, costates, values])
 
 
-def sequence(
+def arc_order(
     bvp: BoundaryValueProblem, times: np.ndarray, columns: np.ndarray, least: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """The values of the jumping inputs in the order met, shape (k, m), and when each sets in, shape (k,).
 
     Args:
-      ask: of a mixture.
+      bvp: the boundary-value problem of a mixture.
       times: increasing.
       columns: (x, p, w) at these times.
       least: the share of the time that an arc must last; the one before goes on in place of a shorter one.
     """
-    which = np.asarray(_best(bvp, times, columns))
+    which = np.asarray(_dominant_value(bvp, times, columns))
+    # runs of one value; then without the short ones, and neighbours that have become alike made one run
     begins = np.flatnonzero(np.append(True, which[1:] != which[:-1]))
     lasting = np.diff(np.append(times[begins], times[-1])) >= least * (times[-1] - times[0])
     begins = begins[lasting]
     begins = begins[np.append(True, which[begins[1:]] != which[begins[:-1]])] if len(begins) else np.zeros(1, int)
+    # a switch lies between the last sample of one value and the first of the next: half way
     starts = np.append(times[0], 0.5 * (times[begins[1:]] + times[begins[1:] - 1]))
     return values(bvp)[which[begins]], starts
 
@@ -133,28 +167,31 @@ def values(bvp: BoundaryValueProblem) -> np.ndarray:
 
 
 @jax.jit
-def _corners(bvp: BoundaryValueProblem) -> Any:
+def _corners(bvp: BoundaryValueProblem) -> jax.Array:
     return pointwise.corners(bvp.problem, bvp.rule)
 
 
 @jax.jit
-def _best(bvp: BoundaryValueProblem, times: Any, columns: Any) -> Any:
+def _dominant_value(bvp: BoundaryValueProblem, times: Array, columns: Array) -> jax.Array:
     """The index of the value with the largest weight at every time."""
 
     def one(t, z):
         x, p, _ = bvp.split(z)
-        return jnp.argmax(bvp.weighted(t, x, p, bvp.arcs[0])[1])
+        return jnp.argmax(bvp.mixture(t, x, p, bvp.arcs[0])[1])
 
     return jax.vmap(one, (0, 1))(times, columns)
 
 
-def size(bvp: BoundaryValueProblem, times: np.ndarray, columns: np.ndarray) -> float:
-    """The typical size of the Hamiltonian's terms along a guess, where a smoothing starts."""
+def hamiltonian_size(bvp: BoundaryValueProblem, times: np.ndarray, columns: np.ndarray) -> float:
+    """The typical size of the Hamiltonian's terms along a guess, which is the first ε of a smoothing."""
+    # 1 where all are zero: ε = 0 would divide by zero
     return float(np.mean(_sizes(bvp, times, columns))) or 1.0
 
 
 @jax.jit
-def _sizes(bvp: BoundaryValueProblem, times: Any, columns: Any) -> Any:
+def _sizes(bvp: BoundaryValueProblem, times: Array, columns: Array) -> jax.Array:
+    """The larger of spread and mean size of H over the values of the jumping inputs, at every time."""
+
     def one(t, z):
         x, p, _ = bvp.split(z)
         values = pointwise.corners(bvp.problem, bvp.rule)

@@ -1,7 +1,5 @@
 """The answer of ``pontryagin``: the extremal, how its solve ended, and how well it meets the necessary conditions."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +8,7 @@ from hjbjax.extremals.boundary_value import BoundaryValueProblem
 from hjbjax.hamiltonian import pointwise
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import samples
+from hjbjax.problem.types import Array, Number
 from hjbjax.solution.screen import encodable
 from hjbjax.solution.status import Status
 
@@ -19,7 +18,7 @@ BUDGET = 200  # controls with which the minimiser is compared
 
 @pytree_dataclass()
 class Optimality:
-    """How well an extremal meets the necessary conditions, in cost units per unit time.
+    """Residuals of the necessary conditions along an extremal, in cost units per unit time.
 
     Args:
       hamiltonian: e^{−βt}(H − βw) less what ∂H/∂t makes of it, at every time, shape (k+1,): a constant, which is
@@ -29,10 +28,10 @@ class Optimality:
       scale: the largest size of the terms of H, which both are to be compared with.
     """
 
-    hamiltonian: Any
-    drift: Any
-    gap: Any
-    scale: Any
+    hamiltonian: Array
+    drift: Number
+    gap: Number
+    scale: Number
 
 
 @pytree_dataclass(host=("message",))
@@ -53,21 +52,21 @@ class Extremal:
       message: how the solve ended, in a sentence; host level.
     """
 
-    times: Any
-    states: Any
-    controls: Any
-    costates: Any
-    values: Any
-    switches: Any
-    cost: Any
-    horizon: Any
+    times: Array
+    states: Array
+    controls: Array
+    costates: Array
+    values: Array
+    switches: Array
+    cost: Number
+    horizon: Number
     optimality_check: Optimality
-    code: Any
+    code: int | Array
     message: str = ""
 
     @property
     def status(self) -> Status:
-        """How the solve ended."""
+        """The ``Status`` with which the solve ended."""
         return Status(int(self.code))
 
     def __repr__(self) -> str:
@@ -78,23 +77,27 @@ class Extremal:
 
 
 @jax.jit
-def measure(bvp: BoundaryValueProblem, t: Any, z: Any, corner: Any) -> dict[str, Any]:
-    """What the check needs at all times of one arc; ``z`` has shape (2n+1, k+1)."""
-    controls: Any = bvp.problem.controls
+def measure(bvp: BoundaryValueProblem, t: Array, z: Array, corner: Array) -> dict[str, jax.Array]:
+    """Control, H and its excess over the least at all times of one arc; ``z`` has shape (2n+1, k+1)."""
+    controls = bvp.problem.controls
+    assert controls is not None
     tried = jnp.asarray(samples(controls, BUDGET), z.dtype)
 
     def one(t, z):
         x, p, w = bvp.split(z)
-        at, weights = bvp.weighted(t, x, p, corner)
+        at, weights = bvp.mixture(t, x, p, corner)
         u = weights @ at
         energy = weights @ jax.vmap(lambda u: bvp.hamiltonian(t, x, p, u))(at)
+        # samples of the whole set, which no local search can miss, and the minimiser, which is finer than they are
         least = jnp.min(jax.vmap(lambda u: bvp.hamiltonian(t, x, p, u))(tried))
         least = jnp.minimum(
             least, bvp.hamiltonian(t, x, p, pointwise.minimiser(bvp.problem, bvp.rule, t, bvp.wrap(x), p))
         )
+        # what H is made of: near a rest or a free end H itself cancels to 0, and nothing could be relative to it
         terms = bvp.problem.drift(*bvp.problem.arguments(bvp.wrap(x), u, t=t)) * p
         cost = pointwise.running_cost(bvp.problem, t, bvp.wrap(x), u)
         now = jnp.exp(-bvp.problem.discount * t)
+        # d/dt of e^{−βt}(H − βw) along an extremal is e^{−βt} ∂H/∂t
         moving = now * jax.grad(bvp.hamiltonian, 0)(t, x, p, u) if bvp.problem.time_dependent else 0.0 * t
         size = jnp.maximum(jnp.max(jnp.abs(terms)), jnp.abs(cost))
         constant = now * (energy - bvp.problem.discount * w)
@@ -109,10 +112,10 @@ def assemble(
     """The extremal from the functions on [0, 1] that solve ``bvp``; float64 has to be on."""
     from scipy.integrate import cumulative_simpson
 
-    arrays = jax.tree.map(jnp.asarray, bvp)
+    arrays = jax.tree.map(jnp.asarray, bvp)  # NumPy's leaves would be copied to the device in every call
     lengths = np.asarray(bvp.durations(jnp.asarray(theta)))
     begins, stacked = np.cumsum(lengths) - lengths, y.reshape(bvp.count, -1, len(s))
-    parts, moved = [], 0.0
+    parts, moved = [], 0.0  # moved: the integral of e^{−βt} ∂H/∂t over the arcs so far
     for number, (begin, length, z, corner) in enumerate(
         zip(begins, lengths, stacked, np.asarray(bvp.arcs), strict=True)
     ):
@@ -121,30 +124,33 @@ def assemble(
         gone = np.full(len(s), moved)
         if bvp.problem.time_dependent:  # a mesh that crowds may repeat a node
             once, back = np.unique(s, return_index=True, return_inverse=True)[1:]
+            # Simpson's rule, of order 4 like the collocation: a cruder one would be all that the check sees
             gone += length * cumulative_simpson(part["moving"][once], x=s[once], initial=0.0)[back]
+        # each arc goes on from what the arcs before it have gathered
         part["constant"], moved = part["constant"] - gone, gone[-1]
         if code is Status.CONVERGED and length <= EMPTY * lengths.sum():  # an arc that begins where it ends
             continue
         states = z[: bvp.n].T + (0.0 if bvp.shifts is None else bvp.shifts[number])
         parts.append({**part, "t": t, "z": np.concatenate([states, z[bvp.n :].T], 1)})
 
-    def joined(name, last=True):
-        """Over all arcs; at a switch the next arc's."""
+    def join(name: str, last: bool = True) -> np.ndarray:
+        """A quantity over all arcs; at a switch the next arc's, and without ``last`` one entry an interval."""
         rows = [part[name][:-1] for part in parts]
         return np.concatenate([*rows, parts[-1][name][-1:]] if last else rows)
 
-    n, z = bvp.n, joined("z")
+    n, z = bvp.n, join("z")
+    # both sides of every switch, of which the arrays of the answer keep one: a jump of H there is a failure
     every = np.concatenate([part["constant"] for part in parts])
     check = Optimality(
-        hamiltonian=joined("constant"),
+        hamiltonian=join("constant"),
         drift=float(np.max(every) - np.min(every)),
         gap=float(max(np.max(part["gap"]) for part in parts)),
         scale=float(max(np.max(part["size"]) for part in parts)),
     )
     return Extremal(
-        times=joined("t"),
+        times=join("t"),
         states=z[:, :n],
-        controls=joined("u", last=False),
+        controls=join("u", last=False),
         costates=z[:, n : 2 * n],
         values=z[:, -1],
         switches=np.array([part["t"][0] for part in parts[1:] if not bvp.seams]),
@@ -156,9 +162,12 @@ def assemble(
     )
 
 
-def unchecked(bvp: BoundaryValueProblem, s: np.ndarray, y: np.ndarray, lengths: np.ndarray, code: Status) -> Extremal:
+def last_iterate(
+    bvp: BoundaryValueProblem, s: np.ndarray, y: np.ndarray, lengths: np.ndarray, code: Status
+) -> Extremal:
     """A path with its costates as far as a solve came, without controls, which would have to be compiled for."""
     begins, n = np.cumsum(lengths) - lengths, bvp.n
+    # from (k, 2n+1, nodes) to (k, nodes, 2n+1); a copy, for ``y`` is the solver's
     z = np.moveaxis(y.reshape(bvp.count, -1, len(s)), 1, 2).copy()
     if bvp.shifts is not None:
         z[..., :n] += np.asarray(bvp.shifts)[:, None]

@@ -21,7 +21,7 @@ def split(
     """The boundary-value problem in arcs, their mesh, the guess on it, and their durations; None without a crossing.
 
     Args:
-      ask: with one arc, and a grid where it has periodic axes.
+      bvp: with one arc, and a grid where it has periodic axes.
       times: increasing from 0.
       columns: the guess (x, p, w) at these times.
     """
@@ -30,9 +30,11 @@ def split(
     cyclic, fine = np.array(bvp.grid.periodic), np.linspace(0, times[-1], FINE)
     lo, period = np.asarray(bvp.grid.lo), np.asarray(bvp.grid.hi) - np.asarray(bvp.grid.lo)
     states = np.stack([np.interp(fine, times, row) for row in columns[: bvp.n]], axis=-1)
+    # the number of whole periods that each unwound state is away from the box, shape (FINE, n)
     turns = np.where(cyclic, np.floor((states - lo) / period), 0)
     at = 1 + np.flatnonzero(np.any(np.diff(turns, axis=0) != 0, axis=1))
     steps = turns[at] - turns[at - 1]
+    # two seams within one sample, or a seam jumped over twice, have no order that the guess could tell
     if not len(at) or np.any(np.sum(np.abs(steps), axis=1) != 1):
         return None
     axes = np.argmax(np.abs(steps), axis=1)
@@ -44,12 +46,13 @@ def split(
         np.stack([np.interp(begin + s * length, times, row) for row in columns])
         for begin, length in zip(starts, lengths, strict=True)
     ]
+    # into the box: costates and cost to go are the same in every period, states are shifted
     for piece, shift in zip(pieces, shifts, strict=True):
         piece[: bvp.n] -= shift[:, None]
     rest = bvp.rest and dataclasses.replace(bvp.rest, state=bvp.rest.state - shifts[-1])
     apart = dataclasses.replace(
         bvp,
-        grid=None,
+        grid=None,  # an iterate may overshoot the seam a little: there the drift goes on smoothly, unwrapped
         start=bvp.start - shifts[0],
         ends=bvp.ends - np.where(bvp.held, shifts[-1], 0),
         rest=rest,

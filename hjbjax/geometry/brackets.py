@@ -11,7 +11,7 @@ arrays; under a tracer it is traced like anything else.
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +19,10 @@ import numpy as np
 
 from hjbjax.problem import arguments
 from hjbjax.problem.pytree import as_partial, cast, is_traced, pytree_dataclass
+from hjbjax.problem.types import Array, Control, Number, State
 
-Field = Callable[[Any], Any]
+T = TypeVar("T")
+Field: TypeAlias = Callable[[State], State]
 
 
 def lie_derivative(f: Field, h: Callable) -> Callable:
@@ -37,7 +39,8 @@ def lie_derivative(f: Field, h: Callable) -> Callable:
     """
 
     def derivative(x):
-        return jax.jvp(floating(h), (as_state(x),), (floating(f)(as_state(x)),))[1]
+        # forward mode, one pass through h whatever its shape: its Jacobian is never formed
+        return jax.jvp(in_state_dtype(h), (as_state(x),), (in_state_dtype(f)(as_state(x)),))[1]
 
     return derivative
 
@@ -56,8 +59,9 @@ def lie_bracket(f: Field, g: Field) -> Field:
     """
 
     def bracket(x):
-        change = jax.jvp(floating(g), (as_state(x),), (floating(f)(as_state(x)),))[1]
-        return change - jax.jvp(floating(f), (as_state(x),), (floating(g)(as_state(x)),))[1]
+        # two directional derivatives in place of two n × n Jacobians
+        change = jax.jvp(in_state_dtype(g), (as_state(x),), (in_state_dtype(f)(as_state(x)),))[1]
+        return change - jax.jvp(in_state_dtype(f), (as_state(x),), (in_state_dtype(g)(as_state(x)),))[1]
 
     return bracket
 
@@ -79,6 +83,8 @@ def ad(f: Field, g: Field, k: int) -> Field:
       [1.0, 0.0, 0.0]
     """
     arguments.count(k, "ad: k", least=0)
+    # each bracket evaluates the one inside it and differentiates it: on the ball and beam the program has 25 operations
+    # for k = 0, 1677 for k = 3 and 5695 for k = 4; ``along`` shares the inner evaluation and is half as long
     for _ in range(k):
         g = lie_bracket(f, g)
     return g
@@ -97,7 +103,7 @@ def affine_fields(drift: Callable, inputs: int) -> tuple[Field, Sequence[Field]]
       ([3.0, 0.0], [0.0, 2.0])
     """
     arguments.count(inputs, "affine_fields: inputs", least=0)
-    held = as_partial(drift, "affine_fields: drift")
+    held = as_pytree(drift, "affine_fields: drift")
     return _Affine(held, inputs, None), [_Affine(held, inputs, j) for j in range(inputs)]
 
 
@@ -105,7 +111,7 @@ def affine_fields(drift: Callable, inputs: int) -> tuple[Field, Sequence[Field]]
 class _Affine:
     """x ↦ f(x, 0), or with j the rate of f(x, u) with u_j; the drift's numbers stay leaves."""
 
-    drift: Any
+    drift: Callable[[State, Control], State]
     inputs: int
     j: int | None
 
@@ -114,23 +120,26 @@ class _Affine:
         zero = jnp.zeros(self.inputs, x.dtype)
         if self.j is None:
             return self.drift(x, zero)
+        # a derivative, exact for an affine drift: f(x, e_j) − f(x, 0) would lose g_j to rounding beside a large f(x, 0)
         return jax.jvp(functools.partial(self.drift, x), (zero,), (zero.at[self.j].set(1),))[1]
 
 
-def along(function: Callable, x: Any, directions: Any) -> Any:
+def along(function: Callable[[State], T], x: State, directions: Array) -> tuple[T, T]:
     """The value at x, and the derivatives along directions, shape (p, n), with a leading axis of length p.
 
     One evaluation gives both, so that the program of k nested ones grows like 2^k and no faster.
     """
+    # out_axes None: the value does not depend on the direction, so that it is computed once and not p times
     return jax.vmap(lambda v: jax.jvp(function, (x,), (v,)), out_axes=(None, 0))(directions)
 
 
-def stacked(fields: Sequence[Field]) -> Callable:
+def stack_fields(fields: Sequence[Field]) -> Callable[[State], jax.Array]:
     """Several fields as one function that returns shape (m, n)."""
 
     def every(x):
-        rows = [floating(field)(x) for field in fields]
+        rows = [in_state_dtype(field)(x) for field in fields]
         for row in rows:
+            # a number or (n, 1) would broadcast to brackets of the right shape with the wrong entries
             if row.shape != x.shape:
                 raise ValueError(
                     f"a vector field returned shape {row.shape}, expected {x.shape}: one rate a state, for one state"
@@ -140,22 +149,28 @@ def stacked(fields: Sequence[Field]) -> Callable:
     return every
 
 
-def decide(rule: Callable, functions: tuple, x: Any, tolerance: Any, **static: Any) -> Any:
+def decide(
+    rule: Callable[..., T], functions: tuple, x: State | Sequence[float], tolerance: Number | None, **static: float
+) -> T:
     """``rule(functions, x, tolerance, **static)``: in float64 at the host, in its own dtype under a tracer."""
     if is_traced(functions, x, tolerance):
         x = as_state(x)
         return rule(functions, x, jnp.finfo(x.dtype).eps ** 0.5 if tolerance is None else tolerance, **static)
+    # float64 whatever the session has: in float32 √eps is 3.5e-4, and that would decide ranks
     with jax.enable_x64(True):
         state = np.asarray(x, np.float64)
         if state.ndim != 1 or not np.all(np.isfinite(state)):
             raise ValueError(f"got x = {x!r}, wanted finite numbers of shape (n,): one state")
+        # √eps, 1.5e-8: above what rounding leaves of a bracket, 1e-12, below clear ranks, 0.1 for a car with trailers
         allowed = 2.0**-26 if tolerance is None else float(tolerance)
         if not 0 < allowed < 1:
             raise ValueError(f"got tolerance = {tolerance!r}, wanted a number between 0 and 1")
         try:
-            answer = _compiled(rule, tuple(static.items()))(cast(functions, np.float64), state, allowed)
+            answer = _compiled_rule(rule, tuple(static.items()))(cast(functions, np.float64), state, allowed)
         except jax.errors.JAXTypeError as error:
+            # an ``if`` on a state, or a NumPy function of one
             raise ValueError("a field cannot be traced: use jnp.where instead of if, jnp instead of numpy") from error
+        # what a field closes over may be traced though neither field nor state is; such answers stay in their trace
         answer = jax.tree.map(lambda leaf: leaf if is_traced(leaf) else np.asarray(leaf), answer)
     numbers = [leaf for leaf in jax.tree.leaves(answer) if not is_traced(leaf)]
     if not all(np.all(np.isfinite(leaf)) for leaf in numbers):
@@ -166,23 +181,34 @@ def decide(rule: Callable, functions: tuple, x: Any, tolerance: Any, **static: A
 
 
 @functools.lru_cache(maxsize=256)
-def _compiled(rule, static):
+def _compiled_rule(rule: Callable[..., T], static: tuple[tuple[str, float], ...]) -> Callable[..., T]:
+    # jit knows its programs by the identity of the function, and a new partial in every call would compile anew
     return jax.jit(functools.partial(rule, **dict(static)))
 
 
-def as_fields(gs: Any) -> list[Field]:
-    """A sequence of fields from one or several."""
-    return [gs] if callable(gs) else list(gs)
+def as_pytree(function: Callable, name: str = "function") -> jax.tree_util.Partial:
+    """A function as a pytree, with the numbers of the object that it is a method of as leaves."""
+    held = as_partial(function, name)
+    if held is None:
+        raise TypeError(f"{name}: got None, wanted a function of one state")
+    return held
 
 
-def as_state(x: Any) -> Any:
+def as_fields(f: Field | None, gs: Field | Sequence[Field]) -> tuple[jax.tree_util.Partial, ...]:
+    """The drift, if any, and one or several input fields, as pytrees."""
+    drift = () if f is None else (f,)
+    return tuple(as_pytree(field) for field in (*drift, *([gs] if callable(gs) else gs)))
+
+
+def as_state(x: State | Sequence[float]) -> jax.Array:
     """A state as a floating-point array."""
+    # JAX differentiates nothing along integers, and [0, 1] is a state like any other
     x = jnp.asarray(x)
     return x if jnp.issubdtype(x.dtype, jnp.inexact) else x.astype(float)
 
 
-def floating(function: Callable) -> Callable:
-    """The function with a list, an integer or a constant of its own dtype made an array in that of the state."""
+def in_state_dtype(function: Callable[[State], Array | Number]) -> Callable[[State], jax.Array]:
+    """The function with its answer as an array in the dtype of the state, be it a list, an integer or a constant."""
 
     def call(x):
         return jnp.asarray(function(x), x.dtype)

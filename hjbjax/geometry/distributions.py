@@ -11,14 +11,14 @@ Cost: the program of depth k holds 2^k derivatives, and the number of brackets g
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from hjbjax.geometry.brackets import Field, along, as_fields, decide, floating, stacked
+from hjbjax.geometry.brackets import Field, along, as_fields, as_pytree, decide, in_state_dtype, stack_fields
 from hjbjax.problem import arguments
-from hjbjax.problem.pytree import as_partial, is_traced, pytree_dataclass
+from hjbjax.problem.pytree import is_traced, pytree_dataclass
+from hjbjax.problem.types import Array, Number, State
 
 
 @pytree_dataclass()
@@ -32,49 +32,58 @@ class Distribution:
       tolerance: what counts, as a part of the largest singular value.
     """
 
-    vectors: Any
-    directions: Any
-    singular_values: Any
-    tolerance: Any
+    vectors: Array
+    directions: Array
+    singular_values: Array
+    tolerance: Number
 
     @property
-    def counted(self) -> Any:
-        """Which singular values count towards the rank, shape (min(n, p),)."""
+    def counted(self) -> Array:
+        """A mask of the singular values that count towards the rank, shape (min(n, p),)."""
+        # strictly above, so that fields that all vanish have rank 0
         return self.singular_values > self.tolerance * self.singular_values[0]
 
     @property
-    def rank(self) -> Any:
-        """How many singular values count; an int outside of a trace."""
+    def rank(self) -> int | jax.Array:
+        """The number of singular values that count; an int outside of a trace."""
         rank = self.counted.sum()
         return rank if is_traced(rank) else int(rank)
 
     @property
-    def basis(self) -> Any:
+    def basis(self) -> Array:
         """An orthonormal basis in columns, shape (n, rank); under a tracer all directions, with zeros past the rank."""
+        # a traced rank is no shape, and a projection B Bᵀ is the same with columns of zeros
         if is_traced(self.singular_values):
             return self.directions * self.counted
         return self.directions[:, : self.rank]
 
     @property
-    def margin(self) -> Any:
+    def margin(self) -> Number:
         """The smallest singular value that counts over the largest; compare with ``tolerance``."""
         return self._largest_ratio(jnp.where(self.counted, self.singular_values, jnp.inf).min())
 
     @property
-    def residue(self) -> Any:
+    def residue(self) -> Number:
         """The largest singular value that does not count over the largest; compare with ``tolerance``."""
         return self._largest_ratio(jnp.where(self.counted, 0.0, self.singular_values).max())
 
-    def _largest_ratio(self, value: Any) -> Any:
+    def _largest_ratio(self, value: Array) -> Number:
         largest = self.singular_values[0]
+        # over a safe 1 where all fields vanish: a ``where`` after 0/0 keeps NaN out of the value and not of a gradient;
+        # ``value`` is infinite where it is the least of no singular values at all
         ratio = jnp.where((largest > 0) & jnp.isfinite(value), value / jnp.where(largest > 0, largest, 1.0), 0.0)
         return ratio if is_traced(ratio) else float(ratio)
 
 
 def reachability_distribution(
-    f: Field | None, gs: Field | Sequence[Field], x: Any, depth: int, *, tolerance: Any = None
+    f: Field | None,
+    gs: Field | Sequence[Field],
+    x: State | Sequence[float],
+    depth: int,
+    *,
+    tolerance: Number | None = None,
 ) -> Distribution:
-    """What f, the g_j and their brackets span at a state (4.5).
+    """The span of f, the g_j and their brackets at a state (4.5).
 
     The first generation holds the brackets of two fields, generation k those of a field with one of generation
     k − 1. Rank n says that the states reachable from x in any time fill an open set (accessibility), and without
@@ -102,14 +111,20 @@ def reachability_distribution(
       [1, 1, 2]
     """
     arguments.count(depth, "reachability_distribution: depth", least=0)
-    fields = tuple(as_partial(field) for field in [*([] if f is None else [f]), *as_fields(gs)])
+    fields = as_fields(f, gs)
     return decide(_reach, fields, x, tolerance, depth=int(depth))
 
 
 def observability_codistribution(
-    f: Field | None, gs: Field | Sequence[Field], h: Callable, x: Any, depth: int, *, tolerance: Any = None
+    f: Field | None,
+    gs: Field | Sequence[Field],
+    h: Callable,
+    x: State | Sequence[float],
+    depth: int,
+    *,
+    tolerance: Number | None = None,
 ) -> Distribution:
-    """What the differentials of the outputs and of their Lie derivatives span at a state (4.11).
+    """The span of the differentials of the outputs and of their Lie derivatives at a state (4.11).
 
     Rank n says that states near x are told apart by their outputs under suitable inputs (local observability);
     it says nothing of states far from each other.
@@ -136,12 +151,13 @@ def observability_codistribution(
       2
     """
     arguments.count(depth, "observability_codistribution: depth", least=0)
-    fields = tuple(as_partial(field) for field in [*([] if f is None else [f]), *as_fields(gs)])
-    return decide(_observe, (fields, as_partial(h)), x, tolerance, depth=int(depth))
+    fields = as_fields(f, gs)
+    return decide(_observe, (fields, as_pytree(h)), x, tolerance, depth=int(depth))
 
 
-def _reach(fields, x, tolerance, *, depth):
-    field = stacked(fields)
+def _reach(fields: tuple[Field, ...], x: State, tolerance: Number, *, depth: int) -> Distribution:
+    """The span of the fields and of ``depth`` generations of brackets."""
+    field = stack_fields(fields)
 
     def generations(state):
         return (field(state),)
@@ -151,40 +167,47 @@ def _reach(fields, x, tolerance, *, depth):
     return span(jnp.concatenate(generations(x)), tolerance)
 
 
-def _with_brackets(fields, generations):
+def _with_brackets(
+    fields: Callable[[State], jax.Array], generations: Callable[[State], tuple[jax.Array, ...]]
+) -> Callable[[State], tuple[jax.Array, ...]]:
     """The generations and one more: the brackets of every field with every member of the last one."""
 
     def longer(x):
-        found, changes = along(generations, x, fields(x))
-        _, bends = along(fields, x, found[-1])  # (members, fields, n)
-        brackets = changes[-1] - bends.swapaxes(0, 1)
+        found, changes = along(generations, x, fields(x))  # (∂Y/∂x) X is changes[-1], shape (fields, members, n)
+        _, bends = along(fields, x, found[-1])  # (∂X/∂x) Y, shape (members, fields, n)
+        brackets = changes[-1] - bends.swapaxes(0, 1)  # [X, Y] by (4.4), every field X with every member Y
         return (*found, brackets.reshape(-1, x.shape[0]))
 
     return longer
 
 
-def _observe(functions, x, tolerance, *, depth):
+def _observe(functions: tuple[tuple[Field, ...], Callable], x: State, tolerance: Number, *, depth: int) -> Distribution:
+    """The span of the differentials of the outputs and of ``depth`` generations of their Lie derivatives."""
     fields, h = functions
 
     def generations(state):
-        return (jnp.atleast_1d(floating(h)(state)),)
+        return (jnp.atleast_1d(in_state_dtype(h)(state)),)
 
     for _ in range(depth if fields else 0):
-        generations = _with_derivatives(stacked(fields), generations)
+        generations = _with_derivatives(stack_fields(fields), generations)
+    # one Jacobian of all generations, each (members, n): taken of each alone it would evaluate the shorter ones again
     return span(jnp.concatenate(jax.jacfwd(generations)(x)), tolerance)
 
 
-def _with_derivatives(fields, generations):
+def _with_derivatives(
+    fields: Callable[[State], jax.Array], generations: Callable[[State], tuple[jax.Array, ...]]
+) -> Callable[[State], tuple[jax.Array, ...]]:
     """The generations and one more: the derivatives of the last one along every field."""
 
     def longer(x):
         found, changes = along(generations, x, fields(x))
-        return (*found, changes[-1].reshape(-1))
+        return (*found, changes[-1].reshape(-1))  # from (fields, members)
 
     return longer
 
 
-def span(vectors: Any, tolerance: Any) -> Distribution:
+def span(vectors: Array, tolerance: Number) -> Distribution:
     """The Distribution of row vectors, shape (p, n)."""
+    # singular values and not a QR decomposition: they say how far the rank is from another one
     directions, values, _ = jnp.linalg.svd(vectors.T, full_matrices=False)
     return Distribution(vectors, directions, values, jnp.asarray(tolerance, vectors.dtype))

@@ -14,20 +14,20 @@ relative to what it is made of; the margin of a verdict is to be compared with i
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.geometry.brackets import Field, along, as_fields, as_state, decide, floating, stacked
+from hjbjax.geometry.brackets import Field, along, as_fields, as_pytree, as_state, decide, in_state_dtype, stack_fields
 from hjbjax.problem import arguments
-from hjbjax.problem.pytree import as_partial, is_traced, pytree_dataclass
+from hjbjax.problem.pytree import is_traced, pytree_dataclass
+from hjbjax.problem.types import Array, Control, DType, Number, State
 
 
 @pytree_dataclass(static=("states",))
 class RelativeDegree:
-    """How often each output is differentiated before an input appears.
+    """The relative degree: how often each output is differentiated before an input appears.
 
     Args:
       degrees: r_i, one an output; 0 where no input ever appears.
@@ -38,16 +38,16 @@ class RelativeDegree:
       states: n.
     """
 
-    degrees: Any
-    decoupling: Any
-    margin: Any
-    tolerance: Any
+    degrees: Array
+    decoupling: Array
+    margin: Number
+    tolerance: Number
     states: int
 
     @property
-    def defined(self) -> Any:
+    def defined(self) -> bool | jax.Array:
         """Whether inputs reach every output, and no combination of the outputs loses them at the state."""
-        return plain((self.margin > self.tolerance) & jnp.all(jnp.asarray(self.degrees) > 0))
+        return as_bool((self.margin > self.tolerance) & jnp.all(jnp.asarray(self.degrees) > 0))
 
     @property
     def degree(self) -> int | None:
@@ -62,10 +62,10 @@ class RelativeDegree:
             return f"not defined: no input ever reaches output {int(np.argmin(degrees))}"
         if not self.defined:
             return (
-                f"not defined: nearby {_listed(degrees)}, but at this state the decoupling matrix is singular "
+                f"not defined: nearby {_in_words(degrees)}, but at this state the decoupling matrix is singular "
                 f"(margin {float(self.margin):.2g}, tolerance {float(self.tolerance):.2g})"
             )
-        return _named(degrees, self.states)
+        return _verdict(degrees, self.states)
 
 
 @pytree_dataclass(static=("degrees",))
@@ -78,38 +78,39 @@ class Linearisation:
       degrees: r_i, one an output; ``None`` to decide them around the origin when a state is first seen.
     """
 
-    fields: Any
-    output: Any
+    fields: tuple[Field, ...]
+    output: Callable[[State], Array | Number]
     degrees: tuple[int, ...] | None
 
     def __iter__(self):
         return iter((self.alpha, self.beta, self.coordinates))
 
-    def alpha(self, x: Any) -> Any:
+    def alpha(self, x: State) -> Control:
         """α(x) = −β (L_f^{r_i} h_i), shape (m,)."""
         last, matrix, _ = self._ladder(as_state(x))
+        # a solve, more accurate than β times L_f^r h
         return -jnp.linalg.solve(matrix, last)
 
-    def beta(self, x: Any) -> Any:
+    def beta(self, x: State) -> jax.Array:
         """β(x), the inverse of the matrix of L_{g_j} L_f^{r_i − 1} h_i, shape (m, m)."""
         return jnp.linalg.inv(self._ladder(as_state(x))[1])
 
-    def coordinates(self, x: Any) -> Any:
+    def coordinates(self, x: State) -> jax.Array:
         """ξ = (h_1, L_f h_1, …, L_f^{r_1 − 1} h_1, h_2, …), shape (Σ r_i,): all coordinates where Σ r_i = n."""
         return self._ladder(as_state(x))[2]
 
-    def control(self, x: Any, v: Any) -> Any:
+    def control(self, x: State, v: Array) -> Control:
         """α(x) + β(x) v, shape (m,)."""
         last, matrix, _ = self._ladder(as_state(x))
-        return jnp.linalg.solve(matrix, v - last)
+        return jnp.linalg.solve(matrix, v - last)  # from ξ^(r) = L_f^r h + (L_g L_f^{r−1} h) u = v
 
-    def zero_dynamics(self, x: Any) -> Any:
+    def zero_dynamics(self, x: State) -> State:
         """f + g α, shape (n,): it keeps {ξ = 0}, and what it does there is the zero dynamics."""
         x = as_state(x)
-        f, *gs = stacked(self.fields)(x)
+        f, *gs = stack_fields(self.fields)(x)
         return f + jnp.stack(gs).T @ self.alpha(x)
 
-    def zero_spectrum(self, x: Any) -> np.ndarray:
+    def zero_spectrum(self, x: State | Sequence[float]) -> np.ndarray:
         """The eigenvalues of the zero dynamics at a rest point with ξ = 0, shape (n − r,); host level.
 
         All in the left half plane: minimum phase, and a v that brings ξ to zero brings the state to rest.
@@ -120,28 +121,33 @@ class Linearisation:
         with jax.enable_x64(True):
             x = jnp.asarray(x, float)
             size = float(jnp.max(jnp.abs(self.coordinates(x)), initial=0) + jnp.max(jnp.abs(self.zero_dynamics(x))))
+            # ``not <`` refuses NaN as well
             if not size < 1e-6:
                 raise ValueError(
                     f"zero_spectrum: x = {x.tolist()} is no rest point with ξ = 0: it is off by {size:.2g}"
                 )
             slopes, rates = np.asarray(jax.jacfwd(self.coordinates)(x)), np.asarray(jax.jacfwd(self.zero_dynamics)(x))
+        # {ξ = 0} is invariant, so the linearised flow maps its tangent space, the kernel of ∂ξ/∂x, into itself
         kernel = np.linalg.svd(slopes)[2][len(slopes) :]
         return np.linalg.eigvals(kernel @ rates @ kernel.T)
 
     def message(self, states: int) -> str:
-        """What the feedback reaches of ``states`` coordinates; it names the zero dynamics where there are any."""
-        return _named(self._decided(states, float), states)
+        """The relative degree out of ``states`` in words; it names the zero dynamics where there are any."""
+        return _verdict(self._known_degrees(states, float), states)
 
-    def _ladder(self, x: Any) -> tuple:
+    def _ladder(self, x: State) -> tuple[jax.Array, jax.Array, jax.Array]:
         """L_f^{r_i} h_i, the decoupling matrix, and ξ."""
-        degrees = self._decided(x.shape[0], x.dtype)
-        values, slopes = along(_derivatives(self.fields[0], self.output, max(degrees)), x, stacked(self.fields)(x))
+        degrees = self._known_degrees(x.shape[0], x.dtype)
+        # values[k] is L_f^k h, shape (outputs,), and slopes[k] its derivatives along f, g_1, …, shape (1 + m, outputs)
+        ladder = _derivatives(self.fields[0], self.output, max(degrees))
+        values, slopes = along(ladder, x, stack_fields(self.fields)(x))
         top = [(r - 1, i) for i, r in enumerate(degrees)]
         last = jnp.stack([slopes[k][0, i] for k, i in top])
         matrix = jnp.stack([slopes[k][1:, i] for k, i in top])
         return last, matrix, jnp.stack([values[k][i] for i, r in enumerate(degrees) for k in range(r)])
 
-    def _decided(self, states: int, dtype: Any) -> tuple[int, ...]:
+    def _known_degrees(self, states: int, dtype: DType) -> tuple[int, ...]:
+        """The r_i given, or else those around the origin."""
         if self.degrees is not None:
             return self.degrees
         if is_traced(self.fields, self.output):
@@ -149,8 +155,9 @@ class Linearisation:
         with jax.ensure_compile_time_eval():  # only the length of the state is needed, which a tracer has too
             origin = jnp.zeros(states, dtype)
 
-            def rule(depth):
-                tolerance = jnp.finfo(origin.dtype).eps ** 0.5
+            # radius and samples as ``relative_degree`` has them by default
+            def rule(depth: int) -> RelativeDegree:
+                tolerance = np.asarray(jnp.finfo(origin.dtype).eps ** 0.5)
                 return _relative_degree(
                     (self.fields, self.output), origin, tolerance, radius=0.1, samples=16, depth=depth
                 )
@@ -162,13 +169,13 @@ def relative_degree(
     f: Field,
     g: Field | Sequence[Field],
     h: Callable,
-    x: Any,
+    x: State | Sequence[float],
     *,
     radius: float = 0.1,
     samples: int = 16,
-    tolerance: Any = None,
+    tolerance: Number | None = None,
 ) -> RelativeDegree:
-    """How often the outputs are differentiated before the inputs appear, at a state.
+    """The relative degree at a state: how often the outputs are differentiated before the inputs appear.
 
     It is not defined where L_g L_f^{r−1} h vanishes at x but not near it, as on the ball and beam.
 
@@ -195,15 +202,18 @@ def relative_degree(
       relative degree 2 of 3 states: zero dynamics of dimension 1 on {h = L_f h = 0}
     """
     arguments.count(samples, "relative_degree: samples", least=0)
-    functions = (tuple(as_partial(field) for field in (f, *as_fields(g))), as_partial(h))
+    functions = (as_fields(f, g), as_pytree(h))
     settings = {"radius": float(radius), "samples": int(samples)}
     states = np.shape(x)[0] if np.ndim(x) else 1
     if is_traced(functions, x, tolerance):
+        # under a tracer no verdict can be looked at, so that all n derivatives go into the program
         return decide(_relative_degree, functions, x, tolerance, **settings, depth=states)
     return _deepen(lambda depth: decide(_relative_degree, functions, x, tolerance, **settings, depth=depth), states)
 
 
-def linearising_feedback(f: Field, g: Field | Sequence[Field], h: Callable, x: Any = None) -> Linearisation:
+def linearising_feedback(
+    f: Field, g: Field | Sequence[Field], h: Callable, x: State | Sequence[float] | None = None
+) -> Linearisation:
     """The feedback u = α(x) + β(x) v after which the r-th derivative of the output is v.
 
     Args:
@@ -225,7 +235,7 @@ def linearising_feedback(f: Field, g: Field | Sequence[Field], h: Callable, x: A
       >>> float(alpha(x)[0] + 9.81 * jnp.sin(1.0) / 2), beta(x).tolist(), coordinates(x).tolist()
       (0.0, [[0.5]], [1.0, 3.0])
     """
-    fields, output = tuple(as_partial(field) for field in (f, *as_fields(g))), as_partial(h)
+    fields, output = as_fields(f, g), as_pytree(h)
     if x is None:
         return Linearisation(fields, output, None)
     if is_traced(fields, output, x):
@@ -234,8 +244,9 @@ def linearising_feedback(f: Field, g: Field | Sequence[Field], h: Callable, x: A
     return Linearisation(fields, output, _degrees_or_refuse(answer, f"x = {np.asarray(x).tolist()}"))
 
 
-def _deepen(rule: Callable, states: int) -> RelativeDegree:
-    """The rule with as many derivatives as it takes: every one more than doubles its program."""
+def _deepen(rule: Callable[[int], RelativeDegree], states: int) -> RelativeDegree:
+    """The relative degree by a rule of the number of derivatives, with as few of them as it takes."""
+    # every further one makes the program 2.7 times as long: on the ball and beam 30 operations at L_f h, 639 at L_f^4 h
     for depth in range(1, states):
         answer = rule(depth)
         if np.all(np.asarray(answer.degrees) > 0):
@@ -244,6 +255,8 @@ def _deepen(rule: Callable, states: int) -> RelativeDegree:
 
 
 def _degrees_or_refuse(answer: RelativeDegree, place: str) -> tuple[int, ...]:
+    """The r_i of a relative degree that is defined, with as many inputs as outputs; otherwise a refusal."""
+    # β is an inverse matrix: with more inputs u is not determined by v, and with fewer no v is reached in general
     outputs, inputs = np.shape(answer.decoupling)
     if outputs != inputs:
         raise ValueError(f"linearising_feedback: got {outputs} outputs and {inputs} inputs, wanted as many of both")
@@ -254,13 +267,14 @@ def _degrees_or_refuse(answer: RelativeDegree, place: str) -> tuple[int, ...]:
     return tuple(int(r) for r in answer.degrees)
 
 
-def _listed(degrees: Any) -> str:
+def _in_words(degrees: Sequence[int] | np.ndarray) -> str:
     return str(int(degrees[0])) if len(degrees) == 1 else str(tuple(int(r) for r in degrees))
 
 
-def _named(degrees: Any, states: int) -> str:
+def _verdict(degrees: Sequence[int] | np.ndarray, states: int) -> str:
+    """The relative degree and the dimension of its zero dynamics, in words."""
     total = int(np.sum(degrees))
-    text = f"relative degree {_listed(degrees)} of {states} states: "
+    text = f"relative degree {_in_words(degrees)} of {states} states: "
     if total == states:
         return text + "no zero dynamics"
     names = ["h", "L_f h", *(f"L_f^{k} h" for k in range(2, max(degrees)))][: max(degrees)]
@@ -268,22 +282,25 @@ def _named(degrees: Any, states: int) -> str:
     return text + f"zero dynamics of dimension {states - total} on {{{place}}}"
 
 
-def near(x: Any, radius: float, samples: int) -> Any:
+def near(x: State, radius: float, samples: int) -> jax.Array:
     """The state and points around it, shape (samples + 1, n)."""
+    # a fixed seed: a verdict must not change from call to call, nor between a trace and the host
     spread = np.random.default_rng(0).uniform(-1.0, 1.0, (samples, x.shape[0]))
-    return x + radius * jnp.asarray(np.concatenate([np.zeros((1, x.shape[0])), spread]), x.dtype)
+    return jnp.asarray(x) + radius * jnp.asarray(np.concatenate([np.zeros((1, x.shape[0])), spread]), x.dtype)
 
 
-def _derivatives(f, h, count):
+def _derivatives(
+    f: Field, h: Callable[[State], Array | Number], count: int
+) -> Callable[[State], tuple[jax.Array, ...]]:
     """x ↦ (h, L_f h, …, L_f^{count − 1} h), each of shape (outputs,)."""
 
     def ladder(x):
-        return (jnp.atleast_1d(floating(h)(x)),)
+        return (jnp.atleast_1d(in_state_dtype(h)(x)),)
 
     def longer(shorter):
         def step(x):
-            found, changes = along(shorter, x, stacked([f])(x))
-            return (*found, changes[-1][0])
+            found, changes = along(shorter, x, stack_fields([f])(x))
+            return (*found, changes[-1][0])  # [0]: the one direction, f
 
         return step
 
@@ -292,27 +309,39 @@ def _derivatives(f, h, count):
     return ladder
 
 
-def _relative_degree(functions, x, tolerance, *, radius, samples, depth):
-    """Looks at L_g L_f^k h for k < depth."""
+def _relative_degree(
+    functions: tuple[tuple[Field, ...], Callable],
+    x: State,
+    tolerance: Number,
+    *,
+    radius: float,
+    samples: int,
+    depth: int,
+) -> RelativeDegree:
+    """The relative degree as far as L_g L_f^k h shows it for k < depth."""
     (f, *gs), h = functions
     n, ladder = x.shape[0], _derivatives(f, h, depth)
 
     def at(y):
-        inputs = stacked(gs)(y)
+        inputs = stack_fields(gs)(y)
         slopes = jnp.stack(jax.jacfwd(ladder)(y))  # (depth, outputs, n)
+        # the steepest L_f^j h so far: one that vanishes identically has a slope of rounding, large relative to itself
         steepness = jax.lax.cummax(jnp.sqrt(jnp.sum(slopes * slopes, axis=-1)), axis=0)
         return slopes @ inputs.T, steepness * jnp.sqrt(jnp.sum(inputs * inputs))
 
     effects, scales = jax.vmap(at)(near(x, radius, samples))  # (points, depth, outputs, m); without m
+    # at any point near x: on the ball and beam L_g L_f² h = 2B r θ̇ is 0 at rest alone, which makes no degree of 4
     appears = jnp.any(jnp.max(jnp.abs(effects), axis=-1) > tolerance * scales, axis=0)
+    # argmax of truth values is the first True, and 0 without one, which ``reached`` tells apart
     first, reached = jnp.argmax(appears, axis=0), jnp.any(appears, axis=0)
     outputs = jnp.arange(first.shape[0])
     decoupling, scale = effects[0][first, outputs], scales[0][first, outputs]
     rows = decoupling / jnp.where(scale > 0, scale, 1)[:, None]
+    # with more outputs than inputs the rows are dependent, and the margin is 0 without any SVD
     margin = jnp.linalg.svd(rows, compute_uv=False)[-1] if rows.shape[0] <= rows.shape[1] else jnp.zeros((), x.dtype)
     return RelativeDegree(jnp.where(reached, first + 1, 0), decoupling, margin, jnp.asarray(tolerance, x.dtype), n)
 
 
-def plain(verdict: Any) -> Any:
-    """A bool outside of a trace."""
-    return verdict if is_traced(verdict) else bool(verdict)
+def as_bool(verdict: bool | Array) -> bool | jax.Array:
+    """A verdict as a bool; inside a trace as it is."""
+    return verdict if isinstance(verdict, jax.core.Tracer) else bool(verdict)

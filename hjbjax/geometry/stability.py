@@ -10,23 +10,23 @@ states Brockett's theorem of 1983.
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.geometry.brackets import Field, as_fields, decide, stacked
-from hjbjax.geometry.distributions import span
+from hjbjax.geometry.brackets import Field, as_fields, decide, stack_fields
+from hjbjax.geometry.distributions import Distribution, span
 from hjbjax.geometry.lyapunov import LyapunovReport, lyapunov_check, lyapunov_derivative
-from hjbjax.problem.pytree import as_partial, pytree_dataclass
+from hjbjax.problem.pytree import pytree_dataclass
+from hjbjax.problem.types import Number, State
 
 __all__ = ["BrockettVerdict", "LyapunovReport", "brockett_check", "lyapunov_check", "lyapunov_derivative"]
 
 
 @pytree_dataclass(static=("message",))
 class BrockettVerdict:
-    """Whether a system meets Brockett's necessary condition for a continuous stabilising feedback of the state.
+    """The verdict of Brockett's necessary condition for a continuous stabilising feedback of the state.
 
     Args:
       satisfied: ``False`` rules such a feedback out, ``True`` does not promise one; ``None`` is undecided.
@@ -41,7 +41,9 @@ class BrockettVerdict:
     message: str
 
 
-def brockett_check(f: Field | None, gs: Field | Sequence[Field], x: Any, *, tolerance: Any = None) -> BrockettVerdict:
+def brockett_check(
+    f: Field | None, gs: Field | Sequence[Field], x: State | Sequence[float], *, tolerance: Number | None = None
+) -> BrockettVerdict:
     """Brockett's necessary condition for a continuous feedback u(x) that makes a rest point asymptotically stable.
 
     Decided where it can be from first derivatives at x: without drift by the fields themselves, with drift by
@@ -67,34 +69,41 @@ def brockett_check(f: Field | None, gs: Field | Sequence[Field], x: Any, *, tole
       >>> print(brockett_check(None, [drive, turn], jnp.zeros(3)).message)
       violated: 2 independent fields move 3 states without drift; no continuous u(x) makes this state stable
     """
-    inputs = as_fields(gs)
-    fields = tuple(as_partial(field) for field in [*([] if f is None else [f]), *inputs])
+    fields = as_fields(f, gs)
     linear, unbalanced = decide(_linearisation, fields, x, tolerance, drift=f is not None)
-    n, m, rank = linear.vectors.shape[1], len(inputs), linear.rank
+    n, m, rank = linear.vectors.shape[1], len(fields) - (f is not None), int(linear.rank)
+    # about √eps of float64: a rest point is known to rounding of the root finder or the formula it comes from
     if unbalanced > 1e-8:
         raise ValueError(
             f"brockett_check: no input keeps the system at rest at x = {np.asarray(x).tolist()}: "
             f"the drift there leaves the span of the fields by {unbalanced:.2g} of its size"
         )
     satisfied: bool | None
+    # where the linearisation is onto, so is f near (x, u) by the inverse function theorem: a neighbourhood is covered
     if rank == n:
         satisfied, reason = True, "satisfied: the linearisation moves the state in every direction"
+    # the module's docstring has the argument; with dependent fields it says nothing, for they may span more nearby
     elif f is None and rank == m:
         fields_and_states = f"{m} independent fields move {n} states without drift"
         satisfied, reason = False, f"violated: {fields_and_states}; no continuous u(x) makes this state stable"
     else:
         satisfied, reason = None, f"undecided: the linearisation has rank {rank} of {n}, and higher orders decide"
-    return BrockettVerdict(satisfied, rank, linear.margin, reason)
+    return BrockettVerdict(satisfied, rank, float(linear.margin), reason)
 
 
-def _linearisation(fields, x, tolerance, *, drift):
-    """(∂f/∂x, ∂f/∂u) at x and the input that balances the drift best, and what of the drift that leaves."""
-    vectors = stacked(fields)(x)
+def _linearisation(
+    fields: tuple[Field, ...], x: State, tolerance: Number, *, drift: bool
+) -> tuple[Distribution, jax.Array]:
+    """(∂f/∂x, ∂f/∂u) at x and the input that balances the drift best, and the share of the drift left unbalanced."""
+    vectors = stack_fields(fields)(x)
+    # without drift u = 0 keeps every state at rest, where ∂f/∂x = Σ u_j ∂g_j/∂x is zero: the fields are all there is
     if not drift:
         return span(vectors, tolerance), jnp.zeros((), x.dtype)
     gs = vectors[1:].T
+    # least squares: the balancing input need not be unique, and where there is none its residual says so
     u, *_ = jnp.linalg.lstsq(gs, -vectors[0])
     size = jnp.sqrt(jnp.sum(vectors[0] ** 2))
     left = jnp.sqrt(jnp.sum((vectors[0] + gs @ u) ** 2))
-    slopes = jnp.einsum("k,kij->ij", jnp.append(1.0, u).astype(x.dtype), jax.jacfwd(stacked(fields))(x))
+    # ∂f/∂x + Σ u_j ∂g_j/∂x; its columns and the fields are the rows of which the span is taken
+    slopes = jnp.einsum("k,kij->ij", jnp.append(1.0, u).astype(x.dtype), jax.jacfwd(stack_fields(fields))(x))
     return span(jnp.concatenate([slopes.T, vectors[1:]]), tolerance), left / jnp.where(size > 0, size, 1)

@@ -356,7 +356,7 @@ AFFINE = (tilted, lambda x, u: 1 + x[0] * u[0])
 SETS = {"box": hjb.Box([-1.0, -0.5], [0.7, 1.0]), "ball": hjb.Ball(0.9, 2)}
 
 
-@pytest.mark.parametrize("choices", SETS)
+@pytest.mark.parametrize("admissible", SETS)
 @pytest.mark.parametrize(("functions", "exactly"), [(QUADRATIC, True), (AFFINE, True), (COUPLED, False)])
 def test_no_sample_beats_the_minimiser(admissible, functions, exactly):
     problem = hjb.Problem(*functions, SETS[admissible])

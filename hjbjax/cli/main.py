@@ -14,12 +14,18 @@ import signal
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TextIO, cast
 
 import click
 
 from hjbjax._version import __version__
 from hjbjax.cli.command_line import Failure, Name, Number, OneLineGroup, Shape, finite, say, unknown
+
+if TYPE_CHECKING:  # --help is to come at once: JAX and the zoo are imported by the commands that need them
+    from hjbjax.problem.grid import Grid
+    from hjbjax.problem.problem import Problem
+    from hjbjax.solution.solution import Solution
+    from hjbjax.zoo.entry import Entry
 
 FILES = ("solution.npz", "value.png", "policy.png", "trajectory.png")
 CODES = {"CONVERGED": 0, "DIVERGED": 4, "NONFINITE": 4, "INTERRUPTED": 130}  # any other status: 3, not converged
@@ -29,6 +35,7 @@ PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "diffrax", "optax", "matplotlib",
 
 
 def _systems() -> Iterable[str]:
+    """The names of the ready problems; a function, so that they are looked up only when a name is checked."""
     from hjbjax import zoo
 
     return zoo.catalogue
@@ -85,7 +92,13 @@ def list_problems(name: str | None) -> None:
 @click.option("--force", is_flag=True, help="Replace results that are there already.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of the screen.")
 def solve(
-    name: str, shape: Any, settings: tuple[str, ...], out: Path | None, force: bool, as_json: bool, **options: Any
+    name: str,
+    shape: tuple[int, ...] | None,
+    settings: tuple[str, ...],
+    out: Path | None,
+    force: bool,
+    as_json: bool,
+    **options: Any,
 ) -> None:
     """Solve the ready problem NAME; write solution.npz, value.png, policy.png and trajectory.png."""
     from hjbjax import zoo
@@ -94,11 +107,12 @@ def solve(
     entry = zoo.catalogue[name]
     parameters = _parameters(entry, settings)
     out = Path(name) if out is None else out
+    # refusals in the order of what they cost: words, folder, problem; the solve comes after all of them
     with _failing(OSError, 2, "--out: "):
         run_folder.check_folder(out, force)
     problem, grid = _build(entry, parameters, shape)
     path, made = None, []
-    with contextlib.ExitStack() as stack:
+    with contextlib.ExitStack() as stack:  # the hidden folder goes last: after an interrupt, too
         with _failing(OSError, 2, "--out: "):
             staging = stack.enter_context(run_folder.staging(out))
         stack.enter_context(_one_line_warnings())
@@ -111,7 +125,7 @@ def solve(
                 pictures = run_folder.make(
                     problem, solution, staging, start=start, duration=entry.duration, finish=finish
                 )
-                for file, drawn in pictures:
+                for file, drawn in pictures:  # a generator: each file is whole before the next one is begun
                     made.append(file)
                     path = drawn
             finally:  # what is whole is kept
@@ -146,7 +160,7 @@ def _failing(kind: type[Exception], exit_code: int, prefix: str = "") -> Iterato
 # ------------------------------------------------------------------------------------- before the solve
 
 
-def _parameters(entry: Any, settings: tuple[str, ...]) -> dict[str, Any]:
+def _parameters(entry: "Entry", settings: tuple[str, ...]) -> dict[str, Any]:
     """The values of --set, each of the kind of its default."""
     defaults = {key: value for key, value in entry.parameters.items() if key != "shape"}
     chosen: dict[str, Any] = {}
@@ -164,8 +178,9 @@ def _parameters(entry: Any, settings: tuple[str, ...]) -> dict[str, Any]:
     return chosen
 
 
-def _value_of(key: str, text: str, default: Any) -> Any:
-    if isinstance(default, bool):
+def _value_of(key: str, text: str, default: object) -> bool | float | tuple[float, ...]:
+    """The text of one --set as a value of its default's kind."""
+    if isinstance(default, bool):  # before int, of which bool is a subclass
         if text.lower() not in ("true", "false"):
             raise Failure(f"--set: got {key}={text}, wanted true or false")
         return text.lower() == "true"
@@ -181,19 +196,21 @@ def _value_of(key: str, text: str, default: Any) -> Any:
         raise Failure(f"--set: got {key}={text}, wanted {wanted}")
     if len(parts) > 1 and isinstance(default, (int, float)):
         raise Failure(f"--set: got {key}={text}, wanted one number")
-    return numbers if len(parts) > 1 else numbers[0]
+    known = cast(tuple[float, ...], numbers)  # None has been refused
+    return known if len(parts) > 1 else known[0]
 
 
-def _written(value: Any) -> str:
+def _written(value: object) -> str:
     """A parameter's value as --set takes it."""
     if isinstance(value, bool):
         return str(value).lower()
     return "..." if value is None else ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
 
 
-def _build(entry: Any, parameters: dict[str, Any], shape: tuple[int, ...] | None) -> tuple[Any, Any]:
+def _build(entry: "Entry", parameters: dict[str, Any], shape: tuple[int, ...] | None) -> tuple["Problem", "Grid"]:
+    """The problem and its grid; refusals of either in one line."""
     try:
-        problem, grid = entry.build(**parameters)
+        problem, grid = entry.build(**parameters)  # its own shape first: it knows how many axes there are
         if shape is None:
             return problem, grid
         if len(shape) != grid.ndim:
@@ -229,11 +246,22 @@ def _interruptible() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _one_line_warnings() -> Iterator[None]:
-    def show(message: Any, *_: Any, **__: Any) -> None:
+    """Warnings of the user's concern as one line each, without the source line that Python adds."""
+
+    def show(
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
+    ) -> None:
         say(f"warning: {' '.join(str(message).split())}")
 
     with warnings.catch_warnings():
-        warnings.simplefilter("always", UserWarning)
+        warnings.simplefilter(
+            "always", UserWarning
+        )  # by default one is shown once a place, and PYTHONWARNINGS may hide it
         warnings.showwarning = show
         yield
 
@@ -241,22 +269,25 @@ def _one_line_warnings() -> Iterator[None]:
 # ------------------------------------------------------------------------------------- solve and write
 
 
-def _solve(problem: Any, grid: Any, options: dict[str, Any]) -> Any:
+def _solve(problem: "Problem", grid: "Grid", options: dict[str, Any]) -> "Solution":
+    """The solution, converged or not; what the solver refuses or breaks on as one line and an exit code."""
     import jax
 
     import hjbjax as hjb
 
+    # an option that was not given must not reach solve as None: its own default stands
     given = {key: value for key, value in options.items() if value is not None}
     for key, table in (("method", METHODS), ("scheme", SCHEMES)):
         if key in given:
             given[key] = getattr(hjb, table[given[key]])()
     try:
+        # no throw: what there is is saved and drawn also where it has not converged, and the exit code says so
         return hjb.solve(problem, grid, throw=False, **given)
     except (ValueError, TypeError) as error:
         raise Failure(error) from error
     except MemoryError as error:
         raise Failure(error, 6) from error
-    except jax.errors.JaxRuntimeError as error:
+    except jax.errors.JaxRuntimeError as error:  # XLA has one type for all its faults, and the word in the text
         raise Failure(error, 6 if "RESOURCE_EXHAUSTED" in str(error) else 4) from error
 
 

@@ -31,7 +31,7 @@ class OneLineGroup(click.Group):
         standalone_mode: bool = True,
         **extra: Any,
     ) -> Any:
-        """Runs a command and, unless ``standalone_mode`` is off, ends the process with its exit code."""
+        """Run a command and, unless ``standalone_mode`` is off, end the process with its exit code."""
         if not standalone_mode:
             return super().main(args, prog_name, complete_var, False, **extra)
         try:

@@ -21,7 +21,7 @@ import click
 from hjbjax._version import __version__
 from hjbjax.cli.command_line import Failure, Name, Number, OneLineGroup, Shape, finite, say, unknown
 
-if TYPE_CHECKING:  # --help is to come at once: JAX and the zoo are imported by the commands that need them
+if TYPE_CHECKING:  # for annotations alone: what is heavy is imported by the command that needs it
     from hjbjax.problem.grid import Grid
     from hjbjax.problem.problem import Problem
     from hjbjax.solution.solution import Solution
@@ -41,7 +41,7 @@ def _systems() -> Iterable[str]:
     return zoo.catalogue
 
 
-def _offered(table: dict[str, str]) -> Callable[[], Iterable[str]]:
+def _names_of(table: dict[str, str]) -> Callable[[], Iterable[str]]:
     """The names in a table of choices that this version has."""
 
     def names() -> Iterable[str]:
@@ -76,15 +76,15 @@ def list_problems(name: str | None) -> None:
     click.echo(f"{entry.name}: {entry.summary}")
     for key, default in entry.parameters.items():
         if key != "shape":
-            click.echo(f"  --set {key}={_written(default)}")
+            click.echo(f"  --set {key}={_as_setting(default)}")
 
 
 @main.command()
 @click.argument("name", type=Name("problem", _systems))
 @click.option("--shape", type=Shape(), help="Nodes along each axis, as in 200x201.")
 @click.option("--set", "settings", multiple=True, metavar="NAME=VALUE", help="A parameter; may be given several times.")
-@click.option("--method", type=Name("method", _offered(METHODS)), help=f"{' or '.join(METHODS)}; chosen if not given.")
-@click.option("--scheme", type=Name("scheme", _offered(SCHEMES)), help="The discretisation; upwind if not given.")
+@click.option("--method", type=Name("method", _names_of(METHODS)), help=f"{' or '.join(METHODS)}; chosen if not given.")
+@click.option("--scheme", type=Name("scheme", _names_of(SCHEMES)), help="The discretisation; upwind if not given.")
 @click.option("--tol", type=Number(), help="Certified bound on the algebraic error, in cost units.")
 @click.option("--max-steps", type=Number(int), help="Stop after so many steps.")
 @click.option("--time-limit", type=Number(), help="Stop after so many seconds.")
@@ -108,17 +108,17 @@ def solve(
     parameters = _parameters(entry, settings)
     out = Path(name) if out is None else out
     # refusals in the order of what they cost: words, folder, problem; the solve comes after all of them
-    with _failing(OSError, 2, "--out: "):
+    with _one_line_error(OSError, 2, "--out: "):
         run_folder.check_folder(out, force)
     problem, grid = _build(entry, parameters, shape)
     path, made = None, []
     with contextlib.ExitStack() as stack:  # the hidden folder goes last: after an interrupt, too
-        with _failing(OSError, 2, "--out: "):
+        with _one_line_error(OSError, 2, "--out: "):
             staging = stack.enter_context(run_folder.staging(out))
         stack.enter_context(_one_line_warnings())
         stack.enter_context(_interruptible())
         solution = _solve(problem, grid, options)
-        with _failing(OSError, 5, "the results could not be written: "):
+        with _one_line_error(OSError, 5, "the results could not be written: "):
             try:
                 start = entry.initial_state(grid.ndim)
                 finish = None if entry.finish is None else entry.finish(**parameters)
@@ -149,8 +149,8 @@ def solve(
 
 
 @contextlib.contextmanager
-def _failing(kind: type[Exception], exit_code: int, prefix: str = "") -> Iterator[None]:
-    """An error of a kind as one line and an exit code."""
+def _one_line_error(kind: type[Exception], exit_code: int, prefix: str = "") -> Iterator[None]:
+    """An error of one kind, turned into one line and an exit code."""
     try:
         yield
     except kind as error:
@@ -200,7 +200,7 @@ def _value_of(key: str, text: str, default: object) -> bool | float | tuple[floa
     return known if len(parts) > 1 else known[0]
 
 
-def _written(value: object) -> str:
+def _as_setting(value: object) -> str:
     """A parameter's value as --set takes it."""
     if isinstance(value, bool):
         return str(value).lower()
@@ -259,9 +259,8 @@ def _one_line_warnings() -> Iterator[None]:
         say(f"warning: {' '.join(str(message).split())}")
 
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "always", UserWarning
-        )  # by default one is shown once a place, and PYTHONWARNINGS may hide it
+        # by default a warning is shown once a place, and PYTHONWARNINGS may hide it or make an error of it
+        warnings.simplefilter("always", UserWarning)
         warnings.showwarning = show
         yield
 

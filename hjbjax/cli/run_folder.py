@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FILES = ("solution.npz", "value.png", "policy.png", "trajectory.png")
+Plain: TypeAlias = "dict[str, Plain] | list[Plain] | str | float | bool | None"  # what JSON has
 SAMPLES = 400  # of a bang-bang feedback along its trajectory
 DPI = 160
 
@@ -150,7 +151,7 @@ def is_bang_bang(problem: Problem, solution: Solution) -> bool:
     if solution.discrete or lo is None or hi is None:
         return solution.discrete
     # nine of ten: nodes at rest and on the switching curve itself may hold anything between
-    policy, near = _known(solution), 1e-6 * (hi - lo)
+    policy, near = _finite_controls(solution), 1e-6 * (hi - lo)
     return policy.size > 0 and bool(np.mean((policy <= lo + near) | (policy >= hi - near)) > 0.9)
 
 
@@ -158,11 +159,11 @@ def _is_direction(problem: Problem, solution: Solution) -> bool:
     """True where the feedback is a direction: nine of ten of its controls lie on the sphere around a ball."""
     if not isinstance(problem.controls, Ball):
         return False
-    policy = _known(solution)
+    policy = _finite_controls(solution)
     return policy.size > 0 and bool(np.mean(np.linalg.norm(policy, axis=-1) > problem.controls.radius * 0.999999) > 0.9)
 
 
-def _known(solution: Solution) -> np.ndarray:
+def _finite_controls(solution: Solution) -> np.ndarray:
     """The controls of the nodes where there is one, (k, m)."""
     policy = np.asarray(solution.policy)
     return policy[np.all(np.isfinite(policy), axis=-1)]
@@ -176,7 +177,7 @@ def _trajectory(
     jumps: bool,
     finish: tuple[Problem, Feedback] | None,
 ) -> Trajectory | None:
-    """The closed loop, and what follows in the target.
+    """The path of the closed loop, with the stretch that follows inside the target.
 
     Where the control jumps or is a direction, the mean of two is optimal for neither: there the Hamiltonian is
     minimised at the state. One that jumps is sampled: an adaptive stepper crawls along its switching curve.
@@ -232,7 +233,7 @@ def difference(exact: Exact, solution: Solution) -> float | None:
 
     Args:
       exact: the value as a function of one state.
-      solution: what ``solve`` returned.
+      solution: the solution of ``solve``.
 
     Returns:
       The difference in cost units; ``None`` if nothing there is finite.
@@ -275,9 +276,6 @@ def report(solution: Solution, path: Trajectory | None, files: Sequence[Path], *
         "version": __version__,
     }
     return cast(dict[str, Any], _plain(answer))
-
-
-Plain: TypeAlias = "dict[str, Plain] | list[Plain] | str | float | bool | None"  # what JSON has
 
 
 def _plain(value: object) -> Plain:

@@ -23,7 +23,7 @@ def costates(
     """The costates of an extremal over time, and DV of a solution along its path: two roads to one curve.
 
     Args:
-      extremal: what ``pontryagin`` returned.
+      extremal: the extremal of ``pontryagin``.
 
     Keyword Args:
       solution: of the same problem on a grid, or ``None``; its DV is drawn broken, where the path is inside the grid.

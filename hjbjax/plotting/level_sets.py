@@ -55,7 +55,7 @@ def zero_level_set(
     """The boundary of {V ≤ 0}: a curve over two axes, a stack of curves over three.
 
     Args:
-      solution: what ``solve`` or ``march`` returned.
+      solution: the solution of ``solve`` or ``march``.
 
     Keyword Args:
       ax: matplotlib axes to draw on, three-dimensional for three free axes; ``None`` makes a figure.
@@ -183,7 +183,7 @@ def animation(
     """A marched solution over time, from the horizon backwards as it was found.
 
     Args:
-      solution: what ``march`` returned, with the times that become the frames.
+      solution: the solution of ``march``, with the times that become the frames.
       draw: what draws one frame: ``zero_level_set``, ``value`` or ``policy`` of this module, or a function that
         takes the solution, ``ax=`` and ``time=``.
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hjbjax.plotting.slices import Cuts, at_time, feedback, folded, lifted, nodes_in, section_of, zeros
+from hjbjax.plotting.slices import Cuts, at_time, feedback, line_in_box, nodes_in, section_of, without_jumps, zeros
 from hjbjax.plotting.style import COLOURS, axes_of, bands, draw, frame, label_axes, legend, styled
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.types import Number, State
@@ -34,7 +34,7 @@ def value(
     """The value function: a line over one axis, colours with contour lines over two.
 
     Args:
-      solution: what ``solve`` or ``march`` returned.
+      solution: the solution of ``solve`` or ``march``.
 
     Keyword Args:
       ax: matplotlib axes to draw on; ``None`` makes a figure.
@@ -88,7 +88,7 @@ def policy(
     Nodes where no control is defined or the value is not finite are greyed out.
 
     Args:
-      solution: what ``solve`` or ``march`` returned.
+      solution: the solution of ``solve`` or ``march``.
 
     Keyword Args:
       input: which of the m inputs, from 0.
@@ -108,13 +108,13 @@ def switching_curve(
     color: str = "black",
     label: str | None = "switching curve",
 ) -> list[Artist]:
-    """Where one input changes sign: the zero level of the feedback, linear between nodes.
+    """The curve on which one input changes sign: the zero level of the feedback, linear between nodes.
 
     A bang-bang feedback jumps between two nodes, so its curve is known to half a cell, as it is drawn. Over
     one axis the places are vertical lines.
 
     Args:
-      solution: what ``solve`` or ``march`` returned.
+      solution: the solution of ``solve`` or ``march``.
 
     Keyword Args:
       input, ax, fixed, time: as for :func:`policy`.
@@ -159,7 +159,7 @@ def trajectory(
     Works on top of :func:`value` or :func:`policy`: pass their ``ax``. A ring marks the start, a dot the end.
 
     Args:
-      path: what ``simulate`` returned: ``times`` (k+1,) and ``states`` (k+1, n).
+      path: the path of ``simulate``: ``times`` (k+1,) and ``states`` (k+1, n).
 
     Keyword Args:
       ax: matplotlib axes to draw on; ``None`` makes a figure.
@@ -180,7 +180,7 @@ def trajectory(
     times, states = np.asarray(path.times), np.asarray(path.states)
     count = states.shape[1]
     names = tuple(names or (grid.names if grid is not None else (f"x{i + 1}" for i in range(count))))
-    states = lifted(states, grid)
+    states = without_jumps(states, grid)
     if axes is None or count == 1:
         ax = axes_of(ax, wide=True)
         colours = itertools.cycle((color,) if color else COLOURS)
@@ -193,8 +193,8 @@ def trajectory(
         raise ValueError(f"trajectory: got axes={axes!r}; the path has {count} states, wanted two of 0 to {count - 1}")
     ax = axes_of(ax)
     # the ends each for themselves: the rows of the folded path may begin or end with a cut at the seam
-    first, last = folded(states[:1], axes, grid)[0], folded(states[-1:], axes, grid)[0]
-    plane = folded(states, axes, grid)
+    first, last = line_in_box(states[:1], axes, grid)[0], line_in_box(states[-1:], axes, grid)[0]
+    plane = line_in_box(states, axes, grid)
     color = color or COLOURS[1]
     casing = [Stroke(linewidth=3.4, foreground="white"), Normal()]  # a white edge: it reads on any colour
     artists = [*ax.plot(*plane.T, color=color, linewidth=1.8, label=label, path_effects=casing, zorder=4)]
@@ -211,7 +211,7 @@ def controls(path: Path, *, ax: Axes | None = None, names: Sequence[str] | None 
     """The inputs of a path over time, each constant over its step; ``path.controls`` has shape (k, m).
 
     Args:
-      path: what ``simulate`` returned.
+      path: the path of ``simulate``.
 
     Keyword Args:
       ax: matplotlib axes to draw on; ``None`` makes a figure.
@@ -244,8 +244,8 @@ def closed_loop(
     """One figure: the path on the value function, and its states and inputs over time.
 
     Args:
-      solution: what ``solve`` returned.
-      path: what ``simulate`` returned for it.
+      solution: the solution of ``solve``.
+      path: the path of ``simulate`` for it.
 
     Keyword Args:
       axes: the two states of the plane on the left; left out for one state.
@@ -283,7 +283,7 @@ def residuals(solution: Solution, *, ax: Axes | None = None, label: str | None =
     """The residual after each step on a logarithmic scale; steps where it is not finite are marked grey.
 
     Args:
-      solution: what ``solve`` returned; its history lives on the host and is kept by neither ``jit`` nor ``vmap``.
+      solution: the solution of ``solve``; its history lives on the host and is kept by neither ``jit`` nor ``vmap``.
 
     Keyword Args:
       ax: matplotlib axes to draw on; ``None`` makes a figure.

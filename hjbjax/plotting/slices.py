@@ -82,7 +82,7 @@ def section_of(
     caption: str,
     nearest: bool = False,
 ) -> Section:
-    """Cuts the field at the fixed coordinates, closes periodic axes and masks what is not finite."""
+    """The field cut at the fixed coordinates, closed along periodic axes, masked where it is not finite."""
     if field.shape != grid.shape:
         raise ValueError(
             f"{what}: got a field of shape {field.shape} on a grid of shape {grid.shape}; draw one lane at a time"
@@ -159,7 +159,7 @@ def _closed_axis(grid: Grid, axis: int) -> np.ndarray:
 
 
 def zeros(x: np.ndarray, values: np.ma.MaskedArray) -> list[float]:
-    """Where a sampled function changes sign, linear between nodes; at the middle of nodes where it is zero."""
+    """Places where a sampled function changes sign, linear between nodes; the middle of a run of zeros."""
     samples = values.filled(np.nan)  # NaN ≠ 0, so that a masked node ends a run of zeros and makes no crossing
     signed = np.flatnonzero(samples != 0).tolist()
     crossings = []
@@ -173,7 +173,7 @@ def zeros(x: np.ndarray, values: np.ma.MaskedArray) -> list[float]:
     return crossings
 
 
-def lifted(states: np.ndarray, grid: Grid | None) -> np.ndarray:
+def without_jumps(states: np.ndarray, grid: Grid | None) -> np.ndarray:
     """States (k, n) with the jumps of periodic ones at their seam taken out, continuous in time."""
     states = np.array(states, dtype=float)
     for axis in range(0 if grid is None else grid.ndim):
@@ -182,7 +182,7 @@ def lifted(states: np.ndarray, grid: Grid | None) -> np.ndarray:
     return states
 
 
-def folded(states: np.ndarray, axes: tuple[int, int], grid: Grid | None) -> np.ndarray:
+def line_in_box(states: np.ndarray, axes: tuple[int, int], grid: Grid | None) -> np.ndarray:
     """Two columns with periodic states brought into the box, the line cut (a row of NaN) where it crosses a seam."""
     points = states[:, list(axes)]  # (k, 2)
     # an endless period stands for an axis that is not periodic, so that both columns take one way

@@ -24,7 +24,7 @@ def convergence(study: Study, *, ax: Axes | Sequence[Axes] | np.ndarray | None =
     slope. Errors of zero have no logarithm and are left out; an estimate is called one in the label of the axis.
 
     Args:
-      study: what ``convergence_study`` returned.
+      study: the result of ``convergence_study``.
 
     Keyword Args:
       ax: matplotlib axes to draw on: one for the errors over the spacing, or two, the second for the seconds;
@@ -68,7 +68,7 @@ def perturbation(study: Perturbation, *, ax: Axes | None = None) -> list[Artist]
     Full marks are values, rings feedbacks; the thin grey line beside the full marks has the fitted slope.
 
     Args:
-      study: what ``perturbation_study`` returned.
+      study: the result of ``perturbation_study``.
 
     Keyword Args:
       ax: matplotlib axes to draw on; ``None`` makes a figure.

@@ -108,7 +108,7 @@ def merton(
     problem = Problem(
         system.drift,
         system.cost,
-        Box([0.0, 0.01], [1.0, 0.1]),  # no short sale and no credit; at zero consumption the utility is infinite
+        Box([0.0, 0.01], [1.0, 0.1]),  # no short sale, no credit; at k = 0 the cost is infinite for γ > 1
         noise=system.noise,
         discount=discount,
         target=OutsideCube(1.0).level,

@@ -63,6 +63,7 @@ class Unicycle:
 
     def drift(self, x: State, u: Control) -> State:
         """(u₁ cos θ, u₁ sin θ, u₂)."""
+        # along the heading alone: the velocity across it is what a wheel that does not slip forbids
         return jnp.stack([u[0] * jnp.cos(x[2]), u[0] * jnp.sin(x[2]), u[1]])
 
 

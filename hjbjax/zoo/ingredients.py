@@ -99,7 +99,7 @@ class OutsideBall:
         return self.radius * (1 - 1e-6) - jnp.sqrt(jnp.sum(x * x))
 
 
-class Arriving(Protocol):
+class Traveller(Protocol):
     """A system whose least time to the target is known."""
 
     def arrival_time(self, x: State) -> Scalar:
@@ -111,15 +111,15 @@ class Arriving(Protocol):
 class Arrival:
     """(1 − e^{−βT})/β for the time T = ``system.arrival_time``: S of (8.14) for β = 1, T itself for β = 0."""
 
-    system: Arriving
+    system: Traveller
     discount: Number = 1.0
 
     def value(self, x: State) -> Scalar:
         """The value at one state."""
-        return discounted(self.system.arrival_time(jnp.asarray(x)), self.discount)
+        return discounted_time(self.system.arrival_time(jnp.asarray(x)), self.discount)
 
 
-def discounted(time: Number, discount: Number) -> Scalar:
+def discounted_time(time: Number, discount: Number) -> Scalar:
     """∫₀ᵀ e^{−βs} ds = (1 − e^{−βT})/β, and T where β = 0."""
     # a divisor that is never zero: the branch not taken is evaluated too, and 0/0 there would make derivatives NaN
     rate = jnp.where(discount == 0, 1.0, discount)

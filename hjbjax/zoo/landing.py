@@ -53,7 +53,7 @@ class Lander:
         """ku, mass per unit of time."""
         return self.consumption * u[0]
 
-    def _begin(self, q: Number, mass: Number) -> tuple[Number, Number, Number]:
+    def _ignition_point(self, q: Number, mass: Number) -> tuple[Number, Number, Number]:
         """Duration, first velocity and first height of the burn that leaves the share e^{−q} of a mass."""
         left, k = jnp.exp(-q), self.consumption
         duration = mass * (1 - left) / (k * self.thrust)
@@ -62,7 +62,7 @@ class Lander:
         climbed = mass * (1 - left * (1 + q)) / (k * k * self.thrust)
         return duration, velocity, -velocity * duration + 0.5 * self.gravity * duration * duration - climbed
 
-    def _ratio(self, x: State) -> Number:
+    def _log_ratio(self, x: State) -> Number:
         """q; zero at rest on the ground."""
         height, velocity, mass = x[0], x[1], x[2]
         energy = 0.5 * velocity * velocity + self.gravity * height
@@ -76,9 +76,10 @@ class Lander:
             if step == NEWTON - EXACT:
                 # at the solution one step of Newton's carries the implicit function's derivative, a second the next one
                 q = jax.lax.stop_gradient(q)
-            duration, first, start = self._begin(q, mass)
+            duration, first, start = self._ignition_point(q, mass)
             needed = 0.5 * first * first + self.gravity * start
             # ∂E/∂q = v₁ ∂v₁/∂q + g ∂h₁/∂q
+            # ∂τ/∂q, ∂v₁/∂q and ∂h₁/∂q in turn
             longer = mass * jnp.exp(-q) / (self.consumption * self.thrust)
             faster = self.gravity * longer - 1 / self.consumption
             higher = (
@@ -90,13 +91,13 @@ class Lander:
         return jnp.where(resting, 0.0, q)
 
     def fuel(self, x: State) -> Scalar:
-        """The least fuel to land, m(1 − e^{−q}); of a rocket that falls too fast what the formula gives."""
+        """The least fuel to land, m(1 − e^{−q}); for a rocket that falls too fast the number that the formula gives."""
         x = jnp.asarray(x)
-        return x[2] * (1 - jnp.exp(-self._ratio(x)))
+        return x[2] * (1 - jnp.exp(-self._log_ratio(x)))
 
     def margin(self, x: State) -> Number:
         """v − v₁: how much faster it may yet fall; 0 where the burn has to begin, below it crashes."""
-        return x[1] - self._begin(self._ratio(x), x[2])[1]
+        return x[1] - self._ignition_point(self._log_ratio(x), x[2])[1]
 
     def sinking(self, x: State) -> Number:
         """−v: 0 where the rocket stands still, at the end of the burn."""
@@ -109,7 +110,8 @@ class Lander:
     def ignition(self, x: State) -> tuple[Number, Number]:
         """When the engine starts, and how long it burns."""
         x = jnp.asarray(x)
-        return self.margin(x) / self.gravity, self._begin(self._ratio(x), x[2])[0]
+        # a coast changes v at the rate −g, and neither mass nor energy, so that v₁ waits where it is
+        return self.margin(x) / self.gravity, self._ignition_point(self._log_ratio(x), x[2])[0]
 
 
 def moon_landing(

@@ -57,6 +57,7 @@ class GameCost:
 
     def rate(self, x: State, u: Control, d: Disturbance) -> Number:
         """Cost per unit time."""
+        # what the disturbance spends is counted against it: V is finite if and only if the gain is below γ
         return jnp.sum(x * x) + jnp.sum(u * u) - self.gamma * self.gamma * jnp.sum(d * d)
 
 
@@ -118,7 +119,7 @@ def double_integrator_lq(
     problem = Problem(
         DoubleIntegrator(mass).drift,
         QuadraticCost(1.0, control_weight).rate,
-        Box([-bound], [bound]),
+        Box([-bound], [bound]),  # with the defaults the best force is −x₁ − √3x₂, at most 5.5 on the box
         noise=noise_or_none(noise),
         discount=discount,
     )
@@ -141,7 +142,7 @@ def double_integrator_lq_exact(
     """
     from scipy.linalg import solve_continuous_are
 
-    a = np.array([[0.0, 1.0], [0.0, 0.0]]) - 0.5 * discount * np.eye(2)  # βP = A'P + PA + … shared between the two
+    a = np.array([[0.0, 1.0], [0.0, 0.0]]) - 0.5 * discount * np.eye(2)  # SciPy's equation knows no discount
     b = np.array([[0.0], [1.0 / mass]])
     matrix = solve_continuous_are(a, b, np.eye(2), control_weight * np.eye(1))
     constant = 0.0  # of V = x'Px + c the noise changes c alone: ½ tr(σσ'·2P) = βc
@@ -180,7 +181,7 @@ def stochastic_lq(
     problem = Problem(
         LinearScalar(rate).drift,
         QuadraticCost(state_weight, control_weight).rate,
-        Box([-bound], [bound]),
+        Box([-bound], [bound]),  # with the defaults |u| = p|x| is at most 1.3
         noise=noise_or_none(noise),
         discount=discount,
         target=OutsideCube(2.0).level,
@@ -234,7 +235,7 @@ def lq_game(
     problem = Problem(
         LinearScalar(rate).contested_drift,
         GameCost(gamma).rate,
-        Box([-bound], [bound]),
+        Box([-bound], [bound]),  # with the defaults u = −px and d = px/γ² are at most 1.2 and .3
         disturbances=Box([-bound], [bound]),
         discount=discount,
         target=Disc(0.0, 1).level,  # the node at the origin alone

@@ -118,6 +118,7 @@ class Manipulator:
 
     def coriolis_matrix(self, q: Joints, w: Joints) -> jax.Array:
         """C(q, w) of Christoffel's symbols, shape (n, n): C w is ``coriolis``, and Ṁ − 2C is skew."""
+        # (i, j, k); the swaps below put ∂M_ik/∂q_j and ∂M_jk/∂q_i at that place
         slopes = jax.jacfwd(self.mass_matrix)(jnp.stack(_scalars(q, self.links)))  # ∂M_ij/∂q_k
         symbols = slopes + slopes.swapaxes(1, 2) - slopes.transpose(2, 1, 0)
         return 0.5 * symbols @ jnp.stack(_scalars(w, self.links))
@@ -138,6 +139,7 @@ class Manipulator:
         """
         n = self.links
         angles, rates, wanted = (_scalars(vector, n) for vector in (q, w, acceleration))
+        # sums of scalars and no matrix product, which a solver could not take apart into components
         matrix, bias, weight = self._mass(angles), self._coriolis(angles, rates), self._gravity(angles)
         return jnp.stack([sum(matrix[i][j] * wanted[j] for j in range(n)) + bias[i] + weight[i] for i in range(n)])
 
@@ -167,12 +169,15 @@ class Manipulator:
         return jnp.stack([*w, *_solve_positive(self._mass(q), rest)])
 
     def _mass(self, q: list[jax.Array]) -> list[list[jax.Array]]:
+        """The columns of M(q)."""
         # T is quadratic in w, so its gradient at the unit vector e_j is the column j of M.
         zero, one = jnp.zeros((), q[0].dtype), jnp.ones((), q[0].dtype)
         units = ([one if i == j else zero for i in range(self.links)] for j in range(self.links))
         return [jax.grad(self.kinetic_energy, argnums=1)(q, unit) for unit in units]
 
     def _coriolis(self, q: list[jax.Array], w: list[jax.Array]) -> list[jax.Array]:
+        """V(q, w), one torque a joint."""
+
         def momentum(angles: list[jax.Array]) -> list[jax.Array]:
             return jax.grad(self.kinetic_energy, argnums=1)(angles, w)
 
@@ -182,10 +187,12 @@ class Manipulator:
         return [change[i] - pull[i] for i in range(self.links)]
 
     def _gravity(self, q: list[jax.Array]) -> list[jax.Array]:
+        """G(q), one torque a joint."""
         return jax.grad(self.potential_energy)(q)
 
 
 def _hold_upright(arm: Manipulator, damping: Number, stiffness: Number, x: State) -> Control:
+    """The torque under which every joint is a damped spring around upright."""
     q, w = x[: arm.links], x[arm.links :]
     return arm.computed_torque(q, w, -damping * w - stiffness * q)
 
@@ -198,6 +205,8 @@ def _track(
     t: Number,
     x: State,
 ) -> Control:
+    """The torque under which the error from the reference is a damped spring in every joint."""
+
     def rate(time: Number) -> State:  # q̇*; forward mode, since time is one number and q* may be many
         return jax.jvp(reference, (time,), (jnp.ones_like(time),))[1]
 
@@ -208,6 +217,7 @@ def _track(
 
 
 def _scalars(vector: Joints, count: int) -> list[jax.Array]:
+    """The first entries of a vector, each for itself."""
     vector = jnp.asarray(vector)
     # angles written as integers have no derivative: jax.grad would refuse them
     vector = vector if jnp.issubdtype(vector.dtype, jnp.inexact) else vector.astype(float)

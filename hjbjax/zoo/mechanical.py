@@ -50,14 +50,16 @@ class Pendulum:
 
     def drift(self, x: State, u: Control) -> State:
         """(θ̇, g sin θ + gain·τ)."""
+        # gravity pulls away from upright, which makes it the unstable rest
         return jnp.stack([x[1], self.g * jnp.sin(x[0]) + self.gain * u[0]])
 
     def linearising_torque(self, x: State) -> Control:
         """(2.8), τ = −mg sin θ − 3mθ̇ − 2mθ: the loop is θ̈ + 3θ̇ + 2θ = 0, however large the angle."""
+        # the first term takes gravity out; θ̈ + 3θ̇ + 2θ has the roots −1 and −2
         return jnp.stack([-(self.g * jnp.sin(x[0]) + 3 * x[1] + 2 * x[0]) / self.gain])
 
     def linear_torque(self, x: State) -> Control:
-        """The same design for the pendulum linearised upright, τ = −mgθ − 3mθ̇ − 2mθ."""
+        """The design of (2.8) for the pendulum linearised upright, τ = −mgθ − 3mθ̇ − 2mθ."""
         return jnp.stack([-(self.g * x[0] + 3 * x[1] + 2 * x[0]) / self.gain])
 
 
@@ -156,10 +158,11 @@ def pendulum(
       discount: β.
       shape: nodes in angle (even) and velocity (odd), on [−π, π) × [−8, 8].
     """
-    # printed, a unit of torque is worth g times as much, so that the bound may be the smaller
+    # for m = 1 either bound raises the pendulum without swinging: 30 > g, and printed, with the gain g/m, 6g > g
     bound = (6.0 if as_printed else 30.0) if torque is None else torque
     system = Pendulum(mass=mass, g=g, as_printed=as_printed)
     problem = Problem(system.drift, QuadraticCost(0.5, 0.5).rate, Box([-bound], [bound]), discount=discount)
+    # the angle omits π, which is −π: hanging is one node
     return problem, Grid([-math.pi, -8.0], [math.pi, 8.0], shape, periodic=(True, False), names=("angle", "velocity"))
 
 

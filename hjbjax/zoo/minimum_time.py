@@ -43,6 +43,7 @@ class DoubleIntegrator:
         """The least time to rest at the origin under |u| ≤ 1."""
         # in the coordinates m·x₁ and m·x₂ the mass is one
         position, velocity = self.mass * x[0], self.mass * x[1]
+        # ≥ 0 right of the switching curve: first −1 until the curve is met, then +1 along it
         side = position + 0.5 * velocity * jnp.abs(velocity)
         sign = jnp.where(side >= 0, 1.0, -1.0)  # left of the curve the plane is mirrored; no jnp.sign, which is 0 on it
         # On the switching curve the root is |velocity|; rounding must not make its argument negative.
@@ -81,6 +82,7 @@ class Boat:
         current = self.current[0] * self.current[0] + self.current[1] * self.current[1]
         inside = along * along + (self.speed * self.speed - current) * square
         below = jnp.sqrt(jnp.maximum(inside, 0.0)) - along
+        # inside < 0: the disc of radius sT around the drifting boat never holds the origin; below ≤ 0: only in the past
         reachable = (inside >= 0) & (below > 0)
         time = jnp.where(reachable, square / jnp.where(reachable, below, 1.0), jnp.inf)
         return jnp.where(square == 0, 0.0, time)  # at the origin both are 0, which reads as out of reach above

@@ -42,6 +42,7 @@ class SingleIntegrator:
         """‖x‖/s."""
         if self.norm == 1:
             return jnp.sum(jnp.abs(x)) / self.speed
+        # at full speed straight to the origin: the time is the norm whose unit ball the velocities fill
         return (jnp.sqrt(jnp.sum(x * x)) if self.norm == 2 else jnp.max(jnp.abs(x))) / self.speed
 
 
@@ -161,7 +162,8 @@ def dubins(
         unit_cost,
         Box([-turn], [turn]),
         discount=discount,
-        target=Disc(radius, 2).level,
+        target=Disc(radius, 2).level,  # in any heading; with no exact value beside it zero is held there
     )
+    # the heading is periodic, and its 40 nodes omit π, which is −π
     lo, hi = [-2.0, -2.0, -math.pi], [2.0, 2.0, math.pi]
     return problem, Grid(lo, hi, shape, periodic=(False, False, True), names=("x", "y", "heading"))

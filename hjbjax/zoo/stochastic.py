@@ -51,9 +51,10 @@ class CubeExit:
         # Along y = max the factor cosh μy/cosh μ would not decay; along the smaller coordinate it does.
         across, along = jnp.max(scaled), jnp.min(scaled)
         odd = np.arange(1, 2 * TERMS, 2)  # cos(½πk x) vanishes at ±1 for odd k
-        wave = 0.5 * np.pi * odd
+        wave = 0.5 * np.pi * odd  # (TERMS,), as all that follows
         sign = np.where(odd % 4 == 1, 1.0, -1.0)
         rate = jnp.sqrt(wave**2 + kappa**2)
+        # the interval's value in cosines: 1 = Σ 2·sign/wave·cos, divided by ½(wave² + κ²) of the operator
         amplitude = 4 * sign / (wave * (wave**2 + kappa**2))
         # cosh(rate·along)/cosh(rate) by decaying exponentials: the largest rate is 627, and float32 ends at e^88
         decay = jnp.exp(rate * (along - 1)) * (1 + jnp.exp(-2 * rate * along)) / (1 + jnp.exp(-2 * rate))
@@ -84,7 +85,7 @@ class BallExit:
         positive("brownian_ball", noise=self.noise, radius=self.radius)
 
     def value(self, x: State) -> Scalar:
-        """The value at one state; outside the ball the same formula, which is negative there."""
+        """The value at one state; outside the ball the formula goes on and is negative."""
         x = jnp.asarray(x)
         return (self.radius * self.radius - jnp.sum(x * x)) / (self.dim * self.noise * self.noise)
 
@@ -108,6 +109,7 @@ def brownian_exit(
     """
     positive("brownian_exit", noise=noise, half_width=half_width)
     problem = Problem(no_drift, unit_cost, noise=noise, discount=discount, target=OutsideCube(half_width).level)
+    # odd numbers put a node at the centre
     shape = ((101,) if dim == 1 else (41,) * dim) if shape is None else shape
     return problem, Grid([-half_width] * dim, [half_width] * dim, shape)
 
@@ -196,7 +198,9 @@ class BangBang:
         # the positive root of ½ε²μ² + μ − λ = 0, in the form that has the limit λ at ε = 0
         mu = 2 * rate / (1 + jnp.sqrt(1 + 2 * variance * rate))
         distance = jnp.abs(jnp.asarray(x)[0])
+        # what u = −sgn x would cost if it went straight on through zero
         parabola = distance * distance / rate - 2 * distance / rate**2 + 2 / rate**3 + variance / rate**2
+        # the exponential makes the slope vanish at zero, where the control changes sign
         return parabola - 2 / (rate**2 * mu) * jnp.exp(-mu * distance)
 
 

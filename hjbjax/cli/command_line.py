@@ -5,8 +5,8 @@ import difflib
 import math
 import os
 import sys
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, overload
 
 import click
 
@@ -14,7 +14,8 @@ import click
 class Failure(click.ClickException):
     """A refusal or a fault: one line and an exit code."""
 
-    def __init__(self, message: Any, exit_code: int = 2):
+    def __init__(self, message: str | Exception, exit_code: int = 2):
+        # an exception's text may have several lines; a script that reads stderr is promised one
         super().__init__(" ".join(str(message).split()))
         self.exit_code = exit_code  # type: ignore[misc]
 
@@ -24,44 +25,48 @@ class OneLineGroup(click.Group):
 
     def main(
         self,
-        args: Any = None,
-        prog_name: Any = None,
-        complete_var: Any = None,
+        args: Sequence[str] | None = None,
+        prog_name: str | None = None,
+        complete_var: str | None = None,
         standalone_mode: bool = True,
         **extra: Any,
     ) -> Any:
-        """Runs a command and, unless ``standalone_mode`` is off, ends the process with its exit code."""
+        """Run a command and, unless ``standalone_mode`` is off, end the process with its exit code."""
         if not standalone_mode:
             return super().main(args, prog_name, complete_var, False, **extra)
         try:
+            # not standalone, click raises in place of printing a usage block and ending the process itself
             code = super().main(args, prog_name, complete_var, False, **extra)
         except click.ClickException as error:
             say(" ".join(error.format_message().split()))
             code = error.exit_code
         except (click.Abort, KeyboardInterrupt):
             say("interrupted")
-            code = 130
+            code = 130  # 128 + SIGINT, as shells have it
         except OSError as error:  # what is not a file of ours is standard output: a full disk, a closed pipe
             code = 5
             _let_go_of_output()
             say(f"the output could not be written: {error.strerror or error}")
         if code == 130 and sys.stdout is sys.__stdout__:  # a process of our own
+            # os._exit loses what is in a buffer; a stream is None where the process has none
             for stream in filter(None, (sys.stdout, sys.stderr)):
                 with contextlib.suppress(OSError):
                     stream.flush()
             os._exit(code)  # JAX may still be at work, which the usual exit waits for, or crashes on
-        sys.exit(code if isinstance(code, int) else 0)
+        sys.exit(code if isinstance(code, int) else 0)  # a command that ends well returns None
 
 
 def say(line: str) -> None:
-    """One line on standard error; the exit code stands even if nobody can read it."""
+    """Write one line on standard error; the exit code stands even if nobody can read it."""
     with contextlib.suppress(OSError):
         click.echo(f"hjbjax: {line}", err=True)
 
 
 def _let_go_of_output() -> None:
-    """Sends what is left in a buffer of standard output nowhere, or the interpreter fails on it again at its end."""
+    """Send what is left in a buffer of standard output nowhere, or the interpreter fails on it again at its end."""
     with contextlib.suppress(OSError, ValueError, AttributeError):
+        # the descriptor is replaced below Python: closing the stream would flush it and fail once more; a test's
+        # stand-in for stdout has no descriptor, hence the other two errors
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())
         os.close(nowhere)
@@ -72,12 +77,12 @@ class Number(click.ParamType):
 
     name = "number"
 
-    def __init__(self, kind: type = float):
+    def __init__(self, kind: type[float] = float):
         self.kind = kind
 
-    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """The number, or a usage error."""
-        number = finite(str(value), self.kind)
+        number = finite(str(value), self.kind)  # click converts defaults, too, which are numbers already
         if number is None or number <= 0:
             self.fail(f"got {value!r}, wanted a {'whole' if self.kind is int else 'finite'} number > 0", param, ctx)
         return number
@@ -88,12 +93,12 @@ class Shape(click.ParamType):
 
     name = "NxN"
 
-    def convert(self, value: Any, param: Any, ctx: Any) -> tuple[int, ...]:
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
         """One integer an axis, or a usage error."""
         counts = [finite(part, int) for part in str(value).lower().split("x")]
         if any(count is None or count < 2 for count in counts):
             self.fail(f"got {value!r}, wanted whole numbers of at least 2, one an axis, as in 200x201", param, ctx)
-        return tuple(counts)
+        return tuple(count for count in counts if count is not None)  # for the type alone: None has failed above
 
 
 class Name(click.ParamType):
@@ -104,25 +109,31 @@ class Name(click.ParamType):
     def __init__(self, what: str, allowed: Callable[[], Iterable[str]]):
         self.what, self.allowed = what, allowed
 
-    def convert(self, value: Any, param: Any, ctx: Any) -> str:
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> str:
         """The name, or a usage error."""
-        if value not in (names := list(self.allowed())):
-            self.fail(unknown(self.what, value, names), param, ctx)
-        return value
+        if (word := str(value)) not in (names := list(self.allowed())):
+            self.fail(unknown(self.what, word, names), param, ctx)
+        return word
 
 
-def finite(text: str, kind: type) -> Any:
+@overload
+def finite(text: str, kind: type[int]) -> int | None: ...
+@overload
+def finite(text: str, kind: type[float]) -> float | None: ...
+def finite(text: str, kind: type[float]) -> float | None:
     """``text`` as a finite number of a kind; ``None`` if it is none."""
     try:
         number = kind(text)
     except ValueError:
         return None
+    # an integer of 400 digits is finite, and math.isfinite would overflow on its way to a float
     return number if kind is int or math.isfinite(number) else None
 
 
 def unknown(what: str, got: str, allowed: Iterable[str]) -> str:
     """A refusal of a name, with those that there are and the nearest of them."""
     names = list(allowed)
+    # hyphens first, for who writes a name as in Python; then as it is, for parameters, which have underscores
     near = difflib.get_close_matches(got.lower().replace("_", "-"), names, 1) or difflib.get_close_matches(
         got, names, 1
     )

@@ -18,7 +18,8 @@ PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "diffrax", "optax", "matplotlib",
 
 
 def examine() -> Iterator[tuple[str, bool, str]]:
-    """Runs the checks one by one; yields the name of each, whether it is well, and what was found."""
+    """The checks, run one by one: the name of each, True where it is well, and what was found."""
+    # each imports what it needs by itself: one that is broken is a line of the report and not its end
     checks: dict[str, Callable[[], str]] = {
         "python": lambda: f"{sys.version.split()[0]} at {sys.executable}",
         "hjbjax": lambda: f"{__version__} at {Path(__file__).parent}",
@@ -47,8 +48,9 @@ def _float64() -> str:
     import jax
     import jax.numpy as jnp
 
-    with jax.enable_x64(True):
+    with jax.enable_x64(True):  # compiled, as a solve is: that is where a device without float64 shows
         third = jax.jit(lambda x: x / 3)(jnp.asarray(1.0))
+        # 1/3 has no finite expansion: computed in float32 it would differ in the eighth digit
         if float(third) != 1 / 3 or third.dtype != np.float64:
             raise ArithmeticError(f"1/3 is {float(third)!r} in {third.dtype}")
     return "works, inside jax.enable_x64(True)"
@@ -57,6 +59,7 @@ def _float64() -> str:
 def _solve() -> str:
     import hjbjax as hjb
 
+    # the smallest problem that goes through tracing, compiling and certification
     problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x + u @ u, hjb.Box([-3.0], [3.0]), discount=1.0)
     begun = time.perf_counter()
     solution = hjb.solve(problem, hjb.Grid([-1.0], [1.0], (41,)))
@@ -64,6 +67,7 @@ def _solve() -> str:
 
 
 def _memory() -> str:
+    # on Linux alone: elsewhere the name is unknown, and the line says so
     free, total = (os.sysconf("SC_PAGE_SIZE") * os.sysconf(f"SC_{which}_PAGES") / 2**30 for which in ("AVPHYS", "PHYS"))
     return f"{free:.1f} GiB free of {total:.1f} GiB"
 
@@ -72,13 +76,15 @@ def _pictures() -> str:
     import matplotlib
     from matplotlib.figure import Figure
 
+    # into memory, by the renderer that savefig would choose: no display, no file
     Figure(figsize=(1, 1)).savefig(io.BytesIO(), format="png")
-    backend = matplotlib.get_backend(auto_select=False)
+    backend = matplotlib.get_backend(auto_select=False)  # to ask otherwise would choose one, and import pyplot
     return f"PNG works without a display; matplotlib's backend is {backend or 'not chosen yet'}"
 
 
 def _folder() -> str:
-    placement.sweep(".")
+    placement.sweep(".")  # what a killed command left here
+    # made and taken away again, as a solve does: permission bits say nothing of a full or read-only disk
     folder = Path(placement.hidden_name("doctor"))
     folder.mkdir()
     folder.rmdir()

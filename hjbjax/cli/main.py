@@ -14,12 +14,18 @@ import signal
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TextIO, cast
 
 import click
 
 from hjbjax._version import __version__
 from hjbjax.cli.command_line import Failure, Name, Number, OneLineGroup, Shape, finite, say, unknown
+
+if TYPE_CHECKING:  # for annotations alone: what is heavy is imported by the command that needs it
+    from hjbjax.problem.grid import Grid
+    from hjbjax.problem.problem import Problem
+    from hjbjax.solution.solution import Solution
+    from hjbjax.zoo.entry import Entry
 
 FILES = ("solution.npz", "value.png", "policy.png", "trajectory.png")
 CODES = {"CONVERGED": 0, "DIVERGED": 4, "NONFINITE": 4, "INTERRUPTED": 130}  # any other status: 3, not converged
@@ -29,12 +35,13 @@ PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "diffrax", "optax", "matplotlib",
 
 
 def _systems() -> Iterable[str]:
+    """The names of the ready problems; a function, so that they are looked up only when a name is checked."""
     from hjbjax import zoo
 
     return zoo.catalogue
 
 
-def _offered(table: dict[str, str]) -> Callable[[], Iterable[str]]:
+def _names_of(table: dict[str, str]) -> Callable[[], Iterable[str]]:
     """The names in a table of choices that this version has."""
 
     def names() -> Iterable[str]:
@@ -69,15 +76,15 @@ def list_problems(name: str | None) -> None:
     click.echo(f"{entry.name}: {entry.summary}")
     for key, default in entry.parameters.items():
         if key != "shape":
-            click.echo(f"  --set {key}={_written(default)}")
+            click.echo(f"  --set {key}={_as_setting(default)}")
 
 
 @main.command()
 @click.argument("name", type=Name("problem", _systems))
 @click.option("--shape", type=Shape(), help="Nodes along each axis, as in 200x201.")
 @click.option("--set", "settings", multiple=True, metavar="NAME=VALUE", help="A parameter; may be given several times.")
-@click.option("--method", type=Name("method", _offered(METHODS)), help=f"{' or '.join(METHODS)}; chosen if not given.")
-@click.option("--scheme", type=Name("scheme", _offered(SCHEMES)), help="The discretisation; upwind if not given.")
+@click.option("--method", type=Name("method", _names_of(METHODS)), help=f"{' or '.join(METHODS)}; chosen if not given.")
+@click.option("--scheme", type=Name("scheme", _names_of(SCHEMES)), help="The discretisation; upwind if not given.")
 @click.option("--tol", type=Number(), help="Certified bound on the algebraic error, in cost units.")
 @click.option("--max-steps", type=Number(int), help="Stop after so many steps.")
 @click.option("--time-limit", type=Number(), help="Stop after so many seconds.")
@@ -85,7 +92,13 @@ def list_problems(name: str | None) -> None:
 @click.option("--force", is_flag=True, help="Replace results that are there already.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of the screen.")
 def solve(
-    name: str, shape: Any, settings: tuple[str, ...], out: Path | None, force: bool, as_json: bool, **options: Any
+    name: str,
+    shape: tuple[int, ...] | None,
+    settings: tuple[str, ...],
+    out: Path | None,
+    force: bool,
+    as_json: bool,
+    **options: Any,
 ) -> None:
     """Solve the ready problem NAME; write solution.npz, value.png, policy.png and trajectory.png."""
     from hjbjax import zoo
@@ -94,24 +107,25 @@ def solve(
     entry = zoo.catalogue[name]
     parameters = _parameters(entry, settings)
     out = Path(name) if out is None else out
-    with _failing(OSError, 2, "--out: "):
+    # refusals in the order of what they cost: words, folder, problem; the solve comes after all of them
+    with _one_line_error(OSError, 2, "--out: "):
         run_folder.check_folder(out, force)
     problem, grid = _build(entry, parameters, shape)
     path, made = None, []
-    with contextlib.ExitStack() as stack:
-        with _failing(OSError, 2, "--out: "):
+    with contextlib.ExitStack() as stack:  # the hidden folder goes last: after an interrupt, too
+        with _one_line_error(OSError, 2, "--out: "):
             staging = stack.enter_context(run_folder.staging(out))
         stack.enter_context(_one_line_warnings())
         stack.enter_context(_interruptible())
         solution = _solve(problem, grid, options)
-        with _failing(OSError, 5, "the results could not be written: "):
+        with _one_line_error(OSError, 5, "the results could not be written: "):
             try:
                 start = entry.initial_state(grid.ndim)
                 finish = None if entry.finish is None else entry.finish(**parameters)
                 pictures = run_folder.make(
                     problem, solution, staging, start=start, duration=entry.duration, finish=finish
                 )
-                for file, drawn in pictures:
+                for file, drawn in pictures:  # a generator: each file is whole before the next one is begun
                     made.append(file)
                     path = drawn
             finally:  # what is whole is kept
@@ -135,8 +149,8 @@ def solve(
 
 
 @contextlib.contextmanager
-def _failing(kind: type[Exception], exit_code: int, prefix: str = "") -> Iterator[None]:
-    """An error of a kind as one line and an exit code."""
+def _one_line_error(kind: type[Exception], exit_code: int, prefix: str = "") -> Iterator[None]:
+    """An error of one kind, turned into one line and an exit code."""
     try:
         yield
     except kind as error:
@@ -146,7 +160,7 @@ def _failing(kind: type[Exception], exit_code: int, prefix: str = "") -> Iterato
 # ------------------------------------------------------------------------------------- before the solve
 
 
-def _parameters(entry: Any, settings: tuple[str, ...]) -> dict[str, Any]:
+def _parameters(entry: "Entry", settings: tuple[str, ...]) -> dict[str, Any]:
     """The values of --set, each of the kind of its default."""
     defaults = {key: value for key, value in entry.parameters.items() if key != "shape"}
     chosen: dict[str, Any] = {}
@@ -164,8 +178,9 @@ def _parameters(entry: Any, settings: tuple[str, ...]) -> dict[str, Any]:
     return chosen
 
 
-def _value_of(key: str, text: str, default: Any) -> Any:
-    if isinstance(default, bool):
+def _value_of(key: str, text: str, default: object) -> bool | float | tuple[float, ...]:
+    """The text of one --set as a value of its default's kind."""
+    if isinstance(default, bool):  # before int, of which bool is a subclass
         if text.lower() not in ("true", "false"):
             raise Failure(f"--set: got {key}={text}, wanted true or false")
         return text.lower() == "true"
@@ -181,19 +196,21 @@ def _value_of(key: str, text: str, default: Any) -> Any:
         raise Failure(f"--set: got {key}={text}, wanted {wanted}")
     if len(parts) > 1 and isinstance(default, (int, float)):
         raise Failure(f"--set: got {key}={text}, wanted one number")
-    return numbers if len(parts) > 1 else numbers[0]
+    known = cast(tuple[float, ...], numbers)  # None has been refused
+    return known if len(parts) > 1 else known[0]
 
 
-def _written(value: Any) -> str:
+def _as_setting(value: object) -> str:
     """A parameter's value as --set takes it."""
     if isinstance(value, bool):
         return str(value).lower()
     return "..." if value is None else ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
 
 
-def _build(entry: Any, parameters: dict[str, Any], shape: tuple[int, ...] | None) -> tuple[Any, Any]:
+def _build(entry: "Entry", parameters: dict[str, Any], shape: tuple[int, ...] | None) -> tuple["Problem", "Grid"]:
+    """The problem and its grid; refusals of either in one line."""
     try:
-        problem, grid = entry.build(**parameters)
+        problem, grid = entry.build(**parameters)  # its own shape first: it knows how many axes there are
         if shape is None:
             return problem, grid
         if len(shape) != grid.ndim:
@@ -229,10 +246,20 @@ def _interruptible() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _one_line_warnings() -> Iterator[None]:
-    def show(message: Any, *_: Any, **__: Any) -> None:
+    """Warnings of the user's concern as one line each, without the source line that Python adds."""
+
+    def show(
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
+    ) -> None:
         say(f"warning: {' '.join(str(message).split())}")
 
     with warnings.catch_warnings():
+        # by default a warning is shown once a place, and PYTHONWARNINGS may hide it or make an error of it
         warnings.simplefilter("always", UserWarning)
         warnings.showwarning = show
         yield
@@ -241,22 +268,25 @@ def _one_line_warnings() -> Iterator[None]:
 # ------------------------------------------------------------------------------------- solve and write
 
 
-def _solve(problem: Any, grid: Any, options: dict[str, Any]) -> Any:
+def _solve(problem: "Problem", grid: "Grid", options: dict[str, Any]) -> "Solution":
+    """The solution, converged or not; what the solver refuses or breaks on as one line and an exit code."""
     import jax
 
     import hjbjax as hjb
 
+    # an option that was not given must not reach solve as None: its own default stands
     given = {key: value for key, value in options.items() if value is not None}
     for key, table in (("method", METHODS), ("scheme", SCHEMES)):
         if key in given:
             given[key] = getattr(hjb, table[given[key]])()
     try:
+        # no throw: what there is is saved and drawn also where it has not converged, and the exit code says so
         return hjb.solve(problem, grid, throw=False, **given)
     except (ValueError, TypeError) as error:
         raise Failure(error) from error
     except MemoryError as error:
         raise Failure(error, 6) from error
-    except jax.errors.JaxRuntimeError as error:
+    except jax.errors.JaxRuntimeError as error:  # XLA has one type for all its faults, and the word in the text
         raise Failure(error, 6 if "RESOURCE_EXHAUSTED" in str(error) else 4) from error
 
 

@@ -15,9 +15,9 @@ import math
 import os
 import shutil
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import jax
 import numpy as np
@@ -32,21 +32,29 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import Ball
 from hjbjax.solution import placement
 from hjbjax.solution.solution import Solution, Status
+from hjbjax.zoo.ingredients import Exact, Feedback
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 FILES = ("solution.npz", "value.png", "policy.png", "trajectory.png")
+Plain: TypeAlias = "dict[str, Plain] | list[Plain] | str | float | bool | None"  # what JSON has
 SAMPLES = 400  # of a bang-bang feedback along its trajectory
 DPI = 160
 
 
 def check_folder(out: Path, force: bool = False) -> None:
-    """Refuses a folder that holds results, unless by ``force``, and what is no folder.
+    """Refuse a folder that holds results, unless by ``force``, and a path that is no folder.
 
     Raises:
       OSError: with a line on what to do.
     """
+    # lexists: a link that leads nowhere is there as well, and writing would go through it
     if os.path.lexists(out) and not out.is_dir():
         raise NotADirectoryError(f"{out} is there and is no folder; give another name")
-    for file in FILES:
+    for file in FILES:  # a folder or a device of such a name is refused even by force
         placement.check_place(out / file, force=True)
     old = [file for file in FILES if os.path.lexists(out / file)]
     if old and not force:
@@ -62,6 +70,7 @@ def staging(out: Path) -> Iterator[Path]:
     Raises:
       OSError: ``out`` cannot be written.
     """
+    # beside the nearest folder that exists: moving files is atomic on one file system only, /tmp may be another
     place = out.absolute()
     while not place.is_dir():
         if os.path.lexists(place):
@@ -70,18 +79,18 @@ def staging(out: Path) -> Iterator[Path]:
     placement.sweep(place)
     folder = place / placement.hidden_name(out.name)
     try:
-        folder.mkdir(mode=0o700)
+        folder.mkdir(mode=0o700)  # nobody else looks into it before it is whole
     except OSError as error:
         raise OSError(f"{out} cannot be written: {error.strerror}; give another folder") from error
     try:
         with placement.claimed(folder):
             yield folder
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        shutil.rmtree(folder, ignore_errors=True)  # the next command's sweep takes what could not be removed
 
 
 def publish(folder: Path, out: Path, made: Sequence[str], force: bool = False) -> None:
-    """Moves whole files into ``out``; an older file that has no successor goes with the result it belonged to.
+    """Move whole files into ``out``; an older file that has no successor goes with the result it belonged to.
 
     Raises:
       OSError: ``out`` cannot be written, or holds results by now.
@@ -104,9 +113,9 @@ def make(
     *,
     start: Sequence[float],
     duration: float,
-    finish: tuple[Problem, Any] | None = None,
+    finish: tuple[Problem, Feedback] | None = None,
 ) -> Iterator[tuple[str, Trajectory | None]]:
-    """Makes the files one by one; yields the name of each and, with the last, the trajectory that it shows.
+    """The files, made one by one: the name of each and, with the last, the trajectory that it shows.
 
     An interrupted solve is saved and not drawn; one that did not converge gets no trajectory. ``finish`` is the
     problem and the feedback by which a trajectory goes on from the target, where that holds the rest of the cost.
@@ -115,21 +124,21 @@ def make(
       OSError: a file cannot be written.
     """
 
-    def draw(name: str, artists: list[Any]) -> None:
-        artists[0].get_figure().savefig(folder / name, dpi=DPI)
+    def draw(name: str, artists: list["Artist"]) -> None:
+        cast("Figure", artists[0].get_figure()).savefig(folder / name, dpi=DPI)
 
-    solution.save(folder / "solution.npz")
+    solution.save(folder / "solution.npz")  # first: what took the longest is safe before anything is drawn
     yield "solution.npz", None
     if solution.status == Status.INTERRUPTED:
         return
-    fixed = dict(enumerate(start[2:], 2))
+    fixed = dict(enumerate(start[2:], 2))  # axes from the third on, cut where the trajectory starts
     jumps = is_bang_bang(problem, solution)
     draw("value.png", _with_curve(plotting.value(solution, fixed=fixed, target=problem.target), solution, fixed, jumps))
     yield "value.png", None
     draw("policy.png", _policies(solution, fixed, jumps))
     yield "policy.png", None
     path = None
-    if solution.status == Status.CONVERGED:
+    if solution.status == Status.CONVERGED:  # a loop closed with a half-done feedback would be taken for the answer
         path = _trajectory(problem, solution, start, duration, jumps, finish)
     if path is not None:
         draw("trajectory.png", plotting.closed_loop(solution, path, fixed=fixed, target=problem.target))
@@ -137,23 +146,25 @@ def make(
 
 
 def is_bang_bang(problem: Problem, solution: Solution) -> bool:
-    """Whether the feedback jumps: it is enumerated, or nine of ten of its entries lie on a bound."""
+    """True where the feedback jumps: it is enumerated, or nine of ten of its entries lie on a bound."""
     lo, hi = getattr(problem.controls, "lo", None), getattr(problem.controls, "hi", None)
     if solution.discrete or lo is None or hi is None:
         return solution.discrete
-    policy, near = _known(solution), 1e-6 * (hi - lo)
+    # nine of ten: nodes at rest and on the switching curve itself may hold anything between
+    policy, near = _finite_controls(solution), 1e-6 * (hi - lo)
     return policy.size > 0 and bool(np.mean((policy <= lo + near) | (policy >= hi - near)) > 0.9)
 
 
 def _is_direction(problem: Problem, solution: Solution) -> bool:
-    """Whether the feedback is a direction: nine of ten of its controls lie on the sphere around a ball."""
+    """True where the feedback is a direction: nine of ten of its controls lie on the sphere around a ball."""
     if not isinstance(problem.controls, Ball):
         return False
-    policy = _known(solution)
+    policy = _finite_controls(solution)
     return policy.size > 0 and bool(np.mean(np.linalg.norm(policy, axis=-1) > problem.controls.radius * 0.999999) > 0.9)
 
 
-def _known(solution: Solution) -> np.ndarray:
+def _finite_controls(solution: Solution) -> np.ndarray:
+    """The controls of the nodes where there is one, (k, m)."""
     policy = np.asarray(solution.policy)
     return policy[np.all(np.isfinite(policy), axis=-1)]
 
@@ -164,32 +175,34 @@ def _trajectory(
     start: Sequence[float],
     duration: float,
     jumps: bool,
-    finish: tuple[Problem, Any] | None,
+    finish: tuple[Problem, Feedback] | None,
 ) -> Trajectory | None:
-    """The closed loop, and what follows in the target.
+    """The path of the closed loop, with the stretch that follows inside the target.
 
     Where the control jumps or is a direction, the mean of two is optimal for neither: there the Hamiltonian is
     minimised at the state. One that jumps is sampled: an adaptive stepper crawls along its switching curve.
     """
+    # one key for ever: the command draws the same path twice, and a picture can be reproduced
     options: dict[str, Any] = {} if problem.noise is None else {"key": 0}
     if jumps:
         options["hold"] = duration / SAMPLES
     sharp = jumps or _is_direction(problem, solution)
     feedback = greedy_feedback(problem, solution) if sharp else solution
-    if finish is not None:
+    if finish is not None:  # or the cost of the rest would be paid twice, as exit cost and on the way
         problem = dataclasses.replace(problem, exit_cost=None)
     try:
         path = simulate(problem, feedback, start, duration, **options)
         if finish is None or path.reached is None:
             return path
-        rest = simulate(*finish, path.states[-1], duration)
+        rest_problem, rest_feedback = finish
+        rest = simulate(rest_problem, rest_feedback, path.states[-1], duration)
         return joined(path, rest, float(np.asarray(problem.discount)))
-    except ValueError as error:
+    except ValueError as error:  # a start outside the box that parameters made smaller: no reason to lose the rest
         warnings.warn(f"no trajectory.png: {error}", UserWarning, stacklevel=2)
         return None
 
 
-def _policies(solution: Solution, fixed: dict[int, float], jumps: bool) -> list[Any]:
+def _policies(solution: Solution, fixed: dict[int, float], jumps: bool) -> list["Artist"]:
     """One picture an input, side by side."""
     from matplotlib.figure import Figure
 
@@ -197,7 +210,7 @@ def _policies(solution: Solution, fixed: dict[int, float], jumps: bool) -> list[
     figure = Figure(figsize=(5.4 * max(1, count), 4.2), layout="constrained")
     if count == 0:
         return [figure.text(0.5, 0.5, "this problem has no control", ha="center", va="center", color="0.4")]
-    artists: list[Any] = []
+    artists: list[Artist] = []
     for input, ax in enumerate(figure.subplots(1, count, squeeze=False)[0]):
         drawn = plotting.policy(solution, input=input, fixed=fixed, ax=plotting.styled(ax))
         artists += _with_curve(drawn, solution, fixed, jumps, input)
@@ -205,21 +218,22 @@ def _policies(solution: Solution, fixed: dict[int, float], jumps: bool) -> list[
 
 
 def _with_curve(
-    artists: list[Any], solution: Solution, fixed: dict[int, float], jumps: bool, input: int = 0
-) -> list[Any]:
+    artists: list["Artist"], solution: Solution, fixed: dict[int, float], jumps: bool, input: int = 0
+) -> list["Artist"]:
     """A picture with the switching curve, where there is one."""
+    # an enumerated control is no number that changes its sign; over one axis the jump is in the line itself
     if jumps and not solution.discrete and solution.grid.ndim > 1:
         with contextlib.suppress(ValueError):  # the control keeps its sign
-            artists += plotting.switching_curve(solution, input=input, fixed=fixed, ax=artists[0].axes)
+            artists += plotting.switching_curve(solution, input=input, fixed=fixed, ax=cast("Axes", artists[0].axes))
     return artists
 
 
-def difference(exact: Callable, solution: Solution) -> float | None:
+def difference(exact: Exact, solution: Solution) -> float | None:
     """The largest |V − exact| on the inner half of the box, where its edge is not felt.
 
     Args:
       exact: the value as a function of one state.
-      solution: what ``solve`` returned.
+      solution: the solution of ``solve``.
 
     Returns:
       The difference in cost units; ``None`` if nothing there is finite.
@@ -228,14 +242,16 @@ def difference(exact: Callable, solution: Solution) -> float | None:
     index = []
     for axis in range(grid.ndim):
         lo, hi, nodes = grid.lo[axis], grid.hi[axis], np.asarray(grid.axis(axis))
+        # the half around the middle; a periodic axis has no edge, and all of it counts
         inner = np.abs(nodes - (lo + hi) / 2) <= (hi - lo) / 4
         index.append(np.arange(len(nodes)) if grid.periodic[axis] else np.flatnonzero(inner))  # type: ignore[index]
     corner = np.ix_(*index)
-    states = grid.nodes()[corner]
+    states = grid.nodes()[corner]  # (k₁, …, k_n, n)
+    # in chunks, as series and Newton's steps at every node at once would need many times the memory of the value
     with jax.enable_x64(True):
         wanted = np.asarray(jax.lax.map(exact, states.reshape(-1, grid.ndim), batch_size=1 << 16))
     off = np.abs(np.asarray(solution.value)[corner] - wanted.reshape(states.shape[:-1]))
-    off = off[np.isfinite(off)]
+    off = off[np.isfinite(off)]  # ∞ − ∞ where both say out of reach
     return float(off.max()) if off.size else None
 
 
@@ -259,10 +275,11 @@ def report(solution: Solution, path: Trajectory | None, files: Sequence[Path], *
         "files": [str(file) for file in files],
         "version": __version__,
     }
-    return _plain(answer)
+    return cast(dict[str, Any], _plain(answer))
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> Plain:
+    """Numbers, arrays and names as JSON has them."""
     if isinstance(value, dict):
         return {str(key): _plain(entry) for key, entry in value.items()}
     if isinstance(value, np.ndarray | np.generic) or hasattr(value, "tolist"):

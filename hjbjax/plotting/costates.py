@@ -1,18 +1,29 @@
 """The picture of costates over time: Pontryagin's λ, and DV of a solution on a grid along the same path."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hjbjax.plotting.style import COLOURS, axes_of, label_axes, legend
 
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
 
-def costates(extremal: Any, *, solution: Any = None, ax: Any = None, names: Sequence[str] | None = None) -> list[Any]:
+    from hjbjax.extremals.necessary_conditions import Extremal
+    from hjbjax.solution.solution import Solution
+
+
+def costates(
+    extremal: Extremal, *, solution: Solution | None = None, ax: Axes | None = None, names: Sequence[str] | None = None
+) -> list[Artist]:
     """The costates of an extremal over time, and DV of a solution along its path: two roads to one curve.
 
     Args:
-      extremal: what ``pontryagin`` returned.
+      extremal: the extremal of ``pontryagin``.
 
     Keyword Args:
       solution: of the same problem on a grid, or ``None``; its DV is drawn broken, where the path is inside the grid.
@@ -33,14 +44,17 @@ def costates(extremal: Any, *, solution: Any = None, ax: Any = None, names: Sequ
     names = tuple(names or (solution.grid.names if solution is not None else (f"x{i + 1}" for i in range(count))))
     ax = axes_of(ax, wide=True)
     colours = [COLOURS[i % len(COLOURS)] for i in range(count)]
-    artists = [
+    artists: list[Artist] = [
         ax.plot(times, costates[:, i], color=colours[i], linewidth=1.4, label=f"λ, {names[i]}")[0] for i in range(count)
     ]
     if solution is not None:
+        # a marched V has the time as its first argument; angles of an extremal run on, those of the grid do not
         where = (times,) * (solution.times is not None) + (np.asarray(solution.grid.wrap(extremal.states)),)
+        # NaN outside the grid: there the line is interrupted
         slopes = np.ma.masked_invalid(solution.costate_at(*where))
         for i in range(count):
-            style = {"color": colours[i], "linewidth": 3.6, "alpha": 0.4, "linestyle": "--"}
+            # broad and pale: the line λ stays to be seen where the two agree
+            style: dict[str, Any] = {"color": colours[i], "linewidth": 3.6, "alpha": 0.4, "linestyle": "--"}
             artists += ax.plot(times, slopes[:, i], label=f"DV, {names[i]}", **style)
     label_axes(ax, "t", "costate")
     return [*artists, legend(ax)]

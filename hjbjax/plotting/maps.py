@@ -1,30 +1,40 @@
 """Pictures over one or two axes of a value, a feedback, its switching curve; of paths and of residuals."""
 
+from __future__ import annotations
+
 import itertools
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hjbjax.plotting.slices import at_time, feedback, folded, lifted, nodes_in, section_of, zeros
+from hjbjax.plotting.slices import Cuts, at_time, feedback, line_in_box, nodes_in, section_of, without_jumps, zeros
 from hjbjax.plotting.style import COLOURS, axes_of, bands, draw, frame, label_axes, legend, styled
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.types import Number, State
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+
+    from hjbjax.feedback.path import Path
+    from hjbjax.solution.solution import Solution
 
 
 def value(
-    solution: Any,
+    solution: Solution,
     *,
-    ax: Any = None,
-    fixed: Mapping[Any, float] | None = None,
+    ax: Axes | None = None,
+    fixed: Cuts | None = None,
     time: float | None = None,
     levels: int | Sequence[float] = 9,
     colorbar: bool = True,
-    target: Callable | None = None,
-) -> list[Any]:
+    target: Callable[[State], Number] | None = None,
+) -> list[Artist]:
     """The value function: a line over one axis, colours with contour lines over two.
 
     Args:
-      solution: what ``solve`` or ``march`` returned.
+      solution: the solution of ``solve`` or ``march``.
 
     Keyword Args:
       ax: matplotlib axes to draw on; ``None`` makes a figure.
@@ -51,11 +61,12 @@ def value(
     field, caption = at_time(solution, solution.value, time)
     section = section_of("value", field, solution.grid, fixed, caption)
     ax = axes_of(ax)
+    # .data is what the mask hides: infinity is out of reach, NaN is something else and must not be called so
     hidden = "V = ∞" if np.all(np.isposinf(section.values.data[section.values.mask])) else "V not finite"
     if target is not None and len(section.axes) == 2 and np.any(inside := nodes_in(target, solution.grid)):
         hidden = f"target, or {hidden}" if np.ma.getmaskarray(section.values).any() else "target"
         section = section_of("value", np.where(inside, np.nan, field), solution.grid, fixed, caption)
-    artists = draw(ax, section, solution.grid, "V", hidden, colorbar=colorbar)
+    artists = draw(ax, section, "V", hidden, colorbar=colorbar)
     lines = _levels(section.values, levels) if len(section.axes) == 2 else ()
     if len(lines):
         x, y = section.coordinates
@@ -64,46 +75,46 @@ def value(
 
 
 def policy(
-    solution: Any,
+    solution: Solution,
     *,
     input: int = 0,
-    ax: Any = None,
-    fixed: Mapping[Any, float] | None = None,
+    ax: Axes | None = None,
+    fixed: Cuts | None = None,
     time: float | None = None,
     colorbar: bool = True,
-) -> list[Any]:
+) -> list[Artist]:
     """One input of the feedback u(x): a line over one axis, diverging colours centred at zero over two.
 
     Nodes where no control is defined or the value is not finite are greyed out.
 
     Args:
-      solution: what ``solve`` or ``march`` returned.
+      solution: the solution of ``solve`` or ``march``.
 
     Keyword Args:
       input: which of the m inputs, from 0.
       ax, fixed, time, colorbar: as for :func:`value`, with its result and its refusals.
     """
     section, label = feedback(solution, input, fixed, time)
-    return draw(axes_of(ax), section, solution.grid, label, "no control defined", colorbar=colorbar, diverging=True)
+    return draw(axes_of(ax), section, label, "no control defined", colorbar=colorbar, diverging=True)
 
 
 def switching_curve(
-    solution: Any,
+    solution: Solution,
     *,
     input: int = 0,
-    ax: Any = None,
-    fixed: Mapping[Any, float] | None = None,
+    ax: Axes | None = None,
+    fixed: Cuts | None = None,
     time: float | None = None,
     color: str = "black",
     label: str | None = "switching curve",
-) -> list[Any]:
-    """Where one input changes sign: the zero level of the feedback, linear between nodes.
+) -> list[Artist]:
+    """The curve on which one input changes sign: the zero level of the feedback, linear between nodes.
 
     A bang-bang feedback jumps between two nodes, so its curve is known to half a cell, as it is drawn. Over
     one axis the places are vertical lines.
 
     Args:
-      solution: what ``solve`` or ``march`` returned.
+      solution: the solution of ``solve`` or ``march``.
 
     Keyword Args:
       input, ax, fixed, time: as for :func:`policy`.
@@ -115,39 +126,40 @@ def switching_curve(
     """
     section, name = feedback(solution, input, fixed, time)
     known = section.values.compressed()
+    # refused here: matplotlib would warn of a contour that does not exist and draw nothing
     if known.size == 0 or known.min() >= 0 or known.max() <= 0:
         between = f"{known.min():g} and {known.max():g}" if known.size else "no finite values"
         raise ValueError(f"switching_curve: {name} stays between {between}; there is no change of sign to draw")
     ax = axes_of(ax)
-    style = {"color": color, "linewidth": 1.6}
+    style: dict[str, Any] = {"color": color, "linewidth": 1.6}
     if len(section.axes) == 1:
-        artists = [ax.axvline(x, **style) for x in zeros(section.coordinates[0], section.values)]
+        artists: list[Artist] = [ax.axvline(x, **style) for x in zeros(section.coordinates[0], section.values)]
     else:
         x, y = section.coordinates
         artists = [ax.contour(x, y, section.values.T, levels=[0.0], colors=color, linewidths=1.6)]
-    frame(ax, section, solution.grid)
-    if label:
+    frame(ax, section)
+    if label:  # on an empty line: contours take none
         artists += ax.plot([], [], label=label, **style)
         legend(ax)
     return artists
 
 
 def trajectory(
-    path: Any,
+    path: Path,
     *,
-    ax: Any = None,
+    ax: Axes | None = None,
     axes: tuple[int, int] | None = (0, 1),
     grid: Grid | None = None,
     names: Sequence[str] | None = None,
     color: str | None = None,
     label: str | None = None,
-) -> list[Any]:
+) -> list[Artist]:
     """A path in the plane of two states, or its states over time.
 
     Works on top of :func:`value` or :func:`policy`: pass their ``ax``. A ring marks the start, a dot the end.
 
     Args:
-      path: what ``simulate`` returned: ``times`` (k+1,) and ``states`` (k+1, n).
+      path: the path of ``simulate``: ``times`` (k+1,) and ``states`` (k+1, n).
 
     Keyword Args:
       ax: matplotlib axes to draw on; ``None`` makes a figure.
@@ -168,22 +180,25 @@ def trajectory(
     times, states = np.asarray(path.times), np.asarray(path.states)
     count = states.shape[1]
     names = tuple(names or (grid.names if grid is not None else (f"x{i + 1}" for i in range(count))))
-    states = lifted(states, grid)
+    states = without_jumps(states, grid)
     if axes is None or count == 1:
         ax = axes_of(ax, wide=True)
         colours = itertools.cycle((color,) if color else COLOURS)
-        artists = [ax.plot(times, states[:, i], color=next(colours), label=names[i])[0] for i in range(count)]
+        artists: list[Artist] = [
+            ax.plot(times, states[:, i], color=next(colours), label=names[i])[0] for i in range(count)
+        ]
         label_axes(ax, "t", names[0] if count == 1 else "state")
         return artists if count == 1 else [*artists, legend(ax)]
     if len(axes) != 2 or not all(0 <= i < count for i in axes):
         raise ValueError(f"trajectory: got axes={axes!r}; the path has {count} states, wanted two of 0 to {count - 1}")
     ax = axes_of(ax)
-    first, last = folded(states[:1], axes, grid)[0], folded(states[-1:], axes, grid)[0]
-    plane = folded(states, axes, grid)
+    # the ends each for themselves: the rows of the folded path may begin or end with a cut at the seam
+    first, last = line_in_box(states[:1], axes, grid)[0], line_in_box(states[-1:], axes, grid)[0]
+    plane = line_in_box(states, axes, grid)
     color = color or COLOURS[1]
     casing = [Stroke(linewidth=3.4, foreground="white"), Normal()]  # a white edge: it reads on any colour
-    artists = ax.plot(*plane.T, color=color, linewidth=1.8, label=label, path_effects=casing, zorder=4)
-    marks = {"linestyle": "none", "marker": "o", "markeredgecolor": color, "markersize": 6, "zorder": 5}
+    artists = [*ax.plot(*plane.T, color=color, linewidth=1.8, label=label, path_effects=casing, zorder=4)]
+    marks: dict[str, Any] = {"linestyle": "none", "marker": "o", "markeredgecolor": color, "markersize": 6, "zorder": 5}
     artists += ax.plot(*first, markerfacecolor="white", markeredgewidth=1.6, **marks)
     artists += ax.plot(*last, markerfacecolor=color, path_effects=casing, **marks)
     label_axes(ax, names[axes[0]], names[axes[1]])
@@ -192,11 +207,11 @@ def trajectory(
     return artists
 
 
-def controls(path: Any, *, ax: Any = None, names: Sequence[str] | None = None) -> list[Any]:
+def controls(path: Path, *, ax: Axes | None = None, names: Sequence[str] | None = None) -> list[Artist]:
     """The inputs of a path over time, each constant over its step; ``path.controls`` has shape (k, m).
 
     Args:
-      path: what ``simulate`` returned.
+      path: the path of ``simulate``.
 
     Keyword Args:
       ax: matplotlib axes to draw on; ``None`` makes a figure.
@@ -210,7 +225,7 @@ def controls(path: Any, *, ax: Any = None, names: Sequence[str] | None = None) -
     names = tuple(names or (("u",) if count == 1 else (f"u{i + 1}" for i in range(count))))
     ax = axes_of(ax, wide=True)
     colours = itertools.cycle(COLOURS)
-    artists = [
+    artists: list[Artist] = [
         ax.stairs(inputs[:, i], times, baseline=None, color=next(colours), linewidth=1.4, label=names[i])
         for i in range(count)
     ]
@@ -219,18 +234,18 @@ def controls(path: Any, *, ax: Any = None, names: Sequence[str] | None = None) -
 
 
 def closed_loop(
-    solution: Any,
-    path: Any,
+    solution: Solution,
+    path: Path,
     *,
     axes: tuple[int, int] = (0, 1),
-    fixed: Mapping[Any, float] | None = None,
-    target: Callable | None = None,
-) -> list[Any]:
+    fixed: Cuts | None = None,
+    target: Callable[[State], Number] | None = None,
+) -> list[Artist]:
     """One figure: the path on the value function, and its states and inputs over time.
 
     Args:
-      solution: what ``solve`` returned.
-      path: what ``simulate`` returned for it.
+      solution: the solution of ``solve``.
+      path: the path of ``simulate`` for it.
 
     Keyword Args:
       axes: the two states of the plane on the left; left out for one state.
@@ -242,30 +257,33 @@ def closed_loop(
     """
     from matplotlib.figure import Figure
 
-    grid, artists = solution.grid, []
+    grid = solution.grid
+    artists: list[Artist] = []
     plane, driven = grid.ndim > 1, np.shape(path.controls)[1] > 0
     figure = Figure(figsize=(9.6 if plane else 5.4, 4.2), layout="constrained")
     columns = figure.add_gridspec(1 + driven, 1 + plane, width_ratios=(1.25, 1.0)[: 1 + plane])
     if plane:
         start = np.asarray(path.states)[0]
-        cut: Mapping[Any, float] = {axis: float(start[axis]) for axis in range(grid.ndim) if axis not in axes}
+        # the path leaves this plane in its other states: it is its shadow that is drawn on the section
+        cut: Cuts = {axis: float(start[axis]) for axis in range(grid.ndim) if axis not in axes}
         ax = styled(figure.add_subplot(columns[:, 0]))
         artists += value(solution, ax=ax, fixed=cut if fixed is None else fixed, target=target)
+        # a section has its axes in the order of the grid
         artists += trajectory(path, ax=ax, axes=axes if axes[0] < axes[1] else axes[::-1], grid=grid)
     upper = styled(figure.add_subplot(columns[0, -1]))
     artists += trajectory(path, ax=upper, axes=None, grid=grid)
     if driven:
-        upper.set_xlabel("")
+        upper.set_xlabel("")  # time is written once, below
         artists += controls(path, ax=styled(figure.add_subplot(columns[1, -1], sharex=upper)))
         upper.tick_params(labelbottom=False)
     return artists
 
 
-def residuals(solution: Any, *, ax: Any = None, label: str | None = None) -> list[Any]:
+def residuals(solution: Solution, *, ax: Axes | None = None, label: str | None = None) -> list[Artist]:
     """The residual after each step on a logarithmic scale; steps where it is not finite are marked grey.
 
     Args:
-      solution: what ``solve`` returned; its history lives on the host and is kept by neither ``jit`` nor ``vmap``.
+      solution: the solution of ``solve``; its history lives on the host and is kept by neither ``jit`` nor ``vmap``.
 
     Keyword Args:
       ax: matplotlib axes to draw on; ``None`` makes a figure.
@@ -282,11 +300,12 @@ def residuals(solution: Any, *, ax: Any = None, label: str | None = None) -> lis
     ax = axes_of(ax, wide=True)
     steps = np.arange(1, history.size + 1)
     drawable = np.isfinite(history) & (history > 0)  # an exact zero has no logarithm
-    artists = ax.plot(steps, np.ma.masked_where(~drawable, history), color=None if label else COLOURS[0], label=label)
-    if history.size < 60:
-        artists[0].set(marker="o", markersize=3)
+    shown = np.ma.masked_where(~drawable, history)
+    line = ax.plot(steps, shown, color=None if label else COLOURS[0], label=label)[0]
+    if history.size < 60:  # more marks than that would run together
+        line.set(marker="o", markersize=3)
     ax.set_yscale("log")
-    artists += bands(ax, steps, ~np.isfinite(history), "not finite")
+    artists = [line, *bands(ax, steps, ~np.isfinite(history), "not finite")]
     label_axes(ax, "step", "residual")
     if label or len(artists) > 1:
         legend(ax)
@@ -298,5 +317,6 @@ def _levels(values: np.ma.MaskedArray, levels: int | Sequence[float]) -> np.ndar
     known = values.compressed()
     if known.size == 0:
         return known
+    # two more than wanted: those at the extremes are dropped, where a contour is a point or a speck of rounding
     places = np.linspace(known.min(), known.max(), levels + 2) if isinstance(levels, int) else np.sort(levels)
     return places[(places > known.min()) & (places < known.max())]

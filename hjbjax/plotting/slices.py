@@ -8,27 +8,37 @@ import difflib
 import itertools
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import jax
 import numpy as np
 
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.types import Array, Number, State
 
+if TYPE_CHECKING:
+    from hjbjax.solution.solution import Solution
+
+# where axes are cut, by their numbers or names; three times, since a type checker takes no {0: 1.0} for the last
+Cuts: TypeAlias = Mapping[int, float] | Mapping[str, float] | Mapping[int | str, float]
+CHUNK = 1 << 16  # states for which a target is evaluated at once, which bounds the memory of its intermediate arrays
+ON_NODE = 1e-9  # of a cell: a coordinate this near to a node is meant to be it, 0.1 + 0.2 as well as 0.3
 COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight")
 
 
 class Section(NamedTuple):
-    """A field cut down to one or two axes: the axes, their coordinates, masked values, and where it was cut."""
+    """A field cut down to one or two axes: the axes, their names and coordinates, masked values, where it was cut."""
 
     axes: tuple[int, ...]
+    names: tuple[str, ...]
     coordinates: tuple[np.ndarray, ...]
     values: np.ma.MaskedArray
     caption: str
 
 
-def at_time(solution: Any, field: Any, time: float | None) -> tuple[np.ndarray, str]:
-    """The field at one stored time, and how to say so."""
+def at_time(solution: "Solution", field: Array, time: float | None) -> tuple[np.ndarray, str]:
+    """The field at one stored time, and the caption that names it."""
+    # solutions of reachability and stand-ins of a user's own may carry no times at all
     field, times = np.asarray(field), getattr(solution, "times", None)
     if times is None:
         if time is not None:
@@ -39,23 +49,25 @@ def at_time(solution: Any, field: Any, time: float | None) -> tuple[np.ndarray, 
     return field[index], f"t = {times[index]:.4g}"
 
 
-def nodes_in(target: Callable, grid: Grid) -> np.ndarray:
-    """Which nodes lie in a target, a bool (*grid)."""
+def nodes_in(target: Callable[[State], Number], grid: Grid) -> np.ndarray:
+    """The nodes that lie in a target, a bool (*grid)."""
     states = grid.nodes().reshape(-1, grid.ndim)
-    with jax.enable_x64(True):
-        level = np.asarray(jax.lax.map(target, states, batch_size=1 << 16))
+    with jax.enable_x64(True):  # the nodes are float64; in float32 a level at a face of the box would round either way
+        level = np.asarray(jax.lax.map(target, states, batch_size=CHUNK))
     return level.reshape(grid.shape) <= 0
 
 
-def feedback(solution: Any, input: int, fixed: Any, time: float | None) -> tuple[Section, str]:
+def feedback(solution: "Solution", input: int, fixed: Cuts | None, time: float | None) -> tuple[Section, str]:
     """One input's section, masked where no control is defined or the value is not finite, and its name."""
     if solution.policy is None:
         raise ValueError("policy: this solution has no policy")
     inputs, caption = at_time(solution, solution.policy, time)
     count = inputs.shape[-1]
+    # True would be the input 1
     if isinstance(input, bool) or not isinstance(input, (int, np.integer)) or not 0 <= input < count:
         allowed = f"0 to {count - 1}" if count else "none: the problem has no control"
         raise ValueError(f"policy: got input={input!r}, wanted one of {allowed}")
+    # where V is infinite the greedy control is one of many that are as bad, and says nothing
     known = np.isfinite(at_time(solution, solution.value, time)[0])
     field = np.where(known, inputs[..., input], np.nan)
     nearest = getattr(solution, "discrete", False)  # the mean of two enumerated controls need not be admissible
@@ -66,16 +78,16 @@ def section_of(
     what: str,
     field: np.ndarray,
     grid: Grid,
-    fixed: Mapping[Any, float] | None,
+    fixed: Cuts | None,
     caption: str,
     nearest: bool = False,
 ) -> Section:
-    """Cuts the field at the fixed coordinates, closes periodic axes and masks what is not finite."""
+    """The field cut at the fixed coordinates, closed along periodic axes, masked where it is not finite."""
     if field.shape != grid.shape:
         raise ValueError(
             f"{what}: got a field of shape {field.shape} on a grid of shape {grid.shape}; draw one lane at a time"
         )
-    cuts: dict[int, float] = {}
+    cuts: dict[int, float] = {}  # by number: an axis may be given by its name and its number at once
     for key, place in dict(fixed or {}).items():
         axis = axis_number(key, grid)
         if axis in cuts:
@@ -86,17 +98,21 @@ def section_of(
     free = tuple(axis for axis in range(grid.ndim) if axis not in cuts)
     if not 1 <= len(free) <= 2:
         raise ValueError(f"{what}: {_how_many(grid, free)}")
-    for axis in sorted(cuts, reverse=True):
+    for axis in sorted(cuts, reverse=True):  # the last first: a cut takes its axis out, and those behind move up
         field = _cut(what, field, grid, axis, cuts[axis], nearest)
     for position, axis in enumerate(free):
+        # (M, …) becomes (M + 1, …): the first row once more at the upper end, so that no gap is left at the seam
         if grid.periodic[axis]:  # type: ignore[index]
             field = np.concatenate([field, np.take(field, [0], position)], position)
     coordinates = tuple(_closed_axis(grid, axis) for axis in free)
     places = [caption] * bool(caption) + [f"{grid.names[axis]} = {cuts[axis]:.4g}" for axis in sorted(cuts)]
-    return Section(free, coordinates, np.ma.masked_invalid(field), ", ".join(places))
+    return Section(
+        free, tuple(grid.names[axis] for axis in free), coordinates, np.ma.masked_invalid(field), ", ".join(places)
+    )
 
 
 def _how_many(grid: Grid, free: tuple[int, ...]) -> str:
+    """How to come from the free axes to two: what a refusal advises."""
     if not free:
         return "every axis is fixed; leave one or two of them free"
     rest = grid.ndim - 2
@@ -108,7 +124,7 @@ def _how_many(grid: Grid, free: tuple[int, ...]) -> str:
     )
 
 
-def axis_number(key: Any, grid: Grid) -> int:
+def axis_number(key: object, grid: Grid) -> int:
     """The axis that a number or a name means."""
     if isinstance(key, str) and key in grid.names:
         return grid.names.index(key)
@@ -125,9 +141,10 @@ def _cut(what: str, field: np.ndarray, grid: Grid, axis: int, place: float, near
     if grid.periodic[axis] and math.isfinite(place):  # type: ignore[index]
         place = lo + (place - lo) % (hi - lo)
     position = (place - lo) / (hi - lo) * last
-    if not -1e-9 <= position <= last + 1e-9:
+    if not -ON_NODE <= position <= last + ON_NODE:  # written so that NaN is refused
         raise ValueError(f"{what}: got {grid.names[axis]} = {place:g}, which is outside the grid, [{lo:g}, {hi:g}]")
-    if nearest or abs(position - round(position)) < 1e-9:  # on a node but for rounding
+    # on a node but for rounding; otherwise 0·∞ of the neighbour without weight would grey out a whole slice
+    if nearest or abs(position - round(position)) < ON_NODE:
         return np.take(field, round(position) % grid.shape[axis], axis)
     cell = math.floor(position)
     left, right = np.take(field, cell, axis), np.take(field, (cell + 1) % grid.shape[axis], axis)
@@ -142,21 +159,22 @@ def _closed_axis(grid: Grid, axis: int) -> np.ndarray:
 
 
 def zeros(x: np.ndarray, values: np.ma.MaskedArray) -> list[float]:
-    """Where a sampled function changes sign, linear between nodes; at the middle of nodes where it is zero."""
-    samples = values.filled(np.nan)
+    """Places where a sampled function changes sign, linear between nodes; the middle of a run of zeros."""
+    samples = values.filled(np.nan)  # NaN ≠ 0, so that a masked node ends a run of zeros and makes no crossing
     signed = np.flatnonzero(samples != 0).tolist()
     crossings = []
     for left, right in itertools.pairwise(signed):
         if samples[left] * samples[right] >= 0 or np.isnan(samples[left] * samples[right]):
             continue
+        # the mean over a run of zeros: a control that rests in between switches nowhere in particular
         share = samples[left] / (samples[left] - samples[right])
         place = x[left] + share * (x[right] - x[left]) if right == left + 1 else np.mean(x[left + 1 : right])
         crossings.append(float(place))
     return crossings
 
 
-def lifted(states: np.ndarray, grid: Grid | None) -> np.ndarray:
-    """Periodic states made continuous in time."""
+def without_jumps(states: np.ndarray, grid: Grid | None) -> np.ndarray:
+    """States (k, n) with the jumps of periodic ones at their seam taken out, continuous in time."""
     states = np.array(states, dtype=float)
     for axis in range(0 if grid is None else grid.ndim):
         if grid.periodic[axis]:  # type: ignore[union-attr, index]
@@ -164,33 +182,36 @@ def lifted(states: np.ndarray, grid: Grid | None) -> np.ndarray:
     return states
 
 
-def folded(states: np.ndarray, axes: tuple[int, int], grid: Grid | None) -> np.ndarray:
+def line_in_box(states: np.ndarray, axes: tuple[int, int], grid: Grid | None) -> np.ndarray:
     """Two columns with periodic states brought into the box, the line cut (a row of NaN) where it crosses a seam."""
-    points = states[:, list(axes)]
+    points = states[:, list(axes)]  # (k, 2)
+    # an endless period stands for an axis that is not periodic, so that both columns take one way
     lo, period = np.zeros(2), np.full(2, np.inf)
     for column, axis in enumerate(axes):
         if grid is not None and grid.periodic[axis]:  # type: ignore[index]
             lo[column], period[column] = grid.lo[axis], grid.hi[axis] - grid.lo[axis]
 
-    def turns(point):
+    def turns(point: np.ndarray) -> np.ndarray:  # how many periods the point is away from the box, (2,)
         return np.where(np.isinf(period), 0.0, np.floor((point - lo) / period))
 
-    def shift(count):
+    def shift(count: np.ndarray) -> np.ndarray:  # that many periods as a length; 0·∞ would be NaN
         return np.where(np.isinf(period), 0.0, count * np.where(np.isinf(period), 0.0, period))
 
     here = turns(points[0])
     rows = [points[0] - shift(here)]
     for start, end in itertools.pairwise(points):
-        cuts: set[float] = {0.0, 1.0}
+        cuts: set[float] = {0.0, 1.0}  # shares of the piece from start to end at which it crosses a seam
         for column in np.flatnonzero(turns(start) != turns(end)).tolist():
             low, high = sorted((turns(start)[column], turns(end)[column]))
             edges = lo[column] + np.arange(low + 1, high + 1) * period[column]
             shares = (edges - start[column]) / (end[column] - start[column])
             cuts.update(np.round(shares, 12).tolist())  # rounded, so that a corner is one cut
         for a, b in itertools.pairwise(sorted(cuts)):
+            # by its middle: its ends lie on seams, where rounding decides the side
             piece = turns(start + (a + b) / 2 * (end - start))
             if np.any(piece != here):
                 rows += [np.full(2, np.nan), start + a * (end - start) - shift(piece)]
                 here = piece
+            # the end itself and not start + 1·(end − start), which rounds
             rows.append((end if b == 1 else start + b * (end - start)) - shift(here))
     return np.array(rows)

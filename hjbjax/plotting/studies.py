@@ -1,20 +1,30 @@
 """Pictures of studies: errors over spacings, and changes over noise and disturbances, with the fitted orders."""
 
-from typing import Any
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from hjbjax.plotting.style import COLOURS, GREY, axes_of, label_axes, legend, logarithmic, pair_of_axes
 
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
 
-def convergence(study: Any, *, ax: Any = None) -> list[Any]:
+    from hjbjax.applications.convergence import Study
+    from hjbjax.applications.perturbations import Perturbation
+
+
+def convergence(study: Study, *, ax: Axes | Sequence[Axes] | np.ndarray | None = None) -> list[Artist]:
     """The errors of a convergence study over the spacing and over the seconds, with the fitted orders.
 
     Full marks are the largest errors, rings the mean ones; the thin line beside the full marks has the fitted
     slope. Errors of zero have no logarithm and are left out; an estimate is called one in the label of the axis.
 
     Args:
-      study: what ``convergence_study`` returned.
+      study: the result of ``convergence_study``.
 
     Keyword Args:
       ax: matplotlib axes to draw on: one for the errors over the spacing, or two, the second for the seconds;
@@ -28,36 +38,37 @@ def convergence(study: Any, *, ax: Any = None) -> list[Any]:
     """
     if not np.any((study.errors > 0) & np.isfinite(study.errors)):
         raise ValueError(f"convergence: the errors are {study.errors}; there is none with a logarithm to draw")
-    axes = pair_of_axes() if ax is None else list(np.ravel(ax))
+    axes: list[Axes] = pair_of_axes() if ax is None else list(np.ravel(cast(Any, ax)))
     quality = "estimated error" if study.estimated else "error"
-    own = ax is None
-    artists = []
-    for ax, x, name in zip(axes, (study.h, study.seconds), ("h", "seconds"), strict=False):
+    own = ax is None  # of a figure of our own the second axes share the first one's scale, and its label
+    artists: list[Artist] = []
+    for place, x, name in zip(axes, (study.h, study.seconds), ("h", "seconds"), strict=False):
         for y, order, kind, fill in (
             (study.errors, study.order, "largest", COLOURS[0]),
             (study.mean_errors, study.mean_order, "mean", "white"),
         ):
             label = f"{kind}, order {order:.2f}" if np.isfinite(order) and name == "h" else kind
             shown = np.ma.masked_where(~(np.isfinite(y) & (y > 0)), y)
-            style = {"color": COLOURS[0], "markerfacecolor": fill, "linewidth": 1.2, "markersize": 5}
-            artists += ax.plot(x, shown, marker="o", label=label, **style)
+            style: dict[str, Any] = {"color": COLOURS[0], "markerfacecolor": fill, "linewidth": 1.2, "markersize": 5}
+            artists += place.plot(x, shown, marker="o", label=label, **style)
         fitted = study.fitted & np.isfinite(study.errors) & (study.errors > 0)
         if name == "h" and np.isfinite(study.order) and fitted.any():
+            # log E = log C + p log h: with the slope p known, the mean of the logarithms gives C
             middle = np.exp(np.mean(np.log(study.errors[fitted])) - study.order * np.mean(np.log(x[fitted])))
-            artists += ax.plot(x[fitted], middle * x[fitted] ** study.order, color=GREY, linewidth=3, zorder=0)
-        logarithmic(ax, study.h if name == "h" else None)
-        label_axes(ax, name, "" if own and name == "seconds" else quality)
-        legend(ax)
+            artists += place.plot(x[fitted], middle * x[fitted] ** study.order, color=GREY, linewidth=3, zorder=0)
+        logarithmic(place, study.h if name == "h" else None)
+        label_axes(place, name, "" if own and name == "seconds" else quality)
+        legend(place)
     return artists
 
 
-def perturbation(study: Any, *, ax: Any = None) -> list[Any]:
+def perturbation(study: Perturbation, *, ax: Axes | None = None) -> list[Artist]:
     """The changes of value and feedback over ε and over 1/γ in one picture, with the fitted orders.
 
     Full marks are values, rings feedbacks; the thin grey line beside the full marks has the fitted slope.
 
     Args:
-      study: what ``perturbation_study`` returned.
+      study: the result of ``perturbation_study``.
 
     Keyword Args:
       ax: matplotlib axes to draw on; ``None`` makes a figure.
@@ -68,7 +79,7 @@ def perturbation(study: Any, *, ax: Any = None) -> list[Any]:
     Raises:
       ValueError: no change is positive and finite.
     """
-    artists = []
+    artists: list[Artist] = []
     ax = axes_of(ax)
     for series, color in ((study.noise, COLOURS[0]), (study.gain, COLOURS[1])):
         if not np.any((series.errors > 0) & np.isfinite(series.errors)):
@@ -79,7 +90,7 @@ def perturbation(study: Any, *, ax: Any = None) -> list[Any]:
         ):
             shown = np.ma.masked_where(~(np.isfinite(y) & (y > 0)), y)
             label = f"{what} over {series.name}" + (f", order {order:.2f}" if np.isfinite(order) else "")
-            style = {"color": color, "markerfacecolor": fill, "linewidth": 1.2, "markersize": 5}
+            style: dict[str, Any] = {"color": color, "markerfacecolor": fill, "linewidth": 1.2, "markersize": 5}
             artists += ax.plot(series.parameters, shown, marker="o", label=label, **style)
         if np.isfinite(series.order):
             x, y = series.parameters[series.fitted], series.errors[series.fitted]

@@ -55,6 +55,7 @@ from hjbjax.zoo.stochastic import (
 )
 
 _ENTRIES = (
+    # not quite from hanging, θ = π, where both ways up are equally good and a path would have to choose
     Entry("pendulum", "swing a pendulum up and hold it upright", pendulum, start=(2.8, 0.0), duration=6.0),
     Entry(
         "double-integrator",
@@ -110,6 +111,7 @@ _ENTRIES = (
     ),
     Entry("eikonal", "the shortest way to the origin", eikonal, eikonal_exact, start=(0.8, 0.5), duration=2.0),
     Entry("dubins", "drive a car that cannot turn on the spot to a disc", dubins, start=(-1.5, 0.5, 0.0), duration=8.0),
+    # from the limit cycle, whose amplitude is 2
     Entry("van-der-pol", "quieten a Van der Pol oscillator", van_der_pol, start=(2.0, 0.0), duration=10.0),
     Entry("bang-bang", "hold a point near zero with a bounded speed", bang_bang, bang_bang_exact, start=(1.5,)),
     Entry(
@@ -132,6 +134,7 @@ _ENTRIES = (
     Entry("smooth", "a smooth nonlinear problem made for a known value", smooth, smooth_exact, start=(0.8, 0.5)),
 )
 
+# in the order in which `hjbjax list` prints them
 catalogue: dict[str, Entry] = {entry.name: entry for entry in _ENTRIES}
 
 __all__ = [

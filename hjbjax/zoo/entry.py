@@ -5,6 +5,10 @@ import inspect
 from collections.abc import Callable
 from typing import Any
 
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.zoo.ingredients import Exact, Feedback
+
 
 @dataclasses.dataclass(frozen=True)
 class Entry:
@@ -32,14 +36,14 @@ class Entry:
 
     name: str
     summary: str
-    build: Callable[..., tuple[Any, Any]]
-    exact: Callable[..., Callable] | None = None
+    build: Callable[..., tuple[Problem, Grid]]
+    exact: Callable[..., Exact] | None = None
     start: tuple[float, ...] = ()
     duration: float = 5.0
-    finish: Callable[..., tuple[Any, Any]] | None = None
+    finish: Callable[..., tuple[Problem, Feedback]] | None = None
 
     @property
-    def parameters(self) -> dict[str, Any]:
+    def parameters(self) -> dict[str, Any]:  # numbers, tuples of them, truth values or None
         """The keywords of ``build`` with their defaults."""
         return {name: argument.default for name, argument in inspect.signature(self.build).parameters.items()}
 

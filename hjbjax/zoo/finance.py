@@ -5,8 +5,6 @@
 A utility to be maximised is minus a cost.
 """
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
 
@@ -14,7 +12,8 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
 from hjbjax.problem.sets import Box
-from hjbjax.zoo.ingredients import OutsideCube, answer, positive
+from hjbjax.problem.types import Control, Number, State
+from hjbjax.zoo.ingredients import Exact, OutsideCube, Scalar, answer, positive
 
 
 @pytree_dataclass()
@@ -37,45 +36,48 @@ class Merton:
       discount: ρ.
     """
 
-    interest: Any = 0.03
-    growth: Any = 0.07
-    volatility: Any = 0.2
-    aversion: Any = 2.0
-    discount: Any = 0.05
+    interest: Number = 0.03
+    growth: Number = 0.07
+    volatility: Number = 0.2
+    aversion: Number = 2.0
+    discount: Number = 0.05
 
     def __post_init__(self):
         positive("merton", volatility=self.volatility, aversion=self.aversion, discount=self.discount)
         if not is_traced(self.aversion) and np.any(np.asarray(self.aversion) == 1):
             raise ValueError("merton: got aversion = 1 (logarithmic utility), wanted another number > 0")
 
-    def drift(self, x: Any, u: Any) -> Any:
+    def drift(self, x: State, u: Control) -> State:
         """The mean growth of the logarithm of wealth."""
         spread = u[0] * self.volatility
+        # −½π²σ² is Itô's correction of the logarithm: it makes growth concave in π, though wealth's is linear
         growth = self.interest + u[0] * (self.growth - self.interest) - u[1] - 0.5 * spread * spread
         return jnp.stack([growth])
 
-    def noise(self, x: Any, u: Any) -> Any:
+    def noise(self, x: State, u: Control) -> State:
         """πσ."""
-        return jnp.stack([u[0] * self.volatility])
+        return jnp.stack([u[0] * self.volatility])  # (n,): the diagonal of σ
 
-    def cost(self, x: Any, u: Any) -> Any:
+    def cost(self, x: State, u: Control) -> Number:
         """Minus the utility of the consumption k·e^z."""
         power = 1 - self.aversion
+        # (k·e^z)^{1−γ} by its logarithm: one exponential in place of a power of a product
         return -jnp.exp(power * (x[0] + jnp.log(u[1]))) / power
 
     @property
-    def share(self) -> Any:
+    def share(self) -> Number:
         """π*, the best share in the risky asset."""
         return (self.growth - self.interest) / (self.aversion * self.volatility * self.volatility)
 
     @property
-    def consumption(self) -> Any:
+    def consumption(self) -> Number:
         """k*, the best consumption per unit of wealth and time."""
         premium = self.growth - self.interest
+        # the riskless rate that is worth as much as the best portfolio: r + (μ−r)²/(2γσ²)
         certain = self.interest + premium * premium / (2 * self.aversion * self.volatility * self.volatility)
         return (self.discount - (1 - self.aversion) * certain) / self.aversion
 
-    def value(self, x: Any) -> Any:
+    def value(self, x: State) -> Scalar:
         """The value at one state, while the best controls are admissible and k* > 0."""
         power = 1 - self.aversion
         return -(self.consumption**-self.aversion) * jnp.exp(power * jnp.asarray(x)[0]) / power
@@ -83,11 +85,11 @@ class Merton:
 
 def merton(
     *,
-    interest: Any = 0.03,
-    growth: Any = 0.07,
-    volatility: Any = 0.2,
-    aversion: Any = 2.0,
-    discount: Any = 0.05,
+    interest: Number = 0.03,
+    growth: Number = 0.07,
+    volatility: Number = 0.2,
+    aversion: Number = 2.0,
+    discount: Number = 0.05,
     shape: tuple[int, ...] = (101,),
 ) -> tuple[Problem, Grid]:
     """Consume and invest: log-wealth on [−1, 1], share in [0, 1], consumption rate in [.01, .1].
@@ -106,7 +108,7 @@ def merton(
     problem = Problem(
         system.drift,
         system.cost,
-        Box([0.0, 0.01], [1.0, 0.1]),
+        Box([0.0, 0.01], [1.0, 0.1]),  # no short sale, no credit; at k = 0 the cost is infinite for γ > 1
         noise=system.noise,
         discount=discount,
         target=OutsideCube(1.0).level,
@@ -117,12 +119,12 @@ def merton(
 
 def merton_exact(
     *,
-    interest: Any = 0.03,
-    growth: Any = 0.07,
-    volatility: Any = 0.2,
-    aversion: Any = 2.0,
-    discount: Any = 0.05,
-) -> Any:
+    interest: Number = 0.03,
+    growth: Number = 0.07,
+    volatility: Number = 0.2,
+    aversion: Number = 2.0,
+    discount: Number = 0.05,
+) -> Exact:
     """The value as a function of log-wealth; 493.8271605 at wealth 1 with the defaults.
 
     Args:

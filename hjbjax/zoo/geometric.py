@@ -7,12 +7,15 @@ car, n trailers   the same, and θ̇_i = (v_{i−1}/d_i) sin(θ_{i−1} − θ_i
 Pomet             ẋ₁ = u₁, ẋ₂ = x₁u₂, ẋ₃ = u₂             (6.6), stabilised by a feedback of (t, x)
 """
 
-from typing import Any
+from collections.abc import Sequence
+from typing import cast
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.pytree import pytree_dataclass
+from hjbjax.problem.types import Array, Control, Number, State
 from hjbjax.zoo.ingredients import positive
 
 
@@ -26,14 +29,15 @@ class OneWay:
       speed: s in ẋ₂ = s x₁²; negative for the system run backwards.
     """
 
-    speed: Any = 1.0
+    speed: Number = 1.0
 
-    def drift(self, x: Any, u: Any) -> Any:
+    def drift(self, x: State, u: Control) -> State:
         """(u, s x₁²)."""
         return jnp.stack([u[0], self.speed * x[0] * x[0]])
 
-    def frontier(self, x: Any) -> Any:
+    def frontier(self, x: State) -> Number:
         """x₂ − s|x₁|³/3: ≥ 0 where the origin's forward set is, for s > 0 and |u| ≤ 1."""
+        # x₂ = s∫x₁² dt along x₁ that runs straight to its end at |u| = 1, which gathers the least
         return x[1] - self.speed * jnp.abs(x[0]) ** 3 / 3
 
 
@@ -44,11 +48,11 @@ class Angle:
     The outputs tell apart states that are near to each other, and no two that are 2π apart.
     """
 
-    def drift(self, x: Any, u: Any) -> Any:
+    def drift(self, x: State, u: Control) -> State:
         """u."""
         return jnp.stack([u[0]])
 
-    def output(self, x: Any) -> Any:
+    def output(self, x: State) -> jax.Array:
         """(cos x, sin x)."""
         return jnp.stack([jnp.cos(x[0]), jnp.sin(x[0])])
 
@@ -57,8 +61,9 @@ class Angle:
 class Unicycle:
     """A wheel that rolls and turns on the spot but does not slip, state (x, y, θ), control (forward, turn)."""
 
-    def drift(self, x: Any, u: Any) -> Any:
+    def drift(self, x: State, u: Control) -> State:
         """(u₁ cos θ, u₁ sin θ, u₂)."""
+        # along the heading alone: the velocity across it is what a wheel that does not slip forbids
         return jnp.stack([u[0] * jnp.cos(x[2]), u[0] * jnp.sin(x[2]), u[1]])
 
 
@@ -75,24 +80,29 @@ class CarWithTrailers:
     """
 
     trailers: int = 1
-    lengths: Any = 1.0
+    lengths: Number | Sequence[Number] | Array = 1.0
 
     def __post_init__(self):
         if isinstance(self.trailers, bool) or not isinstance(self.trailers, int) or self.trailers < 1:
             raise ValueError(f"CarWithTrailers: got trailers = {self.trailers!r}, wanted a positive integer")
-        if np.ndim(self.lengths) == 0:
+        if np.ndim(cast(Array, self.lengths)) == 0:
             object.__setattr__(self, "lengths", (self.lengths,) * self.trailers)
-        if len(self.lengths) != self.trailers:
-            raise ValueError(f"CarWithTrailers.lengths: got {len(self.lengths)} numbers, wanted {self.trailers}")
+        if len(self._lengths) != self.trailers:
+            raise ValueError(f"CarWithTrailers.lengths: got {len(self._lengths)} numbers, wanted {self.trailers}")
         positive("CarWithTrailers", lengths=self.lengths)
 
-    def drift(self, x: Any, u: Any) -> Any:
+    @property
+    def _lengths(self) -> Sequence[Number]:
+        return cast(Sequence[Number], self.lengths)  # one number has become n of them in __post_init__
+
+    def drift(self, x: State, u: Control) -> State:
         """(u₁ cos θ₀, u₁ sin θ₀, u₂, (v_{i−1}/d_i) sin(θ_{i−1} − θ_i), …)."""
+        # the speed is the car's, and in the loop that of the axle before trailer i
         speed, rates = u[0], [u[0] * jnp.cos(x[2]), u[0] * jnp.sin(x[2]), u[1]]
         for i in range(self.trailers):
-            bend = x[2 + i] - x[3 + i]
-            rates.append(speed * jnp.sin(bend) / self.lengths[i])
-            speed = speed * jnp.cos(bend)
+            bend = x[2 + i] - x[3 + i]  # between the axle before and trailer i
+            rates.append(speed * jnp.sin(bend) / self._lengths[i])  # the part across the trailer turns it
+            speed = speed * jnp.cos(bend)  # the part along it pulls
         return jnp.stack(rates)
 
 
@@ -103,26 +113,27 @@ class Pomet:
     The state decays only like t^(−1/2).
     """
 
-    def drift(self, x: Any, u: Any) -> Any:
+    def drift(self, x: State, u: Control) -> State:
         """(6.6): (u₁, x₁u₂, u₂)."""
         return jnp.stack([u[0], x[0] * u[1], u[1]])
 
-    def feedback(self, t: Any, x: Any) -> Any:
+    def feedback(self, t: Number, x: State) -> Control:
         """(6.7): (x₂ sin t − z, −z x₁ cos t − (x₁x₂ + x₃)) with z = x₁ + x₂ cos t; for ``time_varying=True``."""
         z = x[0] + x[1] * jnp.cos(t)
         return jnp.stack([x[1] * jnp.sin(t) - z, -z * x[0] * jnp.cos(t) - (x[0] * x[1] + x[2])])
 
-    def closed_loop(self, t: Any, x: Any) -> Any:
+    def closed_loop(self, t: Number, x: State) -> State:
         """The drift under the feedback."""
         return self.drift(x, self.feedback(t, x))
 
-    def lyapunov(self, t: Any, x: Any) -> Any:
+    def lyapunov(self, t: Number, x: State) -> Number:
         """(6.8): V = ½(x₁ + x₂ cos t)² + ½x₂² + ½x₃²."""
         z = x[0] + x[1] * jnp.cos(t)
         return 0.5 * (z * z + x[1] * x[1] + x[2] * x[2])
 
-    def lyapunov_rate(self, t: Any, x: Any) -> Any:
+    def lyapunov_rate(self, t: Number, x: State) -> Number:
         """dV/dt along the closed loop, in closed form: −z² − (x₁x₂ + x₃ + x₁ z cos t)²."""
         z = x[0] + x[1] * jnp.cos(t)
+        # two squares: the rate is never positive, and vanishes on more than the origin
         rest = x[0] * x[1] + x[2] + x[0] * z * jnp.cos(t)
         return -z * z - rest * rest

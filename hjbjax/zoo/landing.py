@@ -10,8 +10,6 @@ than v₁ crashes. On a grid the value is held there, at the number that the sam
 the edge of that region where its burn begins, so the value elsewhere does not change.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
@@ -19,7 +17,8 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Box
-from hjbjax.zoo.ingredients import answer, positive
+from hjbjax.problem.types import Control, Number, State
+from hjbjax.zoo.ingredients import Exact, Feedback, Scalar, answer, positive
 
 NEWTON = 6  # steps for the square root of E, which is nearly linear in q: quadratic from the first on
 EXACT = 2  # of them, the last ones, carry derivatives: the first and the second
@@ -39,82 +38,87 @@ class Lander:
       0.4102
     """
 
-    thrust: Any = 2.0
-    consumption: Any = 0.3
-    gravity: Any = 1.0
+    thrust: Number = 2.0
+    consumption: Number = 0.3
+    gravity: Number = 1.0
 
     def __post_init__(self):
         positive("Lander", thrust=self.thrust, consumption=self.consumption, gravity=self.gravity)
 
-    def drift(self, x: Any, u: Any) -> Any:
+    def drift(self, x: State, u: Control) -> State:
         """(v, −g + u/m, −ku)."""
         return jnp.stack([x[1], -self.gravity + u[0] / x[2], -self.consumption * u[0]])
 
-    def fuel_rate(self, x: Any, u: Any) -> Any:
+    def fuel_rate(self, x: State, u: Control) -> Number:
         """ku, mass per unit of time."""
         return self.consumption * u[0]
 
-    def _begin(self, q: Any, mass: Any) -> tuple[Any, Any, Any]:
+    def _ignition_point(self, q: Number, mass: Number) -> tuple[Number, Number, Number]:
         """Duration, first velocity and first height of the burn that leaves the share e^{−q} of a mass."""
         left, k = jnp.exp(-q), self.consumption
         duration = mass * (1 - left) / (k * self.thrust)
         velocity = self.gravity * duration - q / k
+        # ∫(τ − s)·U/m(s) ds: what thrust alone would lift the rocket by, from rest
         climbed = mass * (1 - left * (1 + q)) / (k * k * self.thrust)
         return duration, velocity, -velocity * duration + 0.5 * self.gravity * duration * duration - climbed
 
-    def _ratio(self, x: Any) -> Any:
+    def _log_ratio(self, x: State) -> Number:
         """q; zero at rest on the ground."""
         height, velocity, mass = x[0], x[1], x[2]
         energy = 0.5 * velocity * velocity + self.gravity * height
         resting = energy <= 0
-        energy = jnp.where(resting, 1.0, energy)
+        energy = jnp.where(resting, 1.0, energy)  # √0 has no derivative, and the branch not taken is differentiated too
         pull = self.thrust / mass
-        # with a constant mass E = v²/2 · U/(U − gm), and a lighter rocket needs less
+        # with a constant mass E = v²/2 · U/(U − gm), and a lighter rocket needs less; where full thrust hardly holds
+        # its weight the divisor stays a tenth of the thrust, or the first guess would be infinite
         q = self.consumption * jnp.sqrt(2 * energy * pull / jnp.maximum(pull - self.gravity, 0.1 * pull))
-        for step in range(NEWTON):
+        for step in range(NEWTON):  # a fixed number: a loop until convergence would have no reverse derivative
             if step == NEWTON - EXACT:
+                # at the solution one step of Newton's carries the implicit function's derivative, a second the next one
                 q = jax.lax.stop_gradient(q)
-            duration, first, start = self._begin(q, mass)
+            duration, first, start = self._ignition_point(q, mass)
             needed = 0.5 * first * first + self.gravity * start
             # ∂E/∂q = v₁ ∂v₁/∂q + g ∂h₁/∂q
+            # ∂τ/∂q, ∂v₁/∂q and ∂h₁/∂q in turn
             longer = mass * jnp.exp(-q) / (self.consumption * self.thrust)
             faster = self.gravity * longer - 1 / self.consumption
             higher = (
                 -faster * duration - first * longer + self.gravity * duration * longer - q * longer / self.consumption
             )
             slope = first * faster + self.gravity * higher
-            # Newton's step for √needed − √energy
+            # Newton's step for √needed − √energy, times √needed above and below: √E is nearly linear in q, E is not
             q = q - 2 * (needed - jnp.sqrt(needed * energy)) / slope
         return jnp.where(resting, 0.0, q)
 
-    def fuel(self, x: Any) -> Any:
-        """The least fuel to land, m(1 − e^{−q}); of a rocket that falls too fast what the formula gives."""
+    def fuel(self, x: State) -> Scalar:
+        """The least fuel to land, m(1 − e^{−q}); for a rocket that falls too fast the number that the formula gives."""
         x = jnp.asarray(x)
-        return x[2] * (1 - jnp.exp(-self._ratio(x)))
+        return x[2] * (1 - jnp.exp(-self._log_ratio(x)))
 
-    def margin(self, x: Any) -> Any:
+    def margin(self, x: State) -> Number:
         """v − v₁: how much faster it may yet fall; 0 where the burn has to begin, below it crashes."""
-        return x[1] - self._begin(self._ratio(x), x[2])[1]
+        return x[1] - self._ignition_point(self._log_ratio(x), x[2])[1]
 
-    def sinking(self, x: Any) -> Any:
+    def sinking(self, x: State) -> Number:
         """−v: 0 where the rocket stands still, at the end of the burn."""
         return -x[1]
 
-    def burn(self, x: Any) -> Any:
+    def burn(self, x: State) -> Control:
         """Full thrust."""
-        return jnp.full(1, self.thrust, jnp.result_type(x))
+        return jnp.full(1, self.thrust, jnp.result_type(x))  # in the state's precision
 
-    def ignition(self, x: Any) -> tuple[Any, Any]:
+    def ignition(self, x: State) -> tuple[Number, Number]:
         """When the engine starts, and how long it burns."""
         x = jnp.asarray(x)
-        return self.margin(x) / self.gravity, self._begin(self._ratio(x), x[2])[0]
+        # a coast changes v at the rate −g, and neither mass nor energy, so that v₁ waits where it is
+        return self.margin(x) / self.gravity, self._ignition_point(self._log_ratio(x), x[2])[0]
 
 
 def moon_landing(
     *,
-    thrust: Any = 2.0,
-    consumption: Any = 0.3,
-    gravity: Any = 1.0,
+    thrust: Number = 2.0,
+    consumption: Number = 0.3,
+    gravity: Number = 1.0,
     shape: tuple[int, ...] = (41, 51, 9),
 ) -> tuple[Problem, Grid]:
     """Land on the Moon with the least fuel, on [0, 1.5] × [−2, 0.5] × [0.3, 1]; 0 ≤ u ≤ thrust.
@@ -134,14 +138,16 @@ def moon_landing(
     problem = Problem(
         lander.drift,
         lander.fuel_rate,
-        Box([0.0], [thrust]),
+        Box([0.0], [thrust]),  # all between as well: that none or all is best, the solver has to find
         target=lander.margin,
         exit_cost=answer(lander.fuel),
     )
     return problem, Grid([0.0, -2.0, 0.3], [1.5, 0.5, 1.0], shape, names=("height", "velocity", "mass"))
 
 
-def moon_landing_burn(*, thrust: Any = 2.0, consumption: Any = 0.3, gravity: Any = 1.0) -> tuple[Problem, Any]:
+def moon_landing_burn(
+    *, thrust: Number = 2.0, consumption: Number = 0.3, gravity: Number = 1.0
+) -> tuple[Problem, Feedback]:
     """The burn that follows where the grid's problem ends: full thrust until the rocket stands, on the ground.
 
     Args:
@@ -157,7 +163,7 @@ def moon_landing_burn(*, thrust: Any = 2.0, consumption: Any = 0.3, gravity: Any
     return problem, answer(lander.burn)
 
 
-def moon_landing_exact(*, thrust: Any = 2.0, consumption: Any = 0.3, gravity: Any = 1.0) -> Any:
+def moon_landing_exact(*, thrust: Number = 2.0, consumption: Number = 0.3, gravity: Number = 1.0) -> Exact:
     """m(1 − e^{−q}), with q of the burn that takes away the energy ½v² + gh.
 
     Args:

@@ -8,8 +8,6 @@ A discount β acts on the quadratic part like the drift A − ½βI. The answers
 is left, compare on its inner half, unless the problem holds its ends at the exact value.
 """
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
 
@@ -17,7 +15,18 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
 from hjbjax.problem.sets import Box
-from hjbjax.zoo.ingredients import Disc, OutsideCube, QuadraticCost, QuadraticValue, answer, noise_or_none, positive
+from hjbjax.problem.types import Control, Disturbance, Number, State
+from hjbjax.zoo.ingredients import (
+    Disc,
+    Exact,
+    OutsideCube,
+    QuadraticCost,
+    QuadraticValue,
+    Scalar,
+    answer,
+    noise_or_none,
+    positive,
+)
 from hjbjax.zoo.minimum_time import DoubleIntegrator
 
 
@@ -29,13 +38,13 @@ class LinearScalar:
       rate: a, per unit time.
     """
 
-    rate: Any = 0.0
+    rate: Number = 0.0
 
-    def drift(self, x: Any, u: Any) -> Any:
+    def drift(self, x: State, u: Control) -> State:
         """ax + u."""
         return self.rate * x + u
 
-    def contested_drift(self, x: Any, u: Any, d: Any) -> Any:
+    def contested_drift(self, x: State, u: Control, d: Disturbance) -> State:
         """ax + u + d."""
         return self.rate * x + u + d
 
@@ -44,10 +53,11 @@ class LinearScalar:
 class GameCost:
     """The cost x² + u² − γ²d² of the attenuation level γ."""
 
-    gamma: Any
+    gamma: Number
 
-    def rate(self, x: Any, u: Any, d: Any) -> Any:
+    def rate(self, x: State, u: Control, d: Disturbance) -> Number:
         """Cost per unit time."""
+        # what the disturbance spends is counted against it: V is finite if and only if the gain is below γ
         return jnp.sum(x * x) + jnp.sum(u * u) - self.gamma * self.gamma * jnp.sum(d * d)
 
 
@@ -63,21 +73,23 @@ class ScalarQuadratic:
       noise: σ.
     """
 
-    state: Any
-    weight: Any
-    rate: Any
-    discount: Any
-    noise: Any = 0.0
+    state: Number
+    weight: Number
+    rate: Number
+    discount: Number
+    noise: Number = 0.0
 
     @property
-    def curvature(self) -> Any:
+    def curvature(self) -> Scalar:
         """The root p, written so that it stays finite where the weight vanishes."""
         shifted = self.rate - 0.5 * self.discount
+        # q/(√(s² + wq) − s) in place of (√(s² + wq) + s)/w: the game's weight 1 − γ⁻² is zero at γ = 1
         return self.state / (jnp.sqrt(shifted * shifted + self.weight * self.state) - shifted)
 
-    def value(self, x: Any) -> Any:
+    def value(self, x: State) -> Scalar:
         """The value at one state."""
         x, p = jnp.asarray(x), self.curvature
+        # no divisor is ever zero: derivatives pass through both branches of a where, and 0/0 makes them NaN
         beta = jnp.where(self.discount == 0, 1.0, self.discount)
         constant = jnp.where(jnp.asarray(self.noise) == 0, 0.0, self.noise * self.noise * p / beta)
         return p * jnp.sum(x * x) + constant
@@ -85,11 +97,11 @@ class ScalarQuadratic:
 
 def double_integrator_lq(
     *,
-    mass: Any = 1.0,
-    control_weight: Any = 1.0,
-    noise: Any = 0.0,
-    discount: Any = 0.0,
-    bound: Any = 8.0,
+    mass: Number = 1.0,
+    control_weight: Number = 1.0,
+    noise: Number = 0.0,
+    discount: Number = 0.0,
+    bound: Number = 8.0,
     shape: tuple[int, ...] = (101, 101),
 ) -> tuple[Problem, Grid]:
     """Bring a mass to rest at the cost |x|² + r u², on [−2, 2]²; the bound on u is there to be slack.
@@ -107,7 +119,7 @@ def double_integrator_lq(
     problem = Problem(
         DoubleIntegrator(mass).drift,
         QuadraticCost(1.0, control_weight).rate,
-        Box([-bound], [bound]),
+        Box([-bound], [bound]),  # with the defaults the best force is −x₁ − √3x₂, at most 5.5 on the box
         noise=noise_or_none(noise),
         discount=discount,
     )
@@ -116,7 +128,7 @@ def double_integrator_lq(
 
 def double_integrator_lq_exact(
     *, mass: float = 1.0, control_weight: float = 1.0, noise: float = 0.0, discount: float = 0.0, bound: float = 8.0
-) -> Any:
+) -> Exact:
     """x'Px + σ² tr(P)/β on the whole plane while the bound is slack, by SciPy's Riccati solver; host level.
 
     With the defaults P = [[√3, 1], [1, √3]].
@@ -130,10 +142,10 @@ def double_integrator_lq_exact(
     """
     from scipy.linalg import solve_continuous_are
 
-    a = np.array([[0.0, 1.0], [0.0, 0.0]]) - 0.5 * discount * np.eye(2)
+    a = np.array([[0.0, 1.0], [0.0, 0.0]]) - 0.5 * discount * np.eye(2)  # SciPy's equation knows no discount
     b = np.array([[0.0], [1.0 / mass]])
     matrix = solve_continuous_are(a, b, np.eye(2), control_weight * np.eye(1))
-    constant = 0.0
+    constant = 0.0  # of V = x'Px + c the noise changes c alone: ½ tr(σσ'·2P) = βc
     if noise:
         positive("double_integrator_lq with noise", discount=discount)
         constant = noise**2 * np.trace(matrix) / discount
@@ -142,12 +154,12 @@ def double_integrator_lq_exact(
 
 def stochastic_lq(
     *,
-    rate: Any = 0.0,
-    state_weight: Any = 1.0,
-    control_weight: Any = 1.0,
-    noise: Any = 1.0,
-    discount: Any = 1.0,
-    bound: Any = 8.0,
+    rate: Number = 0.0,
+    state_weight: Number = 1.0,
+    control_weight: Number = 1.0,
+    noise: Number = 1.0,
+    discount: Number = 1.0,
+    bound: Number = 8.0,
     shape: tuple[int, ...] = (201,),
 ) -> tuple[Problem, Grid]:
     """Hold dx = (ax + u)dt + σ dw near zero at the cost qx² + ru², on [−2, 2].
@@ -169,7 +181,7 @@ def stochastic_lq(
     problem = Problem(
         LinearScalar(rate).drift,
         QuadraticCost(state_weight, control_weight).rate,
-        Box([-bound], [bound]),
+        Box([-bound], [bound]),  # with the defaults |u| = p|x| is at most 1.3
         noise=noise_or_none(noise),
         discount=discount,
         target=OutsideCube(2.0).level,
@@ -180,13 +192,13 @@ def stochastic_lq(
 
 def stochastic_lq_exact(
     *,
-    rate: Any = 0.0,
-    state_weight: Any = 1.0,
-    control_weight: Any = 1.0,
-    noise: Any = 1.0,
-    discount: Any = 1.0,
-    bound: Any = 8.0,
-) -> Any:
+    rate: Number = 0.0,
+    state_weight: Number = 1.0,
+    control_weight: Number = 1.0,
+    noise: Number = 1.0,
+    discount: Number = 1.0,
+    bound: Number = 8.0,
+) -> Exact:
     """px² + σ²p/β while the bound is slack; with the defaults p = (√5 − 1)/2.
 
     Args:
@@ -203,10 +215,10 @@ def stochastic_lq_exact(
 
 def lq_game(
     *,
-    gamma: Any = 2.0,
-    rate: Any = 0.0,
-    discount: Any = 0.0,
-    bound: Any = 4.0,
+    gamma: Number = 2.0,
+    rate: Number = 0.0,
+    discount: Number = 0.0,
+    bound: Number = 4.0,
     shape: tuple[int, ...] = (201,),
 ) -> tuple[Problem, Grid]:
     """Attenuate a disturbance to the level γ: ẋ = ax + u + d, cost x² + u² − γ²d², on [−1, 1].
@@ -223,15 +235,15 @@ def lq_game(
     problem = Problem(
         LinearScalar(rate).contested_drift,
         GameCost(gamma).rate,
-        Box([-bound], [bound]),
+        Box([-bound], [bound]),  # with the defaults u = −px and d = px/γ² are at most 1.2 and .3
         disturbances=Box([-bound], [bound]),
         discount=discount,
-        target=Disc(0.0, 1).level,
+        target=Disc(0.0, 1).level,  # the node at the origin alone
     )
     return problem, Grid([-1.0], [1.0], shape, names=("x",))
 
 
-def lq_game_exact(*, gamma: Any = 2.0, rate: Any = 0.0, discount: Any = 0.0, bound: Any = 4.0) -> Any:
+def lq_game_exact(*, gamma: Number = 2.0, rate: Number = 0.0, discount: Number = 0.0, bound: Number = 4.0) -> Exact:
     """px² with p = 1/(√(α² + 1 − γ⁻²) − α), α = a − β/2; with the defaults p = 2/√3.
 
     Args:
@@ -246,6 +258,7 @@ def lq_game_exact(*, gamma: Any = 2.0, rate: Any = 0.0, discount: Any = 0.0, bou
     positive("lq_game", gamma=gamma)
     if not is_traced(gamma, rate, discount):
         shifted, weight = rate - 0.5 * discount, 1 - gamma**-2
+        # no real root, or one that does not stabilise: the Riccati equation loses its solution at this level
         if shifted**2 + weight < 0 or (weight <= 0 and shifted >= 0):
             raise ValueError(
                 f"lq_game_exact: got gamma = {gamma:g}, wanted a level above the least attainable one "

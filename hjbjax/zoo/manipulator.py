@@ -16,7 +16,8 @@ which a solver can evaluate on a whole grid without forming a matrix a node.
 """
 
 import math
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import TypeAlias, cast
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +27,10 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, pytree_dataclass
 from hjbjax.problem.sets import Box
+from hjbjax.problem.types import Array, Control, Number, State
 from hjbjax.zoo.ingredients import QuadraticCost, positive
+
+Joints: TypeAlias = Sequence[Number] | Array  # one number a joint: a vector, or a list of scalars
 
 
 @pytree_dataclass(static=("links",))
@@ -48,9 +52,9 @@ class Manipulator:
     """
 
     links: int = 1
-    lengths: Any = None
-    masses: Any = None
-    g: Any = 9.81
+    lengths: Number | Joints | None = None
+    masses: Number | Joints | None = None
+    g: Number = 9.81
 
     def __post_init__(self):
         if isinstance(self.links, bool) or not isinstance(self.links, int) or self.links < 1:
@@ -65,55 +69,65 @@ class Manipulator:
                 raise ValueError(f"Manipulator.{name}: got {len(numbers)} numbers, wanted {self.links}: one a link")
             positive("Manipulator", **{name: getattr(self, name)})
 
-    def kinetic_energy(self, q: Any, w: Any) -> Any:
+    @property
+    def _lengths(self) -> Joints:
+        return cast(Joints, self.lengths)  # one number, or none, has become n of them in __post_init__
+
+    @property
+    def _masses(self) -> Joints:
+        return cast(Joints, self.masses)
+
+    def kinetic_energy(self, q: Joints, w: Joints) -> Number:
         """T(q, w), of vectors or lists of n scalars."""
-        total: Any = 0.0
-        angle: Any = 0.0
-        rate: Any = 0.0
-        across: Any = 0.0
-        up: Any = 0.0
+        total: Number = 0.0
+        angle: Number = 0.0
+        rate: Number = 0.0
+        across: Number = 0.0
+        up: Number = 0.0
         for i in range(self.links):
+            # joint angles are relative, so they add up from joint to joint, and so do the velocities (across, up)
             angle, rate = angle + q[i], rate + w[i]
-            across = across + self.lengths[i] * jnp.cos(angle) * rate
-            up = up - self.lengths[i] * jnp.sin(angle) * rate
-            total = total + 0.5 * self.masses[i] * (across * across + up * up)
+            across = across + self._lengths[i] * jnp.cos(angle) * rate
+            up = up - self._lengths[i] * jnp.sin(angle) * rate
+            total = total + 0.5 * self._masses[i] * (across * across + up * up)
         return total
 
-    def potential_energy(self, q: Any) -> Any:
+    def potential_energy(self, q: Joints) -> Number:
         """U(q), zero at the height of the first joint."""
-        total: Any = 0.0
-        angle: Any = 0.0
-        height: Any = 0.0
+        total: Number = 0.0
+        angle: Number = 0.0
+        height: Number = 0.0
         for i in range(self.links):
             angle = angle + q[i]
-            height = height + self.lengths[i] * jnp.cos(angle)
-            total = total + self.masses[i] * self.g * height
+            height = height + self._lengths[i] * jnp.cos(angle)
+            total = total + self._masses[i] * self.g * height
         return total
 
-    def energy(self, x: Any) -> Any:
+    def energy(self, x: State) -> Number:
         """T + U at the state x = (q, w): constant without torque, and dE/dt = w·τ with it."""
         return self.kinetic_energy(x[: self.links], x[self.links :]) + self.potential_energy(x)
 
-    def mass_matrix(self, q: Any) -> Any:
+    def mass_matrix(self, q: Joints) -> jax.Array:
         """M(q), shape (n, n), symmetric and positive definite."""
         columns = self._mass(_scalars(q, self.links))
         return jnp.stack([jnp.stack(column) for column in columns])
 
-    def coriolis(self, q: Any, w: Any) -> Any:
+    def coriolis(self, q: Joints, w: Joints) -> jax.Array:
         """V(q, w), shape (n,): the centrifugal and Coriolis torques."""
         return jnp.stack(self._coriolis(_scalars(q, self.links), _scalars(w, self.links)))
 
-    def coriolis_matrix(self, q: Any, w: Any) -> Any:
+    def coriolis_matrix(self, q: Joints, w: Joints) -> jax.Array:
         """C(q, w) of Christoffel's symbols, shape (n, n): C w is ``coriolis``, and Ṁ − 2C is skew."""
+        # (i, j, k); the swaps below put ∂M_ik/∂q_j and ∂M_jk/∂q_i at that place
         slopes = jax.jacfwd(self.mass_matrix)(jnp.stack(_scalars(q, self.links)))  # ∂M_ij/∂q_k
         symbols = slopes + slopes.swapaxes(1, 2) - slopes.transpose(2, 1, 0)
         return 0.5 * symbols @ jnp.stack(_scalars(w, self.links))
 
-    def gravity(self, q: Any) -> Any:
+    def gravity(self, q: Joints) -> jax.Array:
         """G(q), shape (n,)."""
         return jnp.stack(self._gravity(_scalars(q, self.links)))
 
-    def computed_torque(self, q: Any, w: Any, acceleration: Any) -> Any:
+    def computed_torque(self, q: Joints, w: Joints, acceleration: Joints) -> Control:
         """(5.6), the torque M τ' + V + G under which q̈ is the acceleration τ', shape (n,).
 
         Example:
@@ -125,10 +139,13 @@ class Manipulator:
         """
         n = self.links
         angles, rates, wanted = (_scalars(vector, n) for vector in (q, w, acceleration))
+        # sums of scalars and no matrix product, which a solver could not take apart into components
         matrix, bias, weight = self._mass(angles), self._coriolis(angles, rates), self._gravity(angles)
         return jnp.stack([sum(matrix[i][j] * wanted[j] for j in range(n)) + bias[i] + weight[i] for i in range(n)])
 
-    def tracking(self, reference: Any = None, damping: Any = 3.0, stiffness: Any = 2.0) -> Any:
+    def tracking(
+        self, reference: Callable[[Number], State] | None = None, damping: Number = 3.0, stiffness: Number = 2.0
+    ) -> Callable[..., Control]:
         """A feedback for ``simulate`` by computed torque: q̈ = q̈* − damping·(w − q̇*) − stiffness·(q − q*).
 
         Args:
@@ -137,11 +154,12 @@ class Manipulator:
           damping: per unit of time.
           stiffness: per unit of time squared.
         """
+        # Partials, so that the arm's numbers and the gains are leaves: another mass recompiles no simulation
         if reference is None:
             return jax.tree_util.Partial(_hold_upright, self, damping, stiffness)
         return jax.tree_util.Partial(_track, self, damping, stiffness, as_partial(reference, "Manipulator.tracking"))
 
-    def drift(self, x: Any, tau: Any) -> Any:
+    def drift(self, x: State, tau: Control) -> State:
         """(w, M⁻¹(τ − V − G))."""
         n = self.links
         numbers = _scalars(x, 2 * n)
@@ -150,31 +168,46 @@ class Manipulator:
         rest = [tau[i] - bias[i] - weight[i] for i in range(n)]
         return jnp.stack([*w, *_solve_positive(self._mass(q), rest)])
 
-    def _mass(self, q: list) -> list[list]:
+    def _mass(self, q: list[jax.Array]) -> list[list[jax.Array]]:
+        """The columns of M(q)."""
         # T is quadratic in w, so its gradient at the unit vector e_j is the column j of M.
         zero, one = jnp.zeros((), q[0].dtype), jnp.ones((), q[0].dtype)
         units = ([one if i == j else zero for i in range(self.links)] for j in range(self.links))
         return [jax.grad(self.kinetic_energy, argnums=1)(q, unit) for unit in units]
 
-    def _coriolis(self, q: list, w: list) -> list:
-        def momentum(angles):
+    def _coriolis(self, q: list[jax.Array], w: list[jax.Array]) -> list[jax.Array]:
+        """V(q, w), one torque a joint."""
+
+        def momentum(angles: list[jax.Array]) -> list[jax.Array]:
             return jax.grad(self.kinetic_energy, argnums=1)(angles, w)
 
+        # (∂/∂q ∂T/∂w) w is a derivative along w, so one forward pass gives it without the matrix
         _, change = jax.jvp(momentum, (q,), (w,))
         pull = jax.grad(self.kinetic_energy, argnums=0)(q, w)
         return [change[i] - pull[i] for i in range(self.links)]
 
-    def _gravity(self, q: list) -> list:
+    def _gravity(self, q: list[jax.Array]) -> list[jax.Array]:
+        """G(q), one torque a joint."""
         return jax.grad(self.potential_energy)(q)
 
 
-def _hold_upright(arm, damping, stiffness, x):
+def _hold_upright(arm: Manipulator, damping: Number, stiffness: Number, x: State) -> Control:
+    """The torque under which every joint is a damped spring around upright."""
     q, w = x[: arm.links], x[arm.links :]
     return arm.computed_torque(q, w, -damping * w - stiffness * q)
 
 
-def _track(arm, damping, stiffness, reference, t, x):
-    def rate(time):
+def _track(
+    arm: Manipulator,
+    damping: Number,
+    stiffness: Number,
+    reference: Callable[[Number], State],
+    t: Number,
+    x: State,
+) -> Control:
+    """The torque under which the error from the reference is a damped spring in every joint."""
+
+    def rate(time: Number) -> State:  # q̇*; forward mode, since time is one number and q* may be many
         return jax.jvp(reference, (time,), (jnp.ones_like(time),))[1]
 
     q, w = x[: arm.links], x[arm.links :]
@@ -183,14 +216,17 @@ def _track(arm, damping, stiffness, reference, t, x):
     return arm.computed_torque(q, w, wanted)
 
 
-def _scalars(vector: Any, count: int) -> list:
+def _scalars(vector: Joints, count: int) -> list[jax.Array]:
+    """The first entries of a vector, each for itself."""
     vector = jnp.asarray(vector)
+    # angles written as integers have no derivative: jax.grad would refuse them
     vector = vector if jnp.issubdtype(vector.dtype, jnp.inexact) else vector.astype(float)
     return [vector[i] for i in range(count)]
 
 
-def _solve_positive(matrix: list[list], rest: list) -> list:
+def _solve_positive(matrix: list[list[jax.Array]], rest: list[jax.Array]) -> list[jax.Array]:
     """The solution of a symmetric positive definite system by elimination without pivoting, on scalars."""
+    # positive pivots come by themselves, so no order has to be chosen by values, which differ from node to node
     n, matrix, rest = len(rest), [list(row) for row in matrix], list(rest)
     for k in range(n):
         for i in range(k + 1, n):
@@ -208,11 +244,11 @@ def _solve_positive(matrix: list[list], rest: list) -> list:
 def manipulator(
     *,
     links: int = 1,
-    lengths: Any = None,
-    masses: Any = None,
-    g: Any = 9.81,
-    torque: Any = 30.0,
-    discount: Any = 0.0,
+    lengths: Number | Joints | None = None,
+    masses: Number | Joints | None = None,
+    g: Number = 9.81,
+    torque: Number = 30.0,
+    discount: Number = 0.0,
     shape: tuple[int, ...] | None = None,
 ) -> tuple[Problem, Grid]:
     """Raise an arm and hold it upright, at the cost ½(|x|² + |τ|²).
@@ -232,7 +268,7 @@ def manipulator(
         60 and 61 with one link, 20 and 21 with more.
     """
     system = Manipulator(links=links, lengths=lengths, masses=masses, g=g)
-    if shape is None:
+    if shape is None:  # an even number of angles has a node upright, an odd number of velocities one at rest
         shape = (60, 61) if links == 1 else (20,) * links + (21,) * links
     controls = Box([-torque] * links, [torque] * links)
     problem = Problem(system.drift, QuadraticCost(0.5, 0.5).rate, controls, discount=discount)

@@ -6,15 +6,14 @@ With f₀ the drift at u = 0, the choice q = βV − f₀·DV + ¼c²V₂² make
 linear-quadratic problem is no such test: schemes that limit slopes are exact on a quadratic.
 """
 
-from typing import Any
-
 import jax.numpy as jnp
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Box
-from hjbjax.zoo.ingredients import answer
+from hjbjax.problem.types import Control, Number, State
+from hjbjax.zoo.ingredients import Exact, Scalar, answer
 
 
 @pytree_dataclass()
@@ -25,37 +24,38 @@ class Smooth:
       discount: β.
     """
 
-    discount: Any = 0.5
+    discount: Number = 0.5
 
-    def drift(self, x: Any, u: Any) -> Any:
+    def drift(self, x: State, u: Control) -> State:
         """The drift above."""
-        gain = self.gain(x)
+        gain = self.gain(x)  # between 1 and 3: the control acts at every state
         return jnp.stack([x[1] - x[0], -0.5 * x[0] - 0.5 * x[1] * (1 - gain * gain) + gain * u[0]])
 
-    def gain(self, x: Any) -> Any:
+    def gain(self, x: State) -> Number:
         """The input gain c = 2 + cos 2x₁."""
         return 2 + jnp.cos(2 * x[0])
 
-    def cost(self, x: Any, u: Any) -> Any:
+    def cost(self, x: State, u: Control) -> Number:
         """The cost q(x) + u² that makes V the value."""
         free, slope = self.drift(x, jnp.zeros_like(u)), self.slope(x)
+        # u² + c V₂ u is least at u = −½cV₂ and −¼c²V₂² there, which the cost has to make up for
         best = self.gain(x) * slope[1]
         return (
             self.discount * self.value(x) - (free[0] * slope[0] + free[1] * slope[1]) + 0.25 * best * best + u[0] * u[0]
         )
 
-    def value(self, x: Any) -> Any:
+    def value(self, x: State) -> Scalar:
         """The chosen value."""
         x = jnp.asarray(x)
         product = x[0] * x[1]
         return jnp.cosh(x[0]) - 1 + x[1] * x[1] + 0.25 * product * product
 
-    def slope(self, x: Any) -> Any:
+    def slope(self, x: State) -> tuple[Scalar, Scalar]:
         """DV, the two derivatives of the value."""
         return jnp.sinh(x[0]) + 0.5 * x[0] * x[1] * x[1], 2 * x[1] + 0.5 * x[0] * x[0] * x[1]
 
 
-def smooth(*, discount: Any = 0.5, shape: tuple[int, ...] = (81, 81)) -> tuple[Problem, Grid]:
+def smooth(*, discount: Number = 0.5, shape: tuple[int, ...] = (81, 81)) -> tuple[Problem, Grid]:
     """A smooth nonlinear problem on [−1, 1]² whose value is known; compare on |x₁| ≤ .5, |x₂| ≤ .45.
 
     Args:
@@ -63,10 +63,11 @@ def smooth(*, discount: Any = 0.5, shape: tuple[int, ...] = (81, 81)) -> tuple[P
       shape: nodes.
     """
     system = Smooth(discount)
+    # |½cV₂| is at most 3 on the box: the bound is slack, or V would not be the value
     problem = Problem(system.drift, system.cost, Box([-6.0], [6.0]), discount=discount)
     return problem, Grid([-1.0, -1.0], [1.0, 1.0], shape)
 
 
-def smooth_exact(*, discount: Any = 0.5) -> Any:
+def smooth_exact(*, discount: Number = 0.5) -> Exact:
     """The value cosh x₁ − 1 + x₂² + ¼x₁²x₂², whatever the discount."""
     return answer(Smooth(discount).value)

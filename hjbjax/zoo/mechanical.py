@@ -10,7 +10,6 @@ The pendulum follows from mθ̈ − mg sin θ = τ; (9.4) of the chapter prints 
 """
 
 import math
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +18,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Box
+from hjbjax.problem.types import Control, Number, State
 from hjbjax.zoo.ingredients import QuadraticCost, QuadraticValue, positive
 
 
@@ -36,28 +36,30 @@ class Pendulum:
       [0.0, 0.5]
     """
 
-    mass: Any = 1.0
-    g: Any = 9.81
+    mass: Number = 1.0
+    g: Number = 9.81
     as_printed: bool = False
 
     def __post_init__(self):
         positive("Pendulum", mass=self.mass)
 
     @property
-    def gain(self) -> Any:
+    def gain(self) -> Number:
         """θ̈ per unit of torque."""
         return (self.g if self.as_printed else 1.0) / self.mass
 
-    def drift(self, x: Any, u: Any) -> Any:
+    def drift(self, x: State, u: Control) -> State:
         """(θ̇, g sin θ + gain·τ)."""
+        # gravity pulls away from upright, which makes it the unstable rest
         return jnp.stack([x[1], self.g * jnp.sin(x[0]) + self.gain * u[0]])
 
-    def linearising_torque(self, x: Any) -> Any:
+    def linearising_torque(self, x: State) -> Control:
         """(2.8), τ = −mg sin θ − 3mθ̇ − 2mθ: the loop is θ̈ + 3θ̇ + 2θ = 0, however large the angle."""
+        # the first term takes gravity out; θ̈ + 3θ̇ + 2θ has the roots −1 and −2
         return jnp.stack([-(self.g * jnp.sin(x[0]) + 3 * x[1] + 2 * x[0]) / self.gain])
 
-    def linear_torque(self, x: Any) -> Any:
-        """The same design for the pendulum linearised upright, τ = −mgθ − 3mθ̇ − 2mθ."""
+    def linear_torque(self, x: State) -> Control:
+        """The design of (2.8) for the pendulum linearised upright, τ = −mgθ − 3mθ̇ − 2mθ."""
         return jnp.stack([-(self.g * x[0] + 3 * x[1] + 2 * x[0]) / self.gain])
 
 
@@ -69,10 +71,11 @@ class VanDerPol:
       stiffness: μ ≥ 0; at zero the oscillator is harmonic.
     """
 
-    stiffness: Any = 1.0
+    stiffness: Number = 1.0
 
-    def drift(self, x: Any, u: Any) -> Any:
+    def drift(self, x: State, u: Control) -> State:
         """(ẋ, μ(1 − x²)ẋ − x + u)."""
+        # μ(1 − x²)ẋ drives the oscillator within |x| < 1 and damps it outside: hence the limit cycle
         return jnp.stack([x[1], self.stiffness * (1 - x[0] * x[0]) * x[1] - x[0] + u[0]])
 
 
@@ -87,14 +90,15 @@ class BallAndBeam:
       g: gravity; 9.81 m/s².
     """
 
-    inertia: Any = 5 / 7
-    g: Any = 9.81
+    inertia: Number = 5 / 7
+    g: Number = 9.81
 
-    def drift(self, x: Any, u: Any) -> Any:
+    def drift(self, x: State, u: Control) -> State:
         """(ṙ, B(r θ̇² − g sin θ), θ̇, u)."""
+        # r θ̇² is the centrifugal push outwards, g sin θ the slope of the beam
         return jnp.stack([x[1], self.inertia * (x[0] * x[3] * x[3] - self.g * jnp.sin(x[2])), x[3], u[0]])
 
-    def output(self, x: Any) -> Any:
+    def output(self, x: State) -> Number:
         """r, the place of the ball."""
         return x[0]
 
@@ -112,33 +116,33 @@ class FlexibleJoint:
       stiffness: k, of the spring.
     """
 
-    link: Any = 1.0
-    motor: Any = 1.0
-    weight: Any = 9.81
-    stiffness: Any = 10.0
+    link: Number = 1.0
+    motor: Number = 1.0
+    weight: Number = 9.81
+    stiffness: Number = 10.0
 
     def __post_init__(self):
         positive("FlexibleJoint", link=self.link, motor=self.motor)
 
-    def drift(self, x: Any, u: Any) -> Any:
+    def drift(self, x: State, u: Control) -> State:
         """(q̇₁, −(MgL sin q₁ + k(q₁ − q₂))/I, q̇₂, (k(q₁ − q₂) + u)/J)."""
-        spring = self.stiffness * (x[0] - x[2])
+        spring = self.stiffness * (x[0] - x[2])  # the torque that slows the link and turns the motor
         return jnp.stack(
             [x[1], -(self.weight * jnp.sin(x[0]) + spring) / self.link, x[3], (spring + u[0]) / self.motor]
         )
 
-    def output(self, x: Any) -> Any:
+    def output(self, x: State) -> Number:
         """q₁, the angle of the link."""
         return x[0]
 
 
 def pendulum(
     *,
-    mass: Any = 1.0,
+    mass: Number = 1.0,
     as_printed: bool = False,
-    g: Any = 9.81,
-    torque: Any = None,
-    discount: Any = 0.0,
+    g: Number = 9.81,
+    torque: Number | None = None,
+    discount: Number = 0.0,
     shape: tuple[int, ...] = (200, 201),
 ) -> tuple[Problem, Grid]:
     """Swing a pendulum up and hold it there, at the cost ½(|x|² + τ²).
@@ -154,9 +158,11 @@ def pendulum(
       discount: β.
       shape: nodes in angle (even) and velocity (odd), on [−π, π) × [−8, 8].
     """
+    # for m = 1 either bound raises the pendulum without swinging: 30 > g, and printed, with the gain g/m, 6g > g
     bound = (6.0 if as_printed else 30.0) if torque is None else torque
     system = Pendulum(mass=mass, g=g, as_printed=as_printed)
     problem = Problem(system.drift, QuadraticCost(0.5, 0.5).rate, Box([-bound], [bound]), discount=discount)
+    # the angle omits π, which is −π: hanging is one node
     return problem, Grid([-math.pi, -8.0], [math.pi, 8.0], shape, periodic=(True, False), names=("angle", "velocity"))
 
 
@@ -176,13 +182,14 @@ def pendulum_near_upright(
     from scipy.linalg import solve_continuous_are
 
     gain = Pendulum(mass, g, as_printed).gain
+    # sin θ ≈ θ upright; βV in the equation acts like the drift A − ½βI
     a = np.array([[0.0, 1.0], [g, 0.0]]) - 0.5 * discount * np.eye(2)
     matrix = solve_continuous_are(a, np.array([[0.0], [gain]]), np.eye(2), np.eye(1))
-    return QuadraticValue(0.5 * matrix)
+    return QuadraticValue(0.5 * matrix)  # the running cost is ½(|x|² + τ²), SciPy's is |x|² + τ²
 
 
 def van_der_pol(
-    *, stiffness: Any = 1.0, bound: Any = 1.0, discount: Any = 0.5, shape: tuple[int, ...] = (121, 121)
+    *, stiffness: Number = 1.0, bound: Number = 1.0, discount: Number = 0.5, shape: tuple[int, ...] = (121, 121)
 ) -> tuple[Problem, Grid]:
     """Quieten a Van der Pol oscillator at the cost ½(|x|² + u²), |u| ≤ bound, on [−3, 3]².
 

@@ -10,7 +10,7 @@ held within ``radius``: by the dynamic programming principle the value elsewhere
 leaves the origin alone as the target.
 """
 
-from typing import Any
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 
@@ -18,7 +18,8 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Ball, Box
-from hjbjax.zoo.ingredients import Arrival, Disc, answer, positive, unit_cost
+from hjbjax.problem.types import Array, Control, Number, State
+from hjbjax.zoo.ingredients import Arrival, Disc, Exact, Scalar, answer, positive, unit_cost
 
 
 @pytree_dataclass()
@@ -29,24 +30,26 @@ class DoubleIntegrator:
       mass: m.
     """
 
-    mass: Any = 1.0
+    mass: Number = 1.0
 
     def __post_init__(self):
         positive("DoubleIntegrator", mass=self.mass)
 
-    def drift(self, x: Any, u: Any) -> Any:
+    def drift(self, x: State, u: Control) -> State:
         """(x₂, u/m)."""
         return jnp.stack([x[1], u[0] / self.mass])
 
-    def arrival_time(self, x: Any) -> Any:
+    def arrival_time(self, x: State) -> Scalar:
         """The least time to rest at the origin under |u| ≤ 1."""
+        # in the coordinates m·x₁ and m·x₂ the mass is one
         position, velocity = self.mass * x[0], self.mass * x[1]
+        # ≥ 0 right of the switching curve: first −1 until the curve is met, then +1 along it
         side = position + 0.5 * velocity * jnp.abs(velocity)
-        sign = jnp.where(side >= 0, 1.0, -1.0)
+        sign = jnp.where(side >= 0, 1.0, -1.0)  # left of the curve the plane is mirrored; no jnp.sign, which is 0 on it
         # On the switching curve the root is |velocity|; rounding must not make its argument negative.
         return sign * velocity + jnp.sqrt(jnp.maximum(4 * sign * position + 2 * velocity * velocity, 0.0))
 
-    def switching_position(self, velocity: Any) -> Any:
+    def switching_position(self, velocity: Number) -> Number:
         """x₁ on the switching curve x₁ = −½m x₂|x₂|; to its right the best force is −1, to its left +1."""
         return -0.5 * self.mass * velocity * jnp.abs(velocity)
 
@@ -60,30 +63,33 @@ class Boat:
       current: c, of the water, two numbers.
     """
 
-    speed: Any = 1.0
-    current: Any = (0.5, 0.0)
+    speed: Number = 1.0
+    current: Sequence[Number] | Array = (0.5, 0.0)
 
     def __post_init__(self):
         positive("Boat", speed=self.speed)
 
-    def drift(self, x: Any, u: Any) -> Any:
+    def drift(self, x: State, u: Control) -> State:
         """c + s·u."""
         return jnp.stack([self.current[0] + self.speed * u[0], self.current[1] + self.speed * u[1]])
 
-    def arrival_time(self, x: Any) -> Any:
+    def arrival_time(self, x: State) -> Scalar:
         """The least T with |x + cT| = sT; infinite where a current stronger than the boat carries it past."""
+        # the roots of (s² − |c|²)T² − 2(x·c)T − |x|² = 0, the least positive one, written without that leading term,
+        # which is zero where boat and current are equally fast
         along = x[0] * self.current[0] + x[1] * self.current[1]
         square = x[0] * x[0] + x[1] * x[1]
         current = self.current[0] * self.current[0] + self.current[1] * self.current[1]
         inside = along * along + (self.speed * self.speed - current) * square
         below = jnp.sqrt(jnp.maximum(inside, 0.0)) - along
+        # inside < 0: the disc of radius sT around the drifting boat never holds the origin; below ≤ 0: only in the past
         reachable = (inside >= 0) & (below > 0)
         time = jnp.where(reachable, square / jnp.where(reachable, below, 1.0), jnp.inf)
-        return jnp.where(square == 0, 0.0, time)
+        return jnp.where(square == 0, 0.0, time)  # at the origin both are 0, which reads as out of reach above
 
 
 def double_integrator(
-    *, mass: Any = 1.0, discount: Any = 1.0, radius: Any = 0.2, shape: tuple[int, ...] = (101, 101)
+    *, mass: Number = 1.0, discount: Number = 1.0, radius: Number = 0.2, shape: tuple[int, ...] = (101, 101)
 ) -> tuple[Problem, Grid]:
     """Bring a mass to rest at the origin in the least time, |u| ≤ 1, on [−2, 2]²; figures 8 and 9 of the chapter.
 
@@ -105,7 +111,7 @@ def double_integrator(
     return problem, Grid([-2.0, -2.0], [2.0, 2.0], shape, names=("position", "velocity"))
 
 
-def double_integrator_exact(*, mass: Any = 1.0, discount: Any = 1.0, radius: Any = 0.2) -> Any:
+def double_integrator_exact(*, mass: Number = 1.0, discount: Number = 1.0, radius: Number = 0.2) -> Exact:
     """(1 − e^{−βT})/β with x₂ + √(4x₁ + 2x₂²) for T to the right of the switching curve, mirrored to its left.
 
     Args:
@@ -118,10 +124,10 @@ def double_integrator_exact(*, mass: Any = 1.0, discount: Any = 1.0, radius: Any
 
 def zermelo(
     *,
-    speed: Any = 1.0,
-    current: Any = (0.5, 0.0),
-    discount: Any = 1.0,
-    radius: Any = 0.2,
+    speed: Number = 1.0,
+    current: Sequence[Number] | Array = (0.5, 0.0),
+    discount: Number = 1.0,
+    radius: Number = 0.2,
     shape: tuple[int, ...] = (101, 101),
 ) -> tuple[Problem, Grid]:
     """Steer a boat through a constant current to the origin in the least time, on [−2, 2]².
@@ -145,7 +151,9 @@ def zermelo(
     return problem, Grid([-2.0, -2.0], [2.0, 2.0], shape, names=("east", "north"))
 
 
-def zermelo_exact(*, speed: Any = 1.0, current: Any = (0.5, 0.0), discount: Any = 1.0, radius: Any = 0.2) -> Any:
+def zermelo_exact(
+    *, speed: Number = 1.0, current: Sequence[Number] | Array = (0.5, 0.0), discount: Number = 1.0, radius: Number = 0.2
+) -> Exact:
     """(1 − e^{−βT})/β with T = |x|²/(√((x·c)² + (s² − |c|²)|x|²) − x·c).
 
     Args:

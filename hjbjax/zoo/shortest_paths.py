@@ -7,7 +7,6 @@ Minimum time in the discounted form V = (1 − e^{−βT})/β.
 """
 
 import math
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,32 +15,34 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Ball, Box, Finite
-from hjbjax.zoo.ingredients import Arrival, Disc, answer, positive, unit_cost
+from hjbjax.problem.types import Control, Number, State
+from hjbjax.zoo.ingredients import Arrival, Disc, Exact, Scalar, answer, positive, unit_cost
 
 
 @pytree_dataclass(static=("norm",))
 class SingleIntegrator:
-    """A point that moves at will, ẋ = s·u, with u in the unit ball of the norm dual to ``norm``.
+    """A point that moves at will, ẋ = s·u, with u in the unit ball of ``norm``.
 
     Args:
       speed: s.
       norm: the norm in which the distance to the origin is the time: 1, 2 or infinity.
     """
 
-    speed: Any = 1.0
+    speed: Number = 1.0
     norm: float = 2
 
     def __post_init__(self):
         positive("SingleIntegrator", speed=self.speed)
 
-    def drift(self, x: Any, u: Any) -> Any:
+    def drift(self, x: State, u: Control) -> State:
         """s·u."""
         return self.speed * u
 
-    def arrival_time(self, x: Any) -> Any:
+    def arrival_time(self, x: State) -> Scalar:
         """‖x‖/s."""
         if self.norm == 1:
             return jnp.sum(jnp.abs(x)) / self.speed
+        # at full speed straight to the origin: the time is the norm whose unit ball the velocities fill
         return (jnp.sqrt(jnp.sum(x * x)) if self.norm == 2 else jnp.max(jnp.abs(x))) / self.speed
 
 
@@ -53,12 +54,12 @@ class Dubins:
       speed: s.
     """
 
-    speed: Any = 1.0
+    speed: Number = 1.0
 
     def __post_init__(self):
         positive("Dubins", speed=self.speed)
 
-    def drift(self, x: Any, u: Any) -> Any:
+    def drift(self, x: State, u: Control) -> State:
         """(s cos θ, s sin θ, u)."""
         return jnp.stack([self.speed * jnp.cos(x[2]), self.speed * jnp.sin(x[2]), u[0]])
 
@@ -67,9 +68,9 @@ def eikonal(
     *,
     norm: float = 2,
     dim: int = 2,
-    speed: Any = 1.0,
-    discount: Any = 1.0,
-    radius: Any = 0.2,
+    speed: Number = 1.0,
+    discount: Number = 1.0,
+    radius: Number = 0.2,
     directions: int | None = None,
     shape: tuple[int, ...] | None = None,
 ) -> tuple[Problem, Grid]:
@@ -103,11 +104,11 @@ def eikonal_exact(
     *,
     norm: float = 2,
     dim: int = 2,
-    speed: Any = 1.0,
-    discount: Any = 1.0,
-    radius: Any = 0.2,
+    speed: Number = 1.0,
+    discount: Number = 1.0,
+    radius: Number = 0.2,
     directions: int | None = None,
-) -> Any:
+) -> Exact:
     """(1 − e^{−βT})/β with T = ‖x‖/s.
 
     Args:
@@ -118,29 +119,31 @@ def eikonal_exact(
       radius: where the problem holds the value; the answer does not depend on it.
       directions: of the problem in the plane; the answer is that of the ball.
     """
-    _unit_ball(norm, dim, directions)
+    _unit_ball(norm, dim, directions)  # for its refusals: the answer exists where the problem does
     return answer(Arrival(SingleIntegrator(speed, norm), discount).value)
 
 
 def _unit_ball(norm: float, dim: int, directions: int | None) -> Ball | Box | Finite:
+    """The admissible velocities at unit speed: the unit ball of ``norm``."""
     if norm not in (1, 2, math.inf):
         raise ValueError(f"eikonal: got norm = {norm!r}, wanted 1, 2 or infinity")
     if directions is not None:
         if (dim, norm) != (2, 2):
             raise ValueError(f"eikonal: got directions with dim = {dim} and norm = {norm:g}, wanted 2 and 2")
-        angles = 2 * np.pi * np.arange(directions) / directions
+        angles = 2 * np.pi * np.arange(directions) / directions  # the last is not the first once more
         return Finite(np.stack([np.cos(angles), np.sin(angles)], axis=-1))
     if norm == 1:
+        # H is linear in u, so of the unit ball Σ|u_i| ≤ 1 its 2·dim corners are enough
         return Finite(np.concatenate([np.eye(dim), -np.eye(dim)]))
     return Ball(1.0, dim) if norm == 2 else Box([-1.0] * dim, [1.0] * dim)
 
 
 def dubins(
     *,
-    speed: Any = 1.0,
-    turn: Any = 1.0,
-    radius: Any = 0.3,
-    discount: Any = 1.0,
+    speed: Number = 1.0,
+    turn: Number = 1.0,
+    radius: Number = 0.3,
+    discount: Number = 1.0,
     shape: tuple[int, ...] = (41, 41, 40),
 ) -> tuple[Problem, Grid]:
     """Drive a Dubins car to a disc around the origin in the least time, in any heading, on [−2, 2]² × [−π, π).
@@ -159,7 +162,8 @@ def dubins(
         unit_cost,
         Box([-turn], [turn]),
         discount=discount,
-        target=Disc(radius, 2).level,
+        target=Disc(radius, 2).level,  # in any heading; with no exact value beside it zero is held there
     )
+    # the heading is periodic, and its 40 nodes omit π, which is −π
     lo, hi = [-2.0, -2.0, -math.pi], [2.0, 2.0, math.pi]
     return problem, Grid(lo, hi, shape, periodic=(False, False, True), names=("x", "y", "heading"))

@@ -6,8 +6,6 @@
 Both are held at the exact value where the box ends, so that the answer is exact at every node.
 """
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
 
@@ -15,12 +13,13 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Box
-from hjbjax.zoo.ingredients import OutsideBall, OutsideCube, answer, noise_or_none, positive, unit_cost
+from hjbjax.problem.types import Control, Number, State
+from hjbjax.zoo.ingredients import Exact, OutsideBall, OutsideCube, Scalar, answer, noise_or_none, positive, unit_cost
 
 TERMS = 200  # of the series for the square, whose tail falls like k⁻³ at the worst place: 1e-6 there, 1e-15 inside
 
 
-def no_drift(x: Any, u: Any) -> Any:
+def no_drift(x: State, u: Control) -> State:
     """Zero: only the noise moves the state."""
     return jnp.zeros_like(x)
 
@@ -33,41 +32,44 @@ class CubeExit:
     difference from the interval's value is expanded in cosines along the longer coordinate.
     """
 
-    noise: Any
-    discount: Any
-    half_width: Any
+    noise: Number
+    discount: Number
+    half_width: Number
     dim: int
 
     def __post_init__(self):
         positive("brownian_exit", noise=self.noise, half_width=self.half_width)
 
-    def value(self, x: Any) -> Any:
+    def value(self, x: State) -> Scalar:
         """The value at one state."""
-        scaled = jnp.abs(jnp.asarray(x)) / self.half_width
+        scaled = jnp.abs(jnp.asarray(x)) / self.half_width  # even in every coordinate, so on [0, 1]
+        # with R as the length and R²/σ² as the time one number κ is left
         time = (self.half_width / self.noise) ** 2
         kappa = jnp.sqrt(2 * self.discount * time)
         if self.dim == 1:
             return time * _interval(scaled[0], kappa)
         # Along y = max the factor cosh μy/cosh μ would not decay; along the smaller coordinate it does.
         across, along = jnp.max(scaled), jnp.min(scaled)
-        odd = np.arange(1, 2 * TERMS, 2)
-        wave = 0.5 * np.pi * odd
+        odd = np.arange(1, 2 * TERMS, 2)  # cos(½πk x) vanishes at ±1 for odd k
+        wave = 0.5 * np.pi * odd  # (TERMS,), as all that follows
         sign = np.where(odd % 4 == 1, 1.0, -1.0)
         rate = jnp.sqrt(wave**2 + kappa**2)
+        # the interval's value in cosines: 1 = Σ 2·sign/wave·cos, divided by ½(wave² + κ²) of the operator
         amplitude = 4 * sign / (wave * (wave**2 + kappa**2))
+        # cosh(rate·along)/cosh(rate) by decaying exponentials: the largest rate is 627, and float32 ends at e^88
         decay = jnp.exp(rate * (along - 1)) * (1 + jnp.exp(-2 * rate * along)) / (1 + jnp.exp(-2 * rate))
         return time * (_interval(across, kappa) - jnp.sum(amplitude * jnp.cos(wave * across) * decay))
 
 
-def _interval(x: Any, kappa: Any) -> Any:
+def _interval(x: Number, kappa: Number) -> Scalar:
     """2(1 − cosh κx/cosh κ)/κ², as (1 − x²) times factors that are 1 at κ = 0 and never cancel or overflow."""
     near, far = 0.5 * kappa * (1 - x), 0.5 * kappa * (1 + x)  # their sum is κ
     return (1 - x * x) * _sinhc(near) * _sinhc(far) * 2 / (1 + jnp.exp(-2 * kappa))
 
 
-def _sinhc(z: Any) -> Any:
+def _sinhc(z: Number) -> Scalar:
     """e^{−z} sinh(z)/z."""
-    small = jnp.where(z == 0, 1.0, z)
+    small = jnp.where(z == 0, 1.0, z)  # any divisor but zero: the branch not taken is differentiated too
     return jnp.where(z == 0, 1.0, -jnp.expm1(-2 * small) / (2 * small))
 
 
@@ -75,21 +77,26 @@ def _sinhc(z: Any) -> Any:
 class BallExit:
     """The mean time for which σ dw stays in the ball |x| < R: (R² − |x|²)/(nσ²)."""
 
-    noise: Any
-    radius: Any
+    noise: Number
+    radius: Number
     dim: int
 
     def __post_init__(self):
         positive("brownian_ball", noise=self.noise, radius=self.radius)
 
-    def value(self, x: Any) -> Any:
-        """The value at one state; outside the ball the same formula, which is negative there."""
+    def value(self, x: State) -> Scalar:
+        """The value at one state; outside the ball the formula goes on and is negative."""
         x = jnp.asarray(x)
         return (self.radius * self.radius - jnp.sum(x * x)) / (self.dim * self.noise * self.noise)
 
 
 def brownian_exit(
-    *, dim: int = 1, noise: Any = 1.0, discount: Any = 0.0, half_width: Any = 1.0, shape: tuple[int, ...] | None = None
+    *,
+    dim: int = 1,
+    noise: Number = 1.0,
+    discount: Number = 0.0,
+    half_width: Number = 1.0,
+    shape: tuple[int, ...] | None = None,
 ) -> tuple[Problem, Grid]:
     """How long a Brownian motion stays in the cube |x_i| < half_width: no control, cost 1.
 
@@ -102,11 +109,14 @@ def brownian_exit(
     """
     positive("brownian_exit", noise=noise, half_width=half_width)
     problem = Problem(no_drift, unit_cost, noise=noise, discount=discount, target=OutsideCube(half_width).level)
+    # odd numbers put a node at the centre
     shape = ((101,) if dim == 1 else (41,) * dim) if shape is None else shape
     return problem, Grid([-half_width] * dim, [half_width] * dim, shape)
 
 
-def brownian_exit_exact(*, dim: int = 1, noise: Any = 1.0, discount: Any = 0.0, half_width: Any = 1.0) -> Any:
+def brownian_exit_exact(
+    *, dim: int = 1, noise: Number = 1.0, discount: Number = 0.0, half_width: Number = 1.0
+) -> Exact:
     """(1 − x²)/σ² on the interval (−1, 1), .58937083 at the centre of the square for σ = 1.
 
     Args:
@@ -124,7 +134,7 @@ def brownian_exit_exact(*, dim: int = 1, noise: Any = 1.0, discount: Any = 0.0, 
 
 
 def brownian_ball(
-    *, dim: int = 2, noise: Any = 1.0, radius: Any = 1.0, shape: tuple[int, ...] | None = None
+    *, dim: int = 2, noise: Number = 1.0, radius: Number = 1.0, shape: tuple[int, ...] | None = None
 ) -> tuple[Problem, Grid]:
     """How long on average a Brownian motion stays in the ball |x| < radius: no control, cost 1.
 
@@ -140,13 +150,13 @@ def brownian_ball(
         no_drift,
         unit_cost,
         noise=noise,
-        target=OutsideBall(radius).level,
+        target=OutsideBall(radius).level,  # the corners of the box, too
         exit_cost=brownian_ball_exact(dim=dim, noise=noise, radius=radius),
     )
     return problem, Grid([-radius] * dim, [radius] * dim, (41,) * dim if shape is None else shape)
 
 
-def brownian_ball_exact(*, dim: int = 2, noise: Any = 1.0, radius: Any = 1.0) -> Any:
+def brownian_ball_exact(*, dim: int = 2, noise: Number = 1.0, radius: Number = 1.0) -> Exact:
     """(R² − |x|²)/(nσ²).
 
     Args:
@@ -168,30 +178,33 @@ class BangBang:
       noise: ε.
     """
 
-    discount: Any = 1.0
-    noise: Any = 0.0
+    discount: Number = 1.0
+    noise: Number = 0.0
 
     def __post_init__(self):
         positive("bang_bang", discount=self.discount)
 
-    def drift(self, x: Any, u: Any) -> Any:
+    def drift(self, x: State, u: Control) -> State:
         """The control itself."""
         return u
 
-    def cost(self, x: Any, u: Any) -> Any:
+    def cost(self, x: State, u: Control) -> Number:
         """x²."""
         return jnp.sum(x * x)
 
-    def value(self, x: Any) -> Any:
+    def value(self, x: State) -> Scalar:
         """The value at one state of the whole line."""
         rate, variance = self.discount, self.noise * self.noise
+        # the positive root of ½ε²μ² + μ − λ = 0, in the form that has the limit λ at ε = 0
         mu = 2 * rate / (1 + jnp.sqrt(1 + 2 * variance * rate))
         distance = jnp.abs(jnp.asarray(x)[0])
+        # what u = −sgn x would cost if it went straight on through zero
         parabola = distance * distance / rate - 2 * distance / rate**2 + 2 / rate**3 + variance / rate**2
+        # the exponential makes the slope vanish at zero, where the control changes sign
         return parabola - 2 / (rate**2 * mu) * jnp.exp(-mu * distance)
 
 
-def bang_bang(*, discount: Any = 1.0, noise: Any = 0.0, shape: tuple[int, ...] = (81,)) -> tuple[Problem, Grid]:
+def bang_bang(*, discount: Number = 1.0, noise: Number = 0.0, shape: tuple[int, ...] = (81,)) -> tuple[Problem, Grid]:
     """Hold a point near zero with |u| ≤ 1 at the cost x², on [−2, 2] with the ends held at the exact value.
 
     Args:
@@ -212,7 +225,7 @@ def bang_bang(*, discount: Any = 1.0, noise: Any = 0.0, shape: tuple[int, ...] =
     return problem, Grid([-2.0], [2.0], shape, names=("x",))
 
 
-def bang_bang_exact(*, discount: Any = 1.0, noise: Any = 0.0) -> Any:
+def bang_bang_exact(*, discount: Number = 1.0, noise: Number = 0.0) -> Exact:
     """The value on the whole line, with noise or without; see ``BangBang``.
 
     Args:

@@ -80,9 +80,8 @@ def excess(f: Any, a: Any, grid: Grid, axis: int, scheme: Upwind, link: Links) -
     a = jnp.maximum(a, 0)  # along_axis may leave a rounding error below zero
     if not scheme.central:
         return a + least
-    return jnp.where(
-        stencil.walls(grid, axis), a + least, jnp.maximum(a, least)
-    )  # projection wants drift and noise apart
+    # at a wall the projection of the drift wants drift and noise apart
+    return jnp.where(stencil.walls(grid, axis), a + least, jnp.maximum(a, least))
 
 
 def axis_rates(f: Any, a: Any, grid: Grid, axis: int, scheme: Upwind, link: Links) -> tuple[Any, Any]:
@@ -103,19 +102,29 @@ def rates(on: Discretisation, u: list, d: list | None = None) -> Rates:
       u: the m components of the control, each of a shape that broadcasts to (*grid).
       d: likewise of the disturbance, in a game.
     """
-    grid, scheme = on.grid, on.scheme.chain
+    grid = on.grid
     x, u, d = jax.lax.optimization_barrier((on.coordinates(), u, d))  # or loops keep drift that u does not move
-    f, a = on.drift(u, d, x), on.diffusion(u, d, x)
+    first, *others = on.drifts(u, d, x)
+    table = _table(on, first, on.diffusion(u, d, x))
+    for other in others:  # jumps of one chain or of the other
+        for offset, rate in _table(on, other, {}).items():
+            table[offset] = table[offset] + rate
+    values = tuple(jnp.broadcast_to(jnp.asarray(rate, on.dtype), grid.shape) for rate in table.values())
+    return Rates(tuple(table), values, one_way=on.problem.noise is None and not others)
+
+
+def _table(on: Discretisation, f: list, a: dict[tuple[int, int], Any]) -> dict[Offset, Any]:
+    """The rate of every jump for a drift f and a diffusion a."""
+    grid, scheme = on.grid, on.scheme.chain
     table: dict[Offset, Any] = {}
     for axis, link in enumerate(links(on.chain)):
         pair = axis_rates(f[axis], correlated_noise.along_axis(a, grid, axis), grid, axis, scheme, link)
         for step, rate in zip((1, -1), pair, strict=True):
-            table[stencil.unit(grid, axis, step)] = _inside(rate, grid, axis, step)
+            table[stencil.unit(grid, axis, step)] = jnp.where(stencil.wall(grid, axis, step), 0, rate)
     for (i, j), entry in a.items():
         if i != j:
             _add_diagonal_jumps(table, entry, grid, i, j)
-    values = tuple(jnp.broadcast_to(jnp.asarray(rate, on.dtype), grid.shape) for rate in table.values())
-    return Rates(tuple(table), values, one_way=on.problem.noise is None)
+    return table
 
 
 def fastest_rate(on: Discretisation) -> jax.Array:
@@ -128,10 +137,6 @@ def fastest_rate(on: Discretisation) -> jax.Array:
         for d in sets.probes(on.problem.disturbances, on.dtype):
             result = jnp.maximum(result, rates(on, u, d).total())
     return result
-
-
-def _inside(rate: Any, grid: Grid, axis: int, step: int) -> Any:
-    return jnp.where(stencil.wall(grid, axis, step), 0, rate)
 
 
 def _add_diagonal_jumps(table: dict[Offset, Any], entry: Any, grid: Grid, i: int, j: int) -> None:
@@ -288,7 +293,8 @@ def transition_arrays(
     actions = decision_process.actions(problem)
     held, given = decision_process.target(problem, grid)
     found = (
-        _checked(problem, grid, list(action), None, scheme, 0.0, ~held, np.finfo(np.float64).eps) for action in actions
+        _checked(Discretisation(problem, grid, scheme, np.float64), list(action), None, ~held, np.finfo(np.float64).eps)
+        for action in actions
     )
     with jax.enable_x64(True):
         cut = links(Discretisation(*cast((problem, grid), np.float64), scheme, np.dtype(np.float64)))
@@ -306,27 +312,26 @@ def _under_policy(problem: Problem, grid: Grid, policy: Any, disturbance: Any, s
     active &= ~decision_process.target(problem, grid, t)[0]
     kinds = [np.asarray(array).dtype for array in (policy, disturbance) if array is not None]
     eps = max([np.finfo(kind).eps for kind in kinds if kind.kind == "f"], default=np.finfo(np.float64).eps)
-    jumps, _, leaving = _checked(problem, grid, u, d, scheme, t, active, eps)
+    jumps, _, leaving = _checked(Discretisation(problem, grid, scheme, np.float64, t), u, d, active, eps)
     decision_process.refuse("the policy leaves the box across a constrained end", leaving, grid)
     return jumps
 
 
 def _checked(
-    problem: Problem, grid: Grid, u: list, d: list | None, scheme: Upwind, t: float, active: np.ndarray, eps: Any
+    on: Discretisation, u: list, d: list | None, active: np.ndarray, eps: Any
 ) -> tuple[Rates, np.ndarray, np.ndarray]:
     """Rates and running cost at the ``active`` nodes, zero elsewhere, and where an end forbids the actions there.
 
     Refuses what is not usable.
     """
+    grid = on.grid
     if grid.sides("open"):
         raise ValueError(
             "chain: a grid with open ends has no chain: a value that is continued from inside makes negative "
             "probabilities; choose edges='projected' or 'constrained'"
         )
     with jax.enable_x64(True):
-        jumps, cost, lacking, leaving = jax.device_get(
-            _evaluate(*cast((Discretisation(problem, grid, scheme, np.dtype(np.float64), t), u, d), np.float64), eps)
-        )
+        jumps, cost, lacking, leaving = jax.device_get(_evaluate(*cast((on, u, d), np.float64), eps))
     decision_process.refuse("the running cost is not finite", active & ~np.isfinite(cost), grid)
     decision_process.refuse(
         "a jump rate, made of drift and noise, is not finite", active & ~np.isfinite(jumps.total()), grid

@@ -16,7 +16,7 @@ from hjbjax.discretisation.stencil import Links
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import pytree_dataclass
-from hjbjax.tracing import components
+from hjbjax.tracing import components, dependence
 
 
 @runtime_checkable
@@ -38,6 +38,10 @@ class Scheme(Protocol):
     @property
     def subcell(self) -> bool:
         """Whether the boundary of a target is met between two nodes."""
+
+    @property
+    def split(self) -> bool:
+        """Whether the drifts of two players who drive one component are upwinded apart, see ``Upwind``."""
 
     @property
     def stages(self) -> int:
@@ -103,6 +107,32 @@ class Discretisation:
     def drift(self, u: list, d: list | None = None, x: list | None = None) -> list:
         """The n components of f; at the nodes, or where ``x`` is."""
         return list(components.components(self.problem.drift, *self._arguments(u, d, x), dtype=self.dtype))
+
+    @property
+    def apart(self) -> bool:
+        """Whether each player's drift is upwinded by itself: the scheme does, and they meet in a component.
+
+        Then drift and cost must be sums of what each does, f = f(x, u, 0) + [f(x, 0, d) − f(x, 0, 0)]. At constrained
+        ends what is admissible depends on the sum.
+        """
+        if not (self.scheme.split and self.problem.is_game) or self.grid.sides("constrained"):
+            return False
+        found = dependence.influence(self.problem, self.grid.ndim, self.dtype)
+        return found.separable and found.meet
+
+    def drifts(self, u: list, d: list | None = None, x: list | None = None) -> list[list]:
+        """The drift in the parts that are upwinded each by itself: the whole, or what each player adds.
+
+        The noise goes with the first part; components that the disturbance does not drive are exactly zero in its own.
+        """
+        if not self.apart:
+            return [self.drift(u, d, x)]
+        found = dependence.influence(self.problem, self.grid.ndim, self.dtype)
+        driven, zero = found.drift.driven_by(found.disturbance), jnp.zeros((), self.dtype)
+        no_u, no_d = ([zero] * len(inputs) for inputs in (found.control, found.disturbance))
+        still, pushed = self.drift(no_u, no_d, x), self.drift(no_u, d, x)
+        theirs = [pushed[i] - still[i] if i in driven else zero for i in range(self.grid.ndim)]
+        return [self.drift(u, no_d, x), theirs]
 
     def running_cost(self, u: list, d: list | None = None, x: list | None = None) -> Any:
         """L, in cost per unit time; zero where the problem has none."""

@@ -10,7 +10,7 @@ slopes to zero. A class of high order that limits slopes by minmod, on equal spa
     >>> from hjbjax.discretisation import stencil
     >>> @dataclasses.dataclass(frozen=True)
     ... class Minmod:
-    ...     monotone, stationary, even, subcell = False, True, True, False
+    ...     monotone, stationary, even, subcell, split = False, True, True, False, True
     ...     stages, points, chain = 2, 3, hjb.Upwind()
     ...
     ...     def slopes(self, around):
@@ -69,7 +69,7 @@ def check(scheme: Any, name: str, grid: Grid, *, stationary: bool = False) -> No
         )
 
 
-@pytree_dataclass(static=("central", "subcell"))
+@pytree_dataclass(static=("central", "subcell", "split"))
 class Upwind:
     """First-order upwind differences: the Kushner–Dupuis chain, monotone on every grid.
 
@@ -82,10 +82,20 @@ class Upwind:
       central: whether to use central differences where they stay monotone.
       subcell: whether the boundary of a target {l ≤ 0} is met where l = 0 between two nodes, which wants l to be a
         signed distance or like one; otherwise the target is the nodes with l ≤ 0.
+      split: whether in a game whose players both drive a component each one's drift is upwinded by itself. Where
+        f = f₁(x, u) + f₂(x, d), L = L₁ + L₂ and noise is nobody's,
+
+            H = min_u [L₁ + Σ_i f₁ᵢ⁺ D_i⁺ + f₁ᵢ⁻ D_i⁻ + noise]  +  max_d [L₂ + Σ_i f₂ᵢ⁺ D_i⁺ + f₂ᵢ⁻ D_i⁻]
+
+        is consistent and monotone like upwinding the sum f: two optimisations of one player in place of a nested
+        one, and min max = max min on the grid as well (with f = u + d, D⁺ = 1, D⁻ = −1 the sum has min max 1, max
+        min 0). There |f₁| + |f₂| takes the place of |f₁ + f₂| in the dissipation, as in a Lax–Friedrichs flux, and
+        who is held back by the other is still shaken: a target that can only just be kept off is reached in the end.
     """
 
     central: bool = True
     subcell: bool = False
+    split: bool = False
     monotone, stationary, even = True, True, False
     stages, points = 1, 2
 
@@ -99,7 +109,7 @@ class Upwind:
         return around.one_sided
 
 
-@pytree_dataclass(static=("subcell",))
+@pytree_dataclass(static=("subcell", "split"))
 class Limited:
     """Second order where the solution is smooth: one-sided differences with limited slopes.
 
@@ -113,16 +123,18 @@ class Limited:
 
     Args:
       subcell: as for ``Upwind``; on by default, since a target snapped to nodes is of first order.
+      split: as for ``Upwind``.
     """
 
     subcell: bool = True
+    split: bool = False
     monotone, stationary, even = False, True, False
     stages, points = 2, 2
 
     @property
     def chain(self) -> Upwind:
         """The monotone chain whose matrix makes the corrections."""
-        return Upwind(subcell=self.subcell)
+        return Upwind(subcell=self.subcell, split=self.split)
 
     def slopes(self, around: Differences) -> Slopes:
         """Limited slopes; central ones where noise keeps those monotone, a_ii ≥ h |f_i| for all actions."""
@@ -159,13 +171,13 @@ class Eno2:
     The smoother stencil, node by node, as C.-W. Shu and S. Osher choose it. Wants equal spacings.
     """
 
-    monotone, stationary, even, subcell = False, False, True, False
+    monotone, stationary, even, subcell, split = False, False, True, False, True
     stages, points = 2, 3
 
     @property
     def chain(self) -> Upwind:
         """The monotone chain with the same fastest rate."""
-        return Upwind()
+        return Upwind(split=True)
 
     def slopes(self, around: Differences) -> Slopes:
         """Those of the smoother of two stencils."""
@@ -180,13 +192,13 @@ class Weno5:
     Wants equal spacings and at least seven points an axis.
     """
 
-    monotone, stationary, even, subcell = False, False, True, False
+    monotone, stationary, even, subcell, split = False, False, True, False, True
     stages, points = 3, 7
 
     @property
     def chain(self) -> Upwind:
         """The monotone chain with the same fastest rate."""
-        return Upwind()
+        return Upwind(split=True)
 
     def slopes(self, around: Differences) -> Slopes:
         """A mean of three stencils with weights that favour the smoothest."""

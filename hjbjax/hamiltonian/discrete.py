@@ -96,10 +96,13 @@ class DiscreteHamiltonian:
 
     def at(self, u: Action, d: Action) -> Any:
         """H(u, d) at every node, in cost per unit time."""
-        f, a, grid = self.on.drift(u, d, self.x), self.on.diffusion(u, d, self.x), self.on.grid
+        a, grid = self.on.diffusion(u, d, self.x), self.on.grid
+        first, *others = self.on.drifts(u, d, self.x)
         total = self.on.running_cost(u, d, self.x)
         for axis in range(grid.ndim):
-            total = total + self.gain(axis, f[axis], correlated_noise.along_axis(a, grid, axis))
+            total = total + self.gain(axis, first[axis], correlated_noise.along_axis(a, grid, axis))
+            for other in others:
+                total = total + self.gain(axis, other[axis], None)
         for (i, j), entry in a.items():
             if i != j:
                 total = total + self._diagonal(i, j, entry)
@@ -248,7 +251,11 @@ def _exact(hamiltonian: DiscreteHamiltonian, player: Player, join: Callable) -> 
     zero = [jnp.zeros((), dtype)] * admissible.dim
     u, d = join(zero)
     arguments = problem.arguments(hamiltonian.x, u, d, hamiltonian.on.t)
-    offsets = hamiltonian.on.drift(u, d, hamiltonian.x)
+    parts = hamiltonian.on.drifts(u, d, hamiltonian.x)
+    part = (
+        0 if player.sign > 0 else len(parts) - 1
+    )  # where drifts are upwinded apart, the noise goes with the control's
+    noise = hamiltonian.on.diffusion(u, d, hamiltonian.x) if part == 0 else {}
     slopes = [
         components.components(player.derivative(problem, problem.drift, j), *arguments, dtype=dtype)
         for j in range(admissible.dim)
@@ -259,7 +266,7 @@ def _exact(hamiltonian: DiscreteHamiltonian, player: Player, join: Callable) -> 
 
     def piece(i: int, group: Sequence[int]) -> Kinked:
         slope = [slopes[j][i] for j in group]
-        return _kinked(hamiltonian, (u, d), i, offsets[i], slope[0] if len(group) == 1 else slope)
+        return _kinked(hamiltonian, noise, i, parts[part][i], slope[0] if len(group) == 1 else slope)
 
     if isinstance(admissible, Ball):
         single = [[piece(i, [j]) for i in player.driven[j]] for j in range(admissible.dim)]
@@ -293,10 +300,10 @@ def _cost_coefficients(hamiltonian: DiscreteHamiltonian, player: Player, argumen
 
 
 def _kinked(
-    hamiltonian: DiscreteHamiltonian, base: tuple[Action, Action], axis: int, offset: Any, slope: Any
+    hamiltonian: DiscreteHamiltonian, noise: dict[tuple[int, int], Any], axis: int, offset: Any, slope: Any
 ) -> Kinked:
-    u, d = base
-    left = correlated_noise.along_axis(hamiltonian.on.diffusion(u, d, hamiltonian.x), hamiltonian.on.grid, axis)
+    """The gain of one component as a function of an input: offset, slope, and where its derivative jumps."""
+    left = correlated_noise.along_axis(noise, hamiltonian.on.grid, axis)
     up, down = hamiltonian.up[axis], hamiltonian.down[axis]
 
     def gain(f):

@@ -89,7 +89,8 @@ class Players:
     Attributes:
       control, disturbance: the players.
       separable: whether drift and cost are sums of what each player does, and noise is neither's.
-      decoupled: whether they drive different components as well; then the Isaacs condition holds on every grid.
+      decoupled: whether H is a sum of what each player does on the grid, too: they drive different components, or each
+        one's drift is upwinded by itself; then the Isaacs condition holds on every grid.
       disturbance_costs: whether the running cost depends on the disturbance.
       steers_noise: whether the noise depends on an action.
       isaacs: who moves first, as in ``Problem``; that player's optimum is searched unless the two are decoupled.
@@ -113,43 +114,26 @@ class Players:
 
 
 def players_of(on: Discretisation) -> Players:
-    """The players of a problem on its grid."""
-    return find_players(on.problem, on.grid.ndim, on.dtype)
+    """The players of a problem on its grid; those whose drifts are upwinded apart do not meet there."""
+    players = find_players(on.problem, on.grid.ndim, on.dtype)
+    return dataclasses.replace(players, decoupled=players.decoupled or on.apart)
 
 
 def find_players(problem: Problem, n: int, dtype: Any) -> Players:
-    """Read from the problem's functions how the Hamiltonian depends on each player."""
-    m = 0 if problem.controls is None else problem.controls.dim
-    k = 0 if problem.disturbances is None else problem.disturbances.dim
-    time = ((None, False),) * problem.time_dependent
-    game = ((k, True),) * problem.is_game
-    arguments = (*time, (n, False), (m, True), *game)
-    drift = dependence.dependence(problem.drift, *arguments, dtype=dtype)
-    constant = dependence.Dependence((dependence.CONSTANT,))
-    cost = constant if problem.cost is None else dependence.dependence(problem.cost, *arguments, dtype=dtype)
-    noise = dependence.dependence(problem.noise, *arguments, dtype=dtype) if callable(problem.noise) else constant
-    inputs_u, inputs_d = range(m), range(m, m + k)
+    """The players of a problem with ``n`` states, read from its functions."""
+    found = dependence.influence(problem, n, dtype)
     branches = 2 if problem.noise is None else 4  # central differences have three kinks a component
-    mine = _player(problem.controls, 1, inputs_u, drift, cost, noise, branches)
-    theirs = _player(problem.disturbances, -1, inputs_d, drift, cost, noise, branches)
-    separate = not set(drift.driven_by(inputs_u)) & set(drift.driven_by(inputs_d))
-    crossed = any(function.crosses(inputs_u, inputs_d) for function in (drift, cost))
-    separable = not crossed and noise.is_constant
     return Players(
-        mine, theirs, separable, separate and separable, not cost.free_of(inputs_d), not noise.is_constant,
-        problem.isaacs,
+        _player(problem.controls, 1, found, branches), _player(problem.disturbances, -1, found, branches),
+        found.separable, found.separable and not found.meet, not found.cost.free_of(found.disturbance),
+        not found.noise.is_constant, problem.isaacs,
     )  # fmt: skip
 
 
-def _player(
-    admissible: AdmissibleSet | None,
-    sign: int,
-    inputs: range,
-    drift: dependence.Dependence,
-    cost: dependence.Dependence,
-    noise: dependence.Dependence,
-    branches: int,
-) -> Player:
+def _player(admissible: AdmissibleSet | None, sign: int, found: dependence.Influence, branches: int) -> Player:
+    """The control, for ``sign`` 1, or the disturbance, −1; drifts have so many ``branches`` a component."""
+    drift, cost, noise = found.drift, found.cost, found.noise
+    inputs = found.control if sign > 0 else found.disturbance
     driven = tuple(drift.driven_by([j]) for j in inputs)
     curved = tuple(cost.has_square([j]) for j in inputs)
     groups = _groups(driven)

@@ -113,10 +113,6 @@ class TimeMethod(Protocol):
     """How V is carried from t to t − Δt, as a value: frozen and hashable or a pytree."""
 
     @property
-    def halves(self) -> bool:
-        """If it steps with each player's drift upwinded by itself, see ``splitting``."""
-
-    @property
     def limited(self) -> bool:
         """If steps longer than 1/(max Q + β) over ``courant`` are unstable."""
 
@@ -155,7 +151,6 @@ class Explicit:
 
     stages: int | Tableau | None = None
     fraction: Any = 0.9
-    halves = True  # players who meet in a component are upwinded each by itself, see ``splitting``
     limited, monotone_only = True, False
 
     def __post_init__(self):
@@ -217,7 +212,6 @@ class Implicit:
     evaluation: Evaluation | None = None
     tol: Any = 1e-6
     max_steps: int = 100
-    halves = False  # a chain has one drift, the sum of both players'
     limited, monotone_only = False, True
     courant, tableau = math.inf, TABLEAUX[1]
 

@@ -11,9 +11,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax.discretisation import correlated_noise
+from hjbjax.discretisation import chain, correlated_noise
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.hamiltonian import discrete, splitting
+from hjbjax.hamiltonian import discrete
 from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import Obstacles
 from hjbjax.iteration.time_methods import TimeMethod
@@ -77,7 +77,7 @@ class March:
 
     def rate(self, value: Field, t: Number) -> tuple[Field, "Seen"]:
         """F = min max H − β V, cost per unit time, and what the optimal actions show."""
-        best, u, d = splitting.optimise(self.on.at(t), value)
+        best, u, d = discrete.optimise(discrete.around(self.on.at(t), value))
         return best - self.problem.discount * value, self.look(u, d, t)
 
     def look(self, u: list, d: list, t: Number) -> "Seen":
@@ -85,7 +85,7 @@ class March:
         on, dtype = self.on.at(t), self.on.dtype
         seen = self.nothing_seen()
         if self.checks_rates:
-            fastest = jnp.max(splitting.rate(on, u, d)) + jnp.asarray(on.problem.discount, dtype)
+            fastest = jnp.max(chain.rates(on, u, d).total()) + jnp.asarray(on.problem.discount, dtype)
             seen = dataclasses.replace(seen, fastest=fastest)
         if self.checks_noise:
             lacking = correlated_noise.lacking(on, on.diffusion(u, d))
@@ -139,7 +139,7 @@ class Seen:
 
 def stable(on: Discretisation) -> jax.Array:
     """The longest step for which explicit Euler is monotone, 1/(max Q + β); inf where nothing moves."""
-    rate = jnp.max(splitting.fastest_rate(on)) + on.problem.discount
+    rate = jnp.max(chain.fastest_rate(on)) + on.problem.discount
     return jnp.where(rate > 0, 1 / jnp.where(rate > 0, rate, 1), jnp.inf)
 
 
@@ -243,10 +243,7 @@ def repeat(march: March, value: jax.Array, start: float, end: float, count: int)
 def greedy(march: March, value: jax.Array, t: Any) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, ...]]:
     """The control and the disturbance at the time t, each component of shape (*grid), of the H that steps solve."""
     on = march.on.at(t)
-    if march.method.halves:
-        _, u, d = splitting.optimise(on, value)
-    else:
-        _, u, d = discrete.optimise(discrete.around(on, value))
+    _, u, d = discrete.optimise(discrete.around(on, value))
 
     def full(action):
         return tuple(jnp.broadcast_to(jnp.asarray(entry, value.dtype), march.grid.shape) for entry in action)

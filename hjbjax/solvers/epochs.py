@@ -52,8 +52,7 @@ def _gap_at(task: March, value: jax.Array, t: Any) -> tuple[jax.Array, jax.Array
 
     None where the players drive components of their own, and where each is upwinded by itself.
     """
-    players = players_of(task.on)
-    if players.decoupled or (players.separable and task.method.halves):
+    if players_of(task.on).decoupled:
         return jnp.zeros(()), jnp.ones(())
     hamiltonian = discrete.around(task.on.at(t), value)
     return isaacs_gap(hamiltonian, ~task.obstacles_at(t).fixed)

@@ -53,7 +53,7 @@ def march(
     *,
     times: Any = None,
     start: Any = None,
-    scheme: Scheme = Upwind(),
+    scheme: Scheme = Upwind(split=True),
     method: Explicit | Implicit | None = None,
     step: float | None = None,
     inner: float | None = None,

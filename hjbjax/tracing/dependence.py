@@ -16,6 +16,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import remembered
 from hjbjax.tracing.interpreter import evaluate
 
@@ -100,6 +101,45 @@ def dependence(function: Callable, *arguments: tuple[int | None, bool], dtype: A
     if not (isinstance(result, np.ndarray) and result.dtype == object):
         return Dependence((CONSTANT,) * int(np.size(result)))
     return Dependence(tuple(result.reshape(-1)))
+
+
+@dataclass(frozen=True)
+class Influence:
+    """How drift, cost and noise depend on both players' inputs: the control's first, the disturbance's after them.
+
+    Attributes:
+      drift, cost, noise: the dependences.
+      control, disturbance: the inputs of each player.
+    """
+
+    drift: Dependence
+    cost: Dependence
+    noise: Dependence
+    control: range
+    disturbance: range
+
+    @property
+    def separable(self) -> bool:
+        """Whether drift and cost are sums of what each player does, and noise is neither's."""
+        crossed = any(function.crosses(self.control, self.disturbance) for function in (self.drift, self.cost))
+        return not crossed and self.noise.is_constant
+
+    @property
+    def meet(self) -> bool:
+        """Whether both players drive some component of the state."""
+        return bool(set(self.drift.driven_by(self.control)) & set(self.drift.driven_by(self.disturbance)))
+
+
+def influence(problem: Problem, n: int, dtype: Any) -> Influence:
+    """How the functions of a problem with ``n`` states depend on its players."""
+    m = 0 if problem.controls is None else problem.controls.dim
+    k = 0 if problem.disturbances is None else problem.disturbances.dim
+    arguments = (*((None, False),) * problem.time_dependent, (n, False), (m, True), *((k, True),) * problem.is_game)
+
+    def of(function: Any) -> Dependence:
+        return dependence(function, *arguments, dtype=dtype) if callable(function) else Dependence((CONSTANT,))
+
+    return Influence(of(problem.drift), of(problem.cost), of(problem.noise), range(m), range(m, m + k))
 
 
 def _some_function(operands: Iterable[Terms]) -> Terms:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
+from hjbjax.discretisation import chain
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.hamiltonian import splitting
 from hjbjax.iteration import time_stepping
 
 UNIT = hjb.Box([-1.0], [1.0])
@@ -144,7 +144,7 @@ def test_noise_between_the_sampled_controls_is_looked_at_under_the_policy(ask):
 
 @functools.partial(jax.jit, static_argnames="dtype")
 def rates(problem, u, d, dtype):
-    return splitting.rate(Discretisation(problem, LINE, hjb.Upwind(), dtype), u, d)
+    return chain.rates(Discretisation(problem, LINE, hjb.Upwind(split=True), dtype), u, d).total()
 
 
 @pytest.mark.parametrize("name", QUESTIONS)
@@ -153,4 +153,4 @@ def test_no_action_is_faster_than_what_a_march_sees(name):
     problem = QUESTIONS[name]
     u, d = [jnp.asarray(0.3)], [jnp.asarray(1.0)] if problem.is_game else []
     fast = float(jnp.max(rates(problem, u, d, np.float32)))
-    assert fast * float(time_stepping.stable(Discretisation(problem, LINE, hjb.Upwind(), np.float32))) > 1.2
+    assert fast * float(time_stepping.stable(Discretisation(problem, LINE, hjb.Upwind(split=True), np.float32))) > 1.2

@@ -111,7 +111,7 @@ def joined(first: Path, then: Path, discount: float) -> Path:
     )
 
 
-def truncated(path: Path, count: int, max_steps: int, grid: Grid | None, controls: Any, noisy: bool) -> Path:
+def truncate(path: Path, count: int, max_steps: int, grid: Grid | None, controls: Any, noisy: bool) -> Path:
     """A path of full length cut where it ends, with its line; one that ends early outside the target warns.
 
     Args:

@@ -22,7 +22,7 @@ from hjbjax.solution.clock import CHUNK_SECONDS, Clock, noting_interrupts
 
 Feedback: TypeAlias = GridFeedback | Callable | None  # None where there is no control
 
-INTERVALS = 200  # of the output, where nobody says how many: a picture's curve is smooth
+INTERVALS = 200  # of the output, where nobody says how many
 
 _jit_part = jax.jit(integrate_part, donate_argnames="so_far")  # the rows of all intervals are overwritten in place
 
@@ -141,7 +141,7 @@ def _in_chunks(ivp: InitialValueProblem, stepping: Stepping, clock: Clock) -> tu
     count, done, chunk = len(ivp.times) - 1, 0, 1
     if clock.interrupted:
         raise KeyboardInterrupt("simulate: interrupted before the path began")
-    so_far, answer = _jit_part(ivp, stepping, so_far, 0, 0)  # no interval: it compiles, and the pace is that of steps
+    so_far, answer = _jit_part(ivp, stepping, so_far, 0, 0)  # no interval: compiled apart from the first pace
     ending = PathStatus.INTERRUPTED  # what a path is called that has intervals left
     while ending is PathStatus.INTERRUPTED and done < count and not clock.interrupted:
         began, until = clock.elapsed(), min(done + chunk, count)
@@ -166,8 +166,8 @@ def rollout(
     hold: bool = False,
     grid: Grid | None = None,
     clamp: bool = False,
-    rtol: float = 1e-6,
-    atol: float = 1e-8,
+    rtol: Number = 1e-6,
+    atol: Number = 1e-8,
     max_step: Number | None = None,
     max_steps: int = 100_000,
 ) -> Path:

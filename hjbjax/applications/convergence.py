@@ -20,9 +20,9 @@ from hjbjax.applications.reference import (
     distance,
     mask_of,
     mean_spacing,
+    restrict,
     richardson,
     spacings,
-    thinned,
     words_for,
 )
 from hjbjax.discretisation.discretisation import Scheme
@@ -31,15 +31,18 @@ from hjbjax.iteration.methods import Method
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import is_traced
+from hjbjax.problem.types import Numbers
 from hjbjax.solution.clock import Clock, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
 from hjbjax.solvers.stationary import solve
 
+REFINED = 1.1  # the factors by which the axes are refined over one another, at most
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Study:
-    """What a study measured, one entry a grid from coarse to fine; ``print`` shows the table.
+    """Spacings, errors and seconds of a study, one entry a grid from coarse to fine; ``print`` shows the table.
 
     Args:
       grids: the grids.
@@ -47,7 +50,7 @@ class Study:
       scheme: the scheme's text.
       tol: the tolerance of every solve.
       reference: what the errors are measured against, in words.
-      estimated: whether that is an estimate from these very solutions.
+      estimated: True where that is an estimate from these very solutions.
       h: spacings, the geometric mean over the axes.
       errors: the largest |V_h − V| over the nodes of the region.
       mean_errors: the mean of it.
@@ -81,7 +84,7 @@ class Study:
 
     @property
     def fitted(self) -> np.ndarray:
-        """Which grids count for the orders: converged, and with an error that rises above the tolerance."""
+        """A mask of the grids that count for the orders: converged, and with an error above the tolerance."""
         converged = np.array([status is Status.CONVERGED for status in self.statuses])
         return converged & np.isfinite(self.errors) & (self.errors > self.tol)
 
@@ -106,7 +109,9 @@ class Study:
         return self._steps(self.mean_errors)
 
     def _steps(self, errors: np.ndarray) -> np.ndarray:
+        """The slopes of log error over log h from each grid to the next; NaN beside one that is not fitted."""
         known = self.fitted[:-1] & self.fitted[1:]
+        # an error of zero has no logarithm, and is not fitted: any positive number stands in for it
         logs = np.log(np.where(self.fitted, errors, 1.0))
         return np.where(known, np.diff(logs) / np.diff(np.log(self.h)), np.nan)
 
@@ -196,7 +201,7 @@ def convergence_study(
     """
     if is_traced(problem, grids, reference):
         raise ValueError("convergence_study: it runs at host level only, outside of jit, vmap and grad")
-    ordered = _ordered(grids)
+    ordered = _sort(grids)
     check_reference(reference, ordered)
     compared = ordered if reference is not None else ordered[:1] * len(ordered)  # the estimate lives on the coarsest
     masks = [mask_of(region, grid) for grid in compared]
@@ -204,9 +209,10 @@ def convergence_study(
     clock, timed = Clock(), []
     with noting_interrupts(clock):
         for grid in ordered:
-            timed.append(_timed(problem, grid, clock, scheme=scheme, method=method, tol=tol, throw=False))
+            timed.append(_solve_twice(problem, grid, clock, scheme=scheme, method=method, tol=tol, throw=False))
             if clock.interrupted:
                 break
+    # Ctrl-C: the rows so far are a study, whose last grid may have one solve in place of two
     whole = len(timed) == len(ordered)
     ordered, masks, exact = ordered[: len(timed)], masks[: len(timed)], exact[: len(timed)]
     solutions = tuple(solution for solution, _, _ in timed)
@@ -214,7 +220,8 @@ def convergence_study(
     h = np.array([mean_spacing(grid) for grid in ordered])
     extrapolated, words = None, words_for(reference, ordered)
     if reference is None:
-        values = [thinned(value, grid, ordered[0]) for value, grid in zip(values, ordered, strict=True)]
+        # all errors on the nodes of the coarsest grid, which all have: there alone V is known from three spacings
+        values = [restrict(value, grid, ordered[0]) for value, grid in zip(values, ordered, strict=True)]
         if clock.interrupted:
             words = "nothing: the study was interrupted"
         else:
@@ -232,6 +239,7 @@ def convergence_study(
         errors=np.array([np.max(each) for each in off]),
         mean_errors=np.array([np.mean(each) for each in off]),
         seconds=np.array([warm for _, _, warm in timed]),
+        # the clock may run backwards by its jitter where nothing had to be compiled
         compile_seconds=np.array([cold if math.isnan(warm) else max(0.0, cold - warm) for _, cold, warm in timed]),
         extrapolated=extrapolated,
     )
@@ -241,7 +249,7 @@ def convergence_study(
     return study
 
 
-def fitted_order(h: Any, errors: Any) -> float:
+def fitted_order(h: Numbers | Sequence[float], errors: Numbers | Sequence[float]) -> float:
     """The slope of log error over log h by least squares; NaN unless two errors are positive and finite."""
     h, errors = np.asarray(h, float), np.asarray(errors, float)
     usable = np.isfinite(errors) & (errors > 0)
@@ -250,7 +258,7 @@ def fitted_order(h: Any, errors: Any) -> float:
     return float(np.polyfit(np.log(h[usable]), np.log(errors[usable]), 1)[0])
 
 
-def _timed(problem: Problem, grid: Grid, clock: Clock, **options: Any) -> tuple[Solution, float, float]:
+def _solve_twice(problem: Problem, grid: Grid, clock: Clock, **options: Any) -> tuple[Solution, float, float]:
     """A solution, and the wall time of the first and of a second solve, NaN where that was interrupted."""
     marks = [time.perf_counter()]
     solution = solve(problem, grid, **options)
@@ -263,7 +271,7 @@ def _timed(problem: Problem, grid: Grid, clock: Clock, **options: Any) -> tuple[
     return solution, marks[1] - marks[0], marks[2] - marks[1]
 
 
-def _ordered(grids: Any) -> tuple[Grid, ...]:
+def _sort(grids: Sequence[Grid] | Grid) -> tuple[Grid, ...]:
     """The grids from coarse to fine, once they are known to be of one box and to shrink alike."""
     grids = list(grids) if isinstance(grids, Sequence) else [grids]
     for grid in grids:
@@ -277,7 +285,8 @@ def _ordered(grids: Any) -> tuple[Grid, ...]:
         if repr(grid.stretch) != repr(first.stretch):
             raise ValueError(f"convergence_study: got stretch {first.stretch} and {grid.stretch}; wanted one for all")
         ratios = spacings(first) / spacings(grid)
-        if ratios.max() > 1.1 * ratios.min():
+        # intervals are integers: 10 % lets an odd axis be refined by almost the factor of the others
+        if ratios.max() > REFINED * ratios.min():
             raise ValueError(
                 f"convergence_study: from {first.shape} to {grid.shape} the axes are refined by the factors "
                 f"{', '.join(f'{ratio:.3g}' for ratio in ratios)}; wanted one factor, so that one h stands for all"
@@ -288,4 +297,5 @@ def _ordered(grids: Any) -> tuple[Grid, ...]:
 
 
 def _order(order: float) -> str:
+    """An order as the table shows it."""
     return f"{order:.2f}" if math.isfinite(order) else "-"

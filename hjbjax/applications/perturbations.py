@@ -11,14 +11,13 @@ orders are slopes of log error over log ε and log 1/γ by least squares, of err
 """
 
 import dataclasses
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import jax
 import numpy as np
 
 from hjbjax.applications.convergence import fitted_order
-from hjbjax.applications.l2_gain import attenuation, saturation
+from hjbjax.applications.l2_gain import InputMatrix, attenuation, saturation
 from hjbjax.applications.reference import mask_of
 from hjbjax.discretisation.discretisation import Scheme
 from hjbjax.discretisation.schemes import Limited
@@ -26,6 +25,7 @@ from hjbjax.iteration.methods import Method
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box
+from hjbjax.problem.types import Mask
 from hjbjax.solution.clock import Clock, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
@@ -81,8 +81,8 @@ class Perturbation:
 
     Args:
       nominal: the solution without either.
-      noise: what the noises ε did.
-      gain: what the disturbances at the levels γ did, over 1/γ.
+      noise: the changes by the noises ε.
+      gain: the changes by the disturbances at the levels γ, over 1/γ.
       scheme: the scheme's text.
       tol: the tolerance of every solve.
     """
@@ -108,8 +108,8 @@ def perturbation_study(
     noises: Sequence[float],
     gammas: Sequence[float],
     disturbances: AdmissibleSet,
-    enters: Any = None,
-    region: Any = 0.25,
+    enters: InputMatrix = None,
+    region: Callable | float | None = 0.25,
     scheme: Scheme = Limited(),
     method: Method | None = None,
     tol: float = 1e-6,
@@ -151,6 +151,7 @@ def perturbation_study(
     if not np.asarray(problem.discount) > 0:
         raise ValueError("perturbation_study: with noise and no discount the cost has no end; give a discount > 0")
     mask = mask_of(region, grid, "perturbation_study")
+    # from the highest level, the weakest disturbance, on: like the noises in the order of their effect
     games = [attenuation(problem, gamma, disturbances, enters=enters) for gamma in levels[1][::-1]]
     if not isinstance(disturbances, (Box, Ball)):
         raise ValueError(f"perturbation_study: the disturbances are {disturbances!r:.60}; wanted a Box or a Ball")
@@ -173,32 +174,38 @@ def perturbation_study(
     if clock.interrupted:
         came = f"{len(found)} of {len(noisy) + len(games)} perturbed problems"
         raise SolveError(f"perturbation_study: interrupted after {came}; .solution is the study so far", study)
-    felt = saturation(dataclasses.replace(found[-1], disturbance=_within(found[-1], mask)), games[-1], inner=1.0)
+    # the lowest level has the strongest worst case: if that does not come to its bound, none does
+    felt = saturation(
+        dataclasses.replace(found[-1], disturbance=_disturbance_within(found[-1], mask)), games[-1], inner=1.0
+    )
     if felt.share > 0:
         raise ValueError(f"perturbation_study: at gamma = {levels[1][0]:g} {felt}; widen the set, or raise gamma")
     return study
 
 
-def _increasing(name: str, numbers: Any) -> np.ndarray:
+def _increasing(name: str, numbers: Sequence[float]) -> np.ndarray:
+    """The parameters in increasing order, each once."""
     values = np.unique(np.asarray(numbers, np.float64))
     if values.size < 2 or not np.all(np.isfinite(values) & (values > 0)):
         raise ValueError(f"perturbation_study: got {name} = {numbers!r}, wanted at least two finite numbers > 0")
     return values
 
 
-def _within(solution: Solution, mask: np.ndarray) -> np.ndarray:
+def _disturbance_within(solution: Solution, mask: Mask) -> np.ndarray:
     """The disturbance in the region, NaN outside."""
     return np.where(mask[..., None], solution.disturbance, np.nan)
 
 
 def _series(
-    name: str, parameters: np.ndarray, solutions: Sequence[Solution], nominal: Solution, mask: np.ndarray, tol: float
+    name: str, parameters: np.ndarray, solutions: Sequence[Solution], nominal: Solution, mask: Mask, tol: float
 ) -> Series:
+    """The changes against the unperturbed solution, and which of them count for the orders."""
     parameters = parameters[: len(solutions)]  # fewer where the study was interrupted
     values = [np.abs(each.value - nominal.value)[mask] for each in solutions]
+    # NaN, as of a solve that was cut short, goes through the maxima and is not fitted
     inputs = [np.abs(each.policy - nominal.policy)[mask] for each in solutions]
     errors = np.array([np.max(each) for each in values])
-    feedback = np.array([np.max(each, initial=0.0) for each in inputs])
+    feedback = np.array([np.max(each, initial=0.0) for each in inputs])  # initial: without controls u is empty
     converged = np.array([each.status is Status.CONVERGED for each in solutions], bool)
     fitted = converged & np.isfinite(errors) & (errors > tol)
     finest = min(float(nominal.grid.spacing(axis)) for axis in range(nominal.grid.ndim))

@@ -205,12 +205,13 @@ def convergence_study(
     check_reference(reference, ordered)
     compared = ordered if reference is not None else ordered[:1] * len(ordered)  # the estimate lives on the coarsest
     masks = [mask_of(region, grid) for grid in compared]
+    # the reference at all nodes before the first solve: what cannot be measured against is refused at once
     exact = [] if reference is None else list(map(at_nodes_of, repeat(reference), ordered, masks))
     clock, timed = Clock(), []
     with noting_interrupts(clock):
         for grid in ordered:
             timed.append(_solve_twice(problem, grid, clock, scheme=scheme, method=method, tol=tol, throw=False))
-            if clock.interrupted:
+            if clock.interrupted:  # the solve has handed back what it had, not raised
                 break
     # Ctrl-C: the rows so far are a study, whose last grid may have one solve in place of two
     whole = len(timed) == len(ordered)
@@ -227,6 +228,7 @@ def convergence_study(
         else:
             extrapolated, words = richardson(values[-3:], h[-3:], masks[0], tol)
         exact = [np.full(masks[0].shape, np.nan) if extrapolated is None else extrapolated] * len(values)
+    # one row of distances a grid, over the nodes of its region
     off = [distance(*pair)[mask] for *pair, mask in zip(values, exact, masks, strict=True)]
     study = Study(
         ordered,
@@ -239,7 +241,7 @@ def convergence_study(
         errors=np.array([np.max(each) for each in off]),
         mean_errors=np.array([np.mean(each) for each in off]),
         seconds=np.array([warm for _, _, warm in timed]),
-        # the clock may run backwards by its jitter where nothing had to be compiled
+        # where nothing had to be compiled the second solve may by chance take longer
         compile_seconds=np.array([cold if math.isnan(warm) else max(0.0, cold - warm) for _, cold, warm in timed]),
         extrapolated=extrapolated,
     )
@@ -253,7 +255,7 @@ def fitted_order(h: Numbers | Sequence[float], errors: Numbers | Sequence[float]
     """The slope of log error over log h by least squares; NaN unless two errors are positive and finite."""
     h, errors = np.asarray(h, float), np.asarray(errors, float)
     usable = np.isfinite(errors) & (errors > 0)
-    if np.count_nonzero(usable) < 2:
+    if np.count_nonzero(usable) < 2:  # a line through one point has every slope
         return math.nan
     return float(np.polyfit(np.log(h[usable]), np.log(errors[usable]), 1)[0])
 
@@ -261,7 +263,7 @@ def fitted_order(h: Numbers | Sequence[float], errors: Numbers | Sequence[float]
 def _solve_twice(problem: Problem, grid: Grid, clock: Clock, **options: Any) -> tuple[Solution, float, float]:
     """A solution, and the wall time of the first and of a second solve, NaN where that was interrupted."""
     marks = [time.perf_counter()]
-    solution = solve(problem, grid, **options)
+    solution = solve(problem, grid, **options)  # compiles, unless a grid of this shape was solved before
     marks.append(time.perf_counter())
     if not clock.interrupted:
         solve(problem, grid, **options)
@@ -282,7 +284,7 @@ def _sort(grids: Sequence[Grid] | Grid) -> tuple[Grid, ...]:
     first, *rest = ordered = sorted(grids, key=mean_spacing, reverse=True)
     for grid in rest:
         check_box("grids of different boxes", first, grid)
-        if repr(grid.stretch) != repr(first.stretch):
+        if repr(grid.stretch) != repr(first.stretch):  # by their text: they compare as objects
             raise ValueError(f"convergence_study: got stretch {first.stretch} and {grid.stretch}; wanted one for all")
         ratios = spacings(first) / spacings(grid)
         # intervals are integers: 10 % lets an odd axis be refined by almost the factor of the others

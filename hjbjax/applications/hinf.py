@@ -200,7 +200,7 @@ def hinf_level(
 
 def _bisect(at: Callable[[float], Trial], lo: float, hi: float, tol: float, settle: float) -> None:
     """Try γ after γ until the bracket is narrow enough."""
-    top = at(hi)
+    top = at(hi)  # first: where even hi fails, sets, grid or horizon are at fault, and lo says nothing more
     if not top.feasible:
         raise ValueError(f"hinf_level: hi = {hi:g} is not feasible: {_why(top, settle)}")
     bottom = at(lo)
@@ -219,6 +219,7 @@ def _level(trials: list[Trial], cut: Trial | None = None) -> Level:
     """The level by the trials so far, of which ``cut`` came to no verdict."""
     top = min((trial.gamma for trial in trials if trial.feasible), default=math.inf)
     bottom = max((trial.gamma for trial in trials if not trial.feasible and trial is not cut), default=0.0)
+    # a trial that was cut has shown nothing: it is listed, and bounds the bracket on neither side
     status = Status.CONVERGED if cut is None else cut.solution.status
     return Level(top, (bottom, top), tuple(sorted(trials, key=lambda trial: trial.gamma)), status)
 
@@ -237,6 +238,7 @@ def _try(
     # a march stops by itself where the worst case comes to the bound of a Box; of a Ball only its end is looked at
     watch = inner if isinstance(problem.disturbances, Box) else 0.0
     inside = grid.inner(inner)
+    # some node of the inner box needs both of its neighbours in it
     if not np.all([np.sum(np.any(inside, axis=_others(grid, k))) >= 3 for k in range(grid.ndim)]):
         raise ValueError(f"hinf_level: inner = {inner:g} of {grid.shape} nodes holds fewer than 3 along an axis")
     # gains: of V over each doubling, the first against nothing before
@@ -246,14 +248,14 @@ def _try(
         solution = march(problem, grid, span, start=value, inner=watch, throw=False, scheme=scheme, time_limit=left)
         if solution.status in CUTS:
             return _no_verdict(solution, gamma, total + span - float(solution.times[0]), inner)
+        # a march that was decided early stands at times[0] > 0, and less than the span has passed
         after, total = np.asarray(solution.value[0]), total + span - float(solution.times[0])
         size, gain = (float(np.max(np.abs(each[inside]))) for each in (after, after - value))
-        # a V that is zero all over, as of a plant at rest, has not grown
         bound = saturation(solution, problem, inner=inner)
         reason = _reason(solution.status, bound, gain / size if size else 0.0, gain / gains[-1], settle)
-        if reason or total >= horizon * (1 - 1e-9):
+        if reason or total >= horizon * (1 - 1e-9):  # the total is a sum of spans, by rounding
             break
-        value, span, gains = after, total, [*gains, gain]
+        value, span, gains = after, total, [*gains, gain]  # as long again as all before: T doubles
         # never 0 or less: march wants a positive limit, and hands back what there is after its first look
         left = time_limit and max(time_limit - (perf_counter() - began), SOON)
     kept = _stationary(solution, total)
@@ -271,13 +273,15 @@ def _no_verdict(solution: Solution, gamma: float, total: float, inner: float) ->
 
 def _stationary(solution: Solution, total: float) -> Solution:
     """The last slice of a march over the time ``total`` as a stationary solution."""
+    # of the kept times, the leading axis, the first is the last that was marched
     first = {name: getattr(solution, name)[0] for name in ("value", "policy", "disturbance")}
     return dataclasses.replace(solution, times=None, stats={**solution.stats, "horizon": total}, **first)
 
 
 def _reason(status: Status, bound: Saturation, growth: float, ratio: float, settle: float) -> str:
     """The verdict of a march and the reason to stop here; empty to go on."""
-    # DIVERGED is the march's own word for a disturbance at its bound, see ``watch``
+    # DIVERGED is what the march calls a disturbance that came to its bound while it watched
+    # first of all: where d is cut off V settles too, at a value that is the set's and no gain
     if status is Status.DIVERGED or bound.share > 0:
         return "saturated"
     if status is not Status.CONVERGED:

@@ -137,6 +137,7 @@ def saturation(solution: Solution, problem: Problem, *, inner: float = 0.5) -> S
         raise ValueError(f"saturation: the disturbances are {len(admissible.points)} points; wanted a Box or a Ball")
     if not 0 < inner <= 1:
         raise ValueError(f"saturation: got inner = {inner!r}; wanted a share of the box in (0, 1]")
+    # a march is judged where it has come to, the earliest kept time: there the worst case has the longest way ahead
     d = np.asarray(solution.disturbance if solution.times is None else solution.disturbance[0], np.float64)
     inside = solution.grid.inner(inner) & np.all(np.isfinite(d), axis=-1)
     if not inside.any():

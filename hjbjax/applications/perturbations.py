@@ -155,19 +155,20 @@ def perturbation_study(
     games = [attenuation(problem, gamma, disturbances, enters=enters) for gamma in levels[1][::-1]]
     if not isinstance(disturbances, (Box, Ball)):
         raise ValueError(f"perturbation_study: the disturbances are {disturbances!r:.60}; wanted a Box or a Ball")
+    # before the first solve, which may take long: E and the set of d are met by the games alone
     with jax.enable_x64(True):
         checks.shapes(games[0], grid, scheme)
 
-    def solved(which: Problem, throw: bool = False) -> Solution:
+    def solution_of(which: Problem, throw: bool = False) -> Solution:
         return solve(which, grid, scheme=scheme, method=method, tol=tol, throw=throw)
 
     clock, found = Clock(), []
     noisy = [dataclasses.replace(problem, noise=epsilon) for epsilon in levels[0]]
     with noting_interrupts(clock):
-        nominal = solved(problem, throw=True)
+        nominal = solution_of(problem, throw=True)  # without it there is nothing to compare with
         for perturbed in (*noisy, *games):
             if not clock.interrupted:
-                found.append(solved(perturbed))
+                found.append(solution_of(perturbed))
     noise = _series("ε", levels[0], found[: len(noisy)], nominal, mask, tol)
     gain = _series("1/γ", 1 / levels[1][::-1], found[len(noisy) :], nominal, mask, tol)
     study = Perturbation(nominal, noise, gain, str(scheme), tol)
@@ -175,9 +176,8 @@ def perturbation_study(
         came = f"{len(found)} of {len(noisy) + len(games)} perturbed problems"
         raise SolveError(f"perturbation_study: interrupted after {came}; .solution is the study so far", study)
     # the lowest level has the strongest worst case: if that does not come to its bound, none does
-    felt = saturation(
-        dataclasses.replace(found[-1], disturbance=_disturbance_within(found[-1], mask)), games[-1], inner=1.0
-    )
+    watched = dataclasses.replace(found[-1], disturbance=_disturbance_within(found[-1], mask))
+    felt = saturation(watched, games[-1], inner=1.0)
     if felt.share > 0:
         raise ValueError(f"perturbation_study: at gamma = {levels[1][0]:g} {felt}; widen the set, or raise gamma")
     return study
@@ -202,7 +202,7 @@ def _series(
     """The changes against the unperturbed solution, and which of them count for the orders."""
     parameters = parameters[: len(solutions)]  # fewer where the study was interrupted
     values = [np.abs(each.value - nominal.value)[mask] for each in solutions]
-    # NaN, as of a solve that was cut short, goes through the maxima and is not fitted
+    # a NaN goes through the maxima, and what it touches is not fitted
     inputs = [np.abs(each.policy - nominal.policy)[mask] for each in solutions]
     errors = np.array([np.max(each) for each in values])
     feedback = np.array([np.max(each, initial=0.0) for each in inputs])  # initial: without controls u is empty

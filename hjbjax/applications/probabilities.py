@@ -134,6 +134,7 @@ def stay_probability(
       0.37
     """
     leaving = jax.tree_util.Partial(exit_problems.complement, as_partial(region, "stay_probability: region"))
+    # P(stays) = 1 − P(leaves), also of a partial solution; the least probability of leaving is the greatest of staying
     with _affine_in_errors(1.0, -1.0):
         left = reach_probability(problem, grid, leaving, horizon=horizon, least=not least, feedback=feedback, **options)
     return _affine(left, 1.0, -1.0)
@@ -183,7 +184,7 @@ def expected_exit_time(
     name = "expected_exit_time"
     _refuse_open(grid, name)
     problem, inside, _ = _system(problem, target, None, feedback, horizon, name)
-    sign = -1.0 if greatest else 1.0
+    sign = -1.0 if greatest else 1.0  # max E τ = −min E(−τ): a cost of −1 per unit time
     question = exit_problems.exit_problem(problem, inside, None, sign, 0.0)
     with _no_fallback_warning(feedback):
         if horizon is None:
@@ -256,9 +257,10 @@ def _zero(*where: Place) -> jax.Array:
 
 def _count_staying(question: Problem, grid: Grid, options: dict) -> int:
     """The number of nodes at which some actions keep the state away from every end for ever; 0 while traced."""
+    # the checks of ``solve``, in its order: the survey of all nodes must not be the first to meet a bad argument
     scheme, kind = options.get("scheme", Upwind()), as_dtype(options.get("dtype"))
     check_arguments(question, grid, options.get("method"), scheme, options["tol"])
-    if is_traced(question, grid):
+    if is_traced(question, grid):  # values of the problem's functions are needed, which there are none of
         return 0
     method = options.get("method") or ValueIteration()  # needs the least; solve asks again for what it takes
     with jax.enable_x64(kind == np.float64):

@@ -141,6 +141,7 @@ def _drift(drift: Callable, forward: bool, time_dependent: bool) -> Callable:
     """The drift, backwards for a forward set."""
     if not forward:
         return drift
+    # x(T) is reached from the target exactly if the target is reached from x(T) with time running backwards
     if time_dependent:
         raise ValueError(
             "forward=True turns the time round, which it cannot do for functions of the time; write drift(T - t, x, u) "

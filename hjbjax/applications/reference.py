@@ -29,6 +29,7 @@ def mean_spacing(grid: Grid) -> float:
 
 def spacings(grid: Grid) -> np.ndarray:
     """The mean spacing along every axis, shape (n,)."""
+    # of a stretched axis the mean; on a finer grid all of its spacings shrink by about the factor of the mean
     counts = np.array([grid.intervals(axis) for axis in range(grid.ndim)])
     return (np.asarray(grid.hi) - np.asarray(grid.lo)) / counts
 
@@ -165,7 +166,7 @@ def richardson(values: list[np.ndarray], h: np.ndarray, mask: np.ndarray, tol: f
         return (h[0] ** order - h[1] ** order) - wide / narrow * (h[1] ** order - h[2] ** order)
 
     if not (math.isfinite(wide) and narrow > tol and excess(FLATTEST) < 0 < excess(STEEPEST)):
-        # a change below the tolerance is the iteration's; where the excess changes no sign no order explains the changes
+        # a change below the tolerance is the iteration's; without a change of sign no order explains the two changes
         return None, (
             "nothing: no Richardson estimate, since from grid to grid the mean "
             f"changes by {wide:.3g} and {narrow:.3g}, which shows no order"
@@ -173,7 +174,7 @@ def richardson(values: list[np.ndarray], h: np.ndarray, mask: np.ndarray, tol: f
     from scipy.optimize import brentq
 
     order = brentq(excess, FLATTEST, STEEPEST)
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore"):  # nodes that are infinite on all grids stay so
         step = np.where(fine == middle, 0.0, fine - middle)
     extrapolated = fine + step * h[2] ** order / (h[1] ** order - h[2] ** order)
     return extrapolated, f"Richardson's estimate from the three finest grids, which show order {order:.2f}"

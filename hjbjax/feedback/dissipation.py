@@ -139,7 +139,7 @@ def dissipation(
         key = jax.random.key(key)
     import diffrax  # noqa: F401  # before anything is compiled, see simulate
 
-    with jax.enable_x64(True):
+    with jax.enable_x64(True):  # the margin is a difference of energies, near zero in the worst case
         problem, solution = cast(problem, np.float64), cast(solution, np.float64)
         times = np.linspace(0.0, float(duration), STEPS + 1)
         lanes, kinds = _lanes(problem, starts, random, typing.cast("Key", key))
@@ -169,6 +169,7 @@ def _lanes(problem: Problem, starts: np.ndarray, random: int, key: Key) -> tuple
     assert admissible is not None
     # equally spaced in the logarithm: each decade down to WEAKEST gets its share, the last is the whole set
     strength = np.geomspace(WEAKEST, 1.0, random) if random > 1 else np.ones(random)
+    # the point of the set nearest to 0, about which the set is scaled
     least = np.clip(0.0, admissible.lo, admissible.hi) if isinstance(admissible, Box) else np.zeros(admissible.dim)
     away = np.zeros((0, POINTS, admissible.dim))
     if count:
@@ -190,6 +191,7 @@ def _uniform(admissible: Box | Ball, key: Key, shape: tuple[int, ...]) -> jax.Ar
 
 def _disturbance(look: Callable, weight: Number, points: Array, duration: Number, t: Number, x: State) -> Array:
     """The worst case times ``weight``, plus a signal that is linear between its points."""
+    # by index and share, as the points are equally spaced; at the end of the path the last cell goes on
     place = jnp.clip(t / duration, 0, 1) * (POINTS - 1)
     cell = jnp.clip(jnp.floor(place).astype(int), 0, POINTS - 2)
     signal = points[cell] + (place - cell) * (points[cell + 1] - points[cell])

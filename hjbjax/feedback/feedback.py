@@ -104,6 +104,7 @@ def lookups(feedback: GridFeedback) -> tuple[Callable, Callable]:
     if isinstance(feedback, Solution):
         players = {"policy": feedback.discrete, "disturbance": feedback.discrete_disturbance}
         given = {name: getattr(feedback, name) for name in players if getattr(feedback, name) is not None}
+        # nodes without a control get that of their neighbours: asked second, they answer where a whole cell is NaN
         filled = {name: extended(feedback.grid, array, players[name]) for name, array in given.items()}
         answers.append(dataclasses.replace(feedback, **filled))
     ask = _stationary if feedback.times is None else _marched
@@ -184,7 +185,7 @@ class Greedy:
     def _ask(self, where: tuple[Place, ...], clamp: bool) -> tuple[Array, Array]:
         """Both players' actions: float64 NumPy from concrete data, else of the tracer's dtype."""
         costate = self.solution.costate_at(*where, clamp=clamp)  # refuses what is no state
-        if is_traced(costate, self):
+        if is_traced(costate, self):  # float64 must not be switched on in the middle of somebody's trace
             return _minimax(self, where, costate)
         with jax.enable_x64(True):
             greedy, where, costate = cast((self, where, costate), np.float64)
@@ -239,7 +240,7 @@ def greedy_feedback(problem: Problem, solution: Solution) -> Greedy:
 
 def _minimax(greedy: Greedy, where: tuple, costate: Array) -> tuple[Array, Array]:
     """Both players' actions at states of shape (..., n), one by one, shapes (..., m) and (..., l)."""
-    times, shape = where[:-1], jnp.shape(costate)
+    times, shape = where[:-1], jnp.shape(costate)  # the time and the states broadcast to the shape of the costates
     states = jnp.broadcast_to(jnp.asarray(where[-1], costate.dtype), shape).reshape(-1, shape[-1])
     moments = [jnp.broadcast_to(jnp.asarray(t, costate.dtype), shape[:-1]).reshape(-1) for t in times]
     answers = list(jax.vmap(lambda x, p, *t: _at(greedy, t, x, p))(states, costate.reshape(-1, shape[-1]), *moments))
@@ -271,7 +272,9 @@ def _at(greedy: Greedy, when: tuple[Number, ...], x: State, p: Costate) -> tuple
     problem, grid = greedy.problem, greedy.grid
     n, t = grid.ndim, (when[0] if when else 0.0)
     x = grid.wrap(x)
+    # clipped as the costate was: outside of the box the Hamiltonian is that of the nearest point
     x = jnp.where(np.array(grid.periodic), x, jnp.clip(x, jnp.asarray(grid.lo, x.dtype), jnp.asarray(grid.hi, x.dtype)))
+    # V is looked up one mean cell away, also on a stretched axis: for D²V a cell is the least that the nodes resolve
     widths = [jnp.asarray(grid.spacing(axis), x.dtype) for axis in range(n)]
     h = jnp.stack([jnp.mean(width) for width in widths])
     # without noise no second difference is asked for, and zeros stand in for V at the 3^n nodes

@@ -124,7 +124,7 @@ class Loop:
         if self.grid is None or self.clamp:
             return jnp.asarray(jnp.inf, x.dtype)
         lo, hi = self._corners(x)
-        inside = jnp.minimum(x - lo, hi - x) / (hi - lo)
+        inside = jnp.minimum(x - lo, hi - x) / (hi - lo)  # over the width, so that axes of any units compare
         # A path may rest on the edge, where rounding must not push it out: 64 units in the last place, 1.4e-14 of the
         # width in float64, is far above the rounding of a step and far below what anybody would call outside.
         slack = 64 * jnp.finfo(x.dtype).eps

@@ -132,7 +132,7 @@ def truncate(
     status, times, states = path.status, path.times[: count + 1], path.states[: count + 1]
     applied = path.controls[:count]
     where = f"t = {times[-1]:.6g}"
-    if status in (PathStatus.NONFINITE, PathStatus.UNDEFINED):
+    if status in (PathStatus.NONFINITE, PathStatus.UNDEFINED):  # the state is what one looks at to find the fault
         where += f", x = [{', '.join(f'{entry:.4g}' for entry in states[-1])}]"
     said = [
         f"{status.message} at {where}",

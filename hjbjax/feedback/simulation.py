@@ -119,7 +119,7 @@ def simulate(
         jax.enable_x64(True),
         jax.debug_nans(False),
     ):  # after the end of a path its controls are NaN
-        loop = cast(loop, np.float64)
+        loop = cast(loop, np.float64)  # a solution of float32 closes the loop in float64, as the path is integrated
         check_shapes(loop, start)
         if loop.grid is not None and not loop.margin(start) > 0:
             lo, hi = np.asarray(loop.grid.lo).tolist(), np.asarray(loop.grid.hi).tolist()
@@ -147,7 +147,7 @@ def _in_chunks(ivp: InitialValueProblem, stepping: Stepping, clock: Clock) -> tu
         began, until = clock.elapsed(), min(done + chunk, count)
         so_far, answer = _jit_part(ivp, stepping, so_far, done, until)
         ending = PathStatus(int(answer[0].code))
-        pace = max(clock.elapsed() - began, 1e-4) / (until - done)
+        pace = max(clock.elapsed() - began, 1e-4) / (until - done)  # seconds an interval; a clock may not tick
         # at most eight times as many as before: the pace of one quick interval says little of those that follow
         chunk = int(np.clip(CHUNK_SECONDS / pace, 1, 8 * chunk))
         done = until
@@ -228,7 +228,7 @@ def _close(
         )
     control, opponent = None if is_grid_feedback(feedback) else feedback, disturbance
     if is_grid_feedback(feedback):
-        if grid is not None and grid is not feedback.grid:
+        if grid is not None and grid is not feedback.grid:  # its own, said once more, does no harm
             raise ValueError("simulate: the solution brings its own grid; leave out grid=")
         grid = feedback.grid
         control, worst = lookups(feedback)
@@ -273,6 +273,7 @@ def _within_horizon(problem: Problem, solution: GridFeedback, duration: float) -
       ValueError: the feedback is not known well enough up to the duration.
     """
     horizon = check_kept(solution, duration, "simulate: duration")
+    # V at the horizon is owed there, not where a shorter path stops
     if duration < horizon * (1 - 1e-9) and problem.terminal_cost is not None:
         problem = copy.copy(problem)  # and no `replace`, which would check and wrap all other fields again
         object.__setattr__(problem, "terminal_cost", None)

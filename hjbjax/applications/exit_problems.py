@@ -106,7 +106,7 @@ def exit_problem(
     Args:
       problem: whose drift, noise and players count.
       target: a function ≤ 0 inside.
-      obstacle: likewise, or None; it ends the path as well, and wins where the two overlap.
+      obstacle: a function ≤ 0 inside, or None; it ends the path as well, and wins where the two overlap.
       cost: per unit time; 0 for none.
       exit_cost: on the target; 0 for none.
     """

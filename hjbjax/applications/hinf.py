@@ -258,20 +258,20 @@ def _try(
         value, span, gains = after, total, [*gains, gain]  # as long again as all before: T doubles
         # never 0 or less: march wants a positive limit, and hands back what there is after its first look
         left = time_limit and max(time_limit - (perf_counter() - began), SOON)
-    kept = _stationary(solution, total)
+    kept = _as_stationary(solution, total)
     reason, growth = reason or "growing", gain / size if size else 0.0
     return Trial(gamma, reason == "settled", reason, total, growth, size, bound, kept)
 
 
 def _no_verdict(solution: Solution, gamma: float, total: float, inner: float) -> Trial:
     """A trial without a verdict, from a march that was cut short."""
-    kept = _stationary(solution, total)
+    kept = _as_stationary(solution, total)
     size = float(np.max(np.abs(kept.value[kept.grid.inner(inner)])))
     unknown = Saturation(math.nan, math.nan, np.full(kept.grid.ndim, math.nan), inner)
     return Trial(gamma, False, CUTS[solution.status], total, math.nan, size, unknown, kept)
 
 
-def _stationary(solution: Solution, total: float) -> Solution:
+def _as_stationary(solution: Solution, total: float) -> Solution:
     """The last slice of a march over the time ``total`` as a stationary solution."""
     # of the kept times, the leading axis, the first is the last that was marched
     first = {name: getattr(solution, name)[0] for name in ("value", "policy", "disturbance")}
@@ -279,7 +279,7 @@ def _stationary(solution: Solution, total: float) -> Solution:
 
 
 def _reason(status: Status, bound: Saturation, growth: float, ratio: float, settle: float) -> str:
-    """The verdict of a march and the reason to stop here; empty to go on."""
+    """The verdict after a march, as ``Trial.reason`` has it; empty to go on."""
     # DIVERGED is what the march calls a disturbance that came to its bound while it watched
     # first of all: where d is cut off V settles too, at a value that is the set's and no gain
     if status is Status.DIVERGED or bound.share > 0:

@@ -143,13 +143,13 @@ def saturation(solution: Solution, problem: Problem, *, inner: float = 0.5) -> S
     if not inside.any():
         raise ValueError(f"saturation: no node with a disturbance in the inner {inner:g} of the box; enlarge it")
     # −1 outside: an argmax finds a node of the inner box, also where d is zero in all of it
-    size = np.where(inside, _relative(admissible, d), -1.0)
+    size = np.where(inside, _share_of_bound(admissible, d), -1.0)
     index = np.unravel_index(int(np.argmax(size)), size.shape)
     share = float(np.mean(size[inside] >= 1 - NEAR))
     return Saturation(share, float(size[index]), solution.grid.state([int(i) for i in index]), float(inner))
 
 
-def _relative(admissible: Box | Ball, d: np.ndarray) -> np.ndarray:
+def _share_of_bound(admissible: Box | Ball, d: np.ndarray) -> np.ndarray:
     """|d| over its bound at every node; inputs that cannot move do not count."""
     if isinstance(admissible, Ball):
         return np.linalg.norm(d, axis=-1) / np.where(admissible.radius > 0, admissible.radius, np.inf)

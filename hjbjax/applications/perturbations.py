@@ -62,7 +62,7 @@ class Series:
 
     @property
     def feedback_order(self) -> float:
-        """The fitted slope of the feedback, likewise."""
+        """The fitted slope of the feedback; NaN with fewer than two entries to fit."""
         return fitted_order(self.parameters[self.feedback_fitted], self.feedback_errors[self.feedback_fitted])
 
     def __str__(self) -> str:
@@ -118,7 +118,7 @@ def perturbation_study(
 
     Args:
       problem: the question, without noise or disturbances; without discount noise would cost without end.
-      grid: the nodes, the same for all.
+      grid: the nodes, on which all of them are solved.
       noises: ε, at least two numbers > 0.
       gammas: γ, at least two feasible levels.
       disturbances: the set of d, not saturated in the region.
@@ -145,7 +145,7 @@ def perturbation_study(
       (2.0, 2.0)
     """
     check_arguments(problem, grid, method, scheme, tol)
-    levels = _increasing("noises", noises), _increasing("gammas", gammas)
+    levels = _parameters("noises", noises), _parameters("gammas", gammas)
     if problem.is_game or problem.noise is not None:
         raise ValueError("perturbation_study: the problem has noise or disturbances already; leave them out")
     if not np.asarray(problem.discount) > 0:
@@ -183,7 +183,7 @@ def perturbation_study(
     return study
 
 
-def _increasing(name: str, numbers: Sequence[float]) -> np.ndarray:
+def _parameters(name: str, numbers: Sequence[float]) -> np.ndarray:
     """The parameters in increasing order, each once."""
     values = np.unique(np.asarray(numbers, np.float64))
     if values.size < 2 or not np.all(np.isfinite(values) & (values > 0)):

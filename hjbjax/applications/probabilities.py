@@ -135,7 +135,7 @@ def stay_probability(
     """
     leaving = jax.tree_util.Partial(exit_problems.complement, as_partial(region, "stay_probability: region"))
     # P(stays) = 1 − P(leaves), also of a partial solution; the least probability of leaving is the greatest of staying
-    with _affine_in_errors(1.0, -1.0):
+    with _map_errors(1.0, -1.0):
         left = reach_probability(problem, grid, leaving, horizon=horizon, least=not least, feedback=feedback, **options)
     return _affine(left, 1.0, -1.0)
 
@@ -228,7 +228,7 @@ def _system(
 
 @contextlib.contextmanager
 def _no_fallback_warning(feedback: GridFeedback | Callable | None) -> Iterator[None]:
-    """A feedback that is a Solution is looked up node by node; that is no fault of the user's functions."""
+    """No warning while a Solution closes the loop: its lookup node by node is no fault of the user's functions."""
     if not is_grid_feedback(feedback):  # filters of warnings belong to the whole process: not touched without need
         yield
         return
@@ -238,7 +238,7 @@ def _no_fallback_warning(feedback: GridFeedback | Callable | None) -> Iterator[N
 
 
 def _without_end(question: Problem, grid: Grid, least: bool, options: dict) -> tuple[Problem, dict]:
-    """The question for all times, with what finds the least of its solutions where one may stay away for ever.
+    """The question for all times, and options by which the least of its solutions is found where it has several.
 
     Zero, a bound of the value, is given as a running maximum, or for the greatest probability, which comes with its
     sign changed, as a stopping cost: so that the iteration starts there, and no node is taken for one without a value.
@@ -284,14 +284,14 @@ def _refuse_staying(question: Problem, grid: Grid, options: dict) -> None:
 
 def _answer(question: Problem, grid: Grid, horizon: float | None, options: dict, sign: float) -> Solution:
     """sign · V of the question, also for a partial solution."""
-    with _affine_in_errors(0.0, sign):
+    with _map_errors(0.0, sign):
         found = solve(question, grid, **options) if horizon is None else march(question, grid, horizon, **options)
     return _affine(found, 0.0, sign)
 
 
 @contextlib.contextmanager
-def _affine_in_errors(offset: float, sign: float) -> Iterator[None]:
-    """An error's partial solution undergoes what the whole one does."""
+def _map_errors(offset: float, sign: float) -> Iterator[None]:
+    """An error raised inside has offset + sign · V for V in its partial solution."""
     try:
         yield
     except SolveError as error:

@@ -35,7 +35,7 @@ def spacings(grid: Grid) -> np.ndarray:
 
 
 def check_box(what: str, first: Grid, second: Grid) -> None:
-    """Refuse two grids that are not of the same box."""
+    """Refuse two grids of different boxes."""
     alike = first.periodic == second.periodic
     if not (alike and np.array_equal(first.lo, second.lo) and np.array_equal(first.hi, second.hi)):
         boxes = [f"{grid.lo} to {grid.hi}, periodic {grid.periodic}" for grid in (first, second)]
@@ -43,7 +43,7 @@ def check_box(what: str, first: Grid, second: Grid) -> None:
 
 
 def check_reference(reference: object, grids: tuple[Grid, ...]) -> None:
-    """Refuse, before anything is solved, what the errors cannot be measured against."""
+    """Refuse a reference against which no error can be measured, before anything is solved."""
     if reference is None:
         if len(grids) < 3:
             raise ValueError(

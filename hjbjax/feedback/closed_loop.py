@@ -57,7 +57,7 @@ class Stepping:
       atol: absolute error of an internal step, in the units of the state and of the cost.
       max_step: the longest internal step, may be inf.
       max_steps: the most internal steps.
-      held: whether the control is held from one output time to the next.
+      held: True where the control is held from one output time to the next.
     """
 
     rtol: Number
@@ -69,7 +69,7 @@ class Stepping:
 
 @pytree_dataclass()
 class InitialValueProblem:
-    """A closed loop, and where, when and under which noise it starts.
+    """A closed loop with its initial state, its output times and the key of its noise.
 
     Args:
       loop: the closed loop.
@@ -107,12 +107,12 @@ def blank_record(loop: Loop, x0: np.ndarray, times: np.ndarray) -> tuple[tuple, 
 def integrate_part(
     ivp: InitialValueProblem, stepping: Stepping, so_far: tuple[Begun, Rows], done: Number, until: Number
 ) -> tuple[tuple[Begun, Rows], tuple[Path, jax.Array]]:
-    """``integrate`` from the interval ``done`` to before ``until``: the state and all rows, and the path so far.
+    """The path so far, after the intervals from ``done`` to before ``until``, beside the record to go on from.
 
     Args:
-      ivp: the question of the whole path.
-      stepping: likewise.
-      so_far: the state and the rows of the intervals before; at first ``blank_record``.
+      ivp: the initial-value problem of the whole path.
+      stepping: how the whole path is integrated.
+      so_far: the record, that is the state and the rows of the intervals before; at first ``blank_record``.
       done: the first interval.
       until: the interval after the last one.
     """
@@ -210,7 +210,7 @@ def _advance(
 
 
 def _solver(ivp: InitialValueProblem, stepping: Stepping) -> Callable:
-    """diffrax's solve with all that stays; its ``args``: control, time and state at the beginning of an interval."""
+    """diffrax's solve of one interval, with all that no interval changes; ``args`` are the interval's ``Beginning``."""
     import diffrax
 
     loop, x0, start, duration = ivp.loop, ivp.x0, ivp.times[0], ivp.times[-1] - ivp.times[0]
@@ -245,7 +245,7 @@ def _solver(ivp: InitialValueProblem, stepping: Stepping) -> Callable:
         additive = not callable(loop.problem.noise)
         brownian = _brownian(ivp, stepping.max_step, additive)
         terms = diffrax.MultiTerm(terms, diffrax.ControlTerm(noise, brownian))
-        # SRA1 has its order for additive noise alone; a function may depend on the state, whether it does is not asked
+        # SRA1 has its order for additive noise alone; a function may depend on the state, and is not asked
         solver, controller = diffrax.SRA1() if additive else diffrax.Euler(), diffrax.ConstantStepSize()
     event = None
     if (

@@ -40,7 +40,7 @@ Energies: TypeAlias = tuple[jax.Array, jax.Array, jax.Array, jax.Array]  # outpu
 
 @pytree_dataclass()
 class Lanes:
-    """Paths with made disturbances, one row a path; a lane has the worst case or a random signal.
+    """Paths under the worst case or under a random signal, one row a path.
 
     Args:
       starts: x₀, shape (p, n).
@@ -174,7 +174,7 @@ def _lanes(problem: Problem, starts: np.ndarray, random: int, key: Key) -> tuple
     away = np.zeros((0, POINTS, admissible.dim))
     if count:
         assert not isinstance(admissible, Finite)  # refused, where random ones are asked for
-        away = np.asarray(_uniform(admissible, key, (count, POINTS))) - least
+        away = np.asarray(_sample(admissible, key, (count, POINTS))) - least
     points = least + np.repeat(strength, len(starts))[:, None, None] * away
     still = np.zeros((len(starts), POINTS, admissible.dim))
     weight = np.repeat([1.0, 0.0], [len(starts), count])
@@ -182,7 +182,7 @@ def _lanes(problem: Problem, starts: np.ndarray, random: int, key: Key) -> tuple
     return lanes, ["worst case"] * len(starts) + ["random"] * count
 
 
-def _uniform(admissible: Box | Ball, key: Key, shape: tuple[int, ...]) -> jax.Array:
+def _sample(admissible: Box | Ball, key: Key, shape: tuple[int, ...]) -> jax.Array:
     """Independent points, uniform in a set, shape (*shape, l)."""
     if isinstance(admissible, Box):
         return jax.random.uniform(key, (*shape, admissible.dim), minval=admissible.lo, maxval=admissible.hi)

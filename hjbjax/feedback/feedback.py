@@ -107,7 +107,7 @@ def lookups(feedback: GridFeedback) -> tuple[Callable, Callable]:
         # nodes without a control get that of their neighbours: asked second, they answer where a whole cell is NaN
         filled = {name: extended(feedback.grid, array, players[name]) for name, array in given.items()}
         answers.append(dataclasses.replace(feedback, **filled))
-    ask = _stationary if feedback.times is None else _marched
+    ask = _look_up if feedback.times is None else _look_up_in_time
     control, disturbance = (
         jax.tree_util.Partial(ask, tuple(as_partial(getattr(each, name)) for each in answers))
         for name in ("control_at", "disturbance_at")
@@ -118,12 +118,12 @@ def lookups(feedback: GridFeedback) -> tuple[Callable, Callable]:
 # The loop clips every state into the box before it asks; clamp=True, or one on the edge is refused for a rounding.
 
 
-def _stationary(looks: tuple[Callable, ...], t: Number, x: State) -> Array:
+def _look_up(looks: tuple[Callable, ...], t: Number, x: State) -> Array:
     """The first of several lookups at x that is not NaN, whatever the time."""
     return _first([look(x, clamp=True) for look in looks])
 
 
-def _marched(looks: tuple[Callable, ...], t: Number, x: State) -> Array:
+def _look_up_in_time(looks: tuple[Callable, ...], t: Number, x: State) -> Array:
     """The first of several lookups at (t, x) that is not NaN."""
     return _first([look(t, x, clamp=True) for look in looks])
 

@@ -26,9 +26,9 @@ class Loop:
     Args:
       problem: the system and its costs.
       control: a pytree that is called with (t, x); None where there is no control.
-      opponent: likewise, for the disturbance.
+      opponent: a pytree like it for the disturbance; None where nobody acts.
       grid: the Grid in whose box the players are known; None where that is everywhere.
-      clamp: outside the box, whether to go on with what the players say at its nearest point.
+      clamp: outside the box, True goes on with what the players say at its nearest point, False ends the path.
     """
 
     problem: Problem

@@ -29,7 +29,7 @@ class PathStatus(enum.IntEnum):
 
     @property
     def message(self) -> str:
-        """What happened and what to do, as said of a path."""
+        """The end and advice in words that follow 'the path'."""
         return MESSAGES[self]
 
 

@@ -104,7 +104,7 @@ def least_restrictive(solution: Solution, nominal: GridFeedback | Callable, *, m
     )  # discrete: the nearest node's action
     if margin is not None and not is_traced(margin) and not (np.isfinite(margin) and margin >= 0):
         raise ValueError(f"least_restrictive: margin = {margin!r}; wanted a finite number ≥ 0, in the units of V")
-    # inside a transformation V is no known number: neither its jump nor whether it converged can be looked at
+    # inside a transformation V is no known number: its jump and its status cannot be looked at
     if is_traced(solution, margin):
         if margin is None:
             raise ValueError("least_restrictive: inside jit, vmap and grad give margin=, a number in the units of V")

@@ -98,7 +98,7 @@ def simulate(
     if _is_marched(feedback):
         problem = _within_horizon(problem, feedback, duration)
     loop = _close(problem, feedback, disturbance, grid, clamp, time_varying)
-    start = _initial(x0, loop.grid)
+    start = _initial_state(x0, loop.grid)
     hold = None if hold is False else hold
     times = _times(duration, steps, hold)
     stepping = Stepping(
@@ -185,7 +185,7 @@ def rollout(
     Keyword Args:
       disturbance: as in ``simulate``, like ``time_varying``.
       key: a JAX random key; wanted exactly when the problem has noise.
-      hold: whether the control is held from one output time to the next.
+      hold: True where the control is held from one output time to the next.
       grid: as in ``simulate``, like ``clamp``, ``rtol``, ``atol``, ``max_step`` and ``max_steps``.
 
     Returns:
@@ -280,7 +280,7 @@ def _within_horizon(problem: Problem, solution: GridFeedback, duration: float) -
     return problem
 
 
-def _initial(x0: object, grid: Grid | None) -> np.ndarray:
+def _initial_state(x0: object, grid: Grid | None) -> np.ndarray:
     """The state at the beginning, shape (n,), float64, once it is known to be one."""
     try:
         state = np.asarray(x0, np.float64)

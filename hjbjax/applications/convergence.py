@@ -141,6 +141,7 @@ class Study:
         what = "estimated" if self.estimated else "largest"
         lines = [f"{self.scheme}, tol {self.tol:g}; error against {self.reference}"]
         lines.append(f"{'grid':>14} {'h':>9} {what:>11} {'order':>6} {'mean':>10} {'order':>6}  seconds  first  status")
+        # an order belongs to a step between two grids, and is written beside the finer one
         orders, means = (["", *map(_order, steps)] for steps in (self.orders, self.mean_orders))
         for k, grid in enumerate(self.grids):
             lines.append(
@@ -293,6 +294,7 @@ def _sort(grids: Sequence[Grid] | Grid) -> tuple[Grid, ...]:
                 f"convergence_study: from {first.shape} to {grid.shape} the axes are refined by the factors "
                 f"{', '.join(f'{ratio:.3g}' for ratio in ratios)}; wanted one factor, so that one h stands for all"
             )
+    # between two equal spacings there is no slope to fit
     if any(coarse.shape == fine.shape for coarse, fine in pairwise(ordered)):
         raise ValueError(f"convergence_study: got grids {[grid.shape for grid in ordered]}; wanted each one once")
     return tuple(ordered)

@@ -54,7 +54,7 @@ def attenuation(
         raise ValueError(f"attenuation: the problem already has disturbances, {problem.disturbances!r}; leave them out")
     if problem.cost is None:
         raise ValueError("attenuation: the problem has no cost; wanted L = ½|z|² of the output z to be kept small")
-    level = numbers(gamma, "attenuation: gamma")
+    level = numbers(gamma, "attenuation: gamma")  # a tracer goes through: its sign is not known yet
     if np.ndim(level) or (isinstance(level, np.ndarray) and not 0 < level < math.inf):
         raise ValueError(f"attenuation: got gamma = {gamma!r}, wanted a finite number > 0")
     level = float(level) if isinstance(level, np.ndarray) else level
@@ -139,6 +139,7 @@ def saturation(solution: Solution, problem: Problem, *, inner: float = 0.5) -> S
         raise ValueError(f"saturation: got inner = {inner!r}; wanted a share of the box in (0, 1]")
     # a march is judged where it has come to, the earliest kept time: there the worst case has the longest way ahead
     d = np.asarray(solution.disturbance if solution.times is None else solution.disturbance[0], np.float64)
+    # nodes without a disturbance, as those of a target, do not count
     inside = solution.grid.inner(inner) & np.all(np.isfinite(d), axis=-1)
     if not inside.any():
         raise ValueError(f"saturation: no node with a disturbance in the inner {inner:g} of the box; enlarge it")

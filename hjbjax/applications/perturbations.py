@@ -153,6 +153,7 @@ def perturbation_study(
     mask = mask_of(region, grid, "perturbation_study")
     # from the highest level, the weakest disturbance, on: like the noises in the order of their effect
     games = [attenuation(problem, gamma, disturbances, enters=enters) for gamma in levels[1][::-1]]
+    # ``saturation`` at the end knows no other sets: better refused before the solves than after them
     if not isinstance(disturbances, (Box, Ball)):
         raise ValueError(f"perturbation_study: the disturbances are {disturbances!r:.60}; wanted a Box or a Ball")
     # before the first solve, which may take long: E and the set of d are met by the games alone
@@ -163,6 +164,7 @@ def perturbation_study(
         return solve(which, grid, scheme=scheme, method=method, tol=tol, throw=throw)
 
     clock, found = Clock(), []
+    # a number is ε I; as a leaf it compiles once for all of them
     noisy = [dataclasses.replace(problem, noise=epsilon) for epsilon in levels[0]]
     with noting_interrupts(clock):
         nominal = solution_of(problem, throw=True)  # without it there is nothing to compare with
@@ -201,12 +203,14 @@ def _series(
 ) -> Series:
     """The changes against the unperturbed solution, and which of them count for the orders."""
     parameters = parameters[: len(solutions)]  # fewer where the study was interrupted
+    # one grid and one scheme: the grid's own error cancels but for its product with the change
     values = [np.abs(each.value - nominal.value)[mask] for each in solutions]
     # a NaN goes through the maxima, and what it touches is not fitted
     inputs = [np.abs(each.policy - nominal.policy)[mask] for each in solutions]
     errors = np.array([np.max(each) for each in values])
     feedback = np.array([np.max(each, initial=0.0) for each in inputs])  # initial: without controls u is empty
     converged = np.array([each.status is Status.CONVERGED for each in solutions], bool)
+    # a change within the tolerance may be the iteration's
     fitted = converged & np.isfinite(errors) & (errors > tol)
     finest = min(float(nominal.grid.spacing(axis)) for axis in range(nominal.grid.ndim))
     seen = fitted & (feedback > tol / finest)  # a slope of V is known no better than that

@@ -217,7 +217,7 @@ def _system(
     inside = problem.target if target is None else as_partial(target, f"{name}: target")
     if inside is None:
         raise ValueError(f"{name}: there is nothing to reach: give target=, a function ≤ 0 inside, or problem.target")
-    hit = as_partial(obstacle, f"{name}: obstacle")
+    hit = as_partial(obstacle, f"{name}: obstacle")  # the problem has no obstacle of its own
     if feedback is None:
         return problem, inside, hit
     loop = exit_problems.close_loop(problem, feedback, horizon, name)
@@ -247,6 +247,7 @@ def _without_end(question: Problem, grid: Grid, least: bool, options: dict) -> t
     if not _count_staying(question, grid, options):
         return question, options
     bound: dict[str, Any] = {"running_max" if least else "stopping_cost": jax.tree_util.Partial(_zero)}
+    # another method may find another of the solutions; who asks for one by name gets it
     return dataclasses.replace(question, **bound), {"method": ValueIteration()} | options
 
 
@@ -267,6 +268,7 @@ def _count_staying(question: Problem, grid: Grid, options: dict) -> int:
         memory.require(question, grid, method, kind, options.get("max_memory"))
         checks.shapes(question, grid, scheme)
         node_checks.values(question, grid, kind)
+        # of the chain beneath the scheme: slopes of higher order make no transition probabilities
         kept = attainability.refuge(Discretisation(question, grid, scheme.chain, kind))
         return int(np.sum(np.asarray(kept)))
 
@@ -296,7 +298,7 @@ def _map_errors(offset: float, sign: float) -> Iterator[None]:
         yield
     except SolveError as error:
         if error.solution is not None:
-            error.solution = _affine(error.solution, offset, sign)
+            error.solution = _affine(error.solution, offset, sign)  # in place: the traceback stays what it is
         raise
 
 

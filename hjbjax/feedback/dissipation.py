@@ -148,7 +148,7 @@ def dissipation(
             found.append(_energies_under(problem, solution, as_partial(signal), starts, times, rtol))
         output, total, ends, codes = (np.concatenate(each) for each in zip(*jax.device_get(found), strict=True))
         stored = np.asarray(solution.value_at(starts))
-    count = len(output) // len(starts)
+    count = len(output) // len(starts)  # paths of each start; all starts come in turn under each disturbance
     statuses = tuple(PathStatus(int(code)) for code in codes)
     # a path that came to no finite state ends at the one before, whose energies say nothing of the rest
     output = np.where([status is PathStatus.NONFINITE for status in statuses], np.nan, output)

@@ -16,7 +16,7 @@ MANY = 1000  # internal steps, beside an eighth of those allowed: more of them t
 SLACK = 1e-9  # relative, of an admissible set: what interpolation between the nodes rounds a control by
 
 
-class PathStatus(enum.IntEnum):
+class PathStatus(enum.IntEnum):  # of integers, since compiled programs and vmap know no others
     """Why a path ends."""
 
     DURATION = 0
@@ -85,7 +85,7 @@ class Path:
         return PathStatus(int(self.code))
 
     def __str__(self) -> str:
-        return encodable(self.message)
+        return encodable(self.message)  # a terminal may lack a letter, and print would raise
 
 
 def joined(first: Path, then: Path, discount: float) -> Path:
@@ -106,6 +106,7 @@ def joined(first: Path, then: Path, discount: float) -> Path:
     return Path(
         times=np.concatenate([first.times, end + then.times[1:]]),
         states=np.concatenate([first.states, then.states[1:]]),
+        # the state in which one ends and the other begins is there once, the controls of intervals all
         controls=np.concatenate([first.controls, then.controls]),
         disturbances=None if both else np.concatenate([first.disturbances, then.disturbances]),
         cost=cost,
@@ -149,7 +150,7 @@ def truncate(
     if _are_inadmissible(controls, applied):
         said.append("controls outside the problem's admissible set were applied as they are")
     if status not in (PathStatus.DURATION, PathStatus.TARGET, PathStatus.INTERRUPTED):  # that is raised
-        warnings.warn(f"simulate: the path {said[0]}", UserWarning, stacklevel=3)
+        warnings.warn(f"simulate: the path {said[0]}", UserWarning, stacklevel=3)  # at the line that calls simulate
     return Path(
         times=times,
         states=states,

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     import diffrax
 
 # Before an interval: the time, the state with the running cost (n+1), the PathStatus and the steps so far.
-Begun: TypeAlias = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
+Progress: TypeAlias = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
 Beginning: TypeAlias = tuple[Control, Number, State]  # of an interval: the control held through it, when and where
 # Of each interval: time and state at its end, both actions at its start, and True where the path runs through it.
 Rows: TypeAlias = tuple[jax.Array, jax.Array, jax.Array, jax.Array | None, jax.Array]
@@ -105,8 +105,8 @@ def blank_record(loop: Loop, x0: np.ndarray, times: np.ndarray) -> tuple[tuple, 
 
 
 def integrate_part(
-    ivp: InitialValueProblem, stepping: Stepping, so_far: tuple[Begun, Rows], done: Number, until: Number
-) -> tuple[tuple[Begun, Rows], tuple[Path, jax.Array]]:
+    ivp: InitialValueProblem, stepping: Stepping, so_far: tuple[Progress, Rows], done: Number, until: Number
+) -> tuple[tuple[Progress, Rows], tuple[Path, jax.Array]]:
     """The path so far, after the intervals from ``done`` to before ``until``, beside the record to go on from.
 
     Args:
@@ -121,7 +121,7 @@ def integrate_part(
     # the first code asks the target and the box: here, where functions of the user's are compiled, not at the host
     state = jax.tree.map(lambda old, new: jnp.where(done == 0, new, old), state, first)
 
-    def one(k: jax.Array, carry: tuple[Begun, Rows]) -> tuple[Begun, Rows]:
+    def one(k: jax.Array, carry: tuple[Progress, Rows]) -> tuple[Progress, Rows]:
         state, row = interval(carry[0], ivp.times[k + 1])
         return state, jax.tree.map(lambda array, entry: array.at[k].set(entry), carry[1], row)
 
@@ -136,12 +136,12 @@ def integrate_part(
     return (state, rows), _path(ivp, last, shown)
 
 
-def _intervals(ivp: InitialValueProblem, stepping: Stepping) -> tuple[Callable, Begun]:
+def _intervals(ivp: InitialValueProblem, stepping: Stepping) -> tuple[Callable, Progress]:
     """One output interval as a step of a scan, and the state (t, y, code, steps) before the first."""
     loop, x0, start = ivp.loop, ivp.x0, ivp.times[0]
     solve = _solver(ivp, stepping)
 
-    def interval(state: Begun, end: jax.Array) -> tuple[Begun, Rows]:
+    def interval(state: Progress, end: jax.Array) -> tuple[Progress, Rows]:
         t, y, code, count = state
         u, d = loop.players(t, y[:-1])
         code = jnp.where((code == PathStatus.DURATION) & ~are_finite((u, d)), PathStatus.UNDEFINED, code)
@@ -161,7 +161,7 @@ def _intervals(ivp: InitialValueProblem, stepping: Stepping) -> tuple[Callable, 
     return interval, (start, jnp.append(x0, 0.0), code, jnp.zeros((), jnp.int32))
 
 
-def _path(ivp: InitialValueProblem, last: Begun, shown: Rows) -> tuple[Path, jax.Array]:
+def _path(ivp: InitialValueProblem, last: Progress, shown: Rows) -> tuple[Path, jax.Array]:
     """The path of full length from its last state and the rows of its intervals, and a mask of those that it ran."""
     loop, x0, start = ivp.loop, ivp.x0, ivp.times[0]
     (t, y, code, count), (later, states, controls, disturbances, active) = last, shown
@@ -215,15 +215,15 @@ def _solver(ivp: InitialValueProblem, stepping: Stepping) -> Callable:
 
     loop, x0, start, duration = ivp.loop, ivp.x0, ivp.times[0], ivp.times[-1] - ivp.times[0]
 
-    def act(t: Number, y: Array, begun: Beginning) -> Actions:
-        u, d = loop.actions(t, y[:-1], begun[1:])
-        return (begun[0] if stepping.held else u), d
+    def act(t: Number, y: Array, beginning: Beginning) -> Actions:
+        u, d = loop.actions(t, y[:-1], beginning[1:])
+        return (beginning[0] if stepping.held else u), d
 
-    def rate(t: Number, y: Array, begun: Beginning) -> jax.Array:
-        return loop.rate(t, y[:-1], *act(t, y, begun), loop.discount(t - start))
+    def rate(t: Number, y: Array, beginning: Beginning) -> jax.Array:
+        return loop.rate(t, y[:-1], *act(t, y, beginning), loop.discount(t - start))
 
-    def noise(t: Number, y: Array, begun: Beginning) -> jax.Array:
-        return loop.noise(t, y[:-1], *act(t, y, begun))
+    def noise(t: Number, y: Array, beginning: Beginning) -> jax.Array:
+        return loop.noise(t, y[:-1], *act(t, y, beginning))
 
     def margin(t: Number, y: Array, args: Beginning, **kwargs: object) -> jax.Array:
         inside = jnp.minimum(loop.target(t, y[:-1]), loop.margin(y[:-1]))

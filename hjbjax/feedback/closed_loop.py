@@ -45,7 +45,7 @@ Rows: TypeAlias = tuple[jax.Array, jax.Array, jax.Array, jax.Array | None, jax.A
 LEAST_STEPS = 10  # of an output interval with noise, where no estimate of the error shortens a step
 TREE = 64  # the shortest step over the tolerance of the Brownian tree, below which w is interpolated
 DEEPEST = 2**30  # the duration over that tolerance, at most: each halving is one level of the tree in every step
-HITS = 4  # units in the last place, of the bracket around the time at which a path meets a boundary
+BRACKET = 4  # units in the last place, of the bracket around the time at which a path meets a boundary
 
 
 @pytree_dataclass(static=("max_steps", "held"))
@@ -236,7 +236,7 @@ def _solver(ivp: InitialValueProblem, stepping: Stepping) -> Callable:
     controller: diffrax.AbstractStepSizeController
     if loop.problem.noise is None:
         solver = diffrax.Tsit5()
-        # at the shortest step half of max_steps reach the end, however often a feedback that jumps has one rejected
+        # the shortest step is taken whatever its error (force_dtmin), and half of max_steps such steps reach the end
         controller = diffrax.PIDController(
             rtol=stepping.rtol, atol=stepping.atol, dtmin=2 * duration / stepping.max_steps, dtmax=stepping.max_step,
             force_dtmin=True, norm=_size,
@@ -251,7 +251,7 @@ def _solver(ivp: InitialValueProblem, stepping: Stepping) -> Callable:
     if (
         loop.guarded or loop.problem.target is not None or (loop.grid is not None and not loop.clamp)
     ):  # it doubles the compile time
-        close = HITS * jnp.finfo(x0.dtype).eps
+        close = BRACKET * jnp.finfo(x0.dtype).eps
         # flip=True: the function falls through zero. "detect" would put a host callback into the compiled run.
         event = diffrax.Event(margin, _bisection()(close, close, flip=True), direction=False)
     return functools.partial(

@@ -20,9 +20,9 @@ from hjbjax.applications.reference import (
     distance,
     mask_of,
     mean_spacing,
+    restrict,
     richardson,
     spacings,
-    thinned,
     words_for,
 )
 from hjbjax.discretisation.discretisation import Scheme
@@ -31,15 +31,18 @@ from hjbjax.iteration.methods import Method
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import is_traced
+from hjbjax.problem.types import Numbers
 from hjbjax.solution.clock import Clock, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
 from hjbjax.solvers.stationary import solve
 
+REFINED = 1.1  # the factors by which the axes are refined over one another, at most
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Study:
-    """What a study measured, one entry a grid from coarse to fine; ``print`` shows the table.
+    """Spacings, errors and seconds of a study, one entry a grid from coarse to fine; ``print`` shows the table.
 
     Args:
       grids: the grids.
@@ -47,7 +50,7 @@ class Study:
       scheme: the scheme's text.
       tol: the tolerance of every solve.
       reference: what the errors are measured against, in words.
-      estimated: whether that is an estimate from these very solutions.
+      estimated: True where that is an estimate from these very solutions.
       h: spacings, the geometric mean over the axes.
       errors: the largest |V_h − V| over the nodes of the region.
       mean_errors: the mean of it.
@@ -81,7 +84,7 @@ class Study:
 
     @property
     def fitted(self) -> np.ndarray:
-        """Which grids count for the orders: converged, and with an error that rises above the tolerance."""
+        """A mask of the grids that count for the orders: converged, and with an error above the tolerance."""
         converged = np.array([status is Status.CONVERGED for status in self.statuses])
         return converged & np.isfinite(self.errors) & (self.errors > self.tol)
 
@@ -106,7 +109,9 @@ class Study:
         return self._steps(self.mean_errors)
 
     def _steps(self, errors: np.ndarray) -> np.ndarray:
+        """The slopes of log error over log h from each grid to the next; NaN beside one that is not fitted."""
         known = self.fitted[:-1] & self.fitted[1:]
+        # an error of zero has no logarithm, and is not fitted: any positive number stands in for it
         logs = np.log(np.where(self.fitted, errors, 1.0))
         return np.where(known, np.diff(logs) / np.diff(np.log(self.h)), np.nan)
 
@@ -136,6 +141,7 @@ class Study:
         what = "estimated" if self.estimated else "largest"
         lines = [f"{self.scheme}, tol {self.tol:g}; error against {self.reference}"]
         lines.append(f"{'grid':>14} {'h':>9} {what:>11} {'order':>6} {'mean':>10} {'order':>6}  seconds  first  status")
+        # an order belongs to a step between two grids, and is written beside the finer one
         orders, means = (["", *map(_order, steps)] for steps in (self.orders, self.mean_orders))
         for k, grid in enumerate(self.grids):
             lines.append(
@@ -196,17 +202,19 @@ def convergence_study(
     """
     if is_traced(problem, grids, reference):
         raise ValueError("convergence_study: it runs at host level only, outside of jit, vmap and grad")
-    ordered = _ordered(grids)
+    ordered = _sort(grids)
     check_reference(reference, ordered)
     compared = ordered if reference is not None else ordered[:1] * len(ordered)  # the estimate lives on the coarsest
     masks = [mask_of(region, grid) for grid in compared]
+    # the reference at all nodes before the first solve: what cannot be measured against is refused at once
     exact = [] if reference is None else list(map(at_nodes_of, repeat(reference), ordered, masks))
     clock, timed = Clock(), []
     with noting_interrupts(clock):
         for grid in ordered:
-            timed.append(_timed(problem, grid, clock, scheme=scheme, method=method, tol=tol, throw=False))
-            if clock.interrupted:
+            timed.append(_solve_twice(problem, grid, clock, scheme=scheme, method=method, tol=tol, throw=False))
+            if clock.interrupted:  # the solve has handed back what it had, not raised
                 break
+    # Ctrl-C: the rows so far are a study, whose last grid may have one solve in place of two
     whole = len(timed) == len(ordered)
     ordered, masks, exact = ordered[: len(timed)], masks[: len(timed)], exact[: len(timed)]
     solutions = tuple(solution for solution, _, _ in timed)
@@ -214,12 +222,14 @@ def convergence_study(
     h = np.array([mean_spacing(grid) for grid in ordered])
     extrapolated, words = None, words_for(reference, ordered)
     if reference is None:
-        values = [thinned(value, grid, ordered[0]) for value, grid in zip(values, ordered, strict=True)]
+        # all errors on the nodes of the coarsest grid, which all have: there alone V is known from three spacings
+        values = [restrict(value, grid, ordered[0]) for value, grid in zip(values, ordered, strict=True)]
         if clock.interrupted:
             words = "nothing: the study was interrupted"
         else:
             extrapolated, words = richardson(values[-3:], h[-3:], masks[0], tol)
         exact = [np.full(masks[0].shape, np.nan) if extrapolated is None else extrapolated] * len(values)
+    # one row of distances a grid, over the nodes of its region
     off = [distance(*pair)[mask] for *pair, mask in zip(values, exact, masks, strict=True)]
     study = Study(
         ordered,
@@ -232,6 +242,7 @@ def convergence_study(
         errors=np.array([np.max(each) for each in off]),
         mean_errors=np.array([np.mean(each) for each in off]),
         seconds=np.array([warm for _, _, warm in timed]),
+        # where nothing had to be compiled the second solve may by chance take longer
         compile_seconds=np.array([cold if math.isnan(warm) else max(0.0, cold - warm) for _, cold, warm in timed]),
         extrapolated=extrapolated,
     )
@@ -241,19 +252,19 @@ def convergence_study(
     return study
 
 
-def fitted_order(h: Any, errors: Any) -> float:
+def fitted_order(h: Numbers | Sequence[float], errors: Numbers | Sequence[float]) -> float:
     """The slope of log error over log h by least squares; NaN unless two errors are positive and finite."""
     h, errors = np.asarray(h, float), np.asarray(errors, float)
     usable = np.isfinite(errors) & (errors > 0)
-    if np.count_nonzero(usable) < 2:
+    if np.count_nonzero(usable) < 2:  # a line through one point has every slope
         return math.nan
     return float(np.polyfit(np.log(h[usable]), np.log(errors[usable]), 1)[0])
 
 
-def _timed(problem: Problem, grid: Grid, clock: Clock, **options: Any) -> tuple[Solution, float, float]:
+def _solve_twice(problem: Problem, grid: Grid, clock: Clock, **options: Any) -> tuple[Solution, float, float]:
     """A solution, and the wall time of the first and of a second solve, NaN where that was interrupted."""
     marks = [time.perf_counter()]
-    solution = solve(problem, grid, **options)
+    solution = solve(problem, grid, **options)  # compiles, unless a grid of this shape was solved before
     marks.append(time.perf_counter())
     if not clock.interrupted:
         solve(problem, grid, **options)
@@ -263,7 +274,7 @@ def _timed(problem: Problem, grid: Grid, clock: Clock, **options: Any) -> tuple[
     return solution, marks[1] - marks[0], marks[2] - marks[1]
 
 
-def _ordered(grids: Any) -> tuple[Grid, ...]:
+def _sort(grids: Sequence[Grid] | Grid) -> tuple[Grid, ...]:
     """The grids from coarse to fine, once they are known to be of one box and to shrink alike."""
     grids = list(grids) if isinstance(grids, Sequence) else [grids]
     for grid in grids:
@@ -274,18 +285,21 @@ def _ordered(grids: Any) -> tuple[Grid, ...]:
     first, *rest = ordered = sorted(grids, key=mean_spacing, reverse=True)
     for grid in rest:
         check_box("grids of different boxes", first, grid)
-        if repr(grid.stretch) != repr(first.stretch):
+        if repr(grid.stretch) != repr(first.stretch):  # by their text: they compare as objects
             raise ValueError(f"convergence_study: got stretch {first.stretch} and {grid.stretch}; wanted one for all")
         ratios = spacings(first) / spacings(grid)
-        if ratios.max() > 1.1 * ratios.min():
+        # intervals are integers: 10 % lets an odd axis be refined by almost the factor of the others
+        if ratios.max() > REFINED * ratios.min():
             raise ValueError(
                 f"convergence_study: from {first.shape} to {grid.shape} the axes are refined by the factors "
                 f"{', '.join(f'{ratio:.3g}' for ratio in ratios)}; wanted one factor, so that one h stands for all"
             )
+    # between two equal spacings there is no slope to fit
     if any(coarse.shape == fine.shape for coarse, fine in pairwise(ordered)):
         raise ValueError(f"convergence_study: got grids {[grid.shape for grid in ordered]}; wanted each one once")
     return tuple(ordered)
 
 
 def _order(order: float) -> str:
+    """An order as the table shows it."""
     return f"{order:.2f}" if math.isfinite(order) else "-"

@@ -8,54 +8,59 @@ that of minus the cost. A feedback that is given closes the loop: what is left h
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.feedback.feedback import check_kept
+from hjbjax.feedback.feedback import GridFeedback, Place, check_kept, is_grid_feedback
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, is_traced, pytree_dataclass
+from hjbjax.problem.types import Array, Control, Disturbance, Number, State
+
+T = TypeVar("T", bound=Callable | None)
 
 
 @pytree_dataclass(static=("marched", "timed"))
-class Closed:
+class ClosedLoop:
     """A problem's drift and noise under a feedback; where the feedback is NaN, the state stays where it is.
 
     Args:
       problem: the problem.
       control: a pytree that is called with (x), or with (t, x) if ``marched``, or if a function of the time.
-      marched: whether the control takes the time.
-      timed: whether the closed loop depends on the time.
+      marched: True where the control takes the time.
+      timed: True where the closed loop depends on the time.
     """
 
     problem: Problem
-    control: Any
+    control: Callable
     marched: bool
     timed: bool
 
-    def drift(self, *arguments: Any) -> jax.Array:
+    def drift(self, *arguments: Array) -> jax.Array:
         """f(x, control(x), d), shape (n,)."""
-        t, x, u, d, acts = self._given(arguments)
+        t, x, u, d, acts = self._actions(arguments)
         return jnp.where(acts, jnp.asarray(self.problem.drift(*self.problem.arguments(x, u, d, t))), 0)
 
-    def noise(self, *arguments: Any) -> jax.Array:
+    def noise(self, *arguments: Array) -> jax.Array:
         """σ there, in the shape in which the problem gives it."""
-        t, x, u, d, acts = self._given(arguments)
+        t, x, u, d, acts = self._actions(arguments)
         sigma = self.problem.noise
         return jnp.where(acts, jnp.asarray(sigma(*self.problem.arguments(x, u, d, t)) if callable(sigma) else sigma), 0)
 
-    def _given(self, arguments: tuple) -> tuple[Any, Any, Any, Any, Any]:
-        """The time, the state, the control, the disturbance, and whether there is a control."""
+    def _actions(self, arguments: tuple[Array, ...]) -> tuple[Number, State, Control, Disturbance | None, jax.Array]:
+        """The time, the state, the control, the disturbance, and True where there is a control."""
+        # the problem without controls is called with u of shape (0,) in the control's place
         t, rest = (arguments[0], arguments[1:]) if self.timed else (0.0, arguments)
         x, d = rest[0], rest[2] if self.problem.is_game else None
         u = jnp.asarray(self.control(t, x) if self.marched else self.control(x))
         acts = ~jnp.any(jnp.isnan(u))
+        # zero in place of NaN: also the branch that `where` discards is evaluated, and NaN would reach derivatives
         return t, x, jnp.where(acts, u, 0), d, acts
 
 
-def closed(problem: Problem, feedback: Any, horizon: Any, name: str) -> Problem:
+def close_loop(problem: Problem, feedback: GridFeedback | Callable, horizon: Number | None, name: str) -> Problem:
     """The problem with its control replaced by a feedback, and with none of its costs.
 
     Args:
@@ -70,36 +75,44 @@ def closed(problem: Problem, feedback: Any, horizon: Any, name: str) -> Problem:
     """
     if problem.controls is None:
         raise ValueError(f"{name}: got a feedback, but problem.controls is None; leave out feedback")
-    solved = hasattr(feedback, "control_at")
-    if not solved and not callable(feedback):
+    if not is_grid_feedback(feedback) and not callable(feedback):
         signature = "(t, x)" if problem.time_dependent else "(x)"
         raise TypeError(f"{name}: feedback is {feedback!r}, wanted a Solution or a function {signature}")
-    marched = feedback.times is not None if solved else problem.time_dependent
-    if solved and marched and isinstance(horizon, (int, float, np.number)) and not is_traced(feedback.times):
-        check_kept(feedback, float(horizon), f"{name}: horizon")
-    look = jax.tree_util.Partial(_inside, as_partial(feedback.control_at)) if solved else as_partial(feedback)
-    loop = Closed(problem, look, marched, marched or problem.time_dependent)
-    still = solved or callable(problem.noise)  # a function always has a control, and leaves a number what it is
+    if is_grid_feedback(feedback):
+        marched = feedback.times is not None
+        if marched and isinstance(horizon, (int, float, np.number)) and not is_traced(feedback.times):
+            check_kept(feedback, float(horizon), f"{name}: horizon")
+        look: Callable | None = jax.tree_util.Partial(_control, as_partial(feedback.control_at))
+    else:
+        marched, look = problem.time_dependent, as_partial(feedback)
+    assert look is not None
+    loop = ClosedLoop(problem, look, marched, marched or problem.time_dependent)
+    # where a Solution is NaN the state must stay, also against noise; a function always has a control, and leaves noise
+    # that is a number what it is
+    looped = problem.noise is not None and (is_grid_feedback(feedback) or callable(problem.noise))
     return Problem(
         loop.drift, None, None, disturbances=problem.disturbances,
-        noise=loop.noise if still and problem.noise is not None else problem.noise,
+        noise=loop.noise if looped else problem.noise,
         isaacs=problem.isaacs,
         time_dependent=loop.timed,
     )  # fmt: skip
 
 
-def ending(problem: Problem, target: Any, obstacle: Any, cost: float, exit_cost: float) -> Problem:
+def exit_problem(
+    problem: Problem, target: Callable, obstacle: Callable | None, cost: float, exit_cost: float
+) -> Problem:
     """The problem that pays ``cost`` per unit time and ``exit_cost`` on the target where that is no obstacle.
 
     Args:
       problem: whose drift, noise and players count.
       target: a function ≤ 0 inside.
-      obstacle: likewise, or None; it ends the path as well, and wins where the two overlap.
+      obstacle: a function ≤ 0 inside, or None; it ends the path as well, and wins where the two overlap.
       cost: per unit time; 0 for none.
       exit_cost: on the target; 0 for none.
     """
     sets = (target,) if obstacle is None else (target, obstacle)
-    paid = jax.tree_util.Partial(_paid, exit_cost, sets) if exit_cost else None
+    # a cost of zero is None: of a function nobody would know that it is zero
+    paid = jax.tree_util.Partial(_exit_cost, exit_cost, sets) if exit_cost else None
     return Problem(
         problem.drift, jax.tree_util.Partial(_constant, cost) if cost else None, problem.controls,
         disturbances=problem.disturbances, noise=problem.noise, target=jax.tree_util.Partial(_nearest, sets),
@@ -107,38 +120,41 @@ def ending(problem: Problem, target: Any, obstacle: Any, cost: float, exit_cost:
     )  # fmt: skip
 
 
-def outside(region: Callable, *where: Any) -> Any:
-    """The complement of a set given by a function ≤ 0 inside."""
+def complement(region: Callable, *where: Place) -> Array:
+    """A function ≤ 0 outside of a set, which is given by a function ≤ 0 inside."""
     return -region(*where)
 
 
-def timed(function: Any, needed: bool) -> Any:
-    """A function of the state as one of time and state."""
+def with_time(function: T, needed: bool) -> T | jax.tree_util.Partial:
+    """A function of the state as one of time and state, where that is needed."""
     return jax.tree_util.Partial(_timeless, function) if needed and function is not None else function
 
 
-def _timeless(function: Callable, t: Any, *arguments: Any) -> Any:
+def _timeless(function: Callable, t: Number, *arguments: Array) -> Array:
+    """A function of the state at any time."""
     return function(*arguments)
 
 
-def _inside(look_up: Callable, *where: Any) -> Any:
+def _control(look_up: Callable, *where: Place) -> Array:
     """A solution's control; a node on the edge must not be refused for a rounding."""
     return look_up(*where, clamp=True)
 
 
-def _constant(value: Any, *arguments: Any) -> Any:
+def _constant(value: Number, *arguments: Array) -> jax.Array:
+    """The cost per unit time, whatever state and actions are."""
     return jnp.asarray(value, jnp.result_type(float))
 
 
-def _nearest(sets: tuple, *where: Any) -> Any:
-    """≤ 0 in one of the sets."""
+def _nearest(sets: tuple[Callable, ...], *where: Place) -> jax.Array:
+    """The smallest of the sets' functions, which is ≤ 0 in their union."""
     distances = [jnp.asarray(each(*where)) for each in sets]
     return distances[0] if len(sets) == 1 else jnp.minimum(*distances)
 
 
-def _paid(amount: Any, sets: tuple, *where: Any) -> Any:
+def _exit_cost(amount: Number, sets: tuple[Callable, ...], *where: Place) -> jax.Array:
     """The amount where the path ends in the target; on a boundary between nodes the nearer set is the one it met."""
     if len(sets) == 1:
         return jnp.asarray(amount, jnp.result_type(float))
     inside, hit = (jnp.asarray(each(*where)) for each in sets)
+    # on the boundary rounding decides of the sign of either: then the smaller one tells, and a tie is no success
     return jnp.where((hit <= 0) | (hit <= inside), 0.0, amount)

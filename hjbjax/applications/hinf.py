@@ -30,7 +30,6 @@ import dataclasses
 import math
 from collections.abc import Callable
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 
@@ -46,19 +45,34 @@ from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
 from hjbjax.solvers.finite_horizon import march
 
-DOUBLINGS = 6  # of the time marched, at most
+DOUBLINGS = 6  # of the time marched, at most: the first look is at a 64th of the horizon
 SOON = 1e-6  # seconds: a limit that ends a march after its first look
 CUTS = {Status.INTERRUPTED: "interrupted", Status.TIME_LIMIT: "out of time"}
 CLOSE, FALL = 10.0, 1 / 3  # growth so near settle counts as settled if it falls by this factor; at the level it halves
 
 
+@dataclasses.dataclass(frozen=True)
+class Settling:
+    """Where, how far and until when V must settle.
+
+    Args:
+      inner: the share of the grid's box that is looked at, around its middle.
+      settle: growth over a doubling of the time below which V has settled.
+      horizon: the longest time to march.
+    """
+
+    inner: float
+    settle: float
+    horizon: float
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Trial:
-    """What was found at one γ.
+    """The verdict on one γ, and what it rests on.
 
     Args:
       gamma: γ.
-      feasible: whether the value settled.
+      feasible: True where the value settled.
       reason: "settled", "saturated", "growing" or "not finite"; "interrupted" or "out of time" is no verdict.
       time: the time T that was marched.
       growth: what V grew by over the last doubling of T, over its size, in the inner box.
@@ -163,13 +177,14 @@ def hinf_level(
       >>> abs(level.gamma / 0.5**0.5 - 1) < 0.02
       True
     """
-    _check_rule(problem_of_gamma, lo, hi, tol, inner, settle, horizon)
+    settling = Settling(inner, settle, horizon)
+    _check_rule(problem_of_gamma, lo, hi, tol, settling)
     clock, trials = Clock(), []
 
     def at(gamma: float) -> Trial:
         problem = problem_of_gamma(gamma)
         _check_problem(problem, gamma)
-        trial = _try(problem, grid, float(gamma), inner, settle, horizon, scheme, time_limit)
+        trial = _try(problem, grid, float(gamma), settling, scheme, time_limit)
         trials.append(trial)
         if trial.reason in CUTS.values():
             raise SolveError(f"hinf_level: at gamma = {gamma:g}: {trial.solution.message}", _level(trials, trial))
@@ -185,7 +200,7 @@ def hinf_level(
 
 def _bisect(at: Callable[[float], Trial], lo: float, hi: float, tol: float, settle: float) -> None:
     """Try γ after γ until the bracket is narrow enough."""
-    top = at(hi)
+    top = at(hi)  # first: where even hi fails, sets, grid or horizon are at fault, and lo says nothing more
     if not top.feasible:
         raise ValueError(f"hinf_level: hi = {hi:g} is not feasible: {_why(top, settle)}")
     bottom = at(lo)
@@ -195,6 +210,7 @@ def _bisect(at: Callable[[float], Trial], lo: float, hi: float, tol: float, sett
             "give a smaller lo"
         )
     while top.gamma > bottom.gamma * (1 + tol):
+        # the geometric mean: tol is relative, and each trial halves the logarithm of what is left
         middle = at(math.sqrt(bottom.gamma * top.gamma))
         bottom, top = (bottom, middle) if middle.feasible else (middle, top)
 
@@ -203,6 +219,7 @@ def _level(trials: list[Trial], cut: Trial | None = None) -> Level:
     """The level by the trials so far, of which ``cut`` came to no verdict."""
     top = min((trial.gamma for trial in trials if trial.feasible), default=math.inf)
     bottom = max((trial.gamma for trial in trials if not trial.feasible and trial is not cut), default=0.0)
+    # a trial that was cut has shown nothing: it is listed, and bounds the bracket on neither side
     status = Status.CONVERGED if cut is None else cut.solution.status
     return Level(top, (bottom, top), tuple(sorted(trials, key=lambda trial: trial.gamma)), status)
 
@@ -211,52 +228,60 @@ def _try(
     problem: Problem,
     grid: Grid,
     gamma: float,
-    inner: float,
-    settle: float,
-    horizon: float,
+    settling: Settling,
     scheme: Scheme,
     time_limit: float | None,
 ) -> Trial:
-    """March until the value settles, saturates or the horizon is there, doubling the time."""
+    """The verdict on one γ: the time marched is doubled until the value settles, saturates or the horizon is there."""
     began, left = perf_counter(), time_limit
+    inner, settle, horizon = settling.inner, settling.settle, settling.horizon
+    # a march stops by itself where the worst case comes to the bound of a Box; of a Ball only its end is looked at
     watch = inner if isinstance(problem.disturbances, Box) else 0.0
     inside = grid.inner(inner)
+    # some node of the inner box needs both of its neighbours in it
     if not np.all([np.sum(np.any(inside, axis=_others(grid, k))) >= 3 for k in range(grid.ndim)]):
         raise ValueError(f"hinf_level: inner = {inner:g} of {grid.shape} nodes holds fewer than 3 along an axis")
+    # gains: of V over each doubling, the first against nothing before
     value, total, span, gains = np.zeros(grid.shape), 0.0, horizon / 2**DOUBLINGS, [math.inf]
     while True:
+        # V_T goes on from where it stood: the march from V = 0 over 2T is one over T from V_T
         solution = march(problem, grid, span, start=value, inner=watch, throw=False, scheme=scheme, time_limit=left)
         if solution.status in CUTS:
-            return _unfinished(solution, gamma, total + span - float(solution.times[0]), inner)
+            return _no_verdict(solution, gamma, total + span - float(solution.times[0]), inner)
+        # a march that was decided early stands at times[0] > 0, and less than the span has passed
         after, total = np.asarray(solution.value[0]), total + span - float(solution.times[0])
         size, gain = (float(np.max(np.abs(each[inside]))) for each in (after, after - value))
         bound = saturation(solution, problem, inner=inner)
         reason = _reason(solution.status, bound, gain / size if size else 0.0, gain / gains[-1], settle)
-        if reason or total >= horizon * (1 - 1e-9):
+        if reason or total >= horizon * (1 - 1e-9):  # the total is a sum of spans, by rounding
             break
-        value, span, gains = after, total, [*gains, gain]
+        value, span, gains = after, total, [*gains, gain]  # as long again as all before: T doubles
+        # never 0 or less: march wants a positive limit, and hands back what there is after its first look
         left = time_limit and max(time_limit - (perf_counter() - began), SOON)
-    kept = _stationary(solution, total)
+    kept = _as_stationary(solution, total)
     reason, growth = reason or "growing", gain / size if size else 0.0
     return Trial(gamma, reason == "settled", reason, total, growth, size, bound, kept)
 
 
-def _unfinished(solution: Solution, gamma: float, total: float, inner: float) -> Trial:
+def _no_verdict(solution: Solution, gamma: float, total: float, inner: float) -> Trial:
     """A trial without a verdict, from a march that was cut short."""
-    kept = _stationary(solution, total)
+    kept = _as_stationary(solution, total)
     size = float(np.max(np.abs(kept.value[kept.grid.inner(inner)])))
     unknown = Saturation(math.nan, math.nan, np.full(kept.grid.ndim, math.nan), inner)
     return Trial(gamma, False, CUTS[solution.status], total, math.nan, size, unknown, kept)
 
 
-def _stationary(solution: Solution, total: float) -> Solution:
+def _as_stationary(solution: Solution, total: float) -> Solution:
     """The last slice of a march over the time ``total`` as a stationary solution."""
+    # of the kept times, the leading axis, the first is the last that was marched
     first = {name: getattr(solution, name)[0] for name in ("value", "policy", "disturbance")}
     return dataclasses.replace(solution, times=None, stats={**solution.stats, "horizon": total}, **first)
 
 
 def _reason(status: Status, bound: Saturation, growth: float, ratio: float, settle: float) -> str:
-    """Why to stop here; empty to go on."""
+    """The verdict after a march, as ``Trial.reason`` has it; empty to go on."""
+    # DIVERGED is what the march calls a disturbance that came to its bound while it watched
+    # first of all: where d is cut off V settles too, at a value that is the set's and no gain
     if status is Status.DIVERGED or bound.share > 0:
         return "saturated"
     if status is not Status.CONVERGED:
@@ -266,7 +291,7 @@ def _reason(status: Status, bound: Saturation, growth: float, ratio: float, sett
 
 
 def _why(trial: Trial, settle: float) -> str:
-    """What ended a trial and what to do, in words."""
+    """The end of a trial that is not feasible and advice, in words."""
     if trial.reason == "saturated":
         return f"{trial.saturation};\ngive a larger hi, wider sets of controls and disturbances, or a smaller inner"
     if trial.reason == "growing":
@@ -278,26 +303,29 @@ def _why(trial: Trial, settle: float) -> str:
 
 
 def _others(grid: Grid, axis: int) -> tuple[int, ...]:
+    """All axes but one."""
     return tuple(k for k in range(grid.ndim) if k != axis)
 
 
-def _check_rule(make: Any, lo: Any, hi: Any, tol: Any, inner: Any, settle: Any, horizon: Any) -> None:
+def _check_rule(make: object, lo: float, hi: float, tol: float, settling: Settling) -> None:
+    """Refuse numbers by which nothing can be bisected."""
     if not callable(make):
         raise TypeError(f"hinf_level: problem_of_gamma is {make!r}, wanted a function of gamma that returns a Problem")
     for name, number, most in (
         ("lo", lo, math.inf),
         ("hi", hi, math.inf),
         ("tol", tol, 1),
-        ("inner", inner, 1),
-        ("settle", settle, 0.5),
-        ("horizon", horizon, math.inf),
+        ("inner", settling.inner, 1),
+        ("settle", settling.settle, 0.5),  # a constant rate makes one half of growth, at any T
+        ("horizon", settling.horizon, math.inf),
     ):
         arguments.positive(number, f"hinf_level: {name}", most=most)
     if lo >= hi:
         raise ValueError(f"hinf_level: got lo = {lo:g} and hi = {hi:g}, wanted lo < hi")
 
 
-def _check_problem(problem: Any, gamma: float) -> None:
+def _check_problem(problem: object, gamma: float) -> None:
+    """Refuse a problem whose V tells no gain."""
     if not isinstance(problem, Problem):
         raise TypeError(f"hinf_level: problem_of_gamma({gamma:g}) returned {problem!r:.60}, wanted a Problem")
     if not isinstance(problem.disturbances, (Box, Ball)):

@@ -8,8 +8,8 @@ enough to be inactive: ``saturation`` tells.
 
 import dataclasses
 import math
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -18,12 +18,17 @@ import numpy as np
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, numbers
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite
+from hjbjax.problem.types import Array, Number, Numbers
 from hjbjax.solution.solution import Solution
 
 NEAR = 2e-3  # of the half width: a disturbance so near its bound sits on it
 
+InputMatrix: TypeAlias = Callable | Numbers | Sequence | None  # E, a number or a matrix (n, l), perhaps of the state
 
-def attenuation(problem: Problem, gamma: Any, disturbances: AdmissibleSet, *, enters: Any = None) -> Problem:
+
+def attenuation(
+    problem: Problem, gamma: Numbers, disturbances: AdmissibleSet, *, enters: InputMatrix = None
+) -> Problem:
     """The L₂-gain problem of a problem without disturbances: drift f + E d, cost L − ½γ²|d|².
 
     Args:
@@ -49,33 +54,38 @@ def attenuation(problem: Problem, gamma: Any, disturbances: AdmissibleSet, *, en
         raise ValueError(f"attenuation: the problem already has disturbances, {problem.disturbances!r}; leave them out")
     if problem.cost is None:
         raise ValueError("attenuation: the problem has no cost; wanted L = ½|z|² of the output z to be kept small")
-    level = numbers(gamma, "attenuation: gamma")
+    level = numbers(gamma, "attenuation: gamma")  # a tracer goes through: its sign is not known yet
     if np.ndim(level) or (isinstance(level, np.ndarray) and not 0 < level < math.inf):
         raise ValueError(f"attenuation: got gamma = {gamma!r}, wanted a finite number > 0")
     level = float(level) if isinstance(level, np.ndarray) else level
     enters = as_partial(enters) if callable(enters) else None if enters is None else numbers(enters, "enters")
+    # Partials that hold γ and E as leaves: another level is another number in the same compiled program
     return dataclasses.replace(
         problem,
-        drift=jax.tree_util.Partial(_pushed, problem.drift, enters),
-        cost=jax.tree_util.Partial(_charged, problem.cost, level),
-        noise=jax.tree_util.Partial(_blind, problem.noise) if callable(problem.noise) else problem.noise,
+        drift=jax.tree_util.Partial(_drift, problem.drift, enters),
+        cost=jax.tree_util.Partial(_cost, problem.cost, level),
+        noise=jax.tree_util.Partial(_noise, problem.noise) if callable(problem.noise) else problem.noise,
         disturbances=disturbances,
     )
 
 
-def _pushed(drift: Callable, enters: Any, *arguments: Any) -> Any:
+def _drift(drift: Callable, enters: Callable | Array | None, *arguments: Array) -> Array:
+    """f(x, u) + E(x) d; the time may go first."""
     *seen, d = arguments
     if enters is None:
         return drift(*seen) + d
+    # the state is the last but one of (t, x, u) and of (x, u)
     return drift(*seen) + jnp.matmul(enters(seen[-2]) if callable(enters) else enters, d)
 
 
-def _charged(cost: Callable, gamma: Any, *arguments: Any) -> Any:
+def _cost(cost: Callable, gamma: Number, *arguments: Array) -> Array:
+    """L(x, u) − ½γ²|d|²."""
     *seen, d = arguments
     return cost(*seen) - 0.5 * gamma**2 * (d @ d)
 
 
-def _blind(noise: Callable, *arguments: Any) -> Any:
+def _noise(noise: Callable, *arguments: Array) -> Array:
+    """σ(x, u), which the disturbance does not move."""
     return noise(*arguments[:-1])
 
 
@@ -104,7 +114,7 @@ class Saturation:
 
 
 def saturation(solution: Solution, problem: Problem, *, inner: float = 0.5) -> Saturation:
-    """Whether the bound on the disturbances, meant to be inactive, is: the worst case d(x) in an inner box.
+    """How near the worst disturbance comes to its bound, which is meant to be inactive, in an inner box.
 
     Where it sits on the bound the answer is that of the set and not of the equation: widen the set, or take the
     level γ for infeasible.
@@ -127,19 +137,23 @@ def saturation(solution: Solution, problem: Problem, *, inner: float = 0.5) -> S
         raise ValueError(f"saturation: the disturbances are {len(admissible.points)} points; wanted a Box or a Ball")
     if not 0 < inner <= 1:
         raise ValueError(f"saturation: got inner = {inner!r}; wanted a share of the box in (0, 1]")
+    # a march is judged where it has come to, the earliest kept time: there the worst case has the longest way ahead
     d = np.asarray(solution.disturbance if solution.times is None else solution.disturbance[0], np.float64)
+    # nodes without a disturbance, as those of a target, do not count
     inside = solution.grid.inner(inner) & np.all(np.isfinite(d), axis=-1)
     if not inside.any():
         raise ValueError(f"saturation: no node with a disturbance in the inner {inner:g} of the box; enlarge it")
-    size = np.where(inside, _relative(admissible, d), -1.0)
+    # −1 outside: an argmax finds a node of the inner box, also where d is zero in all of it
+    size = np.where(inside, _share_of_bound(admissible, d), -1.0)
     index = np.unravel_index(int(np.argmax(size)), size.shape)
     share = float(np.mean(size[inside] >= 1 - NEAR))
     return Saturation(share, float(size[index]), solution.grid.state([int(i) for i in index]), float(inner))
 
 
-def _relative(admissible: Box | Ball, d: np.ndarray) -> np.ndarray:
-    """|d| over its bound; inputs that cannot move do not count."""
+def _share_of_bound(admissible: Box | Ball, d: np.ndarray) -> np.ndarray:
+    """|d| over its bound at every node; inputs that cannot move do not count."""
     if isinstance(admissible, Ball):
         return np.linalg.norm(d, axis=-1) / np.where(admissible.radius > 0, admissible.radius, np.inf)
+    # of a box the nearest bound decides, input by input, and d is measured from the middle
     lo, hi = np.asarray(admissible.lo), np.asarray(admissible.hi)
     return np.max(np.abs(d - (lo + hi) / 2) / np.where(hi > lo, (hi - lo) / 2, np.inf), axis=-1)

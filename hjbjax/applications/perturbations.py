@@ -11,14 +11,13 @@ orders are slopes of log error over log ε and log 1/γ by least squares, of err
 """
 
 import dataclasses
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import jax
 import numpy as np
 
 from hjbjax.applications.convergence import fitted_order
-from hjbjax.applications.l2_gain import attenuation, saturation
+from hjbjax.applications.l2_gain import InputMatrix, attenuation, saturation
 from hjbjax.applications.reference import mask_of
 from hjbjax.discretisation.discretisation import Scheme
 from hjbjax.discretisation.schemes import Limited
@@ -26,6 +25,7 @@ from hjbjax.iteration.methods import Method
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box
+from hjbjax.problem.types import Mask
 from hjbjax.solution.clock import Clock, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
@@ -62,7 +62,7 @@ class Series:
 
     @property
     def feedback_order(self) -> float:
-        """The fitted slope of the feedback, likewise."""
+        """The fitted slope of the feedback; NaN with fewer than two entries to fit."""
         return fitted_order(self.parameters[self.feedback_fitted], self.feedback_errors[self.feedback_fitted])
 
     def __str__(self) -> str:
@@ -81,8 +81,8 @@ class Perturbation:
 
     Args:
       nominal: the solution without either.
-      noise: what the noises ε did.
-      gain: what the disturbances at the levels γ did, over 1/γ.
+      noise: the changes by the noises ε.
+      gain: the changes by the disturbances at the levels γ, over 1/γ.
       scheme: the scheme's text.
       tol: the tolerance of every solve.
     """
@@ -108,8 +108,8 @@ def perturbation_study(
     noises: Sequence[float],
     gammas: Sequence[float],
     disturbances: AdmissibleSet,
-    enters: Any = None,
-    region: Any = 0.25,
+    enters: InputMatrix = None,
+    region: Callable | float | None = 0.25,
     scheme: Scheme = Limited(),
     method: Method | None = None,
     tol: float = 1e-6,
@@ -118,7 +118,7 @@ def perturbation_study(
 
     Args:
       problem: the question, without noise or disturbances; without discount noise would cost without end.
-      grid: the nodes, the same for all.
+      grid: the nodes, on which all of them are solved.
       noises: ε, at least two numbers > 0.
       gammas: γ, at least two feasible levels.
       disturbances: the set of d, not saturated in the region.
@@ -145,61 +145,72 @@ def perturbation_study(
       (2.0, 2.0)
     """
     check_arguments(problem, grid, method, scheme, tol)
-    levels = _increasing("noises", noises), _increasing("gammas", gammas)
+    levels = _parameters("noises", noises), _parameters("gammas", gammas)
     if problem.is_game or problem.noise is not None:
         raise ValueError("perturbation_study: the problem has noise or disturbances already; leave them out")
     if not np.asarray(problem.discount) > 0:
         raise ValueError("perturbation_study: with noise and no discount the cost has no end; give a discount > 0")
     mask = mask_of(region, grid, "perturbation_study")
+    # from the highest level, the weakest disturbance, on: like the noises in the order of their effect
     games = [attenuation(problem, gamma, disturbances, enters=enters) for gamma in levels[1][::-1]]
+    # ``saturation`` at the end knows no other sets: better refused before the solves than after them
     if not isinstance(disturbances, (Box, Ball)):
         raise ValueError(f"perturbation_study: the disturbances are {disturbances!r:.60}; wanted a Box or a Ball")
+    # before the first solve, which may take long: E and the set of d are met by the games alone
     with jax.enable_x64(True):
         checks.shapes(games[0], grid, scheme)
 
-    def solved(which: Problem, throw: bool = False) -> Solution:
+    def solution_of(which: Problem, throw: bool = False) -> Solution:
         return solve(which, grid, scheme=scheme, method=method, tol=tol, throw=throw)
 
     clock, found = Clock(), []
+    # a number is ε I; as a leaf it compiles once for all of them
     noisy = [dataclasses.replace(problem, noise=epsilon) for epsilon in levels[0]]
     with noting_interrupts(clock):
-        nominal = solved(problem, throw=True)
+        nominal = solution_of(problem, throw=True)  # without it there is nothing to compare with
         for perturbed in (*noisy, *games):
             if not clock.interrupted:
-                found.append(solved(perturbed))
+                found.append(solution_of(perturbed))
     noise = _series("ε", levels[0], found[: len(noisy)], nominal, mask, tol)
     gain = _series("1/γ", 1 / levels[1][::-1], found[len(noisy) :], nominal, mask, tol)
     study = Perturbation(nominal, noise, gain, str(scheme), tol)
     if clock.interrupted:
         came = f"{len(found)} of {len(noisy) + len(games)} perturbed problems"
         raise SolveError(f"perturbation_study: interrupted after {came}; .solution is the study so far", study)
-    felt = saturation(dataclasses.replace(found[-1], disturbance=_within(found[-1], mask)), games[-1], inner=1.0)
+    # the lowest level has the strongest worst case: if that does not come to its bound, none does
+    watched = dataclasses.replace(found[-1], disturbance=_disturbance_within(found[-1], mask))
+    felt = saturation(watched, games[-1], inner=1.0)
     if felt.share > 0:
         raise ValueError(f"perturbation_study: at gamma = {levels[1][0]:g} {felt}; widen the set, or raise gamma")
     return study
 
 
-def _increasing(name: str, numbers: Any) -> np.ndarray:
+def _parameters(name: str, numbers: Sequence[float]) -> np.ndarray:
+    """The parameters in increasing order, each once."""
     values = np.unique(np.asarray(numbers, np.float64))
     if values.size < 2 or not np.all(np.isfinite(values) & (values > 0)):
         raise ValueError(f"perturbation_study: got {name} = {numbers!r}, wanted at least two finite numbers > 0")
     return values
 
 
-def _within(solution: Solution, mask: np.ndarray) -> np.ndarray:
+def _disturbance_within(solution: Solution, mask: Mask) -> np.ndarray:
     """The disturbance in the region, NaN outside."""
     return np.where(mask[..., None], solution.disturbance, np.nan)
 
 
 def _series(
-    name: str, parameters: np.ndarray, solutions: Sequence[Solution], nominal: Solution, mask: np.ndarray, tol: float
+    name: str, parameters: np.ndarray, solutions: Sequence[Solution], nominal: Solution, mask: Mask, tol: float
 ) -> Series:
+    """The changes against the unperturbed solution, and which of them count for the orders."""
     parameters = parameters[: len(solutions)]  # fewer where the study was interrupted
+    # one grid and one scheme: the grid's own error cancels but for its product with the change
     values = [np.abs(each.value - nominal.value)[mask] for each in solutions]
+    # a NaN goes through the maxima, and what it touches is not fitted
     inputs = [np.abs(each.policy - nominal.policy)[mask] for each in solutions]
     errors = np.array([np.max(each) for each in values])
-    feedback = np.array([np.max(each, initial=0.0) for each in inputs])
+    feedback = np.array([np.max(each, initial=0.0) for each in inputs])  # initial: without controls u is empty
     converged = np.array([each.status is Status.CONVERGED for each in solutions], bool)
+    # a change within the tolerance may be the iteration's
     fitted = converged & np.isfinite(errors) & (errors > tol)
     finest = min(float(nominal.grid.spacing(axis)) for axis in range(nominal.grid.ndim))
     seen = fitted & (feedback > tol / finest)  # a slope of V is known no better than that

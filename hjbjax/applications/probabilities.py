@@ -19,6 +19,7 @@ import numpy as np
 from hjbjax.applications import exit_problems
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
+from hjbjax.feedback.feedback import GridFeedback, Place, is_grid_feedback
 from hjbjax.finiteness import attainability, node_checks
 from hjbjax.iteration.methods import ValueIteration
 from hjbjax.problem.grid import Grid
@@ -31,7 +32,7 @@ from hjbjax.solvers.stationary import as_dtype, check_arguments, solve
 from hjbjax.tracing import checks
 from hjbjax.tracing.interpreter import FallbackWarning
 
-TOL = 1e-6
+TOL = 1e-6  # the 1e-3 of ``solve`` would show in the third digit of a probability
 
 
 def reach_probability(
@@ -42,7 +43,7 @@ def reach_probability(
     obstacle: Callable | None = None,
     horizon: float | None = None,
     least: bool = False,
-    feedback: Any = None,
+    feedback: GridFeedback | Callable | None = None,
     **options: Any,
 ) -> Solution:
     """The greatest probability with which the control can bring the state into the target.
@@ -85,10 +86,10 @@ def reach_probability(
     """
     name = "reach_probability"
     _refuse_open(grid, name)
-    problem, inside, hit = _asked(problem, target, obstacle, feedback, horizon, name)
-    sign = 1.0 if least else -1.0
-    question = exit_problems.ending(problem, inside, hit, 0.0, sign)
-    with _quiet(feedback):
+    problem, inside, hit = _system(problem, target, obstacle, feedback, horizon, name)
+    sign = 1.0 if least else -1.0  # the control minimises: the greatest probability is minus the least of −P
+    question = exit_problems.exit_problem(problem, inside, hit, 0.0, sign)
+    with _no_fallback_warning(feedback):
         if horizon is None:
             question, options = _without_end(question, grid, least, options)
         return _answer(question, grid, horizon, options, sign)
@@ -101,7 +102,7 @@ def stay_probability(
     *,
     horizon: float | None = None,
     least: bool = False,
-    feedback: Any = None,
+    feedback: GridFeedback | Callable | None = None,
     **options: Any,
 ) -> Solution:
     """The greatest probability with which the control can keep the state in a region.
@@ -132,10 +133,11 @@ def stay_probability(
       >>> round(float(kept.value_at(0.0, [0.0])), 2)  # (4/π) e^{−π²/8} − ...
       0.37
     """
-    leaving = jax.tree_util.Partial(exit_problems.outside, as_partial(region, "stay_probability: region"))
-    with _scaled_errors(1.0, -1.0):
+    leaving = jax.tree_util.Partial(exit_problems.complement, as_partial(region, "stay_probability: region"))
+    # P(stays) = 1 − P(leaves), also of a partial solution; the least probability of leaving is the greatest of staying
+    with _map_errors(1.0, -1.0):
         left = reach_probability(problem, grid, leaving, horizon=horizon, least=not least, feedback=feedback, **options)
-    return _scaled(left, 1.0, -1.0)
+    return _affine(left, 1.0, -1.0)
 
 
 def expected_exit_time(
@@ -145,7 +147,7 @@ def expected_exit_time(
     *,
     horizon: float | None = None,
     greatest: bool = False,
-    feedback: Any = None,
+    feedback: GridFeedback | Callable | None = None,
     **options: Any,
 ) -> Solution:
     """The least expected time in which the control can bring the state into the target.
@@ -181,10 +183,10 @@ def expected_exit_time(
     """
     name = "expected_exit_time"
     _refuse_open(grid, name)
-    problem, inside, _ = _asked(problem, target, None, feedback, horizon, name)
-    sign = -1.0 if greatest else 1.0
-    question = exit_problems.ending(problem, inside, None, sign, 0.0)
-    with _quiet(feedback):
+    problem, inside, _ = _system(problem, target, None, feedback, horizon, name)
+    sign = -1.0 if greatest else 1.0  # max E τ = −min E(−τ): a cost of −1 per unit time
+    question = exit_problems.exit_problem(problem, inside, None, sign, 0.0)
+    with _no_fallback_warning(feedback):
         if horizon is None:
             options = {"tol": TOL} | options
             if greatest:
@@ -192,7 +194,8 @@ def expected_exit_time(
         return _answer(question, grid, horizon, options, sign)
 
 
-def _refuse_open(grid: Any, name: str) -> None:
+def _refuse_open(grid: object, name: str) -> None:
+    """Refuse a grid with open ends; what is no grid is refused by ``solve``."""
     if isinstance(grid, Grid) and grid.sides("open"):
         raise ValueError(
             f"{name}: beyond an open end a value is continued from inside, which makes no probability and no time of "
@@ -200,27 +203,33 @@ def _refuse_open(grid: Any, name: str) -> None:
         )
 
 
-def _asked(
-    problem: Any, target: Any, obstacle: Any, feedback: Any, horizon: Any, name: str
-) -> tuple[Problem, Any, Any]:
+def _system(
+    problem: Problem,
+    target: Callable | None,
+    obstacle: Callable | None,
+    feedback: GridFeedback | Callable | None,
+    horizon: float | None,
+    name: str,
+) -> tuple[Problem, Callable, Callable | None]:
     """The system that runs, with its loop closed if there is a feedback, its target and its obstacle."""
     if not isinstance(problem, Problem):
         raise TypeError(f"{name}: got {type(problem).__name__}, wanted a Problem")
     inside = problem.target if target is None else as_partial(target, f"{name}: target")
     if inside is None:
         raise ValueError(f"{name}: there is nothing to reach: give target=, a function ≤ 0 inside, or problem.target")
-    hit = as_partial(obstacle, f"{name}: obstacle")
+    hit = as_partial(obstacle, f"{name}: obstacle")  # the problem has no obstacle of its own
     if feedback is None:
         return problem, inside, hit
-    loop = exit_problems.closed(problem, feedback, horizon, name)
+    loop = exit_problems.close_loop(problem, feedback, horizon, name)
+    # a marched feedback makes the loop depend on the time, which the user's sets do not know of
     needs_time = loop.time_dependent and not problem.time_dependent
-    return loop, exit_problems.timed(inside, needs_time), exit_problems.timed(hit, needs_time)
+    return loop, exit_problems.with_time(inside, needs_time), exit_problems.with_time(hit, needs_time)
 
 
 @contextlib.contextmanager
-def _quiet(feedback: Any) -> Iterator[None]:
-    """A feedback that is a Solution is looked up node by node; that is no fault of the user's functions."""
-    if not hasattr(feedback, "control_at"):
+def _no_fallback_warning(feedback: GridFeedback | Callable | None) -> Iterator[None]:
+    """No warning while a Solution closes the loop: its lookup node by node is no fault of the user's functions."""
+    if not is_grid_feedback(feedback):  # filters of warnings belong to the whole process: not touched without need
         yield
         return
     with warnings.catch_warnings():
@@ -229,39 +238,44 @@ def _quiet(feedback: Any) -> Iterator[None]:
 
 
 def _without_end(question: Problem, grid: Grid, least: bool, options: dict) -> tuple[Problem, dict]:
-    """The question for all times, with what finds the least of its solutions where one may stay away for ever.
+    """The question for all times, and options by which the least of its solutions is found where it has several.
 
     Zero, a bound of the value, is given as a running maximum, or for the greatest probability, which comes with its
     sign changed, as a stopping cost: so that the iteration starts there, and no node is taken for one without a value.
     """
     options = {"tol": TOL} | options
-    if not _may_stay(question, grid, options):
+    if not _count_staying(question, grid, options):
         return question, options
     bound: dict[str, Any] = {"running_max" if least else "stopping_cost": jax.tree_util.Partial(_zero)}
+    # another method may find another of the solutions; who asks for one by name gets it
     return dataclasses.replace(question, **bound), {"method": ValueIteration()} | options
 
 
-def _zero(*where: Any) -> Any:
+def _zero(*where: Place) -> jax.Array:
+    """Zero, a bound of every probability."""
     return jnp.zeros(())
 
 
-def _may_stay(question: Problem, grid: Grid, options: dict) -> int:
+def _count_staying(question: Problem, grid: Grid, options: dict) -> int:
     """The number of nodes at which some actions keep the state away from every end for ever; 0 while traced."""
+    # the checks of ``solve``, in its order: the survey of all nodes must not be the first to meet a bad argument
     scheme, kind = options.get("scheme", Upwind()), as_dtype(options.get("dtype"))
     check_arguments(question, grid, options.get("method"), scheme, options["tol"])
-    if is_traced(question, grid):
+    if is_traced(question, grid):  # values of the problem's functions are needed, which there are none of
         return 0
     method = options.get("method") or ValueIteration()  # needs the least; solve asks again for what it takes
     with jax.enable_x64(kind == np.float64):
         memory.require(question, grid, method, kind, options.get("max_memory"))
         checks.shapes(question, grid, scheme)
         node_checks.values(question, grid, kind)
+        # of the chain beneath the scheme: slopes of higher order make no transition probabilities
         kept = attainability.refuge(Discretisation(question, grid, scheme.chain, kind))
         return int(np.sum(np.asarray(kept)))
 
 
 def _refuse_staying(question: Problem, grid: Grid, options: dict) -> None:
-    count = _may_stay(question, grid, options)
+    """Refuse to ask for the greatest time where it may be infinite, which no iteration would find."""
+    count = _count_staying(question, grid, options)
     if count:
         how, who = ("may be", "actions of both players keep") if question.is_game else ("is", "action keeps")
         raise ValueError(
@@ -272,23 +286,23 @@ def _refuse_staying(question: Problem, grid: Grid, options: dict) -> None:
 
 def _answer(question: Problem, grid: Grid, horizon: float | None, options: dict, sign: float) -> Solution:
     """sign · V of the question, also for a partial solution."""
-    with _scaled_errors(0.0, sign):
+    with _map_errors(0.0, sign):
         found = solve(question, grid, **options) if horizon is None else march(question, grid, horizon, **options)
-    return _scaled(found, 0.0, sign)
+    return _affine(found, 0.0, sign)
 
 
 @contextlib.contextmanager
-def _scaled_errors(offset: float, sign: float) -> Iterator[None]:
-    """An error's partial solution is scaled as the whole one is."""
+def _map_errors(offset: float, sign: float) -> Iterator[None]:
+    """An error raised inside has offset + sign · V for V in its partial solution."""
     try:
         yield
     except SolveError as error:
         if error.solution is not None:
-            error.solution = _scaled(error.solution, offset, sign)
+            error.solution = _affine(error.solution, offset, sign)  # in place: the traceback stays what it is
         raise
 
 
-def _scaled(solution: Solution, offset: float, sign: float) -> Solution:
+def _affine(solution: Solution, offset: float, sign: float) -> Solution:
     """The solution with offset + sign · V for V; no certificate holds for a cost that is negative."""
     if sign > 0:
         return dataclasses.replace(solution, value=offset + solution.value)

@@ -12,7 +12,6 @@ Hamilton–Jacobi formulation of reachable sets for continuous dynamic games, IE
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +19,7 @@ import jax.numpy as jnp
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial
 from hjbjax.problem.sets import AdmissibleSet
+from hjbjax.problem.types import Array
 
 
 def reach(
@@ -56,9 +56,10 @@ def reach(
       (True, False)
     """
     inside = as_partial(target, "reach: target")
+    # a tube may stop at any s and pays l there, V ≤ l; a set pays l at the end alone
     stop, end = (inside, None) if tube else (None, inside)
     return Problem(
-        _running(drift, forward, time_dependent), None, controls, disturbances=disturbances, stopping_cost=stop,
+        _drift(drift, forward, time_dependent), None, controls, disturbances=disturbances, stopping_cost=stop,
         terminal_cost=end, isaacs=isaacs, time_dependent=time_dependent,
     )  # fmt: skip
 
@@ -90,9 +91,10 @@ def avoid(
       The problem; −V is the least distance that the control can guarantee.
     """
     depth = jax.tree_util.Partial(_negative, as_partial(obstacle, "avoid: obstacle"))
+    # −l is largest where the path is deepest in the obstacle: the running maximum keeps it, V ≥ −l
     most, end = (depth, None) if tube else (None, depth)
     return Problem(
-        _running(drift, forward, time_dependent), None, controls, disturbances=disturbances, running_max=most,
+        _drift(drift, forward, time_dependent), None, controls, disturbances=disturbances, running_max=most,
         terminal_cost=end, isaacs=isaacs, time_dependent=time_dependent,
     )  # fmt: skip
 
@@ -127,17 +129,19 @@ def reach_avoid(
     """
     inside, hit = as_partial(target, "reach_avoid: target"), as_partial(obstacle, "reach_avoid: obstacle")
     depth = jax.tree_util.Partial(_negative, hit)
+    # both at once: max{·, −o} is outermost, so that l ≤ 0 inside the obstacle is no success
     stop, end = (inside, None) if tube else (None, inside)
     return Problem(
-        _running(drift, forward, time_dependent), None, controls, disturbances=disturbances, stopping_cost=stop,
+        _drift(drift, forward, time_dependent), None, controls, disturbances=disturbances, stopping_cost=stop,
         terminal_cost=end, running_max=depth, isaacs=isaacs, time_dependent=time_dependent,
     )  # fmt: skip
 
 
-def _running(drift: Callable, forward: bool, time_dependent: bool) -> Callable:
+def _drift(drift: Callable, forward: bool, time_dependent: bool) -> Callable:
     """The drift, backwards for a forward set."""
     if not forward:
         return drift
+    # x(T) is reached from the target exactly if the target is reached from x(T) with time running backwards
     if time_dependent:
         raise ValueError(
             "forward=True turns the time round, which it cannot do for functions of the time; write drift(T - t, x, u) "
@@ -146,9 +150,11 @@ def _running(drift: Callable, forward: bool, time_dependent: bool) -> Callable:
     return jax.tree_util.Partial(_backwards, as_partial(drift, "drift"))
 
 
-def _backwards(drift: Callable, *arguments: Any) -> Any:
+def _backwards(drift: Callable, *arguments: Array) -> jax.Array:
+    """The drift with its sign changed."""
     return -jnp.asarray(drift(*arguments))
 
 
-def _negative(distance: Callable, *arguments: Any) -> Any:
+def _negative(distance: Callable, *arguments: Array) -> Array:
+    """A signed distance with its sign changed: ≥ 0 inside."""
     return -distance(*arguments)

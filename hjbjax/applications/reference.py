@@ -10,14 +10,16 @@ which is an estimate, and is called one wherever it shows.
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import numpy as np
 
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.types import Mask, Nodes
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
+
+FLATTEST, STEEPEST = 1e-3, 16.0  # orders between which Richardson's is sought; the highest of a scheme is 5
 
 
 def mean_spacing(grid: Grid) -> float:
@@ -27,20 +29,21 @@ def mean_spacing(grid: Grid) -> float:
 
 def spacings(grid: Grid) -> np.ndarray:
     """The mean spacing along every axis, shape (n,)."""
+    # of a stretched axis the mean; on a finer grid all of its spacings shrink by about the factor of the mean
     counts = np.array([grid.intervals(axis) for axis in range(grid.ndim)])
     return (np.asarray(grid.hi) - np.asarray(grid.lo)) / counts
 
 
 def check_box(what: str, first: Grid, second: Grid) -> None:
-    """Refuse two grids that are not of the same box."""
+    """Refuse two grids of different boxes."""
     alike = first.periodic == second.periodic
     if not (alike and np.array_equal(first.lo, second.lo) and np.array_equal(first.hi, second.hi)):
         boxes = [f"{grid.lo} to {grid.hi}, periodic {grid.periodic}" for grid in (first, second)]
         raise ValueError(f"convergence_study: got {what}: {boxes[0]} and {boxes[1]}; wanted one box")
 
 
-def check_reference(reference: Any, grids: tuple[Grid, ...]) -> None:
-    """Refuse, before anything is solved, what the errors cannot be measured against."""
+def check_reference(reference: object, grids: tuple[Grid, ...]) -> None:
+    """Refuse a reference against which no error can be measured, before anything is solved."""
     if reference is None:
         if len(grids) < 3:
             raise ValueError(
@@ -59,6 +62,7 @@ def check_reference(reference: Any, grids: tuple[Grid, ...]) -> None:
                 f"convergence_study: the reference is {reference.status.name}; wanted a converged solution"
             )
         check_box("a reference of another box", grids[0], reference.grid)
+        # its own error must be smaller than those it is to measure, along every axis
         if not np.all(spacings(reference.grid) < spacings(grids[-1])):
             raise ValueError(
                 f"convergence_study: the reference is on {reference.grid.shape} nodes and the finest grid has "
@@ -70,18 +74,19 @@ def check_reference(reference: Any, grids: tuple[Grid, ...]) -> None:
         )
 
 
-def words_for(reference: Any, grids: tuple[Grid, ...]) -> str:
-    """The reference in a few words."""
+def words_for(reference: object, grids: tuple[Grid, ...]) -> str:
+    """The reference in a few words, for the head of the table."""
     if not isinstance(reference, Solution):
         return "the function given"
     shape = " x ".join(map(str, reference.grid.shape))
-    between = "" if all(nested(reference.grid, grid) for grid in grids) else ", linear between its nodes"
+    between = "" if all(is_nested(reference.grid, grid) for grid in grids) else ", linear between its nodes"
     return f"the solution on {shape} nodes{between}"
 
 
-def at_nodes_of(reference: Any, grid: Grid, mask: np.ndarray) -> np.ndarray:
+def at_nodes_of(reference: Solution | Callable, grid: Grid, mask: Mask) -> np.ndarray:
     """The reference at the nodes of a grid."""
     if isinstance(reference, Solution):
+        # clamped: a node on the edge may lie outside of the other grid by rounding
         values = np.asarray(reference.value_at(grid.nodes(), clamp=True))
     else:
         values = evaluate(reference, grid, "the reference")
@@ -97,7 +102,7 @@ def at_nodes_of(reference: Any, grid: Grid, mask: np.ndarray) -> np.ndarray:
 
 def evaluate(function: Callable, grid: Grid, what: str, name: str = "convergence_study") -> np.ndarray:
     """A function of one state at all nodes, in float64; ``name`` is who asks, for refusals."""
-    with jax.enable_x64(True):
+    with jax.enable_x64(True):  # the reference must not be what limits the errors seen
         got = jax.eval_shape(function, jax.ShapeDtypeStruct((grid.ndim,), np.float64))
         if getattr(got, "shape", None) != ():
             shape = getattr(got, "shape", got)
@@ -106,7 +111,7 @@ def evaluate(function: Callable, grid: Grid, what: str, name: str = "convergence
         return np.asarray(jax.jit(jax.vmap(function))(states)).reshape(grid.shape)
 
 
-def mask_of(region: Any, grid: Grid, name: str = "convergence_study") -> np.ndarray:
+def mask_of(region: Callable | float | None, grid: Grid, name: str = "convergence_study") -> np.ndarray:
     """The nodes that count, bool (*grid); ``name`` is who asks, for refusals."""
     if region is None:
         return np.ones(grid.shape, bool)
@@ -123,15 +128,15 @@ def mask_of(region: Any, grid: Grid, name: str = "convergence_study") -> np.ndar
     return inside
 
 
-def nested(fine: Grid, coarse: Grid) -> bool:
-    """Whether every node of the coarse grid is a node of the fine one, in grids of one box."""
+def is_nested(fine: Grid, coarse: Grid) -> bool:
+    """True if every node of the coarse grid is a node of the fine one, in grids of one box."""
     multiple = all(fine.intervals(axis) % coarse.intervals(axis) == 0 for axis in range(coarse.ndim))
     return multiple and repr(fine.stretch) == repr(coarse.stretch)
 
 
 def strides(fine: Grid, coarse: Grid) -> tuple[slice, ...]:
-    """Which nodes of the fine grid are those of the coarse one."""
-    if not nested(fine, coarse):
+    """The slices of the fine grid that pick the nodes of the coarse one."""
+    if not is_nested(fine, coarse):
         raise ValueError(
             f"convergence_study: without a reference the nodes of {coarse.shape} must be nodes of {fine.shape}; wanted "
             "intervals that are multiples of the coarsest grid's, as with 41, 81 and 161 nodes"
@@ -139,34 +144,37 @@ def strides(fine: Grid, coarse: Grid) -> tuple[slice, ...]:
     return tuple(slice(None, None, fine.intervals(axis) // coarse.intervals(axis)) for axis in range(fine.ndim))
 
 
-def thinned(value: np.ndarray, fine: Grid, coarse: Grid) -> np.ndarray:
+def restrict(value: np.ndarray, fine: Grid, coarse: Grid) -> np.ndarray:
     """The values at the nodes that both grids have."""
     return value[strides(fine, coarse)]
 
 
-def distance(value: np.ndarray, exact: np.ndarray) -> np.ndarray:
+def distance(value: Nodes, exact: Nodes) -> np.ndarray:
     """|V − W|; two equal infinities are no distance apart."""
+    # ∞ − ∞ is NaN and warns, though `where` does not take it
     with np.errstate(invalid="ignore"):
         return np.where(value == exact, 0.0, np.abs(value - exact))
 
 
 def richardson(values: list[np.ndarray], h: np.ndarray, mask: np.ndarray, tol: float) -> tuple[np.ndarray | None, str]:
-    """The extrapolated value from three grids, or ``None`` where they show no order, and what to call it."""
-    (coarse, middle, fine), h = values, h / h[0]
+    """The extrapolated value from three grids, or ``None`` where they show no order, and its name in the table."""
+    (coarse, middle, fine), h = values, h / h[0]  # spacings over the coarsest: powers of order 16 stay in range
     wide, narrow = (float(np.mean(distance(a, b)[mask])) for a, b in ((coarse, middle), (middle, fine)))
 
-    def excess(order):
+    def excess(order: float) -> float:
+        """The first line of the module's, left side less right side, times h₂^p − h₃^p: its zero is the order."""
         return (h[0] ** order - h[1] ** order) - wide / narrow * (h[1] ** order - h[2] ** order)
 
-    if not (math.isfinite(wide) and narrow > tol and excess(1e-3) < 0 < excess(16.0)):
+    if not (math.isfinite(wide) and narrow > tol and excess(FLATTEST) < 0 < excess(STEEPEST)):
+        # a change below the tolerance is the iteration's; without a change of sign no order explains the two changes
         return None, (
             "nothing: no Richardson estimate, since from grid to grid the mean "
             f"changes by {wide:.3g} and {narrow:.3g}, which shows no order"
         )
     from scipy.optimize import brentq
 
-    order = brentq(excess, 1e-3, 16.0)
-    with np.errstate(invalid="ignore"):
+    order = brentq(excess, FLATTEST, STEEPEST)
+    with np.errstate(invalid="ignore"):  # nodes that are infinite on all grids stay so
         step = np.where(fine == middle, 0.0, fine - middle)
     extrapolated = fine + step * h[2] ** order / (h[1] ** order - h[2] ** order)
     return extrapolated, f"Richardson's estimate from the three finest grids, which show order {order:.2f}"

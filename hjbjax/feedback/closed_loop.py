@@ -22,48 +22,80 @@ With noise a target is met late, since what happens between two steps is not see
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.feedback.loop import Loop, defined
+from hjbjax.feedback.loop import Actions, Loop, are_finite
 from hjbjax.feedback.path import Path, PathStatus
 from hjbjax.problem.pytree import pytree_dataclass
+from hjbjax.problem.types import Array, Control, Key, Number, State
+
+if TYPE_CHECKING:
+    import diffrax
+
+# Before an interval: the time, the state with the running cost (n+1), the PathStatus and the steps so far.
+Progress: TypeAlias = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
+Beginning: TypeAlias = tuple[Control, Number, State]  # of an interval: the control held through it, when and where
+# Of each interval: time and state at its end, both actions at its start, and True where the path runs through it.
+Rows: TypeAlias = tuple[jax.Array, jax.Array, jax.Array, jax.Array | None, jax.Array]
+
+LEAST_STEPS = 10  # of an output interval with noise, where no estimate of the error shortens a step
+TREE = 64  # the shortest step over the tolerance of the Brownian tree, below which w is interpolated
+DEEPEST = 2**30  # the duration over that tolerance, at most: each halving is one level of the tree in every step
+BRACKET = 4  # units in the last place, of the bracket around the time at which a path meets a boundary
 
 
 @pytree_dataclass(static=("max_steps", "held"))
 class Stepping:
-    """How the integrator steps.
+    """Tolerances and limits of the integrator's steps.
 
     Args:
       rtol: relative error of an internal step.
       atol: absolute error of an internal step, in the units of the state and of the cost.
       max_step: the longest internal step, may be inf.
       max_steps: the most internal steps.
-      held: whether the control is held from one output time to the next.
+      held: True where the control is held from one output time to the next.
     """
 
-    rtol: Any
-    atol: Any
-    max_step: Any
+    rtol: Number
+    atol: Number
+    max_step: Number
     max_steps: int
     held: bool
 
 
-def integrate(loop: Loop, x0: Any, times: Any, key: Any, stepping: Stepping) -> tuple[Path, Any]:
-    """The path of full length, and for each interval whether the path runs through it, shape (k,).
+@pytree_dataclass()
+class InitialValueProblem:
+    """A closed loop with its initial state, its output times and the key of its noise.
+
+    Args:
+      loop: the closed loop.
+      x0: the state at the first time, shape (n,).
+      times: output times, shape (k+1,), increasing.
+      key: of the Brownian path; None without noise.
+    """
+
+    loop: Loop
+    x0: State
+    times: Array
+    key: Key | None
+
+
+def integrate(ivp: InitialValueProblem, stepping: Stepping) -> tuple[Path, jax.Array]:
+    """The path of full length, and a mask (k,) of the intervals that it runs through.
 
     One diffrax solve an output interval, all in one scan; a path that has ended gets intervals of length zero.
     """
-    interval, first = _intervals(loop, x0, times, key, stepping)
-    last, rows = jax.lax.scan(interval, first, times[1:])
-    return _path(loop, x0, times[0], last, rows)
+    interval, first = _intervals(ivp, stepping)
+    last, rows = jax.lax.scan(interval, first, ivp.times[1:])
+    return _path(ivp, last, rows)
 
 
-def unbegun(loop: Loop, x0: np.ndarray, times: np.ndarray) -> tuple[tuple, tuple]:
-    """The state before the first interval, but for its code, and room for what all intervals show; NumPy."""
+def blank_record(loop: Loop, x0: np.ndarray, times: np.ndarray) -> tuple[tuple, tuple]:
+    """The state before the first interval, but for its code, and empty rows for all intervals; NumPy."""
     count, players = len(times) - 1, (loop.problem.controls, loop.problem.disturbances)
     inputs = [0 if admissible is None else admissible.dim for admissible in players]
     controls, disturbances = (np.zeros((count, size), x0.dtype) for size in inputs)
@@ -72,46 +104,49 @@ def unbegun(loop: Loop, x0: np.ndarray, times: np.ndarray) -> tuple[tuple, tuple
     return state, (np.zeros(count, x0.dtype), np.zeros((count, len(x0)), x0.dtype), *shown, np.zeros(count, bool))
 
 
-def some(
-    loop: Loop, x0: Any, times: Any, key: Any, stepping: Stepping, so_far: tuple, done: Any, until: Any
-) -> tuple[tuple, tuple[Path, Any]]:
-    """``integrate`` from the interval ``done`` to before ``until``: the state and all shown, and the path so far.
+def integrate_part(
+    ivp: InitialValueProblem, stepping: Stepping, so_far: tuple[Progress, Rows], done: Number, until: Number
+) -> tuple[tuple[Progress, Rows], tuple[Path, jax.Array]]:
+    """The path so far, after the intervals from ``done`` to before ``until``, beside the record to go on from.
 
     Args:
-      loop, x0, times, key, stepping: of the whole path.
-      so_far: the state and what the intervals before have shown; at first as ``unbegun`` makes them.
+      ivp: the initial-value problem of the whole path.
+      stepping: how the whole path is integrated.
+      so_far: the record, that is the state and the rows of the intervals before; at first ``blank_record``.
       done: the first interval.
       until: the interval after the last one.
     """
-    interval, first = _intervals(loop, x0, times, key, stepping)
+    interval, first = _intervals(ivp, stepping)
     state, rows = so_far
+    # the first code asks the target and the box: here, where functions of the user's are compiled, not at the host
     state = jax.tree.map(lambda old, new: jnp.where(done == 0, new, old), state, first)
 
-    def one(k, carry):
-        state, row = interval(carry[0], times[k + 1])
+    def one(k: jax.Array, carry: tuple[Progress, Rows]) -> tuple[Progress, Rows]:
+        state, row = interval(carry[0], ivp.times[k + 1])
         return state, jax.tree.map(lambda array, entry: array.at[k].set(entry), carry[1], row)
 
+    # both ends are traced, so that chunks of every length share one compiled program
     state, rows = jax.lax.fori_loop(done, until, one, (state, rows))
     t, y, code, count = state
-    came = jnp.arange(len(times) - 1) < until
+    came = jnp.arange(len(ivp.times) - 1) < until
     later, states, controls, disturbances, active = rows
-    cut = (code == PathStatus.DURATION) & (until < len(times) - 1)
+    cut = (code == PathStatus.DURATION) & (until < len(ivp.times) - 1)
     last = t, y, jnp.where(cut, PathStatus.INTERRUPTED, code).astype(code.dtype), count
     shown = jnp.where(came, later, t), jnp.where(came[:, None], states, y[:-1]), controls, disturbances, active & came
-    return (state, rows), _path(loop, x0, times[0], last, shown)
+    return (state, rows), _path(ivp, last, shown)
 
 
-def _intervals(loop: Loop, x0: Any, times: Any, key: Any, stepping: Stepping) -> tuple[Callable, tuple]:
+def _intervals(ivp: InitialValueProblem, stepping: Stepping) -> tuple[Callable, Progress]:
     """One output interval as a step of a scan, and the state (t, y, code, steps) before the first."""
-    start = times[0]
-    solve = _solver(loop, x0, times, key, stepping)
+    loop, x0, start = ivp.loop, ivp.x0, ivp.times[0]
+    solve = _solver(ivp, stepping)
 
-    def interval(state, end):
+    def interval(state: Progress, end: jax.Array) -> tuple[Progress, Rows]:
         t, y, code, count = state
         u, d = loop.players(t, y[:-1])
-        code = jnp.where((code == PathStatus.DURATION) & ~defined((u, d)), PathStatus.UNDEFINED, code)
-        active = code == PathStatus.DURATION
-        later, moved, result, made = _advance(loop, solve, t, jnp.where(active, end, t), y, u, stepping)
+        code = jnp.where((code == PathStatus.DURATION) & ~are_finite((u, d)), PathStatus.UNDEFINED, code)
+        active = code == PathStatus.DURATION  # while all is well the code is that of a path which lasts to its end
+        later, moved, result, made = _advance(loop, stepping, solve, (t, jnp.where(active, end, t)), y, u)
         count = count + made
         code = jnp.where(active, result, code)
         code = jnp.where((code == PathStatus.DURATION) & (count >= stepping.max_steps), PathStatus.MAX_STEPS, code)
@@ -120,22 +155,25 @@ def _intervals(loop: Loop, x0: Any, times: Any, key: Any, stepping: Stepping) ->
         shown = jax.tree.map(lambda a: jnp.where(active, a, jnp.nan), (u, d))
         return (t, y, code.astype(jnp.int32), count), (t, y[:-1], *shown, active)
 
+    # the target comes last and wins: a start in both a target and beyond the edge has arrived
     code = jnp.where(loop.margin(x0) > 0, PathStatus.DURATION, PathStatus.LEFT_BOX)
     code = jnp.where(loop.target(start, x0) <= 0, PathStatus.TARGET, code).astype(jnp.int32)
     return interval, (start, jnp.append(x0, 0.0), code, jnp.zeros((), jnp.int32))
 
 
-def _path(loop: Loop, x0: Any, start: Any, last: tuple, shown: tuple) -> tuple[Path, Any]:
-    """The path of full length from its last state and what its intervals have shown, and which it runs through."""
+def _path(ivp: InitialValueProblem, last: Progress, shown: Rows) -> tuple[Path, jax.Array]:
+    """The path of full length from its last state and the rows of its intervals, and a mask of those that it ran."""
+    loop, x0, start = ivp.loop, ivp.x0, ivp.times[0]
     (t, y, code, count), (later, states, controls, disturbances, active) = last, shown
     hit = code == PathStatus.TARGET
     times, states = jnp.append(start, later), jnp.concatenate([x0[None], states])
     ended = code == PathStatus.DURATION
     if loop.problem.running_max is None:
+        # e^{−βτ} exit cost or e^{−βT} terminal cost; a path that ends by leaving or failing owes neither
         exit_cost, final = (loop.number(c, t, y[:-1]) for c in (loop.problem.exit_cost, loop.problem.terminal_cost))
         due = jnp.where(hit, exit_cost, jnp.where(ended, final, 0))
         cost = y[-1] + loop.discount(t - start) * due
-    else:
+    else:  # V ≥ g: the cost is the maximum of g along the path, seen at the output times; it has no discount
         cost = jnp.max(jax.vmap(lambda t, x: loop.number(loop.problem.running_max, t, x))(times, states))
         if loop.problem.terminal_cost is not None:
             final = loop.number(loop.problem.terminal_cost, t, y[:-1])
@@ -143,22 +181,27 @@ def _path(loop: Loop, x0: Any, start: Any, last: tuple, shown: tuple) -> tuple[P
     return Path(times, states, controls, disturbances, cost, jnp.where(hit, t, jnp.inf), code, count), active
 
 
-def _advance(loop, solve, t, end, y, u, stepping):
-    """From ``t`` to ``end``, or to the target or the edge if they come first: (time, y, code, steps)."""
+def _advance(
+    loop: Loop, stepping: Stepping, solve: Callable, interval: tuple[jax.Array, jax.Array], y: jax.Array, u: Control
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """The path at the end of an interval, or at the target or the edge if they come first: (time, y, code, steps)."""
     import diffrax
 
+    t, end = interval
     width = jnp.where(end > t, end - t, 1)  # of an ended path: any positive number
     if loop.problem.noise is None:
         step = jnp.minimum(width, stepping.max_step)
     else:
-        step = width / jnp.ceil(jnp.maximum(width / stepping.max_step, 10) - 1e-6)
+        # equal steps that end on the output time; the 1e-6 forgives a quotient that rounding lifts over an integer
+        step = width / jnp.ceil(jnp.maximum(width / stepping.max_step, LEAST_STEPS) - 1e-6)
     solved = solve(t0=t, t1=end, dt0=step, y0=y, args=(u, t, y[:-1]))
     later, y = solved.ts[0], solved.ys[0]
     target, margin = loop.target(later, y[:-1]), loop.margin(y[:-1])
+    # the codes are laid over one another from the weakest reason to the strongest, each `where` overrules those before
     code = jnp.where(target <= margin, PathStatus.TARGET, PathStatus.LEFT_BOX)
     if loop.guarded and not stepping.held:
         inside = (target > 0) & (margin > 0)
-        code = jnp.where(inside & ~defined(loop.players(later, y[:-1])), PathStatus.UNDEFINED, code)
+        code = jnp.where(inside & ~are_finite(loop.players(later, y[:-1])), PathStatus.UNDEFINED, code)
     code = jnp.where(diffrax.is_event(solved.result), code, PathStatus.DURATION)
     code = jnp.where(jnp.all(jnp.isfinite(y)), code, PathStatus.NONFINITE)
     # diffrax hands back infinity where it ran out of steps, and the state need not have been
@@ -166,47 +209,49 @@ def _advance(loop, solve, t, end, y, u, stepping):
     return later, y, code, solved.stats["num_steps"].astype(jnp.int32)
 
 
-def _solver(loop, x0, times, key, stepping) -> Callable:
-    """diffrax's solve with all that stays; its ``args``: control, time and state at the beginning of an interval."""
+def _solver(ivp: InitialValueProblem, stepping: Stepping) -> Callable:
+    """diffrax's solve of one interval, with all that no interval changes; ``args`` are the interval's ``Beginning``."""
     import diffrax
 
-    start, duration = times[0], times[-1] - times[0]
+    loop, x0, start, duration = ivp.loop, ivp.x0, ivp.times[0], ivp.times[-1] - ivp.times[0]
 
-    def act(t, y, begun):
-        u, d = loop.actions(t, y[:-1], begun[1:])
-        return (begun[0] if stepping.held else u), d
+    def act(t: Number, y: Array, beginning: Beginning) -> Actions:
+        u, d = loop.actions(t, y[:-1], beginning[1:])
+        return (beginning[0] if stepping.held else u), d
 
-    def rate(t, y, begun):
-        return loop.rate(t, y[:-1], *act(t, y, begun), loop.discount(t - start))
+    def rate(t: Number, y: Array, beginning: Beginning) -> jax.Array:
+        return loop.rate(t, y[:-1], *act(t, y, beginning), loop.discount(t - start))
 
-    def noise(t, y, begun):
-        return loop.noise(t, y[:-1], *act(t, y, begun))
+    def noise(t: Number, y: Array, beginning: Beginning) -> jax.Array:
+        return loop.noise(t, y[:-1], *act(t, y, beginning))
 
-    def margin(t, y, args, **kwargs):
+    def margin(t: Number, y: Array, args: Beginning, **kwargs: object) -> jax.Array:
         inside = jnp.minimum(loop.target(t, y[:-1]), loop.margin(y[:-1]))
         if not loop.guarded or stepping.held:  # under a hold the players are asked at its samples only
             return inside
-        return jnp.where(defined(loop.players(t, y[:-1])), inside, jnp.minimum(inside, -1))
+        return jnp.where(are_finite(loop.players(t, y[:-1])), inside, jnp.minimum(inside, -1))
 
-    terms: Any = diffrax.ODETerm(rate)
-    solver: Any
-    controller: Any
+    terms: diffrax.AbstractTerm = diffrax.ODETerm(rate)
+    solver: diffrax.AbstractSolver
+    controller: diffrax.AbstractStepSizeController
     if loop.problem.noise is None:
         solver = diffrax.Tsit5()
+        # the shortest step is taken whatever its error (force_dtmin), and half of max_steps such steps reach the end
         controller = diffrax.PIDController(
             rtol=stepping.rtol, atol=stepping.atol, dtmin=2 * duration / stepping.max_steps, dtmax=stepping.max_step,
             force_dtmin=True, norm=_size,
         )  # fmt: skip
     else:
         additive = not callable(loop.problem.noise)
-        brownian = _brownian(loop, x0, times, key, stepping.max_step, additive)
+        brownian = _brownian(ivp, stepping.max_step, additive)
         terms = diffrax.MultiTerm(terms, diffrax.ControlTerm(noise, brownian))
+        # SRA1 has its order for additive noise alone; a function may depend on the state, and is not asked
         solver, controller = diffrax.SRA1() if additive else diffrax.Euler(), diffrax.ConstantStepSize()
     event = None
     if (
         loop.guarded or loop.problem.target is not None or (loop.grid is not None and not loop.clamp)
     ):  # it doubles the compile time
-        close = 4 * jnp.finfo(x0.dtype).eps
+        close = BRACKET * jnp.finfo(x0.dtype).eps
         # flip=True: the function falls through zero. "detect" would put a host callback into the compiled run.
         event = diffrax.Event(margin, _bisection()(close, close, flip=True), direction=False)
     return functools.partial(
@@ -215,35 +260,39 @@ def _solver(loop, x0, times, key, stepping) -> Callable:
     )  # fmt: skip
 
 
-def _brownian(loop, x0, times, key, max_step, additive):
-    """The Brownian path of a key, the same whatever the steps."""
+def _brownian(ivp: InitialValueProblem, max_step: Number, additive: bool) -> "diffrax.VirtualBrownianTree":
+    """The Brownian path of a key, which does not depend on the steps."""
     import diffrax
 
+    loop, x0, times = ivp.loop, ivp.x0, ivp.times
     start, duration = times[0], times[-1] - times[0]
     # Below its tolerance the tree interpolates, which is not Brownian: keep that far below a step (of 1/10 interval
     # or less), but one for the whole run, so that neighbouring intervals agree on w, and at most 30 levels deep.
-    fine = jnp.maximum(jnp.minimum(jnp.min(jnp.diff(times)) / 10, max_step) / 64, duration / 2**30)
+    fine = jnp.maximum(jnp.minimum(jnp.min(jnp.diff(times)) / LEAST_STEPS, max_step) / TREE, duration / DEEPEST)
+    # SRA1 wants the integral of w over a step beside its increment
     area = diffrax.SpaceTimeLevyArea if additive else diffrax.BrownianIncrement
     sources = jax.eval_shape(lambda x: loop.noise(start, x, *loop.players(start, x)), x0).shape[1]
     shape = jax.ShapeDtypeStruct((sources,), x0.dtype)
-    return diffrax.VirtualBrownianTree(start, start + duration, fine, shape, key, levy_area=area)
+    return diffrax.VirtualBrownianTree(start, start + duration, fine, shape, ivp.key, levy_area=area)
 
 
-def _size(error: Any) -> Any:
+def _size(error: jax.Array) -> jax.Array:
     """The root mean square of a scaled error; infinite for NaN, from which diffrax would make a step of NaN."""
     size = jnp.sqrt(jnp.mean(jnp.square(error)))
     return jnp.where(jnp.isnan(size), jnp.inf, size)
 
 
 @functools.cache
-def _bisection() -> Any:
-    """optimistix's bisection, stopped by the width of its bracket alone: a target function may be steep, or jump.
+def _bisection() -> type:
+    """The class of optimistix's bisection, stopped by the width of its bracket alone.
+
+    A target function may be steep, or jump: a test of its value would never be met, or met too early.
 
     The answer is the late end of the bracket, where the function has fallen to zero or below.
     """
     import optimistix
 
-    class Bisection(optimistix.Bisection):
+    class Bisection(optimistix.Bisection):  # the arguments are optimistix's
         def terminate(self, fn, y, args, options, state, tags):
             narrow = jnp.abs(state.lower - state.upper) < self.atol + self.rtol * jnp.abs(y)
             return narrow, optimistix.RESULTS.successful

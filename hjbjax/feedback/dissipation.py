@@ -15,23 +15,42 @@ point nearest to 0, so that they stay in it.
 """
 
 import dataclasses
+import typing
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.feedback.path import PathStatus
+from hjbjax.feedback.path import Path, PathStatus
 from hjbjax.feedback.simulation import rollout
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_partial, cast, is_traced
-from hjbjax.problem.sets import Box, Finite
+from hjbjax.problem.pytree import as_partial, cast, is_traced, pytree_dataclass
+from hjbjax.problem.sets import Ball, Box, Finite
+from hjbjax.problem.types import Array, Key, Number, Numbers, State
 from hjbjax.solution.solution import Solution
 
 POINTS = 33  # of a random disturbance
-STEPS = 64  # output intervals of a path
+STEPS = 64  # output intervals of a path: two between neighbouring points, so that no step runs over a kink
 WEAKEST = 0.01  # random disturbance over the set
+
+Energies: TypeAlias = tuple[jax.Array, jax.Array, jax.Array, jax.Array]  # output, whole cost, last state, PathStatus
+
+
+@pytree_dataclass()
+class Lanes:
+    """Paths under the worst case or under a random signal, one row a path.
+
+    Args:
+      starts: x₀, shape (p, n).
+      weights: of the worst case, shape (p,): 1 or 0.
+      points: what the signal beside it goes through, shape (p, POINTS, l).
+    """
+
+    starts: Array
+    weights: Array
+    points: Array
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -80,12 +99,12 @@ class Dissipation:
 def dissipation(
     problem: Problem,
     solution: Solution,
-    x0s: Any,
+    x0s: Numbers | Sequence,
     duration: float,
     *,
     disturbances: Sequence[Callable] = (),
     random: int = 8,
-    key: Any = 0,
+    key: Key | int = 0,
     rtol: float = 1e-6,
 ) -> Dissipation:
     """Check ∫|z|² ≤ γ²∫|d|² + β₀(x₀) along paths with the worst, with random and with given disturbances.
@@ -120,63 +139,67 @@ def dissipation(
         key = jax.random.key(key)
     import diffrax  # noqa: F401  # before anything is compiled, see simulate
 
-    with jax.enable_x64(True):
+    with jax.enable_x64(True):  # the margin is a difference of energies, near zero in the worst case
         problem, solution = cast(problem, np.float64), cast(solution, np.float64)
         times = np.linspace(0.0, float(duration), STEPS + 1)
-        lanes, kinds = _lanes(problem, starts, random, key)
-        found = [_paths(problem, solution, *lanes, times, rtol)]
+        lanes, kinds = _lanes(problem, starts, random, typing.cast("Key", key))
+        found = [_energies(problem, solution, lanes, times, rtol)]
         for signal in disturbances:
-            found.append(_given(problem, solution, as_partial(signal), starts, times, rtol))
+            found.append(_energies_under(problem, solution, as_partial(signal), starts, times, rtol))
         output, total, ends, codes = (np.concatenate(each) for each in zip(*jax.device_get(found), strict=True))
         stored = np.asarray(solution.value_at(starts))
-    count = len(output) // len(starts)
+    count = len(output) // len(starts)  # paths of each start; all starts come in turn under each disturbance
     statuses = tuple(PathStatus(int(code)) for code in codes)
+    # a path that came to no finite state ends at the one before, whose energies say nothing of the rest
     output = np.where([status is PathStatus.NONFINITE for status in statuses], np.nan, output)
     return Dissipation(
         np.tile(starts, (count, 1)),
         tuple(kinds) + ("given",) * (len(output) - len(kinds)),
         output,
-        output - total,
+        output - total,  # ∫ L(x, u, 0) − ∫ L(x, u, d)
         np.tile(stored, count),
         ends,
         statuses,
     )
 
 
-def _lanes(problem: Problem, starts: np.ndarray, random: int, key: Any) -> tuple[tuple, list[str]]:
-    """Starts, the weight of the worst case and the points of a signal, one row a path; and what they are called."""
+def _lanes(problem: Problem, starts: np.ndarray, random: int, key: Key) -> tuple[Lanes, list[str]]:
+    """The paths with the worst case and with random disturbances, in this order, and the kind of each."""
     admissible, count = problem.disturbances, random * len(starts)
     assert admissible is not None
+    # equally spaced in the logarithm: each decade down to WEAKEST gets its share, the last is the whole set
     strength = np.geomspace(WEAKEST, 1.0, random) if random > 1 else np.ones(random)
+    # the point of the set nearest to 0, about which the set is scaled
     least = np.clip(0.0, admissible.lo, admissible.hi) if isinstance(admissible, Box) else np.zeros(admissible.dim)
-    away = (
-        np.asarray(_uniform(admissible, key, (count, POINTS))) - least
-        if count
-        else np.zeros((0, POINTS, admissible.dim))
-    )
+    away = np.zeros((0, POINTS, admissible.dim))
+    if count:
+        assert not isinstance(admissible, Finite)  # refused, where random ones are asked for
+        away = np.asarray(_sample(admissible, key, (count, POINTS))) - least
     points = least + np.repeat(strength, len(starts))[:, None, None] * away
     still = np.zeros((len(starts), POINTS, admissible.dim))
     weight = np.repeat([1.0, 0.0], [len(starts), count])
-    lanes = np.tile(starts, (1 + random, 1)), weight, np.concatenate([still, points])
+    lanes = Lanes(np.tile(starts, (1 + random, 1)), weight, np.concatenate([still, points]))
     return lanes, ["worst case"] * len(starts) + ["random"] * count
 
 
-def _uniform(admissible: Any, key: Any, shape: tuple[int, ...]) -> jax.Array:
-    """Points of a set, shape (*shape, l)."""
+def _sample(admissible: Box | Ball, key: Key, shape: tuple[int, ...]) -> jax.Array:
+    """Independent points, uniform in a set, shape (*shape, l)."""
     if isinstance(admissible, Box):
         return jax.random.uniform(key, (*shape, admissible.dim), minval=admissible.lo, maxval=admissible.hi)
     return admissible.radius * jax.random.ball(key, admissible.dim, shape=shape)
 
 
-def _mixed(look: Callable, weight: Any, points: Any, duration: Any, t: Any, x: Any) -> Any:
-    """The worst case times ``weight``, and beside it a signal that is linear between its points."""
+def _disturbance(look: Callable, weight: Number, points: Array, duration: Number, t: Number, x: State) -> Array:
+    """The worst case times ``weight``, plus a signal that is linear between its points."""
+    # by index and share, as the points are equally spaced; at the end of the path the last cell goes on
     place = jnp.clip(t / duration, 0, 1) * (POINTS - 1)
     cell = jnp.clip(jnp.floor(place).astype(int), 0, POINTS - 2)
     signal = points[cell] + (place - cell) * (points[cell + 1] - points[cell])
+    # weight 0 times NaN, where the solution knows no worst case, would be NaN
     return weight * jnp.nan_to_num(look(x, clamp=True)) + signal
 
 
-def _energy(cost: Callable, share: Any, *arguments: Any) -> Any:
+def _running_cost(cost: Callable, share: Number, *arguments: Array) -> jax.Array:
     """L(x, u, d) for share = 1, L(x, u, 0) for share = 0."""
     *seen, d = arguments
     still = cost(*seen, jnp.zeros_like(d))
@@ -184,35 +207,47 @@ def _energy(cost: Callable, share: Any, *arguments: Any) -> Any:
 
 
 @jax.jit
-def _paths(problem, solution, starts, weights, points, times, rtol):
-    """The energy of the output, the whole cost, the last state and the code, for every lane."""
+def _energies(problem: Problem, solution: Solution, lanes: Lanes, times: Array, rtol: Number) -> Energies:
+    """The energy of the output, the whole cost, the last state and the status, for every lane."""
 
-    def lane(start, weight, signal):
-        opponent = jax.tree_util.Partial(_mixed, as_partial(solution.disturbance_at), weight, signal, times[-1])
-        return _both(problem, solution, opponent, start, times, rtol)
+    def lane(each: Lanes) -> Energies:
+        worst = as_partial(solution.disturbance_at)
+        opponent = jax.tree_util.Partial(_disturbance, worst, each.weights, each.points, times[-1])
+        return _path_energies(problem, solution, opponent, each.starts, times, rtol)
 
-    return jax.vmap(lane)(starts, weights, points)
+    return jax.vmap(lane)(lanes)
 
 
 @jax.jit
-def _given(problem, solution, signal, starts, times, rtol):
-    """The same for one signal of the user's."""
-    return jax.vmap(lambda start: _both(problem, solution, signal, start, times, rtol))(starts)
+def _energies_under(
+    problem: Problem, solution: Solution, signal: Callable, starts: Array, times: Array, rtol: Number
+) -> Energies:
+    """The energies of the paths from all starts under one signal of the user's."""
+    return jax.vmap(lambda start: _path_energies(problem, solution, signal, start, times, rtol))(starts)
 
 
-def _both(problem, solution, opponent, start, times, rtol):
-    """One path with both costs."""
+def _path_energies(
+    problem: Problem, solution: Solution, opponent: Callable, start: State, times: Array, rtol: Number
+) -> Energies:
+    """The energies of one path, which is integrated twice side by side: an integrator carries one running cost."""
 
-    def run(share):
-        measured = dataclasses.replace(problem, cost=jax.tree_util.Partial(_energy, problem.cost, share))
+    def run(share: jax.Array) -> Path:
+        measured = dataclasses.replace(problem, cost=jax.tree_util.Partial(_running_cost, problem.cost, share))
         return rollout(measured, solution, start, times, disturbance=opponent, time_varying=True, rtol=rtol)
 
-    path = jax.vmap(run)(jnp.arange(2.0))
+    path = jax.vmap(run)(jnp.arange(2.0))  # share 0 and share 1
     return path.cost[0], path.cost[1], path.states[0, -1], path.code[0]
 
 
-def _check(problem: Any, solution: Any, x0s: Any, duration: Any, signals: Any, random: Any) -> np.ndarray:
-    """Refuse what has no inequality; the starts, shape (k, n)."""
+def _check(
+    problem: Problem,
+    solution: Solution,
+    x0s: Numbers | Sequence,
+    duration: object,
+    signals: Sequence[object],
+    random: object,
+) -> np.ndarray:
+    """The starts, shape (k, n), once it is known that there is an inequality to check along these paths."""
     if is_traced(problem, solution, x0s):
         raise ValueError("dissipation: it runs at host level only, outside of jit, vmap and grad")
     if problem.disturbances is None or solution.disturbance is None or problem.cost is None:

@@ -8,7 +8,8 @@ with DV.
 """
 
 import dataclasses
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -21,13 +22,49 @@ from hjbjax.hamiltonian.discrete import DiscreteHamiltonian, optimise
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, cast, is_traced, pytree_dataclass
+from hjbjax.problem.types import Array, Costate, DType, Number, Numbers, State
 from hjbjax.solution.interpolation import extended
 from hjbjax.solution.solution import Solution
 
+if TYPE_CHECKING:
+    from typing_extensions import TypeIs
+
 FEWEST = 10  # intervals between kept times that a marched feedback must have over a path
+ROUNDING = 1e-9  # relative, of times: one of two that are compared may be a sum of steps
+
+Place: TypeAlias = Numbers | Sequence  # a state, shape (n,) or (..., n), or the time that goes before it
 
 
-def check_kept(solution: Any, duration: float, name: str) -> float:
+class GridFeedback(Protocol):
+    """Both players on a grid, looked up between its nodes, as a Solution or a ``greedy_feedback`` has them."""
+
+    @property
+    def grid(self) -> Grid:
+        """The nodes, in whose box the players are known."""
+
+    @property
+    def times(self) -> Array | None:
+        """The kept times of a march; None of a stationary feedback."""
+
+    @property
+    def disturbance(self) -> Array | None:
+        """Not None exactly where the worst case is known."""
+
+    @property
+    def control_at(self) -> Callable[..., Array]:
+        """The control at (x), of a marched one at (t, x); with the keyword ``clamp``."""
+
+    @property
+    def disturbance_at(self) -> Callable[..., Array]:
+        """The opponent's action there."""
+
+
+def is_grid_feedback(feedback: object) -> "TypeIs[GridFeedback]":
+    """True for a Solution and for what answers as one does, False for a plain function of the state."""
+    return hasattr(feedback, "control_at")
+
+
+def check_kept(solution: GridFeedback, duration: float, name: str) -> float:
     """Refuse a marched feedback that is not known well enough up to the duration.
 
     Args:
@@ -43,11 +80,12 @@ def check_kept(solution: Any, duration: float, name: str) -> float:
     """
     times = np.asarray(solution.times, np.float64)
     horizon = float(getattr(solution, "stats", {}).get("horizon", times[-1]))
-    if duration > horizon * (1 + 1e-9):
+    if duration > horizon * (1 + ROUNDING):
         raise ValueError(f"{name} = {duration:g} goes beyond the horizon {horizon:g} of the solution; shorten it")
+    # between two kept times the feedback is linear: with the two ends among them, no gap may be wider than a tenth
     between = np.concatenate([[0.0], times[(times > 0) & (times < duration)], [duration]])
     gap = float(np.max(np.diff(between)))
-    if times[0] > 0 or times[-1] < duration * (1 - 1e-9) or gap > duration / FEWEST * (1 + 1e-9):
+    if times[0] > 0 or times[-1] < duration * (1 - ROUNDING) or gap > duration / FEWEST * (1 + ROUNDING):
         raise ValueError(
             f"{name} = {duration:g}, but the solution was marched and kept at {times.size} times from {times[0]:g} to "
             f"{times[-1]:g}; a feedback up to t = {duration:g} wants all of that covered,\n"
@@ -56,38 +94,42 @@ def check_kept(solution: Any, duration: float, name: str) -> float:
     return horizon
 
 
-def lookups(feedback: Any) -> tuple[Any, Any]:
+def lookups(feedback: GridFeedback) -> tuple[Callable, Callable]:
     """The control and the disturbance of a Solution, or of what answers as one does, as functions of (t, x).
 
     A state outside the target may lie in a cell whose nodes are all in it, as beside a hollow one. There the nodes
     around the cell answer.
     """
-    answers = [feedback]
+    answers: list[GridFeedback] = [feedback]
     if isinstance(feedback, Solution):
         players = {"policy": feedback.discrete, "disturbance": feedback.discrete_disturbance}
         given = {name: getattr(feedback, name) for name in players if getattr(feedback, name) is not None}
+        # nodes without a control get that of their neighbours: asked second, they answer where a whole cell is NaN
         filled = {name: extended(feedback.grid, array, players[name]) for name, array in given.items()}
         answers.append(dataclasses.replace(feedback, **filled))
-    ask = _stationary if feedback.times is None else _marched
-    return tuple(
-        jax.tree_util.Partial(ask, *(as_partial(getattr(each, name)) for each in answers))
+    ask = _look_up if feedback.times is None else _look_up_in_time
+    control, disturbance = (
+        jax.tree_util.Partial(ask, tuple(as_partial(getattr(each, name)) for each in answers))
         for name in ("control_at", "disturbance_at")
-    )  # type: ignore[return-value]
+    )
+    return control, disturbance
 
 
-def _stationary(*arguments: Any) -> Any:
-    """The first answer at x that is none of NaN; the state comes clamped, and must not be refused for a rounding."""
-    *looks, _, x = arguments
+# The loop clips every state into the box before it asks; clamp=True, or one on the edge is refused for a rounding.
+
+
+def _look_up(looks: tuple[Callable, ...], t: Number, x: State) -> Array:
+    """The first of several lookups at x that is not NaN, whatever the time."""
     return _first([look(x, clamp=True) for look in looks])
 
 
-def _marched(*arguments: Any) -> Any:
-    """Likewise at (t, x), between the kept times."""
-    *looks, t, x = arguments
+def _look_up_in_time(looks: tuple[Callable, ...], t: Number, x: State) -> Array:
+    """The first of several lookups at (t, x) that is not NaN."""
     return _first([look(t, x, clamp=True) for look in looks])
 
 
-def _first(answers: list) -> Any:
+def _first(answers: list[Array]) -> Array:
+    """The first answer, entry by entry the next one where it is NaN."""
     answer, *others = answers
     for other in others:
         answer = jnp.where(jnp.isnan(answer), other, answer)
@@ -108,15 +150,15 @@ class Greedy:
     problem: Problem
     solution: Solution
 
-    def __call__(self, *where: Any) -> Any:
+    def __call__(self, *where: Place) -> Array:
         """The control, shape (m,); outside the grid that of its nearest point."""
         return self.control_at(*where, clamp=True)
 
-    def control_at(self, *where: Any, clamp: bool = False) -> Any:
+    def control_at(self, *where: Place, clamp: bool = False) -> Array:
         """The minimising control, shape ``x.shape[:-1] + (m,)``; arguments and refusals as of a Solution's."""
         return self._ask(where, clamp)[0]
 
-    def disturbance_at(self, *where: Any, clamp: bool = False) -> Any:
+    def disturbance_at(self, *where: Place, clamp: bool = False) -> Array:
         """The maximising disturbance, shape ``x.shape[:-1] + (l,)``."""
         return self._ask(where, clamp)[1]
 
@@ -126,7 +168,7 @@ class Greedy:
         return self.solution.grid
 
     @property
-    def times(self) -> Any:
+    def times(self) -> Array | None:
         """The kept times of a marched solution, or None."""
         return self.solution.times
 
@@ -136,18 +178,18 @@ class Greedy:
         return self.solution.stats
 
     @property
-    def disturbance(self) -> Any:
+    def disturbance(self) -> Array | None:
         """Not None in a game: the nodes' disturbances, which the solution has; they are not looked up."""
         return self.solution.disturbance
 
-    def _ask(self, where: tuple, clamp: bool) -> tuple[Any, Any]:
-        """Both players: float64 NumPy from concrete data, else as the tracer is."""
+    def _ask(self, where: tuple[Place, ...], clamp: bool) -> tuple[Array, Array]:
+        """Both players' actions: float64 NumPy from concrete data, else of the tracer's dtype."""
         costate = self.solution.costate_at(*where, clamp=clamp)  # refuses what is no state
-        if is_traced(costate, self):
+        if is_traced(costate, self):  # float64 must not be switched on in the middle of somebody's trace
             return _minimax(self, where, costate)
         with jax.enable_x64(True):
             greedy, where, costate = cast((self, where, costate), np.float64)
-            return jax.tree.map(np.array, _compiled(greedy, where, costate))
+            return jax.tree.map(np.array, _jit_minimax(greedy, where, costate))
 
 
 def greedy_feedback(problem: Problem, solution: Solution) -> Greedy:
@@ -196,46 +238,52 @@ def greedy_feedback(problem: Problem, solution: Solution) -> Greedy:
     return Greedy(problem, solution)
 
 
-def _minimax(greedy: Greedy, where: tuple, costate: Any) -> tuple[Any, Any]:
-    """The players at states of shape (..., n), one by one."""
-    times, shape = where[:-1], jnp.shape(costate)
+def _minimax(greedy: Greedy, where: tuple, costate: Array) -> tuple[Array, Array]:
+    """Both players' actions at states of shape (..., n), one by one, shapes (..., m) and (..., l)."""
+    times, shape = where[:-1], jnp.shape(costate)  # the time and the states broadcast to the shape of the costates
     states = jnp.broadcast_to(jnp.asarray(where[-1], costate.dtype), shape).reshape(-1, shape[-1])
     moments = [jnp.broadcast_to(jnp.asarray(t, costate.dtype), shape[:-1]).reshape(-1) for t in times]
     answers = list(jax.vmap(lambda x, p, *t: _at(greedy, t, x, p))(states, costate.reshape(-1, shape[-1]), *moments))
     if greedy.grid.sides("constrained"):
+        # the block around a state has no wall, so that its minimiser may leave; the nodes' own controls do not
         beside = _beside_a_wall(greedy.grid, states)[:, None]
         looks = [greedy.solution.control_at, greedy.solution.disturbance_at][: 1 + greedy.problem.is_game]
         for player, look in enumerate(looks):
             answers[player] = jnp.where(beside, look(*moments, states, clamp=True), answers[player])
-    return tuple(each.reshape(*shape[:-1], each.shape[-1]) for each in answers)
+    control, disturbance = (each.reshape(*shape[:-1], each.shape[-1]) for each in answers)
+    return control, disturbance
 
 
-_compiled = jax.jit(_minimax)
+_jit_minimax = jax.jit(_minimax)
 
 
-def _beside_a_wall(grid: Grid, states: Any) -> Any:
-    """Whether states (k, n) lie in a cell at a constrained end, where what leaves is allowed short of the end alone."""
+def _beside_a_wall(grid: Grid, states: Array) -> jax.Array:
+    """A mask (k,) of the states (k, n) that lie in a cell at a constrained end."""
     found = jnp.zeros(states.shape[:1], bool)
     for axis, step in grid.sides("constrained"):
-        nodes = np.arange(grid.shape[axis])[[-2, 1][step < 0]]
+        nodes = np.arange(grid.shape[axis])[[-2, 1][step < 0]]  # the first node inside, from either end
         inner = jnp.asarray(grid.axis(axis), states.dtype)[nodes]
         found |= step * (states[:, axis] - inner) > 0
     return found
 
 
-def _at(greedy: Greedy, when: tuple, x: Any, p: Any) -> tuple[Any, Any]:
-    """Both players at one state with the costate p."""
+def _at(greedy: Greedy, when: tuple[Number, ...], x: State, p: Costate) -> tuple[jax.Array, jax.Array]:
+    """Both players' actions at one state with the costate p."""
     problem, grid = greedy.problem, greedy.grid
     n, t = grid.ndim, (when[0] if when else 0.0)
     x = grid.wrap(x)
+    # clipped as the costate was: outside of the box the Hamiltonian is that of the nearest point
     x = jnp.where(np.array(grid.periodic), x, jnp.clip(x, jnp.asarray(grid.lo, x.dtype), jnp.asarray(grid.hi, x.dtype)))
+    # V is looked up one mean cell away, also on a stretched axis: for D²V a cell is the least that the nodes resolve
     widths = [jnp.asarray(grid.spacing(axis), x.dtype) for axis in range(n)]
     h = jnp.stack([jnp.mean(width) for width in widths])
+    # without noise no second difference is asked for, and zeros stand in for V at the 3^n nodes
     value, bends = jnp.zeros((3,) * n, x.dtype), (jnp.zeros((), x.dtype),) * n
     if problem.noise is not None:
         steps = np.stack(np.meshgrid(*[(-1, 0, 1)] * n, indexing="ij"), axis=-1)
         value = greedy.solution.value_at(*when, x + h * steps, clamp=True)
         center = (1,) * n
+        # D⁺ − D⁻ along every axis, the second difference times h: the form in which the Hamiltonian takes noise
         bends = tuple(
             sum(value[(*center[:axis], side, *center[axis + 1 :])] - value[center] for side in (0, 2)) / h[axis]
             for axis in range(n)
@@ -246,12 +294,14 @@ def _at(greedy: Greedy, when: tuple, x: Any, p: Any) -> tuple[Any, Any]:
     on = Discretisation(problem, block, Limited(), x.dtype, t)
     hamiltonian = DiscreteHamiltonian(on, list(x), value, slopes, slopes, bends, links)
     _, u, d = optimise(hamiltonian)
-    known = jnp.all(jnp.isfinite(p))
-    return tuple(jnp.where(known, _stacked(action, x.dtype, n), jnp.nan) for action in (u, d))  # type: ignore[return-value]
+    known = jnp.all(jnp.isfinite(p))  # a minimum over slopes of NaN would still be some admissible action
+    control, disturbance = (jnp.where(known, _middle(action, x.dtype, n), jnp.nan) for action in (u, d))
+    return control, disturbance
 
 
-def _stacked(action: list, dtype: Any, n: int) -> Any:
-    """An action at the middle of the block, as one array."""
+def _middle(action: list[Array], dtype: DType, n: int) -> jax.Array:
+    """An action at the middle node of the block of 3^n, as one array of shape (m,)."""
     if not action:
         return jnp.zeros(0, dtype)
+    # an input that does not depend on the node comes as a number, one that varies along an axis broadcasts
     return jnp.stack([jnp.broadcast_to(jnp.asarray(entry, dtype), (3,) * n)[(1,) * n] for entry in action])

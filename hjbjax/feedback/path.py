@@ -9,10 +9,14 @@ import numpy as np
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box
+from hjbjax.problem.types import Array
 from hjbjax.solution.screen import encodable
 
+MANY = 1000  # internal steps, beside an eighth of those allowed: more of them tell of a feedback that jumps
+SLACK = 1e-9  # relative, of an admissible set: what interpolation between the nodes rounds a control by
 
-class PathStatus(enum.IntEnum):
+
+class PathStatus(enum.IntEnum):  # of integers, since compiled programs and vmap know no others
     """Why a path ends."""
 
     DURATION = 0
@@ -25,7 +29,7 @@ class PathStatus(enum.IntEnum):
 
     @property
     def message(self) -> str:
-        """What happened and what to do, as said of a path."""
+        """The end and advice in words that follow 'the path'."""
         return MESSAGES[self]
 
 
@@ -65,7 +69,7 @@ class Path:
       message: one line on how the path ended.
     """
 
-    times: Any
+    times: Any  # NumPy arrays and numbers of `simulate`, JAX's of `rollout`, with more axes under vmap
     states: Any
     controls: Any
     disturbances: Any
@@ -81,7 +85,7 @@ class Path:
         return PathStatus(int(self.code))
 
     def __str__(self) -> str:
-        return encodable(self.message)
+        return encodable(self.message)  # a terminal may lack a letter, and print would raise
 
 
 def joined(first: Path, then: Path, discount: float) -> Path:
@@ -93,6 +97,7 @@ def joined(first: Path, then: Path, discount: float) -> Path:
       discount: β of the problem.
     """
     end = first.times[-1]
+    # the second path discounts from its own start, which is e^{−β end} of what it counts for the whole
     cost, steps = float(first.cost + np.exp(-discount * end) * then.cost), first.steps + then.steps
     said = (
         f"{first.status.message} at t = {end:.6g}; from there {then.status.message} at t = {end + then.times[-1]:.6g}"
@@ -101,6 +106,7 @@ def joined(first: Path, then: Path, discount: float) -> Path:
     return Path(
         times=np.concatenate([first.times, end + then.times[1:]]),
         states=np.concatenate([first.states, then.states[1:]]),
+        # the state in which one ends and the other begins is there once, the controls of intervals all
         controls=np.concatenate([first.controls, then.controls]),
         disturbances=None if both else np.concatenate([first.disturbances, then.disturbances]),
         cost=cost,
@@ -111,8 +117,10 @@ def joined(first: Path, then: Path, discount: float) -> Path:
     )
 
 
-def truncated(path: Path, count: int, max_steps: int, grid: Grid | None, controls: Any, noisy: bool) -> Path:
-    """A path of full length cut where it ends, with its line; one that ends early outside the target warns.
+def truncate(
+    path: Path, count: int, max_steps: int, grid: Grid | None, controls: AdmissibleSet | None, noisy: bool
+) -> Path:
+    """A path of full length cut where it ends, with its message; one that ends early outside the target warns.
 
     Args:
       path: NumPy arrays over all output times.
@@ -120,28 +128,29 @@ def truncated(path: Path, count: int, max_steps: int, grid: Grid | None, control
       max_steps: the most internal steps that it could make.
       grid: the box that the feedback is known in, if there is one.
       controls: the admissible set of the problem, or None.
-      noisy: whether the steps were fixed in advance, so that their number says nothing of the loop.
+      noisy: True where the steps were fixed in advance, so that their number says nothing of the loop.
     """
     status, times, states = path.status, path.times[: count + 1], path.states[: count + 1]
     applied = path.controls[:count]
     where = f"t = {times[-1]:.6g}"
-    if status in (PathStatus.NONFINITE, PathStatus.UNDEFINED):
+    if status in (PathStatus.NONFINITE, PathStatus.UNDEFINED):  # the state is what one looks at to find the fault
         where += f", x = [{', '.join(f'{entry:.4g}' for entry in states[-1])}]"
     said = [
         f"{status.message} at {where}",
         f"cost {float(path.cost):.6g}",
         f"{int(path.steps)} internal steps",
     ]
+    # only with clamp=True does a path go on outside; its states are unwound, so that a periodic entry may leave the box
     if grid is not None and status != PathStatus.LEFT_BOX:
         outside = np.any(((states < grid.lo) | (states > grid.hi)) & ~np.array(grid.periodic), axis=-1)
         if outside.any():
             said.append(f"left the box at t = {times[np.argmax(outside)]:.6g}: controls there are the nearest point's")
-    if not noisy and path.steps > max(1000, max_steps / 8):
+    if not noisy and path.steps > max(MANY, max_steps / 8):
         said.append("the feedback jumps or the loop is stiff: hold=dt is faster")
-    if _inadmissible(controls, applied):
+    if _are_inadmissible(controls, applied):
         said.append("controls outside the problem's admissible set were applied as they are")
     if status not in (PathStatus.DURATION, PathStatus.TARGET, PathStatus.INTERRUPTED):  # that is raised
-        warnings.warn(f"simulate: the path {said[0]}", UserWarning, stacklevel=3)
+        warnings.warn(f"simulate: the path {said[0]}", UserWarning, stacklevel=3)  # at the line that calls simulate
     return Path(
         times=times,
         states=states,
@@ -155,9 +164,9 @@ def truncated(path: Path, count: int, max_steps: int, grid: Grid | None, control
     )
 
 
-def _inadmissible(controls: AdmissibleSet | None, applied: np.ndarray) -> bool:
-    """Whether a control lies outside a box or a ball by more than rounding."""
+def _are_inadmissible(controls: AdmissibleSet | None, applied: Array) -> bool:
+    """True if a control lies outside a box or a ball by more than rounding; a finite set is not looked at."""
     if isinstance(controls, Box):
-        slack = 1e-9 * (1 + np.abs(controls.lo) + np.abs(controls.hi))
+        slack = SLACK * (1 + np.abs(controls.lo) + np.abs(controls.hi))
         return bool(np.any((applied < controls.lo - slack) | (applied > controls.hi + slack)))
-    return isinstance(controls, Ball) and bool(np.any(np.linalg.norm(applied, axis=-1) > controls.radius * (1 + 1e-9)))
+    return isinstance(controls, Ball) and bool(np.any(np.linalg.norm(applied, axis=-1) > controls.radius * (1 + SLACK)))

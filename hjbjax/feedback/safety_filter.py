@@ -10,14 +10,15 @@ straight ahead of an obstacle, going left and going right are both safe, and the
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hjbjax.feedback.feedback import GridFeedback, Place, is_grid_feedback
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import as_partial, is_traced, pytree_dataclass
+from hjbjax.problem.types import Array, Number
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
 
@@ -33,27 +34,29 @@ class Filter:
     """
 
     tube: Solution
-    nominal: Any
-    margin: Any
+    nominal: Callable
+    margin: Number
 
-    def __call__(self, *where: Any) -> jax.Array:
+    def __call__(self, *where: Place) -> jax.Array:
         """The control, shape (m,)."""
         wanted = jnp.asarray(self.nominal(*where))
         wanted = wanted.astype(jnp.result_type(wanted, float))  # or integers would cut off the safe action
         acts = self.acts(*where)
-        safe = jnp.asarray(self.tube.control_at(*self._asked(where), clamp=True), wanted.dtype)
+        # clamped: outside the grid the nearest point's action is a better guess than NaN, which would end a path
+        safe = jnp.asarray(self.tube.control_at(*self._arguments(where), clamp=True), wanted.dtype)
         return jnp.where(acts, safe, wanted)
 
-    def acts(self, *where: Any) -> jax.Array:
-        """Whether the filter takes over, a bool."""
-        return ~(jnp.asarray(self.tube.value_at(*self._asked(where), clamp=True)) <= -self.margin)
+    def acts(self, *where: Place) -> jax.Array:
+        """True where the filter takes over."""
+        # the negation and no `>`: where V is NaN nothing is known to be safe, and the filter takes over
+        return ~(jnp.asarray(self.tube.value_at(*self._arguments(where), clamp=True)) <= -self.margin)
 
-    def _asked(self, where: tuple) -> tuple:
-        """What the tube is asked: a stationary one does not want the time."""
+    def _arguments(self, where: tuple[Place, ...]) -> tuple[Place, ...]:
+        """The arguments of the tube's lookups: a stationary one does not want the time."""
         return where[-1:] if self.tube.times is None else where
 
 
-def least_restrictive(solution: Solution, nominal: Any, *, margin: float | None = None) -> Filter:
+def least_restrictive(solution: Solution, nominal: GridFeedback | Callable, *, margin: float | None = None) -> Filter:
     """A feedback that leaves the nominal control alone until the tube's boundary, and then does what is safe.
 
     u(x) = nominal(x) where V(x) ≤ −margin, else the tube's action. For ``simulate``, ``jit`` and ``vmap``. A
@@ -101,6 +104,7 @@ def least_restrictive(solution: Solution, nominal: Any, *, margin: float | None 
     )  # discrete: the nearest node's action
     if margin is not None and not is_traced(margin) and not (np.isfinite(margin) and margin >= 0):
         raise ValueError(f"least_restrictive: margin = {margin!r}; wanted a finite number ≥ 0, in the units of V")
+    # inside a transformation V is no known number: its jump and its status cannot be looked at
     if is_traced(solution, margin):
         if margin is None:
             raise ValueError("least_restrictive: inside jit, vmap and grad give margin=, a number in the units of V")
@@ -115,11 +119,11 @@ def least_restrictive(solution: Solution, nominal: Any, *, margin: float | None 
     return Filter(tube, control, margin)
 
 
-def _nominal(nominal: Any) -> Callable:
+def _nominal(nominal: GridFeedback | Callable) -> Callable:
     """The nominal control as a pytree."""
-    if hasattr(nominal, "control_at"):
+    if is_grid_feedback(nominal):
         look = as_partial(nominal.control_at)
-        return jax.tree_util.Partial(_of_solution if nominal.times is None else _of_march, look)
+        return jax.tree_util.Partial(_control_at if nominal.times is None else _control_at_time, look)
     if not callable(nominal):
         raise TypeError(f"least_restrictive: nominal is {nominal!r}, wanted a function of the state or a Solution")
     control = as_partial(nominal)
@@ -127,15 +131,18 @@ def _nominal(nominal: Any) -> Callable:
     return control
 
 
-def _of_solution(look_up: Callable, *where: Any) -> Any:
+def _control_at(look_up: Callable, *where: Place) -> Array:
+    """A stationary solution's control at the state, whatever the time."""
     return look_up(where[-1], clamp=True)
 
 
-def _of_march(look_up: Callable, *where: Any) -> Any:
+def _control_at_time(look_up: Callable, *where: Place) -> Array:
+    """A marched solution's control at (t, x)."""
     return look_up(*where, clamp=True)
 
 
 def _check_tube(tube: Solution) -> None:
+    """Refuse a tube that did not converge."""
     if tube.status is not Status.CONVERGED:
         raise ValueError(
             f"least_restrictive: the tube ended as {tube.status!r}, so that it promises nothing; "
@@ -145,11 +152,11 @@ def _check_tube(tube: Solution) -> None:
 
 def _jump(grid: Grid, value: np.ndarray) -> float:
     """The largest change of V between neighbours on different sides of its zero level; 0 where there is none."""
-    first, largest = value.ndim - grid.ndim, 0.0
+    first, largest = value.ndim - grid.ndim, 0.0  # the axes of the grid come last, after that of the kept times
     for axis in range(grid.ndim):
         following = np.roll(value, -1, axis=first + axis)
         crosses = (value < 0) != (following < 0)
         if not grid.periodic[axis]:  # type: ignore[index]
-            np.moveaxis(crosses, first + axis, 0)[-1] = False
+            np.moveaxis(crosses, first + axis, 0)[-1] = False  # the last node's neighbour by `roll` is the first
         largest = max(largest, float(np.max(np.where(crosses, np.abs(following - value), 0))))
     return largest

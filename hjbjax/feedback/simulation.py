@@ -1,39 +1,43 @@
-"""Simulation: ``simulate`` at the host, with checks and a report; ``rollout``, the same as a pure function."""
+"""Simulation: ``simulate`` at the host, with checks and a report; ``rollout``, its integration as a pure function."""
 
 import copy
-import functools
 import math
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import TypeAlias, TypeGuard
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.feedback.closed_loop import Stepping, integrate, some, unbegun
-from hjbjax.feedback.feedback import check_kept, lookups
-from hjbjax.feedback.loop import Loop
-from hjbjax.feedback.path import Interrupted, Path, PathStatus, truncated
+from hjbjax.feedback.closed_loop import InitialValueProblem, Stepping, blank_record, integrate, integrate_part
+from hjbjax.feedback.feedback import GridFeedback, check_kept, is_grid_feedback, lookups
+from hjbjax.feedback.loop import Loop, check_shapes
+from hjbjax.feedback.path import Interrupted, Path, PathStatus, truncate
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, cast, is_traced
+from hjbjax.problem.types import Array, Key, Number, Numbers, State
 from hjbjax.solution.clock import CHUNK_SECONDS, Clock, noting_interrupts
 
-_compiled = jax.jit(some, donate_argnames="so_far")
+Feedback: TypeAlias = GridFeedback | Callable | None  # None where there is no control
+
+INTERVALS = 200  # of the output, where nobody says how many
+
+_jit_part = jax.jit(integrate_part, donate_argnames="so_far")  # the rows of all intervals are overwritten in place
 
 
 def simulate(
     problem: Problem,
-    feedback: Any,
-    x0: Any,
+    feedback: Feedback,
+    x0: Numbers | Sequence[float],
     duration: float,
     *,
     steps: int | None = None,
     disturbance: Callable | None = None,
     time_varying: bool = False,
-    key: Any = None,
-    hold: Any = False,
+    key: Key | int | None = None,
+    hold: float | None = False,
     grid: Grid | None = None,
     clamp: bool = False,
     rtol: float = 1e-6,
@@ -91,10 +95,10 @@ def simulate(
     if is_traced(problem, feedback, x0, duration, key, grid):
         raise ValueError("simulate: got traced values; inside jit, vmap or grad use hjbjax.feedback.simulation.rollout")
     duration = float(arguments.positive(duration, "simulate: duration", "in units of time"))
-    if getattr(feedback, "times", None) is not None:
+    if _is_marched(feedback):
         problem = _within_horizon(problem, feedback, duration)
     loop = _close(problem, feedback, disturbance, grid, clamp, time_varying)
-    x0 = _initial(x0, loop.grid)
+    start = _initial_state(x0, loop.grid)
     hold = None if hold is False else hold
     times = _times(duration, steps, hold)
     stepping = Stepping(
@@ -104,8 +108,7 @@ def simulate(
         max_steps=arguments.count(max_steps, "simulate: max_steps"),
         held=hold is not None,
     )
-    key = _key(key)
-    _check_key(problem, key)
+    key = _random_key(problem, key)
     # Its import adds to JAX's configuration, which is part of the key of every compiled function: once before, or
     # the second call compiles again.
     import diffrax  # noqa: F401
@@ -116,36 +119,36 @@ def simulate(
         jax.enable_x64(True),
         jax.debug_nans(False),
     ):  # after the end of a path its controls are NaN
-        loop = cast(loop, np.float64)
-        _probe(loop, x0)
-        if not loop.margin(x0) > 0:
+        loop = cast(loop, np.float64)  # a solution of float32 closes the loop in float64, as the path is integrated
+        check_shapes(loop, start)
+        if loop.grid is not None and not loop.margin(start) > 0:
             lo, hi = np.asarray(loop.grid.lo).tolist(), np.asarray(loop.grid.hi).tolist()
             raise ValueError(
-                f"simulate: x0 = {x0.tolist()} lies outside the box from {lo} to {hi}, where the feedback is not "
+                f"simulate: x0 = {start.tolist()} lies outside the box from {lo} to {hi}, where the feedback is not "
                 "known; start inside, or give clamp=True"
             )
-        path, active = _in_chunks(loop, x0, times, key, stepping, clock)
+        path, active = _in_chunks(InitialValueProblem(loop, start, times, key), stepping, clock)
         path, active, grid, controls = jax.tree.map(np.asarray, (path, active, loop.grid, problem.controls))
-        path = truncated(path, int(np.sum(active)), max_steps, grid, controls, problem.noise is not None)
+        path = truncate(path, int(np.sum(active)), max_steps, grid, controls, problem.noise is not None)
         if clock.interrupted:
             raise Interrupted(path)
     return path
 
 
-def _in_chunks(
-    loop: Loop, x0: np.ndarray, times: np.ndarray, key: Any, stepping: Stepping, clock: Clock
-) -> tuple[Path, Any]:
+def _in_chunks(ivp: InitialValueProblem, stepping: Stepping, clock: Clock) -> tuple[Path, jax.Array]:
     """The path, some output intervals at a time, for about half a second each, until it ends or Ctrl-C is noted."""
-    so_far, count, done, chunk = unbegun(loop, x0, times), len(times) - 1, 0, 1
+    so_far = blank_record(ivp.loop, np.asarray(ivp.x0), np.asarray(ivp.times))
+    count, done, chunk = len(ivp.times) - 1, 0, 1
     if clock.interrupted:
         raise KeyboardInterrupt("simulate: interrupted before the path began")
-    so_far, answer = _compiled(loop, x0, times, key, stepping, so_far, 0, 0)  # compiles
+    so_far, answer = _jit_part(ivp, stepping, so_far, 0, 0)  # no interval: compiled apart from the first pace
     ending = PathStatus.INTERRUPTED  # what a path is called that has intervals left
     while ending is PathStatus.INTERRUPTED and done < count and not clock.interrupted:
         began, until = clock.elapsed(), min(done + chunk, count)
-        so_far, answer = _compiled(loop, x0, times, key, stepping, so_far, done, until)
+        so_far, answer = _jit_part(ivp, stepping, so_far, done, until)
         ending = PathStatus(int(answer[0].code))
-        pace = max(clock.elapsed() - began, 1e-4) / (until - done)
+        pace = max(clock.elapsed() - began, 1e-4) / (until - done)  # seconds an interval; a clock may not tick
+        # at most eight times as many as before: the pace of one quick interval says little of those that follow
         chunk = int(np.clip(CHUNK_SECONDS / pace, 1, 8 * chunk))
         done = until
     return answer
@@ -153,19 +156,19 @@ def _in_chunks(
 
 def rollout(
     problem: Problem,
-    feedback: Any,
-    x0: Any,
-    times: Any,
+    feedback: Feedback,
+    x0: Numbers | Sequence[float],
+    times: Numbers | Sequence[float],
     *,
     disturbance: Callable | None = None,
     time_varying: bool = False,
-    key: Any = None,
+    key: Key | None = None,
     hold: bool = False,
     grid: Grid | None = None,
     clamp: bool = False,
-    rtol: float = 1e-6,
-    atol: float = 1e-8,
-    max_step: Any = None,
+    rtol: Number = 1e-6,
+    atol: Number = 1e-8,
+    max_step: Number | None = None,
     max_steps: int = 100_000,
 ) -> Path:
     """``simulate`` as a pure function, for ``jit``, ``vmap`` (over keys, starts, parameters) and forward derivatives.
@@ -182,7 +185,7 @@ def rollout(
     Keyword Args:
       disturbance: as in ``simulate``, like ``time_varying``.
       key: a JAX random key; wanted exactly when the problem has noise.
-      hold: whether the control is held from one output time to the next.
+      hold: True where the control is held from one output time to the next.
       grid: as in ``simulate``, like ``clamp``, ``rtol``, ``atol``, ``max_step`` and ``max_steps``.
 
     Returns:
@@ -200,25 +203,32 @@ def rollout(
       >>> jax.vmap(lambda key: rollout(walk, None, jnp.zeros(1), jnp.linspace(0, 1, 3), key=key))(keys).states.shape
       (4, 3, 1)
     """
-    x0 = jnp.asarray(x0)
-    if not jnp.issubdtype(x0.dtype, jnp.floating):
-        raise ValueError(f"rollout: x0 has dtype {x0.dtype}, wanted floating point: the path follows it")
+    start = jnp.asarray(x0)
+    if not jnp.issubdtype(start.dtype, jnp.floating):
+        raise ValueError(f"rollout: x0 has dtype {start.dtype}, wanted floating point: the path follows it")
     _check_key(problem, key)
     loop = _close(problem, feedback, disturbance, grid, clamp, time_varying)
-    _probe(loop, x0)
+    check_shapes(loop, start)
     stepping = Stepping(rtol, atol, np.inf if max_step is None else max_step, max_steps, hold)
-    return integrate(loop, x0, jnp.asarray(times, x0.dtype), key, stepping)[0]
+    return integrate(InitialValueProblem(loop, start, jnp.asarray(times, start.dtype), key), stepping)[0]
 
 
-def _close(problem: Problem, feedback: Any, disturbance: Any, grid: Any, clamp: bool, time_varying: Any) -> Loop:
+def _close(
+    problem: Problem,
+    feedback: Feedback,
+    disturbance: Callable | None,
+    grid: Grid | None,
+    clamp: bool,
+    time_varying: bool,
+) -> Loop:
     """The loop through a Solution, which brings its grid and its worst case, or through functions."""
     if disturbance is not None and not problem.is_game:
         raise ValueError(
             "simulate: got a disturbance, but problem.disturbances is None; give the problem an admissible set"
         )
-    control, opponent = feedback, disturbance
-    if hasattr(feedback, "control_at"):
-        if grid is not None and grid is not feedback.grid:
+    control, opponent = None if is_grid_feedback(feedback) else feedback, disturbance
+    if is_grid_feedback(feedback):
+        if grid is not None and grid is not feedback.grid:  # its own, said once more, does no harm
             raise ValueError("simulate: the solution brings its own grid; leave out grid=")
         grid = feedback.grid
         control, worst = lookups(feedback)
@@ -237,7 +247,7 @@ def _close(problem: Problem, feedback: Any, disturbance: Any, grid: Any, clamp: 
     for name, function, optional in (("feedback", control, problem.controls is None), ("disturbance", opponent, True)):
         if not callable(function) and not (function is None and optional):
             raise TypeError(f"simulate: {name} is {function!r}, wanted a Solution or a function {signature}")
-    if not (problem.time_dependent or time_varying):
+    if not (problem.time_dependent or time_varying):  # from here on every player is one of (t, x); lookups are already
         control, opponent = (
             jax.tree_util.Partial(_timeless, as_partial(player)) if player is not None and player is given else player
             for player, given in ((control, feedback), (opponent, disturbance))
@@ -246,21 +256,32 @@ def _close(problem: Problem, feedback: Any, disturbance: Any, grid: Any, clamp: 
     return Loop(problem, control, as_partial(opponent), grid, bool(clamp))
 
 
-def _timeless(function: Callable, t: Any, x: Any) -> Any:
-    """A user's function of the state alone."""
+def _timeless(function: Callable, t: Number, x: State) -> Array:
+    """A user's function of the state alone, as one of time and state."""
     return function(x)
 
 
-def _within_horizon(problem: Problem, solution: Any, duration: float) -> Problem:
-    """Refuse a marched feedback that is not known well enough; without the terminal cost if the path ends before."""
+def _is_marched(feedback: object) -> TypeGuard[GridFeedback]:
+    """True for a feedback that was kept at some times."""
+    return getattr(feedback, "times", None) is not None
+
+
+def _within_horizon(problem: Problem, solution: GridFeedback, duration: float) -> Problem:
+    """The problem under a marched feedback, without its terminal cost if the path ends before the horizon.
+
+    Raises:
+      ValueError: the feedback is not known well enough up to the duration.
+    """
     horizon = check_kept(solution, duration, "simulate: duration")
+    # V at the horizon is owed there, not where a shorter path stops
     if duration < horizon * (1 - 1e-9) and problem.terminal_cost is not None:
-        problem = copy.copy(problem)
+        problem = copy.copy(problem)  # and no `replace`, which would check and wrap all other fields again
         object.__setattr__(problem, "terminal_cost", None)
     return problem
 
 
-def _initial(x0: Any, grid: Grid | None) -> np.ndarray:
+def _initial_state(x0: object, grid: Grid | None) -> np.ndarray:
+    """The state at the beginning, shape (n,), float64, once it is known to be one."""
     try:
         state = np.asarray(x0, np.float64)
     except (TypeError, ValueError):
@@ -273,78 +294,44 @@ def _initial(x0: Any, grid: Grid | None) -> np.ndarray:
     return state
 
 
-def _times(duration: float, steps: Any, hold: Any) -> np.ndarray:
+def _times(duration: float, steps: int | None, hold: float | None) -> np.ndarray:
     """The output times; under a hold, the sampling instants."""
     if hold is None:
-        return np.linspace(0.0, duration, 1 + (200 if steps is None else arguments.count(steps, "simulate: steps")))
+        count = INTERVALS if steps is None else arguments.count(steps, "simulate: steps")
+        return np.linspace(0.0, duration, 1 + count)
     hold = float(arguments.positive(hold, "simulate: hold", "the sampling interval in units of time"))
     if steps is not None:
         raise ValueError(f"simulate: got steps = {steps} and hold = {hold}; leave out steps: the output is every hold")
-    count = max(1, duration / hold - 1e-9)
-    if count > 10**7:
-        raise ValueError(f"simulate: hold = {hold} makes {count:.3g} intervals of {duration:g}, wanted at most 1e7")
-    return np.append(np.arange(math.ceil(count)) * hold, duration)
+    held = max(1, duration / hold - 1e-9)  # or rounding makes one more interval, of length zero, at the end
+    if held > 10**7:  # 80 MB a state: a hold in another unit than the duration
+        raise ValueError(f"simulate: hold = {hold} makes {held:.3g} intervals of {duration:g}, wanted at most 1e7")
+    return np.append(np.arange(math.ceil(held)) * hold, duration)  # the last interval may be shorter
 
 
-def _key(key: Any) -> Any:
-    """The random key of a seed; anything else as it is."""
-    if isinstance(key, bool) or not isinstance(key, (int, np.integer)):
-        return key
-    try:
-        return jax.random.key(int(key))
-    except OverflowError:
-        raise ValueError(f"simulate: key is {key}, wanted a seed that fits 64 bits, or a JAX random key") from None
+def _random_key(problem: Problem, given: Key | int | None) -> Key | None:
+    """The random key, or that of a seed; refuses what is none, one without noise, and noise without one."""
+    key = given
+    if isinstance(given, (int, np.integer)) and not isinstance(given, bool):
+        try:
+            key = jax.random.key(int(given))
+        except OverflowError:
+            raise ValueError(
+                f"simulate: key is {given}, wanted a seed that fits 64 bits, or a JAX random key"
+            ) from None
+    _check_key(problem, key)
+    assert not isinstance(key, int)
+    return key
 
 
-def _check_key(problem: Problem, key: Any) -> None:
+def _check_key(problem: Problem, key: Key | int | None) -> None:
+    """Refuse a key without noise, noise without a key, and what is no key."""
     if problem.noise is not None and key is None:
         raise ValueError("simulate: the problem has noise; give key=jax.random.key(0), or any other seed")
     if problem.noise is None and key is not None:
         raise ValueError("simulate: got a key, but problem.noise is None and nothing is random; leave out key")
-    dtype, shape = getattr(key, "dtype", None), np.shape(key)
+    dtype, shape = getattr(key, "dtype", None), () if key is None else np.shape(key)
     typed = dtype is not None and jax.dtypes.issubdtype(dtype, jax.dtypes.prng_key)
+    # two kinds of keys: typed ones, and rows of uint32 as jax.random.PRNGKey makes them
     if key is not None and not (typed and shape == ()) and not (dtype == np.uint32 and len(shape) == 1):
         given = f"an array of shape {shape} and type {dtype}" if dtype is not None else repr(key)
         raise ValueError(f"simulate: key is {given}, wanted one random key: key=jax.random.key(0), or another seed")
-
-
-def _probe(loop: Loop, x0: Any) -> None:
-    """Trace every function of the loop once, abstractly, and compare the shapes it returns with those wanted."""
-    problem, n = loop.problem, x0.shape[0]
-    m = 0 if problem.controls is None else problem.controls.dim
-    opponents = 0 if problem.disturbances is None else problem.disturbances.dim
-    u, d = jnp.zeros(m, x0.dtype), jnp.zeros(opponents, x0.dtype)
-    players, state = (x0[0], x0), problem.arguments(x0, u, d, x0[0])
-    for name, function, fed, wanted in (
-        ("feedback", loop.control, players, (m,)),
-        ("disturbance", loop.opponent, players, (opponents,)),
-        ("drift", problem.drift, state, (n,)),
-        ("cost", problem.cost, state, ()),
-        ("target", problem.target, problem.state_arguments(x0, x0[0]), ()),
-    ):
-        if function is None:
-            continue
-        try:
-            found = jax.eval_shape(functools.partial(_array, function, name), *fed)
-        except jax.errors.JAXTypeError as error:
-            raise ValueError(
-                f"simulate: {name} cannot be traced: use jnp.where instead of if, and jnp instead of numpy"
-            ) from error
-        if jnp.issubdtype(found.dtype, jnp.complexfloating):
-            raise ValueError(f"simulate: {name} returned complex numbers, expected real ones, shape {wanted}")
-        if found.shape != wanted:
-            raise ValueError(
-                f"simulate: {name} returned shape {found.shape}, expected {wanted}, for x0 of shape {x0.shape}"
-            )
-
-
-def _array(function: Callable, name: str, *arguments: Any) -> jax.Array:
-    """What the function returns, as an array; refuses what is none."""
-    result = function(*arguments)
-    try:
-        return jnp.asarray(result)
-    except jax.errors.JAXTypeError:  # a tracer where NumPy or Python wants a number
-        raise
-    except (TypeError, ValueError):
-        what = "None; is its return missing?" if result is None else f"a {type(result).__name__}"
-        raise ValueError(f"simulate: {name} returned {what}, expected an array of numbers") from None

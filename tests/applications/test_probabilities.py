@@ -122,7 +122,7 @@ def test_without_drift_the_chance_is_linear_also_between_the_nodes(k, low, m, hi
 )
 def test_who_ends_on_a_boundary_ends_in_the_set_that_it_met(x, paid):
     """The target is x ≥ .6, the obstacle x ≤ .4 and x ≥ .9; on a boundary rounding decides of the sign."""
-    question = exit_problems.ending(
+    question = exit_problems.exit_problem(
         hjb.Problem(still), lambda x: 0.6 - x[0], lambda x: jnp.minimum(x[0] - 0.4, 0.9 - x[0]), 0.0, 1.0
     )
     with jax.enable_x64(True):

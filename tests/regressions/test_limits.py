@@ -692,7 +692,7 @@ def test_ctrl_c_while_an_extremal_is_checked_is_not_lost(monkeypatch):
 
 def pressing(monkeypatch, number):
     """Ctrl-C at the end of that call of a simulation's compiled run; the number of calls."""
-    made, inner = [], simulation._compiled
+    made, inner = [], simulation._jit_part
 
     def counted(*arguments):
         answer = inner(*arguments)
@@ -701,7 +701,7 @@ def pressing(monkeypatch, number):
             signal.raise_signal(signal.SIGINT)
         return answer
 
-    monkeypatch.setattr(simulation, "_compiled", counted)
+    monkeypatch.setattr(simulation, "_jit_part", counted)
     return made
 
 

@@ -16,25 +16,28 @@ import hashlib
 import inspect
 import re
 import types
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend import core as jex
+from jax.tree_util import Partial
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, is_traced
+from hjbjax.problem.types import DType, Numbers
 
 ADDRESS = re.compile(r" at 0x[0-9a-f]+|id=\d+")  # of rules of derivatives, made anew with every trace
+# whose functions compute tomorrow what they compute today: problems made of these alone need no trace at all
 LIBRARIES = frozenset({"builtins", "functools", "hjbjax", "itertools", "jax", "jaxlib", "math", "numpy", "operator"})
 OF_ACTION = ("drift", "cost", "noise")
 OF_STATE = ("target", "exit_cost", "terminal_cost", "stopping_cost", "running_max")
 
 
-def settled(problem: Problem, n: int, dtype: Any = None) -> Problem:
+def settled(problem: Problem, n: int, dtype: DType | None = None) -> Problem:
     """The problem with its functions marked by what they compute now, and traced numbers of closures among its leaves.
 
     Args:
@@ -47,13 +50,15 @@ def settled(problem: Problem, n: int, dtype: Any = None) -> Problem:
     if not names:
         return problem
     if not is_traced(problem):
+        # outside of the caller's ``jit`` and always in float64: every front door finds one mark for one function
         with jax.core.eval_context(), jax.enable_x64(True):
             found = {name: _trace(problem, name, n, np.dtype(np.float64)) for name in names}
         if not any(closed is not None and is_traced(closed.consts) for closed in found.values()):
-            return altered(problem, **{name: _marked(getattr(problem, name), found[name]) for name in names})
+            return altered(problem, **{name: _with_mark(getattr(problem, name), found[name]) for name in names})
+    # A number under differentiation shows only where it is alive: inside the transformation, in its own dtype.
     kind = jnp.result_type(float) if dtype is None else jnp.dtype(dtype)
     found = {name: _trace(problem, name, n, kind) for name in names}
-    return altered(problem, **{name: _settled(getattr(problem, name), found[name]) for name in names})
+    return altered(problem, **{name: _with_closure_as_leaves(getattr(problem, name), found[name]) for name in names})
 
 
 def with_settled_functions(front_door: Callable) -> Callable:
@@ -73,17 +78,18 @@ def with_settled_functions(front_door: Callable) -> Callable:
             return front_door(*arguments, **options)  # which Python refuses
         given = positions | options
         if isinstance(given.get(second), Grid) and first in given:
-            given[first] = _all_settled(given[first], given[second].ndim, given.get("dtype"))
+            given[first] = _settle_all(given[first], given[second].ndim, given.get("dtype"))
         if is_traced(given):
             return front_door(**given)
+        # Only here may a solve be cut in chunks, allocate and refuse by values: inside a trace it has one program.
         with jax.core.eval_context():
             return front_door(**given)
 
     return entered
 
 
-def _all_settled(asked: Any, n: int, dtype: Any) -> Any:
-    """A problem, or the problems among some things, settled."""
+def _settle_all(asked: object, n: int, dtype: DType | None) -> object:
+    """A problem, or the problems among several things, settled; the front door refuses everything else."""
     if isinstance(asked, Problem):
         return settled(asked, n, dtype)
     if not isinstance(asked, Iterable):
@@ -93,16 +99,16 @@ def _all_settled(asked: Any, n: int, dtype: Any) -> Any:
 
 
 class Marked:
-    """A function that equals another only if both compute the same thing."""
+    """A function that equals another if both have one mark: equal functions share their compiled programs."""
 
-    def __init__(self, function: Callable, mark: Any):
+    def __init__(self, function: Callable, mark: object):
         self.__wrapped__, self.mark = function, mark  # the name under which ``inspect`` finds the signature
 
     def __call__(self, *arguments: Any, **options: Any) -> Any:
-        """What the function returns."""
+        """The function's result."""
         return self.__wrapped__(*arguments, **options)
 
-    def __eq__(self, other: Any) -> bool:
+    def __eq__(self, other: object) -> bool:
         return isinstance(other, Marked) and self.mark == other.mark and self.__wrapped__ == other.__wrapped__
 
     def __hash__(self) -> int:
@@ -112,35 +118,39 @@ class Marked:
 class Opened:
     """A traced function of what it closed over, of the leaves it held, and of its arguments."""
 
-    def __init__(self, jaxpr: Any, count: int):
+    def __init__(self, jaxpr: jex.Jaxpr, count: int):
         self.jaxpr, self.count = jaxpr, count
 
     def __call__(self, known: tuple, *arguments: Any) -> Any:
-        """What the function returned, with ``known`` the numbers it closed over and its leaves."""
+        """The function's result, with ``known`` the numbers it closed over and its leaves."""
         constants, leaves = known
+        # a jaxpr wants the dtypes it was traced with, and a solve may have cast the leaves to float32 meanwhile
         closed = self._typed(constants, self.jaxpr.constvars)
         return jax.core.eval_jaxpr(self.jaxpr, closed, *self._typed((*leaves, *arguments), self.jaxpr.invars))[0]
 
     @staticmethod
-    def _typed(values: Any, variables: Any) -> list:
-        return [jnp.asarray(value, var.aval.dtype) for value, var in zip(values, variables, strict=True)]
+    def _typed(values: Iterable[Numbers], variables: Sequence[jex.Var]) -> list[jax.Array]:
+        return [
+            jnp.asarray(value, cast(jax.core.ShapedArray, var.aval).dtype)
+            for value, var in zip(values, variables, strict=True)
+        ]
 
 
-def _settled(function: Any, closed: Any) -> Any:
-    """A function inside a JAX transformation: with a mark, or with what it closed over as leaves."""
+def _with_closure_as_leaves(function: Partial, closed: jex.ClosedJaxpr | None) -> Partial:
+    """A function inside a JAX transformation with the traced numbers it closed over as leaves; else with its mark."""
     if closed is None or not is_traced(closed.consts):
-        return _marked(function, closed)
+        return _with_mark(function, closed)
     leaves = jax.tree.leaves(function)
-    return jax.tree_util.Partial(Opened(closed.jaxpr, len(leaves)), (tuple(closed.consts), leaves))
+    return Partial(Opened(closed.jaxpr, len(leaves)), (tuple(closed.consts), leaves))
 
 
-def _is_fixed(thing: Any, depth: int = 8) -> bool:
+def _is_fixed(thing: object, depth: int = 8) -> bool:
     """Whether a part of a problem reads nothing from outside but library code, so that it never computes otherwise."""
-    if depth == 0:
+    if depth == 0:  # functions that call each other have no end; False costs a trace and is never wrong
         return False
     if thing is None or isinstance(thing, (bool, int, float, str, np.generic, np.ndarray, jax.Array)):
         return True  # the arrays are leaves
-    if isinstance(thing, jax.tree_util.Partial):
+    if isinstance(thing, Partial):
         return all(_is_fixed(each, depth - 1) for each in (thing.func, *thing.args, *thing.keywords.values()))
     if isinstance(thing, (tuple, list)):
         return all(_is_fixed(each, depth - 1) for each in thing)
@@ -153,10 +163,11 @@ def _is_fixed(thing: Any, depth: int = 8) -> bool:
 
 def _reads_no_variables(function: types.FunctionType, depth: int) -> bool:
     """Whether a function's globals are library code, or functions of which that is true."""
-    if function.__closure__ or function.__kwdefaults__:
+    if function.__closure__ or function.__kwdefaults__:  # cells can be rebound, and dictionaries written to
         return False
     if not all(isinstance(each, (int, float, str, type(None))) for each in function.__defaults__ or ()):
         return False
+    # CPython keeps names of globals and of attributes in one table; an attribute that is also a global costs a trace
     known = function.__globals__
     outside = [known[name] for name in _names(function.__code__) if name in known]
     return all(
@@ -165,22 +176,22 @@ def _reads_no_variables(function: types.FunctionType, depth: int) -> bool:
 
 
 def _names(code: types.CodeType) -> set[str]:
-    """The names of globals, and of attributes, in a piece of code and in what is defined inside it."""
+    """The names of globals, and of attributes, in a piece of code and in the functions defined inside it."""
     inner = (_names(each) for each in code.co_consts if isinstance(each, types.CodeType))
     return set(code.co_names).union(*inner)
 
 
-def _is_library(thing: Any) -> bool:
+def _is_library(thing: object) -> bool:
     """Whether a global is a module, a function or a class of a library that nobody changes between two solves."""
     home = thing.__name__ if isinstance(thing, types.ModuleType) else getattr(thing, "__module__", None)
     fixed = isinstance(thing, types.ModuleType) or callable(thing)
     return fixed and isinstance(home, str) and home.split(".")[0] in LIBRARIES
 
 
-def _trace(problem: Problem, name: str, n: int, dtype: Any) -> Any:
+def _trace(problem: Problem, name: str, n: int, dtype: DType) -> jex.ClosedJaxpr | None:
     """The jaxpr of a function of leaves and arguments; None where it cannot be traced: the checks will say why."""
     function = getattr(problem, name)
-    leaves, structure = jax.tree.flatten(function)
+    leaves, structure = jax.tree.flatten(function)  # as inputs: their numbers must not get into the mark
     sizes = {
         letter: 0 if admissible is None else admissible.dim
         for letter, admissible in (("u", problem.controls), ("d", problem.disturbances))
@@ -198,32 +209,33 @@ def _trace(problem: Problem, name: str, n: int, dtype: Any) -> Any:
         return None
 
 
-def _marked(function: Any, closed: Any) -> Any:
+def _with_mark(function: Partial, closed: jex.ClosedJaxpr | None) -> Partial:
     """The function with the mark of its trace; where there is none it equals no other."""
     inner = function.func.__wrapped__ if isinstance(function.func, Marked) else function.func
     mark = object() if closed is None else fingerprint(closed)
-    return jax.tree_util.Partial(Marked(inner, mark), *function.args, **function.keywords)
+    return Partial(Marked(inner, mark), *function.args, **function.keywords)
 
 
 def fingerprint(closed: jex.ClosedJaxpr) -> bytes:
     """A digest of what a jaxpr computes, with every number that it holds."""
-    digest = hashlib.blake2b(digest_size=16)
+    digest = hashlib.blake2b(digest_size=16)  # by chance two of 10^10 functions share 128 bits once in 10^18 cases
     _feed(digest, closed.jaxpr, closed.consts)
     return digest.digest()
 
 
-def _feed(digest: Any, jaxpr: Any, consts: Iterable[Any]) -> None:
-    numbers: dict[Any, int] = {}
+def _feed(digest: hashlib.blake2b, jaxpr: jex.Jaxpr, consts: Iterable[Numbers]) -> None:
+    """Put a jaxpr into a digest, equation by equation."""
+    numbers: dict[jex.Var, int] = {}  # variables by their first appearance; their own names differ from trace to trace
 
     def tell(*words: Any) -> None:
         digest.update(repr(words).encode())
 
-    def number(value: Any) -> None:
-        array = np.asarray(value)
+    def number(value: Numbers) -> None:
+        array = np.asarray(value)  # its bits, since a printed one is rounded and a long one abridged
         tell(array.dtype, array.shape)
         digest.update(array.tobytes())
 
-    def tell_parameter(value: Any) -> None:
+    def tell_parameter(value: object) -> None:
         if isinstance(value, jex.ClosedJaxpr):
             _feed(digest, value.jaxpr, value.consts)
         elif isinstance(value, jex.Jaxpr):
@@ -241,7 +253,7 @@ def _feed(digest: Any, jaxpr: Any, consts: Iterable[Any]) -> None:
         tell(numbers.setdefault(var, len(numbers)), str(var.aval))
     for value in consts:
         number(value)
-    for eqn in (*jaxpr.eqns, None):
+    for eqn in (*jaxpr.eqns, None):  # None: the outputs of the whole, as if an equation took them
         operands, results = (jaxpr.outvars, ()) if eqn is None else (eqn.invars, eqn.outvars)
         tell("" if eqn is None else eqn.primitive.name)
         for operand in operands:
@@ -251,6 +263,7 @@ def _feed(digest: Any, jaxpr: Any, consts: Iterable[Any]) -> None:
                 tell(numbers.get(operand, -1))
         for result in results:
             tell(numbers.setdefault(result, len(numbers)), str(result.aval))
-        for name in sorted(eqn.params) if eqn is not None else ():
+        parameters = {} if eqn is None else eqn.params
+        for name in sorted(parameters):
             tell(name)
-            tell_parameter(eqn.params[name])
+            tell_parameter(parameters[name])

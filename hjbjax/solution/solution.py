@@ -16,6 +16,7 @@ import numpy as np
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
 from hjbjax.problem.stretching import Sinh
+from hjbjax.problem.types import Array
 from hjbjax.solution import files, screen
 from hjbjax.solution.files import Expected, FileError
 from hjbjax.solution.interpolation import between, between_defined, nearest, query, slopes_between
@@ -79,7 +80,7 @@ class Solution:
     """
 
     grid: Grid
-    value: Any
+    value: Array
     policy: Any
     disturbance: Any = None
     code: Any = 0

@@ -8,6 +8,7 @@ max(upper − V, V − lower).
 
 import dataclasses
 from collections.abc import Sequence
+from types import ModuleType
 from typing import Any
 
 import jax.numpy as jnp
@@ -19,7 +20,16 @@ from hjbjax.problem.stretching import Sinh
 from hjbjax.problem.types import Array
 from hjbjax.solution import files, screen
 from hjbjax.solution.files import Expected, FileError
-from hjbjax.solution.interpolation import between, between_defined, nearest, query, slopes_between
+from hjbjax.solution.interpolation import (
+    Interpolation,
+    Samples,
+    between,
+    between_defined,
+    nearest,
+    query,
+    slopes_between,
+)
+from hjbjax.solution.placement import Path
 from hjbjax.solution.status import Status
 
 __all__ = ["FileError", "Solution", "SolveError", "Status", "load"]
@@ -37,7 +47,7 @@ KINDS: dict[str, tuple[type, ...]] = {  # what a file's header holds, as JSON ha
 
 
 class SolveError(RuntimeError):
-    """A solve that did not converge: the ``message`` says how it ended, ``.solution`` is what there is.
+    """A solve that did not converge: the ``message`` says how it ended, ``.solution`` is the answer so far, if any.
 
     ``.solutions`` are those of all lanes of a batch, the finished ones among them.
     """
@@ -97,7 +107,7 @@ class Solution:
     message: str = ""
 
     def __post_init__(self):
-        if isinstance(self.code, Status):
+        if isinstance(self.code, Status):  # a leaf must be a number to JAX, and an enumeration is none
             object.__setattr__(self, "code", int(self.code))
 
     @property
@@ -117,8 +127,9 @@ class Solution:
             return None
         xp: Any = jnp if is_traced(self.value, self.enclosure) else np
         value, (factors, shifts) = xp.asarray(self.value), self._lines(xp)
+        # of a batch every lane has its own lines: factors (lanes,) against values (lanes, *grid)
         finite, numbers = xp.isfinite(value), (..., *(None,) * self.grid.ndim)
-        center = xp.where(finite, value, 0)
+        center = xp.where(finite, value, 0)  # a factor of zero times infinity would be NaN
         lower, upper = (
             xp.where(finite, factors[..., side][numbers] * center + shifts[..., side][numbers], value)
             for side in (0, 1)
@@ -143,11 +154,12 @@ class Solution:
             for side, sign in enumerate((-1, 1))
             for end in (least, most)
         ]
+        # NaN compares with nothing, and least and most look at finite values alone: neither may pass for a bound
         worst = xp.max(xp.stack(off))
         worst = xp.where(xp.isnan(worst) | xp.any(xp.isnan(value)) | ~xp.any(finite), xp.inf, worst)
         return worst if xp is jnp else float(worst)
 
-    def _lines(self, xp: Any) -> tuple[Any, Any]:
+    def _lines(self, xp: ModuleType) -> tuple[Array, Array]:
         """Factors and shifts of the two bounds, each of shape (..., 2)."""
         enclosure = xp.asarray(self.enclosure)
         return enclosure[..., 0], enclosure[..., 1]
@@ -200,11 +212,18 @@ class Solution:
         look = nearest if self.discrete_disturbance else between_defined
         return self._query("disturbance_at", look, self.disturbance, 1, where, clamp)
 
-    def _query(self, name: str, look: Any, values: Any, trailing: int, where: tuple, clamp: bool) -> Any:
+    def _query(
+        self, name: str, look: Interpolation, values: Array | None, trailing: int, where: tuple, clamp: bool
+    ) -> Array:
+        """Values between the nodes by the rule ``look``; of entries per node with ``trailing`` axes."""
+        if values is None:
+            lacking = "policy" if name == "control_at" else "disturbance: the problem is not a game"
+            raise ValueError(f"Solution.{name}: this solution has no {lacking}")
         t, x = _check_query(self, name, values, trailing, where)
-        return query(look, self.grid, values, x, clamp=clamp, name=f"Solution.{name}", times=self.times, t=t)
+        samples = Samples(self.grid, values, self.times)
+        return query(look, samples, x, t, clamp=clamp, name=f"Solution.{name}")
 
-    def save(self, path: Any, *, force: bool = False) -> None:
+    def save(self, path: Path, *, force: bool = False) -> None:
         """Write the solution to ``path``, whole or not at all; ``load`` gives back the same bits.
 
         Statistics come back as JSON has them: tuples as lists, objects as their text.
@@ -236,7 +255,7 @@ class Solution:
         arrays = {}
         for name, wanted in _plan(header).items():
             array = getattr(grid if name in ("lo", "hi") else self, name)
-            if array is None:
+            if array is None:  # what may be missing is optional in the plan, and comes back as None
                 continue
             arrays[name] = array = np.asarray(array)
             if complaint := wanted.complaint(array.shape, array.dtype.str):
@@ -255,7 +274,7 @@ class Solution:
         return screen.show(self)
 
 
-def load(path: Any) -> Solution:
+def load(path: Path) -> Solution:
     """The solution in the file ``path`` that ``Solution.save`` wrote; code in a file is never run.
 
     Raises:
@@ -265,10 +284,11 @@ def load(path: Any) -> Solution:
 
 
 def _plan(header: dict) -> dict[str, Expected]:
-    """What each array must look like, from the grid in the header alone."""
+    """Shapes and dtypes of the arrays in a file, from the grid in its header alone."""
     shape, marched = tuple(header["grid"]["shape"]), header["marched"]
     if not all(type(count) is int and count >= 2 for count in shape):
         raise FileError(f"its grid has shape {shape}")
+    # number of inputs, residuals: any; of a marched solution the kept times go first
     many, lead = (None,), () if marched is None else (marched,)
     controls = Expected((lead + shape + many, many * len(lead) + shape + many))
     return {
@@ -286,24 +306,22 @@ def _plan(header: dict) -> dict[str, Expected]:
 
 
 def _rebuild(header: dict, arrays: dict[str, np.ndarray]) -> Solution:
+    """The solution from the header and the arrays of a file; ``Grid`` checks its own."""
     about = header["grid"]
     stretch = tuple(pair and Sinh(*pair) for pair in about["stretch"])
     grid = Grid(
         arrays.pop("lo"), arrays.pop("hi"), tuple(about["shape"]), about["periodic"], tuple(about["names"]), stretch,
         about.get("edges", "projected"),
     )  # fmt: skip
-    for name, kinds in KINDS.items():
+    for name, kinds in KINDS.items():  # ``type`` and not ``isinstance``: true is no number of steps
         if type(header[name]) not in kinds:
             raise FileError(f"its header has {name} = {header[name]!r:.60}, wanted {kinds[0].__name__}")
-    Status(header["code"])
+    Status(header["code"])  # raises where there is no such status
     return Solution(**{"policy": None, **arrays, "grid": grid, **{name: header[name] for name in KINDS}})
 
 
-def _check_query(solution: Solution, name: str, values: Any, trailing: int, where: tuple) -> tuple[Any, Any]:
-    """The time, None if stationary, and the state; refuses what has no answer."""
-    if values is None:
-        what = "policy" if name == "control_at" else "disturbance: the problem is not a game"
-        raise ValueError(f"Solution.{name}: this solution has no {what}")
+def _check_query(solution: Solution, name: str, values: Array, trailing: int, where: tuple) -> tuple[Any, Any]:
+    """The time, None if stationary, and the state; refuses a time too many or too few, and batches."""
     marched = solution.times is not None
     if len(where) != 1 + marched:
         kind, call = ("marched over times", f"{name}(t, x)") if marched else ("stationary", f"{name}(x)")

@@ -29,7 +29,7 @@ def positive(value: T, name: str, unit: str = "", *, most: float = math.inf, end
     Raises:
       ValueError: zero, negative, NaN, infinite, a truth value, an array, no number at all.
     """
-    if is_traced(value) or (endless and is_number(value) and value == math.inf):  # first whether it compares at all
+    if is_traced(value) or (endless and is_number(value) and value == math.inf):
         return value
     number: Any = value
     if not (is_number(value) and math.isfinite(number) and 0 < number <= most):
@@ -62,10 +62,10 @@ def one_of(value: object, name: str, kinds: tuple[type, ...], wanted: str) -> No
 
 
 def is_number(value: object) -> bool:
-    """Whether ``value`` is one real number; truth values and text that looks like one are none."""
+    """True if ``value`` is one real number; truth values and text that looks like one are none."""
     if isinstance(value, (bool, str, bytes)) or value is None:
         return False
-    if isinstance(value, int):  # NumPy keeps larger ones than 2^63 as objects, so they are judged by themselves
+    if isinstance(value, int):  # NumPy keeps one of 10^20 as an object, so that it is judged by itself
         return value.bit_length() < 1024  # below 2^1023, where float() cannot overflow
     try:
         array = np.asarray(value)

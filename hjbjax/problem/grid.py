@@ -85,7 +85,7 @@ class Grid:
         }  # fmt: skip
         for name, value in checked.items():
             object.__setattr__(self, name, value)
-        tables = (self._computed(axis) if count <= TABLED else None for axis, count in enumerate(shape))
+        tables = (self._by_formula(axis) if count <= TABLED else None for axis, count in enumerate(shape))
         object.__setattr__(self, "coordinates", tuple(tables))
         self.check_spacings(np.float64)  # a solve asks again in its own dtype, which may be float32
 
@@ -138,14 +138,14 @@ class Grid:
 
     def axis(self, axis: int, dtype: DType | None = None) -> Array:
         """The coordinates of the nodes along one axis, shape (N,); the same numbers in every program."""
-        computed, table = self._computed(axis), self.coordinates[axis]
+        computed, table = self._by_formula(axis), self.coordinates[axis]
         table = computed if table is None else table
         # NumPy as long as nothing is traced, also inside ``jit``, where the table then is a constant
         if is_traced(computed, table):
             return _from_table(*(jnp.asarray(each, dtype or jnp.result_type(float)) for each in (computed, table)))
         return np.asarray(table, dtype or np.float64)
 
-    def _computed(self, axis: int) -> Array:
+    def _by_formula(self, axis: int) -> Array:
         """The coordinates by the formula, in NumPy where the corners are known numbers."""
         index: Array = np.arange(self.shape[axis], dtype=np.float64)
         last = self.intervals(axis)
@@ -272,7 +272,7 @@ class Grid:
 @jax.custom_jvp
 def _from_table(computed: jax.Array, table: jax.Array) -> jax.Array:
     """The table, with the derivative of the formula; the formula where the corners were changed alone."""
-    # ``dataclasses.replace`` makes a new table, ``altered`` and ``tree.map`` leave that of the old corners in place
+    # a corner that was swapped for a tracer, as ``grad`` does, comes with the table of the old one
     slack = ROUNDINGS * jnp.finfo(table.dtype).eps * jnp.max(jnp.abs(computed))
     return jnp.where(jnp.abs(computed - table) <= slack, table, computed)
 

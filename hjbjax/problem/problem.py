@@ -90,11 +90,13 @@ class Problem:
         if not callable(drift):
             raise TypeError(f"Problem.drift: got {drift!r}, wanted a function (x, u) -> (n,)")
         _check_sets(controls, disturbances)
+        # the words are part of the structure, and a compiled program has one order of min and max
         if isaacs not in ("upper", "lower"):
             raise ValueError(f"Problem.isaacs: got {isaacs!r}, wanted 'upper' (min max) or 'lower' (max min)")
         discount = _rate(discount)
         if not isinstance(time_dependent, (bool, np.bool_)):
             raise TypeError(f"Problem.time_dependent: got {time_dependent!r}, wanted True or False")
+        # of a running maximum V ≥ g the term β V − L has no meaning: there is no integral to discount
         if running_max is not None and (cost is not None or _is_nonzero(discount)):
             raise ValueError(
                 "Problem.running_max: the cost is the running maximum alone; "
@@ -125,7 +127,7 @@ class Problem:
 
     @property
     def is_game(self) -> bool:
-        """Whether there is an opponent."""
+        """True if there is an opponent."""
         return self.disturbances is not None
 
     def arguments(self, x: object, u: object, d: object = None, t: object = 0.0) -> tuple:
@@ -158,7 +160,7 @@ def is_discounted(problem: Problem) -> bool | None:
 
 
 def _is_nonzero(discount: Number) -> bool:
-    """Whether a discount is given: a traced one counts, as nobody traces a number that is to be left out."""
+    """True if a discount is given: a traced one counts, as nobody traces a number that is to be left out."""
     return is_traced(discount) or bool(discount != 0)
 
 
@@ -172,6 +174,7 @@ def _check_sets(controls: object, disturbances: object) -> None:
 def _rate(discount: object) -> Number:
     """The discount as a float, or the tracer that stands for it."""
     rate = numbers(discount, "Problem.discount")
+    # a tracer has no value that could be compared
     if np.ndim(rate) != 0 or (isinstance(rate, np.ndarray) and not 0 <= rate < np.inf):
         raise ValueError(f"Problem.discount: got {discount!r}, wanted a finite number ≥ 0")
     return float(rate) if isinstance(rate, np.ndarray) else rate
@@ -179,7 +182,7 @@ def _rate(discount: object) -> Number:
 
 def _noise(noise: object) -> Any:
     """σ as a function, a number or an array; its shape and its numbers checked where they are known."""
-    sigma = _function_or_number(noise, "Problem.noise", largest=2)
+    sigma = _function_or_number(noise, "Problem.noise", largest=2)  # ε, (n,) or (n, k)
     if sigma is None or callable(sigma) or is_traced(sigma):
         return sigma
     if not np.all(np.isfinite(sigma)):

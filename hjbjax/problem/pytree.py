@@ -96,7 +96,7 @@ def _default(field: dataclasses.Field) -> Callable[[], Any]:
 
 
 def is_traced(*trees: Any) -> bool:
-    """Whether any leaf of the trees is a tracer, so that its value is not known yet."""
+    """True if any leaf of the trees is a tracer, so that its value is not known yet."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
 
 

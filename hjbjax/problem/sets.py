@@ -24,7 +24,7 @@ def _finite_numbers(value: object, name: str) -> Array:
 
 
 def _is_count(value: object) -> bool:
-    """Whether a value is a positive integer; True is none."""
+    """True if a value is a positive integer; True is none."""
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and int(value) >= 1
 
 
@@ -54,6 +54,7 @@ class Box:
         if isinstance(lo, np.ndarray) and isinstance(hi, np.ndarray) and np.any(lo > hi):
             axis = int(np.argmax(lo > hi))
             raise ValueError(f"Box: no admissible control: input {axis} has lo = {lo[axis]:g} > hi = {hi[axis]:g}")
+        # as arrays of float64; the dataclass is frozen
         object.__setattr__(self, "lo", lo)
         object.__setattr__(self, "hi", hi)
 
@@ -118,7 +119,7 @@ class Finite:
 
     def __post_init__(self):
         points = _finite_numbers(self.points, "Finite.points")
-        if np.ndim(points) == 1 and np.size(points) > 0:
+        if np.ndim(points) == 1 and np.size(points) > 0:  # three numbers: three controls, or one of three inputs?
             raise ValueError(f"Finite: got points of shape {np.shape(points)}, wanted (K, m): one row a control")
         if np.ndim(points) != 2 or 0 in np.shape(points):
             raise ValueError(f"Finite: no admissible control: got points of shape {np.shape(points)}, wanted (K, m)")
@@ -155,7 +156,7 @@ def _values_an_input(box: Box, budget: int) -> int:
 
 def _unit_ball(dim: int, budget: int) -> np.ndarray:
     """Points of the unit ball, shape (K, dim)."""
-    if dim == 1:
+    if dim == 1:  # an odd number of points, so that −1, 0 and 1 are among them
         return np.linspace(-1.0, 1.0, budget // 2 * 2 + 1)[:, None]
     if dim == 2:  # half of the budget a circle, by fours so that the axes are among the directions
         angles = np.arange(max(8, budget // 8 * 4)) * (2 * np.pi / max(8, budget // 8 * 4))

@@ -53,7 +53,7 @@ class Clock:
 
     def over(self) -> Status | None:
         """INTERRUPTED or TIME_LIMIT; ``None`` to go on."""
-        if self.interrupted:
+        if self.interrupted:  # first: who pressed Ctrl-C wants to read that, whatever the time is
             return Status.INTERRUPTED
         return Status.TIME_LIMIT if self.elapsed() >= self.seconds else None
 

@@ -52,7 +52,7 @@ class Expected(NamedTuple):
 
 
 def _matches(shape: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
-    """Whether a shape has the wanted lengths."""
+    """True if a shape has the wanted lengths."""
     return len(shape) == len(wanted) and all(n is None or n == m for m, n in zip(shape, wanted, strict=True))
 
 

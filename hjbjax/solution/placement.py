@@ -144,7 +144,7 @@ def sweep(folder: str | os.PathLike[str]) -> None:
 
 
 def _is_alive(pid: int) -> bool:
-    """Whether a process with this number runs on this machine."""
+    """True if a process with this number runs on this machine."""
     try:
         os.kill(pid, 0)  # signal 0 is none: only its delivery is checked
     except (ProcessLookupError, OverflowError):

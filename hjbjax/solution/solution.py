@@ -17,7 +17,7 @@ import numpy as np
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
 from hjbjax.problem.stretching import Sinh
-from hjbjax.problem.types import Array
+from hjbjax.problem.types import Array, Numbers
 from hjbjax.solution import files, screen
 from hjbjax.solution.files import Expected, FileError
 from hjbjax.solution.interpolation import (
@@ -34,7 +34,7 @@ from hjbjax.solution.status import Status
 
 __all__ = ["FileError", "Solution", "SolveError", "Status", "load"]
 
-FORMAT, VERSION = "hjbjax.Solution", 1
+FORMAT, VERSION = "hjbjax.Solution", 1  # the version goes up when an older hjbjax would read a file wrongly
 KINDS: dict[str, tuple[type, ...]] = {  # what a file's header holds, as JSON has it
     "code": (int,),
     "steps": (int,),
@@ -76,7 +76,7 @@ class Solution:
       cut: at how many nodes of each end of the box the optimal drift is cut off, shape (n, 2), lower and upper; when
         marched, at each kept time, (k, n, 2). Zero at ends that are not projected; ``None`` where it was not counted.
       discrete: whether the controls are enumerated, so that a mean of two need not be admissible.
-      discrete_disturbance: the same of the disturbances.
+      discrete_disturbance: whether the disturbances are enumerated.
       residuals: one number a step; host level.
       stats: "method", "scheme", "device", "dtype", "seconds", "compile_seconds", "bytes", "tol",
         "certificate" (a sentence) and "versions" (a dict), each where known; host level.
@@ -169,7 +169,7 @@ class Solution:
         """The last residual; ``None`` where none was kept."""
         return float(self.residuals[-1]) if len(self.residuals) else None
 
-    def value_at(self, *where: Any, clamp: bool = False) -> Any:
+    def value_at(self, *where: Numbers | Sequence, clamp: bool = False) -> Any:
         """V between the nodes: ``value_at(x)``, or ``value_at(t, x)`` of a marched solution; jit- and vmap-able.
 
         Multilinear interpolation, second order, in the time as well. Concrete states and data give float64 NumPy;
@@ -188,7 +188,7 @@ class Solution:
         """
         return self._query("value_at", between, self.value, 0, where, clamp)
 
-    def costate_at(self, *where: Any, clamp: bool = False) -> Any:
+    def costate_at(self, *where: Numbers | Sequence, clamp: bool = False) -> Any:
         """DV between the nodes, shape ``x.shape[:-1] + (n,)``; arguments and refusals as for ``value_at``.
 
         The costate of Pontryagin's principle, in current value. Central differences at the nodes (parabolas through
@@ -197,17 +197,18 @@ class Solution:
         """
         return self._query("costate_at", slopes_between, self.value, 0, where, clamp)
 
-    def control_at(self, *where: Any, clamp: bool = False) -> Any:
+    def control_at(self, *where: Numbers | Sequence, clamp: bool = False) -> Any:
         """u between the nodes, shape ``x.shape[:-1] + (m,)``; arguments and refusals as for ``value_at``.
 
         Only nodes of the cell where a control is defined count, with their weights scaled to sum to one, so
         that the feedback reaches up to a target or to the edge of the reachable states; where no node of the
         cell has one, the answer is NaN. Enumerated controls are not averaged: the nearest such node's is taken.
         """
+        # the mean of "left" and "right" is no control of a finite set
         look = nearest if self.discrete else between_defined
         return self._query("control_at", look, self.policy, 1, where, clamp)
 
-    def disturbance_at(self, *where: Any, clamp: bool = False) -> Any:
+    def disturbance_at(self, *where: Numbers | Sequence, clamp: bool = False) -> Any:
         """The opponent's d between the nodes, shape ``x.shape[:-1] + (l,)``; as ``control_at``."""
         look = nearest if self.discrete_disturbance else between_defined
         return self._query("disturbance_at", look, self.disturbance, 1, where, clamp)
@@ -286,7 +287,7 @@ def load(path: Path) -> Solution:
 def _plan(header: dict) -> dict[str, Expected]:
     """Shapes and dtypes of the arrays in a file, from the grid in its header alone."""
     shape, marched = tuple(header["grid"]["shape"]), header["marched"]
-    if not all(type(count) is int and count >= 2 for count in shape):
+    if not all(type(count) is int and count >= 2 for count in shape):  # before sizes are made of them
         raise FileError(f"its grid has shape {shape}")
     # number of inputs, residuals: any; of a marched solution the kept times go first
     many, lead = (None,), () if marched is None else (marched,)
@@ -311,7 +312,7 @@ def _rebuild(header: dict, arrays: dict[str, np.ndarray]) -> Solution:
     stretch = tuple(pair and Sinh(*pair) for pair in about["stretch"])
     grid = Grid(
         arrays.pop("lo"), arrays.pop("hi"), tuple(about["shape"]), about["periodic"], tuple(about["names"]), stretch,
-        about.get("edges", "projected"),
+        about.get("edges", "projected"),  # older files have none, as all ends were projected
     )  # fmt: skip
     for name, kinds in KINDS.items():  # ``type`` and not ``isinstance``: true is no number of steps
         if type(header[name]) not in kinds:
@@ -326,6 +327,7 @@ def _check_query(solution: Solution, name: str, values: Array, trailing: int, wh
     if len(where) != 1 + marched:
         kind, call = ("marched over times", f"{name}(t, x)") if marched else ("stationary", f"{name}(x)")
         raise ValueError(f"Solution.{name}: got {len(where)} arguments; this solution is {kind}: call {call}")
+    # one axis too many is that of a batch, which interpolation would take for an axis of the grid
     shape, wanted = np.shape(values), solution.grid.shape
     if marched:
         wanted = np.shape(solution.times) + wanted

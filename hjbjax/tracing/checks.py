@@ -20,7 +20,7 @@ from hjbjax.tracing import indices
 OF_ACTION = ("drift", "cost", "noise")
 STATE_COSTS = ("exit_cost", "terminal_cost", "stopping_cost", "running_max")
 
-_ADVICE = (  # most special first: the two of the first row are kinds of the ConcretizationTypeError of the last
+_ADVICE = (  # most special first: a TracerBoolConversionError is a ConcretizationTypeError, too
     (
         (jax.errors.TracerBoolConversionError, jax.errors.NonConcreteBooleanIndexError),
         "decides by Python `if`, `and`, `min`, `max` or a mask on a traced value: use jnp.where (jnp.minimum, ...)",
@@ -82,6 +82,7 @@ def of_one_state(problem: Problem, n: int, meaning: str) -> None:
     def expect(name: str, wanted: str, fits: Callable[[tuple], bool]) -> None:
         _expect(problem, name, n, wanted, fits, "a scalar" if wanted == "()" else f"n = {n} is {meaning}")
 
+    # answers are remembered, so they must not depend on the precision that JAX is set to when first asked
     with jax.enable_x64(True):
         expect("drift", f"({n},)", lambda shape: shape == (n,))
         expect("noise", f"(), ({n},) or ({n}, k)", lambda shape: shape[:1] in ((), (n,)) and len(shape) <= 2)
@@ -100,6 +101,7 @@ def ill_posed(problem: Problem, has_rest: bool, grid: Grid) -> None:
     Raises:
       ValueError: there is no finite solution; with what would give one.
     """
+    # with any of these the costs of a path may be finite; whether they are, the solve will find out
     ends = (problem.target, problem.stopping_cost, problem.running_max)
     if problem.discount > 0 or has_rest or any(end is not None for end in ends):
         return
@@ -112,12 +114,12 @@ def ill_posed(problem: Problem, has_rest: bool, grid: Grid) -> None:
 
 
 def _middle(grid: Grid) -> str:
-    """The shape that puts a node in the middle of the box, said: even on a periodic axis, odd on another."""
+    """Advice on the shape that puts a node in the middle of the box: even on a periodic axis, odd on another."""
     shape = tuple(
         count - (count % 2 if cyclic else 1 - count % 2)
         for count, cyclic in zip(grid.shape, grid.periodic or (), strict=True)
     )
-    if shape == grid.shape or min(shape) < 2:
+    if shape == grid.shape or min(shape) < 2:  # one stands there already, or an axis of two points would lose one
         return ""
     return f".\nNo node stands in the middle of the box, as in 0 on [-1, 1]; shape={shape} puts one there"
 
@@ -187,6 +189,7 @@ def _probe(problem: Problem, name: str, n: int) -> tuple[int, ...] | str:
     function, names, said_call = getattr(problem, name), _names(problem, name), call(problem, name)
     lengths = _lengths(problem, n)
     _check_arity(problem, name)
+    # any exception may come out of a function of the user's: those of JAX get advice, those of shapes their first line
     try:
         verdict, outside, _ = _trace_once(function, names, tuple(lengths[letter] for letter in names))
     except Exception as error:
@@ -194,14 +197,13 @@ def _probe(problem: Problem, name: str, n: int) -> tuple[int, ...] | str:
         for kind, advice in _ADVICE:
             if isinstance(error, kind):
                 raise ValueError(f"{said_call} {advice}.\nIt is traced once on one state, with {fed}") from error
-        # JAX's own messages go on for pages; the first line names the operation and the shapes
         if isinstance(error, (TypeError, ValueError, IndexError)):
             said = (str(error).strip() or type(error).__name__).splitlines()[0]
             raise ValueError(f"{said_call} failed on one state, with {fed}:\n{said[:400]}") from error
         # an exception of the user's own making stays one, so that it can be caught by its type
         error.add_note(f"raised by {said_call}, traced on one state, with {fed}")
         raise
-    if outside is not None:
+    if outside is not None:  # no exception would ever come: see ``indices``
         raise ValueError(f"{said_call} asks for {outside}.\nJAX would take the nearest one, or none, without a word")
     return verdict
 
@@ -212,7 +214,7 @@ def _lengths(problem: Problem, n: int) -> dict[str, tuple[int, ...]]:
 
 
 def calls_back(problem: Problem, n: int) -> bool:
-    """Whether a function of a problem calls Python while it runs, where anything may happen."""
+    """True if a function of a problem calls Python while it runs, where anything may happen."""
     lengths = _lengths(problem, n)
     with jax.enable_x64(True):
         for name in (*OF_ACTION, "target", *STATE_COSTS):

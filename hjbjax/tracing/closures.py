@@ -46,7 +46,7 @@ def settled(problem: Problem, n: int, dtype: DType | None = None) -> Problem:
       dtype: the floating-point type inside a JAX transformation; ``None`` is that of ``float`` there.
     """
     names = [name for name in (*OF_ACTION, *OF_STATE) if callable(getattr(problem, name))]
-    names = [name for name in names if not _is_fixed(getattr(problem, name))]
+    names = [name for name in names if not _is_fixed(getattr(problem, name))]  # a trace takes about a millisecond
     if not names:
         return problem
     if not is_traced(problem):
@@ -55,7 +55,7 @@ def settled(problem: Problem, n: int, dtype: DType | None = None) -> Problem:
             found = {name: _trace(problem, name, n, np.dtype(np.float64)) for name in names}
         if not any(closed is not None and is_traced(closed.consts) for closed in found.values()):
             return altered(problem, **{name: _with_mark(getattr(problem, name), found[name]) for name in names})
-    # A number under differentiation shows only where it is alive: inside the transformation, in its own dtype.
+    # Tracers belong to the caller's transformation, so that these functions are traced inside it, in its dtype.
     kind = jnp.result_type(float) if dtype is None else jnp.dtype(dtype)
     found = {name: _trace(problem, name, n, kind) for name in names}
     return altered(problem, **{name: _with_closure_as_leaves(getattr(problem, name), found[name]) for name in names})
@@ -81,7 +81,7 @@ def with_settled_functions(front_door: Callable) -> Callable:
             given[first] = _settle_all(given[first], given[second].ndim, given.get("dtype"))
         if is_traced(given):
             return front_door(**given)
-        # Only here may a solve be cut in chunks, allocate and refuse by values: inside a trace it has one program.
+        # inside somebody's ``jit`` a problem of known numbers is still solved on the host, chunk by chunk
         with jax.core.eval_context():
             return front_door(**given)
 
@@ -94,7 +94,7 @@ def _settle_all(asked: object, n: int, dtype: DType | None) -> object:
         return settled(asked, n, dtype)
     if not isinstance(asked, Iterable):
         return asked
-    each = list(asked)
+    each = list(asked)  # once: it may be a generator
     return [settled(one, n, dtype) if isinstance(one, Problem) else one for one in each]
 
 
@@ -125,11 +125,14 @@ class Opened:
         """The function's result, with ``known`` the numbers it closed over and its leaves."""
         constants, leaves = known
         # a jaxpr wants the dtypes it was traced with, and a solve may have cast the leaves to float32 meanwhile
-        closed = self._typed(constants, self.jaxpr.constvars)
-        return jax.core.eval_jaxpr(self.jaxpr, closed, *self._typed((*leaves, *arguments), self.jaxpr.invars))[0]
+        closed = self._in_traced_dtypes(constants, self.jaxpr.constvars)
+        return jax.core.eval_jaxpr(
+            self.jaxpr, closed, *self._in_traced_dtypes((*leaves, *arguments), self.jaxpr.invars)
+        )[0]
 
     @staticmethod
-    def _typed(values: Iterable[Numbers], variables: Sequence[jex.Var]) -> list[jax.Array]:
+    def _in_traced_dtypes(values: Iterable[Numbers], variables: Sequence[jex.Var]) -> list[jax.Array]:
+        """Numbers in the dtypes of variables."""
         return [
             jnp.asarray(value, cast(jax.core.ShapedArray, var.aval).dtype)
             for value, var in zip(values, variables, strict=True)
@@ -145,9 +148,10 @@ def _with_closure_as_leaves(function: Partial, closed: jex.ClosedJaxpr | None) -
 
 
 def _is_fixed(thing: object, depth: int = 8) -> bool:
-    """Whether a part of a problem reads nothing from outside but library code, so that it never computes otherwise."""
+    """True if a part of a problem reads nothing from outside but library code, so that it never computes otherwise."""
     if depth == 0:  # functions that call each other have no end; False costs a trace and is never wrong
         return False
+    # numbers beside the leaves cannot change: a Partial keeps its own, and a dataclass of JAX's is frozen or copied
     if thing is None or isinstance(thing, (bool, int, float, str, np.generic, np.ndarray, jax.Array)):
         return True  # the arrays are leaves
     if isinstance(thing, Partial):
@@ -162,7 +166,7 @@ def _is_fixed(thing: object, depth: int = 8) -> bool:
 
 
 def _reads_no_variables(function: types.FunctionType, depth: int) -> bool:
-    """Whether a function's globals are library code, or functions of which that is true."""
+    """True if a function's globals are library code, or functions of which that is true."""
     if function.__closure__ or function.__kwdefaults__:  # cells can be rebound, and dictionaries written to
         return False
     if not all(isinstance(each, (int, float, str, type(None))) for each in function.__defaults__ or ()):
@@ -182,7 +186,7 @@ def _names(code: types.CodeType) -> set[str]:
 
 
 def _is_library(thing: object) -> bool:
-    """Whether a global is a module, a function or a class of a library that nobody changes between two solves."""
+    """True if a global is a module, a function or a class of a library that nobody changes between two solves."""
     home = thing.__name__ if isinstance(thing, types.ModuleType) else getattr(thing, "__module__", None)
     fixed = isinstance(thing, types.ModuleType) or callable(thing)
     return fixed and isinstance(home, str) and home.split(".")[0] in LIBRARIES
@@ -205,12 +209,13 @@ def _trace(problem: Problem, name: str, n: int, dtype: DType) -> jex.ClosedJaxpr
 
     try:
         return jax.make_jaxpr(of_leaves)(leaves, *arguments)
-    except Exception:
+    except Exception:  # whatever the user's code raises
         return None
 
 
 def _with_mark(function: Partial, closed: jex.ClosedJaxpr | None) -> Partial:
     """The function with the mark of its trace; where there is none it equals no other."""
+    # a problem that is solved twice is marked twice: marks of marks would grow without end
     inner = function.func.__wrapped__ if isinstance(function.func, Marked) else function.func
     mark = object() if closed is None else fingerprint(closed)
     return Partial(Marked(inner, mark), *function.args, **function.keywords)
@@ -257,7 +262,7 @@ def _feed(digest: hashlib.blake2b, jaxpr: jex.Jaxpr, consts: Iterable[Numbers]) 
         operands, results = (jaxpr.outvars, ()) if eqn is None else (eqn.invars, eqn.outvars)
         tell("" if eqn is None else eqn.primitive.name)
         for operand in operands:
-            if isinstance(operand, jex.Literal):
+            if isinstance(operand, jex.Literal):  # a number in the code, of which no variable tells
                 number(operand.val)
             else:
                 tell(numbers.get(operand, -1))

@@ -63,6 +63,7 @@ def trace(function: Callable, *arguments: Any, dtype: DType) -> tuple[jex.Closed
     """The jaxpr of ``function`` on one state, and the arguments as object arrays."""
     packed = [pack(argument) for argument in arguments]
     shapes = [jax.ShapeDtypeStruct(entries.shape, dtype) for entries in packed]
+    # traced with every call: ``function`` may read something that has changed since the last one
     closed = jax.make_jaxpr(function)(*shapes)
     if (outside := indices.beyond(closed)) is not None:  # inside jit, where nobody has looked before
         raise ValueError(f"a function of one state asks for {outside}")
@@ -128,7 +129,7 @@ class _Arrays:
         """Results of one equation at every node, by ``vmap`` over the flattened nodes."""
         varying = [is_components(value) for value in operands]
         shapes = [np.shape(entry) for value, v in zip(operands, varying, strict=True) if v for entry in value.flat]
-        nodes = np.broadcast_shapes(*shapes)
+        nodes = np.broadcast_shapes(*shapes)  # of axes along which an operand varies: others stay of length 1
 
         def gather(value, aval):  # entries that are arrays over the nodes, as one array (nodes, *shape of the operand)
             entries = [jnp.broadcast_to(jnp.asarray(entry, aval.dtype), nodes).reshape(-1) for entry in value.flat]
@@ -137,7 +138,7 @@ class _Arrays:
         arguments = [
             gather(value, var.aval) if v else value for value, v, var in zip(operands, varying, eqn.invars, strict=True)
         ]
-        axes = [0 if v else None for v in varying]
+        axes = [0 if v else None for v in varying]  # what holds at all nodes is not copied to each
         results = jax.vmap(lambda *one: bind(eqn, list(one)), in_axes=axes)(*arguments)
         return [  # results (nodes, *shape), taken apart into one array (*grid) an entry
             object_array(

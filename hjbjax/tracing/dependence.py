@@ -41,11 +41,11 @@ class Dependence:
 
     @property
     def is_constant(self) -> bool:
-        """Whether no entry depends on the control."""
+        """True if no entry depends on the control."""
         return not any(term for entry in self.entries for term in entry)
 
     def affine_in(self, inputs: Sequence[int]) -> bool:
-        """Whether every entry is affine in these inputs together, whatever the others are."""
+        """True if every entry is affine in these inputs together, whatever the others are."""
         wanted = set(inputs)
 
         # u₀u₀ is (0, 0) and counts twice; no function of unknown kind may hold any of the inputs
@@ -55,7 +55,7 @@ class Dependence:
         return all(fits(term) for entry in self.entries for term in entry)
 
     def separable_quadratic_in(self, inputs: Sequence[int]) -> bool:
-        """Whether every entry is a sum of quadratic polynomials of one of these inputs each."""
+        """True if every entry is a sum of quadratic polynomials of one of these inputs each."""
         wanted = set(inputs)
 
         # as a set (0, 0) is one input, so that squares pass and products of two inputs do not
@@ -65,7 +65,7 @@ class Dependence:
         return all(fits(term) for entry in self.entries for term in entry)
 
     def free_of(self, inputs: Sequence[int]) -> bool:
-        """Whether no entry depends on these inputs."""
+        """True if no entry depends on these inputs."""
         return not self.driven_by(inputs)
 
     def driven_by(self, inputs: Sequence[int]) -> tuple[int, ...]:
@@ -74,11 +74,12 @@ class Dependence:
         return tuple(i for i, entry in enumerate(self.entries) if any(wanted & set(term) for term in entry))
 
     def crosses(self, first: Sequence[int], second: Sequence[int]) -> bool:
-        """Whether some term holds inputs of both, so that the function is no sum of a part each."""
+        """True if some term holds inputs of both, so that the function is no sum of a part each."""
         return any(set(term) & set(first) and set(term) & set(second) for entry in self.entries for term in entry)
 
     def has_square(self, inputs: Sequence[int]) -> bool:
-        """Whether some entry holds a second power of one of ``inputs``."""
+        """True if some entry holds a second power of one of ``inputs``."""
+        # a term of unknown kind is none: it is a frozenset, and no minimiser of quadratics takes it
         return any((j, j) in entry for entry in self.entries for j in inputs)
 
 
@@ -98,7 +99,7 @@ def dependence(function: Callable, *arguments: tuple[int | None, bool], dtype: D
     for (_, counts), shape in zip(arguments, shapes, strict=True):
         entries = np.empty(shape.shape, dtype=object)
         for index in np.ndindex(*shape.shape):
-            entries[index] = frozenset({(number,)}) if counts else CONSTANT
+            entries[index] = frozenset({(number,)}) if counts else CONSTANT  # the input alone, or no input
             number += counts
         packed.append(entries)
     (result,) = evaluate(closed, packed, _POLYNOMIALS)
@@ -148,7 +149,7 @@ class _Polynomials:
             return operands[0] | operands[1]
         if name == "mul":
             return _product(*operands)
-        if name == "div" and operands[1] == CONSTANT:
+        if name == "div" and operands[1] == CONSTANT:  # by something that no input enters; u₀/u₁ is no polynomial
             return operands[0]
         if name == "square" or (name == "integer_pow" and params["y"] == 2):
             return _product(operands[0], operands[0])
@@ -160,7 +161,7 @@ class _Polynomials:
         return _some_function(operands)
 
     def combine(self, operation: Callable, dtype: np.dtype, left: Terms, right: Terms) -> Terms:
-        if operation is jax.lax.add:
+        if operation is jax.lax.add:  # what ``reduce_sum``, ``cumsum`` and products of matrices are made of
             return left | right
         if operation is jax.lax.mul:
             return _product(left, right)
@@ -182,7 +183,7 @@ class _Polynomials:
 
 
 def _rounds(dtype: DType) -> bool:
-    """Whether numbers become coarse steps in this type: integers, and floating point of 16 bits or fewer."""
+    """True if numbers become coarse steps in this type: integers, and floating point of 16 bits or fewer."""
     return not np.issubdtype(dtype, np.inexact) or np.finfo(dtype).bits < 32
 
 

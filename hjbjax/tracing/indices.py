@@ -63,7 +63,7 @@ def beyond(closed: jex.ClosedJaxpr, names: Sequence[str] = ()) -> str | None:
 
 
 def calls_back(closed: jex.ClosedJaxpr) -> bool:
-    """Whether a jaxpr calls Python while it runs."""
+    """True if a jaxpr calls Python while it runs."""
     return any("callback" in eqn.primitive.name or any(map(calls_back, _inner(eqn))) for eqn in closed.jaxpr.eqns)
 
 
@@ -81,13 +81,14 @@ def _walk(
     for eqn in jaxpr.eqns:
         known = [look(var) for var in eqn.invars]
         first = eqn.invars[0] if eqn.invars else None
+        # an array is called by its name as long as it is the argument itself, also inside an inner ``jit``
         name = None if first is None or isinstance(first, jex.Literal) else called.get(first)
         if (found := _outside(eqn, known, name)) is not None:
             return [], found
         results: Sequence[Any] = [None] * len(eqn.outvars)
         passed = [None if isinstance(var, jex.Literal) else called.get(var) for var in eqn.invars]
         inner = _inner(eqn)
-        if eqn.primitive.name == "scan":  # of a body, one turn would say nothing about a counter that it carries
+        if eqn.primitive.name == "scan":  # its counters are known turn by turn, and unknown in the body as such
             inner, (results, found) = [], _walk_turns(eqn, known, passed)
             if found is not None:
                 return [], found
@@ -170,6 +171,7 @@ def _outside(eqn: jex.JaxprEqn, known: list[np.ndarray | None], name: str | None
         sizes = eqn.params["slice_sizes"]
     elif kind == "dynamic_update_slice":
         columns, sizes = dict(enumerate(known[2 : 2 + len(shape)])), array_type(eqn.invars[1]).shape
+    # ``x.at[i].get(mode="fill", fill_value=0)`` asks for entries outside on purpose
     elif kind == "gather" and not _has_stand_in(eqn.params.get("fill_value")):
         columns, sizes = _columns(known[1], eqn.params["dimension_numbers"].start_index_map), eqn.params["slice_sizes"]
     elif kind.startswith("scatter"):
@@ -188,7 +190,7 @@ def _outside(eqn: jex.JaxprEqn, known: list[np.ndarray | None], name: str | None
 
 
 def _has_stand_in(fill: float | None) -> bool:
-    """Whether a gather was given a number for entries outside; NaN is what JAX takes unasked."""
+    """True if a gather was given a number for entries outside; NaN is what JAX takes unasked."""
     return fill is not None and not np.isnan(fill)
 
 

@@ -61,7 +61,7 @@ def object_array(entries: Sequence[Any], shape: tuple[int, ...]) -> np.ndarray:
 
 
 def is_components(value: object) -> TypeGuard[np.ndarray]:
-    """Whether an operand is an object array, one that may vary from node to node."""
+    """True if an operand is an object array, one that may vary from node to node."""
     return isinstance(value, np.ndarray) and value.dtype == object
 
 
@@ -147,7 +147,7 @@ def bind(eqn: jex.JaxprEqn, operands: Sequence[Operand]) -> list:
 
 
 def _are_known(values: Iterable[Operand]) -> bool:
-    """Whether all are concrete numbers that hold at all nodes."""
+    """True if all are concrete numbers that hold at all nodes."""
     return not any(is_components(value) or isinstance(value, jax.core.Tracer) for value in values)
 
 
@@ -156,7 +156,7 @@ def _move(eqn: jex.JaxprEqn, operands: list, algebra: Algebra) -> list[np.ndarra
     data = set(MOVES[eqn.primitive.name](len(operands)))
     if not _are_known([value for position, value in enumerate(operands) if position not in data]):
         return None
-    pool: list[Any] = []  # label k stands for the entry pool[k], of whichever operand it came
+    pool: list[Any] = []  # label k stands for the entry pool[k], from whichever operand it came
     labelled = list(operands)
     for position in sorted(data):
         entries = lift(operands[position], algebra)
@@ -200,6 +200,7 @@ def _branch(eqn: jex.JaxprEqn, operands: list, algebra: Algebra) -> list:
     branches = eqn.params["branches"]
     if _are_known([index]):
         return evaluate(branches[int(np.clip(index, 0, len(branches) - 1))], rest, algebra)  # JAX clamps it, too
+    # all branches are evaluated, and ``select_n`` takes one entry: a NaN in another stays out of the value
     index = lift(index, algebra).item()
     outputs = [[lift(value, algebra) for value in evaluate(branch, rest, algebra)] for branch in branches]
     results = []
@@ -229,6 +230,7 @@ def _reduce(eqn: jex.JaxprEqn, entries: np.ndarray, algebra: Algebra) -> np.ndar
         return lift(_bind_uniform(eqn, [np.zeros(entries.shape, array_type(eqn.invars[0]).dtype)])[0], algebra)
     rows = entries.transpose(*kept, *axes).reshape(math.prod(shape), -1)
     combine = functools.partial(algebra.combine, REDUCTIONS[eqn.primitive.name], array_type(eqn.invars[0]).dtype)
+    # from the left, in one order for all nodes; XLA's own reductions may take another and round otherwise
     return object_array([functools.reduce(combine, row) for row in rows], shape)
 
 
@@ -236,7 +238,7 @@ def _accumulate(eqn: jex.JaxprEqn, entries: np.ndarray, algebra: Algebra) -> np.
     """Running sums, products, maxima ... along one axis."""
     axis, step = eqn.params["axis"], -1 if eqn.params["reverse"] else 1
     combine = functools.partial(algebra.combine, CUMULATIVE[eqn.primitive.name], array_type(eqn.invars[0]).dtype)
-    rows = np.moveaxis(entries, axis, -1)[..., ::step]
+    rows = np.moveaxis(entries, axis, -1)[..., ::step]  # turned about for a reverse sum, and back at the end
     result = np.empty(rows.shape, dtype=object)
     for index in np.ndindex(*rows.shape[:-1]):
         result[index] = object_array(list(itertools.accumulate(rows[index], combine)), rows.shape[-1:])

@@ -165,7 +165,7 @@ def _unit_ball(dim: int, budget: int) -> np.ndarray:
         signs = np.array(list(itertools.product((-1.0, 0.0, 1.0), repeat=dim)))
         signs = signs[np.any(signs != 0, axis=1)]
         sphere = signs / np.linalg.norm(signs, axis=1, keepdims=True)
-    # so that no radius is farther than a quarter from a sample's
+    # every |u| ≤ 1 is then within a quarter of a sample's
     return np.concatenate([np.zeros((1, dim)), 0.5 * sphere, sphere])
 
 

@@ -104,7 +104,7 @@ def noting_interrupts(clock: Clock) -> Iterator[None]:
     def note(number: int, frame: FrameType | None) -> None:
         for each in _running:
             each.interrupted = True
-        give_back()  # so that a second Ctrl-C gets out of a compilation that takes minutes
+        give_back()  # a second Ctrl-C is the usual KeyboardInterrupt
 
     # a Ctrl-C that fell between two inner runs was noted on the outer clock
     clock.interrupted |= any(each.interrupted for each in _running)

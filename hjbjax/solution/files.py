@@ -109,7 +109,7 @@ def _write_members(file: IO[bytes], members: Mapping[str, np.ndarray]) -> None:
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         for name, array in members.items():
             info = zipfile.ZipInfo(name + ".npy")  # dated 1980: equal solutions make equal files
-            # zip64, as an entry that is written piece by piece may pass 4 GiB when its header stands already
+            # zip64, as an entry that is written piece by piece may pass 2 GiB when its header stands already
             with archive.open(info, "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, np.asarray(array, order="C"), allow_pickle=False)
 
@@ -179,7 +179,7 @@ def _read_archive(file: IO[bytes], size: int, form: str, version: int, plan: Cal
     """Header and arrays of an archive: first what it claims is checked, then the arrays are read."""
     if size == 0:
         raise FileError("it is empty")
-    start = file.read(4)  # every zip archive that is not empty begins with PK\3\4, a pickle since 2003 with \x80
+    start = file.read(4)  # a zip archive with entries begins with PK\3\4, a pickle of protocol 2 or later with \x80
     if start != b"PK\3\4":
         what = "a pickle, which may run code and is never opened" if start[:1] == b"\x80" else "no npz file"
         raise FileError(f"it is {what}; wanted a file written by save()")
@@ -213,7 +213,7 @@ def _members(archive: zipfile.ZipFile, size: int) -> dict[str, zipfile.ZipInfo]:
     if len(members) != len(archive.infolist()):
         raise FileError("an entry is there twice")
     for name, info in members.items():
-        # a few kB may unpack to terabytes; what is stored as it is takes as many bytes of the file. Bit 0: encrypted
+        # a few kB may unpack to gigabytes; what is stored as it is takes as many bytes of the file. Bit 0: encrypted
         if info.compress_type != zipfile.ZIP_STORED or info.flag_bits & 1:
             raise FileError(f"entry {name!r} is compressed or encrypted: not a file written by save()")
         if info.file_size != info.compress_size:

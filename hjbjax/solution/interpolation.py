@@ -95,7 +95,7 @@ def _moment(times: Array, t: Any, dtype: DType, name: str) -> Moment:
     inside = (t >= times[0] - slack) & (t <= times[-1] + slack)
     if len(times) == 1:
         return Moment(jnp.zeros(t.shape, int), jnp.zeros(t.shape, dtype), inside)
-    # at a kept time the interval behind it, at the last one that before it: there is no other
+    # a kept time counts to the interval that begins there, the last one to the interval that ends there
     before = jnp.clip(jnp.searchsorted(times, t, side="right") - 1, 0, len(times) - 2)
     share = (t - times[before]) / (times[before + 1] - times[before])
     return Moment(before, jnp.clip(share, 0, 1), inside & ~jnp.isnan(t))
@@ -245,11 +245,11 @@ def extended(grid: Grid, values: Array, enumerated: bool) -> Any:
 
 
 def _layers(dtype: np.dtype, values: Array, when: Moment | None) -> list[Layer]:
-    """The kept times before and behind a moment, with their weights; one layer of a stationary function."""
+    """The kept times before and after a moment, with their weights; one layer of a stationary function."""
     if when is None:
         return [(jnp.ones((), dtype), ())]
-    behind = jnp.minimum(when.before + 1, values.shape[0] - 1)  # of a single kept time that one, with weight 0
-    return [(1 - when.share, (when.before,)), (when.share, (behind,))]
+    after = jnp.minimum(when.before + 1, values.shape[0] - 1)  # of a single kept time that one, with weight 0
+    return [(1 - when.share, (when.before,)), (when.share, (after,))]
 
 
 Corner: TypeAlias = tuple[jax.Array, jax.Array, jax.Array]  # weight and flag (...), values (..., *entries)

@@ -29,7 +29,7 @@ class FileError(OSError):
     """A result file that could not be written or read; the message names the path and the reason."""
 
 
-def path_of(path: object, done: str) -> str:
+def path_of(path: Path, done: str) -> str:
     """The name of a file as text.
 
     Args:
@@ -40,7 +40,7 @@ def path_of(path: object, done: str) -> str:
       FileError: no path at all, or one with a null byte, which no system takes.
     """
     try:
-        text = os.fsdecode(path)  # type: ignore[arg-type]
+        text = os.fsdecode(path)
     except TypeError:
         raise FileError(f"{path!r:.80}: cannot be {done}: it is no path; wanted the name of a file") from None
     if "\0" in text:

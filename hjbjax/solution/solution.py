@@ -107,7 +107,7 @@ class Solution:
     message: str = ""
 
     def __post_init__(self):
-        if isinstance(self.code, Status):  # a leaf must be a number to JAX, and an enumeration is none
+        if isinstance(self.code, Status):
             object.__setattr__(self, "code", int(self.code))
 
     @property

@@ -63,7 +63,7 @@ def trace(function: Callable, *arguments: Any, dtype: DType) -> tuple[jex.Closed
     """The jaxpr of ``function`` on one state, and the arguments as object arrays."""
     packed = [pack(argument) for argument in arguments]
     shapes = [jax.ShapeDtypeStruct(entries.shape, dtype) for entries in packed]
-    # traced with every call: ``function`` may read something that has changed since the last one
+    # JAX remembers traces by function, also where a global has changed since: hence the marks of ``closures``
     closed = jax.make_jaxpr(function)(*shapes)
     if (outside := indices.beyond(closed)) is not None:  # inside jit, where nobody has looked before
         raise ValueError(f"a function of one state asks for {outside}")

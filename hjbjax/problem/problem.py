@@ -90,7 +90,7 @@ class Problem:
         if not callable(drift):
             raise TypeError(f"Problem.drift: got {drift!r}, wanted a function (x, u) -> (n,)")
         _check_sets(controls, disturbances)
-        # the words are part of the structure, and a compiled program has one order of min and max
+        # static: the order of min and max is part of a compiled program
         if isaacs not in ("upper", "lower"):
             raise ValueError(f"Problem.isaacs: got {isaacs!r}, wanted 'upper' (min max) or 'lower' (max min)")
         discount = _rate(discount)
@@ -122,7 +122,7 @@ class Problem:
             # in the structure, as ``jit`` hides numbers: which certificate holds must be known while compiling
             "discounted": None if is_traced(discount) else bool(discount > 0),
         }
-        for name, value in fields.items():  # the dataclass is frozen
+        for name, value in fields.items():
             object.__setattr__(self, name, value)
 
     @property
@@ -174,7 +174,6 @@ def _check_sets(controls: object, disturbances: object) -> None:
 def _rate(discount: object) -> Number:
     """The discount as a float, or the tracer that stands for it."""
     rate = numbers(discount, "Problem.discount")
-    # a tracer has no value that could be compared
     if np.ndim(rate) != 0 or (isinstance(rate, np.ndarray) and not 0 <= rate < np.inf):
         raise ValueError(f"Problem.discount: got {discount!r}, wanted a finite number ≥ 0")
     return float(rate) if isinstance(rate, np.ndarray) else rate

@@ -54,7 +54,6 @@ class Box:
         if isinstance(lo, np.ndarray) and isinstance(hi, np.ndarray) and np.any(lo > hi):
             axis = int(np.argmax(lo > hi))
             raise ValueError(f"Box: no admissible control: input {axis} has lo = {lo[axis]:g} > hi = {hi[axis]:g}")
-        # as arrays of float64; the dataclass is frozen
         object.__setattr__(self, "lo", lo)
         object.__setattr__(self, "hi", hi)
 
@@ -165,7 +164,7 @@ def _unit_ball(dim: int, budget: int) -> np.ndarray:
         signs = np.array(list(itertools.product((-1.0, 0.0, 1.0), repeat=dim)))
         signs = signs[np.any(signs != 0, axis=1)]
         sphere = signs / np.linalg.norm(signs, axis=1, keepdims=True)
-    # every |u| ≤ 1 is then within a quarter of a sample's
+    # centre, half way and rim: the size |u| of any control is within ¼ of some sample's
     return np.concatenate([np.zeros((1, dim)), 0.5 * sphere, sphere])
 
 

@@ -38,21 +38,21 @@ def positive(value: T, name: str, unit: str = "", *, most: float = math.inf, end
     return value
 
 
-def count(value: Any, name: str, least: int = 1) -> int:
+def count(value: object, name: str, least: int = 1) -> int:
     """The value, unless it is not an integer of at least ``least``.
 
     Raises:
       ValueError: too small, a float, a truth value, no number at all.
     """
-    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-    if not whole or value < least:
+    # True is an integer to Python, and three steps given as 3.0 are more likely a slip than a count
+    if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < least:
         wanted = "a positive integer" if least == 1 else f"an integer of at least {least}"
         raise ValueError(f"{name} = {shown(value)}; wanted {wanted}")
     return int(value)
 
 
-def one_of(value: Any, name: str, kinds: tuple[type, ...], wanted: str) -> None:
-    """Refuse a choice of another kind.
+def one_of(value: object, name: str, kinds: tuple[type, ...], wanted: str) -> None:
+    """Refuse a value that is none of the admissible kinds.
 
     Raises:
       TypeError: ``value`` is an instance of none of the ``kinds``, which ``wanted`` spells out.
@@ -61,12 +61,12 @@ def one_of(value: Any, name: str, kinds: tuple[type, ...], wanted: str) -> None:
         raise TypeError(f"{name} is {shown(value)}; wanted {wanted}")
 
 
-def is_number(value: Any) -> bool:
-    """Whether ``value`` is one real number; truth values and text that looks like one are none."""
+def is_number(value: object) -> bool:
+    """True if ``value`` is one real number; truth values and text that looks like one are none."""
     if isinstance(value, (bool, str, bytes)) or value is None:
         return False
-    if isinstance(value, int):  # of any size that a float has
-        return value.bit_length() < 1024
+    if isinstance(value, int):  # NumPy keeps one of 10^20 as an object, so that it is judged by itself
+        return value.bit_length() < 1024  # below 2^1023, where float() cannot overflow
     try:
         array = np.asarray(value)
     except (TypeError, ValueError):  # a ragged list, an object that fails on its way to an array
@@ -74,7 +74,7 @@ def is_number(value: Any) -> bool:
     return array.ndim == 0 and array.dtype.kind in "fiu"
 
 
-def shown(value: Any) -> str:
-    """How a value is quoted in a refusal: its ``repr``, one line, not too long."""
+def shown(value: object) -> str:
+    """A value as a refusal quotes it: its ``repr`` in one line of at most ``SHOWN`` characters."""
     text = " ".join(repr(value).split())
     return text if len(text) <= SHOWN else text[: SHOWN - 4] + " ..."

@@ -18,12 +18,11 @@ import numpy as np
 from hjbjax.problem import grid_arguments
 from hjbjax.problem.pytree import altered, is_traced, pytree_dataclass
 from hjbjax.problem.stretching import Stretching
+from hjbjax.problem.types import Array, DType, Number, Numbers, States
 
 ROUNDINGS = 16  # units of eps of the largest coordinate by which the formula may miss its table
-
-
 COINCIDING = 16  # units in the last place of a coordinate, of which a spacing must be more
-TABLED = 2**24  # points of an axis whose coordinates are kept; a grid that is refused must not allocate them before
+TABLED = 2**24  # points of an axis whose coordinates are kept, 128 MiB; a grid too large must not allocate them before
 
 
 @pytree_dataclass(static=("shape", "periodic", "names", "edges"))
@@ -76,7 +75,7 @@ class Grid:
                 "wanted one entry an axis in each".format(*lengths)
             )
         grid_arguments.check_stretch(stretch, periodic)
-        if isinstance(lo, np.ndarray) and isinstance(hi, np.ndarray):
+        if isinstance(lo, np.ndarray) and isinstance(hi, np.ndarray):  # traced corners cannot be compared
             for axis, (low, high) in enumerate(zip(lo, hi, strict=True)):
                 if not (math.isfinite(low) and math.isfinite(high) and low < high):
                     raise ValueError(f"Grid: axis {axis} runs from {low:g} to {high:g}; wanted finite lo < hi")
@@ -86,18 +85,18 @@ class Grid:
         }  # fmt: skip
         for name, value in checked.items():
             object.__setattr__(self, name, value)
-        tables = (self._computed(axis) if count <= TABLED else None for axis, count in enumerate(shape))
+        tables = (self._by_formula(axis) if count <= TABLED else None for axis, count in enumerate(shape))
         object.__setattr__(self, "coordinates", tuple(tables))
-        self.check_spacings(np.float64)
+        self.check_spacings(np.float64)  # a solve asks again in its own dtype, which may be float32
 
-    def check_spacings(self, dtype: Any) -> None:
+    def check_spacings(self, dtype: DType) -> None:
         """Refuse nodes that coincide up to rounding in ``dtype``: differences of values would be rounding as well.
 
         Raises:
           ValueError: with the axis and its ends.
         """
         for axis, nodes in enumerate(self.coordinates):
-            if not isinstance(nodes, np.ndarray):
+            if not isinstance(nodes, np.ndarray):  # traced, or too many to be kept
                 continue
             largest = max(abs(nodes[0]), abs(nodes[-1]))
             if np.min(np.diff(nodes)) <= COINCIDING * np.finfo(dtype).eps * largest:
@@ -120,7 +119,7 @@ class Grid:
 
     def sides(self, kind: str) -> list[tuple[int, int]]:
         """The sides of the box with ends of this kind: pairs of an axis and a step, −1 lower and 1 upper."""
-        ends = ((axis, pair) for axis, pair in enumerate(self.edges) if pair is not None)
+        ends = ((axis, pair) for axis, pair in enumerate(self.edges) if pair is not None)  # None: a periodic axis
         return [(axis, step) for axis, pair in ends for step, name in zip((-1, 1), pair, strict=True) if name == kind]
 
     @property
@@ -133,27 +132,29 @@ class Grid:
         """The number M of intervals between ``lo`` and ``hi``."""
         return self.shape[axis] if self.periodic[axis] else self.shape[axis] - 1  # type: ignore[index]
 
-    def spacing(self, axis: int) -> Any:
+    def spacing(self, axis: int) -> Number:
         """The distance h between neighbours along ``axis``; their mean on a stretched one."""
         return (self.hi[axis] - self.lo[axis]) / self.intervals(axis)
 
-    def axis(self, axis: int, dtype: Any = None) -> Any:
+    def axis(self, axis: int, dtype: DType | None = None) -> Array:
         """The coordinates of the nodes along one axis, shape (N,); the same numbers in every program."""
-        computed, table = self._computed(axis), self.coordinates[axis]
+        computed, table = self._by_formula(axis), self.coordinates[axis]
         table = computed if table is None else table
+        # NumPy as long as nothing is traced, also inside ``jit``, where the table then is a constant
         if is_traced(computed, table):
-            return _tabled(*(jnp.asarray(each, dtype or jnp.result_type(float)) for each in (computed, table)))
+            return _from_table(*(jnp.asarray(each, dtype or jnp.result_type(float)) for each in (computed, table)))
         return np.asarray(table, dtype or np.float64)
 
-    def _computed(self, axis: int) -> Any:
+    def _by_formula(self, axis: int) -> Array:
         """The coordinates by the formula, in NumPy where the corners are known numbers."""
-        index, last = np.arange(self.shape[axis], dtype=np.float64), self.intervals(axis)
+        index: Array = np.arange(self.shape[axis], dtype=np.float64)
+        last = self.intervals(axis)
         stretching = self.stretch[axis]  # type: ignore[index]
         if stretching is not None:
             index = last * stretching.place(index / last)
         return (self.lo[axis] * (last - index) + self.hi[axis] * index) / last
 
-    def components(self, dtype: Any) -> list[jax.Array]:
+    def components(self, dtype: DType) -> list[jax.Array]:
         """The coordinates as n arrays, the i-th of which varies along axis i alone and broadcasts."""
         columns = []
         for axis, count in enumerate(self.shape):
@@ -176,6 +177,7 @@ class Grid:
         for axis in range(self.ndim):
             if not self.periodic[axis]:  # type: ignore[index]
                 nodes, lo, hi = np.asarray(self.axis(axis)), float(self.lo[axis]), float(self.hi[axis])
+                # a node that lies on the rim belongs to the middle, whichever way its coordinate was rounded
                 near = np.abs(nodes - (lo + hi) / 2) <= share * (hi - lo) / 2 * (1 + 1e-9)
                 inside &= near.reshape([-1 if i == axis else 1 for i in range(self.ndim)])
         return inside
@@ -188,21 +190,24 @@ class Grid:
         total = np.ones(())
         for axis, count in enumerate(self.shape):
             gaps = np.diff(np.append(np.asarray(self.axis(axis)), self.hi[axis] if self.periodic[axis] else []))  # type: ignore[index]
+            # Each gap gives half to the node before and half to the one behind it. On a periodic axis there are as many
+            # gaps as nodes and the two slices are one, which is right as such an axis is uniform.
             share = np.zeros(count)
             share[: len(gaps)] += gaps / 2
             share[-len(gaps) :] += gaps / 2
             total = np.multiply.outer(total, share)
         return total
 
-    def wrap(self, x: Any) -> Any:
+    def wrap(self, x: States) -> jax.Array:
         """States with their periodic entries brought into [lo, hi); the others as they are."""
         x = _states(x)
         lo, hi = jnp.asarray(self.lo, x.dtype), jnp.asarray(self.hi, x.dtype)
         moved = lo + jnp.mod(x - lo, hi - lo)
         moved = jnp.where(moved >= hi, lo, moved)  # just below lo, the remainder rounds up to a whole period
+        # a state in [lo, hi) keeps its bits: the remainder of a small difference would be rounded
         return jnp.where(np.array(self.periodic) & ~((x >= lo) & (x < hi)), moved, x)
 
-    def interpolate(self, values: Any, x: Any, *, clamp: bool = False) -> jax.Array:
+    def interpolate(self, values: Array, x: States, *, clamp: bool = False) -> jax.Array:
         """Multilinear interpolation of node values, second order; jit- and vmap-able.
 
         Args:
@@ -220,10 +225,10 @@ class Grid:
             raise ValueError(f"Grid: got values of shape {values.shape}, wanted {self.shape} first: one a node")
         x = self.wrap(x)
         cells, fractions, inside = zip(*(self._locate(axis, x[..., axis]) for axis in range(self.ndim)), strict=True)
-        trailing = (1,) * (values.ndim - self.ndim)
+        trailing = (1,) * (values.ndim - self.ndim)  # weights are per state, values may be vectors
         total = jnp.zeros((), x.dtype)
         for corner in np.ndindex(*(2,) * self.ndim):
-            weight = jnp.ones((), x.dtype)
+            weight = jnp.ones((), x.dtype)  # w_c = Π_i (s_i or 1 − s_i)
             for fraction, bit in zip(fractions, corner, strict=True):
                 weight = weight * (fraction if bit else 1 - fraction)
             index = tuple((cell + bit) % count for cell, bit, count in zip(cells, corner, self.shape, strict=True))
@@ -234,7 +239,7 @@ class Grid:
         return jnp.where(hidden.reshape(hidden.shape + trailing), jnp.nan, total)
 
     def _locate(self, axis: int, x: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """The node below ``x``, the fraction of the way to the next, and whether ``x`` lies in the box."""
+        """The node below ``x``, the fraction of the way to the next, and a flag: True if ``x`` lies in the box."""
         lo, hi, last = jnp.asarray(self.lo[axis], x.dtype), jnp.asarray(self.hi[axis], x.dtype), self.intervals(axis)
         place = (x - lo) / (hi - lo)
         if self.stretch[axis] is not None:  # type: ignore[index]
@@ -251,30 +256,34 @@ class Grid:
         return cell, place - cell, inside
 
     def _locate_stretched(self, axis: int, x: jax.Array, place: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """The same on a stretched axis: the cell by the inverse map, the fraction by the coordinates of its ends."""
-        slack = 64 * jnp.finfo(x.dtype).eps
+        """Node, fraction and flag on a stretched axis: the cell by φ⁻¹, the fraction by the coordinates of its ends."""
+        slack = 64 * jnp.finfo(x.dtype).eps  # of the whole axis, as ``place`` runs from 0 to 1
         inside = (place >= -slack) & (place <= 1 + slack)
         nodes, last = jnp.asarray(self.axis(axis), x.dtype), self.intervals(axis)
         guess = last * self.stretch[axis].fraction(jnp.clip(jnp.nan_to_num(place), 0, 1))  # type: ignore[index, union-attr]
         cell = jnp.clip(jnp.floor(jax.lax.stop_gradient(guess)).astype(int), 0, last - 1)
-        cell = jnp.clip(cell + (x >= nodes[cell + 1]) - (x < nodes[cell]), 0, last - 1)  # rounding of the inverse map
+        # the inverse map is off by rounding, and its cell by one at most: the coordinates decide
+        cell = jnp.clip(cell + (x >= nodes[cell + 1]) - (x < nodes[cell]), 0, last - 1)
         fraction = (x - nodes[cell]) / (nodes[cell + 1] - nodes[cell])
         fraction = jnp.nan_to_num(fraction)  # a clip would halve the derivative on a node, where it is 0 or 1
         return cell, jnp.where((fraction >= 0) & (fraction <= 1), fraction, jnp.clip(fraction, 0, 1)), inside
 
 
 @jax.custom_jvp
-def _tabled(computed: jax.Array, table: jax.Array) -> jax.Array:
+def _from_table(computed: jax.Array, table: jax.Array) -> jax.Array:
     """The table, with the derivative of the formula; the formula where the corners were changed alone."""
+    # a corner that was swapped for a tracer, as ``grad`` does, comes with the table of the old one
     slack = ROUNDINGS * jnp.finfo(table.dtype).eps * jnp.max(jnp.abs(computed))
     return jnp.where(jnp.abs(computed - table) <= slack, table, computed)
 
 
-@_tabled.defjvp
+@_from_table.defjvp
 def _derivative_of_the_formula(primals: tuple, tangents: tuple) -> tuple:
-    return _tabled(*primals), tangents[0]
+    """Value and tangent: nodes move with the corners as the formula says; the table is constant."""
+    return _from_table(*primals), tangents[0]
 
 
-def _states(x: Any) -> jax.Array:
+def _states(x: Numbers) -> jax.Array:
+    """States as a floating-point array; integers in JAX's ``float``."""
     x = jnp.asarray(x)
     return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(float)

@@ -7,7 +7,7 @@ The control minimises cost, the disturbance maximises it. Everything here is wri
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -16,6 +16,7 @@ import numpy as np
 
 from hjbjax.problem.pytree import as_partial, is_traced, numbers, pytree_dataclass
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite
+from hjbjax.problem.types import Control, Disturbance, Number, Numbers, State
 
 
 @pytree_dataclass(static=("isaacs", "time_dependent", "discounted"))
@@ -54,7 +55,7 @@ class Problem:
       1
     """
 
-    drift: Any
+    drift: jax.tree_util.Partial
     cost: Any = None
     controls: AdmissibleSet | None = None
     disturbances: AdmissibleSet | None = None
@@ -76,12 +77,12 @@ class Problem:
         controls: AdmissibleSet | None = None,
         *,
         disturbances: AdmissibleSet | None = None,
-        noise: Any = None,
-        discount: Any = 0.0,
+        noise: Callable | Numbers | Sequence | None = None,
+        discount: Number = 0.0,
         target: Callable | None = None,
-        exit_cost: Any = None,
-        terminal_cost: Any = None,
-        stopping_cost: Any = None,
+        exit_cost: Callable | Number | None = None,
+        terminal_cost: Callable | Number | None = None,
+        stopping_cost: Callable | Number | None = None,
         running_max: Callable | None = None,
         isaacs: str = "upper",
         time_dependent: bool = False,
@@ -89,11 +90,13 @@ class Problem:
         if not callable(drift):
             raise TypeError(f"Problem.drift: got {drift!r}, wanted a function (x, u) -> (n,)")
         _check_sets(controls, disturbances)
+        # static: the order of min and max is part of a compiled program
         if isaacs not in ("upper", "lower"):
             raise ValueError(f"Problem.isaacs: got {isaacs!r}, wanted 'upper' (min max) or 'lower' (max min)")
         discount = _rate(discount)
         if not isinstance(time_dependent, (bool, np.bool_)):
             raise TypeError(f"Problem.time_dependent: got {time_dependent!r}, wanted True or False")
+        # of a running maximum V ≥ g the term β V − L has no meaning: there is no integral to discount
         if running_max is not None and (cost is not None or _is_nonzero(discount)):
             raise ValueError(
                 "Problem.running_max: the cost is the running maximum alone; "
@@ -101,6 +104,7 @@ class Problem:
             )
         if exit_cost is not None and target is None:
             raise ValueError("Problem.exit_cost: there is no target to pay it on; give target as well")
+        # every function becomes a pytree, so that numbers in it are leaves of the problem
         fields = {
             "drift": as_partial(drift, "Problem.drift"),
             "cost": as_partial(cost, "Problem.cost"),
@@ -115,6 +119,7 @@ class Problem:
             "running_max": as_partial(running_max, "Problem.running_max"),
             "isaacs": isaacs,
             "time_dependent": bool(time_dependent),
+            # in the structure, as ``jit`` hides numbers: which certificate holds must be known while compiling
             "discounted": None if is_traced(discount) else bool(discount > 0),
         }
         for name, value in fields.items():
@@ -122,49 +127,51 @@ class Problem:
 
     @property
     def is_game(self) -> bool:
-        """Whether there is an opponent."""
+        """True if there is an opponent."""
         return self.disturbances is not None
 
-    def arguments(self, x: Any, u: Any, d: Any = None, t: Any = 0.0) -> tuple:
-        """The arguments of ``drift``, ``cost`` and ``noise`` in their order."""
+    def arguments(self, x: object, u: object, d: object = None, t: object = 0.0) -> tuple:
+        """The arguments of ``drift``, ``cost`` and ``noise`` in order: arrays, lists of entries, or names."""
         return (t,) * self.time_dependent + (x, u) + (d,) * self.is_game
 
-    def state_arguments(self, x: Any, t: Any = 0.0) -> tuple:
-        """The arguments of the functions of the state alone."""
+    def state_arguments(self, x: object, t: object = 0.0) -> tuple:
+        """The arguments of the functions of the state alone, in their order."""
         return (t,) * self.time_dependent + (x,)
 
-    def diffusion(self, x: Any, u: Any, d: Any = None, t: Any = 0.0) -> jax.Array:
+    def diffusion(self, x: State, u: Control, d: Disturbance | None = None, t: Number = 0.0) -> jax.Array:
         """σ at one state as a matrix, shape (n, k); (n, 0) without noise."""
         n = jnp.shape(x)[-1]
         if self.noise is None:
             return jnp.zeros((n, 0))
         sigma = jnp.asarray(self.noise(*self.arguments(x, u, d, t)) if callable(self.noise) else self.noise)
-        if sigma.ndim == 0:
+        if sigma.ndim == 0:  # one noise of strength ε on every state, independent of each other
             return sigma * jnp.eye(n, dtype=sigma.dtype)
         return jnp.diag(sigma) if sigma.ndim == 1 else sigma
 
 
 def is_discounted(problem: Problem) -> bool | None:
-    """Whether the discount is positive; None where only a run of the compiled program will tell.
+    """True if the discount is positive; None where only a run of the compiled program will tell.
 
     A problem remembers it in its structure, so that it is known inside ``jit`` also where the number is traced.
     """
     if is_traced(problem.discount):
         return problem.discounted
-    return bool(np.all(np.asarray(problem.discount) > 0))
+    return bool(np.all(np.asarray(problem.discount) > 0))  # of a batch, one a problem: all
 
 
-def _is_nonzero(discount: Any) -> bool:
+def _is_nonzero(discount: Number) -> bool:
+    """True if a discount is given: a traced one counts, as nobody traces a number that is to be left out."""
     return is_traced(discount) or bool(discount != 0)
 
 
-def _check_sets(controls: Any, disturbances: Any) -> None:
+def _check_sets(controls: object, disturbances: object) -> None:
+    """Refuse sets of an unknown kind; bounds without a ``Box`` around them are the usual slip."""
     for name, admissible in (("controls", controls), ("disturbances", disturbances)):
         if admissible is not None and not isinstance(admissible, (Box, Ball, Finite)):
             raise TypeError(f"Problem.{name}: got {admissible!r}, wanted a Box, a Ball, a Finite or None")
 
 
-def _rate(discount: Any) -> Any:
+def _rate(discount: object) -> Number:
     """The discount as a float, or the tracer that stands for it."""
     rate = numbers(discount, "Problem.discount")
     if np.ndim(rate) != 0 or (isinstance(rate, np.ndarray) and not 0 <= rate < np.inf):
@@ -172,19 +179,20 @@ def _rate(discount: Any) -> Any:
     return float(rate) if isinstance(rate, np.ndarray) else rate
 
 
-def _noise(noise: Any) -> Any:
-    """σ as a function, a number or an array; with its shape and its numbers checked where they are known."""
-    sigma = _function_or_number(noise, "Problem.noise", largest=2)
+def _noise(noise: object) -> Any:
+    """σ as a function, a number or an array; its shape and its numbers checked where they are known."""
+    sigma = _function_or_number(noise, "Problem.noise", largest=2)  # ε, (n,) or (n, k)
     if sigma is None or callable(sigma) or is_traced(sigma):
         return sigma
     if not np.all(np.isfinite(sigma)):
         raise ValueError(f"Problem.noise: got {noise!r}, wanted finite numbers")
+    # entries of a matrix may be negative: their signs say how the noises are correlated
     if np.ndim(sigma) < 2 and np.any(np.asarray(sigma) < 0):
         raise ValueError(f"Problem.noise: got {noise!r}, wanted numbers ≥ 0: it is σ in dx = f dt + σ dw")
     return sigma
 
 
-def _function_or_number(value: Any, name: str, largest: int = 0) -> Any:
+def _function_or_number(value: object, name: str, largest: int = 0) -> Any:
     """A function as a pytree, or numbers in an array of at most ``largest`` dimensions."""
     if value is None or callable(value):
         return as_partial(value, name)
@@ -194,6 +202,6 @@ def _function_or_number(value: Any, name: str, largest: int = 0) -> Any:
         raise ValueError(f"{name}: got shape {np.shape(array)}, wanted {wanted}")
     if not isinstance(array, np.ndarray):
         return array
-    if np.any(np.isnan(array)):
+    if np.any(np.isnan(array)):  # infinity is a cost: "never stop here", "never enter"
         raise ValueError(f"{name}: got {value!r}, which is not a number")
     return array if array.ndim else float(array)

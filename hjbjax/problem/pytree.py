@@ -16,8 +16,10 @@ from typing import Any, TypeVar, dataclass_transform
 import jax
 import numpy as np
 
+from hjbjax.problem.types import DType, Numbers
+
 T = TypeVar("T")
-REMEMBERED = 256  # answers of one function that are kept, the latest
+REMEMBERED = 256  # answers of one function that are kept, the latest: the keys hold functions, and what these hold
 
 
 @dataclass_transform(frozen_default=True, eq_default=False)
@@ -39,6 +41,7 @@ def pytree_dataclass(*, static: Iterable[str] = (), host: Iterable[str] = ()) ->
     static, host = tuple(static), tuple(host)
 
     def register(cls: type[T]) -> type[T]:
+        # eq=False: a comparison field by field would ask an array for its truth
         cls = dataclasses.dataclass(frozen=True, eq=False, init="__init__" not in vars(cls))(cls)
         fields = dataclasses.fields(cls)  # type: ignore[arg-type]
         unknown = {*static, *host} - {field.name for field in fields}
@@ -49,12 +52,13 @@ def pytree_dataclass(*, static: Iterable[str] = (), host: Iterable[str] = ()) ->
         if not leaves and "__eq__" not in vars(cls):
             _compare_by_value(cls, static)
 
+        # with keys, so that JAX names a leaf in its messages as the user does: ``.discount``
         def flatten_with_keys(self):
             children = [(jax.tree_util.GetAttrKey(name), getattr(self, name)) for name in leaves]
             return children, tuple(getattr(self, name) for name in static)
 
         def unflatten(aux, children):
-            self = object.__new__(cls)
+            self = object.__new__(cls)  # past __init__ and past the lock of a frozen dataclass
             for name, value in (*zip(leaves, children, strict=True), *zip(static, aux, strict=True)):
                 object.__setattr__(self, name, value)
             for name, make in defaults.items():
@@ -68,7 +72,7 @@ def pytree_dataclass(*, static: Iterable[str] = (), host: Iterable[str] = ()) ->
 
 
 def _compare_by_value(cls: type, names: tuple[str, ...]) -> None:
-    """Choices without numbers are equal when their fields are: as static arguments they must not recompile."""
+    """Make choices without numbers equal when their fields are: as static arguments they must not recompile."""
 
     def key(self):
         return tuple(getattr(self, name) for name in names)
@@ -83,6 +87,7 @@ def _compare_by_value(cls: type, names: tuple[str, ...]) -> None:
 
 
 def _default(field: dataclasses.Field) -> Callable[[], Any]:
+    """A function that makes the default of a field, a new one each time as dictionaries may be written to."""
     if field.default_factory is not dataclasses.MISSING:
         return field.default_factory
     if field.default is dataclasses.MISSING:
@@ -91,12 +96,12 @@ def _default(field: dataclasses.Field) -> Callable[[], Any]:
 
 
 def is_traced(*trees: Any) -> bool:
-    """Whether any leaf of the trees is a tracer, that is, whether we run inside a JAX transformation."""
+    """True if any leaf of the trees is a tracer, so that its value is not known yet."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
 
 
 def remembered(function: Callable[..., T]) -> Callable[..., T]:
-    """Remember answers by the first argument, a pytree, with the numbers in it; while those are traced ask anew.
+    """Decorator that keeps answers by the first argument, a pytree, with the numbers in it; while traced asks anew.
 
     For facts read off a trace of a function of the user's: tracing costs more than a small solve. The other arguments
     must be hashable; only answers are kept, no exceptions.
@@ -111,21 +116,22 @@ def remembered(function: Callable[..., T]) -> Callable[..., T]:
         key = (structure, tuple(map(_digest, leaves)), arguments, tuple(options.items()))
         if key not in answers:
             answers[key] = function(tree, *arguments, **options)
-            if len(answers) > REMEMBERED:
+            if len(answers) > REMEMBERED:  # dictionaries keep the order of insertion: the oldest goes
                 del answers[next(iter(answers))]
         return answers[key]
 
     return ask
 
 
-def _digest(leaf: Any) -> tuple[Any, ...]:
-    """What tells one leaf from another: its type, its shape and its numbers."""
-    array = np.ascontiguousarray(leaf)
+def _digest(leaf: Numbers) -> tuple[Any, ...]:
+    """Type, shape, dtype and a digest of the bits of a leaf: equal for equal leaves."""
+    array = np.ascontiguousarray(leaf)  # bits, as NaN equals no NaN and every look would be new
     return type(leaf), array.shape, array.dtype, hashlib.blake2b(array.tobytes(), digest_size=16).digest()
 
 
-def numbers(value: Any, name: str) -> Any:
+def numbers(value: object, name: str) -> Any:
     """``value`` as its own float64 array while it is concrete; a tracer, or a list that holds one, as a tracer."""
+    # float64 whatever JAX is set to: a solve casts to its own dtype later, and grids compare corners before
     if is_traced(value) and isinstance(value, (jax.core.Tracer, Sequence)):
         return jax.numpy.asarray(value)
     try:
@@ -145,6 +151,8 @@ def as_partial(function: Callable | None, name: str = "function") -> jax.tree_ut
         return function
     if not callable(function):
         raise TypeError(f"{name}: got {function!r}, wanted a function of one state")
+    # The function of a Partial belongs to the tree's structure, so it is the one of the class, equal for all objects;
+    # the object with its numbers is an argument. A bound method in its place would compile anew for every object.
     if not jax.tree_util.all_leaves([function]):
         return jax.tree_util.Partial(type(function).__call__, function)
     owner = getattr(function, "__self__", None)
@@ -155,14 +163,14 @@ def as_partial(function: Callable | None, name: str = "function") -> jax.tree_ut
 
 def altered(tree: T, **fields: Any) -> T:
     """A copy with other fields and without the checks that ``dataclasses.replace`` would run on tracers."""
-    result = copy.copy(tree)
+    result = copy.copy(tree)  # shallow, and without __init__
     for name, value in fields.items():
         object.__setattr__(result, name, value)
     return result
 
 
-def cast(tree: T, dtype: Any) -> T:
-    """Every floating-point leaf of ``tree`` in ``dtype``; integers and booleans as they are."""
+def cast(tree: T, dtype: DType) -> T:
+    """The tree with its floating-point leaves in ``dtype``; integers and booleans as they are."""
 
     def convert(leaf):
         if not jax.numpy.issubdtype(jax.numpy.result_type(leaf), jax.numpy.floating):

@@ -12,16 +12,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.pytree import numbers, pytree_dataclass
+from hjbjax.problem.types import Array, DType, Number
 
 
-def _bounded(value: Any, name: str) -> Any:
+def _finite_numbers(value: object, name: str) -> Array:
+    """Numbers as an array, refused where they are not finite: over an unbounded set H may be −∞ at every state."""
     array = numbers(value, name)
     if isinstance(array, np.ndarray) and not np.all(np.isfinite(array)):
         raise ValueError(f"{name}: got {value!r}, wanted finite numbers: bound the set")
     return array
 
 
-def _is_count(value: Any) -> bool:
+def _is_count(value: object) -> bool:
+    """True if a value is a positive integer; True is none."""
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and int(value) >= 1
 
 
@@ -45,7 +48,7 @@ class Box:
     hi: Any
 
     def __post_init__(self):
-        lo, hi = _bounded(self.lo, "Box.lo"), _bounded(self.hi, "Box.hi")
+        lo, hi = _finite_numbers(self.lo, "Box.lo"), _finite_numbers(self.hi, "Box.hi")
         if np.ndim(lo) != 1 or np.shape(lo) != np.shape(hi) or np.size(lo) == 0:
             raise ValueError(f"Box: got lo of shape {np.shape(lo)} and hi of shape {np.shape(hi)}, wanted (m,) twice")
         if isinstance(lo, np.ndarray) and isinstance(hi, np.ndarray) and np.any(lo > hi):
@@ -67,8 +70,9 @@ class Box:
         counts = tuple(num) if isinstance(num, (Sequence, np.ndarray)) else (num,) * self.dim
         if len(counts) != self.dim or not all(_is_count(n) for n in counts):
             raise ValueError(f"Box.grid: got {num!r}, wanted a positive integer or {self.dim} of them")
+        # indices k, shape (K, m), in the order of nested loops: the last input changes fastest
         rows = np.array(list(itertools.product(*(range(int(n)) for n in counts))), dtype=np.float64)
-        last = np.maximum(np.asarray(counts, dtype=np.float64) - 1, 1)
+        last = np.maximum(np.asarray(counts, dtype=np.float64) - 1, 1)  # one value alone is lo, not 0/0
         return Finite((self.lo * (last - rows) + self.hi * rows) / last)
 
 
@@ -88,7 +92,7 @@ class Ball:
     dim: int
 
     def __post_init__(self):
-        radius = _bounded(self.radius, "Ball.radius")
+        radius = _finite_numbers(self.radius, "Ball.radius")
         if not _is_count(self.dim):
             raise ValueError(f"Ball: got dim = {self.dim!r}, wanted a positive integer")
         if np.ndim(radius) != 0:
@@ -113,8 +117,8 @@ class Finite:
     points: Any
 
     def __post_init__(self):
-        points = _bounded(self.points, "Finite.points")
-        if np.ndim(points) == 1 and np.size(points) > 0:
+        points = _finite_numbers(self.points, "Finite.points")
+        if np.ndim(points) == 1 and np.size(points) > 0:  # three numbers: three controls, or one of three inputs?
             raise ValueError(f"Finite: got points of shape {np.shape(points)}, wanted (K, m): one row a control")
         if np.ndim(points) != 2 or 0 in np.shape(points):
             raise ValueError(f"Finite: no admissible control: got points of shape {np.shape(points)}, wanted (K, m)")
@@ -129,57 +133,66 @@ class Finite:
 AdmissibleSet: TypeAlias = Box | Ball | Finite
 
 
-def samples(admissible: AdmissibleSet, budget: int) -> Any:
+def samples(admissible: AdmissibleSet, budget: int) -> Array:
     """Representative points of a set, shape (K, m) with K about ``budget``; all points of a finite one.
 
     A box gets an odd number of values an input, so that its ends and its middle are among them; a ball its
-    centre and directions on spheres, spread by the golden angle in the plane and by axes and diagonals beyond.
+    centre and directions on two spheres, at equal angles in the plane and along axes and diagonals beyond.
     """
     if isinstance(admissible, Finite):
         return admissible.points
     if isinstance(admissible, Box):
-        per_input = max(3, round(budget ** (1 / admissible.dim)) // 2 * 2 + 1)
+        per_input = _values_an_input(admissible, budget)
         return admissible.grid(per_input).points
     unit = _unit_ball(admissible.dim, budget)
     return admissible.radius * unit
 
 
+def _values_an_input(box: Box, budget: int) -> int:
+    """The m-th root of the budget, made odd; at least both ends and the middle."""
+    return max(3, round(budget ** (1 / box.dim)) // 2 * 2 + 1)
+
+
 def _unit_ball(dim: int, budget: int) -> np.ndarray:
-    if dim == 1:
+    """Points of the unit ball, shape (K, dim)."""
+    if dim == 1:  # an odd number of points, so that −1, 0 and 1 are among them
         return np.linspace(-1.0, 1.0, budget // 2 * 2 + 1)[:, None]
-    if dim == 2:
+    if dim == 2:  # half of the budget a circle, by fours so that the axes are among the directions
         angles = np.arange(max(8, budget // 8 * 4)) * (2 * np.pi / max(8, budget // 8 * 4))
         sphere = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    else:
+    else:  # 3^dim − 1 directions whatever the budget: 26, 80, 242, ...
         signs = np.array(list(itertools.product((-1.0, 0.0, 1.0), repeat=dim)))
         signs = signs[np.any(signs != 0, axis=1)]
         sphere = signs / np.linalg.norm(signs, axis=1, keepdims=True)
+    # centre, half way and rim: the size |u| of any control is within ¼ of some sample's
     return np.concatenate([np.zeros((1, dim)), 0.5 * sphere, sphere])
 
 
-def extremes(admissible: AdmissibleSet) -> Any:
+def extremes(admissible: AdmissibleSet) -> Array:
     """Points whose convex hull holds the set, shape (K, m): where a convex function of u is at its largest."""
     if isinstance(admissible, Finite):
         return admissible.points
     if isinstance(admissible, Box):
         return admissible.grid(2).points
+    # the corners of the cube around the ball, 2^m of them: no polytope inside the ball would do
     return admissible.radius * np.array(list(itertools.product((-1.0, 1.0), repeat=admissible.dim)))
 
 
-def probes(admissible: AdmissibleSet | None, dtype: Any) -> list[list]:
-    """Actions among which a convex function of u takes its largest value, and a few more for others."""
+def probes(admissible: AdmissibleSet | None, dtype: DType) -> list[list]:
+    """Actions, lists of m numbers, among which a convex function of u is at its largest; a few more for others."""
     if admissible is None:
-        return [[]]
+        return [[]]  # one action that has no entries, so that loops over actions still run once
     points = jnp.asarray(extremes(admissible), dtype)
     if not isinstance(admissible, Finite):
+        # a function that is not convex may be larger inside; samples are no proof, and cost little
         points = jnp.concatenate([points, jnp.asarray(samples(admissible, 9), dtype)])
     return [[points[k, j] for j in range(points.shape[1])] for k in range(points.shape[0])]
 
 
-def spacing(admissible: AdmissibleSet, budget: int) -> list[Any]:
+def spacing(admissible: AdmissibleSet, budget: int) -> list[Number]:
     """The distance between neighbouring ``samples``, one number an input."""
     if isinstance(admissible, Ball):
-        return [admissible.radius / 2] * admissible.dim
+        return [admissible.radius / 2] * admissible.dim  # from the centre to the half-way sphere and on to the rim
     assert isinstance(admissible, Box)
-    per_input = max(3, round(budget ** (1 / admissible.dim)) // 2 * 2 + 1)
+    per_input = _values_an_input(admissible, budget)
     return [(admissible.hi[j] - admissible.lo[j]) / (per_input - 1) for j in range(admissible.dim)]

@@ -1,11 +1,13 @@
 """Where the nodes of an axis stand: maps of [0, 1] onto itself."""
 
+from types import ModuleType
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
+from hjbjax.problem.types import Array, Number, Numbers
 
 
 @pytree_dataclass()
@@ -28,8 +30,8 @@ class Sinh:
       [0.0, 0.338, 0.5, 0.662, 1.0]
     """
 
-    strength: Any
-    center: Any = 0.5
+    strength: Number
+    center: Number = 0.5
 
     def __post_init__(self):
         if is_traced(self.strength, self.center):
@@ -39,7 +41,8 @@ class Sinh:
         if not 0 <= self.center <= 1:
             raise ValueError(f"Sinh: got center = {self.center!r}, wanted a fraction between 0 and 1")
 
-    def _frame(self, xp: Any) -> tuple[Any, Any, Any]:
+    def _frame(self, xp: ModuleType) -> tuple[Array, Array, Array]:
+        """ξ₀, and sinh κξ₀ and sinh κ(1 − ξ₀), the two ends of the curve that is scaled to [0, 1]."""
         k, c = self.strength, self.center
         # tanh κξ₀ = c sinh κ/(1 − c + c cosh κ) may be near 1, where arctanh loses up to e^(2κ) units in the last place
         middle = xp.log((1 - c + c * xp.exp(k)) / (1 - c + c * xp.exp(-k))) / (2 * k)
@@ -47,14 +50,15 @@ class Sinh:
         below, above = xp.sinh(k * middle), xp.sinh(k * (1 - middle))
         return middle, below, above
 
-    def place(self, fraction: Any) -> Any:
-        """φ: where the node stands that uniform spacing would put at ``fraction``."""
+    def place(self, fraction: Numbers) -> Array:
+        """φ: the place, in [0, 1], of the node that uniform spacing would put at ``fraction``."""
+        # NumPy where numbers are known: a compiled sinh rounds otherwise, and nodes must not move
         xp: Any = jnp if is_traced(self, fraction) else np
         middle, below, above = self._frame(xp)
         return (xp.sinh(self.strength * (fraction - middle)) + below) / (above + below)
 
-    def fraction(self, place: Any) -> Any:
-        """φ⁻¹; JAX arrays."""
+    def fraction(self, place: Numbers) -> Array:
+        """φ⁻¹: the ``fraction`` whose node stands at ``place``; JAX arrays."""
         middle, below, above = self._frame(jnp)
         return middle + jnp.arcsinh(place * (above + below) - below) / self.strength
 

@@ -14,6 +14,7 @@ Array: TypeAlias = jax.Array | np.ndarray  # on the host NumPy's, in a compiled 
 Number: TypeAlias = float | Num[Array, ""]  # a number, which inside a JAX transformation is traced
 Numbers: TypeAlias = jax.typing.ArrayLike  # what a user may write where one number or an array of them is wanted
 State: TypeAlias = Float[Array, " n"]
+States: TypeAlias = Float[Array, "*batch n"]  # one state, or an array of them
 Costate: TypeAlias = Float[Array, " n"]
 Control: TypeAlias = Float[Array, " m"]
 Disturbance: TypeAlias = Float[Array, " k"]

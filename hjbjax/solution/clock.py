@@ -12,17 +12,18 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
+from types import FrameType
 from typing import Any
 
 from hjbjax.solution.status import Status
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-CHUNK_SECONDS = 0.5  # between two looks at the clock, where steps are short
+CHUNK_SECONDS = 0.5  # between two looks at the clock, where steps are short: how long Ctrl-C may take to be heard
 CUT = (Status.INTERRUPTED, Status.TIME_LIMIT)
 
 
 class Stopped(Exception):
-    """A run is over between two of its phases: ``status`` says why, ``reached`` is what it came to, if anything.
+    """A run is over between two of its phases: ``status`` says why, ``reached`` is the answer so far, if there is one.
 
     Caught where there is something to hand back.
     """
@@ -52,7 +53,7 @@ class Clock:
 
     def over(self) -> Status | None:
         """INTERRUPTED or TIME_LIMIT; ``None`` to go on."""
-        if self.interrupted:
+        if self.interrupted:  # first: who pressed Ctrl-C wants to read that, whatever the time is
             return Status.INTERRUPTED
         return Status.TIME_LIMIT if self.elapsed() >= self.seconds else None
 
@@ -70,10 +71,11 @@ class Clock:
     def count(self, seconds: float, steps: int, nodes: int) -> None:
         """Take note of a chunk of steps."""
         self.stepping += seconds
+        # a chunk shorter than the clock can tell must not promise that a million steps take no time
         self.per_node = max(seconds, 1e-4) / (steps * nodes)
 
     def steps_in(self, seconds: float, nodes: int) -> float:
-        """How many steps take so long, by the last chunk."""
+        """The number of steps that take so long, by the last chunk."""
         assert self.per_node is not None
         return seconds / (self.per_node * nodes)
 
@@ -83,14 +85,15 @@ _running: list[Clock] = []  # of the main thread, the outermost run first
 
 @contextlib.contextmanager
 def noting_interrupts(clock: Clock) -> Iterator[None]:
-    """Ctrl-C leaves a note on the clock, and on those of the runs around this one.
+    """Context in which Ctrl-C leaves a note on the clock, and on those of the runs around this one.
 
     A second Ctrl-C is the usual exception. Only in the main thread, and not over a handler of the user's own. SIGTERM
     likewise where it was made to do what Ctrl-C does: ``signal.signal(signal.SIGTERM, signal.default_int_handler)``.
     """
-    if threading.current_thread() is not threading.main_thread():
+    if threading.current_thread() is not threading.main_thread():  # Python hands signals to the main thread alone
         yield
         return
+    # A run inside another one finds the handler of the outer already there.
     usual = signal.default_int_handler
     noted = [] if _running else [number for number in SIGNALS if signal.getsignal(number) is usual]
 
@@ -98,11 +101,12 @@ def noting_interrupts(clock: Clock) -> Iterator[None]:
         for number in noted:
             signal.signal(number, usual)
 
-    def note(number: int, frame: Any) -> None:
+    def note(number: int, frame: FrameType | None) -> None:
         for each in _running:
             each.interrupted = True
-        give_back()
+        give_back()  # a second Ctrl-C is the usual KeyboardInterrupt
 
+    # a Ctrl-C that fell between two inner runs was noted on the outer clock
     clock.interrupted |= any(each.interrupted for each in _running)
     _running.append(clock)
     try:

@@ -16,12 +16,13 @@ import stat
 import struct
 import zipfile
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, TypeVar
+from typing import IO, Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from hjbjax.problem.types import DType
 from hjbjax.solution import screen
-from hjbjax.solution.placement import FileError, check_place, claimed, hidden_name, path_of, place, sweep
+from hjbjax.solution.placement import FileError, Path, check_place, claimed, hidden_name, path_of, place, sweep
 
 T = TypeVar("T")
 
@@ -34,14 +35,14 @@ DECLARATION = re.compile(rb"\{'descr': '([<>|]\w\d)', 'fortran_order': False, 's
 
 
 class Expected(NamedTuple):
-    """What an array must look like: any of the shapes (``None`` matches every length), any of the dtypes."""
+    """Shapes and dtypes of which an array must have one; ``None`` in a shape matches every length."""
 
     shapes: tuple[tuple[int | None, ...], ...]
-    dtypes: tuple[Any, ...] = (np.float64, np.float32)
+    dtypes: tuple[DType, ...] = (np.float64, np.float32)
     optional: bool = True
 
     def complaint(self, shape: tuple[int, ...], code: str) -> str | None:
-        """Why an array with this shape and dtype code, as in '<f8', is refused; ``None`` where it is not."""
+        """The reason why an array with this shape and dtype code, as in '<f8', is refused; ``None`` without one."""
         allowed = [np.dtype(dtype).str for dtype in self.dtypes]
         if code not in allowed:
             return f"has dtype {code!r}, wanted {' or '.join(allowed)}"
@@ -51,14 +52,16 @@ class Expected(NamedTuple):
 
 
 def _matches(shape: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
+    """True if a shape has the wanted lengths."""
     return len(shape) == len(wanted) and all(n is None or n == m for m, n in zip(shape, wanted, strict=True))
 
 
 def _shape_text(wanted: tuple[int | None, ...]) -> str:
+    """A shape as Python writes it, with "any" for lengths that are free."""
     return f"({', '.join('any' if n is None else str(n) for n in wanted)}{',' * (len(wanted) == 1)})"
 
 
-def write(path: Any, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], *, force: bool = False) -> None:
+def write(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], *, force: bool = False) -> None:
     """Write a header and arrays atomically.
 
     Args:
@@ -72,8 +75,8 @@ def write(path: Any, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
       FileError: the folder is missing or cannot be written, the disk is full, or a folder, a device or a pipe has that
         name; no half file is left.
     """
-    path = os.path.realpath(path_of(path, "written"))
-    check_place(path, force)
+    path = os.path.realpath(path_of(path, "written"))  # through links: the file behind one is replaced, not the link
+    check_place(path, force)  # before the arrays are written, and once more when the file is moved
     # A damaged table of contents may hide whole entries, and no checksum covers it: so the header has the list.
     text = json.dumps({**header, "arrays": sorted(arrays)}, default=_plain).encode()
     if len(text) > MAX_HEADER - 1000:  # of which the entry's own header takes some
@@ -83,14 +86,15 @@ def write(path: Any, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
     sweep(folder)
     temporary = os.path.join(folder, hidden_name(name))
     try:
-        open(temporary, "xb").close()
+        open(temporary, "xb").close()  # first the file, then its lock: the pid in the name guards the moment between
         with claimed(temporary):
             with open(temporary, "r+b") as file:
                 _write_members(file, members)
+                # before the move: else a power cut may leave the new name with nothing behind it
                 file.flush()
                 os.fsync(file.fileno())
             place(temporary, path, force)
-    except FileExistsError:
+    except FileExistsError:  # an OSError too, and the one that ``force`` helps against
         raise
     except OSError as error:
         raise FileError(f"{path}: cannot be written: {error.strerror or error}") from error
@@ -100,10 +104,12 @@ def write(path: Any, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
     _sync_folder(folder)
 
 
-def _write_members(file: Any, members: Mapping[str, np.ndarray]) -> None:
+def _write_members(file: IO[bytes], members: Mapping[str, np.ndarray]) -> None:
+    """Write arrays as the entries of a zip archive."""
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         for name, array in members.items():
             info = zipfile.ZipInfo(name + ".npy")  # dated 1980: equal solutions make equal files
+            # zip64, as an entry that is written piece by piece may pass 2 GiB when its header stands already
             with archive.open(info, "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, np.asarray(array, order="C"), allow_pickle=False)
 
@@ -112,7 +118,7 @@ def _sync_folder(folder: str) -> None:
     """Make the new name survive a power cut, where the system can: the file itself is whole either way."""
     try:
         handle = os.open(folder, os.O_RDONLY)
-    except OSError:
+    except OSError:  # Windows opens no folders
         return
     try:
         os.fsync(handle)
@@ -122,28 +128,29 @@ def _sync_folder(folder: str) -> None:
         os.close(handle)
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> Any:
+    """A value for which JSON has no word, as a number, a list or text."""
     return value.tolist() if isinstance(value, (np.generic, np.ndarray)) else str(value)
 
 
 def read(
-    path: Any,
+    path: Path,
     form: str,
     version: int,
     plan: Callable[[dict], Mapping[str, Expected]],
     rebuild: Callable[[dict, dict[str, np.ndarray]], T],
 ) -> T:
-    """Read what ``write`` wrote.
+    """The object in a file that ``write`` wrote.
 
     Args:
       path: the file.
       form: what ``header["format"]`` must say.
       version: the newest ``header["version"]`` that the caller understands.
-      plan: from the header to what each array must look like.
+      plan: from the header to the shapes and dtypes of the arrays.
       rebuild: from the header and the arrays by name, less the optional ones that the file lacks, to the object.
 
     Returns:
-      What ``rebuild`` returns.
+      The object that ``rebuild`` makes.
 
     Raises:
       FileError: for every kind of bad file, before anything of the size that it claims is allocated.
@@ -168,10 +175,11 @@ def read(
     raise FileError(f"{path}: cannot be read: {screen.one_line(reason, REASON)}") from cause
 
 
-def _read_archive(file: Any, size: int, form: str, version: int, plan: Callable) -> tuple[dict, dict]:
+def _read_archive(file: IO[bytes], size: int, form: str, version: int, plan: Callable) -> tuple[dict, dict]:
+    """Header and arrays of an archive: first what it claims is checked, then the arrays are read."""
     if size == 0:
         raise FileError("it is empty")
-    start = file.read(4)
+    start = file.read(4)  # a zip archive with entries begins with PK\3\4, a pickle of protocol 2 or later with \x80
     if start != b"PK\3\4":
         what = "a pickle, which may run code and is never opened" if start[:1] == b"\x80" else "no npz file"
         raise FileError(f"it is {what}; wanted a file written by save()")
@@ -185,6 +193,7 @@ def _read_archive(file: Any, size: int, form: str, version: int, plan: Callable)
             raise FileError("it has no header: not a file written by save()")
         header = _read_header(archive, members["header"], form, version)
         expected = plan(header)
+        # one way it is a damaged table of contents, the other way something that was put in later
         if wrong := set(members) ^ {"header", *header["arrays"]}:
             raise FileError(f"it does not hold the arrays that its header lists: {', '.join(sorted(wrong))}")
         for name, wanted in expected.items():
@@ -199,16 +208,18 @@ def _read_archive(file: Any, size: int, form: str, version: int, plan: Callable)
 
 
 def _members(archive: zipfile.ZipFile, size: int) -> dict[str, zipfile.ZipInfo]:
+    """The entries by name, when together they can be no larger than the file and the memory."""
     members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
     if len(members) != len(archive.infolist()):
         raise FileError("an entry is there twice")
     for name, info in members.items():
+        # a few kB may unpack to gigabytes; what is stored as it is takes as many bytes of the file. Bit 0: encrypted
         if info.compress_type != zipfile.ZIP_STORED or info.flag_bits & 1:
             raise FileError(f"entry {name!r} is compressed or encrypted: not a file written by save()")
         if info.file_size != info.compress_size:
             raise FileError(f"entry {name!r} declares two sizes: it is damaged")
     total, memory = sum(info.file_size for info in members.values()), _memory()
-    if total > size:
+    if total > size:  # entries that overlap, each of which would fit
         raise FileError(f"it claims {total:,} bytes of arrays and is {size:,} bytes long")
     if total > memory:
         raise FileError(f"it holds {total:,} bytes of arrays; this machine has {memory:,} bytes of memory")
@@ -224,11 +235,13 @@ def _memory() -> float:
 
 
 def _read_header(archive: zipfile.ZipFile, info: zipfile.ZipInfo, form: str, version: int) -> dict:
+    """The header, when it is of this format and of a version that is known."""
     _check_member(archive, info, Expected(((None,),), (np.uint8,)))
     header = json.loads(_read_member(archive, info).tobytes())
     if not isinstance(header, dict) or header.get("format") != form:
         raise FileError(f"its header does not say {form!r}: another program wrote it")
     found = header.get("version")
+    # JSON's true is a bool, which Python takes for the integer 1
     if isinstance(found, bool) or not isinstance(found, int) or found < 1:
         raise FileError(f"its format version is {found!r}, wanted an integer from 1 to {version}")
     if found > version:
@@ -237,10 +250,10 @@ def _read_header(archive: zipfile.ZipFile, info: zipfile.ZipInfo, form: str, ver
 
 
 def _check_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, wanted: Expected) -> None:
-    """Compare what the npy header declares with what is wanted and with the bytes that are there."""
+    """Compare shape and dtype that an npy header declares with those wanted and with the bytes that are there."""
     name = info.filename.removesuffix(".npy")
     with archive.open(info) as member:
-        start = member.read(10)
+        start = member.read(10)  # magic, version 1.0, and the length of the text that follows in two bytes
         text = member.read(int.from_bytes(start[8:], "little"))
     declared = DECLARATION.fullmatch(text)
     if start[:8] != b"\x93NUMPY\1\0" or declared is None:
@@ -255,6 +268,7 @@ def _check_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, wanted: Expec
 
 
 def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
+    """One array, when its checksum is right."""
     with archive.open(info) as member:
         array = np.lib.format.read_array(member, allow_pickle=False)
         member.read()  # to the end, where the checksum is compared

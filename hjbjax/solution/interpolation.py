@@ -8,8 +8,8 @@ The slopes DV are found at the nodes and interpolated likewise: second order whe
 
 import functools
 import itertools
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -17,22 +17,48 @@ import numpy as np
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import cast, is_traced
+from hjbjax.problem.types import Array, DType, Numbers
+
+
+class Moment(NamedTuple):
+    """A time among the kept ones: the index before it, the share of the next, and whether it lies among them at all."""
+
+    before: jax.Array
+    share: jax.Array
+    inside: jax.Array
+
+
+Place: TypeAlias = tuple[jax.Array, jax.Array, jax.Array]  # along one axis: node below, fraction to the next, inside
+Layer: TypeAlias = tuple[jax.Array, tuple[jax.Array, ...]]  # weight of a kept time, its index; of a stationary V 1, ()
+
+
+class Interpolation(Protocol):
+    """A rule for values between the nodes: ``between``, ``between_defined``, ``nearest`` or ``slopes_between``."""
+
+    def __call__(self, grid: Grid, values: Array, x: jax.Array, clamp: bool, when: Moment | None = None) -> jax.Array:
+        """The answer at the states x, shape (..., n)."""
+
+
+class Samples(NamedTuple):
+    """A function known at nodes, (*grid, ...), and if ``times`` are given at these, (k, *grid, ...)."""
+
+    grid: Grid
+    values: Array
+    times: Array | None = None
 
 
 def query(
-    look: Callable, grid: Grid, values: Any, x: Any, *, clamp: bool, name: str, times: Any = None, t: Any = None
-) -> Any:
-    """``look`` at node values between the nodes: float64 NumPy from concrete data, else as the tracer is.
+    look: Interpolation, samples: Samples, x: Numbers, t: Numbers | None = None, *, clamp: bool, name: str
+) -> Array:
+    """Values between the nodes: float64 NumPy from concrete data, else JAX's in the dtype of the tracer.
 
     Args:
-      look: ``between``, ``between_defined`` or ``nearest``.
-      grid: the nodes.
-      values: shape (*grid, ...); (k, *grid, ...) with ``times``.
+      look: the rule of interpolation.
+      samples: grid, node values, and times of a marched solution; between them the answer is linear, or the nearest's.
       x: states, shape (..., n).
+      t: time, broadcasts against ``x.shape[:-1]``; outside the times as outside the grid. None without times.
       clamp: outside the grid take the nearest point of its box; otherwise the answer there is NaN.
       name: who asks, for refusals.
-      times: shape (k,), of a marched solution; between them the answer is linear, or that of the nearest.
-      t: when, broadcasts against ``x.shape[:-1]``; outside ``times`` as outside the grid.
 
     Returns:
       Shape ``x.shape[:-1] + values.shape[n:]``.
@@ -41,6 +67,7 @@ def query(
       TypeError: states that are not real numbers.
       ValueError: states of another length.
     """
+    grid, values, times = samples
     traced = [leaf for leaf in jax.tree.leaves((values, x, times, t)) if isinstance(leaf, jax.core.Tracer)]
     if not traced and not is_traced(grid):
         # Inside somebody's jit a constant must come out, and float64 must not be switched on in the middle of it.
@@ -49,35 +76,37 @@ def query(
             # JAX keeps what it made of a NumPy array in float32, outside of here, and would hand it in for float64.
             grid, values = cast((grid, values), np.float64)
             return np.array(look(grid, values, _states(grid, x, np.float64, name), clamp, when))[()]
-    dtype = jnp.result_type(*traced) if traced else jnp.result_type(float)
+    dtype: DType = jnp.result_type(*traced) if traced else jnp.result_type(float)
     if not jnp.issubdtype(dtype, jnp.floating):
         dtype = jnp.result_type(float)
     when = None if times is None else _moment(times, t, dtype, name)
     return look(grid, values, _states(grid, x, dtype, name), clamp, when).astype(dtype)
 
 
-def _moment(times: Any, t: Any, dtype: Any, name: str) -> tuple[Any, Any, Any]:
-    """The kept time before t, the share of the one after it, and whether t lies between the first and the last."""
+def _moment(times: Array, t: Any, dtype: DType, name: str) -> Moment:
+    """The place of t among the kept times."""
     try:
         t = jnp.asarray(t if is_traced(t) else np.asarray(t, np.float64), dtype)
     except (TypeError, ValueError):
         raise TypeError(f"{name}: got t = {t!r}, wanted a time") from None
     times = jnp.asarray(times, dtype)
+    # a user's ``0.1 * k`` and the march's own times differ by rounding
     slack = 8 * jnp.finfo(dtype).eps * jnp.max(jnp.abs(times))
     inside = (t >= times[0] - slack) & (t <= times[-1] + slack)
     if len(times) == 1:
-        return jnp.zeros(t.shape, int), jnp.zeros(t.shape, dtype), inside
+        return Moment(jnp.zeros(t.shape, int), jnp.zeros(t.shape, dtype), inside)
+    # a kept time counts to the interval that begins there, the last one to the interval that ends there
     before = jnp.clip(jnp.searchsorted(times, t, side="right") - 1, 0, len(times) - 2)
     share = (t - times[before]) / (times[before + 1] - times[before])
-    return before, jnp.clip(share, 0, 1), inside & ~jnp.isnan(t)
+    return Moment(before, jnp.clip(share, 0, 1), inside & ~jnp.isnan(t))
 
 
-def _states(grid: Grid, x: Any, dtype: Any, name: str) -> Any:
+def _states(grid: Grid, x: Numbers, dtype: DType, name: str) -> jax.Array:
     """The states in ``dtype``; an infinite entry on a periodic axis is no place and becomes NaN."""
     try:
         x = jnp.asarray(x) if is_traced(x) else np.asarray(x)
     except (TypeError, ValueError):
-        x = np.asarray(None)
+        x = np.asarray(None)  # of no numbers' type, so that it is refused with the others below
     if not jnp.issubdtype(x.dtype, jnp.floating) and not jnp.issubdtype(x.dtype, jnp.integer):
         raise TypeError(f"{name}: got states of type {x.dtype}, wanted real numbers, shape (..., {grid.ndim})")
     if x.ndim == 0 or x.shape[-1] != grid.ndim:
@@ -87,34 +116,36 @@ def _states(grid: Grid, x: Any, dtype: Any, name: str) -> Any:
 
 
 @functools.partial(jax.jit, static_argnames="clamp")
-def between(grid: Grid, values: Any, x: Any, clamp: bool, when: Any = None) -> jax.Array:
+def between(grid: Grid, values: Array, x: jax.Array, clamp: bool, when: Moment | None = None) -> jax.Array:
     """The multilinear interpolant, with NaN and infinity wherever a node that counts has them."""
     if when is None:
         return grid.interpolate(values, x, clamp=clamp)
     total: Any = 0.0
     for weight, hidden, there in _corners(grid, values, x, clamp, when):
+        # 0 · inf is NaN: on a node, a neighbour out of reach has no say
         total = total + jnp.where(hidden, jnp.nan, weight * jnp.where((weight == 0) & ~jnp.isfinite(there), 0, there))
     return total
 
 
 @functools.partial(jax.jit, static_argnames="clamp")
-def between_defined(grid: Grid, values: Any, x: Any, clamp: bool, when: Any = None) -> jax.Array:
+def between_defined(grid: Grid, values: Array, x: jax.Array, clamp: bool, when: Moment | None = None) -> jax.Array:
     """The mean over those nodes of the cell where no entry is NaN."""
     total: Any = 0.0
     sum_of_weights: Any = 0.0
-    for weight, defined, there in _defined(grid, values, x, clamp, when):
+    for weight, defined, there in _defined_corners(grid, values, x, clamp, when):
         weight = jnp.where(defined, weight, 0)[..., None]
         total, sum_of_weights = total + weight * jnp.where(defined[..., None], there, 0), sum_of_weights + weight
     some = sum_of_weights > 0
+    # divided by 1 where there is none: a 0/0 in the branch not taken would still make the derivative NaN
     return jnp.where(some, total / jnp.where(some, sum_of_weights, 1), jnp.nan)
 
 
 @functools.partial(jax.jit, static_argnames="clamp")
-def nearest(grid: Grid, values: Any, x: Any, clamp: bool, when: Any = None) -> jax.Array:
+def nearest(grid: Grid, values: Array, x: jax.Array, clamp: bool, when: Moment | None = None) -> jax.Array:
     """The values at the nearest node of the cell where no entry is NaN; of equally near ones the lower."""
     answer: Any = jnp.nan
     largest: Any = 0.0
-    for weight, defined, there in _defined(grid, values, x, clamp, when):
+    for weight, defined, there in _defined_corners(grid, values, x, clamp, when):
         # A node is nearer in every axis exactly if its weight is larger; half way, rounding must not choose.
         nearer = defined & (weight > largest * (1 + 8 * jnp.finfo(x.dtype).eps))
         answer, largest = jnp.where(nearer[..., None], there, answer), jnp.where(nearer, weight, largest)
@@ -122,19 +153,18 @@ def nearest(grid: Grid, values: Any, x: Any, clamp: bool, when: Any = None) -> j
 
 
 @functools.partial(jax.jit, static_argnames="clamp")
-def slopes_between(grid: Grid, values: Any, x: Any, clamp: bool, when: Any = None) -> jax.Array:
+def slopes_between(grid: Grid, values: Array, x: jax.Array, clamp: bool, when: Moment | None = None) -> jax.Array:
     """DV, shape ``x.shape[:-1] + (n,)``: the slopes at the corners of the cell, interpolated."""
     values, x = jnp.asarray(values), grid.wrap(x)
     places = [grid._locate(axis, x[..., axis]) for axis in range(grid.ndim)]
     hidden = jnp.any(jnp.isnan(x), axis=-1) | ((not clamp) & ~jnp.all(jnp.stack([p[2] for p in places]), axis=0))
-    layers: list[tuple[Any, tuple]] = [(jnp.ones((), x.dtype), ())]
+    layers = _layers(x.dtype, values, when)
     if when is not None:
-        before, share, known = when
-        layers = [(1 - share, (before,)), (share, (jnp.minimum(before + 1, values.shape[0] - 1),))]
-        hidden |= (not clamp) & ~known
+        hidden |= (not clamp) & ~when.inside
     slopes = []
     for axis in range(grid.ndim):
         total: Any = 0.0
+        # along the axis itself ``_slope_along`` interpolates, so that 2^(n−1) edges of the cell are looked at
         others = [(0, 1) if other != axis else (0,) for other in range(grid.ndim)]
         for (layer, moment), corner in itertools.product(layers, itertools.product(*others)):
             weight, nodes = layer, []
@@ -149,7 +179,9 @@ def slopes_between(grid: Grid, values: Any, x: Any, clamp: bool, when: Any = Non
     return jnp.where(hidden[..., None], jnp.nan, jnp.stack(slopes, axis=-1))
 
 
-def _slope_along(grid: Grid, values: Any, axis: int, moment: tuple, nodes: list, place: tuple) -> Any:
+def _slope_along(
+    grid: Grid, values: Array, axis: int, moment: tuple[jax.Array, ...], nodes: list[jax.Array], place: Place
+) -> jax.Array:
     """The slope along one axis on the edge of the cell that begins at ``nodes``, linear between its two ends.
 
     At a node it is that of the parabola through it and its neighbours; beside an end of the axis, or a node whose value
@@ -157,7 +189,7 @@ def _slope_along(grid: Grid, values: Any, axis: int, moment: tuple, nodes: list,
     """
     cell, fraction, _ = place
     count, cyclic = grid.shape[axis], grid.periodic[axis]  # type: ignore[index]
-    row, at = [], []
+    row, at = [], []  # values and coordinates of two nodes before the edge, of its two ends, and of one behind it
     coordinates = jnp.asarray(grid.axis(axis), fraction.dtype)
     for shift in (-2, -1, 0, 1, 2):
         index = cell + shift
@@ -168,7 +200,8 @@ def _slope_along(grid: Grid, values: Any, axis: int, moment: tuple, nodes: list,
         at.append(coordinates[there[axis]])
     spacing = grid.spacing(axis)
     widths = [jnp.asarray(spacing, fraction.dtype)] * 4 if cyclic else [b - a for a, b in itertools.pairwise(at)]
-    widths = [jnp.where(width > 0, width, 1) for width in widths]
+    widths = [jnp.where(width > 0, width, 1) for width in widths]  # beyond an end both are the last node
+    # divided differences, first and (below) second, of Newton's form of the parabola; NaN where a value is not finite
     far, down, here, up = (
         jnp.where(jnp.isfinite(b - a), b - a, jnp.nan) / width
         for (a, b), width in zip(itertools.pairwise(row), widths, strict=True)
@@ -186,7 +219,7 @@ def _slope_along(grid: Grid, values: Any, axis: int, moment: tuple, nodes: list,
     return (1 - fraction) * first + fraction * last
 
 
-def extended(grid: Grid, values: Any, enumerated: bool) -> Any:
+def extended(grid: Grid, values: Array, enumerated: bool) -> Any:
     """Node values (..., *grid, m) with those of the nearest defined nodes where one of the 3^n around a node has any.
 
     Axis by axis, the mean of the two neighbours, or of one of them; ``enumerated`` values are not averaged. The rest
@@ -195,11 +228,13 @@ def extended(grid: Grid, values: Any, enumerated: bool) -> Any:
     xp: Any = jnp if is_traced(values) else np
     values = xp.asarray(values)
     first = values.ndim - 1 - grid.ndim
+    # one axis after the other, so that the second fills from what the first has filled: diagonal neighbours as well
     for axis in range(grid.ndim):
         lost = xp.any(xp.isnan(values), axis=-1, keepdims=True)
         lower, upper = (xp.roll(values, shift, axis=first + axis) for shift in (1, -1))
         if not grid.periodic[axis]:  # type: ignore[index]
             place = xp.arange(grid.shape[axis]).reshape(-1, *(1,) * (grid.ndim - axis))
+            # ``roll`` brings the nodes of the opposite end, which are neighbours on a periodic axis alone
             lower = xp.where(place == 0, xp.nan, lower)
             upper = xp.where(place == grid.shape[axis] - 1, xp.nan, upper)
         no_lower, no_upper = (xp.any(xp.isnan(side), axis=-1, keepdims=True) for side in (lower, upper))
@@ -209,15 +244,26 @@ def extended(grid: Grid, values: Any, enumerated: bool) -> Any:
     return values
 
 
-def _defined(grid: Grid, values: Any, x: Any, clamp: bool, when: Any) -> Iterator[tuple[Any, Any, Any]]:
-    """The nodes around each state: weight, whether the values there are defined and count, and the values."""
+def _layers(dtype: np.dtype, values: Array, when: Moment | None) -> list[Layer]:
+    """The kept times before and after a moment, with their weights; one layer of a stationary function."""
+    if when is None:
+        return [(jnp.ones((), dtype), ())]
+    after = jnp.minimum(when.before + 1, values.shape[0] - 1)  # of a single kept time that one, with weight 0
+    return [(1 - when.share, (when.before,)), (when.share, (after,))]
+
+
+Corner: TypeAlias = tuple[jax.Array, jax.Array, jax.Array]  # weight and flag (...), values (..., *entries)
+
+
+def _defined_corners(grid: Grid, values: Array, x: jax.Array, clamp: bool, when: Moment | None) -> Iterator[Corner]:
+    """The nodes around each state: weight, a flag that is True if the values are defined and count, and the values."""
     for weight, hidden, there in _corners(grid, values, x, clamp, when):
         # On a node its neighbours have no weight, so where it has no control, they have no say.
         yield weight, (weight > 0) & ~hidden & ~jnp.any(jnp.isnan(there), axis=-1), there
 
 
-def _corners(grid: Grid, values: Any, x: Any, clamp: bool, when: Any) -> Iterator[tuple[Any, Any, Any]]:
-    """The 2^n nodes around each state, at two times if marched: weight, whether the answer is hidden, and the values.
+def _corners(grid: Grid, values: Array, x: jax.Array, clamp: bool, when: Moment | None) -> Iterator[Corner]:
+    """The 2^n nodes around each state, at two times if marched: weight, a flag if the answer is hidden, and the values.
 
     The cell, the weights and what is outside are those of ``Grid.interpolate``. Gathering before looking for NaN
     keeps a query as cheap as a few nodes, however many the grid has.
@@ -225,12 +271,9 @@ def _corners(grid: Grid, values: Any, x: Any, clamp: bool, when: Any) -> Iterato
     values, x = jnp.asarray(values), grid.wrap(x)
     cells, fractions, inside = zip(*(grid._locate(axis, x[..., axis]) for axis in range(grid.ndim)), strict=True)
     hidden = jnp.any(jnp.isnan(x), axis=-1) | ((not clamp) & ~jnp.all(jnp.stack(inside), axis=0))
-    layers: list[tuple[Any, tuple]] = [(jnp.ones((), x.dtype), ())]
+    layers = _layers(x.dtype, values, when)
     if when is not None:
-        before, share, known = when
-        last = values.shape[0] - 1
-        layers = [(1 - share, (before,)), (share, (jnp.minimum(before + 1, last),))]
-        hidden |= (not clamp) & ~known
+        hidden |= (not clamp) & ~when.inside
     for (layer, moment), corner in itertools.product(layers, np.ndindex(*(2,) * grid.ndim)):
         weight = layer
         for fraction, bit in zip(fractions, corner, strict=True):

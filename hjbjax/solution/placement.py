@@ -11,13 +11,14 @@ import secrets
 import shutil
 import stat
 from collections.abc import Iterator
-from typing import Any
+from typing import TypeAlias
 
 try:
     import fcntl
 except ImportError:  # Windows, where nothing of a dead process is taken away
     fcntl = None  # type: ignore[assignment]
 
+Path: TypeAlias = str | bytes | os.PathLike  # what the system takes for the name of a file
 NAME = 64  # bytes of a file's name that its temporary one repeats; file systems allow 255 in all
 OWN = re.compile(
     r"\..*\.hjbjax\.tmp-(\d+)-[0-9a-f]{8}", re.DOTALL
@@ -28,7 +29,7 @@ class FileError(OSError):
     """A result file that could not be written or read; the message names the path and the reason."""
 
 
-def path_of(path: Any, done: str) -> str:
+def path_of(path: Path, done: str) -> str:
     """The name of a file as text.
 
     Args:
@@ -47,7 +48,7 @@ def path_of(path: Any, done: str) -> str:
     return text
 
 
-def check_place(path: Any, force: bool) -> None:
+def check_place(path: str | os.PathLike[str], force: bool) -> None:
     """Refuse a path at which no file can be put.
 
     Raises:
@@ -66,7 +67,7 @@ def check_place(path: Any, force: bool) -> None:
         raise FileExistsError(f"{path}: exists already; give another name, or force=True to replace it")
 
 
-def place(source: Any, path: Any, force: bool) -> None:
+def place(source: str | os.PathLike[str], path: str | os.PathLike[str], force: bool) -> None:
     """Move a whole file to its name in one step; without ``force`` only if that name is free at that moment.
 
     Raises:
@@ -77,6 +78,7 @@ def place(source: Any, path: Any, force: bool) -> None:
     if force:
         os.replace(source, path)
         return
+    # ``os.replace`` would take the place of a file that came after the check; a link fails where there is one
     try:
         try:
             os.link(source, path)
@@ -87,11 +89,11 @@ def place(source: Any, path: Any, force: bool) -> None:
         else:
             os.unlink(source)
     except FileExistsError:
-        check_place(path, force)
+        check_place(path, force)  # who refuses in the user's words, unless the file has gone again
         raise
 
 
-def _move_over_reservation(source: Any, path: Any) -> None:
+def _move_over_reservation(source: str | os.PathLike[str], path: str | os.PathLike[str]) -> None:
     """Move a file to a name that an empty file takes first: of two who try, one fails."""
     os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
     try:
@@ -106,13 +108,13 @@ def _move_over_reservation(source: Any, path: Any) -> None:
 
 def hidden_name(name: str) -> str:
     """A name for what will be called ``name``, hidden, with the writer's pid."""
-    start = os.fsdecode(os.fsencode(name)[:NAME])
+    start = os.fsdecode(os.fsencode(name)[:NAME])  # the limit of file systems is in bytes, a cut letter is no harm
     return f".{start}.hjbjax.tmp-{os.getpid()}-{secrets.token_hex(4)}"
 
 
 @contextlib.contextmanager
-def claimed(path: Any) -> Iterator[None]:
-    """Holds a lock on a file or a folder on its way; it ends with the process, however that ends."""
+def claimed(path: Path) -> Iterator[None]:
+    """Context with a lock on a file or a folder on its way; it ends with the process, however that ends."""
     if fcntl is None:
         yield
         return
@@ -125,7 +127,7 @@ def claimed(path: Any) -> Iterator[None]:
         os.close(handle)
 
 
-def sweep(folder: Any) -> None:
+def sweep(folder: str | os.PathLike[str]) -> None:
     """Take away what killed writers left in a folder: what bears a dead pid and is locked by nobody.
 
     Of the two signs one alone would not do: a pid says nothing about another machine that writes into the folder, and
@@ -133,7 +135,7 @@ def sweep(folder: Any) -> None:
     """
     if fcntl is None:
         return
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(OSError):  # a folder that cannot be listed is no reason not to write into it
         for entry in os.scandir(folder):
             found = OWN.fullmatch(entry.name)
             if found and not _is_alive(int(found[1])):
@@ -142,8 +144,9 @@ def sweep(folder: Any) -> None:
 
 
 def _is_alive(pid: int) -> bool:
+    """True if a process with this number runs on this machine."""
     try:
-        os.kill(pid, 0)
+        os.kill(pid, 0)  # signal 0 is none: only its delivery is checked
     except (ProcessLookupError, OverflowError):
         return False
     except OSError:  # another user's
@@ -152,12 +155,13 @@ def _is_alive(pid: int) -> bool:
 
 
 def _remove_unclaimed(entry: os.DirEntry) -> None:
+    """Remove a file or a folder unless a living writer holds its lock."""
     is_folder = entry.is_dir(follow_symlinks=False)
     if not is_folder and not entry.is_file(follow_symlinks=False):
         return
-    handle = os.open(entry.path, os.O_RDONLY | os.O_NOFOLLOW)
+    handle = os.open(entry.path, os.O_RDONLY | os.O_NOFOLLOW)  # a link that came meanwhile may point anywhere
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises where a writer holds it
         shutil.rmtree(entry.path, ignore_errors=True) if is_folder else os.unlink(entry.path)
     finally:
         os.close(handle)

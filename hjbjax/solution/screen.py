@@ -7,11 +7,14 @@ characters are shown as Python would write them, and a statistic of another kind
 import math
 import sys
 import textwrap
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from hjbjax.problem import arguments
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.types import Array, Number
+from hjbjax.solution.status import Status
 
 WIDTH = 100  # columns of the printed screen
 LONGEST = 2000  # characters of a text that are looked at; wrapping a million takes a second
@@ -24,20 +27,50 @@ SPELLED = {  # where the terminal has no such letter
 }
 
 
-def show(solution: Any) -> str:
-    """The screen of a solution: at most 15 lines; what is not known is left out."""
+class _Answer(Protocol):
+    """The part of a solution that is printed."""
+
+    @property
+    def grid(self) -> Grid: ...
+    @property
+    def value(self) -> Array: ...
+    @property
+    def times(self) -> Array | None: ...
+    @property
+    def reached(self) -> Array | None: ...
+    @property
+    def cut(self) -> Array | None: ...
+    @property
+    def steps(self) -> int: ...
+    @property
+    def residual(self) -> float | None: ...
+    @property
+    def error(self) -> Number | None: ...
+    @property
+    def isaacs_gap(self) -> Number | None: ...
+    @property
+    def status(self) -> Status: ...
+    @property
+    def message(self) -> str: ...
+    @property
+    def stats(self) -> dict: ...
+
+
+def show(solution: _Answer) -> str:
+    """The screen of a solution: at most 15 lines; lines of which nothing is known are left out."""
     stats, grid = solution.stats, solution.grid
     axes = " x ".join(name + " (periodic)" * flag for name, flag in zip(grid.names, grid.periodic or (), strict=True))
     last = "" if solution.residual is None else f", last residual {solution.residual:.3g}"
     reached = 1.0 if solution.reached is None else float(np.mean(np.asarray(solution.reached)))
     compiling = f", and {number(stats['compile_seconds'])} to check and compile" if "compile_seconds" in stats else ""
     dtype = number(stats.get("dtype") or str(np.asarray(solution.value).dtype))
+    # each with its own guard: any of the statistics may be unknown, and in a file any may be of another kind
     rows = {
         "grid": f"{axes}: {' x '.join(map(str, grid.shape))} = {grid.size:,} nodes",
         "times": "" if solution.times is None else str(np.size(solution.times)),
         "method": ", ".join(number(stats[name]) for name in ("method", "scheme") if name in stats),
         "steps": f"{int(solution.steps)}{last}",
-        "error": _certified(solution),
+        "error": _error(solution),
         "reached": f"{percent(reached)} of the nodes" if reached < 1 else "",
         "cut": _cuts(solution),
         "isaacs gap": "" if solution.isaacs_gap is None else number(solution.isaacs_gap),
@@ -51,10 +84,11 @@ def show(solution: Any) -> str:
     return encodable("\n".join(lines + [f"  {name:10}  {one_line(text)}" for name, text in rows.items() if text]))
 
 
-def _cuts(solution: Any) -> str:
-    """At which ends of the box the optimal drift is cut off, at how many nodes."""
+def _cuts(solution: _Answer) -> str:
+    """The ends of the box at which the optimal drift is cut off, with the number of nodes at each."""
     if solution.cut is None or not np.any(solution.cut):
         return ""
+    # of a marched solution the worst of the kept times, shape (n, 2)
     counts = np.max(np.asarray(solution.cut).reshape(-1, solution.grid.ndim, 2), axis=0)
     ends = [
         f"{counts[axis, side]} of the {('lower', 'upper')[side]} end of {solution.grid.names[axis]}"
@@ -63,8 +97,8 @@ def _cuts(solution: Any) -> str:
     return f"drift out of the box, at these nodes: {', '.join(ends)}"
 
 
-def _certified(solution: Any) -> str:
-    """The certified error and what certifies it, or why nothing does."""
+def _error(solution: _Answer) -> str:
+    """The certified error and its certificate, or why there is none."""
     error, tol = solution.error, solution.stats.get("tol")
     what = "no certificate" if error is None else f"at most {error:.3g}"
     asked = "" if error is None or tol is None else f" (tol {number(tol)})"
@@ -85,18 +119,19 @@ def plain(text: str) -> str:
 
 
 def encodable(text: str) -> str:
-    """A text that standard output can show: Greek and mathematical letters are spelled out where it has none."""
+    """A text in letters that standard output has: Greek and mathematical ones are spelled out where it lacks them."""
     encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
     try:
-        text.encode(encoding)
+        text.encode(encoding)  # a Windows console may know 256 letters, and print would raise in the middle of a screen
     except UnicodeEncodeError:
-        return "".join(_spelled(letter, encoding) for letter in text)
+        return "".join(_spell(letter, encoding) for letter in text)
     except LookupError:  # an encoding that Python does not know
         pass
     return text
 
 
-def _spelled(letter: str, encoding: str) -> str:
+def _spell(letter: str, encoding: str) -> str:
+    """A letter as it is if the encoding has it, else by its name, else by its code point."""
     try:
         letter.encode(encoding)
     except UnicodeEncodeError:
@@ -112,7 +147,7 @@ def number(value: Any) -> str:
 
 
 def percent(share: float) -> str:
-    """Rounded down to a tenth, so that 100 % is all and nothing else."""
+    """A share in per cent, rounded down to a tenth, so that 100 % is all and nothing else."""
     return f"{math.floor(1000 * share) / 10:.1f} %"
 
 

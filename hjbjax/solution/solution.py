@@ -8,6 +8,7 @@ max(upper − V, V − lower).
 
 import dataclasses
 from collections.abc import Sequence
+from types import ModuleType
 from typing import Any
 
 import jax.numpy as jnp
@@ -16,14 +17,24 @@ import numpy as np
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
 from hjbjax.problem.stretching import Sinh
+from hjbjax.problem.types import Array, Numbers
 from hjbjax.solution import files, screen
 from hjbjax.solution.files import Expected, FileError
-from hjbjax.solution.interpolation import between, between_defined, nearest, query, slopes_between
+from hjbjax.solution.interpolation import (
+    Interpolation,
+    Samples,
+    between,
+    between_defined,
+    nearest,
+    query,
+    slopes_between,
+)
+from hjbjax.solution.placement import Path
 from hjbjax.solution.status import Status
 
 __all__ = ["FileError", "Solution", "SolveError", "Status", "load"]
 
-FORMAT, VERSION = "hjbjax.Solution", 1
+FORMAT, VERSION = "hjbjax.Solution", 1  # the version goes up when an older hjbjax would read a file wrongly
 KINDS: dict[str, tuple[type, ...]] = {  # what a file's header holds, as JSON has it
     "code": (int,),
     "steps": (int,),
@@ -36,7 +47,7 @@ KINDS: dict[str, tuple[type, ...]] = {  # what a file's header holds, as JSON ha
 
 
 class SolveError(RuntimeError):
-    """A solve that did not converge: the ``message`` says how it ended, ``.solution`` is what there is.
+    """A solve that did not converge: the ``message`` says how it ended, ``.solution`` is the answer so far, if any.
 
     ``.solutions`` are those of all lanes of a batch, the finished ones among them.
     """
@@ -65,7 +76,7 @@ class Solution:
       cut: at how many nodes of each end of the box the optimal drift is cut off, shape (n, 2), lower and upper; when
         marched, at each kept time, (k, n, 2). Zero at ends that are not projected; ``None`` where it was not counted.
       discrete: whether the controls are enumerated, so that a mean of two need not be admissible.
-      discrete_disturbance: the same of the disturbances.
+      discrete_disturbance: whether the disturbances are enumerated.
       residuals: one number a step; host level.
       stats: "method", "scheme", "device", "dtype", "seconds", "compile_seconds", "bytes", "tol",
         "certificate" (a sentence) and "versions" (a dict), each where known; host level.
@@ -79,7 +90,7 @@ class Solution:
     """
 
     grid: Grid
-    value: Any
+    value: Array
     policy: Any
     disturbance: Any = None
     code: Any = 0
@@ -116,8 +127,9 @@ class Solution:
             return None
         xp: Any = jnp if is_traced(self.value, self.enclosure) else np
         value, (factors, shifts) = xp.asarray(self.value), self._lines(xp)
+        # of a batch every lane has its own lines: factors (lanes,) against values (lanes, *grid)
         finite, numbers = xp.isfinite(value), (..., *(None,) * self.grid.ndim)
-        center = xp.where(finite, value, 0)
+        center = xp.where(finite, value, 0)  # a factor of zero times infinity would be NaN
         lower, upper = (
             xp.where(finite, factors[..., side][numbers] * center + shifts[..., side][numbers], value)
             for side in (0, 1)
@@ -142,11 +154,12 @@ class Solution:
             for side, sign in enumerate((-1, 1))
             for end in (least, most)
         ]
+        # NaN compares with nothing, and least and most look at finite values alone: neither may pass for a bound
         worst = xp.max(xp.stack(off))
         worst = xp.where(xp.isnan(worst) | xp.any(xp.isnan(value)) | ~xp.any(finite), xp.inf, worst)
         return worst if xp is jnp else float(worst)
 
-    def _lines(self, xp: Any) -> tuple[Any, Any]:
+    def _lines(self, xp: ModuleType) -> tuple[Array, Array]:
         """Factors and shifts of the two bounds, each of shape (..., 2)."""
         enclosure = xp.asarray(self.enclosure)
         return enclosure[..., 0], enclosure[..., 1]
@@ -156,7 +169,7 @@ class Solution:
         """The last residual; ``None`` where none was kept."""
         return float(self.residuals[-1]) if len(self.residuals) else None
 
-    def value_at(self, *where: Any, clamp: bool = False) -> Any:
+    def value_at(self, *where: Numbers | Sequence, clamp: bool = False) -> Any:
         """V between the nodes: ``value_at(x)``, or ``value_at(t, x)`` of a marched solution; jit- and vmap-able.
 
         Multilinear interpolation, second order, in the time as well. Concrete states and data give float64 NumPy;
@@ -175,7 +188,7 @@ class Solution:
         """
         return self._query("value_at", between, self.value, 0, where, clamp)
 
-    def costate_at(self, *where: Any, clamp: bool = False) -> Any:
+    def costate_at(self, *where: Numbers | Sequence, clamp: bool = False) -> Any:
         """DV between the nodes, shape ``x.shape[:-1] + (n,)``; arguments and refusals as for ``value_at``.
 
         The costate of Pontryagin's principle, in current value. Central differences at the nodes (parabolas through
@@ -184,26 +197,34 @@ class Solution:
         """
         return self._query("costate_at", slopes_between, self.value, 0, where, clamp)
 
-    def control_at(self, *where: Any, clamp: bool = False) -> Any:
+    def control_at(self, *where: Numbers | Sequence, clamp: bool = False) -> Any:
         """u between the nodes, shape ``x.shape[:-1] + (m,)``; arguments and refusals as for ``value_at``.
 
         Only nodes of the cell where a control is defined count, with their weights scaled to sum to one, so
         that the feedback reaches up to a target or to the edge of the reachable states; where no node of the
         cell has one, the answer is NaN. Enumerated controls are not averaged: the nearest such node's is taken.
         """
+        # the mean of "left" and "right" is no control of a finite set
         look = nearest if self.discrete else between_defined
         return self._query("control_at", look, self.policy, 1, where, clamp)
 
-    def disturbance_at(self, *where: Any, clamp: bool = False) -> Any:
+    def disturbance_at(self, *where: Numbers | Sequence, clamp: bool = False) -> Any:
         """The opponent's d between the nodes, shape ``x.shape[:-1] + (l,)``; as ``control_at``."""
         look = nearest if self.discrete_disturbance else between_defined
         return self._query("disturbance_at", look, self.disturbance, 1, where, clamp)
 
-    def _query(self, name: str, look: Any, values: Any, trailing: int, where: tuple, clamp: bool) -> Any:
+    def _query(
+        self, name: str, look: Interpolation, values: Array | None, trailing: int, where: tuple, clamp: bool
+    ) -> Array:
+        """Values between the nodes by the rule ``look``; of entries per node with ``trailing`` axes."""
+        if values is None:
+            lacking = "policy" if name == "control_at" else "disturbance: the problem is not a game"
+            raise ValueError(f"Solution.{name}: this solution has no {lacking}")
         t, x = _check_query(self, name, values, trailing, where)
-        return query(look, self.grid, values, x, clamp=clamp, name=f"Solution.{name}", times=self.times, t=t)
+        samples = Samples(self.grid, values, self.times)
+        return query(look, samples, x, t, clamp=clamp, name=f"Solution.{name}")
 
-    def save(self, path: Any, *, force: bool = False) -> None:
+    def save(self, path: Path, *, force: bool = False) -> None:
         """Write the solution to ``path``, whole or not at all; ``load`` gives back the same bits.
 
         Statistics come back as JSON has them: tuples as lists, objects as their text.
@@ -235,7 +256,7 @@ class Solution:
         arrays = {}
         for name, wanted in _plan(header).items():
             array = getattr(grid if name in ("lo", "hi") else self, name)
-            if array is None:
+            if array is None:  # what may be missing is optional in the plan, and comes back as None
                 continue
             arrays[name] = array = np.asarray(array)
             if complaint := wanted.complaint(array.shape, array.dtype.str):
@@ -254,7 +275,7 @@ class Solution:
         return screen.show(self)
 
 
-def load(path: Any) -> Solution:
+def load(path: Path) -> Solution:
     """The solution in the file ``path`` that ``Solution.save`` wrote; code in a file is never run.
 
     Raises:
@@ -264,10 +285,11 @@ def load(path: Any) -> Solution:
 
 
 def _plan(header: dict) -> dict[str, Expected]:
-    """What each array must look like, from the grid in the header alone."""
+    """Shapes and dtypes of the arrays in a file, from the grid in its header alone."""
     shape, marched = tuple(header["grid"]["shape"]), header["marched"]
-    if not all(type(count) is int and count >= 2 for count in shape):
+    if not all(type(count) is int and count >= 2 for count in shape):  # before sizes are made of them
         raise FileError(f"its grid has shape {shape}")
+    # number of inputs, residuals: any; of a marched solution the kept times go first
     many, lead = (None,), () if marched is None else (marched,)
     controls = Expected((lead + shape + many, many * len(lead) + shape + many))
     return {
@@ -285,28 +307,27 @@ def _plan(header: dict) -> dict[str, Expected]:
 
 
 def _rebuild(header: dict, arrays: dict[str, np.ndarray]) -> Solution:
+    """The solution from the header and the arrays of a file; ``Grid`` checks its own."""
     about = header["grid"]
     stretch = tuple(pair and Sinh(*pair) for pair in about["stretch"])
     grid = Grid(
         arrays.pop("lo"), arrays.pop("hi"), tuple(about["shape"]), about["periodic"], tuple(about["names"]), stretch,
-        about.get("edges", "projected"),
+        about.get("edges", "projected"),  # older files have none, as all ends were projected
     )  # fmt: skip
-    for name, kinds in KINDS.items():
+    for name, kinds in KINDS.items():  # ``type`` and not ``isinstance``: true is no number of steps
         if type(header[name]) not in kinds:
             raise FileError(f"its header has {name} = {header[name]!r:.60}, wanted {kinds[0].__name__}")
-    Status(header["code"])
+    Status(header["code"])  # raises where there is no such status
     return Solution(**{"policy": None, **arrays, "grid": grid, **{name: header[name] for name in KINDS}})
 
 
-def _check_query(solution: Solution, name: str, values: Any, trailing: int, where: tuple) -> tuple[Any, Any]:
-    """The time, None if stationary, and the state; refuses what has no answer."""
-    if values is None:
-        what = "policy" if name == "control_at" else "disturbance: the problem is not a game"
-        raise ValueError(f"Solution.{name}: this solution has no {what}")
+def _check_query(solution: Solution, name: str, values: Array, trailing: int, where: tuple) -> tuple[Any, Any]:
+    """The time, None if stationary, and the state; refuses a time too many or too few, and batches."""
     marched = solution.times is not None
     if len(where) != 1 + marched:
         kind, call = ("marched over times", f"{name}(t, x)") if marched else ("stationary", f"{name}(x)")
         raise ValueError(f"Solution.{name}: got {len(where)} arguments; this solution is {kind}: call {call}")
+    # one axis too many is that of a batch, which interpolation would take for an axis of the grid
     shape, wanted = np.shape(values), solution.grid.shape
     if marched:
         wanted = np.shape(solution.times) + wanted

@@ -1,10 +1,10 @@
-"""How a solve ended."""
+"""The ways in which a solve ends."""
 
 import enum
 
 
 class Status(enum.IntEnum):
-    """How a solve ended; ``.message`` says what happened and what to do.
+    """The end of a solve; ``.message`` says what happened and what to do.
 
     Example:
       >>> print(Status(3), int(Status.STALLED))
@@ -22,7 +22,7 @@ class Status(enum.IntEnum):
 
     @property
     def message(self) -> str:
-        """What happened and what to do, in one sentence."""
+        """The event and the remedy, in one sentence."""
         return MESSAGES[self]
 
     def __str__(self) -> str:

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.types import Array, Nodes
 
 FEWEST = 12  # intervals that an axis keeps
 
@@ -21,21 +22,24 @@ def coarser(grid: Grid) -> Grid | None:
     for axis, count in enumerate(grid.shape):
         intervals = grid.intervals(axis)
         half = (intervals + 1) // 2
+        # count - intervals is 1, or 0 on a periodic axis, whose upper end is no node
         shape.append(count - intervals + half if half >= FEWEST else count)
     if tuple(shape) == grid.shape:
         return None
     return dataclasses.replace(grid, shape=tuple(shape))
 
 
-def prolong(values: Any, coarse: Grid, fine: Grid) -> Any:
-    """Multilinear interpolation of node values from one grid on a box to another on the same box, (*fine).
+def prolong(values: Nodes, coarse: Grid, fine: Grid) -> Array:
+    """Multilinear interpolation of node values on one grid of a box to the nodes of another grid of that box, (*fine).
 
     A JAX array for one of JAX, else NumPy's.
     """
     xp: Any = np if isinstance(values, np.ndarray) else jnp
+    # axis by axis: 2n gathers in place of 2^n
     for axis, count in enumerate(fine.shape):
         if coarse.shape[axis] == count:
             continue
+        # in parts of a coarse interval; on a stretched axis, too, as both grids are images of one uniform axis
         place = np.arange(count) * (coarse.intervals(axis) / fine.intervals(axis))
         cell = np.minimum(place.astype(int), coarse.intervals(axis) - 1)
         weight = xp.asarray((place - cell).reshape([-1 if i == axis else 1 for i in range(fine.ndim)]), values.dtype)

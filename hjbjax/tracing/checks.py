@@ -20,7 +20,7 @@ from hjbjax.tracing import indices
 OF_ACTION = ("drift", "cost", "noise")
 STATE_COSTS = ("exit_cost", "terminal_cost", "stopping_cost", "running_max")
 
-_TRACED = (  # most special first
+_ADVICE = (  # most special first: a TracerBoolConversionError is a ConcretizationTypeError, too
     (
         (jax.errors.TracerBoolConversionError, jax.errors.NonConcreteBooleanIndexError),
         "decides by Python `if`, `and`, `min`, `max` or a mask on a traced value: use jnp.where (jnp.minimum, ...)",
@@ -34,7 +34,7 @@ _TRACED = (  # most special first
 )
 
 
-def shapes(problem: Problem, grid: Grid, scheme: Any) -> None:
+def shapes(problem: Problem, grid: Grid, scheme: object) -> None:
     """Refuse functions that cannot be traced on one state or return something else than they should.
 
     Args:
@@ -45,15 +45,16 @@ def shapes(problem: Problem, grid: Grid, scheme: Any) -> None:
     Raises:
       ValueError: a result of the wrong shape or kind, a wrong number of arguments, code that JAX cannot trace.
     """
-    needed = getattr(scheme, "points", 2)
+    needed = getattr(scheme, "points", 2)  # a scheme of the user's need not have one
     for axis, count in enumerate(grid.shape):
         if count < needed:
             raise ValueError(f"axis {axis} has {count} points; {type(scheme).__name__} needs at least {needed}")
     n = grid.ndim
     of_one_state(problem, n, "the number of axes of the grid")
     if problem.noise is not None:
+        # σ of shape (n, k), whose transitions go along diagonals
         with jax.enable_x64(True):
-            if len(_returned(problem, "noise", n)) == 2:
+            if len(_shape_or_fault(problem, "noise", n)) == 2:
                 refuse_stretched(grid)
 
 
@@ -67,7 +68,7 @@ def refuse_stretched(grid: Grid) -> None:
 
 
 def of_one_state(problem: Problem, n: int, meaning: str) -> None:
-    """The same without a grid, for a state of ``n`` numbers.
+    """Refuse functions that cannot be traced on a state of ``n`` numbers or return something else than they should.
 
     Args:
       problem: the problem.
@@ -81,6 +82,7 @@ def of_one_state(problem: Problem, n: int, meaning: str) -> None:
     def expect(name: str, wanted: str, fits: Callable[[tuple], bool]) -> None:
         _expect(problem, name, n, wanted, fits, "a scalar" if wanted == "()" else f"n = {n} is {meaning}")
 
+    # answers are remembered, so they must not depend on the precision that JAX is set to when first asked
     with jax.enable_x64(True):
         expect("drift", f"({n},)", lambda shape: shape == (n,))
         expect("noise", f"(), ({n},) or ({n}, k)", lambda shape: shape[:1] in ((), (n,)) and len(shape) <= 2)
@@ -99,6 +101,7 @@ def ill_posed(problem: Problem, has_rest: bool, grid: Grid) -> None:
     Raises:
       ValueError: there is no finite solution; with what would give one.
     """
+    # with any of these the costs of a path may be finite; whether they are, the solve will find out
     ends = (problem.target, problem.stopping_cost, problem.running_max)
     if problem.discount > 0 or has_rest or any(end is not None for end in ends):
         return
@@ -111,12 +114,12 @@ def ill_posed(problem: Problem, has_rest: bool, grid: Grid) -> None:
 
 
 def _middle(grid: Grid) -> str:
-    """Which shape puts a node in the middle of the box: an even number on a periodic axis, an odd one on another."""
+    """Advice on the shape that puts a node in the middle of the box: even on a periodic axis, odd on another."""
     shape = tuple(
         count - (count % 2 if cyclic else 1 - count % 2)
         for count, cyclic in zip(grid.shape, grid.periodic or (), strict=True)
     )
-    if shape == grid.shape or min(shape) < 2:
+    if shape == grid.shape or min(shape) < 2:  # one stands there already, or an axis of two points would lose one
         return ""
     return f".\nNo node stands in the middle of the box, as in 0 on [-1, 1]; shape={shape} puts one there"
 
@@ -125,13 +128,14 @@ def _middle(grid: Grid) -> str:
 
 
 def call(problem: Problem, name: str) -> str:
-    """How the problem calls one of its functions, as in ``drift(x, u)``."""
+    """A function with the arguments that the problem passes, as in ``drift(x, u)``."""
     if not callable(getattr(problem, name)):
         return name
     return f"{name}({', '.join(_names(problem, name))})"
 
 
 def _names(problem: Problem, name: str) -> tuple[str, ...]:
+    """The arguments that the problem passes to one of its functions, by letters."""
     if name in OF_ACTION:
         return problem.arguments("x", "u", "d", "t")
     return problem.state_arguments("x", "t")
@@ -142,8 +146,8 @@ def _expect(problem: Problem, name: str, n: int, wanted: str, fits: Callable[[tu
     ingredient = getattr(problem, name)
     if ingredient is None:
         return
-    verdict = _returned(problem, name, n)
-    if isinstance(verdict, str):
+    verdict = _shape_or_fault(problem, name, n)
+    if isinstance(verdict, str):  # the commonest slips get the way out as well
         hint = ""
         if verdict.startswith(("a list", "a tuple")) and wanted != "()":
             hint = ": use jnp.stack([...])"
@@ -156,8 +160,8 @@ def _expect(problem: Problem, name: str, n: int, wanted: str, fits: Callable[[tu
         raise ValueError(f"{call(problem, name)} returned shape {verdict}, expected {wanted}: {why}")
 
 
-def _returned(problem: Problem, name: str, n: int) -> tuple[int, ...] | str:
-    """The shape of what an ingredient is or returns; of anything but floating-point numbers a description."""
+def _shape_or_fault(problem: Problem, name: str, n: int) -> tuple[int, ...] | str:
+    """The shape of an ingredient, or of its result if it is a function; of other than numbers a description."""
     ingredient = getattr(problem, name)
     return _probe(problem, name, n) if callable(ingredient) else _verdict(ingredient)
 
@@ -181,23 +185,25 @@ def _verdict(result: Any) -> tuple[int, ...] | str:
 
 
 def _probe(problem: Problem, name: str, n: int) -> tuple[int, ...] | str:
-    """What a function returns on one state, found by tracing it."""
+    """The shape of a function's result on one state, found by tracing it, or a description of what it is instead."""
     function, names, said_call = getattr(problem, name), _names(problem, name), call(problem, name)
     lengths = _lengths(problem, n)
     _check_arity(problem, name)
+    # any exception may come out of a function of the user's: those of JAX get advice, those of shapes their first line
     try:
-        verdict, outside, _ = _traced(function, names, tuple(lengths[letter] for letter in names))
+        verdict, outside, _ = _trace_once(function, names, tuple(lengths[letter] for letter in names))
     except Exception as error:
         fed = ", ".join(f"{letter} of shape {lengths[letter]}" for letter in names)
-        for kind, advice in _TRACED:
+        for kind, advice in _ADVICE:
             if isinstance(error, kind):
                 raise ValueError(f"{said_call} {advice}.\nIt is traced once on one state, with {fed}") from error
         if isinstance(error, (TypeError, ValueError, IndexError)):
             said = (str(error).strip() or type(error).__name__).splitlines()[0]
             raise ValueError(f"{said_call} failed on one state, with {fed}:\n{said[:400]}") from error
+        # an exception of the user's own making stays one, so that it can be caught by its type
         error.add_note(f"raised by {said_call}, traced on one state, with {fed}")
         raise
-    if outside is not None:
+    if outside is not None:  # no exception would ever come: see ``indices``
         raise ValueError(f"{said_call} asks for {outside}.\nJAX would take the nearest one, or none, without a word")
     return verdict
 
@@ -208,22 +214,22 @@ def _lengths(problem: Problem, n: int) -> dict[str, tuple[int, ...]]:
 
 
 def calls_back(problem: Problem, n: int) -> bool:
-    """Whether a function of a problem calls Python while it runs, where anything may happen."""
+    """True if a function of a problem calls Python while it runs, where anything may happen."""
     lengths = _lengths(problem, n)
     with jax.enable_x64(True):
         for name in (*OF_ACTION, "target", *STATE_COSTS):
             function, names = getattr(problem, name), _names(problem, name)
-            if callable(function) and _traced(function, names, tuple(lengths[letter] for letter in names))[2]:
+            if callable(function) and _trace_once(function, names, tuple(lengths[letter] for letter in names))[2]:
                 return True
     return False
 
 
 @remembered
-def _traced(
+def _trace_once(
     function: Callable, names: tuple[str, ...], lengths: tuple[tuple[int, ...], ...]
 ) -> tuple[tuple[int, ...] | str, str | None, bool]:
-    """What a function returns for arguments of these shapes, what it asks for outside an array, if it calls Python."""
-    verdicts = []
+    """Shape or fault of a function's result, an index outside its array in words, and whether it calls Python."""
+    verdicts = []  # taken on the way: ``make_jaxpr`` would raise, in its own words, on a result that is text
 
     def probe(*arguments):
         result = function(*arguments)
@@ -235,10 +241,12 @@ def _traced(
 
 
 def _dim(admissible: sets.AdmissibleSet | None) -> int:
+    """The number of inputs; none without a set."""
     return 0 if admissible is None else admissible.dim
 
 
 def _check_arity(problem: Problem, name: str) -> None:
+    """Refuse a function that takes other arguments than the problem passes; a trace would say so less clearly."""
     try:
         signature = inspect.signature(getattr(problem, name))
     except (TypeError, ValueError):  # a builtin says nothing about its arguments

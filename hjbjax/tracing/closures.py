@@ -16,25 +16,28 @@ import hashlib
 import inspect
 import re
 import types
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend import core as jex
+from jax.tree_util import Partial
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, is_traced
+from hjbjax.problem.types import DType, Numbers
 
 ADDRESS = re.compile(r" at 0x[0-9a-f]+|id=\d+")  # of rules of derivatives, made anew with every trace
+# whose functions compute tomorrow what they compute today: problems made of these alone need no trace at all
 LIBRARIES = frozenset({"builtins", "functools", "hjbjax", "itertools", "jax", "jaxlib", "math", "numpy", "operator"})
 OF_ACTION = ("drift", "cost", "noise")
 OF_STATE = ("target", "exit_cost", "terminal_cost", "stopping_cost", "running_max")
 
 
-def settled(problem: Problem, n: int, dtype: Any = None) -> Problem:
+def settled(problem: Problem, n: int, dtype: DType | None = None) -> Problem:
     """The problem with its functions marked by what they compute now, and traced numbers of closures among its leaves.
 
     Args:
@@ -43,16 +46,19 @@ def settled(problem: Problem, n: int, dtype: Any = None) -> Problem:
       dtype: the floating-point type inside a JAX transformation; ``None`` is that of ``float`` there.
     """
     names = [name for name in (*OF_ACTION, *OF_STATE) if callable(getattr(problem, name))]
-    fixed = {name: _remembering(getattr(problem, name)) for name in names if _is_fixed(getattr(problem, name))}
+    # library code computes tomorrow what it computes today and needs no mark; a trace takes about a millisecond
+    fixed = {name: _with_memory(getattr(problem, name)) for name in names if _is_fixed(getattr(problem, name))}
     asked = [name for name in names if name not in fixed]
     if not is_traced(problem):
+        # outside of the caller's ``jit`` and always in float64: every front door finds one mark for one function
         with jax.core.eval_context(), jax.enable_x64(True):
-            found = {name: _traced(problem, name, n, np.dtype(np.float64)) for name in asked}
+            found = {name: _trace(problem, name, n, np.dtype(np.float64)) for name in asked}
         if not any(is_traced(closed.consts) for _, closed in found.values() if closed is not None):
-            return altered(problem, **fixed, **{name: _marked(*pair) for name, pair in found.items()})
+            return altered(problem, **fixed, **{name: _with_mark(*pair) for name, pair in found.items()})
+    # tracers belong to the caller's transformation, so that these functions are traced inside it, in its type
     kind = jnp.result_type(float) if dtype is None else jnp.dtype(dtype)
-    found = {name: _traced(problem, name, n, kind) for name in asked}
-    return altered(problem, **fixed, **{name: _opened(*pair) for name, pair in found.items()})
+    found = {name: _trace(problem, name, n, kind) for name in asked}
+    return altered(problem, **fixed, **{name: _with_closure_as_leaves(*pair) for name, pair in found.items()})
 
 
 def with_settled_functions(front_door: Callable) -> Callable:
@@ -72,22 +78,23 @@ def with_settled_functions(front_door: Callable) -> Callable:
             return front_door(*arguments, **options)  # which Python refuses
         given = positions | options
         if isinstance(given.get(second), Grid) and first in given:
-            given[first] = _all_settled(given[first], given[second].ndim, given.get("dtype"))
+            given[first] = _settle_all(given[first], given[second].ndim, given.get("dtype"))
         if is_traced(given):
             return front_door(**given)
+        # inside somebody's ``jit`` a problem of known numbers is still solved on the host, chunk by chunk
         with jax.core.eval_context():
             return front_door(**given)
 
     return entered
 
 
-def _all_settled(asked: Any, n: int, dtype: Any) -> Any:
-    """A problem, or the problems among some things, settled."""
+def _settle_all(asked: object, n: int, dtype: DType | None) -> object:
+    """A problem, or the problems among several things, settled; the front door refuses everything else."""
     if isinstance(asked, Problem):
         return settled(asked, n, dtype)
     if not isinstance(asked, Iterable):
         return asked
-    each = list(asked)
+    each = list(asked)  # once: it may be a generator
     return [settled(one, n, dtype) if isinstance(one, Problem) else one for one in each]
 
 
@@ -98,13 +105,14 @@ class Marked:
     dependence on the control, the chain, slopes of the drift in u), and each would trace it anew.
     """
 
-    def __init__(self, function: Callable, mark: Any = None):
+    def __init__(self, function: Callable, mark: object = None):
         self.__wrapped__, self.mark = function, mark  # the name under which ``inspect`` finds the signature
-        self._jaxprs: dict[Any, tuple[jex.ClosedJaxpr, Any] | None] = {}
+        # a key holds x64 as well, under which constants made inside the function have another type
+        self._jaxprs: dict[object, tuple[jex.ClosedJaxpr, Any] | None] = {}
 
     def __call__(self, *arguments: Any, **options: Any) -> Any:
         """What the function returns; under a trace by its jaxpr."""
-        if not is_traced(arguments, options):
+        if not is_traced(arguments, options):  # on the host a number may be compared, which no jaxpr can
             return self.__wrapped__(*arguments, **options)
         found = self.jaxpr(options, arguments)
         if found is None:
@@ -139,7 +147,7 @@ class Marked:
             self._jaxprs[key] = found
         return found
 
-    def __eq__(self, other: Any) -> bool:
+    def __eq__(self, other: object) -> bool:
         return isinstance(other, Marked) and self.mark == other.mark and self.__wrapped__ == other.__wrapped__
 
     def __hash__(self) -> int:
@@ -149,41 +157,49 @@ class Marked:
 class Opened:
     """A traced function of what it closed over, of the leaves it held, and of its arguments."""
 
-    def __init__(self, jaxpr: Any):
+    def __init__(self, jaxpr: jex.Jaxpr):
         self.jaxpr = jaxpr
 
     def __call__(self, known: tuple, *arguments: Any) -> Any:
-        """What the function returned, with ``known`` the numbers it closed over and its leaves."""
+        """The function's result, with ``known`` the numbers it closed over and its leaves."""
         constants, leaves = known
-        closed = self._typed(constants, self.jaxpr.constvars)
-        return jax.core.eval_jaxpr(self.jaxpr, closed, *self._typed((*leaves, *arguments), self.jaxpr.invars))[0]
+        # a jaxpr wants the dtypes it was traced with, and a solve may have cast the leaves to float32 meanwhile
+        closed = self._in_traced_dtypes(constants, self.jaxpr.constvars)
+        return jax.core.eval_jaxpr(
+            self.jaxpr, closed, *self._in_traced_dtypes((*leaves, *arguments), self.jaxpr.invars)
+        )[0]
 
     @staticmethod
-    def _typed(values: Any, variables: Any) -> list:
-        return [jnp.asarray(value, var.aval.dtype) for value, var in zip(values, variables, strict=True)]
+    def _in_traced_dtypes(values: Iterable[Numbers], variables: Sequence[jex.Var]) -> list[jax.Array]:
+        """Numbers in the dtypes of variables."""
+        return [
+            jnp.asarray(value, cast(jax.core.ShapedArray, var.aval).dtype)
+            for value, var in zip(values, variables, strict=True)
+        ]
 
 
-def _kind(leaf: Any) -> tuple[tuple[int, ...], Any, bool]:
+def _kind(leaf: jax.typing.ArrayLike | jax.ShapeDtypeStruct) -> tuple[tuple[int, ...], Any, bool]:
     """Shape, type and weakness of a number or of its place holder: what a jaxpr depends on."""
     aval = leaf if isinstance(leaf, jax.ShapeDtypeStruct) else jax.typeof(leaf)
     return aval.shape, aval.dtype, bool(aval.weak_type)
 
 
-def _opened(function: jax.tree_util.Partial, closed: jex.ClosedJaxpr | None) -> jax.tree_util.Partial:
+def _with_closure_as_leaves(function: Partial, closed: jex.ClosedJaxpr | None) -> Partial:
     """A function inside a JAX transformation: with a mark, or with what it closed over as leaves."""
     if closed is None or not is_traced(closed.consts):
-        return _marked(function, closed)
+        return _with_mark(function, closed)
     leaves = jax.tree.leaves((function.keywords, function.args))
-    return jax.tree_util.Partial(Opened(closed.jaxpr), (tuple(closed.consts), leaves))
+    return Partial(Opened(closed.jaxpr), (tuple(closed.consts), leaves))
 
 
-def _is_fixed(thing: Any, depth: int = 8) -> bool:
-    """Whether a part of a problem reads nothing from outside but library code, so that it never computes otherwise."""
-    if depth == 0:
+def _is_fixed(thing: object, depth: int = 8) -> bool:
+    """True if a part of a problem reads nothing from outside but library code, so that it never computes otherwise."""
+    if depth == 0:  # functions that call each other have no end; False costs a trace and is never wrong
         return False
+    # numbers beside the leaves cannot change: a Partial keeps its own, and a dataclass of JAX's is frozen or copied
     if thing is None or isinstance(thing, (bool, int, float, str, np.generic, np.ndarray, jax.Array)):
         return True  # the arrays are leaves
-    if isinstance(thing, jax.tree_util.Partial):
+    if isinstance(thing, Partial):
         return all(_is_fixed(each, depth - 1) for each in (thing.func, *thing.args, *thing.keywords.values()))
     if isinstance(thing, (tuple, list)):
         return all(_is_fixed(each, depth - 1) for each in thing)
@@ -195,11 +211,12 @@ def _is_fixed(thing: Any, depth: int = 8) -> bool:
 
 
 def _reads_no_variables(function: types.FunctionType, depth: int) -> bool:
-    """Whether a function's globals are library code, or functions of which that is true."""
-    if function.__closure__ or function.__kwdefaults__:
+    """True if a function's globals are library code, or functions of which that is true."""
+    if function.__closure__ or function.__kwdefaults__:  # cells can be rebound, and dictionaries written to
         return False
     if not all(isinstance(each, (int, float, str, type(None))) for each in function.__defaults__ or ()):
         return False
+    # CPython keeps names of globals and of attributes in one table; an attribute that is also a global costs a trace
     known = function.__globals__
     outside = [known[name] for name in _names(function.__code__) if name in known]
     return all(
@@ -208,27 +225,27 @@ def _reads_no_variables(function: types.FunctionType, depth: int) -> bool:
 
 
 def _names(code: types.CodeType) -> set[str]:
-    """The names of globals, and of attributes, in a piece of code and in what is defined inside it."""
+    """The names of globals, and of attributes, in a piece of code and in the functions defined inside it."""
     inner = (_names(each) for each in code.co_consts if isinstance(each, types.CodeType))
     return set(code.co_names).union(*inner)
 
 
-def _is_library(thing: Any) -> bool:
-    """Whether a global is a module, a function or a class of a library that nobody changes between two solves."""
+def _is_library(thing: object) -> bool:
+    """True if a global is a module, a function or a class of a library that nobody changes between two solves."""
     home = thing.__name__ if isinstance(thing, types.ModuleType) else getattr(thing, "__module__", None)
     fixed = isinstance(thing, types.ModuleType) or callable(thing)
     return fixed and isinstance(home, str) and home.split(".")[0] in LIBRARIES
 
 
-def _remembering(function: jax.tree_util.Partial) -> jax.tree_util.Partial:
+def _with_memory(function: Partial) -> Partial:
     """The function with a memory for its jaxprs, and no mark yet."""
     inner = function.func.__wrapped__ if isinstance(function.func, Marked) else function.func
-    return jax.tree_util.Partial(Marked(inner), *function.args, **function.keywords)
+    return Partial(Marked(inner), *function.args, **function.keywords)
 
 
-def _traced(problem: Problem, name: str, n: int, dtype: Any) -> tuple[jax.tree_util.Partial, jex.ClosedJaxpr | None]:
+def _trace(problem: Problem, name: str, n: int, dtype: DType) -> tuple[Partial, jex.ClosedJaxpr | None]:
     """A function and its jaxpr in leaves and arguments; None where it cannot be traced: the checks will say why."""
-    function = _remembering(getattr(problem, name))
+    function = _with_memory(getattr(problem, name))
     sizes = {
         letter: 0 if admissible is None else admissible.dim
         for letter, admissible in (("u", problem.controls), ("d", problem.disturbances))
@@ -241,7 +258,7 @@ def _traced(problem: Problem, name: str, n: int, dtype: Any) -> tuple[jax.tree_u
     return function, None if found is None else found[0]
 
 
-def _marked(function: jax.tree_util.Partial, closed: jex.ClosedJaxpr | None) -> jax.tree_util.Partial:
+def _with_mark(function: Partial, closed: jex.ClosedJaxpr | None) -> Partial:
     """The function with the mark of its trace; where there is none it equals no other."""
     assert isinstance(function.func, Marked)
     function.func.mark = object() if closed is None else fingerprint(closed)
@@ -250,23 +267,24 @@ def _marked(function: jax.tree_util.Partial, closed: jex.ClosedJaxpr | None) -> 
 
 def fingerprint(closed: jex.ClosedJaxpr) -> bytes:
     """A digest of what a jaxpr computes, with every number that it holds."""
-    digest = hashlib.blake2b(digest_size=16)
+    digest = hashlib.blake2b(digest_size=16)  # by chance two of 10^10 functions share 128 bits once in 10^18 cases
     _feed(digest, closed.jaxpr, closed.consts)
     return digest.digest()
 
 
-def _feed(digest: Any, jaxpr: Any, consts: Iterable[Any]) -> None:
-    numbers: dict[Any, int] = {}
+def _feed(digest: hashlib.blake2b, jaxpr: jex.Jaxpr, consts: Iterable[Numbers]) -> None:
+    """Put a jaxpr into a digest, equation by equation."""
+    numbers: dict[jex.Var, int] = {}  # variables by their first appearance; their own names differ from trace to trace
 
     def tell(*words: Any) -> None:
         digest.update(repr(words).encode())
 
-    def number(value: Any) -> None:
-        array = np.asarray(value)
+    def number(value: Numbers) -> None:
+        array = np.asarray(value)  # its bits, since a printed one is rounded and a long one abridged
         tell(array.dtype, array.shape)
         digest.update(array.tobytes())
 
-    def tell_parameter(value: Any) -> None:
+    def tell_parameter(value: object) -> None:
         if isinstance(value, jex.ClosedJaxpr):
             _feed(digest, value.jaxpr, value.consts)
         elif isinstance(value, jex.Jaxpr):
@@ -284,16 +302,17 @@ def _feed(digest: Any, jaxpr: Any, consts: Iterable[Any]) -> None:
         tell(numbers.setdefault(var, len(numbers)), str(var.aval))
     for value in consts:
         number(value)
-    for eqn in (*jaxpr.eqns, None):
+    for eqn in (*jaxpr.eqns, None):  # None: the outputs of the whole, as if an equation took them
         operands, results = (jaxpr.outvars, ()) if eqn is None else (eqn.invars, eqn.outvars)
         tell("" if eqn is None else eqn.primitive.name)
         for operand in operands:
-            if isinstance(operand, jex.Literal):
+            if isinstance(operand, jex.Literal):  # a number in the code, of which no variable tells
                 number(operand.val)
             else:
                 tell(numbers.get(operand, -1))
         for result in results:
             tell(numbers.setdefault(result, len(numbers)), str(result.aval))
-        for name in sorted(eqn.params) if eqn is not None else ():
+        parameters = {} if eqn is None else eqn.params
+        for name in sorted(parameters):
             tell(name)
-            tell_parameter(eqn.params[name])
+            tell_parameter(parameters[name])

@@ -9,7 +9,7 @@ What ``interpreter`` has no rule for falls back to ``vmap``, with one warning.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -18,12 +18,14 @@ import numpy as np
 from jax.extend import core as jex
 
 from hjbjax.problem.problem import Problem
+from hjbjax.problem.types import DType, Numbers
 from hjbjax.tracing import indices
 from hjbjax.tracing.interpreter import bind, evaluate, is_components, lift, object_array, pack
+from hjbjax.tracing.primitives import array_type
 
 
-def components(function: Callable, *arguments: Any, dtype: Any) -> np.ndarray:
-    """``function`` of one state, evaluated at every node.
+def components(function: Callable, *arguments: Any, dtype: DType) -> np.ndarray:
+    """Values of a function of one state at all nodes, entry by entry.
 
     Args:
       function: a JAX-traceable function; its vector arguments have shape (n,), (m,), ...
@@ -39,8 +41,8 @@ def components(function: Callable, *arguments: Any, dtype: Any) -> np.ndarray:
     return lift(result, ARRAYS)
 
 
-def scalar(function: Any, *arguments: Any, dtype: Any) -> Any:
-    """Like ``components`` for a function that returns a scalar, or a number in its place: one per-node scalar."""
+def scalar(function: Callable | Numbers, *arguments: Any, dtype: DType) -> jax.Array:
+    """Values at all nodes of a function that returns a scalar, or of a number in its place: one per-node scalar."""
     if not callable(function):
         return jnp.asarray(function, dtype)
     entries = components(function, *arguments, dtype=dtype)
@@ -49,16 +51,19 @@ def scalar(function: Any, *arguments: Any, dtype: Any) -> Any:
     return entries.item()
 
 
-def of_state(problem: Problem, ingredient: Any, x: list, t: Any, dtype: Any) -> Any:
-    """A problem's function of the state alone, or a number in its place, or None for zero: one per-node scalar."""
+def of_state(
+    problem: Problem, ingredient: Callable | Numbers | None, x: Sequence[Numbers], t: Numbers, dtype: DType
+) -> jax.Array:
+    """Values at all nodes of a problem's function of the state alone, a number in its place, or None for zero."""
     entry = 0.0 if ingredient is None else ingredient
     return scalar(entry, *problem.state_arguments(x, t), dtype=dtype)
 
 
-def trace(function: Callable, *arguments: Any, dtype: Any) -> tuple[jex.ClosedJaxpr, list[np.ndarray]]:
+def trace(function: Callable, *arguments: Any, dtype: DType) -> tuple[jex.ClosedJaxpr, list[np.ndarray]]:
     """The jaxpr of ``function`` on one state, and the arguments as object arrays."""
     packed = [pack(argument) for argument in arguments]
     shapes = [jax.ShapeDtypeStruct(entries.shape, dtype) for entries in packed]
+    # JAX remembers traces by function, also where a global has changed since: hence the marks of ``closures``
     closed = jax.make_jaxpr(function)(*shapes)
     if (outside := indices.beyond(closed)) is not None:  # inside jit, where nobody has looked before
         raise ValueError(f"a function of one state asks for {outside}")
@@ -66,27 +71,33 @@ def trace(function: Callable, *arguments: Any, dtype: Any) -> tuple[jex.ClosedJa
 
 
 class _Arrays:
-    """Scalars that are arrays over the nodes; ranks are those of the grid, or zero."""
+    """Algebra of arrays over the nodes; ranks are those of the grid, or zero."""
 
-    def constant(self, value: Any, index: tuple[int, ...]) -> Any:
+    def constant(self, value: Any, index: tuple[int, ...]) -> Numbers:
         return value[index] if np.ndim(value) else value
 
-    def entrywise(self, primitive: Any, params: dict, operands: list[Any], dtypes: list[Any]) -> Any:
+    def entrywise(
+        self, primitive: jex.Primitive, params: dict, operands: list, dtypes: Sequence[np.dtype]
+    ) -> jax.Array:
+        # XLA's primitives want equal shapes; broadcasts are fused and never written to memory. The dtype is the
+        # traced one: a Python number that met a float32 state has become float32 there, and must here.
         arrays = [jnp.asarray(value, dtype) for value, dtype in zip(operands, dtypes, strict=True)]
         return primitive.bind(*jnp.broadcast_arrays(*arrays), **params)
 
-    def combine(self, operation: Callable, dtype: Any, left: Any, right: Any) -> Any:
+    def combine(self, operation: Callable, dtype: np.dtype, left: Numbers, right: Numbers) -> jax.Array:
         return operation(*jnp.broadcast_arrays(jnp.asarray(left, dtype), jnp.asarray(right, dtype)))
 
-    def custom_jvp(self, eqn: Any, inner: jex.ClosedJaxpr, operands: list[Any]) -> list[Any]:
+    def custom_jvp(self, eqn: jex.JaxprEqn, inner: jex.ClosedJaxpr, operands: list) -> list[np.ndarray]:
         """The function by components, with its own derivative, which is a function of one state as well."""
-        avals = [var.aval for var in eqn.invars]
+        avals = [array_type(var) for var in eqn.invars]
+        # tangents of integers are of the empty type float0, on which no arithmetic is defined
         if not all(jnp.issubdtype(aval.dtype, jnp.floating) for aval in avals):
             return self.nodewise(eqn, operands)
         packed = [lift(value, self) for value in operands]
         shapes = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in avals]
 
-        def flat(closed, rows):
+        # jax.custom_jvp takes lists of arrays and no object arrays: each operand goes in as the list of its entries
+        def flat(closed, rows):  # rows: the operands, or the operands and their tangents, hence zip without strict
             arguments = [object_array(row, shape.shape) for row, shape in zip(rows, shapes * 2, strict=False)]
             return [
                 [jnp.asarray(entry, var.aval.dtype) for entry in lift(value, self).flat]
@@ -99,7 +110,7 @@ class _Arrays:
 
         @function.defjvp
         def derivative(primals, tangents):
-            def one(*args):
+            def one(*args):  # at one state, where binding the equation brings the rule of its author into play
                 half = len(args) // 2
                 return jax.jvp(lambda *state: bind(eqn, list(state)), args[:half], args[half:])
 
@@ -112,25 +123,24 @@ class _Arrays:
             [jnp.asarray(entry, aval.dtype) for entry in value.flat] for value, aval in zip(packed, avals, strict=True)
         ]
         outputs = function(*rows)
-        return [object_array(entries, var.aval.shape) for entries, var in zip(outputs, eqn.outvars, strict=True)]
+        return [object_array(entries, array_type(var).shape) for entries, var in zip(outputs, eqn.outvars, strict=True)]
 
-    def nodewise(self, eqn: Any, operands: list[Any]) -> list[Any]:
-        """One equation at every node by ``vmap`` over the flattened nodes."""
+    def nodewise(self, eqn: jex.JaxprEqn, operands: list) -> list[np.ndarray]:
+        """Results of one equation at every node, by ``vmap`` over the flattened nodes."""
         varying = [is_components(value) for value in operands]
         shapes = [np.shape(entry) for value, v in zip(operands, varying, strict=True) if v for entry in value.flat]
-        nodes = np.broadcast_shapes(*shapes)
+        nodes = np.broadcast_shapes(*shapes)  # of axes along which an operand varies: others stay of length 1
 
-        def gathered(value, aval):
+        def gather(value, aval):  # entries that are arrays over the nodes, as one array (nodes, *shape of the operand)
             entries = [jnp.broadcast_to(jnp.asarray(entry, aval.dtype), nodes).reshape(-1) for entry in value.flat]
             return jnp.stack(entries, axis=-1).reshape(math.prod(nodes), *value.shape)
 
         arguments = [
-            gathered(value, var.aval) if v else value
-            for value, v, var in zip(operands, varying, eqn.invars, strict=True)
+            gather(value, var.aval) if v else value for value, v, var in zip(operands, varying, eqn.invars, strict=True)
         ]
-        axes = [0 if v else None for v in varying]
+        axes = [0 if v else None for v in varying]  # what holds at all nodes is not copied to each
         results = jax.vmap(lambda *one: bind(eqn, list(one)), in_axes=axes)(*arguments)
-        return [
+        return [  # results (nodes, *shape), taken apart into one array (*grid) an entry
             object_array(
                 [result[(slice(None), *index)].reshape(nodes) for index in np.ndindex(*result.shape[1:])],
                 result.shape[1:],

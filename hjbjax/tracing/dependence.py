@@ -11,25 +11,28 @@ The slopes of an affine function are taken by JAX's derivative rules, so that a 
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import numpy as np
+from jax.extend import core as jex
 
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import remembered
-from hjbjax.tracing.interpreter import evaluate
+from hjbjax.problem.types import DType, Numbers
+from hjbjax.tracing.interpreter import evaluate, is_components
+from hjbjax.tracing.primitives import array_type
 
 Term = tuple[int, ...] | frozenset[int]  # a product of at most two inputs, or some function of these inputs
 Terms = frozenset
 CONSTANT: Terms = frozenset({()})
 
+# f(a + b) = f(a) + f(b), so that the terms stay those of the operand
 _LINEAR = frozenset({"neg", "convert_element_type", "copy", "copy_p", "real"})
 
 
 @dataclass(frozen=True)
 class Dependence:
-    """Which terms in the control each entry of a function's result holds.
+    """Terms in the control that each entry of a function's result holds.
 
     Attributes:
       entries: one set of terms an entry.
@@ -39,29 +42,31 @@ class Dependence:
 
     @property
     def is_constant(self) -> bool:
-        """Whether no entry depends on the control."""
+        """True if no entry depends on the control."""
         return not any(term for entry in self.entries for term in entry)
 
     def affine_in(self, inputs: Sequence[int]) -> bool:
-        """Whether every entry is affine in these inputs together, whatever the others are."""
+        """True if every entry is affine in these inputs together, whatever the others are."""
         wanted = set(inputs)
 
+        # u₀u₀ is (0, 0) and counts twice; no function of unknown kind may hold any of the inputs
         def fits(term: Term) -> bool:
             return sum(j in wanted for j in term) <= (1 if isinstance(term, tuple) else 0)
 
         return all(fits(term) for entry in self.entries for term in entry)
 
     def separable_quadratic_in(self, inputs: Sequence[int]) -> bool:
-        """Whether every entry is a sum of quadratic polynomials of one of these inputs each."""
+        """True if every entry is a sum of quadratic polynomials of one of these inputs each."""
         wanted = set(inputs)
 
+        # as a set (0, 0) is one input, so that squares pass and products of two inputs do not
         def fits(term: Term) -> bool:
             return len(wanted & set(term)) <= (1 if isinstance(term, tuple) else 0)
 
         return all(fits(term) for entry in self.entries for term in entry)
 
     def free_of(self, inputs: Sequence[int]) -> bool:
-        """Whether no entry depends on these inputs."""
+        """True if no entry depends on these inputs."""
         return not self.driven_by(inputs)
 
     def driven_by(self, inputs: Sequence[int]) -> tuple[int, ...]:
@@ -70,17 +75,18 @@ class Dependence:
         return tuple(i for i, entry in enumerate(self.entries) if any(wanted & set(term) for term in entry))
 
     def crosses(self, first: Sequence[int], second: Sequence[int]) -> bool:
-        """Whether some term holds inputs of both, so that the function is no sum of a part each."""
+        """True if some term holds inputs of both, so that the function is no sum of a part each."""
         return any(set(term) & set(first) and set(term) & set(second) for entry in self.entries for term in entry)
 
     def has_square(self, inputs: Sequence[int]) -> bool:
-        """Whether some entry holds a second power of one of ``inputs``."""
+        """True if some entry holds a second power of one of ``inputs``."""
+        # a term of unknown kind is none: it is a frozenset, and no minimiser of quadratics takes it
         return any((j, j) in entry for entry in self.entries for j in inputs)
 
 
 @remembered
-def dependence(function: Callable, *arguments: tuple[int | None, bool], dtype: Any) -> Dependence:
-    """The dependence of ``function`` on those of its arguments that are controls.
+def dependence(function: Callable, *arguments: tuple[int | None, bool], dtype: DType) -> Dependence:
+    """Terms of ``function`` in those of its arguments that are controls.
 
     Args:
       function: a function of one state, as a problem holds it: a pytree.
@@ -94,11 +100,11 @@ def dependence(function: Callable, *arguments: tuple[int | None, bool], dtype: A
     for (_, counts), shape in zip(arguments, shapes, strict=True):
         entries = np.empty(shape.shape, dtype=object)
         for index in np.ndindex(*shape.shape):
-            entries[index] = frozenset({(number,)}) if counts else CONSTANT
+            entries[index] = frozenset({(number,)}) if counts else CONSTANT  # the input alone, or no input
             number += counts
         packed.append(entries)
     (result,) = evaluate(closed, packed, _POLYNOMIALS)
-    if not (isinstance(result, np.ndarray) and result.dtype == object):
+    if not is_components(result):  # a constant, which the evaluation left as the number that it is
         return Dependence((CONSTANT,) * int(np.size(result)))
     return Dependence(tuple(result.reshape(-1)))
 
@@ -130,30 +136,32 @@ class Influence:
         return bool(set(self.drift.driven_by(self.control)) & set(self.drift.driven_by(self.disturbance)))
 
 
-def influence(problem: Problem, n: int, dtype: Any) -> Influence:
+def influence(problem: Problem, n: int, dtype: DType) -> Influence:
     """How the functions of a problem with ``n`` states depend on its players."""
     m = 0 if problem.controls is None else problem.controls.dim
     k = 0 if problem.disturbances is None else problem.disturbances.dim
     arguments = (*((None, False),) * problem.time_dependent, (n, False), (m, True), *((k, True),) * problem.is_game)
 
-    def of(function: Any) -> Dependence:
+    def of(function: object) -> Dependence:
         return dependence(function, *arguments, dtype=dtype) if callable(function) else Dependence((CONSTANT,))
 
     return Influence(of(problem.drift), of(problem.cost), of(problem.noise), range(m), range(m, m + k))
 
 
 def _some_function(operands: Iterable[Terms]) -> Terms:
-    """What is known of a function of these operands that is no quadratic polynomial: on which inputs it depends."""
+    """Term of a function of these operands that is no quadratic polynomial: the set of the inputs that enter it."""
     inputs = frozenset(j for terms in operands for term in terms for j in term)
     return frozenset({inputs}) if inputs else CONSTANT
 
 
 def _product(left: Terms, right: Terms) -> Terms:
+    """Terms of a product, each of one factor with each of the other."""
     return frozenset(_times(p, q) for p in left for q in right)
 
 
 def _times(left: Term, right: Term) -> Term:
-    if not left or not right:
+    """A product of two terms."""
+    if not left or not right:  # one of them is the constant term ()
         return left or right
     if isinstance(left, tuple) and isinstance(right, tuple) and len(left) + len(right) <= 2:
         return tuple(sorted(left + right))
@@ -161,15 +169,18 @@ def _times(left: Term, right: Term) -> Term:
 
 
 class _Polynomials:
-    """Scalars that are sets of terms."""
+    """Algebra of sets of terms: no coefficients, so that terms never cancel and what is called affine is so for all."""
 
-    def constant(self, value: Any, index: tuple[int, ...]) -> Terms:
+    def constant(self, value: Numbers, index: tuple[int, ...]) -> Terms:
         return CONSTANT
 
-    def entrywise(self, primitive: Any, params: dict, operands: list[Any], dtypes: list[Any]) -> Terms:
+    def entrywise(
+        self, primitive: jex.Primitive, params: dict, operands: list[Terms], dtypes: Sequence[np.dtype]
+    ) -> Terms:
         name = primitive.name
         if all(value == CONSTANT for value in operands):
             return CONSTANT
+        # before the linear ones: neither the slope nor the ends of a staircase tell where it is smallest
         if name == "convert_element_type" and _rounds(params["new_dtype"]):
             return _some_function(operands)
         if name in _LINEAR:
@@ -178,39 +189,41 @@ class _Polynomials:
             return operands[0] | operands[1]
         if name == "mul":
             return _product(*operands)
-        if name == "div" and operands[1] == CONSTANT:
+        if name == "div" and operands[1] == CONSTANT:  # by something that no input enters; u₀/u₁ is no polynomial
             return operands[0]
         if name == "square" or (name == "integer_pow" and params["y"] == 2):
             return _product(operands[0], operands[0])
         if name == "integer_pow" and params["y"] == 1:
             return operands[0]
+        # the choice is that of a state, so at each state the result is one of the cases
         if name == "select_n" and operands[0] == CONSTANT:
             return frozenset().union(*operands[1:])
         return _some_function(operands)
 
-    def combine(self, operation: Callable, dtype: Any, left: Terms, right: Terms) -> Terms:
-        if operation is jax.lax.add:
+    def combine(self, operation: Callable, dtype: np.dtype, left: Terms, right: Terms) -> Terms:
+        if operation is jax.lax.add:  # what ``reduce_sum``, ``cumsum`` and products of matrices are made of
             return left | right
         if operation is jax.lax.mul:
             return _product(left, right)
         return _some_function([left, right])
 
-    def custom_jvp(self, eqn: Any, inner: Any, operands: list[Any]) -> list[Any]:
+    def custom_jvp(self, eqn: jex.JaxprEqn, inner: jex.ClosedJaxpr, operands: list) -> list[np.ndarray]:
+        # not by the terms of ``inner``: the slope that its rule gives need not be the one of what it computes
         return self.nodewise(eqn, operands)
 
-    def nodewise(self, eqn: Any, operands: list[Any]) -> list[Any]:
-        varying = [v for v in operands if isinstance(v, np.ndarray) and v.dtype == object]
+    def nodewise(self, eqn: jex.JaxprEqn, operands: list) -> list[np.ndarray]:
+        varying = [v for v in operands if is_components(v)]
         known = _some_function(entry for value in varying for entry in value.flat)
         results = []
         for var in eqn.outvars:
-            entries = np.empty(var.aval.shape, dtype=object)
-            entries.fill(known)
+            entries = np.empty(array_type(var).shape, dtype=object)
+            entries.fill(known)  # every result may depend on every operand
             results.append(entries)
         return results
 
 
-def _rounds(dtype: Any) -> bool:
-    """Whether numbers become coarse steps in this type: integers, and floating point of 16 bits or fewer."""
+def _rounds(dtype: DType) -> bool:
+    """True if numbers become coarse steps in this type: integers, and floating point of 16 bits or fewer."""
     return not np.issubdtype(dtype, np.inexact) or np.finfo(dtype).bits < 32
 
 

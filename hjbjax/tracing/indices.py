@@ -8,12 +8,19 @@ NumPy; whatever depends on the state is unknown, and unknown indices are let pas
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import jax
 import numpy as np
 from jax.extend import core as jex
 
+from hjbjax.problem.types import Numbers
+from hjbjax.tracing.primitives import array_type
+
+# A look costs time before every solve, and slips of the pen are small: x[2] of two states, a row beyond a small table.
 MOST = 10_000  # entries of an array of indices that is looked at
 TURNS = 64  # of a loop of known length that are followed
 
+# The operations that stand between a written index and the primitive that takes it. JAX itself would do, but compile
+# each on its first use.
 KNOWN: dict[str, Callable[..., Any]] = {
     "lt": lambda a, b: a < b,
     "le": lambda a, b: a <= b,
@@ -56,30 +63,33 @@ def beyond(closed: jex.ClosedJaxpr, names: Sequence[str] = ()) -> str | None:
 
 
 def calls_back(closed: jex.ClosedJaxpr) -> bool:
-    """Whether a jaxpr calls Python while it runs."""
+    """True if a jaxpr calls Python while it runs."""
     return any("callback" in eqn.primitive.name or any(map(calls_back, _inner(eqn))) for eqn in closed.jaxpr.eqns)
 
 
-def _walk(jaxpr: Any, consts: Sequence[Any], inputs: Sequence[Any], labels: Sequence[Any]) -> tuple[list, str | None]:
-    """Known outputs (``None`` for the others), and what was found first."""
-    values = dict(zip(jaxpr.invars, inputs, strict=True))
-    values |= {var: _index(const) for var, const in zip(jaxpr.constvars, consts, strict=False)}
-    called = dict(zip(jaxpr.invars, labels, strict=True))
+def _walk(
+    jaxpr: jex.Jaxpr, consts: Sequence[Any], inputs: Sequence[Any], labels: Sequence[str | None]
+) -> tuple[list[np.ndarray | None], str | None]:
+    """Known outputs (``None`` for the others), and the first index outside its array, in words."""
+    values: dict[Any, np.ndarray | None] = dict(zip(jaxpr.invars, inputs, strict=True))
+    values |= {var: _index_array(const) for var, const in zip(jaxpr.constvars, consts, strict=False)}
+    called: dict[Any, str | None] = dict(zip(jaxpr.invars, labels, strict=True))
 
-    def look(var: Any) -> Any:
-        return _index(var.val) if isinstance(var, jex.Literal) else values.get(var)
+    def look(var: jex.Var | jex.Literal) -> np.ndarray | None:
+        return _index_array(var.val) if isinstance(var, jex.Literal) else values.get(var)
 
     for eqn in jaxpr.eqns:
         known = [look(var) for var in eqn.invars]
         first = eqn.invars[0] if eqn.invars else None
+        # an array is called by its name as long as it is the argument itself, also inside an inner ``jit``
         name = None if first is None or isinstance(first, jex.Literal) else called.get(first)
         if (found := _outside(eqn, known, name)) is not None:
             return [], found
         results: Sequence[Any] = [None] * len(eqn.outvars)
         passed = [None if isinstance(var, jex.Literal) else called.get(var) for var in eqn.invars]
         inner = _inner(eqn)
-        if eqn.primitive.name == "scan":
-            inner, (results, found) = [], _turns(eqn, known, passed)
+        if eqn.primitive.name == "scan":  # its counters are known turn by turn, and unknown in the body as such
+            inner, (results, found) = [], _walk_turns(eqn, known, passed)
             if found is not None:
                 return [], found
         for body in inner:
@@ -91,16 +101,18 @@ def _walk(jaxpr: Any, consts: Sequence[Any], inputs: Sequence[Any], labels: Sequ
             if fits and len(inner) == 1 and eqn.primitive.name in ("jit", "pjit", "closed_call"):
                 results = outputs
         if not inner and eqn.primitive.name != "scan":
-            results = _evaluated(eqn, known)
+            results = _evaluate(eqn, known)
         values |= dict(zip(eqn.outvars, results, strict=True))
     return [look(var) for var in jaxpr.outvars], None
 
 
-def _turns(eqn: Any, known: list[Any], labels: list[Any]) -> tuple[list, str | None]:
-    """Known results of a loop, turn by turn as far as its counters are known, and what was found first."""
+def _walk_turns(
+    eqn: jex.JaxprEqn, known: list[np.ndarray | None], labels: Sequence[str | None]
+) -> tuple[list[np.ndarray | None], str | None]:
+    """Known results of a loop, turn by turn as far as its counters are known, and the first index outside its array."""
     body, length = eqn.params["jaxpr"], eqn.params["length"]
     fixed = eqn.params["num_consts"]
-    start = fixed + eqn.params["num_carry"]
+    start = fixed + eqn.params["num_carry"]  # operands of ``scan``: constants, carry, and arrays taken row by row
     carry, rows = known[fixed:start], known[start:]
     turns = range(length)[:: -1 if eqn.params["reverse"] else 1]
     for turn in turns[:TURNS]:
@@ -110,12 +122,12 @@ def _turns(eqn: Any, known: list[Any], labels: list[Any]) -> tuple[list, str | N
             return [], found
         carry = outputs[: len(carry)]
         if all(each is None for each in (*carry, *rows)):
-            break
+            break  # nothing known is left, so that every other turn would look like this one
     followed = length <= TURNS and any(each is not None for each in carry)
     return [*(carry if followed else (None,) * len(carry)), *(None for _ in eqn.outvars[len(carry) :])], None
 
 
-def _inner(eqn: Any) -> list[jex.ClosedJaxpr]:
+def _inner(eqn: jex.JaxprEqn) -> list[jex.ClosedJaxpr]:
     """The jaxprs that an equation calls; not the ones that combine two entries of a scatter."""
     found = []
     for name, value in eqn.params.items():
@@ -127,7 +139,7 @@ def _inner(eqn: Any) -> list[jex.ClosedJaxpr]:
     return found
 
 
-def _index(value: Any) -> Any:
+def _index_array(value: Numbers) -> np.ndarray | None:
     """A concrete array of indices as NumPy; ``None`` for anything else."""
     kind = getattr(value, "dtype", np.asarray(value).dtype if isinstance(value, (bool, int)) else None)
     if kind is None or np.dtype(kind).kind not in "iub" or np.size(value) > MOST:
@@ -138,62 +150,66 @@ def _index(value: Any) -> Any:
         return None
 
 
-def _evaluated(eqn: Any, known: list[Any]) -> list[Any]:
+def _evaluate(eqn: jex.JaxprEqn, known: list[np.ndarray | None]) -> list[np.ndarray | None]:
     """Results of an operation on known integers; ``None`` where it is another, or they are not known."""
-    rule, shape = KNOWN.get(eqn.primitive.name), eqn.outvars[0].aval.shape if eqn.outvars else ()
+    rule, shape = KNOWN.get(eqn.primitive.name), array_type(eqn.outvars[0]).shape if eqn.outvars else ()
+    # the size in floating point: a shape such as (10**10, 10**10) would overflow int64 to a small number
     if rule is None or any(value is None for value in known) or np.prod(shape, dtype=float) > MOST:
         return [None] * len(eqn.outvars)
-    with np.errstate(all="ignore"):
-        return [_index(rule(*known, **eqn.params))]
+    with np.errstate(all="ignore"):  # integers that overflow wrap in JAX without a word
+        return [_index_array(rule(*known, **eqn.params))]
 
 
 # --- what an equation indexes ---
 
 
-def _outside(eqn: Any, known: list[Any], name: str | None) -> str | None:
-    """What an equation asks for outside its array, in words."""
+def _outside(eqn: jex.JaxprEqn, known: list[np.ndarray | None], name: str | None) -> str | None:
+    """Entries that an equation asks for outside its array, in words; ``None`` where there are none."""
     kind, shape = eqn.primitive.name, getattr(eqn.invars[0].aval, "shape", ()) if eqn.invars else ()
     if kind == "dynamic_slice":
         columns = dict(enumerate(known[1 : 1 + len(shape)]))
         sizes = eqn.params["slice_sizes"]
     elif kind == "dynamic_update_slice":
-        columns, sizes = dict(enumerate(known[2 : 2 + len(shape)])), eqn.invars[1].aval.shape
+        columns, sizes = dict(enumerate(known[2 : 2 + len(shape)])), array_type(eqn.invars[1]).shape
+    # ``x.at[i].get(mode="fill", fill_value=0)`` asks for entries outside on purpose
     elif kind == "gather" and not _has_stand_in(eqn.params.get("fill_value")):
         columns, sizes = _columns(known[1], eqn.params["dimension_numbers"].start_index_map), eqn.params["slice_sizes"]
     elif kind.startswith("scatter"):
         numbers = eqn.params["dimension_numbers"]
         columns = _columns(known[1], numbers.scatter_dims_to_operand_dims)
-        sizes = _window(numbers, shape, eqn.invars[2].aval.shape)
+        sizes = _window(numbers, shape, array_type(eqn.invars[2]).shape)
     else:
         return None
     for axis, starts in columns.items():
-        last = shape[axis] - sizes[axis]
+        last = shape[axis] - sizes[axis]  # the largest start at which the whole window lies inside
         if starts is None or np.size(starts) == 0 or not (np.min(starts) < 0 or np.max(starts) > last):
             continue
         start = next(int(k) for k in np.ravel(starts) if not 0 <= k <= last)
-        return _said(name, shape, axis, start, sizes[axis])
+        return _sentence(name, shape, axis, start, sizes[axis])
     return None
 
 
-def _has_stand_in(fill: Any) -> bool:
-    """Whether a gather was given a number for what lies outside; NaN is what JAX takes unasked."""
+def _has_stand_in(fill: float | None) -> bool:
+    """True if a gather was given a number for entries outside; NaN is what JAX takes unasked."""
     return fill is not None and not np.isnan(fill)
 
 
-def _columns(indices: Any, axes: Sequence[int]) -> dict[int, Any]:
+def _columns(indices: np.ndarray | None, axes: Sequence[int]) -> dict[int, np.ndarray | None]:
     """The indices along each axis of the array, from the rows of a gather or a scatter."""
     return {} if indices is None else {axis: np.asarray(indices)[..., k] for k, axis in enumerate(axes)}
 
 
-def _window(numbers: Any, shape: tuple[int, ...], updates: tuple[int, ...]) -> list[int]:
-    """How much of each axis one update of a scatter covers."""
+def _window(numbers: jax.lax.ScatterDimensionNumbers, shape: tuple[int, ...], updates: tuple[int, ...]) -> list[int]:
+    """Length along each axis of what one update of a scatter covers."""
     single = {*numbers.inserted_window_dims, *getattr(numbers, "operand_batching_dims", ())}
     widths = iter(updates[axis] for axis in numbers.update_window_dims)
     return [1 if axis in single else next(widths) for axis in range(len(shape))]
 
 
-def _said(name: str | None, shape: tuple[int, ...], axis: int, start: int, size: int) -> str:
+def _sentence(name: str | None, shape: tuple[int, ...], axis: int, start: int, size: int) -> str:
+    """The entry that is asked for and those that there are, for a refusal."""
     count = shape[axis]
+    # x[-3] of two states stands in the jaxpr as -1, after JAX has added the length
     entry = f"entry {start}" if start >= 0 else f"entry {start - count} (from the end)"
     if size > 1:
         entry = f"entries {start} to {start + size - 1}"

@@ -8,22 +8,44 @@ import functools
 import itertools
 import math
 import warnings
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Protocol, TypeAlias, TypeGuard
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend import core as jex
 
-from hjbjax.tracing.primitives import CALLS, CUMULATIVE, ENTRYWISE, IN_NUMPY, MOVES, REDUCTIONS, SCATTERS
+from hjbjax.problem.types import Numbers
+from hjbjax.tracing.primitives import CALLS, CUMULATIVE, ENTRYWISE, IN_NUMPY, MOVES, REDUCTIONS, SCATTERS, array_type
+
+Operand: TypeAlias = Numbers  # of an equation: an object array of scalars, or numbers that hold at all nodes
 
 
 class FallbackWarning(UserWarning):
     """A primitive has no component rule and is evaluated node by node with ``vmap``: correct, slower."""
 
 
-def pack(argument: Any) -> np.ndarray:
+class Algebra(Protocol):
+    """Arithmetic of the scalars in an object array: arrays over the nodes, or sets of terms in the control."""
+
+    def constant(self, value: Numbers, index: tuple[int, ...]) -> Any:
+        """The scalar for one entry of numbers that hold at all nodes."""
+
+    def entrywise(self, primitive: jex.Primitive, params: dict, operands: list, dtypes: Sequence[np.dtype]) -> Any:
+        """One entry of the result of a primitive that acts entry by entry."""
+
+    def combine(self, operation: Callable, dtype: np.dtype, left: Any, right: Any) -> Any:
+        """A sum, a product, a maximum ... of two scalars."""
+
+    def custom_jvp(self, eqn: jex.JaxprEqn, inner: jex.ClosedJaxpr, operands: list) -> list[np.ndarray]:
+        """Results of a function that brings a derivative rule of its own."""
+
+    def nodewise(self, eqn: jex.JaxprEqn, operands: list) -> list[np.ndarray]:
+        """Results of an equation for which there is no rule."""
+
+
+def pack(argument: Sequence[Numbers] | Numbers) -> np.ndarray:
     """A list of per-node scalars, or one of them, as an object array."""
     if isinstance(argument, (list, tuple)):
         return object_array(argument, (len(argument),))
@@ -32,27 +54,27 @@ def pack(argument: Any) -> np.ndarray:
 
 def object_array(entries: Sequence[Any], shape: tuple[int, ...]) -> np.ndarray:
     """An array of objects of a shape, whatever the entries are."""
-    array = np.empty(len(entries), dtype=object)
+    array = np.empty(len(entries), dtype=object)  # np.array(entries) would look into entries that are arrays
     for index, entry in enumerate(entries):
         array[index] = entry
     return array.reshape(shape)
 
 
-def is_components(value: Any) -> bool:
-    """Whether a value is an object array, one that may vary from node to node."""
+def is_components(value: object) -> TypeGuard[np.ndarray]:
+    """True if an operand is an object array, one that may vary from node to node."""
     return isinstance(value, np.ndarray) and value.dtype == object
 
 
-def lift(value: Any, algebra: Any) -> np.ndarray:
-    """A value that is the same at all nodes, as an object array of the algebra's scalars."""
+def lift(value: Operand, algebra: Algebra) -> np.ndarray:
+    """An operand as an object array of the algebra's scalars."""
     if is_components(value):
         return value
     shape = np.shape(value)
     return object_array([algebra.constant(value, index) for index in np.ndindex(*shape)], shape)
 
 
-def evaluate(closed: jex.ClosedJaxpr, arguments: Sequence[Any], algebra: Any) -> list[Any]:
-    """Evaluate a jaxpr on object arrays.
+def evaluate(closed: jex.ClosedJaxpr, arguments: Sequence[Operand], algebra: Algebra) -> list:
+    """Results of a jaxpr on object arrays.
 
     Args:
       closed: the jaxpr of a function of one state.
@@ -62,7 +84,7 @@ def evaluate(closed: jex.ClosedJaxpr, arguments: Sequence[Any], algebra: Any) ->
     Returns:
       One value an output, likewise.
     """
-    env = dict(zip(closed.jaxpr.constvars, closed.consts, strict=True))
+    env: dict[jex.Var, Any] = dict(zip(closed.jaxpr.constvars, closed.consts, strict=True))
     env |= dict(zip(closed.jaxpr.invars, arguments, strict=True))
     for eqn in closed.jaxpr.eqns:
         operands = [var.val if isinstance(var, jex.Literal) else env[var] for var in eqn.invars]
@@ -71,12 +93,13 @@ def evaluate(closed: jex.ClosedJaxpr, arguments: Sequence[Any], algebra: Any) ->
     return [var.val if isinstance(var, jex.Literal) else env[var] for var in closed.jaxpr.outvars]
 
 
-def _apply(eqn: Any, operands: list[Any], algebra: Any) -> list[Any]:
+def _apply(eqn: jex.JaxprEqn, operands: list, algebra: Algebra) -> list:
+    """Results of one equation by the first rule that has an answer."""
     name = eqn.primitive.name
     if not any(map(is_components, operands)):
-        return _uniform(eqn, operands)
+        return _bind_uniform(eqn, operands)
     if name in CALLS and CALLS[name] in eqn.params:
-        inner = eqn.params[CALLS[name]]
+        inner = eqn.params[CALLS[name]]  # some calls keep a jaxpr without constants
         inner = inner if isinstance(inner, jex.ClosedJaxpr) else jex.ClosedJaxpr(inner, ())
         return (
             algebra.custom_jvp(eqn, inner, operands)
@@ -85,6 +108,7 @@ def _apply(eqn: Any, operands: list[Any], algebra: Any) -> list[Any]:
         )
     if name == "cond":
         return _branch(eqn, operands, algebra)
+    # A rule that gives None has met an index that is not known here, which only a node-by-node evaluation can follow.
     if name in MOVES:
         moved = _move(eqn, operands, algebra)
         if moved is not None:
@@ -101,35 +125,38 @@ def _apply(eqn: Any, operands: list[Any], algebra: Any) -> list[Any]:
         return [_reduce(eqn, lift(operands[0], algebra), algebra)]
     elif name == "dot_general":
         return [_contract(eqn, lift(operands[0], algebra), lift(operands[1], algebra), algebra)]
-    if any(np.shape(value) != () for value in operands) or any(var.aval.shape != () for var in eqn.outvars):
+    # Scalars in, scalars out: ``vmap`` over the nodes is then all that a rule would do, nothing to warn of.
+    if any(np.shape(value) != () for value in operands) or any(array_type(var).shape != () for var in eqn.outvars):
         _warn_once(name)
     return algebra.nodewise(eqn, operands)
 
 
-def _uniform(eqn: Any, operands: list[Any]) -> list[Any]:
-    """An equation none of whose operands varies over the nodes; kept concrete while its operands are."""
+def _bind_uniform(eqn: jex.JaxprEqn, operands: list) -> list:
+    """Results of an equation none of whose operands varies over the nodes; concrete while these are."""
     if any(isinstance(value, jax.core.Tracer) for value in operands):
         return bind(eqn, operands)
+    # inside ``jit`` an index that is computed from constants would become a tracer, and every move by it a fallback
     with jax.ensure_compile_time_eval():
         return bind(eqn, operands)
 
 
-def bind(eqn: Any, operands: list[Any]) -> list[Any]:
-    """The results of one equation on JAX arrays."""
+def bind(eqn: jex.JaxprEqn, operands: Sequence[Operand]) -> list:
+    """Results of one equation on JAX arrays."""
     results = eqn.primitive.bind(*operands, **eqn.primitive.get_bind_params(eqn.params))
     return list(results) if eqn.primitive.multiple_results else [results]
 
 
-def _known(values: Sequence[Any]) -> bool:
+def _are_known(values: Iterable[Operand]) -> bool:
+    """True if all are concrete numbers that hold at all nodes."""
     return not any(is_components(value) or isinstance(value, jax.core.Tracer) for value in values)
 
 
-def _move(eqn: Any, operands: list[Any], algebra: Any) -> list[Any] | None:
-    """Where every entry of a data-moving primitive goes, found by moving integer labels."""
+def _move(eqn: jex.JaxprEqn, operands: list, algebra: Algebra) -> list[np.ndarray] | None:
+    """Results of a data-moving primitive: JAX moves integer labels, the entries follow; None for unknown indices."""
     data = set(MOVES[eqn.primitive.name](len(operands)))
-    if not _known([value for position, value in enumerate(operands) if position not in data]):
+    if not _are_known([value for position, value in enumerate(operands) if position not in data]):
         return None
-    pool: list[Any] = []
+    pool: list[Any] = []  # label k stands for the entry pool[k], from whichever operand it came
     labelled = list(operands)
     for position in sorted(data):
         entries = lift(operands[position], algebra)
@@ -137,7 +164,7 @@ def _move(eqn: Any, operands: list[Any], algebra: Any) -> list[Any] | None:
         pool.extend(entries.reshape(-1))
     fill = eqn.params.get("fill_value")
     pool.append(algebra.constant(np.asarray(np.nan if fill is None else fill), ()))
-    if fill is not None:
+    if fill is not None:  # where none is given, JAX fills integers with the least one, a negative label too
         eqn = eqn.replace(params=eqn.params | {"fill_value": -1})
     if eqn.primitive.name in IN_NUMPY:
         moved = [IN_NUMPY[eqn.primitive.name](*labelled, **eqn.params)]
@@ -149,15 +176,15 @@ def _move(eqn: Any, operands: list[Any], algebra: Any) -> list[Any] | None:
     ]
 
 
-def _scatter(eqn: Any, operands: list[Any], algebra: Any) -> np.ndarray | None:
-    """``x.at[known].add(...)`` and its like: each update goes where a one in its place would go."""
+def _scatter(eqn: jex.JaxprEqn, operands: list, algebra: Algebra) -> np.ndarray | None:
+    """``x.at[known].add(...)`` and its like: each update goes where a one in its place would go; None for unknown."""
     target, indices, updates = operands
-    if not _known([indices]):
+    if not _are_known([indices]):
         return None
     entries, updates = lift(target, algebra).copy(), lift(updates, algebra)
     numbers, mode = eqn.params["dimension_numbers"], eqn.params["mode"]
-    combine = functools.partial(algebra.combine, SCATTERS[eqn.primitive.name], eqn.invars[0].aval.dtype)
-    for position in np.ndindex(*updates.shape):
+    combine = functools.partial(algebra.combine, SCATTERS[eqn.primitive.name], array_type(eqn.invars[0]).dtype)
+    for position in np.ndindex(*updates.shape):  # one by one, as labels would add up where two updates meet
         one = np.zeros(updates.shape, np.int32)
         one[position] = 1
         with jax.ensure_compile_time_eval():
@@ -167,54 +194,59 @@ def _scatter(eqn: Any, operands: list[Any], algebra: Any) -> np.ndarray | None:
     return entries
 
 
-def _branch(eqn: Any, operands: list[Any], algebra: Any) -> list[Any]:
+def _branch(eqn: jex.JaxprEqn, operands: list, algebra: Algebra) -> list:
     """``cond`` and ``switch``: the branch that is known to be taken, or a choice node by node, as under ``vmap``."""
     index, *rest = operands
     branches = eqn.params["branches"]
-    if _known([index]):
-        return evaluate(branches[int(np.clip(index, 0, len(branches) - 1))], rest, algebra)
+    if _are_known([index]):
+        return evaluate(branches[int(np.clip(index, 0, len(branches) - 1))], rest, algebra)  # JAX clamps it, too
+    # all branches are evaluated, and ``select_n`` takes one entry: a NaN in another stays out of the value
     index = lift(index, algebra).item()
     outputs = [[lift(value, algebra) for value in evaluate(branch, rest, algebra)] for branch in branches]
     results = []
     for var, cases in zip(eqn.outvars, zip(*outputs, strict=True), strict=True):
-        dtypes = [eqn.invars[0].aval.dtype] + [var.aval.dtype] * len(cases)
+        dtypes = [array_type(eqn.invars[0]).dtype] + [array_type(var).dtype] * len(cases)
         rows = zip(*(case.reshape(-1) for case in cases), strict=True)
         chosen = [algebra.entrywise(jax.lax.select_n_p, {}, [index, *row], dtypes) for row in rows]
         results.append(object_array(chosen, cases[0].shape))
     return results
 
 
-def _entrywise(eqn: Any, operands: list[Any], algebra: Any) -> np.ndarray:
+def _entrywise(eqn: jex.JaxprEqn, operands: list, algebra: Algebra) -> np.ndarray:
+    """Results entry by entry; a scalar beside an array stands for all of its entries."""
     lifted = np.broadcast_arrays(*(lift(value, algebra) for value in operands))
-    dtypes = [var.aval.dtype for var in eqn.invars]
+    dtypes = [array_type(var).dtype for var in eqn.invars]
     rows = zip(*(value.reshape(-1) for value in lifted), strict=True)
     results = [algebra.entrywise(eqn.primitive, eqn.params, list(row), dtypes) for row in rows]
     return object_array(results, lifted[0].shape)
 
 
-def _reduce(eqn: Any, entries: np.ndarray, algebra: Any) -> np.ndarray:
+def _reduce(eqn: jex.JaxprEqn, entries: np.ndarray, algebra: Algebra) -> np.ndarray:
+    """A sum, a product, a maximum ... over some axes, in the order of the entries."""
     axes = tuple(eqn.params["axes"])
     kept = [axis for axis in range(entries.ndim) if axis not in axes]
     shape = tuple(entries.shape[axis] for axis in kept)
-    if entries.size == 0:  # the neutral element
-        return lift(_uniform(eqn, [np.zeros(entries.shape, eqn.invars[0].aval.dtype)])[0], algebra)
+    if entries.size == 0:  # the neutral element, which JAX knows for every operation and dtype
+        return lift(_bind_uniform(eqn, [np.zeros(entries.shape, array_type(eqn.invars[0]).dtype)])[0], algebra)
     rows = entries.transpose(*kept, *axes).reshape(math.prod(shape), -1)
-    combine = functools.partial(algebra.combine, REDUCTIONS[eqn.primitive.name], eqn.invars[0].aval.dtype)
+    combine = functools.partial(algebra.combine, REDUCTIONS[eqn.primitive.name], array_type(eqn.invars[0]).dtype)
+    # from the left, in one order for all nodes; XLA's own reductions may take another and round otherwise
     return object_array([functools.reduce(combine, row) for row in rows], shape)
 
 
-def _accumulate(eqn: Any, entries: np.ndarray, algebra: Any) -> np.ndarray:
+def _accumulate(eqn: jex.JaxprEqn, entries: np.ndarray, algebra: Algebra) -> np.ndarray:
+    """Running sums, products, maxima ... along one axis."""
     axis, step = eqn.params["axis"], -1 if eqn.params["reverse"] else 1
-    combine = functools.partial(algebra.combine, CUMULATIVE[eqn.primitive.name], eqn.invars[0].aval.dtype)
-    rows = np.moveaxis(entries, axis, -1)[..., ::step]
+    combine = functools.partial(algebra.combine, CUMULATIVE[eqn.primitive.name], array_type(eqn.invars[0]).dtype)
+    rows = np.moveaxis(entries, axis, -1)[..., ::step]  # turned about for a reverse sum, and back at the end
     result = np.empty(rows.shape, dtype=object)
     for index in np.ndindex(*rows.shape[:-1]):
         result[index] = object_array(list(itertools.accumulate(rows[index], combine)), rows.shape[-1:])
     return np.moveaxis(result[..., ::step], -1, axis)
 
 
-def _contract(eqn: Any, left: np.ndarray, right: np.ndarray, algebra: Any) -> np.ndarray:
-    """dot_general: batch axes first, then the free axes of the left and of the right operand."""
+def _contract(eqn: jex.JaxprEqn, left: np.ndarray, right: np.ndarray, algebra: Algebra) -> np.ndarray:
+    """``dot_general``: batch axes first, then the free axes of the left and of the right operand."""
     (contract_l, contract_r), (batch_l, batch_r) = eqn.params["dimension_numbers"]
     free_l = [axis for axis in range(left.ndim) if axis not in (*contract_l, *batch_l)]
     free_r = [axis for axis in range(right.ndim) if axis not in (*contract_r, *batch_r)]
@@ -222,10 +254,11 @@ def _contract(eqn: Any, left: np.ndarray, right: np.ndarray, algebra: Any) -> np
     rows = tuple(left.shape[axis] for axis in free_l)
     columns = tuple(right.shape[axis] for axis in free_r)
     length = math.prod(left.shape[axis] for axis in contract_l)
+    # both as (batch, rows or columns, length), so that each entry of the result is one dot product of two last axes
     left = left.transpose(*batch_l, *free_l, *contract_l).reshape(math.prod(batch), math.prod(rows), length)
     right = right.transpose(*batch_r, *free_r, *contract_r).reshape(math.prod(batch), math.prod(columns), length)
-    dtype = eqn.outvars[0].aval.dtype
-    if length == 0:
+    dtype = array_type(eqn.outvars[0]).dtype
+    if length == 0:  # an empty sum, on which functools.reduce would raise
         return lift(np.zeros(batch + rows + columns), algebra)
     add, multiply = (functools.partial(algebra.combine, op, dtype) for op in (jax.lax.add, jax.lax.mul))
     inner = [
@@ -235,8 +268,9 @@ def _contract(eqn: Any, left: np.ndarray, right: np.ndarray, algebra: Any) -> np
     return object_array(inner, batch + rows + columns)
 
 
-@functools.cache
+@functools.cache  # a solve evaluates its functions many times, and every one of them would warn
 def _warn_once(name: str) -> None:
+    """Warn of a primitive without a rule, once in a process."""
     warnings.warn(
         f"the primitive {name!r} has no component rule: the function that uses it is evaluated node by node, "
         "which is correct and slower; entry-by-entry arithmetic on x[0], x[1], ... avoids it",

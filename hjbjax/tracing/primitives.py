@@ -1,11 +1,14 @@
 """JAX's primitives by the rule that evaluates them component by component; see ``components``."""
 
 from collections.abc import Callable, Sequence
+from typing import cast
 
 import jax
 import numpy as np
+from jax.extend import core as jex
 
-# Which operands of a data-moving primitive are data; the others are indices and must be known.
+# Which of its n operands a data-moving primitive moves; the others are indices, and an index that varies from node to
+# node moves other entries at every node, for which only ``vmap`` has an answer.
 MOVES: dict[str, Callable[[int], Sequence[int]]] = {
     "broadcast_in_dim": lambda n: (0,),
     "reshape": lambda n: (0,),
@@ -35,6 +38,7 @@ IN_NUMPY: dict[str, Callable[..., np.ndarray]] = {
     "concatenate": lambda *xs, dimension: np.concatenate(xs, dimension),
 }
 
+# ``scatter`` alone moves entries, these compute: several updates may meet in one entry
 SCATTERS = {"scatter-add": jax.lax.add, "scatter-sub": jax.lax.sub, "scatter-mul": jax.lax.mul}
 SCATTERS |= {"scatter-min": jax.lax.min, "scatter-max": jax.lax.max}
 
@@ -56,5 +60,12 @@ REDUCTIONS: dict[str, Callable] = {
 
 CUMULATIVE = {"cumsum": jax.lax.add, "cumprod": jax.lax.mul, "cummax": jax.lax.max, "cummin": jax.lax.min}
 
+# Under which parameter a call keeps what it calls; a primitive has several names, as JAX has renamed it over the years.
+# A custom_vjp is none of them: to look inside would lose its rule, and ``vmap`` keeps it.
 CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr"}
 CALLS |= {"checkpoint": "jaxpr", "remat": "jaxpr", "remat2": "jaxpr", "custom_jvp_call": "call_jaxpr"}
+
+
+def array_type(var: jex.Var | jex.Literal) -> jax.core.ShapedArray:
+    """Shape and dtype of a variable of a jaxpr; JAX annotates a wider type, for tokens and references."""
+    return cast(jax.core.ShapedArray, var.aval)

@@ -24,7 +24,7 @@ import numpy as np
 
 from hjbjax.discretisation import correlated_noise, decision_process, edges, stationary_law, stencil
 from hjbjax.discretisation.cut_cells import links
-from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.discretisation import Chain, Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.discretisation.stencil import Links
 from hjbjax.problem import sets
@@ -72,24 +72,13 @@ class Rates:
         return Rates(tuple(opposite), tuple(arriving))
 
 
-def excess(f: Any, a: Any, grid: Grid, axis: int, scheme: Upwind, link: Links) -> Any:
-    """e_i, the diffusion that the chain has along an axis: a_ii and what keeps its rates non-negative."""
-    least = jnp.maximum(link.up * f, -link.down * f)
-    if a is None:
-        return least
-    a = jnp.maximum(a, 0)  # along_axis may leave a rounding error below zero
-    if not scheme.central:
-        return a + least
-    # at a wall the projection of the drift wants drift and noise apart
-    return jnp.where(stencil.walls(grid, axis), a + least, jnp.maximum(a, least))
-
-
-def axis_rates(f: Any, a: Any, grid: Grid, axis: int, scheme: Upwind, link: Links) -> tuple[Any, Any]:
+def axis_rates(f: Any, a: Any, scheme: Chain, link: Links, wall: Any) -> tuple[Any, Any]:
     """c_i^+ and c_i^- before the projection at the edges; where e and h f cancel, rounding leaves nothing negative."""
     h_up, h_down = link.up, link.down
-    if a is None:  # the same numbers, without a difference
+    if a is None and scheme.one_way:  # the same numbers, without a difference
         return jnp.maximum(f, 0) / h_up, jnp.maximum(-f, 0) / h_down
-    e = excess(f, a, grid, axis, scheme, link)
+    a = 0 if a is None else jnp.maximum(a, 0)  # along_axis may leave a rounding error below zero
+    e = scheme.excess(f, a, link, wall)
     upward, downward = jnp.maximum(e + h_down * f, 0), jnp.maximum(e - h_up * f, 0)
     return upward / (h_up * (h_up + h_down)), downward / (h_down * (h_up + h_down))
 
@@ -110,15 +99,17 @@ def rates(on: Discretisation, u: list, d: list | None = None) -> Rates:
         for offset, rate in _table(on, other, {}).items():
             table[offset] = table[offset] + rate
     values = tuple(jnp.broadcast_to(jnp.asarray(rate, on.dtype), grid.shape) for rate in table.values())
-    return Rates(tuple(table), values, one_way=on.problem.noise is None and not others)
+    return Rates(tuple(table), values, one_way=on.problem.noise is None and on.scheme.chain.one_way and not others)
 
 
 def _table(on: Discretisation, f: list, a: dict[tuple[int, int], Any]) -> dict[Offset, Any]:
     """The rate of every jump for a drift f and a diffusion a."""
-    grid, scheme = on.grid, on.scheme.chain
+    grid = on.grid
     table: dict[Offset, Any] = {}
     for axis, link in enumerate(links(on.chain)):
-        pair = axis_rates(f[axis], correlated_noise.along_axis(a, grid, axis), grid, axis, scheme, link)
+        pair = axis_rates(
+            f[axis], correlated_noise.along_axis(a, grid, axis), on.scheme.chain, link, stencil.walls(grid, axis)
+        )
         for step, rate in zip((1, -1), pair, strict=True):
             table[stencil.unit(grid, axis, step)] = jnp.where(stencil.wall(grid, axis, step), 0, rate)
     for (i, j), entry in a.items():
@@ -160,7 +151,7 @@ def generator(
     policy: Any = None,
     *,
     disturbance: Any = None,
-    scheme: Upwind = Upwind(),
+    scheme: Chain = Upwind(),
     t: float = 0.0,
 ) -> Any:
     """The generator of the chain under one policy as a sparse matrix; its rows sum to zero.
@@ -193,7 +184,7 @@ def matrix(
     policy: Any = None,
     *,
     disturbance: Any = None,
-    scheme: Upwind = Upwind(),
+    scheme: Chain = Upwind(),
     t: float = 0.0,
 ) -> Any:
     """The transition matrix of the chain under one policy.
@@ -223,7 +214,7 @@ def stationary_density(
     policy: Any = None,
     *,
     disturbance: Any = None,
-    scheme: Upwind = Upwind(),
+    scheme: Chain = Upwind(),
     t: float = 0.0,
 ) -> np.ndarray:
     """The density in which the chain under one policy is found after a long time: 𝓛*p = 0, integral one.
@@ -263,7 +254,7 @@ def stationary_density(
 
 
 def transition_arrays(
-    problem: Problem, grid: Grid, *, scheme: Upwind = Upwind()
+    problem: Problem, grid: Grid, *, scheme: Chain = Upwind()
 ) -> tuple[np.ndarray, Any, np.ndarray, np.ndarray, float]:
     """The controlled chain as a discounted Markov decision problem over pairs of state and action.
 
@@ -306,7 +297,7 @@ def transition_arrays(
     return decision_process.decision_problem(tables, grid, len(actions), held, given, float(problem.discount))
 
 
-def _under_policy(problem: Problem, grid: Grid, policy: Any, disturbance: Any, scheme: Upwind, t: float) -> Rates:
+def _under_policy(problem: Problem, grid: Grid, policy: Any, disturbance: Any, scheme: Chain, t: float) -> Rates:
     """The rates under a policy; zero on the target and where there is no action."""
     u, d, active = decision_process.policies(problem, grid, policy, disturbance)
     active &= ~decision_process.target(problem, grid, t)[0]

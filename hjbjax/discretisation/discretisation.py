@@ -52,11 +52,33 @@ class Scheme(Protocol):
         """The nodes that an axis must have."""
 
     @property
-    def chain(self) -> Any:
-        """The monotone chain that goes with it, an ``Upwind``: it starts and corrects, and limits explicit steps."""
+    def chain(self) -> "Chain":
+        """The monotone chain that goes with it, as ``Upwind()``: it starts and corrects, and limits explicit steps."""
 
     def slopes(self, around: "Differences") -> Sequence[tuple[jax.Array, jax.Array]]:
         """The slopes P⁺ and P⁻ along every axis, each (*grid): drift f has the gain f⁺ P⁺ + f⁻ P⁻; zero at a wall."""
+
+
+class Chain(Scheme, Protocol):
+    """A scheme that is a Markov chain: along an axis the gain of drift f and diffusion a is
+
+        [(e + h⁻ f) D⁺ − (e − h⁺ f) D⁻]/(h⁺ + h⁻),    e ≥ max(a, h⁺ f, −h⁻ f),
+
+    with distances h⁺ and h⁻ to the two neighbours. ``schemes`` tells how to write one.
+    """
+
+    @property
+    def one_way(self) -> bool:
+        """Whether e = max(h⁺ f, −h⁻ f) without noise, so that of two opposite jumps one has no rate."""
+
+    def excess(self, f: Any, a: Any, link: Links, wall: Any) -> Any:
+        """e, the diffusion along an axis; at a ``wall``, bool (*grid), noise reflects and drift out of it drops."""
+
+    def kinks(self, a: Any, slopes: tuple[Any, Any], link: Links, wall: Any) -> tuple[Sequence[Any], Sequence[Any]]:
+        """The drifts f, in order, at which the gain's derivative jumps, and the derivatives between them: one more.
+
+        ``slopes`` are D⁺ and D⁻. At most three kinks.
+        """
 
 
 @pytree_dataclass(static=("scheme", "dtype"))

@@ -22,7 +22,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax.discretisation import chain, correlated_noise, cut_cells, edges, stencil
+from hjbjax.discretisation import correlated_noise, cut_cells, edges, stencil
 from hjbjax.discretisation.discretisation import Differences, Discretisation
 from hjbjax.hamiltonian.piecewise import Kinked, inverse_root, kinked_ball, piecewise_input, piecewise_pair
 from hjbjax.hamiltonian.players import SAMPLES, Player, players_of, shared
@@ -84,13 +84,14 @@ class DiscreteHamiltonian:
     def _free_gain(self, axis: int, f: Any, a: Any) -> Any:
         """What ``gain`` is away from constrained ends; with other slopes f⁺ P⁺ + f⁻ P⁻ + a (D⁺ − D⁻)/(h⁺ + h⁻)."""
         upwind = jnp.maximum(f, 0) * self.up[axis] + jnp.minimum(f, 0) * self.down[axis]
-        if a is None:
+        scheme, link = self.on.scheme, self.links[axis]
+        if a is None and (scheme.chain.one_way or not scheme.monotone):
             return upwind
-        link = self.links[axis]
         h_up, h_down = link.up, link.down
-        if not self.on.scheme.monotone:
-            return upwind + jnp.maximum(a, 0) * self.bends[axis] / (h_up + h_down)
-        e = chain.excess(f, a, self.on.grid, axis, self.on.scheme.chain, link)
+        a = 0 if a is None else jnp.maximum(a, 0)  # correlated noise may leave a rounding error below zero
+        if not scheme.monotone:
+            return upwind + a * self.bends[axis] / (h_up + h_down)
+        e = scheme.chain.excess(f, a, link, stencil.walls(self.on.grid, axis))
         upward, downward = (e + h_down * f) / (h_up + h_down), (e - h_up * f) / (h_up + h_down)
         return upward * self.up[axis] - downward * self.down[axis]
 
@@ -309,11 +310,9 @@ def _kinked(
     def gain(f):
         return hamiltonian.gain(axis, f, left)
 
-    if left is None or not (hamiltonian.on.scheme.monotone and hamiltonian.on.scheme.chain.central):
+    scheme, link = hamiltonian.on.scheme, hamiltonian.links[axis]
+    if not scheme.monotone or (left is None and scheme.chain.one_way):
         return Kinked(gain, offset, slope, (0.0,), (down, up))
-    h_up, h_down = hamiltonian.links[axis].up, hamiltonian.links[axis].down
-    edge = stencil.walls(hamiltonian.on.grid, axis)
-    width = jnp.maximum(left, 0)
-    middle = (h_down * up + h_up * down) / (h_up + h_down)
-    kinks = (jnp.where(edge, 0, -width / h_down), 0.0, jnp.where(edge, 0, width / h_up))
-    return Kinked(gain, offset, slope, kinks, (down, jnp.where(edge, down, middle), jnp.where(edge, up, middle), up))
+    width = 0 if left is None else jnp.maximum(left, 0)
+    wall = stencil.walls(hamiltonian.on.grid, axis)
+    return Kinked(gain, offset, slope, *scheme.chain.kinks(width, (up, down), link, wall))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
+from hjbjax import chain
 from hjbjax.discretisation import stencil
 
 
@@ -14,7 +15,7 @@ from hjbjax.discretisation import stencil
 class Minmod:
     """Second order by the smaller of two second differences of one sign; equal spacings."""
 
-    monotone, stationary, even, subcell = False, True, True, False
+    monotone, stationary, even, subcell, split = False, True, True, False, True
     stages, points, chain = 2, 3, hjb.Upwind()
 
     def slopes(self, around):
@@ -101,3 +102,86 @@ def test_what_a_scheme_of_ones_own_cannot_do_is_said():
         hjb.solve(problem, grid, scheme=hjb.Weno5())
     with pytest.raises(ValueError, match="axis 0 has 2 points; Minmod needs at least 3"):
         hjb.march(free, hjb.Grid([-1.0], [1.0], (2,)), 1.0, scheme=Minmod())
+
+
+# --- a chain of somebody else's: monotone, certified ---
+
+
+@dataclasses.dataclass(frozen=True)
+class LaxFriedrichs:
+    """Central differences, and a diffusion that no drift of at most ``speed`` turns negative."""
+
+    speed: float
+    monotone, stationary, even, subcell, split, one_way = True, True, True, False, False, False
+    stages, points = 1, 2
+
+    @property
+    def chain(self):
+        return self
+
+    def slopes(self, around):
+        return around.one_sided
+
+    def excess(self, f, a, link, wall):
+        return a + self.speed * link.up + 0 * f
+
+    def kinks(self, a, slopes, link, wall):
+        return (), (sum(slopes) / 2,)
+
+
+H, X, US = 0.1, np.linspace(-1, 1, 21), np.linspace(-1, 1, 2001)[:, None]
+BETA = 0.7
+
+
+def dense(noise, speed, cost_of_control=0.3):
+    """Value iteration in NumPy over finely sampled actions."""
+    f = US + 0.2 * X
+    e = noise**2 + speed * H
+    up, down = (e + H * f) / (2 * H**2), (e - H * f) / (2 * H**2)
+    up[:, -1], down[:, 0] = 0, 0
+    value, dt = np.zeros(21), 1 / (np.max(up + down) + BETA)
+    for _ in range(10_000):
+        jumps = up * (np.append(value[1:], 0) - value) + down * (np.append(0, value[:-1]) - value)
+        step = dt * (np.min(X**2 + cost_of_control * US**2 + jumps, axis=0) - BETA * value)
+        value = value + step
+        if np.max(np.abs(step)) < 1e-13:
+            break
+    return value
+
+
+def held_back(noise=None, controls=None):
+    return hjb.Problem(
+        lambda x, u: u + 0.2 * x, lambda x, u: x @ x + 0.3 * u @ u, controls or hjb.Box([-1.0], [1.0]),
+        discount=BETA, noise=noise,
+    )  # fmt: skip
+
+
+@pytest.mark.filterwarnings("ignore:the optimal drift leaves the box")
+@pytest.mark.parametrize("noise", [None, 0.5])
+@pytest.mark.parametrize("method", [None, hjb.ValueIteration(), hjb.PolicyIteration(hjb.Direct())])
+def test_a_chain_of_ones_own_is_solved_and_certified(method, noise):
+    scheme, grid = LaxFriedrichs(1.2), hjb.Grid([-1.0], [1.0], (21,))
+    solution = hjb.solve(held_back(noise), grid, scheme=scheme, method=method, tol=1e-8)
+    known = dense(noise or 0.0, 1.2)
+    np.testing.assert_allclose(solution.value, known, atol=1e-6)  # the table knows two thousand actions
+    assert solution.error <= 1e-8
+    assert "sample" not in solution.stats["certificate"]
+    lane = hjb.solve_batch([held_back(noise)], grid, scheme=scheme, tol=1e-8)[0]
+    np.testing.assert_allclose(lane.value, solution.value, atol=2e-8)
+
+
+@pytest.mark.filterwarnings("ignore:the optimal drift leaves the box")
+@pytest.mark.parametrize("method", [hjb.Explicit(), hjb.Implicit(hjb.Direct())])
+def test_it_marches_to_its_stationary_value(method):
+    grid, scheme = hjb.Grid([-1.0], [1.0], (21,)), LaxFriedrichs(1.2)
+    found = hjb.march(held_back(0.5), grid, 30.0, scheme=scheme, method=method).value[0]
+    np.testing.assert_allclose(found, dense(0.5, 1.2), atol=1e-5)
+
+
+def test_its_generator_is_exported():
+    policy = np.full((21, 1), 0.4)
+    found = chain.generator(held_back(0.5), hjb.Grid([-1.0], [1.0], (21,)), policy, scheme=LaxFriedrichs(1.2)).toarray()
+    f, e = 0.4 + 0.2 * X, 0.25 + 0.12
+    np.testing.assert_allclose(np.diag(found, 1), ((e + H * f) / (2 * H**2))[:-1], atol=1e-10)
+    np.testing.assert_allclose(np.diag(found, -1), ((e - H * f) / (2 * H**2))[1:], atol=1e-10)
+    np.testing.assert_allclose(found.sum(axis=1), 0, atol=1e-10)

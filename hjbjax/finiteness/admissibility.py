@@ -3,8 +3,6 @@
 Without costs and at V = 0 the Hamiltonian is zero where there is one, and infinite elsewhere.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,9 +15,10 @@ from hjbjax.iteration import bellman
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered
+from hjbjax.problem.types import DType, Mask
 
 
-def values(problem: Problem, grid: Grid, dtype: Any, t: float = 0.0) -> None:
+def values(problem: Problem, grid: Grid, dtype: DType, t: float = 0.0) -> None:
     """Refuse a problem that at some node forces the state out across a constrained end.
 
     Args:
@@ -34,7 +33,7 @@ def values(problem: Problem, grid: Grid, dtype: Any, t: float = 0.0) -> None:
     if not grid.sides("constrained"):
         return
     with jax.enable_x64(True):
-        stuck = np.asarray(_stuck(Discretisation(problem, grid, Upwind(), np.dtype(dtype), t)))
+        stuck = np.asarray(_without_action(Discretisation(problem, grid, Upwind(), np.dtype(dtype), t)))
     if not stuck.any():
         return
     index = tuple(int(i) for i in np.argwhere(stuck)[0])
@@ -55,7 +54,7 @@ def values(problem: Problem, grid: Grid, dtype: Any, t: float = 0.0) -> None:
 
 
 @jax.jit
-def _stuck(on: Discretisation) -> jax.Array:
+def _without_action(on: Discretisation) -> Mask:
     """The nodes off the target without an admissible action, bool (*grid)."""
     free = altered(on.problem, cost=None)
     hamiltonian = discrete.around(on.asking(free), jnp.zeros(on.grid.shape, on.dtype))

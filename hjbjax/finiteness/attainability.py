@@ -7,7 +7,6 @@ found on the device, paths by a breadth-first search on the host, or on large gr
 """
 
 import functools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +19,7 @@ from hjbjax.finiteness import tried_actions
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.types import Array, Mask, Number, Scalar
 from hjbjax.solution.clock import Clock
 
 FEW = 9  # of each player in a game, where all pairs are
@@ -29,21 +29,34 @@ SEARCHABLE = 5 * 10**7  # jumps that a search on the host can list: some 60 byte
 LOOK = 10**7  # nodes times actions, or times jumps of a path, between two looks at the clock: about a second
 
 
-def _open_jumps(on: Discretisation, inside: jax.Array | None, clock: Clock, **options: Any) -> Rates:
-    """For every jump whether some action makes it while all jumps of that action stay ``inside``; None is the box."""
+def _open_jumps(
+    on: Discretisation, inside: jax.Array | None, clock: Clock, *, least: Number = 0.0, kinks: bool = False
+) -> Rates:
+    """For every jump the nodes, bool (*grid), at which some action makes it and no other jump that leaves ``inside``.
+
+    Without ``inside`` it is the box. Rates up to ``least`` are rounding; with ``kinks`` actions between the samples, at
+    which a component of the drift vanishes, are tried as well.
+    """
     points = tried_actions.sampled(on.problem)
-    count, some, known = len(points), max(1, LOOK // on.grid.size), None
+    known: Rates | None = None
+    count, some = len(points), max(1, LOOK // on.grid.size)
     for first in range(0, count, some):
         clock.enter(f"the jumps of the chain, {first} of {count} actions")
         last = min(first + some, count)
-        known = _also_open(on, inside, known, points[max(last - some, 0) : last], **options)
+        known = _more_open_jumps(on, inside, known, points[max(last - some, 0) : last], least=least, kinks=kinks)
     assert known is not None
     return known
 
 
 @functools.partial(jax.jit, static_argnames="kinks")
-def _also_open(
-    on: Discretisation, inside: Any, known: Any, points: Any, *, least: Any = 0.0, kinks: bool = False
+def _more_open_jumps(
+    on: Discretisation,
+    inside: jax.Array | None,
+    known: Rates | None,
+    points: Array,
+    *,
+    least: Number = 0.0,
+    kinks: bool = False,
 ) -> Rates:
     """The jumps that are known to be open and those of the actions ``points``, shape (count, m)."""
     grid, points = on.grid, jnp.asarray(points, on.dtype)
@@ -69,8 +82,8 @@ def _also_open(
     return Rates(known.offsets, jax.lax.fori_loop(0, len(points), also, tried(outmost, known.values)))
 
 
-def _stays(rates: Rates, grid: Grid, inside: jax.Array, least: Any) -> jax.Array:
-    """Where all jumps at rates above ``least`` lead ``inside``, bool (*grid)."""
+def _stays(rates: Rates, grid: Grid, inside: jax.Array, least: Number) -> jax.Array:
+    """The nodes from which all jumps at rates above ``least`` lead ``inside``, bool (*grid)."""
     stays = jnp.ones(grid.shape, bool)
     for offset, c in zip(rates.offsets, rates.values, strict=True):
         stays &= (c <= least) | stencil.neighbour(inside, grid, offset)
@@ -78,7 +91,7 @@ def _stays(rates: Rates, grid: Grid, inside: jax.Array, least: Any) -> jax.Array
 
 
 def reached(
-    on: Discretisation, held: np.ndarray, *, surely: bool, least: Any = 0.0, clock: Clock | None = None
+    on: Discretisation, held: np.ndarray, *, surely: bool, least: Number = 0.0, clock: Clock | None = None
 ) -> np.ndarray:
     """The nodes from which the held nodes can be reached; host level, for problems with one player.
 
@@ -95,15 +108,19 @@ def reached(
     on = on.on_grid(on.grid.walled)  # what goes on beyond an open end is not known to come back
     clock, found = clock or Clock(), np.zeros(on.grid.shape, bool)
     for kinks in (False, True):  # what samples do not reach may be reached by the one action that keeps to a way
-        found |= _by_some_actions(on, held, surely, clock, least=least, kinks=kinks)
+        found |= _reached_by_samples(on, held, surely, clock, least=least, kinks=kinks)
         if found.all():
             break
     return found
 
 
-def _by_some_actions(on: Discretisation, held: np.ndarray, surely: bool, clock: Clock, **options: Any) -> np.ndarray:
+def _reached_by_samples(
+    on: Discretisation, held: np.ndarray, surely: bool, clock: Clock, *, least: Number, kinks: bool
+) -> np.ndarray:
+    """The nodes from which the held ones are reached by the actions that are tried, bool (*grid)."""
+
     def staying(inside: jax.Array | None) -> np.ndarray:
-        return _leads_to(held, _open_jumps(on, inside, clock, **options), on.grid, clock)
+        return _backward_reach(held, _open_jumps(on, inside, clock, least=least, kinks=kinks), on.grid, clock)
 
     found, inside = staying(None), np.ones(on.grid.shape, bool)
     while surely and not np.array_equal(found, inside):
@@ -112,21 +129,21 @@ def _by_some_actions(on: Discretisation, held: np.ndarray, surely: bool, clock: 
     return found
 
 
-def surely_reached(on: Discretisation, held: jax.Array, *, least: Any = 0.0) -> jax.Array:
+def surely_reached(on: Discretisation, held: Mask, *, least: Number = 0.0) -> jax.Array:
     """The nodes from which the held ones are reached with probability one, bool (*grid); inside a transformation."""
     points, on = tried_actions.sampled(on.problem), on.on_grid(on.grid.walled)
     grid = on.grid
 
     def shrink(carry):
         inside, _ = carry
-        jumps = _also_open(on, inside, None, points, least=least, kinks=True)
-        found = inside & _further(held, jumps, grid, grid.size)[0]
+        jumps = _more_open_jumps(on, inside, None, points, least=least, kinks=True)
+        found = inside & _predecessors(held, jumps, grid, grid.size)[0]
         return found, jnp.any(found != inside)
 
     return jax.lax.while_loop(lambda carry: carry[1], shrink, (jnp.ones(grid.shape, bool), jnp.ones((), bool)))[0]
 
 
-def forced(on: Discretisation, held: np.ndarray, *, least: Any, clock: Clock) -> np.ndarray:
+def forced(on: Discretisation, held: np.ndarray, *, least: Number, clock: Clock) -> np.ndarray:
     """The nodes of a game from which the control reaches the held ones for certain, whatever the disturbance does.
 
     The largest set R in which some control keeps all jumps inside under every disturbance, and leads on to a nearer
@@ -138,15 +155,17 @@ def forced(on: Discretisation, held: np.ndarray, *, least: Any, clock: Clock) ->
         inside, nearer, more = found, jnp.asarray(held), True
         while more:
             clock.enter("the search for nodes from which the target can be forced")
-            nearer, more = _forced_further(on, inside, nearer, least)
+            nearer, more = _controllable_predecessors(on, inside, nearer, least)
         found = np.asarray(nearer)
         if np.array_equal(found, inside):
             return found
 
 
 @jax.jit
-def _forced_further(on: Discretisation, inside: jax.Array, found: jax.Array, least: Any) -> tuple[jax.Array, jax.Array]:
-    """The nodes one jump further from which the control leads to ``found`` and stays ``inside``; if there are more."""
+def _controllable_predecessors(
+    on: Discretisation, inside: jax.Array, found: jax.Array, least: Number
+) -> tuple[jax.Array, Scalar]:
+    """``found`` with the nodes from which the control leads there and stays ``inside``; and if that adds any."""
     problem, grid, dtype = on.problem, on.grid, on.dtype
     us, ds = (
         jnp.asarray(np.zeros((1, 0)) if admissible is None else sets.samples(admissible, FEW), dtype)
@@ -177,7 +196,7 @@ def _forced_further(on: Discretisation, inside: jax.Array, found: jax.Array, lea
 
 
 @jax.jit
-def refuge(on: Discretisation, inside: Any = None, dearest: Any = None) -> jax.Array:
+def refuge(on: Discretisation, inside: jax.Array | None = None, dearest: Scalar | None = None) -> jax.Array:
     """The nodes from which some actions of both players keep the state off the target for ever, bool (*grid).
 
     The largest set in which every node has an action whose jumps all stay in it: nodes without one are taken away until
@@ -193,9 +212,7 @@ def refuge(on: Discretisation, inside: Any = None, dearest: Any = None) -> jax.A
         jnp.asarray(np.zeros((1, 0)) if admissible is None else sets.samples(admissible, tried_actions.SAMPLES), dtype)
         for admissible in (problem.controls, problem.disturbances)
     )
-    mine, start = players_of(on).control, inside
-    if inside is None:
-        start = cut_cells.level(on) > 0
+    mine, start = players_of(on).control, cut_cells.level(on) > 0 if inside is None else inside
 
     def shrink(carry):
         inside, _ = carry
@@ -221,31 +238,31 @@ def refuge(on: Discretisation, inside: Any = None, dearest: Any = None) -> jax.A
     return jax.lax.while_loop(lambda carry: carry[1], shrink, (start, jnp.ones((), bool)))[0]
 
 
-def _leads_to(held: np.ndarray, jumps: Rates, grid: Grid, clock: Clock) -> np.ndarray:
-    """Nodes with a path of jumps to a held node."""
+def _backward_reach(held: np.ndarray, jumps: Rates, grid: Grid, clock: Clock) -> np.ndarray:
+    """The nodes with a path of jumps to a held node, bool (*grid)."""
     if grid.size > LARGE:
         listed = grid.size * len(jumps.offsets) <= SEARCHABLE
-        found = _spread(held, jumps, grid, clock, LONG * sum(grid.shape) if listed else grid.size)
+        found = _reach_on_device(held, jumps, grid, clock, LONG * sum(grid.shape) if listed else grid.size)
         if found is not None:
             return found
     clock.enter("the search for nodes that reach the target")
-    return _searched(held, jumps, grid)
+    return _reach_on_host(held, jumps, grid)
 
 
-def _spread(held: np.ndarray, jumps: Rates, grid: Grid, clock: Clock, most: int) -> np.ndarray | None:
+def _reach_on_device(held: np.ndarray, jumps: Rates, grid: Grid, clock: Clock, most: int) -> np.ndarray | None:
     """Nodes that lead to a held one, all at once on the device; None if their paths have more than ``most`` jumps."""
     found, more, some = jnp.asarray(held), True, max(1, LOOK // grid.size)
     for step in range(0, most, some):
         clock.enter(f"the search for nodes that reach the target, paths of {step} jumps")
-        found, more = _further(found, jumps, grid, min(some, most - step))
+        found, more = _predecessors(found, jumps, grid, min(some, most - step))
         if not more:
             return np.asarray(found)
     return None
 
 
 @jax.jit
-def _further(found: jax.Array, jumps: Rates, grid: Grid, most: Any) -> tuple[jax.Array, jax.Array]:
-    """The nodes one jump further from the target, ``most`` times over; and whether there may be more."""
+def _predecessors(found: jax.Array, jumps: Rates, grid: Grid, most: int | Scalar) -> tuple[jax.Array, Scalar]:
+    """``found`` with the nodes that lead there in ``most`` jumps; and if there may be more."""
 
     def step(carry):
         found, _, count = carry
@@ -261,8 +278,8 @@ def _further(found: jax.Array, jumps: Rates, grid: Grid, most: Any) -> tuple[jax
     return found, more
 
 
-def _searched(held: np.ndarray, jumps: Rates, grid: Grid) -> np.ndarray:
-    """The same by a breadth-first search, however long the paths are."""
+def _reach_on_host(held: np.ndarray, jumps: Rates, grid: Grid) -> np.ndarray:
+    """The nodes with a path of jumps to a held node by a breadth-first search, however long the paths are."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import breadth_first_order
 

@@ -8,7 +8,7 @@ a negative running cost elsewhere), leaving may be better: whether it is, the an
 each in its own unit.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +19,8 @@ from hjbjax.hamiltonian import discrete
 from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import Obstacles
 from hjbjax.problem import sets
+from hjbjax.problem.sets import AdmissibleSet
+from hjbjax.problem.types import Field, Mask, Numbers, Scalar
 
 ROUNDINGS = 8  # units of eps: sin π, in float32 as well, times what it is multiplied with
 GAIN = 64  # units of eps of Q max|V|: a smaller gain of leaving is rounding
@@ -33,9 +35,9 @@ class Standstill(NamedTuple):
       crossing: the time that the fastest motion takes from end to end of the box, all axes after one another; a number.
     """
 
-    rests: jax.Array
-    least: jax.Array
-    crossing: jax.Array
+    rests: Mask
+    least: Field
+    crossing: Scalar
 
 
 def standstill(on: Discretisation) -> Standstill:
@@ -52,13 +54,13 @@ def standstill(on: Discretisation) -> Standstill:
     effort, u, d = discrete.optimise(discrete.at_rest(on, cost / speeds))
     small = ROUNDINGS * jnp.finfo(dtype).eps
     rests = (jnp.abs(effort) <= small * cost) & (jnp.abs(least) <= small * cost)
-    for axis, speed in enumerate(_spread(on, u, d)):
+    for axis, speed in enumerate(_noise_speeds(on, u, d)):
         rests &= speed <= small * speeds[axis]
     extents = jnp.stack([jnp.asarray(grid.hi[axis] - grid.lo[axis], dtype) for axis in range(grid.ndim)])
     return Standstill(rests, least, jnp.sum(extents / speeds))
 
 
-def _spread(on: Discretisation, u: list, d: list) -> list[Any]:
+def _noise_speeds(on: Discretisation, u: list, d: list) -> list[jax.Array]:
     """a_ii/h_i along every axis: the speed at which noise leaves a node, correlated noise included."""
     a, none = on.diffusion(u, d), jnp.zeros((), on.dtype)
     return [a.get((axis, axis), none) / on.grid.spacing(axis) for axis in range(on.grid.ndim)]
@@ -68,7 +70,7 @@ def _scales(on: Discretisation) -> tuple[jax.Array, jax.Array]:
     """The largest speed along every axis, drift or noise, shape (n,), and the largest |L|, over nodes and actions."""
     grid, dtype = on.grid, on.dtype
 
-    def rows(admissible: Any) -> jax.Array:
+    def rows(admissible: AdmissibleSet | None) -> jax.Array:
         return jnp.stack(
             [jnp.stack(action) if action else jnp.zeros(0, dtype) for action in sets.probes(admissible, dtype)]
         )
@@ -76,12 +78,12 @@ def _scales(on: Discretisation) -> tuple[jax.Array, jax.Array]:
     us, ds = rows(on.problem.controls), rows(on.problem.disturbances)
     pairs = jnp.stack(jnp.meshgrid(jnp.arange(len(us)), jnp.arange(len(ds)), indexing="ij"), -1).reshape(-1, 2)
 
-    def largest(entry: Any) -> jax.Array:
+    def largest(entry: Numbers) -> Scalar:
         return jnp.max(jnp.abs(jnp.broadcast_to(jnp.asarray(entry, dtype), grid.shape)))
 
     def look(found: tuple, pair: jax.Array) -> tuple:
         x, (u, d) = jax.lax.optimization_barrier((on.coordinates(), (list(us[pair[0]]), list(ds[pair[1]]))))
-        f, spread = on.drift(u, d, x), _spread(on, u, d)
+        f, spread = on.drift(u, d, x), _noise_speeds(on, u, d)
         speeds = jnp.stack([largest(jnp.abs(drift) + noise) for drift, noise in zip(f, spread, strict=True)])
         cost = largest(on.running_cost(u, d, x))
         return (jnp.maximum(found[0], speeds), jnp.maximum(found[1], cost)), None
@@ -90,7 +92,7 @@ def _scales(on: Discretisation) -> tuple[jax.Array, jax.Array]:
     return jax.lax.scan(look, start, pairs)[0]
 
 
-def leaving_pays(on: Discretisation, obstacles: Obstacles, counted: Any, value: jax.Array) -> jax.Array:
+def leaving_pays(on: Discretisation, obstacles: Obstacles, counted: Mask, value: Field) -> jax.Array:
     """The held rest nodes at which some action has L + Σ_o c_o (V(x + o) − V(x)) < 0, bool (*grid).
 
     With none of them the value with held rest nodes solves the problem in which they may be left, too.
@@ -104,8 +106,8 @@ def leaving_pays(on: Discretisation, obstacles: Obstacles, counted: Any, value: 
     return rests & (policy.defect < -GAIN * jnp.finfo(value.dtype).eps * (leaving * size + cost))
 
 
-def released(obstacles: Obstacles, pays: jax.Array) -> Obstacles:
-    """The conditions with the nodes ``pays`` no longer held: there the run may rest, V ≤ 0, or leave."""
+def released(obstacles: Obstacles, pays: Mask) -> Obstacles:
+    """The obstacles with the nodes ``pays`` no longer held: there the run may rest, V ≤ 0, or leave."""
     stop = jnp.where(pays, 0, jnp.inf)
     stop = stop if obstacles.upper is None else jnp.minimum(stop, obstacles.upper)
     return bellman.Obstacles(obstacles.fixed & ~pays, obstacles.fixed_value, stop, obstacles.lower, obstacles.ended)

@@ -6,7 +6,6 @@ they should may be thinner than the samples are dense.
 
 import functools
 import itertools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,15 +15,16 @@ from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.hamiltonian.players import Player
 from hjbjax.problem import sets
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.sets import Ball
+from hjbjax.problem.sets import AdmissibleSet, Ball, Box
+from hjbjax.problem.types import Array, Mask
 from hjbjax.tracing import components
 
 COMBINATIONS = 32  # of kinks of all inputs that are tried with one action
 SAMPLES = 33  # actions of a continuum that are tried
 
 
-def sampled(problem: Problem) -> Any:
-    """Actions of the control (count, m); one of no entries where there is no control."""
+def sampled(problem: Problem) -> Array:
+    """Actions of the control, shape (count, m); one of no entries where there is no control."""
     return np.zeros((1, 0)) if problem.controls is None else sets.samples(problem.controls, SAMPLES)
 
 
@@ -69,8 +69,11 @@ def of_a_ball(on: Discretisation, player: Player) -> list[list]:
     return found
 
 
-def _kinks(on: Discretisation, player: Player, base: list, j: int) -> list:
-    """Where the components that input j drives vanish, given the other inputs; its own place if they never do."""
+def _kinks(on: Discretisation, player: Player, base: list, j: int) -> list[jax.Array]:
+    """Where the components that input j drives vanish, as values of u_j at the nodes, given the other inputs.
+
+    Its own place where they never do.
+    """
     problem = on.problem
     at_zero = [jnp.zeros((), on.dtype) if k == j else entry for k, entry in enumerate(base)]
     offset = on.drift(at_zero)
@@ -81,14 +84,16 @@ def _kinks(on: Discretisation, player: Player, base: list, j: int) -> list:
     ]
 
 
-def _where(condition: jax.Array, action: list, otherwise: list) -> list:
+def _where(condition: Mask, action: list, otherwise: list) -> list[jax.Array]:
+    """One action or another, node by node."""
     return [jnp.where(condition, new, old) for new, old in zip(action, otherwise, strict=True)]
 
 
-def _contains(admissible: Any, action: list) -> Any:
-    """Where an action with an entry a node lies in a box or a ball."""
+def _contains(admissible: AdmissibleSet | None, action: list) -> Mask:
+    """The nodes at which an action lies in its box or ball."""
     if isinstance(admissible, Ball):
         return sum(u * u for u in action) <= admissible.radius**2
+    assert isinstance(admissible, Box)  # kinks are asked for where the minimum is exact: of no other set
     return functools.reduce(
         jnp.logical_and, ((u >= admissible.lo[j]) & (u <= admissible.hi[j]) for j, u in enumerate(action))
     )

@@ -6,8 +6,8 @@ changes no bit of the others. Ctrl-C and the time limit end the lanes that still
 """
 
 import dataclasses
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Hashable, Iterable, Sequence
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,7 @@ from hjbjax.iteration.methods import Method
 from hjbjax.problem.arguments import shown
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
+from hjbjax.problem.types import DType, Mask
 from hjbjax.solution.clock import CHUNK_SECONDS, CUT, Clock, Stopped, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
@@ -34,6 +35,7 @@ from hjbjax.solvers.stationary import as_dtype, check_arguments, check_limits, s
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
 
+T = TypeVar("T")
 CHUNK = 8  # steps between two looks at which lanes are done, at most
 
 _begin = jax.vmap(fixed_point.begin)
@@ -48,7 +50,7 @@ def solve_batch(
     method: Method | None = None,
     scheme: Scheme = Upwind(),
     tol: float = 1e-3,
-    dtype: Any = None,
+    dtype: DType | None = None,
     max_steps: int | None = None,
     time_limit: float | None = None,
     throw: bool = True,
@@ -86,7 +88,7 @@ def solve_batch(
     solutions: list[Any] = [None] * len(lanes)
     clock = Clock(max_steps or 10**9, time_limit)
     with noting_interrupts(clock), jax.enable_x64(kind == np.float64):
-        for members in _alike(lanes):
+        for members in _same_program(lanes):
             first = lanes[members[0]]
             chosen = (method or choose(first, grid, traced=False)).inner
             checks.shapes(first, grid, scheme)
@@ -105,22 +107,22 @@ def solve_batch(
     return solutions
 
 
-def _alike(problems: Sequence[Problem]) -> list[list[int]]:
-    """The indices of problems that share functions and shapes, in the order of first appearance."""
+def _same_program(problems: Sequence[Problem]) -> list[list[int]]:
+    """Groups of lanes whose problems share functions and shapes, and so a program, in the order of first appearance."""
     flat = map(jax.tree.flatten, problems)
-    return _grouped((structure, tuple(np.shape(leaf) for leaf in leaves)) for leaves, structure in flat)
+    return _groups((structure, tuple(np.shape(leaf) for leaf in leaves)) for leaves, structure in flat)
 
 
-def _grouped(keys: Iterable[Any]) -> list[list[int]]:
-    """The positions of equal keys together, in the order of first appearance."""
-    groups: dict[Any, list[int]] = {}
+def _groups(keys: Iterable[Hashable]) -> list[list[int]]:
+    """Groups of the positions of equal keys, in the order of first appearance."""
+    groups: dict[Hashable, list[int]] = {}
     for position, key in enumerate(keys):
         groups.setdefault(key, []).append(position)
     return list(groups.values())
 
 
 def _rounds(members: Sequence[int], bytes_each: int, limit: int | None) -> list[Sequence[int]]:
-    """Lanes that fit into half of the memory together."""
+    """Groups of lanes that fit into half of the memory together."""
     free = memory.available() if limit is None else int(limit)
     most = len(members) if free is None else max(1, free // 2 // max(bytes_each, 1))
     return [members[start : start + most] for start in range(0, len(members), most)]
@@ -129,7 +131,7 @@ def _rounds(members: Sequence[int], bytes_each: int, limit: int | None) -> list[
 def _solve_together(lanes: dict[int, Discretisation], method: Method, tol: float, clock: Clock) -> list[Solution]:
     """The solutions of problems that run together, by the numbers of their lanes."""
     began, names, asked = clock.elapsed(), list(lanes), list(lanes.values())
-    prepared: list[tuple[Task, Assumptions, np.ndarray | None]] = []
+    prepared: list[tuple[Task, Assumptions, Mask | None]] = []
     for name, on in lanes.items():
         try:
             node_checks.values(on.problem, on.grid, on.dtype, clock)
@@ -146,20 +148,20 @@ def _solve_together(lanes: dict[int, Discretisation], method: Method, tol: float
         (dataclasses.replace(task, has_lost=has_lost), assumptions, reached) for task, assumptions, reached in prepared
     ]
     solutions: list[Any] = [None] * len(lanes)
-    for members in _grouped(jax.tree.structure(task) for task, _, _ in prepared):  # by certificate, too
+    for members in _groups(jax.tree.structure(task) for task, _, _ in prepared):  # by certificate, too
         tasks = _stack([prepared[i][0] for i in members])
         states = _begin(tasks, jax.vmap(Task.start)(tasks))
         ended, histories = _finish_lanes(tasks, states, len(members), clock)
         for i, (state, code), residuals in zip(members, ended, histories, strict=True):
             history = np.concatenate(residuals)[: int(state.step) + 1]
-            solutions[i] = _finished(Settled(*prepared[i], state, code, history), asked[i], clock)
+            solutions[i] = _lane_solution(Settled(*prepared[i], state, code, history), asked[i], clock)
     about = {"seconds": clock.elapsed() - began, "lanes": len(lanes), "tol": tol}
     for on, solution in zip(asked, solutions, strict=True):
         solution.stats.update(method=method.described(on.problem.is_game), **about)
     return solutions
 
 
-def _finished(settled: Settled, on: Discretisation, clock: Clock) -> Solution:
+def _lane_solution(settled: Settled, on: Discretisation, clock: Clock) -> Solution:
     """The solution of one lane, which may go on by itself: off a node where it rests, or to second order."""
     task, assumptions, reached, state, code, history = settled
     apart: dict[str, Any] = {}
@@ -179,7 +181,7 @@ def _finished(settled: Settled, on: Discretisation, clock: Clock) -> Solution:
 
 
 def _finish_lanes(tasks: Task, states: State, count: int, clock: Clock) -> tuple[list[tuple], list[list]]:
-    """Chunks of steps until every lane is done, or the clock says stop; the last state and the status of each lane.
+    """The last state and the status of each lane, and its residuals, by chunks of steps until all are done or cut.
 
     Lanes that are done are taken out where that halves the work.
     """
@@ -218,9 +220,11 @@ def _finish_lanes(tasks: Task, states: State, count: int, clock: Clock) -> tuple
     return final, histories
 
 
-def _stack(trees: Sequence[Any]) -> Any:
+def _stack(trees: Sequence[T]) -> T:
+    """One tree of trees of one structure, with a leading axis of lanes in every leaf."""
     return jax.tree.map(lambda *leaves: jnp.stack(jnp.broadcast_arrays(*leaves)), *trees)
 
 
-def _take(tree: Any, rows: np.ndarray) -> Any:
+def _take(tree: T, rows: np.ndarray) -> T:
+    """The rows of every leaf."""
     return jax.tree.map(lambda leaf: leaf[rows], tree)

@@ -6,18 +6,23 @@ that says what was needed and what is free.
 
 import contextlib
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import TypeAlias
 
 import jax
 import numpy as np
 
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.types import Nodes
 from hjbjax.solution.clock import Clock
+from hjbjax.solution.solution import Solution
 from hjbjax.solvers import memory
 
 CALLBACK = "CpuCallback error"  # how JAX heads the exception of a callback, whatever its type
 
+Kept: TypeAlias = tuple[np.ndarray, Grid]  # node values that outlived an exception, and their grid
 
-def keep(error: Exception, grid: Any, *values: Callable[[], Any]) -> None:
+
+def keep(error: Exception, grid: Grid, *values: Callable[[], Nodes]) -> None:
     """Notes on an exception the first of some node values that can still be read: a broken run takes its own along."""
     for value in values:
         with contextlib.suppress(Exception):
@@ -26,7 +31,7 @@ def keep(error: Exception, grid: Any, *values: Callable[[], Any]) -> None:
 
 
 @contextlib.contextmanager
-def explained(clock: Clock, needed: int, partial: Callable[[Any], Any]) -> Iterator[None]:
+def explained(clock: Clock, needed: int, partial: Callable[[Kept | None], Solution | None]) -> Iterator[None]:
     """Exceptions of the runtime leave with a solution.
 
     Args:
@@ -49,13 +54,14 @@ def explained(clock: Clock, needed: int, partial: Callable[[Any], Any]) -> Itera
                 solution = partial(getattr(error, "kept", None))
         where = f"It came as far as {clock.phase}; the value so far is .solution of this exception."
         if starved:
-            raise _starved(error, needed, where, solution) from error
+            raise _memory_error(error, needed, where, solution) from error
         error.solution = solution  # type: ignore[attr-defined]
         error.add_note(where)
         raise
 
 
-def _starved(error: Exception, needed: int, where: str, solution: Any) -> MemoryError:
+def _memory_error(error: Exception, needed: int, where: str, solution: Solution | None) -> MemoryError:
+    """The report of memory that ran out: what was needed, what is free now, and the solution so far."""
     free, said = memory.available(), (str(error).strip() or type(error).__name__).splitlines()[0][:200]
     left = "" if free is None else f", {free / 1e9:.3g} GB are free now"
     report = MemoryError(

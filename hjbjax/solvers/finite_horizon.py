@@ -4,10 +4,9 @@ At host level it validates, finds the longest stable step, goes backward in chun
 one kept time to the next, and reports. Under a tracer the same steps run in a scan of fixed length.
 """
 
-import functools
 import itertools
 import math
-from typing import Any
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -19,15 +18,16 @@ from hjbjax.discretisation.schemes import Upwind
 from hjbjax.finiteness import admissibility, node_checks
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import bellman, time_stepping
-from hjbjax.iteration.evaluation import Krylov, Sweeps
+from hjbjax.iteration.evaluation import Evaluation, Krylov, Sweeps
 from hjbjax.iteration.methods import PolicyIteration
-from hjbjax.iteration.time_methods import Explicit, Implicit
+from hjbjax.iteration.time_methods import Explicit, Implicit, TimeMethod
 from hjbjax.iteration.time_stepping import March
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, cast, is_traced
 from hjbjax.problem.sets import Box, Finite
+from hjbjax.problem.types import Array, DType, Mask, Nodes, Scalar
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
@@ -51,13 +51,13 @@ def march(
     grid: Grid,
     horizon: float,
     *,
-    times: Any = None,
-    start: Any = None,
+    times: Sequence[float] | Array | None = None,
+    start: Nodes | None = None,
     scheme: Scheme = Upwind(),
     method: Explicit | Implicit | None = None,
     step: float | None = None,
     inner: float | None = None,
-    dtype: Any = None,
+    dtype: DType | None = None,
     time_limit: float | None = None,
     throw: bool = True,
     progress: bool | None = None,
@@ -120,8 +120,7 @@ def march(
     with noting_interrupts(clock), jax.enable_x64(kind == np.float64):
         needed = memory.fitting(_bytes(problem, grid, kept, method, kind), grid, max_memory)
         on = Discretisation(problem, grid, scheme, kind)
-        unmoved = functools.partial(_unmoved, on, horizon, start)
-        with faults.explained(clock, needed, unmoved):
+        with faults.explained(clock, needed, lambda _: _solution_at_horizon(on, horizon, start, Status.INTERRUPTED)):
             try:
                 checks.shapes(problem, grid, scheme)
                 node_checks.values(_without_moving_target(problem), grid, kind, clock)
@@ -132,7 +131,7 @@ def march(
                 slices, front, code = epochs.drive(task, kept, start, clock)
                 solution = epochs.assemble(task, grid, slices, front, code)
             except Stopped as stop:
-                solution = _unstarted(on, horizon, start, stop.status)
+                solution = _solution_at_horizon(on, horizon, start, stop.status)
         solution = closed(solution, clock)
     solution.stats.update(
         seconds=clock.stepping, compile_seconds=clock.elapsed() - clock.stepping, bytes=needed, horizon=horizon
@@ -142,20 +141,15 @@ def march(
     return solution
 
 
-def _unmoved(on: Discretisation, horizon: float, start: Any, kept: Any) -> Solution:
-    """The solution of a march that broke before its first step."""
-    return _unstarted(on, horizon, start, Status.INTERRUPTED)
-
-
-def _unstarted(on: Discretisation, horizon: float, start: Any, code: Status) -> Solution:
+def _solution_at_horizon(on: Discretisation, horizon: float, start: Nodes | None, code: Status) -> Solution:
     """The solution of a march that ended before its first step: the value it was to start from; NaN if not known."""
     value = np.full((1, *on.grid.shape), np.nan if start is None else np.asarray(start), on.dtype)
     message = f"The march did not leave t = {horizon:g}. {epochs.ADVICE[code]}"
     return altered(unstarted(on, value, code), times=np.array([horizon]), message=message)
 
 
-def _check(problem: Any, grid: Any, scheme: Any, method: Any, step: Any, time_limit: Any) -> None:
-    """Refuse what no march can start with; needs no values of the problem's functions."""
+def _check(problem: object, grid: object, scheme: Scheme, method: TimeMethod, step: object, time_limit: object) -> None:
+    """Refuse arguments with which no march can start; needs no values of the problem's functions."""
     if not isinstance(problem, Problem) or not isinstance(grid, Grid):
         raise TypeError(f"march: got {type(problem).__name__}, {type(grid).__name__}; wanted a Problem and a Grid")
     schemes.check(scheme, "march: scheme", grid)
@@ -169,7 +163,7 @@ def _check(problem: Any, grid: Any, scheme: Any, method: Any, step: Any, time_li
         arguments.positive(time_limit, "march: time_limit", "in seconds", endless=True)
 
 
-def _times(horizon: Any, times: Any) -> tuple[float, np.ndarray]:
+def _times(horizon: float, times: Sequence[float] | Array | None) -> tuple[float, np.ndarray]:
     """The horizon and the kept times, checked."""
     if is_traced(horizon, times):
         raise ValueError("march: horizon and times set the number of steps and must be known numbers, not traced ones")
@@ -191,13 +185,13 @@ def _times(horizon: Any, times: Any) -> tuple[float, np.ndarray]:
     return float(horizon), kept
 
 
-def _bytes(problem: Problem, grid: Grid, kept: np.ndarray, method: Any, dtype: Any) -> int:
+def _bytes(problem: Problem, grid: Grid, kept: np.ndarray, method: TimeMethod, dtype: DType) -> int:
     """Bytes at the peak: kept slices and policies, two slices, slopes, constraints; the matrix if implicit."""
     word = np.dtype(dtype).itemsize
     actions = sum(admissible.dim for admissible in (problem.controls, problem.disturbances) if admissible is not None)
     slices = len(kept) * (1 + actions) + 2 + 2 * grid.ndim + 3 + actions
     if not method.limited:
-        inner = PolicyIteration(method.evaluation or Krylov())
+        inner = PolicyIteration(getattr(method, "evaluation", None) or Krylov())
         slices += memory.estimate(problem, grid, inner, dtype) // (word * grid.size)
     return word * slices * grid.size
 
@@ -210,12 +204,12 @@ def _without_moving_target(problem: Problem) -> Problem:
     return Problem(problem.drift, **{name: getattr(problem, name) for name in names}, time_dependent=True)
 
 
-def _prepare(on: Discretisation, horizon: float, method: Any, step: float | None, inner: float | None) -> March:
+def _prepare(on: Discretisation, horizon: float, method: TimeMethod, step: float | None, inner: float | None) -> March:
     """The task of a march, all arrays in its type, with a given step held against the limit."""
     on, dtype = cast(on, on.dtype), on.dtype
     problem, grid = on.problem, on.grid
     moving = problem.time_dependent
-    limit: Any = jnp.asarray(jnp.inf, dtype)
+    limit: Scalar = jnp.asarray(jnp.inf, dtype)
     method = method.filled(on, _evaluation(problem, grid))
     if method.limited:
         probes = np.linspace(horizon, 0.0, PROBES) if moving else [horizon]
@@ -223,21 +217,20 @@ def _prepare(on: Discretisation, horizon: float, method: Any, step: float | None
             limits = [_stable(on.at(jnp.asarray(t, dtype))) for t in probes]
             limit = jnp.min(jnp.stack(limits))
             _check_step(step, float(limit) / method.tableau.euler)
-        if moving:
-            limit = None
-        else:
-            limit = jnp.asarray(limit * (method.courant if step is None else 1 / method.tableau.euler), dtype)
+        courant = method.courant if step is None else 1 / method.tableau.euler
+        limit = jnp.asarray(limit * courant, dtype)
     checks = _checks(on, method)
     if step is None:  # rates that are found on the way say nothing of the first steps
         step = horizon / FEWEST if moving or checks[0] or not method.limited else math.inf
+    obstacles, limit_known = (None, not method.limited) if moving else (_obstacles(on), True)
     return March(
-        on, method, None if moving else _obstacles(on), limit, jnp.asarray(step, dtype),
-        jnp.asarray(horizon, dtype), _watched(on, inner), *checks,
+        on, method, obstacles, limit if limit_known else None, jnp.asarray(step, dtype),
+        jnp.asarray(horizon, dtype), _blow_up_nodes(on, inner), *checks,
     )  # fmt: skip
 
 
-def _checks(on: Discretisation, method: Any) -> tuple[bool, bool]:
-    """Whether steps must look at rates and at correlated noise under the actions that they choose."""
+def _checks(on: Discretisation, method: TimeMethod) -> tuple[bool, bool]:
+    """Two flags: steps must look at the rates, and at correlated noise, under the actions that they choose."""
     problem = on.problem
     players, moving = players_of(on), problem.time_dependent
     sampled = not (players.control.fastest_at_ends and players.disturbance.fastest_at_ends)
@@ -246,6 +239,7 @@ def _checks(on: Discretisation, method: Any) -> tuple[bool, bool]:
 
 
 def _check_step(step: float | None, limit: float) -> None:
+    """Refuse a step longer than the stability limit."""
     if step is not None and step > limit * (1 + 1e-6):
         raise ValueError(
             f"march: step = {step:g} is above the stability limit 1/(max Q + β) = {limit:.6g} of explicit steps "
@@ -253,14 +247,15 @@ def _check_step(step: float | None, limit: float) -> None:
         )
 
 
-def _evaluation(problem: Problem, grid: Grid) -> Any:
+def _evaluation(problem: Problem, grid: Grid) -> Evaluation:
+    """The evaluation of policies in an implicit step that suits the problem."""
     if grid.sides("open"):
         chosen = choose(problem, grid, traced=False)
         return chosen.evaluation or Krylov()
     return Sweeps() if problem.noise is None else Krylov()
 
 
-def _watched(on: Discretisation, share: float | None) -> Any:
+def _blow_up_nodes(on: Discretisation, share: float | None) -> Mask | None:
     """The nodes where a disturbance at its bound is taken for a blow-up; or None."""
     problem, grid = on.problem, on.grid
     if share is None:
@@ -276,9 +271,9 @@ def _watched(on: Discretisation, share: float | None) -> Any:
 
 
 def _march_traced(
-    on: Discretisation, horizon: float, kept: np.ndarray, start: Any, method: Any, step: float | None
+    on: Discretisation, horizon: float, kept: np.ndarray, start: Nodes | None, method: TimeMethod, step: float | None
 ) -> Solution:
-    """The same steps inside a JAX transformation, in a scan of fixed length: no chunks, no checks of values."""
+    """The solution of a march inside a JAX transformation, in a scan of fixed length: no chunks, no value checks."""
     if step is None:
         raise ValueError(
             "march: inside jit, vmap and grad the number of steps must be known: give step=, for explicit steps at "

@@ -8,7 +8,7 @@ import contextlib
 import dataclasses
 import sys
 import time
-from typing import Any
+from collections.abc import Callable, Iterator
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ import numpy as np
 
 from hjbjax.iteration import fixed_point
 from hjbjax.iteration.fixed_point import HISTORY, State, Task
+from hjbjax.problem.types import Nodes
 from hjbjax.solution.clock import CHUNK_SECONDS, CUT, Clock
 from hjbjax.solution.status import Status
 from hjbjax.solvers import faults
@@ -30,7 +31,7 @@ run = jax.jit(fixed_point.run, donate_argnames="state")
 _run_kept = jax.jit(fixed_point.run)
 
 
-def drive(task: Task, guess: Any, clock: Clock, most: int | None = None) -> tuple[State, Status, np.ndarray]:
+def drive(task: Task, guess: Nodes, clock: Clock, most: int | None = None) -> tuple[State, Status, np.ndarray]:
     """Chunks of steps until the state stops running, the steps or the time run out, or Ctrl-C.
 
     Args:
@@ -55,7 +56,7 @@ def drive(task: Task, guess: Any, clock: Clock, most: int | None = None) -> tupl
             before, state = state, step(task, state, -1)  # compiles and does nothing
             while code is Status.RUNNING:
                 began = time.perf_counter()
-                code = _ended(clock, done, limit, task.grid.size)
+                code = _stop_status(clock, done, limit, task.grid.size)
                 if code is not Status.RUNNING:
                     break
                 clock.phase = f"step {done + 1} on {nodes} nodes" + ", on the way to a guess" * (most is not None)
@@ -82,12 +83,13 @@ def drive(task: Task, guess: Any, clock: Clock, most: int | None = None) -> tupl
 
 
 def _calls_back(task: Task) -> bool:
+    """True if a step calls Python on the host, be it for a solve or in a function of the user's."""
     evaluation = getattr(task.method, "evaluation", None)
     return (evaluation is not None and evaluation.calls_back) or checks.calls_back(task.problem, task.grid.ndim)
 
 
-def _ended(clock: Clock, done: int, limit: int, nodes: int) -> Status:
-    """Why no chunk may follow; else RUNNING. A step that would come too late by the pace of the last is not begun."""
+def _stop_status(clock: Clock, done: int, limit: int, nodes: int) -> Status:
+    """The status that forbids another chunk, else RUNNING; a step that the last pace makes too late is not begun."""
     code = clock.over()
     if code is None and clock.per_node is not None and clock.steps_in(clock.seconds - clock.elapsed(), nodes) < 1:
         code = Status.TIME_LIMIT
@@ -97,7 +99,7 @@ def _ended(clock: Clock, done: int, limit: int, nodes: int) -> Status:
 
 
 def _first_chunk(task: Task, clock: Clock) -> int:
-    """How many steps to take before anything is timed on this grid, beside the look at the guess.
+    """Steps of the first chunk on this grid, before any is timed there, beside the look at the guess.
 
     A coarser grid tells what they take; a finer one may fall out of the cache, hence half a chunk's time. One alone
     where a step may take many passes over the nodes, and more of them on a finer grid.
@@ -121,7 +123,7 @@ def imposed(task: Task, state: State) -> State:
 
 
 @contextlib.contextmanager
-def _bar(progress: bool | None, tol: float) -> Any:
+def _bar(progress: bool | None, tol: float) -> Iterator[Callable[[int, float], None]]:
     """A progress bar on a terminal after one second; silent elsewhere."""
     if progress is False or (progress is None and not sys.stderr.isatty()):
         yield lambda steps, error: None
@@ -138,7 +140,7 @@ def _bar(progress: bool | None, tol: float) -> Any:
 
 
 @contextlib.contextmanager
-def ticker(progress: bool | None, total: float, what: str) -> Any:
+def ticker(progress: bool | None, total: float, what: str) -> Iterator[Callable[[float, int], None]]:
     """A progress bar over the problem's own time; ``show(done, steps)`` moves it."""
     if progress is False or (progress is None and not sys.stderr.isatty()):
         yield lambda done, steps: None

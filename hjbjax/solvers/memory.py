@@ -9,7 +9,6 @@ import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -18,12 +17,13 @@ from hjbjax.iteration.methods import Method
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_discounted
+from hjbjax.problem.types import DType
 
 INDEXABLE = 2**31  # nodes that 32-bit indices can number
 NO_GRID = "hjb.pontryagin(problem, x0) finds the optimal path from one state without a grid"
 
 
-def estimate(problem: Problem, grid: Grid, method: Method, dtype: Any) -> int:
+def estimate(problem: Problem, grid: Grid, method: Method, dtype: DType) -> int:
     """Bytes that a solve keeps at its peak, from a count of the arrays that live at once.
 
     The state is the value, the rate that is left and the policy. A look at it makes the next one beside it; sweeps
@@ -56,7 +56,7 @@ def available() -> int | None:
 
 
 def _of_machine() -> int | None:
-    """What the machine has free, with caches that it would give up."""
+    """Bytes that the machine has free, with caches that it would give up."""
     try:
         with open("/proc/meminfo") as lines:
             for line in lines:
@@ -68,7 +68,7 @@ def _of_machine() -> int | None:
 
 
 def _of_process() -> int | None:
-    """What the limit on the address space of this process leaves; None without one."""
+    """Bytes that the limit on the address space of this process leaves; None without one."""
     try:
         import resource
 
@@ -82,7 +82,7 @@ def _of_process() -> int | None:
 
 
 def _of_groups(process: Path = Path("/proc/self"), mount: Path = Path("/sys/fs/cgroup")) -> int | None:
-    """What the control groups of this process leave, of both versions; None where none is limited."""
+    """Bytes that the control groups of this process leave, of both versions; None where none is limited."""
     left = []
     for folder in _groups(process, mount):
         for most, used in (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes")):
@@ -117,8 +117,8 @@ def _reclaimable(folder: Path) -> int:
     return 0
 
 
-def require(problem: Problem, grid: Grid, method: Method, dtype: Any, limit: int | None) -> int:
-    """The estimate, if it fits.
+def require(problem: Problem, grid: Grid, method: Method, dtype: DType, limit: int | None) -> int:
+    """Bytes that a solve needs, by the estimate, if they fit.
 
     Raises:
       MemoryError: with the estimate, what is free, and the largest N that fits.
@@ -138,24 +138,26 @@ def fitting(needed: int, grid: Grid, limit: int | None) -> int:
     if grid.size >= INDEXABLE:
         largest = math.floor((INDEXABLE - 1) ** (1 / grid.ndim))
         raise MemoryError(
-            f"{_product(grid)} = {grid.size:,} nodes; 32-bit indices number fewer than {INDEXABLE:,}.\n"
+            f"{_counts(grid)} = {grid.size:,} nodes; 32-bit indices number fewer than {INDEXABLE:,}.\n"
             f"At most N = {largest} points an axis in {grid.ndim}-D; {NO_GRID}."
         )
     if free is not None and needed > free:
         raise MemoryError(
-            f"{_product(grid)} = {grid.size:,} nodes need about {needed / 1e9:.3g} GB, {free / 1e9:.3g} GB are free.\n"
-            f"{_fits(free / needed * grid.size, grid.ndim)}; max_memory= (bytes) overrides what counts as free.\n"
+            f"{_counts(grid)} = {grid.size:,} nodes need about {needed / 1e9:.3g} GB, {free / 1e9:.3g} GB are free.\n"
+            f"{_largest(free / needed * grid.size, grid.ndim)}; max_memory= (bytes) overrides what counts as free.\n"
             f"dtype='float32' takes about half; {NO_GRID}."
         )
     return needed
 
 
-def _fits(nodes: float, n: int) -> str:
+def _largest(nodes: float, n: int) -> str:
+    """A sentence on the points an axis of the largest grid of n axes with so many nodes."""
     largest = math.floor(nodes ** (1 / n))
     if largest < 2:
         return f"Not even two points an axis would fit in {n}-D"
     return f"About N = {largest} points an axis would fit in {n}-D"
 
 
-def _product(grid: Grid) -> str:
+def _counts(grid: Grid) -> str:
+    """The points of all axes, as in "41 x 81"."""
     return " x ".join(map(str, grid.shape))

@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import Method, PolicyIteration
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import altered
+from hjbjax.problem.types import Mask, Nodes
 from hjbjax.solution import transfer
 from hjbjax.solution.clock import Clock, Stopped
 from hjbjax.solution.status import Status
@@ -28,8 +29,8 @@ WARM_STEPS = 60  # improvements for each of them
 
 
 def start(
-    on: Discretisation, method: Method, tol: float, guess: Any, clock: Clock
-) -> tuple[Any, list[tuple[int, ...]]]:
+    on: Discretisation, method: Method, tol: float, guess: Nodes | None, clock: Clock
+) -> tuple[Nodes | None, list[tuple[int, ...]]]:
     """The guess for the finest grid: the user's, or the answer of the coarser grids, and the shapes of those.
 
     Where the clock says stop on the way, the answer so far on the finest grid, interpolated by NumPy, which compiles
@@ -38,7 +39,7 @@ def start(
     if guess is not None or method.coarsest is None:
         return guess, []
     grids = levels(on, method, clock)
-    value = None
+    value: Nodes | None = None
     if clock.over() is not None:
         return None, []
     for coarse, fine in itertools.pairwise(grids):
@@ -67,8 +68,8 @@ def levels(on: Discretisation, method: Method, clock: Clock) -> list[Grid]:
     return grids
 
 
-def warm(task: Task, guess: Any, clock: Clock) -> jax.Array:
-    """The guess; without one zero, or without discount what leads to the right one of many fixed points.
+def warm(task: Task, guess: Nodes | None, clock: Clock) -> Nodes:
+    """The guess; without one zero, or without discount a start that leads to the right one of many fixed points.
 
     A stopping cost or a running maximum is itself the start: ψ lies above all fixed points and g below. Otherwise
     the answers for a discount that vanishes lead the way: from below an undiscounted problem is full of policies
@@ -81,12 +82,12 @@ def warm(task: Task, guess: Any, clock: Clock) -> jax.Array:
 
 
 def _needs_a_way(task: Task) -> bool:
-    """Whether from zero the iteration may be caught by policies that stay where they are, at a cost."""
+    """True if the iteration from zero may be caught by policies that stay where they are, at a cost."""
     return task.certificate is Certificate.MULTIPLICATIVE and not task.constrained
 
 
-def _vanishing(task: Task, value: jax.Array, discounts: tuple[float, ...], clock: Clock) -> jax.Array:
-    """The answers for some discounts, over one by the time of a crossing, one after the other."""
+def _vanishing(task: Task, value: Nodes, discounts: tuple[float, ...], clock: Clock) -> Nodes:
+    """The last of the answers for some discounts, over one by the time of a crossing, one after the other."""
     for discount in discounts:
         problem = altered(task.problem, discount=jnp.asarray(discount / task.crossing, task.tol.dtype))
         value = drive(task.asking(problem), value, clock, most=WARM_STEPS)[0].value
@@ -94,24 +95,24 @@ def _vanishing(task: Task, value: jax.Array, discounts: tuple[float, ...], clock
 
 
 class Settled(NamedTuple):
-    """A task that was driven to its end, as it came to be on the way, and how it ended."""
+    """A task at the end of its iteration, as it came to be on the way: its last state, its status, its residuals."""
 
     task: Task
     assumptions: Assumptions
-    reached: np.ndarray | None
+    reached: Mask | None
     state: State
     code: Status
     residuals: np.ndarray
 
 
 def may_go_on(task: Task, assumptions: Assumptions, state: State, code: Status) -> bool:
-    """Whether what ended so may have to go on: rest nodes that it had better leave, a game or a way that failed."""
+    """True if a run that ended so may have to go on: rest nodes to be left, a game or a way that failed."""
     if code is Status.CONVERGED:
         return assumptions.may_rest and float(np.min(np.asarray(state.value), initial=0)) < 0
     return code in FAILED and (task.problem.is_game or _needs_a_way(task))
 
 
-def settle(task: Task, assumptions: Assumptions, reached: np.ndarray | None, guess: Any, clock: Clock) -> Settled:
+def settle(task: Task, assumptions: Assumptions, reached: Mask | None, guess: Nodes | None, clock: Clock) -> Settled:
     """Solve with the nodes where the system can rest held; those that it had better leave are released, and again.
 
     Held, their value is an upper bound of the one sought, from which the iteration only descends: a released node that

@@ -18,7 +18,8 @@ from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import is_traced
-from hjbjax.problem.sets import Finite
+from hjbjax.problem.sets import AdmissibleSet, Finite
+from hjbjax.problem.types import Array, Field, Mask, Nodes, Scalar
 from hjbjax.solution.clock import CUT, Clock
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
@@ -65,7 +66,7 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
         discrete=solution.discrete,
         discrete_disturbance=solution.discrete_disturbance,
         residuals=residuals,
-        message=_message(code, task, state, grid) if earning is None else _endless(earning, grid),
+        message=_message(code, task, state, grid) if earning is None else _unbounded_message(earning, grid),
         stats={
             "scheme": repr(task.scheme),
             "device": str(jax.devices()[0].device_kind),
@@ -76,7 +77,7 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
     )
 
 
-def unstarted(on: Discretisation, value: Any, code: Status) -> Solution:
+def unstarted(on: Discretisation, value: Nodes, code: Status) -> Solution:
     """The solution of a run that ended before its first step: the value it was to start from, and no policy."""
     problem, value = on.problem, np.asarray(value, on.dtype)
     inputs = [0 if admissible is None else admissible.dim for admissible in (problem.controls, problem.disturbances)]
@@ -107,7 +108,7 @@ def closed(solution: Solution, clock: Clock) -> Solution:
 
 
 def assemble(task: Task, state: State, assumptions: Assumptions) -> Solution:
-    """The solution as it stands in the state; pure."""
+    """The solution of a state, without what only the host finds out; pure, so that it may be traced."""
     problem = task.problem
     controls, disturbances = state.policy.controls, state.policy.disturbances
     xp: Any = jnp if is_traced(state) else np
@@ -176,17 +177,17 @@ def _refuse_noise(task: Task, state: State, grid: Grid) -> None:
     )
 
 
-def isaacs_gap(hamiltonian: discrete.DiscreteHamiltonian, free: Any) -> tuple[jax.Array, jax.Array]:
+def isaacs_gap(hamiltonian: discrete.DiscreteHamiltonian, free: Mask) -> tuple[Scalar, Scalar]:
     """The largest min max − max min over the ``free`` nodes, and how much the actions matter there, per unit time.
 
-    What actions matter is the largest difference of H between two pairs of them, of nine representatives a player.
+    How much they matter is the largest difference of H between two pairs of them, of nine representatives a player.
     """
     problem, dtype = hamiltonian.on.problem, hamiltonian.on.dtype
     upper, lower = (discrete.optimise(hamiltonian, isaacs=which)[0] for which in ("upper", "lower"))
     sets_of = (problem.controls, problem.disturbances)
     mine, theirs = (jnp.asarray(_representatives(admissible), dtype) for admissible in sets_of)
 
-    def compare(extremes: Any, pair: Any) -> tuple[Any, None]:
+    def compare(extremes: tuple[Field, Field], pair: jax.Array) -> tuple[tuple[Field, Field], None]:
         total = hamiltonian.at(list(mine[pair[0]]), list(theirs[pair[1]]))
         total = jnp.where(jnp.isfinite(total), total, upper)  # an action that an end of the box rules out
         return (jnp.minimum(extremes[0], total), jnp.maximum(extremes[1], total)), None
@@ -197,7 +198,7 @@ def isaacs_gap(hamiltonian: discrete.DiscreteHamiltonian, free: Any) -> tuple[ja
     return jnp.max(jnp.where(free, upper - lower, 0)), jnp.max(jnp.where(free, most - least + size, 0))
 
 
-def _representatives(admissible: Any) -> Any:
+def _representatives(admissible: AdmissibleSet | None) -> Array:
     """At most nine actions of a player, shape (K, m), the first and the last of its samples among them."""
     if admissible is None:
         return np.zeros((1, 0))
@@ -216,12 +217,14 @@ def warn_of_gap(gap: float, matter: float, isaacs: str) -> None:
 
 
 @jax.jit
-def _gap_at(task: Task, value: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _gap_at(task: Task, value: Field) -> tuple[Scalar, Scalar]:
+    """The Isaacs gap of a stationary game at V, and how much the actions matter, where V is not given."""
     hamiltonian = discrete.around(task.on, value, task.lost)
     return isaacs_gap(hamiltonian, task.counted & ~task.obstacles.fixed)
 
 
 def _isaacs_gap(task: Task, state: State) -> float | None:
+    """The gap at the last state, with a warning where it is large; None without a game."""
     if not task.problem.is_game:
         return None
     gap, matter = (float(number) for number in _gap_at(task, state.value))
@@ -229,7 +232,8 @@ def _isaacs_gap(task: Task, state: State) -> float | None:
     return gap
 
 
-def _endless(earning: earnings.Earning, grid: Grid) -> str:
+def _unbounded_message(earning: earnings.Earning, grid: Grid) -> str:
+    """The message of a value that is −∞, with a place where a policy earns for ever."""
     state = ", ".join(f"{x:.4g}" for x in grid.state(earning.node))
     return (
         f"The value is −∞: without discount, a policy can stay for ever where it pays {earning.mean:.3g} a unit time "
@@ -241,8 +245,8 @@ def _endless(earning: earnings.Earning, grid: Grid) -> str:
 _broken = jax.jit(fixed_point.broken)
 
 
-def _not_finite(task: Task, state: State, grid: Grid) -> str:
-    """Where NaN or infinity appeared, by taking the step once more that brought it."""
+def _not_finite_message(task: Task, state: State, grid: Grid) -> str:
+    """The message on NaN or infinity, with the place, found by taking the step once more that brought it."""
     bad = np.asarray(_broken(task, state))
     step = int(state.step)
     when = "at the guess" if step == 0 else f"in step {step}"
@@ -264,8 +268,9 @@ def _not_finite(task: Task, state: State, grid: Grid) -> str:
 
 
 def _message(code: Status, task: Task, state: State, grid: Grid) -> str:
+    """The sentence that says how a solve ended, and what to do about it."""
     if code is Status.NONFINITE:
-        return _not_finite(task, state, grid)
+        return _not_finite_message(task, state, grid)
     best, tol = float(state.best[0]), float(task.tol)
     certified = task.certificate not in (Certificate.NONE, Certificate.RESIDUAL, Certificate.OPEN)
     if code is Status.STALLED and np.isfinite(best) and certified:

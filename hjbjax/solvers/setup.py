@@ -4,7 +4,6 @@ import dataclasses
 import functools
 import sys
 import warnings
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +21,7 @@ from hjbjax.iteration.methods import Method, Nested, PolicyIteration, ValueItera
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_discounted
 from hjbjax.problem.pytree import cast
+from hjbjax.problem.types import Mask, Number, Scalar
 from hjbjax.solution.clock import Clock
 from hjbjax.tracing import checks
 
@@ -43,7 +43,7 @@ NEST = 100_000  # nodes beyond which compiling coarser grids pays
 
 
 def is_constrained(problem: Problem) -> bool:
-    """Whether the problem has a stopping cost or a running maximum."""
+    """True if the problem has a stopping cost or a running maximum."""
     return problem.stopping_cost is not None or problem.running_max is not None
 
 
@@ -72,7 +72,7 @@ def linear_solve(grid: Grid) -> Direct | Krylov:
     return Direct() if grid.ndim == 1 else Krylov()
 
 
-def prepare(on: Discretisation, *, method: Method, tol: Any, assumptions: "Assumptions") -> Task:
+def prepare(on: Discretisation, *, method: Method, tol: Number, assumptions: "Assumptions") -> Task:
     """The task of a solve, all arrays in its type; pure, so that it may be traced, batched and differentiated."""
     on = cast(on, on.dtype)
     obstacles, still = _obstacles(on, assumptions)
@@ -109,9 +109,9 @@ class Assumptions:
 
     Attributes:
       certificate: which bound on the error applies.
-      exact: whether the minimum over the actions is exact.
-      may_rest: whether rest points at zero cost close the problem (no discount, no constraint).
-      costs_certify: whether without discount the running cost gives a bound, if it is positive.
+      exact: true if the minimum over the actions is exact.
+      may_rest: true if rest points at zero cost close the problem (no discount, no constraint).
+      costs_certify: true if without discount the running cost gives a bound, where it is positive.
     """
 
     certificate: Certificate
@@ -152,8 +152,8 @@ def held_jit(on: Discretisation, *, assumptions: Assumptions) -> jax.Array:
 
 def prepare_on_host(
     on: Discretisation, *, method: Method, tol: float, clock: Clock | None = None
-) -> tuple[Task, Assumptions, np.ndarray | None]:
-    """``prepare`` with the checks that need values: a finite solution exists, and where.
+) -> tuple[Task, Assumptions, Mask | None]:
+    """The task of ``prepare`` with the checks that need values: that there is a finite solution, and where.
 
     It looks at the clock on the way and may raise ``Stopped``.
 
@@ -168,15 +168,15 @@ def prepare_on_host(
     assumptions = assumptions_of(on)
     task = prepare_jit(on, method=method, tol=tol, assumptions=assumptions)
     priced = assumptions.certificate is Certificate.MULTIPLICATIVE
-    if (priced and not _costs_suit(task)) or problem.cost is None:
+    if (priced and not _costs_positive(task)) or problem.cost is None:
         task = _with_refuge(task)
         assumptions = dataclasses.replace(
             assumptions, may_rest=not is_constrained(problem) and not problem.discount > 0
         )
-    if priced and problem.is_game and not _costs_suit(task) and not method.relaxes:
+    if priced and problem.is_game and not _costs_positive(task) and not method.relaxes:
         # policies that go on for ever at no cost have any value: the one sought is the limit of those of long horizons
         task = prepare_jit(on, method=ValueIteration(), tol=tol, assumptions=assumptions)
-    if priced and not _costs_suit(task):
+    if priced and not _costs_positive(task):
         assumptions = dataclasses.replace(assumptions, certificate=Certificate.NONE)
         task = dataclasses.replace(task, certificate=Certificate.NONE, least_cost=None)
     held = np.asarray(task.obstacles.fixed)
@@ -188,11 +188,11 @@ def prepare_on_host(
     if not reached.all():
         _warn_unreached(reached, undiscounted)
         if undiscounted:
-            task = _without(task, reached)
+            task = _finite_part(task, reached)
     return task, assumptions, reached
 
 
-def forced_only(task: Task, clock: Clock) -> tuple[Task, np.ndarray | None]:
+def forced_only(task: Task, clock: Clock) -> tuple[Task, Mask | None]:
     """The task of a game that did not converge, without the nodes from which the target cannot be forced.
 
     Returns:
@@ -205,7 +205,7 @@ def forced_only(task: Task, clock: Clock) -> tuple[Task, np.ndarray | None]:
     if reached.all():
         return task, reached
     _warn_unreached(reached, True)
-    return _without(task, reached), reached
+    return _finite_part(task, reached), reached
 
 
 def _with_refuge(task: Task) -> Task:
@@ -221,13 +221,13 @@ def _with_refuge(task: Task) -> Task:
     return dataclasses.replace(task, obstacles=dataclasses.replace(task.obstacles, fixed=task.obstacles.fixed | found))
 
 
-def _costs_suit(task: Task) -> bool:
-    """Whether the running cost is positive wherever the value is not given."""
+def _costs_positive(task: Task) -> bool:
+    """True if the running cost is positive wherever the value is not given."""
     return bool(np.all(np.asarray(task.least_cost)[~np.asarray(task.obstacles.fixed)] > 0))
 
 
-def prepare_traced(on: Discretisation, *, method: Method, tol: Any) -> tuple[Task, Assumptions]:
-    """``prepare`` with what of the host's checks runs inside a JAX transformation: nodes without a finite value."""
+def prepare_traced(on: Discretisation, *, method: Method, tol: Number) -> tuple[Task, Assumptions]:
+    """The task of ``prepare`` inside a JAX transformation, without the nodes that have no finite value."""
     assumptions, problem = assumptions_of(on), on.problem
     task = prepare(on, method=method, tol=tol, assumptions=assumptions)
     ends = problem.target is not None or assumptions.may_rest
@@ -235,23 +235,24 @@ def prepare_traced(on: Discretisation, *, method: Method, tol: Any) -> tuple[Tas
         return task, assumptions
     known = jax.lax.stop_gradient(task)
     reached = attainability.surely_reached(known.on, known.obstacles.fixed, least=_least_rate(known))
-    return _without(task, reached | (known.problem.discount > 0)), assumptions
+    return _finite_part(task, reached | (known.problem.discount > 0)), assumptions
 
 
-def _least_rate(task: Task) -> Any:
+def _least_rate(task: Task) -> Scalar:
     """Rates up to this one are rounding beside those of the fastest motion on the grid; zero where nobody asks."""
     if task.crossing is None:
         return jnp.zeros((), task.tol.dtype)
     return resting.ROUNDINGS * jnp.finfo(task.tol.dtype).eps * sum(task.grid.shape) / task.crossing
 
 
-def _without(task: Task, reached: Any) -> Task:
-    """The nodes with an infinite value are held above all others, so that no optimal action goes there."""
+def _finite_part(task: Task, reached: Mask) -> Task:
+    """The task on the nodes with a finite value; the others are held above, so that no optimal action goes there."""
     obstacles = dataclasses.replace(task.obstacles, fixed=task.obstacles.fixed | ~jnp.asarray(reached))
     return dataclasses.replace(task, obstacles=obstacles, counted=task.counted & jnp.asarray(reached), has_lost=True)
 
 
-def _warn_unreached(reached: np.ndarray, undiscounted: bool) -> None:
+def _warn_unreached(reached: Mask, undiscounted: bool) -> None:
+    """Warn of nodes from which no policy is sure to reach the target, and say what their value is."""
     share = 100 * (1 - float(np.mean(reached)))
     what = "their value is inf" if undiscounted else "their value is the discounted cost of never arriving"
     warn(f"{share:.3g} % of the nodes cannot reach the target: {what}; see Solution.reached")

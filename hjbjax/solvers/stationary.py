@@ -24,6 +24,7 @@ from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_discounted
 from hjbjax.problem.pytree import altered, is_traced
+from hjbjax.problem.types import DType, Nodes, Number, Scalar
 from hjbjax.solution import transfer
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
@@ -47,8 +48,8 @@ def solve(
     method: Method | None = None,
     scheme: Scheme = Upwind(),
     tol: float = 1e-3,
-    guess: Any = None,
-    dtype: Any = None,
+    guess: Nodes | None = None,
+    dtype: DType | None = None,
     max_steps: int | None = None,
     time_limit: float | None = None,
     throw: bool = True,
@@ -117,17 +118,20 @@ def solve(
     return solution
 
 
-def _partial(on: Discretisation, kept: Any) -> Solution:
-    """The solution of a run that broke, from the value that was kept, maybe on a coarser grid; else zero."""
-    value = np.broadcast_to(np.zeros((), on.dtype), on.grid.shape) if kept is None else kept[0]  # takes no memory
-    if value.shape != on.grid.shape:
-        value = transfer.prolong(value, kept[1], on.grid)
+def _partial(on: Discretisation, kept: faults.Kept | None) -> Solution:
+    """The solution of a run that broke, from the value that outlived it, maybe on a coarser grid; else zero."""
+    if kept is None:
+        value = np.broadcast_to(np.zeros((), on.dtype), on.grid.shape)  # one zero seen everywhere takes no memory
+    else:
+        value, grid = kept
+        value = value if grid.shape == on.grid.shape else transfer.prolong(value, grid, on.grid)
     return unstarted(on, value, Status.INTERRUPTED)
 
 
-def _solve_on_host(on: Discretisation, method: Method, tol: float, guess: Any, clock: Clock) -> Solution:
-    """Checks, coarser grids, preparation and steps, in this order, as far as the clock lets them come."""
-    problem, grid, start = on.problem, on.grid, None if guess is None else np.asarray(guess, on.dtype)
+def _solve_on_host(on: Discretisation, method: Method, tol: float, guess: Nodes | None, clock: Clock) -> Solution:
+    """The solution by checks, coarser grids, preparation and steps, in this order, as far as the clock allows."""
+    problem, grid = on.problem, on.grid
+    start: Nodes | None = None if guess is None else np.asarray(guess, on.dtype)
     try:
         checks.shapes(problem, grid, on.scheme)
         node_checks.values(problem, grid, on.dtype, clock)
@@ -168,8 +172,10 @@ def sharpened(settled: Settled, scheme: Scheme, clock: Clock) -> tuple[Settled, 
     return sharp, {"from_monotone": float(np.max(apart, initial=0))}
 
 
-def _solve_traced(on: Discretisation, method: Any, tol: Any, guess: Any, max_steps: Any) -> Solution:
-    """The iteration inside a JAX transformation: no chunks, no files, no exceptions, no checks of values."""
+def _solve_traced(
+    on: Discretisation, method: Method | None, tol: Number, guess: Nodes | None, max_steps: int | None
+) -> Solution:
+    """The solution inside a JAX transformation: no chunks, no files, no exceptions, no checks of values."""
     if not on.scheme.monotone:
         name = type(on.scheme).__name__
         raise ValueError(f"solve: {name}() runs at host level only; inside jit, vmap and grad use Upwind()")
@@ -182,15 +188,15 @@ def _solve_traced(on: Discretisation, method: Any, tol: Any, guess: Any, max_ste
     state = fixed_point.run(frozen, fixed_point.begin(frozen, start), max_steps or TRACED_STEPS)
     wrong = jnp.zeros((), bool)
     if assumptions.may_rest:
-        state, wrong = _doubted(frozen, state)
+        state, wrong = _without_rests_to_leave(frozen, state)
     solution, value = assemble(task, state, assumptions), adjoint.attach(task, state)
     wrong |= state.code == Status.NONFINITE
     value = value * jnp.where(wrong, jnp.nan, 1).astype(value.dtype)  # a derivative drops the code, and is NaN, too
     return altered(solution, value=jnp.where(task.counted, value, jnp.inf) if task.has_lost else value)
 
 
-def _doubted(task: Task, state: State) -> tuple[State, jax.Array]:
-    """The state, stalled and without bounds where leaving a held rest node would pay: the host alone goes on then."""
+def _without_rests_to_leave(task: Task, state: State) -> tuple[State, Scalar]:
+    """The state, stalled and without bounds if leaving a held rest node would pay, and if so: only the host goes on."""
     pays = resting.leaving_pays(task.on.chain, task.obstacles, task.counted, state.value)
     wrong = jnp.any(pays) & (state.code == Status.CONVERGED) & (task.problem.discount == 0)
     gap, infinite = state.bound, jnp.asarray(jnp.inf, state.value.dtype)
@@ -202,7 +208,7 @@ def _doubted(task: Task, state: State) -> tuple[State, jax.Array]:
     return dataclasses.replace(state, bound=gap, code=code), wrong
 
 
-def as_dtype(dtype: Any) -> np.dtype:
+def as_dtype(dtype: DType | None) -> np.dtype:
     """The floating-point type that a user asked for; None is float64."""
     for kind in (np.dtype(np.float64), np.dtype(np.float32)):
         with contextlib.suppress(TypeError):
@@ -211,16 +217,18 @@ def as_dtype(dtype: Any) -> np.dtype:
     raise ValueError(f"dtype: got {dtype!r}, wanted 'float64' or 'float32'")
 
 
-def check_limits(max_steps: Any, time_limit: Any) -> None:
-    """Refuse what limits no run."""
+def check_limits(max_steps: object, time_limit: object) -> None:
+    """Refuse a number of steps or of seconds that limits no run."""
     if max_steps is not None:
         arguments.count(max_steps, "solve: max_steps")
     if time_limit is not None:
         arguments.positive(time_limit, "solve: time_limit", "in seconds", endless=True)
 
 
-def check_arguments(problem: Any, grid: Any, method: Any, scheme: Any, tol: Any, guess: Any = None) -> None:
-    """Refuse what no solve can start with; needs no values of the problem's functions."""
+def check_arguments(
+    problem: object, grid: object, method: object, scheme: object, tol: object, guess: object = None
+) -> None:
+    """Refuse arguments with which no solve can start; needs no values of the problem's functions."""
     if not isinstance(problem, Problem) or not isinstance(grid, Grid):
         raise TypeError(f"solve: got {type(problem).__name__}, {type(grid).__name__}; wanted a Problem and a Grid")
     if method is not None:
@@ -238,8 +246,8 @@ def check_arguments(problem: Any, grid: Any, method: Any, scheme: Any, tol: Any,
         raise ValueError("solve: a time-dependent problem has no stationary value; it needs a finite horizon")
 
 
-def check_node_values(values: Any, grid: Grid, name: str) -> None:
-    """Refuse what cannot be a value at the nodes; None is none."""
+def check_node_values(values: object, grid: Grid, name: str) -> None:
+    """Refuse values that are not one finite real number a node; None passes."""
     if values is None:
         return
     try:

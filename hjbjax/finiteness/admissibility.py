@@ -33,15 +33,17 @@ def values(problem: Problem, grid: Grid, dtype: DType, t: float = 0.0) -> None:
     if not grid.sides("constrained"):
         return
     with jax.enable_x64(True):
+        # the chain's scheme whatever the user's: which actions an end rules out depends on the drift alone
         stuck = np.asarray(_without_action(Discretisation(problem, grid, Upwind(), np.dtype(dtype), t)))
     if not stuck.any():
         return
-    index = tuple(int(i) for i in np.argwhere(stuck)[0])
+    index = tuple(int(i) for i in np.argwhere(stuck)[0])  # the first one stands for all, which may be thousands
     ends = [
         f"the {'upper' if step > 0 else 'lower'} end of {grid.names[axis]}"
         for axis, step in grid.sides("constrained")
         if index[axis] == (grid.shape[axis] - 1 if step > 0 else 0)
     ]
+    # without a cost, as in the search itself: one that is no polynomial would make it a matter of samples
     exact = find_players(altered(problem, cost=None), grid.ndim, np.float64).exact
     found = "no action is admissible" if exact else "none of the sampled actions is admissible"
     raise ValueError(
@@ -56,7 +58,9 @@ def values(problem: Problem, grid: Grid, dtype: DType, t: float = 0.0) -> None:
 @jax.jit
 def _without_action(on: Discretisation) -> Mask:
     """The nodes off the target without an admissible action, bool (*grid)."""
+    # V = 0 and L = 0 leave the infinite price of leaving as the only term of H
     free = altered(on.problem, cost=None)
     hamiltonian = discrete.around(on.asking(free), jnp.zeros(on.grid.shape, on.dtype))
     least = discrete.optimise(hamiltonian)[0]
+    # on the target the run is over and needs no action
     return ~jnp.isfinite(least) & ~bellman.obstacles(on).fixed

@@ -43,6 +43,7 @@ def _open_jumps(
     for first in range(0, count, some):
         clock.enter(f"the jumps of the chain, {first} of {count} actions")
         last = min(first + some, count)
+        # always as many actions, the last lot overlapping the one before: another number would be another program
         known = _more_open_jumps(on, inside, known, points[max(last - some, 0) : last], least=least, kinks=kinks)
     assert known is not None
     return known
@@ -59,16 +60,20 @@ def _more_open_jumps(
     kinks: bool = False,
 ) -> Rates:
     """The jumps that are known to be open and those of the actions ``points``, shape (count, m)."""
+    # a jump is open once any action makes it, so that the order of the actions, and one tried twice, change nothing
     grid, points = on.grid, jnp.asarray(points, on.dtype)
     mine = players_of(on).control
+    # once, with the first lot: they do not depend on the samples
     outmost = tried_actions.of_a_ball(on, mine) if kinks and known is None else []
     if known is None:
+        # the offsets are those of every action, since they follow from the noise and not from what is done
         start = chain.rates(on, list(points[0]))
         known = Rates(start.offsets, tuple(jnp.zeros(grid.shape, bool) for _ in start.offsets))
 
     def tried(actions, opened):
         for each in actions:
             rates = chain.rates(on, each)
+            # an action that a constrained end rules out makes no jump at all, not one to the node itself
             stays = ~edges.inadmissible(on, each)
             if inside is not None:
                 stays &= _stays(rates, grid, inside, least)
@@ -86,6 +91,7 @@ def _stays(rates: Rates, grid: Grid, inside: jax.Array, least: Number) -> jax.Ar
     """The nodes from which all jumps at rates above ``least`` lead ``inside``, bool (*grid)."""
     stays = jnp.ones(grid.shape, bool)
     for offset, c in zip(rates.offsets, rates.values, strict=True):
+        # beyond the ends of the box there is no jump: rates that lead out are zero
         stays &= (c <= least) | stencil.neighbour(inside, grid, offset)
     return stays
 
@@ -108,6 +114,7 @@ def reached(
     on = on.on_grid(on.grid.walled)  # what goes on beyond an open end is not known to come back
     clock, found = clock or Clock(), np.zeros(on.grid.shape, bool)
     for kinks in (False, True):  # what samples do not reach may be reached by the one action that keeps to a way
+        # each pass alone is sound: whatever it finds is reached by actions of the set, so that the union is, too
         found |= _reached_by_samples(on, held, surely, clock, least=least, kinks=kinks)
         if found.all():
             break
@@ -125,6 +132,7 @@ def _reached_by_samples(
     found, inside = staying(None), np.ones(on.grid.shape, bool)
     while surely and not np.array_equal(found, inside):
         inside = found
+        # nodes are taken away and never put back, as the largest fixed point wants: at most one round a node
         found = inside & staying(jnp.asarray(inside))
     return found
 
@@ -136,6 +144,7 @@ def surely_reached(on: Discretisation, held: Mask, *, least: Number = 0.0) -> ja
 
     def shrink(carry):
         inside, _ = carry
+        # all in one program: no clock, no search on the host, and as many jumps as there are nodes if need be
         jumps = _more_open_jumps(on, inside, None, points, least=least, kinks=True)
         found = inside & _predecessors(held, jumps, grid, grid.size)[0]
         return found, jnp.any(found != inside)
@@ -152,6 +161,8 @@ def forced(on: Discretisation, held: np.ndarray, *, least: Number, clock: Clock)
     """
     found, on = np.ones(on.grid.shape, bool), on.on_grid(on.grid.walled)
     while True:
+        # the outer loop takes nodes away, the inner one starts from the target each time and climbs: a game of reaching
+        # while staying inside is the largest fixed point of a least one
         inside, nearer, more = found, jnp.asarray(held), True
         while more:
             clock.enter("the search for nodes from which the target can be forced")
@@ -172,6 +183,7 @@ def _controllable_predecessors(
         for admissible in (problem.controls, problem.disturbances)
     )
     upper = problem.isaacs == "upper"
+    # who moves first is in the outer loop: in the upper game for some u all d, in the lower for all d some u
     outer, inner = (us, ds) if upper else (ds, us)
 
     def answered(first):
@@ -183,6 +195,7 @@ def _controllable_predecessors(
                 jnp.logical_or, ((c > least) & stencil.neighbour(found, grid, offset) for offset, c in jumps)
             )
             allowed = ~edges.inadmissible(on, list(u), list(d))
+            # for every disturbance one jump is enough that leads on, for all of them none may leave
             good = leads & allowed & _stays(rates, grid, inside, least)
             return (ok & good if upper else ok | good), None
 
@@ -217,6 +230,7 @@ def refuge(on: Discretisation, inside: jax.Array | None = None, dearest: Scalar 
     def shrink(carry):
         inside, _ = carry
 
+        # dear actions are left out where the refuge has to be free of cost
         def kept(action, answer):
             allowed = ~edges.inadmissible(on, action, answer)
             if dearest is not None:
@@ -231,6 +245,7 @@ def refuge(on: Discretisation, inside: jax.Array | None = None, dearest: Scalar 
         pairs = jnp.stack(jnp.meshgrid(jnp.arange(len(u)), jnp.arange(len(d)), indexing="ij"), -1).reshape(-1, 2)
         found = jnp.zeros(grid.shape, bool)
         for action in tried_actions.of_a_ball(on, mine):
+            # with any disturbance: kinks and a ball's outmost actions are those of one player, and a game has none
             found |= kept(action, list(d[0]))
         found = inside & jax.lax.scan(also, found, pairs)[0]
         return found, jnp.any(found != inside)
@@ -240,6 +255,8 @@ def refuge(on: Discretisation, inside: jax.Array | None = None, dearest: Scalar 
 
 def _backward_reach(held: np.ndarray, jumps: Rates, grid: Grid, clock: Clock) -> np.ndarray:
     """The nodes with a path of jumps to a held node, bool (*grid)."""
+    # a pass over all nodes costs little on the device, and a path has as many as it has jumps: long ones, as in a maze,
+    # are left to the search, whose list of jumps has to fit into memory
     if grid.size > LARGE:
         listed = grid.size * len(jumps.offsets) <= SEARCHABLE
         found = _reach_on_device(held, jumps, grid, clock, LONG * sum(grid.shape) if listed else grid.size)
@@ -251,7 +268,7 @@ def _backward_reach(held: np.ndarray, jumps: Rates, grid: Grid, clock: Clock) ->
 
 def _reach_on_device(held: np.ndarray, jumps: Rates, grid: Grid, clock: Clock, most: int) -> np.ndarray | None:
     """Nodes that lead to a held one, all at once on the device; None if their paths have more than ``most`` jumps."""
-    found, more, some = jnp.asarray(held), True, max(1, LOOK // grid.size)
+    found, more, some = jnp.asarray(held), True, max(1, LOOK // grid.size)  # jumps between two looks at the clock
     for step in range(0, most, some):
         clock.enter(f"the search for nodes that reach the target, paths of {step} jumps")
         found, more = _predecessors(found, jumps, grid, min(some, most - step))
@@ -268,6 +285,7 @@ def _predecessors(found: jax.Array, jumps: Rates, grid: Grid, most: int | Scalar
         found, _, count = carry
         more = found
         for offset, jump in zip(jumps.offsets, jumps.values, strict=True):
+            # with what this pass has found so far, so that one pass may follow several jumps
             more |= jump & stencil.neighbour(more, grid, offset)
         return more, jnp.any(more != found), count + 1
 
@@ -284,12 +302,15 @@ def _reach_on_host(held: np.ndarray, jumps: Rates, grid: Grid) -> np.ndarray:
     from scipy.sparse.csgraph import breadth_first_order
 
     starts = [np.flatnonzero(held)]
+    # the search wants one start: an extra node, numbered last, from which all held ones are one jump away
     ends = [np.full_like(starts[0], grid.size)]  # one more node leads to all held ones
     for offset, jump in zip(jumps.offsets, jumps.values, strict=True):
+        # what leaves a held node matters to nobody, since the run is over there
         leaves = ~held & np.asarray(jump)
         starts.append(np.flatnonzero(leaves))
         ends.append(stencil.numbers(grid, offset)[leaves])
     backward = np.concatenate(ends), np.concatenate(starts)
+    # the jumps turned round: from the target to all from which it can be reached
     graph = csr_array((np.ones(len(backward[0])), backward), shape=(grid.size + 1, grid.size + 1))
     found = np.zeros(grid.size + 1, bool)
     found[breadth_first_order(graph, grid.size, directed=True, return_predecessors=False)] = True

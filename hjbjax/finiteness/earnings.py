@@ -41,19 +41,25 @@ def earned(task: Task, state: State) -> Earning | None:
     Host level, for one player; a game's answer to it would be another policy.
     """
     problem = task.problem
+    # a certificate bounds the value, and so does a discount: only what has neither can fall for ever
     bounded = task.certificate is not Certificate.NONE or problem.discount != 0
     if bounded or problem.is_game or problem.cost is None or int(state.step) < 0:
         return None
     jumps, cost = jax.device_get(_rates_and_cost(task, state.policy.controls))
+    # held nodes end the run, so that in the chain they are left by nothing
     going = np.asarray(task.counted) & ~np.asarray(task.obstacles.fixed)
+    # only a class in which some node earns can earn on the average
     if not np.all(np.isfinite(cost[going])) or not np.any(cost[going] < 0):
         return None
+    # rows sum to zero, which is what makes it a generator
     values = [np.where(going, rate, 0) for rate in jumps.values]
     generator = stencil.sparse(jumps.offsets, values, -np.sum(values, axis=0), task.grid)
     for states in stationary_law.classes(generator):
+        # a held node is a class of its own, where nothing is paid any more
         if not going.flat[states[0]]:
             continue
         paid = cost.flat[states]
+        # where every node earns no law is needed: the mean is at most the largest cost
         mean = float(np.max(paid)) if np.all(paid < 0) else _mean_cost(generator, states, cost)
         if mean < 0:
             return Earning(mean, tuple(int(i) for i in np.unravel_index(states[0], task.grid.shape)))
@@ -73,4 +79,5 @@ def _mean_cost(generator: "csr_array", states: np.ndarray, cost: np.ndarray) -> 
         return np.inf
     probabilities, error = stationary_law.law(generator, states)
     paid = cost.flat[states]
+    # a law off by ‖Δp‖₁ changes the mean by ‖Δp‖₁ max|L| at most: −∞ is claimed only if that leaves it negative
     return float(probabilities[states] @ paid + error * np.max(np.abs(paid))) if np.isfinite(error) else np.inf

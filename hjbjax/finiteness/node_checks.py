@@ -42,11 +42,14 @@ def values(problem: Problem, grid: Grid, dtype: DType, clock: Clock | None = Non
     """
     clock, actions = clock or Clock(), _actions(problem)
     on = Discretisation(problem, grid, Upwind(), np.dtype(dtype))
+    # for counts of 64 bits; the functions are evaluated in ``dtype`` all the same
     with jax.enable_x64(True):
+        # nearly every problem passes, and this look compiles faster than one that counts and names
         if _all_pass(on, actions, clock):
             return
         clock.look()
         found = jax.device_get(_survey(on, actions))
+    # what is not finite first: comparisons with NaN are false, so that the rest would speak of something else
     for name in (*OF_ACTION, "target", *STATE_COSTS):
         if name in found and found[name].nodes:
             _not_finite(problem, grid, name, found[name], actions)
@@ -74,6 +77,7 @@ def _actions(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     """Representative pairs of control and disturbance, shapes (K, m) and (K, l)."""
     most = 9 if problem.is_game else ACTIONS
     mine, theirs = (_representatives(admissible, most) for admissible in (problem.controls, problem.disturbances))
+    # all pairs, 81 of them at most: a game's functions may fail for one pair alone
     pairs = list(itertools.product(mine, theirs))
     return np.array([u for u, _ in pairs]), np.array([d for _, d in pairs])
 
@@ -89,6 +93,8 @@ def _representatives(admissible: sets.AdmissibleSet | None, most: int) -> np.nda
 def _all_pass(on: Discretisation, actions: tuple[np.ndarray, np.ndarray], clock: Clock) -> bool:
     """True if ``values`` refuses nothing, some actions at a time."""
     count, some = len(actions[0]), max(1, LOOK // on.grid.size)
+    # in lots of about a second: ten million nodes and 33 actions take half a minute; all lots are one program, since
+    # first and last are arguments
     for first in range(0, count, some):
         clock.enter(f"the survey of the nodes, {first} of {count} actions")
         if not _actions_pass(on, actions, first, min(first + some, count)):
@@ -99,6 +105,7 @@ def _all_pass(on: Discretisation, actions: tuple[np.ndarray, np.ndarray], clock:
 @jax.jit
 def _actions_pass(on: Discretisation, actions: tuple[Array, Array], first: int | Scalar, last: int | Scalar) -> Scalar:
     """True if nothing is refused of the actions from ``first`` to before ``last``; with the first, of the state."""
+    # the state is looked at once, with the first lot
     amiss = jax.lax.cond(first == 0, lambda: _state_fails(on), lambda: jnp.zeros((), bool))
     x, tried = on.coordinates(), jax.tree.map(lambda rows: jnp.asarray(rows, on.dtype), actions)
 
@@ -117,6 +124,7 @@ def _state_fails(on: Discretisation) -> Scalar:
     if problem.target is not None:
         distance = cut_cells.level(on)
         inside = distance <= 0
+        # a target that no node meets, or that all do, leaves no problem
         amiss |= ~jnp.all(jnp.isfinite(distance)) | ~jnp.any(inside) | jnp.all(inside)
     for name in STATE_COSTS:
         ingredient = getattr(problem, name)
@@ -137,6 +145,7 @@ def _survey(on: Discretisation, actions: tuple[Array, Array]) -> dict[str, Any]:
         inside = distance <= 0
         found["target"] = _count(~jnp.isfinite(distance), grid)
         found["inside"] = jnp.sum(inside)
+        # the least value tells how much too coarse the grid is, or how much too small the target
         found["nearest"] = (jnp.min(distance), jnp.argmin(distance))
     for name in STATE_COSTS:
         ingredient = getattr(problem, name)
@@ -155,6 +164,7 @@ def _survey(on: Discretisation, actions: tuple[Array, Array]) -> dict[str, Any]:
         return kept, None
 
     us, ds = (jnp.asarray(action, on.dtype) for action in actions)
+    # the first action at fault is kept, with its own count, and not the sum over all actions
     nothing = _Finding(*(jnp.zeros((), jnp.int64),) * 3)
     names = jax.eval_shape(lambda: _faults(on, x, list(us[0]), list(ds[0])))
     carry, _ = jax.lax.scan(body, dict.fromkeys(names, nothing), (jnp.arange(len(us)), us, ds))
@@ -168,6 +178,7 @@ def _faults(on: Discretisation, x: list, u: list, d: list | None) -> dict[str, M
     def faulty(entries):
         return functools.reduce(jnp.logical_or, (~jnp.isfinite(jnp.asarray(entry, on.dtype)) for entry in entries))
 
+    # only what is there: a problem without cost or noise compiles no look at it
     bad = {"drift": faulty(on.drift(u, d, x))}
     if problem.cost is not None:
         bad["cost"] = faulty([on.running_cost(u, d, x)])
@@ -176,8 +187,10 @@ def _faults(on: Discretisation, x: list, u: list, d: list | None) -> dict[str, M
         bad["noise"] = faulty(a.values())
     if callable(problem.noise):
         sigma = components.components(problem.noise, *problem.arguments(x, u, d, 0.0), dtype=on.dtype)
+        # entries of a matrix may be negative, as a correlation is; a number or a diagonal is a size
         if sigma.ndim < 2:
             bad["negative"] = functools.reduce(jnp.logical_or, (jnp.asarray(entry) < 0 for entry in sigma.flat))
+    # jumps along diagonals take their rates from those along the axes, which must not fall below zero
     lacking = correlated_noise.lacking(on, a)
     if lacking is not None:
         bad["correlation"] = lacking
@@ -224,6 +237,7 @@ def _where(problem: Problem, grid: Grid, finding: _Finding, actions: tuple[np.nd
 def _not_finite(problem: Problem, grid: Grid, name: str, finding: _Finding, actions: tuple) -> NoReturn:
     """Refuse a function that is NaN or infinite at some nodes."""
     ingredient = getattr(problem, name)
+    # a number has no node to blame
     if not callable(ingredient):
         raise ValueError(f"Problem.{name}: got {np.asarray(ingredient)}, wanted finite numbers")
     where = _where(problem, grid, finding, actions if name in OF_ACTION else None)

@@ -46,16 +46,22 @@ def standstill(on: Discretisation) -> Standstill:
     With slopes ±s, s_i = max L/max|f_i|, the Hamiltonian is L + Σ s_i |f_i|: its minimum vanishes at rest alone.
     """
     grid, dtype = on.grid, on.dtype
+    # at V = 0 the Hamiltonian is L alone, and its minimum the least running cost
     least = discrete.optimise(discrete.around(on, jnp.zeros(grid.shape, dtype)))[0]
     speeds, dearest = _scales(on)
     cost = jnp.max(jnp.where(jnp.isfinite(least), jnp.abs(least), 0))  # infinite where a constrained end leaves none
+    # the least cost may be zero everywhere: then the dearest action sets the scale, and without any cost one does
     cost = jnp.where(cost > 0, cost, jnp.where(dearest > 0, dearest, 1))
+    # an axis along which nothing moves puts no condition on rest
     speeds = jnp.where(speeds > 0, speeds, 1)
+    # s_i = max L/max|f_i| puts costs and all speeds into one unit, so that none drowns in the rounding of another
     effort, u, d = discrete.optimise(discrete.at_rest(on, cost / speeds))
     small = ROUNDINGS * jnp.finfo(dtype).eps
+    # of the action that was found, not of all: the minimum is at rest where any action is
     rests = (jnp.abs(effort) <= small * cost) & (jnp.abs(least) <= small * cost)
     for axis, speed in enumerate(_noise_speeds(on, u, d)):
         rests &= speed <= small * speeds[axis]
+    # axes one after another: an upper bound, whichever way the motion turns
     extents = jnp.stack([jnp.asarray(grid.hi[axis] - grid.lo[axis], dtype) for axis in range(grid.ndim)])
     return Standstill(rests, least, jnp.sum(extents / speeds))
 
@@ -82,6 +88,7 @@ def _scales(on: Discretisation) -> tuple[jax.Array, jax.Array]:
         return jnp.max(jnp.abs(jnp.broadcast_to(jnp.asarray(entry, dtype), grid.shape)))
 
     def look(found: tuple, pair: jax.Array) -> tuple:
+        # or XLA hoists what does not depend on the pair and keeps an array of all nodes for each of it
         x, (u, d) = jax.lax.optimization_barrier((on.coordinates(), (list(us[pair[0]]), list(ds[pair[1]]))))
         f, spread = on.drift(u, d, x), _noise_speeds(on, u, d)
         speeds = jnp.stack([largest(jnp.abs(drift) + noise) for drift, noise in zip(f, spread, strict=True)])
@@ -97,7 +104,9 @@ def leaving_pays(on: Discretisation, obstacles: Obstacles, counted: Mask, value:
 
     With none of them the value with held rest nodes solves the problem in which they may be left, too.
     """
+    # fixed nodes are targets, nodes out of reach and rest nodes; only of these the value is in doubt
     rests = obstacles.fixed & counted & ~jnp.asarray(obstacles.ended)
+    # not held for this look: the defect at a rest node is the gain of its best action
     policy = bellman.greedy(on, value, obstacles.fixed & ~rests)
     u, d = list(policy.controls), list(policy.disturbances)
     leaving = chain.rates(on, u, d).total()
@@ -108,6 +117,7 @@ def leaving_pays(on: Discretisation, obstacles: Obstacles, counted: Mask, value:
 
 def released(obstacles: Obstacles, pays: Mask) -> Obstacles:
     """The obstacles with the nodes ``pays`` no longer held: there the run may rest, V ≤ 0, or leave."""
+    # V ≤ 0 as a stopping cost of zero, which is what resting for ever amounts to
     stop = jnp.where(pays, 0, jnp.inf)
     stop = stop if obstacles.upper is None else jnp.minimum(stop, obstacles.upper)
     return bellman.Obstacles(obstacles.fixed & ~pays, obstacles.fixed_value, stop, obstacles.lower, obstacles.ended)

@@ -37,11 +37,13 @@ def with_kinks(on: Discretisation, player: Player, action: list) -> list[list]:
     if not player.exact or on.problem.is_game:
         return found
     for j, driven in enumerate(player.driven):
+        # every input multiplies the count by one more than the components it drives: six inputs of one each make 64
         if len(found) * (1 + len(driven)) > COMBINATIONS:
             break
         for base in tuple(found):
             for kink in _kinks(on, player, base, j):
                 moved = [kink if k == j else entry for k, entry in enumerate(base)]
+                # a kink outside the set is no action: the sample itself stands in, which changes nothing
                 found.append(_where(_contains(player.admissible, moved), moved, base))
     return found
 
@@ -55,15 +57,18 @@ def of_a_ball(on: Discretisation, player: Player) -> list[list]:
     if not player.exact or on.problem.is_game or not isinstance(player.admissible, Ball):
         return []
     none, radius = [jnp.zeros((), on.dtype)] * player.admissible.dim, player.admissible.radius
+    # inputs of a ball drive at most one component each, so that a kink does not depend on the other inputs
     kinks = [_kinks(on, player, none, j) or [none[j]] for j in range(len(none))]
     found: list[list] = []
     for count in range(len(none)):
         if len(found) >= COMBINATIONS:
             break
         for still in itertools.combinations(range(len(none)), count):
+            # what the inputs at their kinks leave of |u|² ≤ r² for the one that goes furthest
             room = radius**2 - sum((kinks[j][0] ** 2 for j in still), start=none[0])
             for k, way in itertools.product(sorted(set(range(len(none))) - set(still)), (-1, 1)):
                 action = [kinks[j][0] if j in still else entry for j, entry in enumerate(none)]
+                # at nodes without such an action the room is negative, and its root NaN
                 action[k] = way * jnp.sqrt(jnp.maximum(room, 0))
                 found.append(_where(room >= 0, action, none))
     return found
@@ -75,12 +80,15 @@ def _kinks(on: Discretisation, player: Player, base: list, j: int) -> list[jax.A
     Its own place where they never do.
     """
     problem = on.problem
+    # f_i is affine in u_j: f_i = offset_i + slope_i u_j vanishes at −offset_i/slope_i
     at_zero = [jnp.zeros((), on.dtype) if k == j else entry for k, entry in enumerate(base)]
     offset = on.drift(at_zero)
     arguments = problem.arguments(on.coordinates(), at_zero, None, 0.0)
     slope = components.components(player.derivative(problem, problem.drift, j), *arguments, dtype=on.dtype)
     return [
-        jnp.where(slope[i] != 0, -offset[i] / jnp.where(slope[i] != 0, slope[i], 1), base[j]) for i in player.driven[j]
+        # a slope may vanish at some nodes: divided by one there, and not used
+        jnp.where(slope[i] != 0, -offset[i] / jnp.where(slope[i] != 0, slope[i], 1), base[j])
+        for i in player.driven[j]
     ]
 
 

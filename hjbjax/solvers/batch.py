@@ -38,6 +38,8 @@ from hjbjax.tracing.closures import with_settled_functions
 T = TypeVar("T")
 CHUNK = 8  # steps between two looks at which lanes are done, at most
 
+# under vmap a loop goes on until its last lane is done; lanes that are done keep their state by a select and pay
+# for the others' steps all the same, hence the short chunks
 _begin = jax.vmap(fixed_point.begin)
 _run = jax.jit(jax.vmap(fixed_point.run, in_axes=(0, 0, 0)))
 
@@ -90,10 +92,12 @@ def solve_batch(
     with noting_interrupts(clock), jax.enable_x64(kind == np.float64):
         for members in _same_program(lanes):
             first = lanes[members[0]]
+            # without nesting, whose levels the host drives one by one
             chosen = (method or choose(first, grid, traced=False)).inner
             checks.shapes(first, grid, scheme)
             on = Discretisation(first, grid, scheme, kind)
             needed = memory.require(first, grid, chosen, kind, max_memory)
+            # what one lane needs was weighed by itself above, so that a round of one lane always fits
             for some in _rounds(members, needed, max_memory):
                 with faults.explained(clock, needed * len(some), lambda _: next(filter(None, solutions), None)):
                     together = _solve_together({i: on.asking(lanes[i]) for i in some}, chosen, tol, clock)
@@ -109,6 +113,7 @@ def solve_batch(
 
 def _same_program(problems: Sequence[Problem]) -> list[list[int]]:
     """Groups of lanes whose problems share functions and shapes, and so a program, in the order of first appearance."""
+    # numbers are leaves and may differ; functions, kinds of sets and flags are structure and cost a program each
     flat = map(jax.tree.flatten, problems)
     return _groups((structure, tuple(np.shape(leaf) for leaf in leaves)) for leaves, structure in flat)
 
@@ -123,6 +128,7 @@ def _groups(keys: Iterable[Hashable]) -> list[list[int]]:
 
 def _rounds(members: Sequence[int], bytes_each: int, limit: int | None) -> list[Sequence[int]]:
     """Groups of lanes that fit into half of the memory together."""
+    # half of it, since the prepared tasks live on beside their stack, and rows that are taken out are copied
     free = memory.available() if limit is None else int(limit)
     most = len(members) if free is None else max(1, free // 2 // max(bytes_each, 1))
     return [members[start : start + most] for start in range(0, len(members), most)]
@@ -143,13 +149,16 @@ def _solve_together(lanes: dict[int, Discretisation], method: Method, tol: float
             nothing = [unstarted(each, np.zeros(each.grid.shape), stop.status) for each in asked]
             return [closed(solution, clock) for solution in nothing]
     clock.phase = f"the steps of lanes {names[0]} to {names[-1]}"
+    # static, so that one lane with nodes out of reach makes all lanes look out for them, and all share a program
     has_lost = any(task.has_lost for task, _, _ in prepared)
     prepared = [
         (dataclasses.replace(task, has_lost=has_lost), assumptions, reached) for task, assumptions, reached in prepared
     ]
     solutions: list[Any] = [None] * len(lanes)
     for members in _groups(jax.tree.structure(task) for task, _, _ in prepared):  # by certificate, too
+        # lanes whose certificates differ stop by different rules, which are part of the structure
         tasks = _stack([prepared[i][0] for i in members])
+        # from zero, or from the constraint of a tube; a lane that is caught there goes on alone, see _lane_solution
         states = _begin(tasks, jax.vmap(Task.start)(tasks))
         ended, histories = _finish_lanes(tasks, states, len(members), clock)
         for i, (state, code), residuals in zip(members, ended, histories, strict=True):
@@ -168,6 +177,8 @@ def _lane_solution(settled: Settled, on: Discretisation, clock: Clock) -> Soluti
     if code in CUT:
         settled = settled._replace(state=imposed(task, state))
     elif nested.may_go_on(task, assumptions, state, code):
+        # an answer, and a game that failed, go on from where they are; whoever was caught at rest starts anew, by the
+        # answers for vanishing discounts
         onwards = code is Status.CONVERGED or task.problem.is_game
         guess = state.value if onwards else None
         settled = nested.settle(task, assumptions, reached, guess, clock)
@@ -189,15 +200,16 @@ def _finish_lanes(tasks: Task, states: State, count: int, clock: Clock) -> tuple
     histories: list[list] = [[np.zeros(0)] for _ in range(count)]
     lanes = np.arange(count)  # which lane each row holds; −1 in rows that only fill up
     nodes = states.value[0].size
-    chunk = int(np.clip(FIRST_NODES / (nodes * count), 1, CHUNK))
+    chunk = int(np.clip(FIRST_NODES / (nodes * count), 1, CHUNK))  # nothing has been timed yet
     if clock.over() is None:
         states = _run(tasks, states, np.full(count, -1))  # compiles and does nothing
     while lanes.size:
         began, before, cut = clock.elapsed(), np.asarray(states.step), clock.over()
         if cut is None:
+            # an array: lanes that are done stand where they stopped
             states = _run(tasks, states, np.minimum(before + chunk, clock.max_steps))
         codes, steps, history = jax.device_get((states.code, states.step, states.history))
-        if cut is None:
+        if cut is None:  # the loop ran as long as its slowest lane, over rows that only fill up as well
             clock.count(clock.elapsed() - began, max(int(np.max(steps - before)), 1), nodes * len(lanes))
             chunk = int(np.clip(clock.steps_in(CHUNK_SECONDS, nodes * len(lanes)), 1, CHUNK))
         going = (codes == Status.RUNNING) & (steps < clock.max_steps) & (lanes >= 0) & (cut is None)
@@ -208,10 +220,12 @@ def _finish_lanes(tasks: Task, states: State, count: int, clock: Clock) -> tuple
         if ended:
             on_host = jax.device_get(states)
             for row in ended:
+                # copied, or a view would keep the arrays of all lanes alive
                 last = jax.tree.map(lambda leaf, row=row: leaf[row].copy(), on_host)
                 own = Status(int(last.code))
                 final[lanes[row]] = last, own if own is not Status.RUNNING else cut or Status.MAX_STEPS
         left = np.flatnonzero(going)
+        # powers of two, since every width is compiled for itself: a thousand lanes take eleven programs at most
         width = 1 << (left.size - 1).bit_length() if left.size else 0
         if width < lanes.size:
             kept = np.resize(left, width)

@@ -35,6 +35,7 @@ ADVICE = {
     Status.STALLED: "The policy iteration of an implicit step did not come to its end; take a shorter step.",
 }
 
+# not donated: a chunk that ends in NaN is done again from the front before it
 _run = jax.jit(time_stepping.run)
 _terminal = jax.jit(time_stepping.terminal)
 
@@ -54,6 +55,7 @@ def _gap_at(task: March, value: Field, t: Number) -> tuple[Scalar, Scalar]:
     No gap where the players drive components of their own, and where each is upwinded by itself.
     """
     players = players_of(task.on)
+    # then H is a sum of what each player does, and min max is max min node by node
     if players.decoupled or (players.separable and task.method.halves):
         return jnp.zeros(()), jnp.ones(())
     hamiltonian = discrete.around(task.on.at(t), value)
@@ -81,10 +83,11 @@ class Slices:
         self.value = np.empty((len(kept), *shape), dtype)
         self.policy, self.disturbance = (np.empty((len(kept), *shape, size), dtype) for size in sizes)
         self.cut, self.ends = (np.zeros((len(kept), len(shape), 2), int) for _ in range(2))
-        self.first = len(kept)
+        self.first = len(kept)  # of the filled ones; it counts down, as the march goes backward in time
 
     def keep(self, task: March, value: Field, t: Number, *, feedback: bool = True) -> None:
         """Fill the next slice; the policy is NaN on the target, and everywhere without ``feedback``."""
+        # one program for all kept times: the time is an argument
         answer = jax.device_get(_greedy(task, value, t)) if feedback else None
         self.first -= 1
         self.times[self.first] = float(t)
@@ -97,7 +100,7 @@ class Slices:
         self.cut[self.first], self.ends[self.first] = found
         for array, action in ((self.policy, u), (self.disturbance, d)):
             for j, entry in enumerate(action):
-                array[self.first, ..., j] = np.where(ended, np.nan, entry)
+                array[self.first, ..., j] = np.where(ended, np.nan, entry)  # the run is over there: no action
 
 
 def drive(task: March, kept: np.ndarray, start: Nodes | None, clock: Clock) -> tuple[Slices, Front, Status]:
@@ -111,6 +114,7 @@ def drive(task: March, kept: np.ndarray, start: Nodes | None, clock: Clock) -> t
             code = _stop_status(clock, code)
             if code is Status.RUNNING:
                 clock.phase = "compiling the steps"
+                # no steps: it compiles, so that the first chunk is timed without that
                 jax.block_until_ready(_run(task, front, jnp.asarray(0, dtype), 0))
             for t in kept[::-1]:
                 until = jnp.asarray(t, dtype)
@@ -120,6 +124,7 @@ def drive(task: March, kept: np.ndarray, start: Nodes | None, clock: Clock) -> t
                         clock.phase = f"step {int(front.steps)}"
                         front, code, chunk = _chunk(task, front, until, chunk, clock)
                         show(float(task.horizon) - float(front.t), int(front.steps))
+                # at the last kept time nothing is missing any more, and a time limit that passes now takes nothing away
                 code = _stop_status(clock, code, arrived=t == kept[0])
                 if code is not Status.RUNNING:
                     break
@@ -128,9 +133,11 @@ def drive(task: March, kept: np.ndarray, start: Nodes | None, clock: Clock) -> t
             clock.interrupted, code = True, Status.INTERRUPTED
         except Exception as error:
             if slices.first > 0:
+                # without a feedback: its program calls the function that raised once more
                 slices.keep(task, front.value, front.t, feedback=False)
             error.solution = assemble(task, task.grid, slices, front, Status.INTERRUPTED)  # type: ignore[attr-defined]
             raise
+    # after a cut nothing is compiled, and the feedback has its program only if a slice was kept before
     if code is not Status.RUNNING and slices.first > 0 and bool(jnp.all(jnp.isfinite(front.value))):
         slices.keep(task, front.value, front.t, feedback=code not in CUT or slices.first < len(kept))  # how far it came
     return slices, front, Status.CONVERGED if code is Status.RUNNING else code
@@ -139,6 +146,7 @@ def drive(task: March, kept: np.ndarray, start: Nodes | None, clock: Clock) -> t
 def _stop_status(clock: Clock, code: Status, *, arrived: bool = False) -> Status:
     """The code of a front, or the status by which the clock stops it; one that has arrived is only interrupted."""
     cut = clock.over()
+    # how it ended comes before the clock: a march that blew up did so, however late it is
     if code is not Status.RUNNING or cut is None or (arrived and cut is Status.TIME_LIMIT):
         return code
     return cut
@@ -155,7 +163,8 @@ def _chunk(task: March, front: Front, until: Scalar, chunk: int, clock: Clock) -
     clock.stepping += took
     code = Status(int(after.code))
     if code is Status.NONFINITE:
-        after = _run(task, front, until, done - 1)
+        after = _run(task, front, until, done - 1)  # the steps are the same ones, so that it ends just before the last
+    # a chunk of a step or two is timed badly, hence not more than eight times as many steps
     chunk = int(np.clip(done * CHUNK_SECONDS / max(took, 1e-4), 1, 8 * chunk))
     return after, code, chunk
 
@@ -165,6 +174,7 @@ def assemble(task: March, grid: Grid, slices: Slices, front: Front, code: Status
     problem = task.problem
     kept = slice(slices.first, None)
     if len(slices.cut[kept]):
+        # at the earliest time, where an end that is cut off has worked its way furthest into the box
         warn_of_cuts(slices.cut[kept][0], slices.ends[kept][0], grid)
     return Solution(
         grid,
@@ -196,6 +206,8 @@ def _message(task: March, front: Front, code: Status) -> str:
     if code is Status.CONVERGED:
         return f"Marched from t = {horizon:g} to t = {t:g}."
     what = ADVICE.get(code, code.message)
+    # a march stalls for one of three reasons, and what to do differs: noise without a chain, rates without a bound,
+    # or a policy iteration that did not end, as ADVICE has it
     if code is Status.STALLED and int(front.seen.lacking) >= 0:
         what = _noise_message(task, front)
     elif code is Status.STALLED and task.method.limited:

@@ -25,6 +25,7 @@ Kept: TypeAlias = tuple[np.ndarray, Grid]  # node values that outlived an except
 def keep(error: Exception, grid: Grid, *values: Callable[[], Nodes]) -> None:
     """Notes on an exception the first of some node values that can still be read: a broken run takes its own along."""
     for value in values:
+        # a buffer that was donated, or that waits for the program that failed, raises when it is read
         with contextlib.suppress(Exception):
             error.kept = np.asarray(value()), grid  # type: ignore[attr-defined]
             return
@@ -45,7 +46,9 @@ def explained(clock: Clock, needed: int, partial: Callable[[Kept | None], Soluti
     try:
         yield
     except Exception as error:
+        # XLA reports memory that ran out by a status in the text, NumPy by the type
         starved = isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error)
+        # a refusal of the package's own says all there is to say, and has no value beside it
         if not (starved or isinstance(error, jax.errors.JaxRuntimeError) or CALLBACK in str(error)):
             raise
         solution = getattr(error, "solution", None)
@@ -62,6 +65,7 @@ def explained(clock: Clock, needed: int, partial: Callable[[Kept | None], Soluti
 
 def _memory_error(error: Exception, needed: int, where: str, solution: Solution | None) -> MemoryError:
     """The report of memory that ran out: what was needed, what is free now, and the solution so far."""
+    # the first line alone: the runtime may append a list of all its buffers
     free, said = memory.available(), (str(error).strip() or type(error).__name__).splitlines()[0][:200]
     left = "" if free is None else f", {free / 1e9:.3g} GB are free now"
     report = MemoryError(

@@ -117,13 +117,16 @@ def march(
     check_node_values(start, grid, "march: start")
     grid.check_spacings(kind)
     clock = Clock(seconds=time_limit, progress=progress)
+    # float64 for this call alone: the caller's own programs, and other threads, keep the type they have
     with noting_interrupts(clock), jax.enable_x64(kind == np.float64):
+        # before anything is compiled: a grid that does not fit is refused within a second
         needed = memory.fitting(_bytes(problem, grid, kept, method, kind), grid, max_memory)
         on = Discretisation(problem, grid, scheme, kind)
         with faults.explained(clock, needed, lambda _: _solution_at_horizon(on, horizon, start, Status.INTERRUPTED)):
             try:
                 checks.shapes(problem, grid, scheme)
                 node_checks.values(_without_moving_target(problem), grid, kind, clock)
+                # a drift that changes in time may keep inside a constrained end now and not later
                 for t in np.linspace(horizon, 0.0, PROBES) if problem.time_dependent else (0.0,):
                     admissibility.values(problem, grid, kind, t)
                 clock.enter("the preparation")
@@ -153,6 +156,7 @@ def _check(problem: object, grid: object, scheme: Scheme, method: TimeMethod, st
     if not isinstance(problem, Problem) or not isinstance(grid, Grid):
         raise TypeError(f"march: got {type(problem).__name__}, {type(grid).__name__}; wanted a Problem and a Grid")
     schemes.check(scheme, "march: scheme", grid)
+    # a class has all these names as well: hjb.Explicit without its brackets
     if isinstance(method, type) or not all(hasattr(method, name) for name in ("filled", "step", "described")):
         raise TypeError(f"march: method is {method!r}; wanted hjb.Explicit(...) or hjb.Implicit(...)")
     if method.monotone_only and not scheme.monotone:
@@ -189,6 +193,8 @@ def _bytes(problem: Problem, grid: Grid, kept: np.ndarray, method: TimeMethod, d
     """Bytes at the peak: kept slices and policies, two slices, slopes, constraints; the matrix if implicit."""
     word = np.dtype(dtype).itemsize
     actions = sum(admissible.dim for admissible in (problem.controls, problem.disturbances) if admissible is not None)
+    # in words a node: the kept slices and their actions; V before and after a chunk; P⁺ and P⁻ along every axis; held
+    # nodes, ψ and g; the actions of a stage
     slices = len(kept) * (1 + actions) + 2 + 2 * grid.ndim + 3 + actions
     if not method.limited:
         inner = PolicyIteration(getattr(method, "evaluation", None) or Krylov())
@@ -212,10 +218,13 @@ def _prepare(on: Discretisation, horizon: float, method: TimeMethod, step: float
     limit: Scalar = jnp.asarray(jnp.inf, dtype)
     method = method.filled(on, _evaluation(problem, grid))
     if method.limited:
+        # 1/(max Q + β) changes with the time if the functions do: a given step is held against the least of many, one
+        # that is left open is found anew before every step
         probes = np.linspace(horizon, 0.0, PROBES) if moving else [horizon]
         if step is not None or not moving:
             limits = [_stable(on.at(jnp.asarray(t, dtype))) for t in probes]
             limit = jnp.min(jnp.stack(limits))
+            # the Euler steps inside a stage are c Δt long, and c Δt (max Q + β) ≤ 1 is what keeps them monotone
             _check_step(step, float(limit) / method.tableau.euler)
         courant = method.courant if step is None else 1 / method.tableau.euler
         limit = jnp.asarray(limit * courant, dtype)
@@ -233,13 +242,16 @@ def _checks(on: Discretisation, method: TimeMethod) -> tuple[bool, bool]:
     """Two flags: steps must look at the rates, and at correlated noise, under the actions that they choose."""
     problem = on.problem
     players, moving = players_of(on), problem.time_dependent
+    # Q is known beforehand where it is largest at an end of the sets; else under the actions that are chosen alone
     sampled = not (players.control.fastest_at_ends and players.disturbance.fastest_at_ends)
+    # a stage after the first looks at a later time, at which Q may have grown beyond the limit of the first
     rates = method.limited and (sampled or (moving and len(method.tableau.means) > 1))
     return rates, callable(problem.noise) and (moving or players.steers_noise)
 
 
 def _check_step(step: float | None, limit: float) -> None:
     """Refuse a step longer than the stability limit."""
+    # who computes the limit by hand is off by rounding, in float32 by some 1e-7
     if step is not None and step > limit * (1 + 1e-6):
         raise ValueError(
             f"march: step = {step:g} is above the stability limit 1/(max Q + β) = {limit:.6g} of explicit steps "
@@ -252,6 +264,7 @@ def _evaluation(problem: Problem, grid: Grid) -> Evaluation:
     if grid.sides("open"):
         chosen = choose(problem, grid, traced=False)
         return chosen.evaluation or Krylov()
+    # sweeps follow the drift and are slow where noise spreads news both ways
     return Sweeps() if problem.noise is None else Krylov()
 
 
@@ -260,6 +273,7 @@ def _blow_up_nodes(on: Discretisation, share: float | None) -> Mask | None:
     problem, grid = on.problem, on.grid
     if share is None:
         players = players_of(on).disturbance
+        # under a penalty γ²|d|² the worst disturbance is gᵀDV/2γ², at its bound only where DV has grown out of hand
         share = 0.5 if isinstance(players.admissible, Box) and all(players.curved) else 0.0
     if not arguments.is_number(share) or not 0 <= share <= 1:
         raise ValueError(f"march: inner = {share!r}; wanted the share of the box that is watched, from 0 (none) to 1")
@@ -285,6 +299,7 @@ def _march_traced(
     task = March(on, method, obstacles, jnp.inf, step, horizon, None)
     value, values, actions, count = time_stepping.terminal(on.at(horizon), start), [], [], 0
     for begin, end in itertools.pairwise([horizon, *kept[::-1].tolist()]):
+        # an interval of a whole number of steps takes no step more by rounding; a kept time at the horizon takes none
         steps = max(math.ceil((begin - end) / step - 1e-6), int(begin > end))
         value, count = time_stepping.repeat(task, value, begin, end, steps), count + steps
         values.append(value)

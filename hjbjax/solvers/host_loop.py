@@ -43,6 +43,7 @@ def drive(task: Task, guess: Nodes, clock: Clock, most: int | None = None) -> tu
     Returns:
       The last state, how it ended, and the residuals of all steps, that of the guess first.
     """
+    # a way to a guess, as by a vanishing discount, is worth few steps, whatever the solve may take
     limit = clock.max_steps if most is None else min(most, clock.max_steps)
     state, residuals, nodes = fixed_point.begin(task, guess), [np.zeros(0)], " x ".join(map(str, task.grid.shape))
     code = clock.over()
@@ -60,6 +61,7 @@ def drive(task: Task, guess: Nodes, clock: Clock, most: int | None = None) -> tu
                 if code is not Status.RUNNING:
                     break
                 clock.phase = f"step {done + 1} on {nodes} nodes" + ", on the way to a guess" * (most is not None)
+                # the look at the guess, step −1, comes with the first chunk unless that is of no steps
                 until = min(max(done, 0) + chunk, limit)
                 before, state = (
                     state,
@@ -68,15 +70,18 @@ def drive(task: Task, guess: Nodes, clock: Clock, most: int | None = None) -> tu
                 code, steps = Status(int(state.code)), int(state.step) - done
                 residuals.append(np.asarray(state.history)[:steps])
                 clock.count(time.perf_counter() - began, steps, task.grid.size)
+                # a chunk records the residuals of HISTORY steps at most; a short one is timed badly, hence the 8
                 chunk = int(np.clip(clock.steps_in(CHUNK_SECONDS, task.grid.size), 1, min(HISTORY, 8 * max(chunk, 1))))
-                show(steps - (done < 0), float(state.bound.error))
+                show(steps - (done < 0), float(state.bound.error))  # the look is no step
                 done += steps
         except KeyboardInterrupt:  # the second one, or by a handler of the user's own
             clock.interrupted, code = True, Status.INTERRUPTED
             residuals.append(np.asarray(state.history)[: int(state.step) - done])  # of steps not yet written down
         except Exception as error:
+            # the state of the step that failed, the one before unless it was donated, and what it all began with
             faults.keep(error, task.grid, lambda: state.value, lambda: before.value, lambda: guess)
             raise
+    # a run that ended before its first look still holds the guess as it came
     if code is Status.NONFINITE or code in CUT:
         state = imposed(task, state)
     return state, code, np.concatenate(residuals)[: int(state.step) + 1]
@@ -91,8 +96,10 @@ def _calls_back(task: Task) -> bool:
 def _stop_status(clock: Clock, done: int, limit: int, nodes: int) -> Status:
     """The status that forbids another chunk, else RUNNING; a step that the last pace makes too late is not begun."""
     code = clock.over()
+    # one step on a large grid may take minutes, and nothing can cut it
     if code is None and clock.per_node is not None and clock.steps_in(clock.seconds - clock.elapsed(), nodes) < 1:
         code = Status.TIME_LIMIT
+    # who wants ten steps has had them, whatever the time; Ctrl-C alone says something else
     if done >= limit and code is not Status.INTERRUPTED:
         return Status.MAX_STEPS
     return Status.RUNNING if code is None else code
@@ -105,16 +112,19 @@ def _first_chunk(task: Task, clock: Clock) -> int:
     where a step may take many passes over the nodes, and more of them on a finer grid.
     """
     method, nodes = task.method, task.grid.size
+    # the look is one pass over the nodes, a step with a linear solve hundreds: it is timed before one is begun
     if clock.per_node is None and nodes > MANY_NODES:
         return 0
     evaluation = getattr(method, "evaluation", None)
+    # a Krylov or direct solve takes more passes on finer grids, and so do the replies of a game: what a step took on a
+    # coarser grid says nothing
     if task.problem.is_game or (evaluation is not None and not evaluation.rough):
         return 1
     if clock.per_node is None:
         steps = FIRST_NODES / nodes
     else:
         steps = clock.steps_in(min(CHUNK_SECONDS / 2, clock.seconds - clock.elapsed()), nodes)
-    return int(np.clip(steps, 1, HISTORY - 1))
+    return int(np.clip(steps, 1, HISTORY - 1))  # one place of the history is the look's
 
 
 def imposed(task: Task, state: State) -> State:

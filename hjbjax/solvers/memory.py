@@ -33,9 +33,12 @@ def estimate(problem: Problem, grid: Grid, method: Method, dtype: DType) -> int:
     word, n = np.dtype(dtype).itemsize, grid.ndim
     actions = sum(admissible.dim for admissible in (problem.controls, problem.disturbances) if admissible is not None)
     conditions = (problem.target, problem.stopping_cost, problem.running_max, problem.disturbances)
+    # V and its defect, the actions, what is given at the nodes or bounds V there, the least cost where that certifies;
+    # and two masks of a byte: the nodes that are held, and those that count
     kept = word * (2 + actions + sum(each is not None for each in conditions) + (is_discounted(problem) is False)) + 2
     look, correction = word * (4 + 2 * actions), 0
     if method.evaluation is not None and not method.relaxes:
+        # 2n jumps along the axes and four diagonal ones for each pair of axes
         weights = 2 * n * n if np.ndim(problem.noise) == 2 or callable(problem.noise) else 2 * n
         if problem.noise is None and method.evaluation.rough:
             weights = n  # one way an axis, since sweeps may keep the two as one
@@ -48,6 +51,7 @@ def estimate(problem: Problem, grid: Grid, method: Method, dtype: DType) -> int:
 def available() -> int | None:
     """Free bytes on the device that JAX computes on, or None where nobody says."""
     device = jax.devices()[0]
+    # of a CPU it is the machine that knows, and the limits of the process
     stats = device.memory_stats() if device.platform != "cpu" else None
     if stats and "bytes_limit" in stats:
         return int(stats["bytes_limit"]) - int(stats.get("bytes_in_use", 0))
@@ -60,9 +64,9 @@ def _of_machine() -> int | None:
     try:
         with open("/proc/meminfo") as lines:
             for line in lines:
-                if line.startswith("MemAvailable:"):
+                if line.startswith("MemAvailable:"):  # not MemFree, from which the caches of files are missing
                     return int(line.split()[1]) * 1024
-        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")  # a system without that line
     except (OSError, ValueError, AttributeError):
         return None
 
@@ -75,6 +79,7 @@ def _of_process() -> int | None:
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
         if limit == resource.RLIM_INFINITY:
             return None
+        # the first number is of addresses, which the limit is on, and not of pages in use
         used = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
     except (ImportError, OSError, ValueError, AttributeError):  # Windows; a system without /proc
         return None
@@ -85,6 +90,7 @@ def _of_groups(process: Path = Path("/proc/self"), mount: Path = Path("/sys/fs/c
     """Bytes that the control groups of this process leave, of both versions; None where none is limited."""
     left = []
     for folder in _groups(process, mount):
+        # version 2, version 1
         for most, used in (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes")):
             with contextlib.suppress(OSError, ValueError):  # "max" is no number, and no limit
                 limit = int((folder / most).read_text())
@@ -98,11 +104,13 @@ def _groups(process: Path, mount: Path) -> Iterator[Path]:
         lines = (process / "cgroup").read_text().splitlines()
     except OSError:
         return
+    # lines are "0::/path" in version 2 and "4:memory,cpu:/path" in version 1
     for number, controllers, path in (line.split(":", 2) for line in lines if line.count(":") >= 2):
         if number != "0" and "memory" not in controllers.split(","):
             continue
         top = mount if number == "0" else mount / "memory"
         folder = top / path.strip("/")
+        # a group is bound by the limits of all that hold it
         while folder != top:
             yield folder
             folder = folder.parent
@@ -141,6 +149,7 @@ def fitting(needed: int, grid: Grid, limit: int | None) -> int:
             f"{_counts(grid)} = {grid.size:,} nodes; 32-bit indices number fewer than {INDEXABLE:,}.\n"
             f"At most N = {largest} points an axis in {grid.ndim}-D; {NO_GRID}."
         )
+    # in proportion to the nodes: the largest grid that would fit has free/needed times as many
     if free is not None and needed > free:
         raise MemoryError(
             f"{_counts(grid)} = {grid.size:,} nodes need about {needed / 1e9:.3g} GB, {free / 1e9:.3g} GB are free.\n"

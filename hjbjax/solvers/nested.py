@@ -25,6 +25,7 @@ from hjbjax.solvers.setup import Assumptions, assumptions_of, forced_only, held_
 VANISHING = (2.0, 0.2, 0.02)  # discounts on the way to none, over one by the time that crossing the box takes
 FURTHER = ((2e-3, 2e-4), (2e-5, 2e-6), (2e-7, 2e-8))  # where parts of the box are that much slower than the fastest
 FAILED = (Status.STALLED, Status.DIVERGED, Status.NONFINITE)
+# the last of the answers is a guess, and need not be exact
 WARM_STEPS = 60  # improvements for each of them
 
 
@@ -45,6 +46,7 @@ def start(
     for coarse, fine in itertools.pairwise(grids):
         clock.phase = f"the preparation of {' x '.join(map(str, coarse.shape))} nodes"
         level = on.on_grid(coarse)
+        # without the checks of the host: a coarser grid gives a guess, and is no reason to refuse or to warn
         task = prepare_jit(level, method=method.inner, tol=tol, assumptions=assumptions_of(level))
         state, _, _ = drive(task, warm(task, value, clock), clock)
         if clock.over() is not None:
@@ -62,6 +64,7 @@ def levels(on: Discretisation, method: Method, clock: Clock) -> list[Grid]:
         if clock.over() is not None:
             break
         clock.phase = f"the choice of coarser grids, {' x '.join(map(str, smaller.shape))} nodes"
+        # without a held node an undiscounted problem has no finite value to start from
         if needs_held and not held_jit(on.on_grid(smaller), assumptions=assumptions).any():
             break
         grids.insert(0, smaller)
@@ -89,6 +92,7 @@ def _needs_a_way(task: Task) -> bool:
 def _vanishing(task: Task, value: Nodes, discounts: tuple[float, ...], clock: Clock) -> Nodes:
     """The last of the answers for some discounts, over one by the time of a crossing, one after the other."""
     for discount in discounts:
+        # the number alone: structure and certificate stay, and the program of the solve itself serves on the way
         problem = altered(task.problem, discount=jnp.asarray(discount / task.crossing, task.tol.dtype))
         value = drive(task.asking(problem), value, clock, most=WARM_STEPS)[0].value
     return value
@@ -129,6 +133,8 @@ def settle(task: Task, assumptions: Assumptions, reached: Mask | None, guess: No
             value = _vanishing(task, value, discounts, clock)
             state, code, residuals = drive(task, value, clock)
     evaluation = task.method.evaluation
+    # a sweep follows the drift from the target on; on a circle there is no first node, and under a discount β Δt ≪ 1 it
+    # takes some 1/(β Δt) rounds
     if code is Status.STALLED and evaluation is not None and evaluation.rough:
         task = dataclasses.replace(task, method=PolicyIteration(linear_solve(task.grid)))
         state, code, residuals = drive(task, state.value, clock)
@@ -137,13 +143,16 @@ def settle(task: Task, assumptions: Assumptions, reached: Mask | None, guess: No
             fewer, forced = forced_only(task, clock)
         except Stopped as stop:
             return Settled(task, assumptions, reached, state, stop.status, residuals)
+        # where the disturbance can keep the state from the target V is infinite, and the iteration climbs without end
         if forced is not None and not forced.all():
             task, reached = fewer, forced
+            # anew, since the value so far is that of the climb
             state, code, residuals = drive(task, warm(task, None, clock), clock)
     while code is Status.CONVERGED and may_go_on(task, assumptions, state, code):
         pays = _leaving_pays(task, state.value)
         if not np.any(np.asarray(pays)):
             break
+        # the bound by the least running cost wants it positive wherever V is not held, and at rest it is zero
         assumptions = dataclasses.replace(assumptions, certificate=Certificate.NONE)
         task = dataclasses.replace(
             task, obstacles=resting.released(task.obstacles, pays), certificate=Certificate.NONE, least_cost=None

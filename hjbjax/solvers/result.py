@@ -39,17 +39,19 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
     stopped = cut or code in CUT
     if not stopped:
         _refuse_noise(task, state, grid)
+    # V falls by the same amount a step for ever, which neither the residual nor the number of steps can tell
     earning = None if stopped else earnings.earned(task, state)
     code = code if earning is None else Status.DIVERGED
     gap = None if stopped else _isaacs_gap(task, state)
-    unanswered = stopped or code in (Status.DIVERGED, Status.NONFINITE)
+    unanswered = stopped or code in (Status.DIVERGED, Status.NONFINITE)  # there is no optimal drift to speak of
     leaving = None if unanswered else _leaving(task, state, grid)
     state = jax.device_get(state)
     solution = assemble(task, state, assumptions)
     lost = ~np.asarray(task.counted)
     arrays = {name: getattr(solution, name) for name in ("value", "policy", "disturbance")}
+    # what the device hands over may be read-only
     arrays = {name: None if array is None else np.require(array, requirements="W") for name, array in arrays.items()}
-    arrays["value"][lost] = np.inf
+    arrays["value"][lost] = np.inf  # until here they held a finite number above all others
     idle = lost | np.asarray(task.obstacles.ended) | (int(state.step) < 0)  # nobody looked for a policy yet
     for array in (arrays["policy"], arrays["disturbance"]):
         if array is not None:
@@ -163,6 +165,7 @@ def _refuse_noise(task: Task, state: State, grid: Grid) -> None:
     if not callable(task.problem.noise) or not players_of(task.on).steers_noise:
         return
     policy = state.policy
+    # the checks before a solve look at samples of the actions, and the exact minimum lies between them
     first = int(_lacking(task, policy.controls, policy.disturbances))
     if first < 0:
         return
@@ -193,6 +196,7 @@ def isaacs_gap(hamiltonian: discrete.DiscreteHamiltonian, free: Mask) -> tuple[S
         return (jnp.minimum(extremes[0], total), jnp.maximum(extremes[1], total)), None
 
     pairs = jnp.asarray([(i, j) for i in range(len(mine)) for j in range(len(theirs))])
+    # one pair at a time: all 81 at once would be 81 arrays of the nodes
     (least, most), _ = jax.lax.scan(compare, (lower, upper), pairs)
     size = 1e3 * jnp.finfo(dtype).eps * (jnp.abs(least) + jnp.abs(most))  # no gap is less than rounding
     return jnp.max(jnp.where(free, upper - lower, 0)), jnp.max(jnp.where(free, most - least + size, 0))
@@ -203,6 +207,7 @@ def _representatives(admissible: AdmissibleSet | None) -> Array:
     if admissible is None:
         return np.zeros((1, 0))
     points = sets.samples(admissible, 9)
+    # a finite set may have thousands of points
     return points[np.unique(np.linspace(0, len(points) - 1, 9).round().astype(int))]
 
 
@@ -247,6 +252,7 @@ _broken = jax.jit(fixed_point.broken)
 
 def _not_finite_message(task: Task, state: State, grid: Grid) -> str:
     """The message on NaN or infinity, with the place, found by taking the step once more that brought it."""
+    # the state holds the last finite value, so that nothing in it shows where the infinity began
     bad = np.asarray(_broken(task, state))
     step = int(state.step)
     when = "at the guess" if step == 0 else f"in step {step}"
@@ -271,6 +277,7 @@ def _message(code: Status, task: Task, state: State, grid: Grid) -> str:
     """The sentence that says how a solve ended, and what to do about it."""
     if code is Status.NONFINITE:
         return _not_finite_message(task, state, grid)
+    # the three certificates that bound no error cannot promise that a smaller tolerance is within reach
     best, tol = float(state.best[0]), float(task.tol)
     certified = task.certificate not in (Certificate.NONE, Certificate.RESIDUAL, Certificate.OPEN)
     if code is Status.STALLED and np.isfinite(best) and certified:

@@ -32,6 +32,7 @@ class SolveWarning(UserWarning):
 
 def warn(message: str) -> None:
     """A ``SolveWarning`` at the line outside of the package from which the front door was called."""
+    # the line of the user's: Python shows a warning once a line, which inside the package would be once for ever
     package, frame, level = __name__.split(".")[0], sys._getframe(1), 2
     while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] == package:
         frame, level = frame.f_back, level + 1
@@ -55,6 +56,7 @@ def choose(problem: Problem, grid: Grid, *, traced: bool) -> Method:
     without discount have policies without a value of their own: there value iteration alone keeps to the extreme
     one of many fixed points.
     """
+    # a policy that waits at ψ or g for nothing solves its own linear equation with any value
     if is_constrained(problem) and is_discounted(problem) is False:
         return ValueIteration()
     if grid.sides("open"):  # what is continued from inside is no matter for sweeps; see relaxation
@@ -64,6 +66,7 @@ def choose(problem: Problem, grid: Grid, *, traced: bool) -> Method:
         method = PolicyIteration(Sweeps())
     else:
         method = PolicyIteration(Krylov() if traced else linear_solve(grid))
+    # from a cold start a good policy spreads by one cell an improvement: N of them on one grid, a few on nested ones
     return Nested(method) if grid.size > NEST and not traced else method
 
 
@@ -76,11 +79,12 @@ def prepare(on: Discretisation, *, method: Method, tol: Number, assumptions: "As
     """The task of a solve, all arrays in its type; pure, so that it may be traced, batched and differentiated."""
     on = cast(on, on.dtype)
     obstacles, still = _obstacles(on, assumptions)
+    # a tube with a traced discount takes relaxations if that is zero, which only the compiled program will see
     undecided = assumptions.certificate is Certificate.BY_DISCOUNT and is_constrained(on.problem)
     outflow = None
     if method.relaxes or undecided or assumptions.certificate is Certificate.OPEN:
         rate = chain.fastest_rate(on) + on.problem.discount
-        outflow = jnp.where(rate > 0, rate, 1)
+        outflow = jnp.where(rate > 0, rate, 1)  # it divides; where nothing moves there is nothing to divide
     priced = assumptions.costs_certify and still is not None
     return Task(
         on, method, obstacles, jnp.ones(on.grid.shape, bool), still.least if priced and still else None, outflow,
@@ -94,12 +98,14 @@ def _obstacles(on: Discretisation, assumptions: "Assumptions") -> tuple[bellman.
     if on.scheme.subcell and problem.exit_cost is not None:
         links = cut_cells.links(on)
         met = [jnp.min(jnp.where(*meets, 0)) for link in links for meets in (link.meets_up, link.meets_down) if meets]
+        # a lower bound on V has to lie below every exit cost, also where the boundary runs between the nodes
         obstacles = dataclasses.replace(obstacles, least_exit=jnp.minimum(jnp.min(jnp.stack(met)), 0))
     if not (assumptions.may_rest or assumptions.costs_certify):
         return obstacles, None
     still = resting.standstill(on)
     if not assumptions.may_rest:
         return obstacles, still
+    # under a discount the equation has one solution and nothing need be held; which of both holds may be traced
     return dataclasses.replace(obstacles, fixed=obstacles.fixed | (still.rests & (problem.discount == 0))), still
 
 
@@ -130,6 +136,7 @@ class Assumptions:
 def assumptions_of(on: Discretisation) -> Assumptions:
     """The assumptions from the structure of the problem; a discount that is traced leaves the certificate open."""
     if on.grid.sides("open"):
+        # what is continued from inside makes no chain, so that none of the bounds holds
         return dataclasses.replace(assumptions_of(on.on_grid(on.grid.walled)), certificate=Certificate.OPEN)
     problem = on.problem
     players, discounted = players_of(on), is_discounted(problem)
@@ -168,6 +175,7 @@ def prepare_on_host(
     assumptions = assumptions_of(on)
     task = prepare_jit(on, method=method, tol=tol, assumptions=assumptions)
     priced = assumptions.certificate is Certificate.MULTIPLICATIVE
+    # where L = 0 the bound by the running cost fails, and a run may go round for ever at no cost as well as rest
     if (priced and not _costs_positive(task)) or problem.cost is None:
         task = _with_refuge(task)
         assumptions = dataclasses.replace(
@@ -182,6 +190,7 @@ def prepare_on_host(
     held = np.asarray(task.obstacles.fixed)
     undiscounted = problem.discount == 0
     checks.ill_posed(problem, bool(assumptions.may_rest and held.any()), grid)
+    # a game is asked when it fails: all pairs of actions are dear; and a constraint gives every node a finite value
     if problem.is_game or is_constrained(problem) or not held.any():
         return task, assumptions, None
     reached = attainability.reached(task.on, held, surely=undiscounted, least=_least_rate(task), clock=clock)
@@ -212,9 +221,11 @@ def _with_refuge(task: Task) -> Task:
     """The task with the nodes held at zero among which a run may go on for ever and pay nothing, as where it rests."""
     if task.problem.is_game or task.constrained or np.asarray(task.problem.discount) > 0:
         return task
+    # on the target the run is over; everywhere else it could go on at the least cost of all actions
     free = ~np.broadcast_to(np.asarray(task.obstacles.ended), task.grid.shape)
     least = np.zeros(task.grid.shape) if task.least_cost is None else np.asarray(task.least_cost)
     small = resting.ROUNDINGS * np.finfo(task.tol.dtype).eps * np.max(np.abs(least))
+    # where something can be earned it is no matter of course that going round for nothing is optimal
     if np.any(least[free] < -small):
         return task
     found = attainability.refuge(task.on, jnp.asarray((least <= small) & free), jnp.asarray(small, task.tol.dtype))
@@ -233,6 +244,7 @@ def prepare_traced(on: Discretisation, *, method: Method, tol: Number) -> tuple[
     ends = problem.target is not None or assumptions.may_rest
     if problem.is_game or is_constrained(problem) or is_discounted(problem) or not ends:
         return task, assumptions
+    # a set of nodes has no derivative
     known = jax.lax.stop_gradient(task)
     reached = attainability.surely_reached(known.on, known.obstacles.fixed, least=_least_rate(known))
     return _finite_part(task, reached | (known.problem.discount > 0)), assumptions
@@ -242,6 +254,7 @@ def _least_rate(task: Task) -> Scalar:
     """Rates up to this one are rounding beside those of the fastest motion on the grid; zero where nobody asks."""
     if task.crossing is None:
         return jnp.zeros((), task.tol.dtype)
+    # nodes of all axes over the time of a crossing: the rate of jumps of the fastest motion
     return resting.ROUNDINGS * jnp.finfo(task.tol.dtype).eps * sum(task.grid.shape) / task.crossing
 
 

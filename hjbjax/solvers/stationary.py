@@ -37,6 +37,7 @@ from hjbjax.solvers.setup import choose, is_constrained, prepare_on_host, prepar
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
 
+# no host looks on inside a transformation: far more steps than policy iteration takes, and an end for all others
 TRACED_STEPS = 10_000
 
 
@@ -104,6 +105,7 @@ def solve(
     grid.check_spacings(kind)
     method = method or choose(problem, grid, traced=False)
     clock = Clock(max_steps or 10**9, time_limit, progress)
+    # float64 for this call alone: another thread, and the caller's own programs, keep theirs
     with noting_interrupts(clock), jax.enable_x64(kind == np.float64):
         needed = memory.require(problem, grid, method, kind, max_memory)
         with faults.explained(clock, needed, lambda kept: _partial(on, kept)):
@@ -133,6 +135,8 @@ def _solve_on_host(on: Discretisation, method: Method, tol: float, guess: Nodes 
     problem, grid = on.problem, on.grid
     start: Nodes | None = None if guess is None else np.asarray(guess, on.dtype)
     try:
+        # from cheap to dear: one state, all nodes, the ends of the box, the coarser grids, and only then what is
+        # compiled for the finest one
         checks.shapes(problem, grid, on.scheme)
         node_checks.values(problem, grid, on.dtype, clock)
         admissibility.values(problem, grid, on.dtype)
@@ -161,6 +165,7 @@ def sharpened(settled: Settled, scheme: Scheme, clock: Clock) -> tuple[Settled, 
     task, state, over = settled.task, settled.state, clock.over()
     if over is not None:
         return settled._replace(code=over), {}
+    # the matrix stays that of the chain, the residual is of the better slopes: defect correction
     higher = dataclasses.replace(task, certificate=Certificate.RESIDUAL, on=dataclasses.replace(task.on, scheme=scheme))
     better, ended, more = drive(higher, state.value, clock)
     if int(better.step) < 0:  # it was stopped before its first look, and the monotone answer stands
@@ -183,6 +188,7 @@ def _solve_traced(
     if method.coarsest is not None:
         raise ValueError("solve: Nested(...) runs at host level only; inside jit, vmap and grad use its inner method")
     task, assumptions = prepare_traced(on, method=method, tol=tol)
+    # the derivative is that of the fixed point, by the implicit function theorem, and not of the steps that led there
     frozen = jax.lax.stop_gradient(task)
     start = frozen.start() if guess is None else jax.lax.stop_gradient(jnp.asarray(guess, on.dtype))
     state = fixed_point.run(frozen, fixed_point.begin(frozen, start), max_steps or TRACED_STEPS)
@@ -198,6 +204,7 @@ def _solve_traced(
 def _without_rests_to_leave(task: Task, state: State) -> tuple[State, Scalar]:
     """The state, stalled and without bounds if leaving a held rest node would pay, and if so: only the host goes on."""
     pays = resting.leaving_pays(task.on.chain, task.obstacles, task.counted, state.value)
+    # under a discount, which may be traced, no node was held for being at rest
     wrong = jnp.any(pays) & (state.code == Status.CONVERGED) & (task.problem.discount == 0)
     gap, infinite = state.bound, jnp.asarray(jnp.inf, state.value.dtype)
     gap = dataclasses.replace(
@@ -210,6 +217,7 @@ def _without_rests_to_leave(task: Task, state: State) -> tuple[State, Scalar]:
 
 def as_dtype(dtype: DType | None) -> np.dtype:
     """The floating-point type that a user asked for; None is float64."""
+    # np.dtype reads many spellings, and raises TypeError at others
     for kind in (np.dtype(np.float64), np.dtype(np.float32)):
         with contextlib.suppress(TypeError):
             if kind == (np.float64 if dtype is None else np.dtype(dtype)):
@@ -256,7 +264,7 @@ def check_node_values(values: object, grid: Grid, name: str) -> None:
         raise ValueError(
             f"{name} is {arguments.shown(values)}; wanted real node values of shape {grid.shape}"
         ) from None
-    if array.dtype.kind not in "fiu":
+    if array.dtype.kind not in "fiu":  # truth values and complex numbers are none
         raise ValueError(f"{name} holds {array.dtype}; wanted real node values of shape {grid.shape}")
     if array.shape != grid.shape:
         hint = "; it looks transposed" if array.shape == grid.shape[::-1] else ""

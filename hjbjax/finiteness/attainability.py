@@ -37,7 +37,7 @@ def _open_jumps(
     Without ``inside`` it is the box. Rates up to ``least`` are rounding; with ``kinks`` actions between the samples, at
     which a component of the drift vanishes, are tried as well.
     """
-    points = tried_actions.sampled(on.problem)
+    points = tried_actions.control_samples(on.problem)
     known: Rates | None = None
     count, some = len(points), max(1, LOOK // on.grid.size)
     for first in range(0, count, some):
@@ -139,7 +139,7 @@ def _reached_by_samples(
 
 def surely_reached(on: Discretisation, held: Mask, *, least: Number = 0.0) -> jax.Array:
     """The nodes from which the held ones are reached with probability one, bool (*grid); inside a transformation."""
-    points, on = tried_actions.sampled(on.problem), on.on_grid(on.grid.walled)
+    points, on = tried_actions.control_samples(on.problem), on.on_grid(on.grid.walled)
     grid = on.grid
 
     def shrink(carry):
@@ -305,7 +305,7 @@ def _reach_on_host(held: np.ndarray, jumps: Rates, grid: Grid) -> np.ndarray:
     # the search wants one start: an extra node, numbered last, from which all held ones are one jump away
     ends = [np.full_like(starts[0], grid.size)]  # one more node leads to all held ones
     for offset, jump in zip(jumps.offsets, jumps.values, strict=True):
-        # what leaves a held node matters to nobody, since the run is over there
+        # jumps out of held nodes are left out: the run is over there
         leaves = ~held & np.asarray(jump)
         starts.append(np.flatnonzero(leaves))
         ends.append(stencil.numbers(grid, offset)[leaves])

@@ -46,7 +46,7 @@ def earned(task: Task, state: State) -> Earning | None:
     if bounded or problem.is_game or problem.cost is None or int(state.step) < 0:
         return None
     jumps, cost = jax.device_get(_rates_and_cost(task, state.policy.controls))
-    # held nodes end the run, so that in the chain they are left by nothing
+    # held nodes end the run: in the chain they are absorbing
     going = np.asarray(task.counted) & ~np.asarray(task.obstacles.fixed)
     # only a class in which some node earns can earn on the average
     if not np.all(np.isfinite(cost[going])) or not np.any(cost[going] < 0):

@@ -29,7 +29,7 @@ LOOK = 10**7  # nodes times actions between two looks at the clock: about a seco
 
 
 def values(problem: Problem, grid: Grid, dtype: DType, clock: Clock | None = None) -> None:
-    """Refuse what the functions return at the nodes: NaN, an empty target, noise that the chain cannot represent.
+    """Refuse a problem by its numbers at the nodes: NaN, an empty target, noise that the chain cannot represent.
 
     Args:
       problem: the problem; one that passed ``checks.shapes``.
@@ -44,7 +44,7 @@ def values(problem: Problem, grid: Grid, dtype: DType, clock: Clock | None = Non
     on = Discretisation(problem, grid, Upwind(), np.dtype(dtype))
     # for counts of 64 bits; the functions are evaluated in ``dtype`` all the same
     with jax.enable_x64(True):
-        # nearly every problem passes, and this look compiles faster than one that counts and names
+        # nearly every problem passes, and is spared counts and first nodes, which are slow on a CPU
         if _all_pass(on, actions, clock):
             return
         clock.look()
@@ -52,7 +52,7 @@ def values(problem: Problem, grid: Grid, dtype: DType, clock: Clock | None = Non
     # what is not finite first: comparisons with NaN are false, so that the rest would speak of something else
     for name in (*OF_ACTION, "target", *STATE_COSTS):
         if name in found and found[name].nodes:
-            _not_finite(problem, grid, name, found[name], actions)
+            _refuse_not_finite(problem, grid, name, found[name], actions)
     if "negative" in found and found["negative"].nodes:
         where = _where(problem, grid, found["negative"], actions)
         raise ValueError(
@@ -60,7 +60,7 @@ def values(problem: Problem, grid: Grid, dtype: DType, clock: Clock | None = Non
             "only an (n, k) matrix may hold negative entries"
         )
     if "correlation" in found and found["correlation"].nodes:
-        _not_representable(problem, grid, found["correlation"], actions)
+        _refuse_noise(problem, grid, found["correlation"], actions)
     if problem.target is not None:
         _check_target(problem, grid, int(found["inside"]), found["nearest"])
 
@@ -234,10 +234,10 @@ def _where(problem: Problem, grid: Grid, finding: _Finding, actions: tuple[np.nd
     return text
 
 
-def _not_finite(problem: Problem, grid: Grid, name: str, finding: _Finding, actions: tuple) -> NoReturn:
+def _refuse_not_finite(problem: Problem, grid: Grid, name: str, finding: _Finding, actions: tuple) -> NoReturn:
     """Refuse a function that is NaN or infinite at some nodes."""
     ingredient = getattr(problem, name)
-    # a number has no node to blame
+    # a plain number is at fault everywhere, and no node need be named
     if not callable(ingredient):
         raise ValueError(f"Problem.{name}: got {np.asarray(ingredient)}, wanted finite numbers")
     where = _where(problem, grid, finding, actions if name in OF_ACTION else None)
@@ -264,7 +264,7 @@ def _check_target(problem: Problem, grid: Grid, inside: int, nearest: tuple[Arra
     )
 
 
-def _not_representable(problem: Problem, grid: Grid, finding: _Finding, actions: tuple) -> NoReturn:
+def _refuse_noise(problem: Problem, grid: Grid, finding: _Finding, actions: tuple) -> NoReturn:
     """Refuse correlated noise, with spacings for which its diagonal jumps leave no negative probability."""
     _, x = _place(grid, finding.first)
     u, d = (rows[finding.action] for rows in actions)

@@ -27,7 +27,7 @@ GAIN = 64  # units of eps of Q max|V|: a smaller gain of leaving is rounding
 
 
 class Standstill(NamedTuple):
-    """Where the system can rest, and the scales of cost and time that tell it.
+    """The nodes where the system can rest, and the scales of cost and time that tell it.
 
     Attributes:
       rests: bool (*grid).
@@ -41,7 +41,7 @@ class Standstill(NamedTuple):
 
 
 def standstill(on: Discretisation) -> Standstill:
-    """Where the system can rest at no cost, up to rounding: sin π is not zero in floating point.
+    """The nodes where the system can rest at no cost, up to rounding: sin π is not zero in floating point.
 
     With slopes ±s, s_i = max L/max|f_i|, the Hamiltonian is L + Σ s_i |f_i|: its minimum vanishes at rest alone.
     """
@@ -115,7 +115,7 @@ def leaving_pays(on: Discretisation, obstacles: Obstacles, counted: Mask, value:
     return rests & (policy.defect < -GAIN * jnp.finfo(value.dtype).eps * (leaving * size + cost))
 
 
-def released(obstacles: Obstacles, pays: Mask) -> Obstacles:
+def release(obstacles: Obstacles, pays: Mask) -> Obstacles:
     """The obstacles with the nodes ``pays`` no longer held: there the run may rest, V ≤ 0, or leave."""
     # V ≤ 0 as a stopping cost of zero, which is what resting for ever amounts to
     stop = jnp.where(pays, 0, jnp.inf)

@@ -23,13 +23,13 @@ COMBINATIONS = 32  # of kinks of all inputs that are tried with one action
 SAMPLES = 33  # actions of a continuum that are tried
 
 
-def sampled(problem: Problem) -> Array:
+def control_samples(problem: Problem) -> Array:
     """Actions of the control, shape (count, m); one of no entries where there is no control."""
     return np.zeros((1, 0)) if problem.controls is None else sets.samples(problem.controls, SAMPLES)
 
 
 def with_kinks(on: Discretisation, player: Player, action: list) -> list[list]:
-    """An action, and those with some inputs where one component of the drift vanishes: (x), each input on the nodes.
+    """An action, and those with some inputs moved to where a component of the drift vanishes; each input (*grid).
 
     Only there may a jump stay away that all samples make. Where the drift is not affine in the inputs there are none.
     """
@@ -75,7 +75,7 @@ def of_a_ball(on: Discretisation, player: Player) -> list[list]:
 
 
 def _kinks(on: Discretisation, player: Player, base: list, j: int) -> list[jax.Array]:
-    """Where the components that input j drives vanish, as values of u_j at the nodes, given the other inputs.
+    """The values of input j, each (*grid), at which a component that it drives vanishes, given the other inputs.
 
     Its own place where they never do.
     """

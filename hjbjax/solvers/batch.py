@@ -27,11 +27,11 @@ from hjbjax.solution.clock import CHUNK_SECONDS, CUT, Clock, Stopped, noting_int
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
 from hjbjax.solvers import faults, memory, nested
-from hjbjax.solvers.host_loop import FIRST_NODES, imposed
+from hjbjax.solvers.host_loop import FIRST_NODES, with_obstacles
 from hjbjax.solvers.nested import Settled
-from hjbjax.solvers.result import closed, finish, unstarted
+from hjbjax.solvers.result import finish, solution_at_start, with_last_phase
 from hjbjax.solvers.setup import Assumptions, choose, prepare_on_host
-from hjbjax.solvers.stationary import as_dtype, check_arguments, check_limits, sharpened
+from hjbjax.solvers.stationary import as_dtype, check_arguments, check_limits, second_order
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
 
@@ -58,7 +58,7 @@ def solve_batch(
     throw: bool = True,
     max_memory: int | None = None,
 ) -> list[Solution]:
-    """Solve many problems on one grid; each answer is what ``solve`` with the same method gives.
+    """Solve many problems on one grid; each answer is that of ``solve`` by this method.
 
     Args:
       problems: problems; those with the same functions and shapes run together, whatever their numbers.
@@ -97,14 +97,14 @@ def solve_batch(
             checks.shapes(first, grid, scheme)
             on = Discretisation(first, grid, scheme, kind)
             needed = memory.require(first, grid, chosen, kind, max_memory)
-            # what one lane needs was weighed by itself above, so that a round of one lane always fits
+            # one lane by itself has been held against the memory above, so that a round is never empty
             for some in _rounds(members, needed, max_memory):
-                with faults.explained(clock, needed * len(some), lambda _: next(filter(None, solutions), None)):
+                with faults.with_solution(clock, needed * len(some), lambda _: next(filter(None, solutions), None)):
                     together = _solve_together({i: on.asking(lanes[i]) for i in some}, chosen, tol, clock)
                 for index, solution in zip(some, together, strict=True):
                     solutions[index] = solution
         if solutions and not any(solution.status in CUT for solution in solutions):
-            solutions[-1] = closed(solutions[-1], clock)  # no late Ctrl-C is lost
+            solutions[-1] = with_last_phase(solutions[-1], clock)  # no late Ctrl-C is lost
     for index, solution in enumerate(solutions):
         if throw and solution.status is not Status.CONVERGED:
             raise SolveError(f"lane {index}: {solution.status.name}: {solution.message}", solution, solutions)
@@ -146,10 +146,10 @@ def _solve_together(lanes: dict[int, Discretisation], method: Method, tol: float
         except ValueError as refusal:
             raise ValueError(f"lane {name}: {refusal}") from refusal
         except Stopped as stop:
-            nothing = [unstarted(each, np.zeros(each.grid.shape), stop.status) for each in asked]
-            return [closed(solution, clock) for solution in nothing]
+            nothing = [solution_at_start(each, np.zeros(each.grid.shape), stop.status) for each in asked]
+            return [with_last_phase(solution, clock) for solution in nothing]
     clock.phase = f"the steps of lanes {names[0]} to {names[-1]}"
-    # static, so that one lane with nodes out of reach makes all lanes look out for them, and all share a program
+    # a static flag, set for all lanes as soon as one has nodes out of reach, so that they share a program
     has_lost = any(task.has_lost for task, _, _ in prepared)
     prepared = [
         (dataclasses.replace(task, has_lost=has_lost), assumptions, reached) for task, assumptions, reached in prepared
@@ -175,7 +175,7 @@ def _lane_solution(settled: Settled, on: Discretisation, clock: Clock) -> Soluti
     task, assumptions, reached, state, code, history = settled
     apart: dict[str, Any] = {}
     if code in CUT:
-        settled = settled._replace(state=imposed(task, state))
+        settled = settled._replace(state=with_obstacles(task, state))
     elif nested.may_go_on(task, assumptions, state, code):
         # an answer, and a game that failed, go on from where they are; whoever was caught at rest starts anew, by the
         # answers for vanishing discounts
@@ -185,10 +185,10 @@ def _lane_solution(settled: Settled, on: Discretisation, clock: Clock) -> Soluti
         if onwards:
             settled = settled._replace(residuals=np.concatenate([history, settled.residuals]))
     if not on.scheme.monotone and settled.code not in CUT:
-        settled, apart = sharpened(settled, on.scheme, clock)
+        settled, apart = second_order(settled, on.scheme, clock)
     solution = finish(settled, on.grid, cut=clock.over() is not None)
     solution.stats.update(apart)
-    return closed(solution, clock) if settled.code in CUT else solution
+    return with_last_phase(solution, clock) if settled.code in CUT else solution
 
 
 def _finish_lanes(tasks: Task, states: State, count: int, clock: Clock) -> tuple[list[tuple], list[list]]:

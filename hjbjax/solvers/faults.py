@@ -23,7 +23,7 @@ Kept: TypeAlias = tuple[np.ndarray, Grid]  # node values that outlived an except
 
 
 def keep(error: Exception, grid: Grid, *values: Callable[[], Nodes]) -> None:
-    """Notes on an exception the first of some node values that can still be read: a broken run takes its own along."""
+    """Attach to an exception the first of some node values that can still be read: a broken run takes its own along."""
     for value in values:
         # a buffer that was donated, or that waits for the program that failed, raises when it is read
         with contextlib.suppress(Exception):
@@ -32,8 +32,8 @@ def keep(error: Exception, grid: Grid, *values: Callable[[], Nodes]) -> None:
 
 
 @contextlib.contextmanager
-def explained(clock: Clock, needed: int, partial: Callable[[Kept | None], Solution | None]) -> Iterator[None]:
-    """Exceptions of the runtime leave with a solution.
+def with_solution(clock: Clock, needed: int, partial: Callable[[Kept | None], Solution | None]) -> Iterator[None]:
+    """Let exceptions of the runtime leave with the solution so far.
 
     Args:
       clock: how far the run came.

@@ -32,7 +32,7 @@ from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
 from hjbjax.solvers import epochs, faults, memory
-from hjbjax.solvers.result import closed, unstarted
+from hjbjax.solvers.result import solution_at_start, with_last_phase
 from hjbjax.solvers.setup import choose
 from hjbjax.solvers.stationary import as_dtype, check_node_values
 from hjbjax.tracing import checks
@@ -122,7 +122,9 @@ def march(
         # before anything is compiled: a grid that does not fit is refused within a second
         needed = memory.fitting(_bytes(problem, grid, kept, method, kind), grid, max_memory)
         on = Discretisation(problem, grid, scheme, kind)
-        with faults.explained(clock, needed, lambda _: _solution_at_horizon(on, horizon, start, Status.INTERRUPTED)):
+        with faults.with_solution(
+            clock, needed, lambda _: _solution_at_horizon(on, horizon, start, Status.INTERRUPTED)
+        ):
             try:
                 checks.shapes(problem, grid, scheme)
                 node_checks.values(_without_moving_target(problem), grid, kind, clock)
@@ -135,7 +137,7 @@ def march(
                 solution = epochs.assemble(task, grid, slices, front, code)
             except Stopped as stop:
                 solution = _solution_at_horizon(on, horizon, start, stop.status)
-        solution = closed(solution, clock)
+        solution = with_last_phase(solution, clock)
     solution.stats.update(
         seconds=clock.stepping, compile_seconds=clock.elapsed() - clock.stepping, bytes=needed, horizon=horizon
     )
@@ -148,7 +150,7 @@ def _solution_at_horizon(on: Discretisation, horizon: float, start: Nodes | None
     """The solution of a march that ended before its first step: the value it was to start from; NaN if not known."""
     value = np.full((1, *on.grid.shape), np.nan if start is None else np.asarray(start), on.dtype)
     message = f"The march did not leave t = {horizon:g}. {epochs.ADVICE[code]}"
-    return altered(unstarted(on, value, code), times=np.array([horizon]), message=message)
+    return altered(solution_at_start(on, value, code), times=np.array([horizon]), message=message)
 
 
 def _check(problem: object, grid: object, scheme: Scheme, method: TimeMethod, step: object, time_limit: object) -> None:
@@ -168,7 +170,7 @@ def _check(problem: object, grid: object, scheme: Scheme, method: TimeMethod, st
 
 
 def _times(horizon: float, times: Sequence[float] | Array | None) -> tuple[float, np.ndarray]:
-    """The horizon and the kept times, checked."""
+    """The horizon as a number, and the kept times as an increasing array in [0, horizon]; refuse all others."""
     if is_traced(horizon, times):
         raise ValueError("march: horizon and times set the number of steps and must be known numbers, not traced ones")
     arguments.positive(horizon, "march: horizon", "in units of time")

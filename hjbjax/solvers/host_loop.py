@@ -32,7 +32,7 @@ _run_kept = jax.jit(fixed_point.run)
 
 
 def drive(task: Task, guess: Nodes, clock: Clock, most: int | None = None) -> tuple[State, Status, np.ndarray]:
-    """Chunks of steps until the state stops running, the steps or the time run out, or Ctrl-C.
+    """Run a task in chunks of steps until its state stops, the steps or the time run out, or Ctrl-C.
 
     Args:
       task: what to iterate.
@@ -48,7 +48,7 @@ def drive(task: Task, guess: Nodes, clock: Clock, most: int | None = None) -> tu
     state, residuals, nodes = fixed_point.begin(task, guess), [np.zeros(0)], " x ".join(map(str, task.grid.shape))
     code = clock.over()
     if code is not None:
-        return imposed(task, state), code, residuals[0]
+        return with_obstacles(task, state), code, residuals[0]
     chunk, done, code = _first_chunk(task, clock), -1, Status.RUNNING  # step −1 is the look at the guess
     step, before = (_run_kept if _calls_back(task) else run), state
     clock.phase = f"compiling for {nodes} nodes"
@@ -83,7 +83,7 @@ def drive(task: Task, guess: Nodes, clock: Clock, most: int | None = None) -> tu
             raise
     # a run that ended before its first look still holds the guess as it came
     if code is Status.NONFINITE or code in CUT:
-        state = imposed(task, state)
+        state = with_obstacles(task, state)
     return state, code, np.concatenate(residuals)[: int(state.step) + 1]
 
 
@@ -99,7 +99,7 @@ def _stop_status(clock: Clock, done: int, limit: int, nodes: int) -> Status:
     # one step on a large grid may take minutes, and nothing can cut it
     if code is None and clock.per_node is not None and clock.steps_in(clock.seconds - clock.elapsed(), nodes) < 1:
         code = Status.TIME_LIMIT
-    # who wants ten steps has had them, whatever the time; Ctrl-C alone says something else
+    # the steps that were asked for are done: that comes before a time limit, but not before Ctrl-C
     if done >= limit and code is not Status.INTERRUPTED:
         return Status.MAX_STEPS
     return Status.RUNNING if code is None else code
@@ -127,7 +127,7 @@ def _first_chunk(task: Task, clock: Clock) -> int:
     return int(np.clip(steps, 1, HISTORY - 1))  # one place of the history is the look's
 
 
-def imposed(task: Task, state: State) -> State:
+def with_obstacles(task: Task, state: State) -> State:
     """The state with what is given at its nodes, which a guess that nobody looked at does not have."""
     return dataclasses.replace(state, value=task.obstacles.impose(jnp.asarray(state.value)))
 

@@ -51,7 +51,7 @@ def estimate(problem: Problem, grid: Grid, method: Method, dtype: DType) -> int:
 def available() -> int | None:
     """Free bytes on the device that JAX computes on, or None where nobody says."""
     device = jax.devices()[0]
-    # of a CPU it is the machine that knows, and the limits of the process
+    # on a CPU the operating system is asked, below
     stats = device.memory_stats() if device.platform != "cpu" else None
     if stats and "bytes_limit" in stats:
         return int(stats["bytes_limit"]) - int(stats.get("bytes_in_use", 0))

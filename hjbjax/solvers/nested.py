@@ -117,7 +117,7 @@ def may_go_on(task: Task, assumptions: Assumptions, state: State, code: Status) 
 
 
 def settle(task: Task, assumptions: Assumptions, reached: Mask | None, guess: Nodes | None, clock: Clock) -> Settled:
-    """Solve with the nodes where the system can rest held; those that it had better leave are released, and again.
+    """The end of a solve with rest nodes held; those that it had better leave are released, and it goes on.
 
     Held, their value is an upper bound of the one sought, from which the iteration only descends: a released node that
     was too low would stay so, since resting costs nothing. A game that does not converge is asked from where its target
@@ -155,7 +155,7 @@ def settle(task: Task, assumptions: Assumptions, reached: Mask | None, guess: No
         # the bound by the least running cost wants it positive wherever V is not held, and at rest it is zero
         assumptions = dataclasses.replace(assumptions, certificate=Certificate.NONE)
         task = dataclasses.replace(
-            task, obstacles=resting.released(task.obstacles, pays), certificate=Certificate.NONE, least_cost=None
+            task, obstacles=resting.release(task.obstacles, pays), certificate=Certificate.NONE, least_cost=None
         )
         state, code, more = drive(task, state.value, clock)
         residuals = np.concatenate([residuals, more])
@@ -164,4 +164,5 @@ def settle(task: Task, assumptions: Assumptions, reached: Mask | None, guess: No
 
 @jax.jit
 def _leaving_pays(task: Task, value: jax.Array) -> jax.Array:
+    """The held rest nodes that it pays to leave, bool (*grid)."""
     return resting.leaving_pays(task.on.chain, task.obstacles, task.counted, value)

@@ -79,7 +79,7 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
     )
 
 
-def unstarted(on: Discretisation, value: Nodes, code: Status) -> Solution:
+def solution_at_start(on: Discretisation, value: Nodes, code: Status) -> Solution:
     """The solution of a run that ended before its first step: the value it was to start from, and no policy."""
     problem, value = on.problem, np.asarray(value, on.dtype)
     inputs = [0 if admissible is None else admissible.dim for admissible in (problem.controls, problem.disturbances)]
@@ -99,7 +99,7 @@ def unstarted(on: Discretisation, value: Nodes, code: Status) -> Solution:
     )  # fmt: skip
 
 
-def closed(solution: Solution, clock: Clock) -> Solution:
+def with_last_phase(solution: Solution, clock: Clock) -> Solution:
     """The solution with how far its run came, where that was cut short; no Ctrl-C is lost, even a late one."""
     if clock.interrupted and solution.status is Status.CONVERGED:
         message = f"It was interrupted after it had come to its end, and nothing is missing. {solution.message}"
@@ -128,7 +128,7 @@ def assemble(task: Task, state: State, assumptions: Assumptions) -> Solution:
 
 
 def _leaving(task: Task, state: State, grid: Grid) -> np.ndarray:
-    """At how many nodes of each end the optimal drift is cut off, with a warning where those are most of them."""
+    """Numbers of nodes at which the optimal drift is cut off, (n, 2), with a warning where they are most of an end."""
     value, policy, obstacles, counted = jax.device_get((state.value, state.policy, task.obstacles, task.counted))
     u, d = (list(players) for players in (policy.controls, policy.disturbances))
     cut, ends = edges.cut(task.problem, task.grid, value, u, d, counted & obstacles.acting(value))

@@ -32,7 +32,7 @@ from hjbjax.solution.status import Status
 from hjbjax.solvers import faults, memory, nested
 from hjbjax.solvers.host_loop import drive
 from hjbjax.solvers.nested import Settled
-from hjbjax.solvers.result import assemble, closed, finish, unstarted
+from hjbjax.solvers.result import assemble, finish, solution_at_start, with_last_phase
 from hjbjax.solvers.setup import choose, is_constrained, prepare_on_host, prepare_traced
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
@@ -108,8 +108,8 @@ def solve(
     # float64 for this call alone: another thread, and the caller's own programs, keep theirs
     with noting_interrupts(clock), jax.enable_x64(kind == np.float64):
         needed = memory.require(problem, grid, method, kind, max_memory)
-        with faults.explained(clock, needed, lambda kept: _partial(on, kept)):
-            solution = closed(_solve_on_host(on, method, tol, guess, clock), clock)
+        with faults.with_solution(clock, needed, lambda kept: _partial(on, kept)):
+            solution = with_last_phase(_solve_on_host(on, method, tol, guess, clock), clock)
     solution.stats.setdefault("method", method.described(problem.is_game))
     solution.stats.update(
         seconds=clock.stepping, compile_seconds=clock.elapsed() - clock.stepping,
@@ -127,7 +127,7 @@ def _partial(on: Discretisation, kept: faults.Kept | None) -> Solution:
     else:
         value, grid = kept
         value = value if grid.shape == on.grid.shape else transfer.prolong(value, grid, on.grid)
-    return unstarted(on, value, Status.INTERRUPTED)
+    return solution_at_start(on, value, Status.INTERRUPTED)
 
 
 def _solve_on_host(on: Discretisation, method: Method, tol: float, guess: Nodes | None, clock: Clock) -> Solution:
@@ -144,11 +144,11 @@ def _solve_on_host(on: Discretisation, method: Method, tol: float, guess: Nodes 
         start, shapes = nested.start(on.chain, method, tol, known, clock)
         task, assumptions, reached = prepare_on_host(on.chain, method=method.inner, tol=tol, clock=clock)
     except Stopped as stop:
-        return unstarted(on, np.zeros(grid.shape) if start is None else np.array(start), stop.status)
+        return solution_at_start(on, np.zeros(grid.shape) if start is None else np.array(start), stop.status)
     settled = nested.settle(task, assumptions, reached, start, clock)
     about: dict[str, Any] = {"levels": [*shapes, grid.shape]}
     if not on.scheme.monotone:
-        settled, apart = sharpened(settled, on.scheme, clock)
+        settled, apart = second_order(settled, on.scheme, clock)
         about |= apart
     solution = finish(settled, grid)
     if type(settled.task.method.evaluation) is not type(method.evaluation):
@@ -157,7 +157,7 @@ def _solve_on_host(on: Discretisation, method: Method, tol: float, guess: Nodes 
     return solution
 
 
-def sharpened(settled: Settled, scheme: Scheme, clock: Clock) -> tuple[Settled, dict[str, Any]]:
+def second_order(settled: Settled, scheme: Scheme, clock: Clock) -> tuple[Settled, dict[str, Any]]:
     """The second-order answer, from the monotone one, and how far apart they are.
 
     Its scheme is not monotone, so that no certificate of the chain holds for it.
@@ -202,7 +202,7 @@ def _solve_traced(
 
 
 def _without_rests_to_leave(task: Task, state: State) -> tuple[State, Scalar]:
-    """The state, stalled and without bounds if leaving a held rest node would pay, and if so: only the host goes on."""
+    """The state, and a flag: stalled and without bounds where leaving a held rest node pays, as only the host goes on."""
     pays = resting.leaving_pays(task.on.chain, task.obstacles, task.counted, state.value)
     # under a discount, which may be traced, no node was held for being at rest
     wrong = jnp.any(pays) & (state.code == Status.CONVERGED) & (task.problem.discount == 0)

@@ -32,7 +32,7 @@ LOOK = 10**7  # nodes times actions, or times jumps of a path, between two looks
 def _open_jumps(
     on: Discretisation, inside: jax.Array | None, clock: Clock, *, least: Number = 0.0, kinks: bool = False
 ) -> Rates:
-    """For every jump the nodes, bool (*grid), at which some action makes it and no other jump that leaves ``inside``.
+    """For every jump the nodes, bool (*grid), with an action that makes it and whose jumps all stay ``inside``.
 
     Without ``inside`` it is the box. Rates up to ``least`` are rounding; with ``kinks`` actions between the samples, at
     which a component of the drift vanishes, are tried as well.

@@ -202,7 +202,7 @@ def _solve_traced(
 
 
 def _without_rests_to_leave(task: Task, state: State) -> tuple[State, Scalar]:
-    """The state, and a flag: stalled and without bounds where leaving a held rest node pays, as only the host goes on."""
+    """The state and a flag: stalled, without bounds, where it pays to leave a held rest node; only the host goes on."""
     pays = resting.leaving_pays(task.on.chain, task.obstacles, task.counted, state.value)
     # under a discount, which may be traced, no node was held for being at rest
     wrong = jnp.any(pays) & (state.code == Status.CONVERGED) & (task.problem.discount == 0)

@@ -3,8 +3,6 @@
 Without costs and at V = 0 the Hamiltonian is zero where there is one, and infinite elsewhere.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,9 +15,10 @@ from hjbjax.iteration import bellman
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered
+from hjbjax.problem.types import DType, Mask
 
 
-def values(problem: Problem, grid: Grid, dtype: Any, t: float = 0.0) -> None:
+def values(problem: Problem, grid: Grid, dtype: DType, t: float = 0.0) -> None:
     """Refuse a problem that at some node forces the state out across a constrained end.
 
     Args:
@@ -34,15 +33,17 @@ def values(problem: Problem, grid: Grid, dtype: Any, t: float = 0.0) -> None:
     if not grid.sides("constrained"):
         return
     with jax.enable_x64(True):
-        stuck = np.asarray(_stuck(Discretisation(problem, grid, Upwind(), np.dtype(dtype), t)))
+        # the chain's scheme whatever the user's: which actions an end rules out depends on the drift alone
+        stuck = np.asarray(_without_action(Discretisation(problem, grid, Upwind(), np.dtype(dtype), t)))
     if not stuck.any():
         return
-    index = tuple(int(i) for i in np.argwhere(stuck)[0])
+    index = tuple(int(i) for i in np.argwhere(stuck)[0])  # the first one stands for all, which may be thousands
     ends = [
         f"the {'upper' if step > 0 else 'lower'} end of {grid.names[axis]}"
         for axis, step in grid.sides("constrained")
         if index[axis] == (grid.shape[axis] - 1 if step > 0 else 0)
     ]
+    # without a cost, as in the search itself: one that is no polynomial would make it a matter of samples
     exact = find_players(altered(problem, cost=None), grid.ndim, np.float64).exact
     found = "no action is admissible" if exact else "none of the sampled actions is admissible"
     raise ValueError(
@@ -55,9 +56,11 @@ def values(problem: Problem, grid: Grid, dtype: Any, t: float = 0.0) -> None:
 
 
 @jax.jit
-def _stuck(on: Discretisation) -> jax.Array:
+def _without_action(on: Discretisation) -> Mask:
     """The nodes off the target without an admissible action, bool (*grid)."""
+    # V = 0 and L = 0 leave the infinite price of leaving as the only term of H
     free = altered(on.problem, cost=None)
     hamiltonian = discrete.around(on.asking(free), jnp.zeros(on.grid.shape, on.dtype))
     least = discrete.optimise(hamiltonian)[0]
+    # on the target the run is over and needs no action
     return ~jnp.isfinite(least) & ~bellman.obstacles(on).fixed

@@ -7,7 +7,6 @@ found on the device, paths by a breadth-first search on the host, or on large gr
 """
 
 import functools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +19,7 @@ from hjbjax.finiteness import tried_actions
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.types import Array, Mask, Number, Scalar
 from hjbjax.solution.clock import Clock
 
 FEW = 9  # of each player in a game, where all pairs are
@@ -29,33 +29,51 @@ SEARCHABLE = 5 * 10**7  # jumps that a search on the host can list: some 60 byte
 LOOK = 10**7  # nodes times actions, or times jumps of a path, between two looks at the clock: about a second
 
 
-def _open_jumps(on: Discretisation, inside: jax.Array | None, clock: Clock, **options: Any) -> Rates:
-    """For every jump whether some action makes it while all jumps of that action stay ``inside``; None is the box."""
-    points = tried_actions.sampled(on.problem)
-    count, some, known = len(points), max(1, LOOK // on.grid.size), None
+def _open_jumps(
+    on: Discretisation, inside: jax.Array | None, clock: Clock, *, least: Number = 0.0, kinks: bool = False
+) -> Rates:
+    """For every jump the nodes, bool (*grid), with an action that makes it and whose jumps all stay ``inside``.
+
+    Without ``inside`` it is the box. Rates up to ``least`` are rounding; with ``kinks`` actions between the samples, at
+    which a component of the drift vanishes, are tried as well.
+    """
+    points = tried_actions.control_samples(on.problem)
+    known: Rates | None = None
+    count, some = len(points), max(1, LOOK // on.grid.size)
     for first in range(0, count, some):
         clock.enter(f"the jumps of the chain, {first} of {count} actions")
         last = min(first + some, count)
-        known = _also_open(on, inside, known, points[max(last - some, 0) : last], **options)
+        # always as many actions, the last lot overlapping the one before: another number would be another program
+        known = _more_open_jumps(on, inside, known, points[max(last - some, 0) : last], least=least, kinks=kinks)
     assert known is not None
     return known
 
 
 @functools.partial(jax.jit, static_argnames="kinks")
-def _also_open(
-    on: Discretisation, inside: Any, known: Any, points: Any, *, least: Any = 0.0, kinks: bool = False
+def _more_open_jumps(
+    on: Discretisation,
+    inside: jax.Array | None,
+    known: Rates | None,
+    points: Array,
+    *,
+    least: Number = 0.0,
+    kinks: bool = False,
 ) -> Rates:
     """The jumps that are known to be open and those of the actions ``points``, shape (count, m)."""
+    # a jump is open once any action makes it, so that the order of the actions, and one tried twice, change nothing
     grid, points = on.grid, jnp.asarray(points, on.dtype)
     mine = players_of(on).control
+    # once, with the first lot: they do not depend on the samples
     outmost = tried_actions.of_a_ball(on, mine) if kinks and known is None else []
     if known is None:
+        # the offsets are those of every action, since they follow from the noise and not from what is done
         start = chain.rates(on, list(points[0]))
         known = Rates(start.offsets, tuple(jnp.zeros(grid.shape, bool) for _ in start.offsets))
 
     def tried(actions, opened):
         for each in actions:
             rates = chain.rates(on, each)
+            # an action that a constrained end rules out makes no jump at all, not one to the node itself
             stays = ~edges.inadmissible(on, each)
             if inside is not None:
                 stays &= _stays(rates, grid, inside, least)
@@ -69,16 +87,17 @@ def _also_open(
     return Rates(known.offsets, jax.lax.fori_loop(0, len(points), also, tried(outmost, known.values)))
 
 
-def _stays(rates: Rates, grid: Grid, inside: jax.Array, least: Any) -> jax.Array:
-    """Where all jumps at rates above ``least`` lead ``inside``, bool (*grid)."""
+def _stays(rates: Rates, grid: Grid, inside: jax.Array, least: Number) -> jax.Array:
+    """The nodes from which all jumps at rates above ``least`` lead ``inside``, bool (*grid)."""
     stays = jnp.ones(grid.shape, bool)
     for offset, c in zip(rates.offsets, rates.values, strict=True):
+        # beyond the ends of the box there is no jump: rates that lead out are zero
         stays &= (c <= least) | stencil.neighbour(inside, grid, offset)
     return stays
 
 
 def reached(
-    on: Discretisation, held: np.ndarray, *, surely: bool, least: Any = 0.0, clock: Clock | None = None
+    on: Discretisation, held: np.ndarray, *, surely: bool, least: Number = 0.0, clock: Clock | None = None
 ) -> np.ndarray:
     """The nodes from which the held nodes can be reached; host level, for problems with one player.
 
@@ -95,38 +114,45 @@ def reached(
     on = on.on_grid(on.grid.walled)  # what goes on beyond an open end is not known to come back
     clock, found = clock or Clock(), np.zeros(on.grid.shape, bool)
     for kinks in (False, True):  # what samples do not reach may be reached by the one action that keeps to a way
-        found |= _by_some_actions(on, held, surely, clock, least=least, kinks=kinks)
+        # each pass alone is sound: whatever it finds is reached by actions of the set, so that the union is, too
+        found |= _reached_by_samples(on, held, surely, clock, least=least, kinks=kinks)
         if found.all():
             break
     return found
 
 
-def _by_some_actions(on: Discretisation, held: np.ndarray, surely: bool, clock: Clock, **options: Any) -> np.ndarray:
+def _reached_by_samples(
+    on: Discretisation, held: np.ndarray, surely: bool, clock: Clock, *, least: Number, kinks: bool
+) -> np.ndarray:
+    """The nodes from which the held ones are reached by the actions that are tried, bool (*grid)."""
+
     def staying(inside: jax.Array | None) -> np.ndarray:
-        return _leads_to(held, _open_jumps(on, inside, clock, **options), on.grid, clock)
+        return _backward_reach(held, _open_jumps(on, inside, clock, least=least, kinks=kinks), on.grid, clock)
 
     found, inside = staying(None), np.ones(on.grid.shape, bool)
     while surely and not np.array_equal(found, inside):
         inside = found
+        # nodes are taken away and never put back, as the largest fixed point wants: at most one round a node
         found = inside & staying(jnp.asarray(inside))
     return found
 
 
-def surely_reached(on: Discretisation, held: jax.Array, *, least: Any = 0.0) -> jax.Array:
+def surely_reached(on: Discretisation, held: Mask, *, least: Number = 0.0) -> jax.Array:
     """The nodes from which the held ones are reached with probability one, bool (*grid); inside a transformation."""
-    points, on = tried_actions.sampled(on.problem), on.on_grid(on.grid.walled)
+    points, on = tried_actions.control_samples(on.problem), on.on_grid(on.grid.walled)
     grid = on.grid
 
     def shrink(carry):
         inside, _ = carry
-        jumps = _also_open(on, inside, None, points, least=least, kinks=True)
-        found = inside & _further(held, jumps, grid, grid.size)[0]
+        # all in one program: no clock, no search on the host, and as many jumps as there are nodes if need be
+        jumps = _more_open_jumps(on, inside, None, points, least=least, kinks=True)
+        found = inside & _predecessors(held, jumps, grid, grid.size)[0]
         return found, jnp.any(found != inside)
 
     return jax.lax.while_loop(lambda carry: carry[1], shrink, (jnp.ones(grid.shape, bool), jnp.ones((), bool)))[0]
 
 
-def forced(on: Discretisation, held: np.ndarray, *, least: Any, clock: Clock) -> np.ndarray:
+def forced(on: Discretisation, held: np.ndarray, *, least: Number, clock: Clock) -> np.ndarray:
     """The nodes of a game from which the control reaches the held ones for certain, whatever the disturbance does.
 
     The largest set R in which some control keeps all jumps inside under every disturbance, and leads on to a nearer
@@ -135,24 +161,29 @@ def forced(on: Discretisation, held: np.ndarray, *, least: Any, clock: Clock) ->
     """
     found, on = np.ones(on.grid.shape, bool), on.on_grid(on.grid.walled)
     while True:
+        # the outer loop takes nodes away, the inner one starts from the target each time and climbs: a game of reaching
+        # while staying inside is the largest fixed point of a least one
         inside, nearer, more = found, jnp.asarray(held), True
         while more:
             clock.enter("the search for nodes from which the target can be forced")
-            nearer, more = _forced_further(on, inside, nearer, least)
+            nearer, more = _controllable_predecessors(on, inside, nearer, least)
         found = np.asarray(nearer)
         if np.array_equal(found, inside):
             return found
 
 
 @jax.jit
-def _forced_further(on: Discretisation, inside: jax.Array, found: jax.Array, least: Any) -> tuple[jax.Array, jax.Array]:
-    """The nodes one jump further from which the control leads to ``found`` and stays ``inside``; if there are more."""
+def _controllable_predecessors(
+    on: Discretisation, inside: jax.Array, found: jax.Array, least: Number
+) -> tuple[jax.Array, Scalar]:
+    """``found`` with the nodes from which the control leads there and stays ``inside``; and if that adds any."""
     problem, grid, dtype = on.problem, on.grid, on.dtype
     us, ds = (
         jnp.asarray(np.zeros((1, 0)) if admissible is None else sets.samples(admissible, FEW), dtype)
         for admissible in (problem.controls, problem.disturbances)
     )
     upper = problem.isaacs == "upper"
+    # who moves first is in the outer loop: in the upper game for some u all d, in the lower for all d some u
     outer, inner = (us, ds) if upper else (ds, us)
 
     def answered(first):
@@ -164,6 +195,7 @@ def _forced_further(on: Discretisation, inside: jax.Array, found: jax.Array, lea
                 jnp.logical_or, ((c > least) & stencil.neighbour(found, grid, offset) for offset, c in jumps)
             )
             allowed = ~edges.inadmissible(on, list(u), list(d))
+            # for every disturbance one jump is enough that leads on, for all of them none may leave
             good = leads & allowed & _stays(rates, grid, inside, least)
             return (ok & good if upper else ok | good), None
 
@@ -177,7 +209,7 @@ def _forced_further(on: Discretisation, inside: jax.Array, found: jax.Array, lea
 
 
 @jax.jit
-def refuge(on: Discretisation, inside: Any = None, dearest: Any = None) -> jax.Array:
+def refuge(on: Discretisation, inside: jax.Array | None = None, dearest: Scalar | None = None) -> jax.Array:
     """The nodes from which some actions of both players keep the state off the target for ever, bool (*grid).
 
     The largest set in which every node has an action whose jumps all stay in it: nodes without one are taken away until
@@ -193,13 +225,12 @@ def refuge(on: Discretisation, inside: Any = None, dearest: Any = None) -> jax.A
         jnp.asarray(np.zeros((1, 0)) if admissible is None else sets.samples(admissible, tried_actions.SAMPLES), dtype)
         for admissible in (problem.controls, problem.disturbances)
     )
-    mine, start = players_of(on).control, inside
-    if inside is None:
-        start = cut_cells.level(on) > 0
+    mine, start = players_of(on).control, cut_cells.level(on) > 0 if inside is None else inside
 
     def shrink(carry):
         inside, _ = carry
 
+        # dear actions are left out where the refuge has to be free of cost
         def kept(action, answer):
             allowed = ~edges.inadmissible(on, action, answer)
             if dearest is not None:
@@ -214,6 +245,7 @@ def refuge(on: Discretisation, inside: Any = None, dearest: Any = None) -> jax.A
         pairs = jnp.stack(jnp.meshgrid(jnp.arange(len(u)), jnp.arange(len(d)), indexing="ij"), -1).reshape(-1, 2)
         found = jnp.zeros(grid.shape, bool)
         for action in tried_actions.of_a_ball(on, mine):
+            # with any disturbance: kinks and a ball's outmost actions are those of one player, and a game has none
             found |= kept(action, list(d[0]))
         found = inside & jax.lax.scan(also, found, pairs)[0]
         return found, jnp.any(found != inside)
@@ -221,36 +253,39 @@ def refuge(on: Discretisation, inside: Any = None, dearest: Any = None) -> jax.A
     return jax.lax.while_loop(lambda carry: carry[1], shrink, (start, jnp.ones((), bool)))[0]
 
 
-def _leads_to(held: np.ndarray, jumps: Rates, grid: Grid, clock: Clock) -> np.ndarray:
-    """Nodes with a path of jumps to a held node."""
+def _backward_reach(held: np.ndarray, jumps: Rates, grid: Grid, clock: Clock) -> np.ndarray:
+    """The nodes with a path of jumps to a held node, bool (*grid)."""
+    # a pass over all nodes costs little on the device, and a path has as many as it has jumps: long ones, as in a maze,
+    # are left to the search, whose list of jumps has to fit into memory
     if grid.size > LARGE:
         listed = grid.size * len(jumps.offsets) <= SEARCHABLE
-        found = _spread(held, jumps, grid, clock, LONG * sum(grid.shape) if listed else grid.size)
+        found = _reach_on_device(held, jumps, grid, clock, LONG * sum(grid.shape) if listed else grid.size)
         if found is not None:
             return found
     clock.enter("the search for nodes that reach the target")
-    return _searched(held, jumps, grid)
+    return _reach_on_host(held, jumps, grid)
 
 
-def _spread(held: np.ndarray, jumps: Rates, grid: Grid, clock: Clock, most: int) -> np.ndarray | None:
+def _reach_on_device(held: np.ndarray, jumps: Rates, grid: Grid, clock: Clock, most: int) -> np.ndarray | None:
     """Nodes that lead to a held one, all at once on the device; None if their paths have more than ``most`` jumps."""
-    found, more, some = jnp.asarray(held), True, max(1, LOOK // grid.size)
+    found, more, some = jnp.asarray(held), True, max(1, LOOK // grid.size)  # jumps between two looks at the clock
     for step in range(0, most, some):
         clock.enter(f"the search for nodes that reach the target, paths of {step} jumps")
-        found, more = _further(found, jumps, grid, min(some, most - step))
+        found, more = _predecessors(found, jumps, grid, min(some, most - step))
         if not more:
             return np.asarray(found)
     return None
 
 
 @jax.jit
-def _further(found: jax.Array, jumps: Rates, grid: Grid, most: Any) -> tuple[jax.Array, jax.Array]:
-    """The nodes one jump further from the target, ``most`` times over; and whether there may be more."""
+def _predecessors(found: jax.Array, jumps: Rates, grid: Grid, most: int | Scalar) -> tuple[jax.Array, Scalar]:
+    """``found`` with the nodes that lead there in ``most`` jumps; and if there may be more."""
 
     def step(carry):
         found, _, count = carry
         more = found
         for offset, jump in zip(jumps.offsets, jumps.values, strict=True):
+            # with what this pass has found so far, so that one pass may follow several jumps
             more |= jump & stencil.neighbour(more, grid, offset)
         return more, jnp.any(more != found), count + 1
 
@@ -261,18 +296,21 @@ def _further(found: jax.Array, jumps: Rates, grid: Grid, most: Any) -> tuple[jax
     return found, more
 
 
-def _searched(held: np.ndarray, jumps: Rates, grid: Grid) -> np.ndarray:
-    """The same by a breadth-first search, however long the paths are."""
+def _reach_on_host(held: np.ndarray, jumps: Rates, grid: Grid) -> np.ndarray:
+    """The nodes with a path of jumps to a held node by a breadth-first search, however long the paths are."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import breadth_first_order
 
     starts = [np.flatnonzero(held)]
+    # the search wants one start: an extra node, numbered last, from which all held ones are one jump away
     ends = [np.full_like(starts[0], grid.size)]  # one more node leads to all held ones
     for offset, jump in zip(jumps.offsets, jumps.values, strict=True):
+        # jumps out of held nodes are left out: the run is over there
         leaves = ~held & np.asarray(jump)
         starts.append(np.flatnonzero(leaves))
         ends.append(stencil.numbers(grid, offset)[leaves])
     backward = np.concatenate(ends), np.concatenate(starts)
+    # the jumps turned round: from the target to all from which it can be reached
     graph = csr_array((np.ones(len(backward[0])), backward), shape=(grid.size + 1, grid.size + 1))
     found = np.zeros(grid.size + 1, bool)
     found[breadth_first_order(graph, grid.size, directed=True, return_predecessors=False)] = True

@@ -19,6 +19,7 @@ from hjbjax.discretisation.schemes import Upwind
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
+from hjbjax.problem.types import Array, DType, Mask, Numbers, Scalar
 from hjbjax.solution.clock import Clock
 from hjbjax.tracing import components
 from hjbjax.tracing.checks import OF_ACTION, STATE_COSTS, call
@@ -27,8 +28,8 @@ ACTIONS = 33  # at most so many actions of one player are tried, 9 where both pl
 LOOK = 10**7  # nodes times actions between two looks at the clock: about a second of a drift with some sines
 
 
-def values(problem: Problem, grid: Grid, dtype: Any, clock: Clock | None = None) -> None:
-    """Refuse what the functions return at the nodes: NaN, an empty target, noise that the chain cannot represent.
+def values(problem: Problem, grid: Grid, dtype: DType, clock: Clock | None = None) -> None:
+    """Refuse a problem by its numbers at the nodes: NaN, an empty target, noise that the chain cannot represent.
 
     Args:
       problem: the problem; one that passed ``checks.shapes``.
@@ -41,80 +42,89 @@ def values(problem: Problem, grid: Grid, dtype: Any, clock: Clock | None = None)
     """
     clock, actions = clock or Clock(), _actions(problem)
     on = Discretisation(problem, grid, Upwind(), np.dtype(dtype))
+    # for counts of 64 bits; the functions are evaluated in ``dtype`` all the same
     with jax.enable_x64(True):
-        if _all_sound(on, actions, clock):
+        # nearly every problem passes, and is spared counts and first nodes, which are slow on a CPU
+        if _all_pass(on, actions, clock):
             return
         clock.look()
         found = jax.device_get(_survey(on, actions))
+    # what is not finite first: comparisons with NaN are false, so that the rest would speak of something else
     for name in (*OF_ACTION, "target", *STATE_COSTS):
-        if name in found and found[name].count:
-            _not_finite(problem, grid, name, found[name], actions)
-    if "negative" in found and found["negative"].count:
+        if name in found and found[name].nodes:
+            _refuse_not_finite(problem, grid, name, found[name], actions)
+    if "negative" in found and found["negative"].nodes:
         where = _where(problem, grid, found["negative"], actions)
         raise ValueError(
             f"{call(problem, 'noise')} is negative at {where}.\nWanted numbers ≥ 0: it is σ in dx = f dt + σ dw; "
             "only an (n, k) matrix may hold negative entries"
         )
-    if "correlation" in found and found["correlation"].count:
-        _not_representable(problem, grid, found["correlation"], actions)
+    if "correlation" in found and found["correlation"].nodes:
+        _refuse_noise(problem, grid, found["correlation"], actions)
     if problem.target is not None:
-        _target(problem, grid, found["inside"], found["nearest"])
+        _check_target(problem, grid, int(found["inside"]), found["nearest"])
 
 
 class _Finding(NamedTuple):
-    """How many nodes, the first of them (flat), and for which action."""
+    """The number of nodes at fault, the first of them, counted flat, and the number of the action."""
 
-    count: Any
-    first: Any
-    action: Any
+    nodes: Array
+    first: Array
+    action: Array
 
 
 def _actions(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     """Representative pairs of control and disturbance, shapes (K, m) and (K, l)."""
     most = 9 if problem.is_game else ACTIONS
-    mine, theirs = (_thinned(admissible, most) for admissible in (problem.controls, problem.disturbances))
+    mine, theirs = (_representatives(admissible, most) for admissible in (problem.controls, problem.disturbances))
+    # all pairs, 81 of them at most: a game's functions may fail for one pair alone
     pairs = list(itertools.product(mine, theirs))
     return np.array([u for u, _ in pairs]), np.array([d for _, d in pairs])
 
 
-def _thinned(admissible: sets.AdmissibleSet | None, most: int) -> np.ndarray:
+def _representatives(admissible: sets.AdmissibleSet | None, most: int) -> np.ndarray:
+    """At most so many actions of one player, shape (K, m), the first and the last of its samples among them."""
     if admissible is None:
         return np.zeros((1, 0))
     points = np.asarray(sets.samples(admissible, 9))
     return points[np.unique(np.linspace(0, len(points) - 1, min(most, len(points))).round().astype(int))]
 
 
-def _all_sound(on: Discretisation, actions: tuple[Any, Any], clock: Clock) -> bool:
-    """Whether there is nothing that ``values`` refuses, some actions at a time."""
+def _all_pass(on: Discretisation, actions: tuple[np.ndarray, np.ndarray], clock: Clock) -> bool:
+    """True if ``values`` refuses nothing, some actions at a time."""
     count, some = len(actions[0]), max(1, LOOK // on.grid.size)
+    # in lots of about a second: ten million nodes and 33 actions take half a minute; all lots are one program, since
+    # first and last are arguments
     for first in range(0, count, some):
         clock.enter(f"the survey of the nodes, {first} of {count} actions")
-        if not _sound(on, actions, first, min(first + some, count)):
+        if not _actions_pass(on, actions, first, min(first + some, count)):
             return False
     return True
 
 
 @jax.jit
-def _sound(on: Discretisation, actions: tuple[Any, Any], first: Any, last: Any) -> jax.Array:
-    """Whether nothing is refused of the actions from ``first`` to before ``last``; with the first, of the state."""
-    amiss = jax.lax.cond(first == 0, lambda: _state_amiss(on), lambda: jnp.zeros((), bool))
+def _actions_pass(on: Discretisation, actions: tuple[Array, Array], first: int | Scalar, last: int | Scalar) -> Scalar:
+    """True if nothing is refused of the actions from ``first`` to before ``last``; with the first, of the state."""
+    # the state is looked at once, with the first lot
+    amiss = jax.lax.cond(first == 0, lambda: _state_fails(on), lambda: jnp.zeros((), bool))
     x, tried = on.coordinates(), jax.tree.map(lambda rows: jnp.asarray(rows, on.dtype), actions)
 
     def look(k, amiss):
         here, (u, d) = jax.lax.optimization_barrier((x, jax.tree.map(lambda rows: rows[k], tried)))  # see _survey
-        bad = _of_action(on, here, list(u), list(d)).values()
+        bad = _faults(on, here, list(u), list(d)).values()
         return amiss | jnp.any(functools.reduce(jnp.logical_or, bad))
 
     return ~jax.lax.fori_loop(first, last, look, amiss)
 
 
-def _state_amiss(on: Discretisation) -> jax.Array:
-    """Whether ``values`` refuses what the functions of the state alone return."""
+def _state_fails(on: Discretisation) -> Scalar:
+    """True if ``values`` refuses numbers that the functions of the state alone return."""
     problem = on.problem
     amiss, inside = jnp.zeros((), bool), jnp.ones((), bool)
     if problem.target is not None:
         distance = cut_cells.level(on)
         inside = distance <= 0
+        # a target that no node meets, or that all do, leaves no problem
         amiss |= ~jnp.all(jnp.isfinite(distance)) | ~jnp.any(inside) | jnp.all(inside)
     for name in STATE_COSTS:
         ingredient = getattr(problem, name)
@@ -125,16 +135,17 @@ def _state_amiss(on: Discretisation) -> jax.Array:
 
 
 @jax.jit
-def _survey(on: Discretisation, actions: tuple[Any, Any]) -> dict[str, Any]:
+def _survey(on: Discretisation, actions: tuple[Array, Array]) -> dict[str, Any]:
     """Counts and first nodes of everything that ``values`` refuses."""
     problem, grid, x = on.problem, on.grid, on.coordinates()
     found: dict[str, Any] = {}
-    inside: Any = True
+    inside: Mask | bool = True
     if problem.target is not None:
         distance = cut_cells.level(on)
         inside = distance <= 0
         found["target"] = _count(~jnp.isfinite(distance), grid)
         found["inside"] = jnp.sum(inside)
+        # the least value tells how much too coarse the grid is, or how much too small the target
         found["nearest"] = (jnp.min(distance), jnp.argmin(distance))
     for name in STATE_COSTS:
         ingredient = getattr(problem, name)
@@ -145,28 +156,29 @@ def _survey(on: Discretisation, actions: tuple[Any, Any]) -> dict[str, Any]:
     def body(carry, index_and_action):
         index, u, d = index_and_action
         here, u, d = jax.lax.optimization_barrier((x, u, d))  # or XLA keeps an array of all nodes per invariant
-        new = _of_action(on, here, list(u), list(d))
-        new = {name: _count(bad, grid, index) for name, bad in new.items()}
+        new = {name: _count(bad, grid, index) for name, bad in _faults(on, here, list(u), list(d)).items()}
         kept = {
-            name: jax.tree.map(functools.partial(jnp.where, carry[name].count > 0), carry[name], new[name])
+            name: jax.tree.map(functools.partial(jnp.where, carry[name].nodes > 0), carry[name], new[name])
             for name in new
         }
         return kept, None
 
     us, ds = (jnp.asarray(action, on.dtype) for action in actions)
+    # the first action at fault is kept, with its own count, and not the sum over all actions
     nothing = _Finding(*(jnp.zeros((), jnp.int64),) * 3)
-    names = jax.eval_shape(lambda: _of_action(on, x, list(us[0]), list(ds[0])))
+    names = jax.eval_shape(lambda: _faults(on, x, list(us[0]), list(ds[0])))
     carry, _ = jax.lax.scan(body, dict.fromkeys(names, nothing), (jnp.arange(len(us)), us, ds))
     return found | carry
 
 
-def _of_action(on: Discretisation, x: list, u: list, d: list | None) -> dict[str, Any]:
-    """Where drift, cost and noise are what they must not be, for one action."""
+def _faults(on: Discretisation, x: list, u: list, d: list | None) -> dict[str, Mask]:
+    """The nodes at which drift, cost and noise are not as they must be under one action, by the name of the fault."""
     problem = on.problem
 
     def faulty(entries):
         return functools.reduce(jnp.logical_or, (~jnp.isfinite(jnp.asarray(entry, on.dtype)) for entry in entries))
 
+    # only what is there: a problem without cost or noise compiles no look at it
     bad = {"drift": faulty(on.drift(u, d, x))}
     if problem.cost is not None:
         bad["cost"] = faulty([on.running_cost(u, d, x)])
@@ -175,15 +187,18 @@ def _of_action(on: Discretisation, x: list, u: list, d: list | None) -> dict[str
         bad["noise"] = faulty(a.values())
     if callable(problem.noise):
         sigma = components.components(problem.noise, *problem.arguments(x, u, d, 0.0), dtype=on.dtype)
+        # entries of a matrix may be negative, as a correlation is; a number or a diagonal is a size
         if sigma.ndim < 2:
             bad["negative"] = functools.reduce(jnp.logical_or, (jnp.asarray(entry) < 0 for entry in sigma.flat))
+    # jumps along diagonals take their rates from those along the axes, which must not fall below zero
     lacking = correlated_noise.lacking(on, a)
     if lacking is not None:
         bad["correlation"] = lacking
     return bad
 
 
-def _count(bad: Any, grid: Grid, action: Any = 0) -> _Finding:
+def _count(bad: Mask, grid: Grid, action: int | Scalar = 0) -> _Finding:
+    """The finding of the nodes ``bad`` under an action, by its number."""
     bad = jnp.broadcast_to(bad, grid.shape)
     # counting and argmax are slow on a CPU: they run where there is something to find
     count, first = jax.lax.cond(
@@ -197,19 +212,21 @@ def _count(bad: Any, grid: Grid, action: Any = 0) -> _Finding:
 # --- what is said ---
 
 
-def _numbers(entries: Any) -> str:
+def _numbers(entries: Numbers) -> str:
+    """A vector as it is printed in a refusal."""
     return "[" + ", ".join(f"{entry:.6g}" for entry in np.asarray(entries, dtype=float)) + "]"
 
 
-def _place(grid: Grid, flat: Any) -> tuple[tuple[int, ...], np.ndarray]:
+def _place(grid: Grid, flat: Array) -> tuple[tuple[int, ...], np.ndarray]:
+    """The index and the state of a node that is counted flat."""
     index = tuple(int(i) for i in np.unravel_index(int(flat), grid.shape))
     return index, grid.state(index)
 
 
-def _where(problem: Problem, grid: Grid, finding: _Finding, actions: tuple | None) -> str:
+def _where(problem: Problem, grid: Grid, finding: _Finding, actions: tuple[np.ndarray, np.ndarray] | None) -> str:
     """ "3 of 100 nodes, first at node (0, 1), x = [...], with u = [...]"."""
     index, x = _place(grid, finding.first)
-    text = f"{int(finding.count)} of {grid.size} nodes, first at node {index}, x = {_numbers(x)}"
+    text = f"{int(finding.nodes)} of {grid.size} nodes, first at node {index}, x = {_numbers(x)}"
     if actions is not None:
         given = zip("ud", actions, strict=True)
         played = [f"{letter} = {_numbers(rows[finding.action])}" for letter, rows in given if rows.shape[1]]
@@ -217,8 +234,10 @@ def _where(problem: Problem, grid: Grid, finding: _Finding, actions: tuple | Non
     return text
 
 
-def _not_finite(problem: Problem, grid: Grid, name: str, finding: _Finding, actions: tuple) -> NoReturn:
+def _refuse_not_finite(problem: Problem, grid: Grid, name: str, finding: _Finding, actions: tuple) -> NoReturn:
+    """Refuse a function that is NaN or infinite at some nodes."""
     ingredient = getattr(problem, name)
+    # a plain number is at fault everywhere, and no node need be named
     if not callable(ingredient):
         raise ValueError(f"Problem.{name}: got {np.asarray(ingredient)}, wanted finite numbers")
     where = _where(problem, grid, finding, actions if name in OF_ACTION else None)
@@ -229,7 +248,8 @@ def _not_finite(problem: Problem, grid: Grid, name: str, finding: _Finding, acti
     )
 
 
-def _target(problem: Problem, grid: Grid, inside: Any, nearest: tuple[Any, Any]) -> None:
+def _check_target(problem: Problem, grid: Grid, inside: int, nearest: tuple[Array, Array]) -> None:
+    """Refuse a target in which no node lies, or all; ``nearest`` is its least value and the node of that."""
     if 0 < inside < grid.size:
         return
     if inside:
@@ -244,7 +264,7 @@ def _target(problem: Problem, grid: Grid, inside: Any, nearest: tuple[Any, Any])
     )
 
 
-def _not_representable(problem: Problem, grid: Grid, finding: _Finding, actions: tuple) -> NoReturn:
+def _refuse_noise(problem: Problem, grid: Grid, finding: _Finding, actions: tuple) -> NoReturn:
     """Refuse correlated noise, with spacings for which its diagonal jumps leave no negative probability."""
     _, x = _place(grid, finding.first)
     u, d = (rows[finding.action] for rows in actions)

@@ -6,7 +6,6 @@ they should may be thinner than the samples are dense.
 
 import functools
 import itertools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,20 +15,21 @@ from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.hamiltonian.players import Player
 from hjbjax.problem import sets
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.sets import Ball
+from hjbjax.problem.sets import AdmissibleSet, Ball, Box
+from hjbjax.problem.types import Array, Mask
 from hjbjax.tracing import components
 
 COMBINATIONS = 32  # of kinks of all inputs that are tried with one action
 SAMPLES = 33  # actions of a continuum that are tried
 
 
-def sampled(problem: Problem) -> Any:
-    """Actions of the control (count, m); one of no entries where there is no control."""
+def control_samples(problem: Problem) -> Array:
+    """Actions of the control, shape (count, m); one of no entries where there is no control."""
     return np.zeros((1, 0)) if problem.controls is None else sets.samples(problem.controls, SAMPLES)
 
 
 def with_kinks(on: Discretisation, player: Player, action: list) -> list[list]:
-    """An action, and those with some inputs where one component of the drift vanishes: (x), each input on the nodes.
+    """An action, and those with some inputs moved to where a component of the drift vanishes; each input (*grid).
 
     Only there may a jump stay away that all samples make. Where the drift is not affine in the inputs there are none.
     """
@@ -37,11 +37,13 @@ def with_kinks(on: Discretisation, player: Player, action: list) -> list[list]:
     if not player.exact or on.problem.is_game:
         return found
     for j, driven in enumerate(player.driven):
+        # every input multiplies the count by one more than the components it drives: six inputs of one each make 64
         if len(found) * (1 + len(driven)) > COMBINATIONS:
             break
         for base in tuple(found):
             for kink in _kinks(on, player, base, j):
                 moved = [kink if k == j else entry for k, entry in enumerate(base)]
+                # a kink outside the set is no action: the sample itself stands in, which changes nothing
                 found.append(_where(_contains(player.admissible, moved), moved, base))
     return found
 
@@ -55,40 +57,51 @@ def of_a_ball(on: Discretisation, player: Player) -> list[list]:
     if not player.exact or on.problem.is_game or not isinstance(player.admissible, Ball):
         return []
     none, radius = [jnp.zeros((), on.dtype)] * player.admissible.dim, player.admissible.radius
+    # inputs of a ball drive at most one component each, so that a kink does not depend on the other inputs
     kinks = [_kinks(on, player, none, j) or [none[j]] for j in range(len(none))]
     found: list[list] = []
     for count in range(len(none)):
         if len(found) >= COMBINATIONS:
             break
         for still in itertools.combinations(range(len(none)), count):
+            # what the inputs at their kinks leave of |u|² ≤ r² for the one that goes furthest
             room = radius**2 - sum((kinks[j][0] ** 2 for j in still), start=none[0])
             for k, way in itertools.product(sorted(set(range(len(none))) - set(still)), (-1, 1)):
                 action = [kinks[j][0] if j in still else entry for j, entry in enumerate(none)]
+                # at nodes without such an action the room is negative, and its root NaN
                 action[k] = way * jnp.sqrt(jnp.maximum(room, 0))
                 found.append(_where(room >= 0, action, none))
     return found
 
 
-def _kinks(on: Discretisation, player: Player, base: list, j: int) -> list:
-    """Where the components that input j drives vanish, given the other inputs; its own place if they never do."""
+def _kinks(on: Discretisation, player: Player, base: list, j: int) -> list[jax.Array]:
+    """The values of input j, each (*grid), at which a component that it drives vanishes, given the other inputs.
+
+    Its own place where they never do.
+    """
     problem = on.problem
+    # f_i is affine in u_j: f_i = offset_i + slope_i u_j vanishes at −offset_i/slope_i
     at_zero = [jnp.zeros((), on.dtype) if k == j else entry for k, entry in enumerate(base)]
     offset = on.drift(at_zero)
     arguments = problem.arguments(on.coordinates(), at_zero, None, 0.0)
     slope = components.components(player.derivative(problem, problem.drift, j), *arguments, dtype=on.dtype)
     return [
-        jnp.where(slope[i] != 0, -offset[i] / jnp.where(slope[i] != 0, slope[i], 1), base[j]) for i in player.driven[j]
+        # a slope may vanish at some nodes: divided by one there, and not used
+        jnp.where(slope[i] != 0, -offset[i] / jnp.where(slope[i] != 0, slope[i], 1), base[j])
+        for i in player.driven[j]
     ]
 
 
-def _where(condition: jax.Array, action: list, otherwise: list) -> list:
+def _where(condition: Mask, action: list, otherwise: list) -> list[jax.Array]:
+    """One action or another, node by node."""
     return [jnp.where(condition, new, old) for new, old in zip(action, otherwise, strict=True)]
 
 
-def _contains(admissible: Any, action: list) -> Any:
-    """Where an action with an entry a node lies in a box or a ball."""
+def _contains(admissible: AdmissibleSet | None, action: list) -> Mask:
+    """The nodes at which an action lies in its box or ball."""
     if isinstance(admissible, Ball):
         return sum(u * u for u in action) <= admissible.radius**2
+    assert isinstance(admissible, Box)  # kinks are asked for where the minimum is exact: of no other set
     return functools.reduce(
         jnp.logical_and, ((u >= admissible.lo[j]) & (u <= admissible.hi[j]) for j, u in enumerate(action))
     )

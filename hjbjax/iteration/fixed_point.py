@@ -48,10 +48,10 @@ class Task:
     Args:
       on: the problem on its grid.
       method: how the correction is made.
-      rules: held nodes and constraints.
+      obstacles: fixed nodes and constraints.
       counted: bool (*grid), nodes that have a finite value.
       least_cost: the least running cost at each node, for the multiplicative certificate; else None.
-      pace: max Q + β at each node, for value iteration and for open ends; else None.
+      outflow: max Q + β at each node, for value iteration and for open ends; else None.
       tol: certified error to reach, cost units.
       certificate: which bound on the error applies.
       crossing: the time that it takes to cross the box at the largest speeds, where that was asked for; else None.

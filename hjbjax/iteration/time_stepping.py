@@ -35,7 +35,7 @@ class March:
     Args:
       on: the problem on its grid, with the slopes of a scheme.
       method: ``Explicit`` with its stages, or ``Implicit`` with its evaluation.
-      rules: held nodes and constraints; ``None`` where they depend on the time.
+      obstacles: fixed nodes and constraints; ``None`` where they depend on the time.
       limit: the longest stable step, inf if all are; ``None`` where it depends on the time.
       step: the longest step wanted; inf where the limit alone counts.
       horizon: the time at which the terminal cost is paid.

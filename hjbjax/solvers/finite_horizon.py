@@ -4,10 +4,9 @@ At host level it validates, finds the longest stable step, goes backward in chun
 one kept time to the next, and reports. Under a tracer the same steps run in a scan of fixed length.
 """
 
-import functools
 import itertools
 import math
-from typing import Any
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -19,20 +18,21 @@ from hjbjax.discretisation.schemes import Upwind
 from hjbjax.finiteness import admissibility, node_checks
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import bellman, time_stepping
-from hjbjax.iteration.evaluation import Krylov, Sweeps
+from hjbjax.iteration.evaluation import Evaluation, Krylov, Sweeps
 from hjbjax.iteration.methods import PolicyIteration
-from hjbjax.iteration.time_methods import Explicit, Implicit
+from hjbjax.iteration.time_methods import Explicit, TimeMethod
 from hjbjax.iteration.time_stepping import March
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, cast, is_traced
 from hjbjax.problem.sets import Box, Finite
+from hjbjax.problem.types import Array, DType, Mask, Nodes, Scalar
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
 from hjbjax.solvers import epochs, faults, memory
-from hjbjax.solvers.result import closed, unstarted
+from hjbjax.solvers.result import solution_at_start, with_last_phase
 from hjbjax.solvers.setup import choose
 from hjbjax.solvers.stationary import as_dtype, check_node_values
 from hjbjax.tracing import checks
@@ -51,13 +51,13 @@ def march(
     grid: Grid,
     horizon: float,
     *,
-    times: Any = None,
-    start: Any = None,
+    times: Sequence[float] | Array | None = None,
+    start: Nodes | None = None,
     scheme: Scheme = Upwind(split=True),
-    method: Explicit | Implicit | None = None,
+    method: TimeMethod | None = None,
     step: float | None = None,
     inner: float | None = None,
-    dtype: Any = None,
+    dtype: DType | None = None,
     time_limit: float | None = None,
     throw: bool = True,
     progress: bool | None = None,
@@ -117,14 +117,18 @@ def march(
     check_node_values(start, grid, "march: start")
     grid.check_spacings(kind)
     clock = Clock(seconds=time_limit, progress=progress)
+    # float64 for this call alone: the caller's own programs, and other threads, keep the type they have
     with noting_interrupts(clock), jax.enable_x64(kind == np.float64):
+        # before anything is compiled: a grid that does not fit is refused within a second
         needed = memory.fitting(_bytes(problem, grid, kept, method, kind), grid, max_memory)
         on = Discretisation(problem, grid, scheme, kind)
-        unmoved = functools.partial(_unmoved, on, horizon, start)
-        with faults.explained(clock, needed, unmoved):
+        with faults.with_solution(
+            clock, needed, lambda _: _solution_at_horizon(on, horizon, start, Status.INTERRUPTED)
+        ):
             try:
                 checks.shapes(problem, grid, scheme)
                 node_checks.values(_without_moving_target(problem), grid, kind, clock)
+                # a drift that changes in time may keep inside a constrained end now and not later
                 for t in np.linspace(horizon, 0.0, PROBES) if problem.time_dependent else (0.0,):
                     admissibility.values(problem, grid, kind, t)
                 clock.enter("the preparation")
@@ -132,8 +136,8 @@ def march(
                 slices, front, code = epochs.drive(task, kept, start, clock)
                 solution = epochs.assemble(task, grid, slices, front, code)
             except Stopped as stop:
-                solution = _unstarted(on, horizon, start, stop.status)
-        solution = closed(solution, clock)
+                solution = _solution_at_horizon(on, horizon, start, stop.status)
+        solution = with_last_phase(solution, clock)
     solution.stats.update(
         seconds=clock.stepping, compile_seconds=clock.elapsed() - clock.stepping, bytes=needed, horizon=horizon
     )
@@ -142,23 +146,19 @@ def march(
     return solution
 
 
-def _unmoved(on: Discretisation, horizon: float, start: Any, kept: Any) -> Solution:
-    """The solution of a march that broke before its first step."""
-    return _unstarted(on, horizon, start, Status.INTERRUPTED)
-
-
-def _unstarted(on: Discretisation, horizon: float, start: Any, code: Status) -> Solution:
+def _solution_at_horizon(on: Discretisation, horizon: float, start: Nodes | None, code: Status) -> Solution:
     """The solution of a march that ended before its first step: the value it was to start from; NaN if not known."""
     value = np.full((1, *on.grid.shape), np.nan if start is None else np.asarray(start), on.dtype)
     message = f"The march did not leave t = {horizon:g}. {epochs.ADVICE[code]}"
-    return altered(unstarted(on, value, code), times=np.array([horizon]), message=message)
+    return altered(solution_at_start(on, value, code), times=np.array([horizon]), message=message)
 
 
-def _check(problem: Any, grid: Any, scheme: Any, method: Any, step: Any, time_limit: Any) -> None:
-    """Refuse what no march can start with; needs no values of the problem's functions."""
+def _check(problem: object, grid: object, scheme: Scheme, method: TimeMethod, step: object, time_limit: object) -> None:
+    """Refuse arguments with which no march can start; needs no values of the problem's functions."""
     if not isinstance(problem, Problem) or not isinstance(grid, Grid):
         raise TypeError(f"march: got {type(problem).__name__}, {type(grid).__name__}; wanted a Problem and a Grid")
     schemes.check(scheme, "march: scheme", grid)
+    # a class has all these names as well: hjb.Explicit without its brackets
     if isinstance(method, type) or not all(hasattr(method, name) for name in ("filled", "step", "described")):
         raise TypeError(f"march: method is {method!r}; wanted hjb.Explicit(...) or hjb.Implicit(...)")
     if method.monotone_only and not scheme.monotone:
@@ -169,8 +169,8 @@ def _check(problem: Any, grid: Any, scheme: Any, method: Any, step: Any, time_li
         arguments.positive(time_limit, "march: time_limit", "in seconds", endless=True)
 
 
-def _times(horizon: Any, times: Any) -> tuple[float, np.ndarray]:
-    """The horizon and the kept times, checked."""
+def _times(horizon: float, times: Sequence[float] | Array | None) -> tuple[float, np.ndarray]:
+    """The horizon as a number, and the kept times as an increasing array in [0, horizon]; refuse all others."""
     if is_traced(horizon, times):
         raise ValueError("march: horizon and times set the number of steps and must be known numbers, not traced ones")
     arguments.positive(horizon, "march: horizon", "in units of time")
@@ -191,13 +191,15 @@ def _times(horizon: Any, times: Any) -> tuple[float, np.ndarray]:
     return float(horizon), kept
 
 
-def _bytes(problem: Problem, grid: Grid, kept: np.ndarray, method: Any, dtype: Any) -> int:
+def _bytes(problem: Problem, grid: Grid, kept: np.ndarray, method: TimeMethod, dtype: DType) -> int:
     """Bytes at the peak: kept slices and policies, two slices, slopes, constraints; the matrix if implicit."""
     word = np.dtype(dtype).itemsize
     actions = sum(admissible.dim for admissible in (problem.controls, problem.disturbances) if admissible is not None)
+    # in words a node: the kept slices and their actions; V before and after a chunk; P⁺ and P⁻ along every axis; held
+    # nodes, ψ and g; the actions of a stage
     slices = len(kept) * (1 + actions) + 2 + 2 * grid.ndim + 3 + actions
     if not method.limited:
-        inner = PolicyIteration(method.evaluation or Krylov())
+        inner = PolicyIteration(getattr(method, "evaluation", None) or Krylov())
         slices += memory.estimate(problem, grid, inner, dtype) // (word * grid.size)
     return word * slices * grid.size
 
@@ -210,42 +212,48 @@ def _without_moving_target(problem: Problem) -> Problem:
     return Problem(problem.drift, **{name: getattr(problem, name) for name in names}, time_dependent=True)
 
 
-def _prepare(on: Discretisation, horizon: float, method: Any, step: float | None, inner: float | None) -> March:
+def _prepare(on: Discretisation, horizon: float, method: TimeMethod, step: float | None, inner: float | None) -> March:
     """The task of a march, all arrays in its type, with a given step held against the limit."""
     on, dtype = cast(on, on.dtype), on.dtype
     problem, grid = on.problem, on.grid
     moving = problem.time_dependent
-    limit: Any = jnp.asarray(jnp.inf, dtype)
+    limit: Scalar = jnp.asarray(jnp.inf, dtype)
     method = method.filled(on, _evaluation(problem, grid))
     if method.limited:
+        # 1/(max Q + β) changes with the time if the functions do: a given step is held against the least of many, one
+        # that is left open is found anew before every step
         probes = np.linspace(horizon, 0.0, PROBES) if moving else [horizon]
         if step is not None or not moving:
             limits = [_stable(on.at(jnp.asarray(t, dtype))) for t in probes]
             limit = jnp.min(jnp.stack(limits))
+            # the Euler steps inside a stage are c Δt long, and c Δt (max Q + β) ≤ 1 is what keeps them monotone
             _check_step(step, float(limit) / method.tableau.euler)
-        if moving:
-            limit = None
-        else:
-            limit = jnp.asarray(limit * (method.courant if step is None else 1 / method.tableau.euler), dtype)
+        courant = method.courant if step is None else 1 / method.tableau.euler
+        limit = jnp.asarray(limit * courant, dtype)
     checks = _checks(on, method)
     if step is None:  # rates that are found on the way say nothing of the first steps
         step = horizon / FEWEST if moving or checks[0] or not method.limited else math.inf
+    obstacles, limit_known = (None, not method.limited) if moving else (_obstacles(on), True)
     return March(
-        on, method, None if moving else _obstacles(on), limit, jnp.asarray(step, dtype),
-        jnp.asarray(horizon, dtype), _watched(on, inner), *checks,
+        on, method, obstacles, limit if limit_known else None, jnp.asarray(step, dtype),
+        jnp.asarray(horizon, dtype), _blow_up_nodes(on, inner), *checks,
     )  # fmt: skip
 
 
-def _checks(on: Discretisation, method: Any) -> tuple[bool, bool]:
-    """Whether steps must look at rates and at correlated noise under the actions that they choose."""
+def _checks(on: Discretisation, method: TimeMethod) -> tuple[bool, bool]:
+    """Two flags: steps must look at the rates, and at correlated noise, under the actions that they choose."""
     problem = on.problem
     players, moving = players_of(on), problem.time_dependent
+    # Q is known beforehand where it is largest at an end of the sets; else under the actions that are chosen alone
     sampled = not (players.control.fastest_at_ends and players.disturbance.fastest_at_ends)
+    # a stage after the first looks at a later time, at which Q may have grown beyond the limit of the first
     rates = method.limited and (sampled or (moving and len(method.tableau.means) > 1))
     return rates, callable(problem.noise) and (moving or players.steers_noise)
 
 
 def _check_step(step: float | None, limit: float) -> None:
+    """Refuse a step longer than the stability limit."""
+    # who computes the limit by hand is off by rounding, in float32 by some 1e-7
     if step is not None and step > limit * (1 + 1e-6):
         raise ValueError(
             f"march: step = {step:g} is above the stability limit 1/(max Q + β) = {limit:.6g} of explicit steps "
@@ -253,18 +261,21 @@ def _check_step(step: float | None, limit: float) -> None:
         )
 
 
-def _evaluation(problem: Problem, grid: Grid) -> Any:
+def _evaluation(problem: Problem, grid: Grid) -> Evaluation:
+    """The evaluation of policies in an implicit step that suits the problem."""
     if grid.sides("open"):
         chosen = choose(problem, grid, traced=False)
         return chosen.evaluation or Krylov()
+    # sweeps follow the drift and are slow where noise spreads news both ways
     return Sweeps() if problem.noise is None else Krylov()
 
 
-def _watched(on: Discretisation, share: float | None) -> Any:
+def _blow_up_nodes(on: Discretisation, share: float | None) -> Mask | None:
     """The nodes where a disturbance at its bound is taken for a blow-up; or None."""
     problem, grid = on.problem, on.grid
     if share is None:
         players = players_of(on).disturbance
+        # under a penalty γ²|d|² the worst disturbance is gᵀDV/2γ², at its bound only where DV has grown out of hand
         share = 0.5 if isinstance(players.admissible, Box) and all(players.curved) else 0.0
     if not arguments.is_number(share) or not 0 <= share <= 1:
         raise ValueError(f"march: inner = {share!r}; wanted the share of the box that is watched, from 0 (none) to 1")
@@ -276,9 +287,9 @@ def _watched(on: Discretisation, share: float | None) -> Any:
 
 
 def _march_traced(
-    on: Discretisation, horizon: float, kept: np.ndarray, start: Any, method: Any, step: float | None
+    on: Discretisation, horizon: float, kept: np.ndarray, start: Nodes | None, method: TimeMethod, step: float | None
 ) -> Solution:
-    """The same steps inside a JAX transformation, in a scan of fixed length: no chunks, no checks of values."""
+    """The solution of a march inside a JAX transformation, in a scan of fixed length: no chunks, no value checks."""
     if step is None:
         raise ValueError(
             "march: inside jit, vmap and grad the number of steps must be known: give step=, for explicit steps at "
@@ -290,6 +301,7 @@ def _march_traced(
     task = March(on, method, obstacles, jnp.inf, step, horizon, None)
     value, values, actions, count = time_stepping.terminal(on.at(horizon), start), [], [], 0
     for begin, end in itertools.pairwise([horizon, *kept[::-1].tolist()]):
+        # an interval of a whole number of steps takes no step more by rounding; a kept time at the horizon takes none
         steps = max(math.ceil((begin - end) / step - 1e-6), int(begin > end))
         value, count = time_stepping.repeat(task, value, begin, end, steps), count + steps
         values.append(value)

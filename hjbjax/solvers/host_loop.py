@@ -8,7 +8,7 @@ import contextlib
 import dataclasses
 import sys
 import time
-from typing import Any
+from collections.abc import Callable, Iterator
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ import numpy as np
 
 from hjbjax.iteration import fixed_point
 from hjbjax.iteration.fixed_point import HISTORY, State, Task
+from hjbjax.problem.types import Nodes
 from hjbjax.solution.clock import CHUNK_SECONDS, CUT, Clock
 from hjbjax.solution.status import Status
 from hjbjax.solvers import faults
@@ -30,8 +31,8 @@ run = jax.jit(fixed_point.run, donate_argnames="state")
 _run_kept = jax.jit(fixed_point.run)
 
 
-def drive(task: Task, guess: Any, clock: Clock, most: int | None = None) -> tuple[State, Status, np.ndarray]:
-    """Chunks of steps until the state stops running, the steps or the time run out, or Ctrl-C.
+def drive(task: Task, guess: Nodes, clock: Clock, most: int | None = None) -> tuple[State, Status, np.ndarray]:
+    """Run a task in chunks of steps until its state stops, the steps or the time run out, or Ctrl-C.
 
     Args:
       task: what to iterate.
@@ -42,11 +43,12 @@ def drive(task: Task, guess: Any, clock: Clock, most: int | None = None) -> tupl
     Returns:
       The last state, how it ended, and the residuals of all steps, that of the guess first.
     """
+    # a way to a guess, as by a vanishing discount, is worth few steps, whatever the solve may take
     limit = clock.max_steps if most is None else min(most, clock.max_steps)
     state, residuals, nodes = fixed_point.begin(task, guess), [np.zeros(0)], " x ".join(map(str, task.grid.shape))
     code = clock.over()
     if code is not None:
-        return imposed(task, state), code, residuals[0]
+        return with_obstacles(task, state), code, residuals[0]
     chunk, done, code = _first_chunk(task, clock), -1, Status.RUNNING  # step −1 is the look at the guess
     step, before = (_run_kept if _calls_back(task) else run), state
     clock.phase = f"compiling for {nodes} nodes"
@@ -55,10 +57,11 @@ def drive(task: Task, guess: Any, clock: Clock, most: int | None = None) -> tupl
             before, state = state, step(task, state, -1)  # compiles and does nothing
             while code is Status.RUNNING:
                 began = time.perf_counter()
-                code = _ended(clock, done, limit, task.grid.size)
+                code = _stop_status(clock, done, limit, task.grid.size)
                 if code is not Status.RUNNING:
                     break
                 clock.phase = f"step {done + 1} on {nodes} nodes" + ", on the way to a guess" * (most is not None)
+                # the look at the guess, step −1, comes with the first chunk unless that is of no steps
                 until = min(max(done, 0) + chunk, limit)
                 before, state = (
                     state,
@@ -67,61 +70,70 @@ def drive(task: Task, guess: Any, clock: Clock, most: int | None = None) -> tupl
                 code, steps = Status(int(state.code)), int(state.step) - done
                 residuals.append(np.asarray(state.history)[:steps])
                 clock.count(time.perf_counter() - began, steps, task.grid.size)
+                # a chunk records the residuals of HISTORY steps at most; a short one is timed badly, hence the 8
                 chunk = int(np.clip(clock.steps_in(CHUNK_SECONDS, task.grid.size), 1, min(HISTORY, 8 * max(chunk, 1))))
-                show(steps - (done < 0), float(state.bound.error))
+                show(steps - (done < 0), float(state.bound.error))  # the look is no step
                 done += steps
         except KeyboardInterrupt:  # the second one, or by a handler of the user's own
             clock.interrupted, code = True, Status.INTERRUPTED
             residuals.append(np.asarray(state.history)[: int(state.step) - done])  # of steps not yet written down
         except Exception as error:
+            # the state of the step that failed, the one before unless it was donated, and what it all began with
             faults.keep(error, task.grid, lambda: state.value, lambda: before.value, lambda: guess)
             raise
+    # a run that ended before its first look still holds the guess as it came
     if code is Status.NONFINITE or code in CUT:
-        state = imposed(task, state)
+        state = with_obstacles(task, state)
     return state, code, np.concatenate(residuals)[: int(state.step) + 1]
 
 
 def _calls_back(task: Task) -> bool:
+    """True if a step calls Python on the host, be it for a solve or in a function of the user's."""
     evaluation = getattr(task.method, "evaluation", None)
     return (evaluation is not None and evaluation.calls_back) or checks.calls_back(task.problem, task.grid.ndim)
 
 
-def _ended(clock: Clock, done: int, limit: int, nodes: int) -> Status:
-    """Why no chunk may follow; else RUNNING. A step that would come too late by the pace of the last is not begun."""
+def _stop_status(clock: Clock, done: int, limit: int, nodes: int) -> Status:
+    """The status that forbids another chunk, else RUNNING; a step that the last pace makes too late is not begun."""
     code = clock.over()
+    # one step on a large grid may take minutes, and nothing can cut it
     if code is None and clock.per_node is not None and clock.steps_in(clock.seconds - clock.elapsed(), nodes) < 1:
         code = Status.TIME_LIMIT
+    # the steps that were asked for are done: that comes before a time limit, but not before Ctrl-C
     if done >= limit and code is not Status.INTERRUPTED:
         return Status.MAX_STEPS
     return Status.RUNNING if code is None else code
 
 
 def _first_chunk(task: Task, clock: Clock) -> int:
-    """How many steps to take before anything is timed on this grid, beside the look at the guess.
+    """Steps of the first chunk on this grid, before any is timed there, beside the look at the guess.
 
     A coarser grid tells what they take; a finer one may fall out of the cache, hence half a chunk's time. One alone
     where a step may take many passes over the nodes, and more of them on a finer grid.
     """
     method, nodes = task.method, task.grid.size
+    # the look is one pass over the nodes, a step with a linear solve hundreds: it is timed before one is begun
     if clock.per_node is None and nodes > MANY_NODES:
         return 0
     evaluation = getattr(method, "evaluation", None)
+    # a Krylov or direct solve takes more passes on finer grids, and so do the replies of a game: what a step took on a
+    # coarser grid says nothing
     if task.problem.is_game or (evaluation is not None and not evaluation.rough):
         return 1
     if clock.per_node is None:
         steps = FIRST_NODES / nodes
     else:
         steps = clock.steps_in(min(CHUNK_SECONDS / 2, clock.seconds - clock.elapsed()), nodes)
-    return int(np.clip(steps, 1, HISTORY - 1))
+    return int(np.clip(steps, 1, HISTORY - 1))  # one place of the history is the look's
 
 
-def imposed(task: Task, state: State) -> State:
+def with_obstacles(task: Task, state: State) -> State:
     """The state with what is given at its nodes, which a guess that nobody looked at does not have."""
     return dataclasses.replace(state, value=task.obstacles.impose(jnp.asarray(state.value)))
 
 
 @contextlib.contextmanager
-def _bar(progress: bool | None, tol: float) -> Any:
+def _bar(progress: bool | None, tol: float) -> Iterator[Callable[[int, float], None]]:
     """A progress bar on a terminal after one second; silent elsewhere."""
     if progress is False or (progress is None and not sys.stderr.isatty()):
         yield lambda steps, error: None
@@ -138,7 +150,7 @@ def _bar(progress: bool | None, tol: float) -> Any:
 
 
 @contextlib.contextmanager
-def ticker(progress: bool | None, total: float, what: str) -> Any:
+def ticker(progress: bool | None, total: float, what: str) -> Iterator[Callable[[float, int], None]]:
     """A progress bar over the problem's own time; ``show(done, steps)`` moves it."""
     if progress is False or (progress is None and not sys.stderr.isatty()):
         yield lambda done, steps: None

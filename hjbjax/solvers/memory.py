@@ -9,7 +9,6 @@ import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -18,12 +17,13 @@ from hjbjax.iteration.methods import Method
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_discounted
+from hjbjax.problem.types import DType
 
 INDEXABLE = 2**31  # nodes that 32-bit indices can number
 NO_GRID = "hjb.pontryagin(problem, x0) finds the optimal path from one state without a grid"
 
 
-def estimate(problem: Problem, grid: Grid, method: Method, dtype: Any) -> int:
+def estimate(problem: Problem, grid: Grid, method: Method, dtype: DType) -> int:
     """Bytes that a solve keeps at its peak, from a count of the arrays that live at once.
 
     The state is the value, the rate that is left and the policy. A look at it makes the next one beside it; sweeps
@@ -33,9 +33,12 @@ def estimate(problem: Problem, grid: Grid, method: Method, dtype: Any) -> int:
     word, n = np.dtype(dtype).itemsize, grid.ndim
     actions = sum(admissible.dim for admissible in (problem.controls, problem.disturbances) if admissible is not None)
     conditions = (problem.target, problem.stopping_cost, problem.running_max, problem.disturbances)
+    # V and its defect, the actions, what is given at the nodes or bounds V there, the least cost where that certifies;
+    # and two masks of a byte: the nodes that are held, and those that count
     kept = word * (2 + actions + sum(each is not None for each in conditions) + (is_discounted(problem) is False)) + 2
     look, correction = word * (4 + 2 * actions), 0
     if method.evaluation is not None and not method.relaxes:
+        # 2n jumps along the axes and four diagonal ones for each pair of axes
         weights = 2 * n * n if np.ndim(problem.noise) == 2 or callable(problem.noise) else 2 * n
         if problem.noise is None and method.evaluation.rough:
             weights = n  # one way an axis, since sweeps may keep the two as one
@@ -48,6 +51,7 @@ def estimate(problem: Problem, grid: Grid, method: Method, dtype: Any) -> int:
 def available() -> int | None:
     """Free bytes on the device that JAX computes on, or None where nobody says."""
     device = jax.devices()[0]
+    # on a CPU the operating system is asked, below
     stats = device.memory_stats() if device.platform != "cpu" else None
     if stats and "bytes_limit" in stats:
         return int(stats["bytes_limit"]) - int(stats.get("bytes_in_use", 0))
@@ -56,25 +60,26 @@ def available() -> int | None:
 
 
 def _of_machine() -> int | None:
-    """What the machine has free, with caches that it would give up."""
+    """Bytes that the machine has free, with caches that it would give up."""
     try:
         with open("/proc/meminfo") as lines:
             for line in lines:
-                if line.startswith("MemAvailable:"):
+                if line.startswith("MemAvailable:"):  # not MemFree, from which the caches of files are missing
                     return int(line.split()[1]) * 1024
-        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")  # a system without that line
     except (OSError, ValueError, AttributeError):
         return None
 
 
 def _of_process() -> int | None:
-    """What the limit on the address space of this process leaves; None without one."""
+    """Bytes that the limit on the address space of this process leaves; None without one."""
     try:
         import resource
 
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
         if limit == resource.RLIM_INFINITY:
             return None
+        # the first number is of addresses, which the limit is on, and not of pages in use
         used = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
     except (ImportError, OSError, ValueError, AttributeError):  # Windows; a system without /proc
         return None
@@ -82,9 +87,10 @@ def _of_process() -> int | None:
 
 
 def _of_groups(process: Path = Path("/proc/self"), mount: Path = Path("/sys/fs/cgroup")) -> int | None:
-    """What the control groups of this process leave, of both versions; None where none is limited."""
+    """Bytes that the control groups of this process leave, of both versions; None where none is limited."""
     left = []
     for folder in _groups(process, mount):
+        # version 2, version 1
         for most, used in (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes")):
             with contextlib.suppress(OSError, ValueError):  # "max" is no number, and no limit
                 limit = int((folder / most).read_text())
@@ -98,11 +104,13 @@ def _groups(process: Path, mount: Path) -> Iterator[Path]:
         lines = (process / "cgroup").read_text().splitlines()
     except OSError:
         return
+    # lines are "0::/path" in version 2 and "4:memory,cpu:/path" in version 1
     for number, controllers, path in (line.split(":", 2) for line in lines if line.count(":") >= 2):
         if number != "0" and "memory" not in controllers.split(","):
             continue
         top = mount if number == "0" else mount / "memory"
         folder = top / path.strip("/")
+        # a group is bound by the limits of all that hold it
         while folder != top:
             yield folder
             folder = folder.parent
@@ -117,8 +125,8 @@ def _reclaimable(folder: Path) -> int:
     return 0
 
 
-def require(problem: Problem, grid: Grid, method: Method, dtype: Any, limit: int | None) -> int:
-    """The estimate, if it fits.
+def require(problem: Problem, grid: Grid, method: Method, dtype: DType, limit: int | None) -> int:
+    """Bytes that a solve needs, by the estimate, if they fit.
 
     Raises:
       MemoryError: with the estimate, what is free, and the largest N that fits.
@@ -138,24 +146,27 @@ def fitting(needed: int, grid: Grid, limit: int | None) -> int:
     if grid.size >= INDEXABLE:
         largest = math.floor((INDEXABLE - 1) ** (1 / grid.ndim))
         raise MemoryError(
-            f"{_product(grid)} = {grid.size:,} nodes; 32-bit indices number fewer than {INDEXABLE:,}.\n"
+            f"{_counts(grid)} = {grid.size:,} nodes; 32-bit indices number fewer than {INDEXABLE:,}.\n"
             f"At most N = {largest} points an axis in {grid.ndim}-D; {NO_GRID}."
         )
+    # in proportion to the nodes: the largest grid that would fit has free/needed times as many
     if free is not None and needed > free:
         raise MemoryError(
-            f"{_product(grid)} = {grid.size:,} nodes need about {needed / 1e9:.3g} GB, {free / 1e9:.3g} GB are free.\n"
-            f"{_fits(free / needed * grid.size, grid.ndim)}; max_memory= (bytes) overrides what counts as free.\n"
+            f"{_counts(grid)} = {grid.size:,} nodes need about {needed / 1e9:.3g} GB, {free / 1e9:.3g} GB are free.\n"
+            f"{_largest(free / needed * grid.size, grid.ndim)}; max_memory= (bytes) overrides what counts as free.\n"
             f"dtype='float32' takes about half; {NO_GRID}."
         )
     return needed
 
 
-def _fits(nodes: float, n: int) -> str:
+def _largest(nodes: float, n: int) -> str:
+    """A sentence on the points an axis of the largest grid of n axes with so many nodes."""
     largest = math.floor(nodes ** (1 / n))
     if largest < 2:
         return f"Not even two points an axis would fit in {n}-D"
     return f"About N = {largest} points an axis would fit in {n}-D"
 
 
-def _product(grid: Grid) -> str:
+def _counts(grid: Grid) -> str:
+    """The points of all axes, as in "41 x 81"."""
     return " x ".join(map(str, grid.shape))

@@ -18,7 +18,8 @@ from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import is_traced
-from hjbjax.problem.sets import Finite
+from hjbjax.problem.sets import AdmissibleSet, Finite
+from hjbjax.problem.types import Array, Field, Mask, Nodes, Scalar
 from hjbjax.solution.clock import CUT, Clock
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
@@ -38,17 +39,19 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
     stopped = cut or code in CUT
     if not stopped:
         _refuse_noise(task, state, grid)
+    # V falls by the same amount a step for ever, which neither the residual nor the number of steps can tell
     earning = None if stopped else earnings.earned(task, state)
     code = code if earning is None else Status.DIVERGED
     gap = None if stopped else _isaacs_gap(task, state)
-    unanswered = stopped or code in (Status.DIVERGED, Status.NONFINITE)
+    unanswered = stopped or code in (Status.DIVERGED, Status.NONFINITE)  # there is no optimal drift to speak of
     leaving = None if unanswered else _leaving(task, state, grid)
     state = jax.device_get(state)
     solution = assemble(task, state, assumptions)
     lost = ~np.asarray(task.counted)
     arrays = {name: getattr(solution, name) for name in ("value", "policy", "disturbance")}
+    # what the device hands over may be read-only
     arrays = {name: None if array is None else np.require(array, requirements="W") for name, array in arrays.items()}
-    arrays["value"][lost] = np.inf
+    arrays["value"][lost] = np.inf  # until here they held a finite number above all others
     idle = lost | np.asarray(task.obstacles.ended) | (int(state.step) < 0)  # nobody looked for a policy yet
     for array in (arrays["policy"], arrays["disturbance"]):
         if array is not None:
@@ -65,7 +68,7 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
         discrete=solution.discrete,
         discrete_disturbance=solution.discrete_disturbance,
         residuals=residuals,
-        message=_message(code, task, state, grid) if earning is None else _endless(earning, grid),
+        message=_message(code, task, state, grid) if earning is None else _unbounded_message(earning, grid),
         stats={
             "scheme": repr(task.scheme),
             "device": str(jax.devices()[0].device_kind),
@@ -76,7 +79,7 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
     )
 
 
-def unstarted(on: Discretisation, value: Any, code: Status) -> Solution:
+def solution_at_start(on: Discretisation, value: Nodes, code: Status) -> Solution:
     """The solution of a run that ended before its first step: the value it was to start from, and no policy."""
     problem, value = on.problem, np.asarray(value, on.dtype)
     inputs = [0 if admissible is None else admissible.dim for admissible in (problem.controls, problem.disturbances)]
@@ -96,7 +99,7 @@ def unstarted(on: Discretisation, value: Any, code: Status) -> Solution:
     )  # fmt: skip
 
 
-def closed(solution: Solution, clock: Clock) -> Solution:
+def with_last_phase(solution: Solution, clock: Clock) -> Solution:
     """The solution with how far its run came, where that was cut short; no Ctrl-C is lost, even a late one."""
     if clock.interrupted and solution.status is Status.CONVERGED:
         message = f"It was interrupted after it had come to its end, and nothing is missing. {solution.message}"
@@ -107,7 +110,7 @@ def closed(solution: Solution, clock: Clock) -> Solution:
 
 
 def assemble(task: Task, state: State, assumptions: Assumptions) -> Solution:
-    """The solution as it stands in the state; pure."""
+    """The solution of a state, without what only the host finds out; pure, so that it may be traced."""
     problem = task.problem
     controls, disturbances = state.policy.controls, state.policy.disturbances
     xp: Any = jnp if is_traced(state) else np
@@ -125,7 +128,7 @@ def assemble(task: Task, state: State, assumptions: Assumptions) -> Solution:
 
 
 def _leaving(task: Task, state: State, grid: Grid) -> np.ndarray:
-    """At how many nodes of each end the optimal drift is cut off, with a warning where those are most of them."""
+    """Numbers of nodes at which the optimal drift is cut off, (n, 2), with a warning where they are most of an end."""
     value, policy, obstacles, counted = jax.device_get((state.value, state.policy, task.obstacles, task.counted))
     u, d = (list(players) for players in (policy.controls, policy.disturbances))
     cut, ends = edges.cut(task.problem, task.grid, value, u, d, counted & obstacles.acting(value))
@@ -162,6 +165,7 @@ def _refuse_noise(task: Task, state: State, grid: Grid) -> None:
     if not callable(task.problem.noise) or not players_of(task.on).steers_noise:
         return
     policy = state.policy
+    # the checks before a solve look at samples of the actions, and the exact minimum lies between them
     first = int(_lacking(task, policy.controls, policy.disturbances))
     if first < 0:
         return
@@ -176,32 +180,34 @@ def _refuse_noise(task: Task, state: State, grid: Grid) -> None:
     )
 
 
-def isaacs_gap(hamiltonian: discrete.DiscreteHamiltonian, free: Any) -> tuple[jax.Array, jax.Array]:
+def isaacs_gap(hamiltonian: discrete.DiscreteHamiltonian, free: Mask) -> tuple[Scalar, Scalar]:
     """The largest min max − max min over the ``free`` nodes, and how much the actions matter there, per unit time.
 
-    What actions matter is the largest difference of H between two pairs of them, of nine representatives a player.
+    How much they matter is the largest difference of H between two pairs of them, of nine representatives a player.
     """
     problem, dtype = hamiltonian.on.problem, hamiltonian.on.dtype
     upper, lower = (discrete.optimise(hamiltonian, isaacs=which)[0] for which in ("upper", "lower"))
     sets_of = (problem.controls, problem.disturbances)
     mine, theirs = (jnp.asarray(_representatives(admissible), dtype) for admissible in sets_of)
 
-    def compare(extremes: Any, pair: Any) -> tuple[Any, None]:
+    def compare(extremes: tuple[Field, Field], pair: jax.Array) -> tuple[tuple[Field, Field], None]:
         total = hamiltonian.at(list(mine[pair[0]]), list(theirs[pair[1]]))
         total = jnp.where(jnp.isfinite(total), total, upper)  # an action that an end of the box rules out
         return (jnp.minimum(extremes[0], total), jnp.maximum(extremes[1], total)), None
 
     pairs = jnp.asarray([(i, j) for i in range(len(mine)) for j in range(len(theirs))])
+    # one pair at a time: all 81 at once would be 81 arrays of the nodes
     (least, most), _ = jax.lax.scan(compare, (lower, upper), pairs)
     size = 1e3 * jnp.finfo(dtype).eps * (jnp.abs(least) + jnp.abs(most))  # no gap is less than rounding
     return jnp.max(jnp.where(free, upper - lower, 0)), jnp.max(jnp.where(free, most - least + size, 0))
 
 
-def _representatives(admissible: Any) -> Any:
+def _representatives(admissible: AdmissibleSet | None) -> Array:
     """At most nine actions of a player, shape (K, m), the first and the last of its samples among them."""
     if admissible is None:
         return np.zeros((1, 0))
     points = sets.samples(admissible, 9)
+    # a finite set may have thousands of points
     return points[np.unique(np.linspace(0, len(points) - 1, 9).round().astype(int))]
 
 
@@ -216,12 +222,14 @@ def warn_of_gap(gap: float, matter: float, isaacs: str) -> None:
 
 
 @jax.jit
-def _gap_at(task: Task, value: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _gap_at(task: Task, value: Field) -> tuple[Scalar, Scalar]:
+    """The Isaacs gap of a stationary game at V, and how much the actions matter, where V is not given."""
     hamiltonian = discrete.around(task.on, value, task.lost)
     return isaacs_gap(hamiltonian, task.counted & ~task.obstacles.fixed)
 
 
 def _isaacs_gap(task: Task, state: State) -> float | None:
+    """The gap at the last state, with a warning where it is large; None without a game."""
     if not task.problem.is_game:
         return None
     gap, matter = (float(number) for number in _gap_at(task, state.value))
@@ -229,7 +237,8 @@ def _isaacs_gap(task: Task, state: State) -> float | None:
     return gap
 
 
-def _endless(earning: earnings.Earning, grid: Grid) -> str:
+def _unbounded_message(earning: earnings.Earning, grid: Grid) -> str:
+    """The message of a value that is −∞, with a place where a policy earns for ever."""
     state = ", ".join(f"{x:.4g}" for x in grid.state(earning.node))
     return (
         f"The value is −∞: without discount, a policy can stay for ever where it pays {earning.mean:.3g} a unit time "
@@ -241,8 +250,9 @@ def _endless(earning: earnings.Earning, grid: Grid) -> str:
 _broken = jax.jit(fixed_point.broken)
 
 
-def _not_finite(task: Task, state: State, grid: Grid) -> str:
-    """Where NaN or infinity appeared, by taking the step once more that brought it."""
+def _not_finite_message(task: Task, state: State, grid: Grid) -> str:
+    """The message on NaN or infinity, with the place, found by taking the step once more that brought it."""
+    # the state holds the last finite value, so that nothing in it shows where the infinity began
     bad = np.asarray(_broken(task, state))
     step = int(state.step)
     when = "at the guess" if step == 0 else f"in step {step}"
@@ -264,8 +274,10 @@ def _not_finite(task: Task, state: State, grid: Grid) -> str:
 
 
 def _message(code: Status, task: Task, state: State, grid: Grid) -> str:
+    """The sentence that says how a solve ended, and what to do about it."""
     if code is Status.NONFINITE:
-        return _not_finite(task, state, grid)
+        return _not_finite_message(task, state, grid)
+    # the three certificates that bound no error cannot promise that a smaller tolerance is within reach
     best, tol = float(state.best[0]), float(task.tol)
     certified = task.certificate not in (Certificate.NONE, Certificate.RESIDUAL, Certificate.OPEN)
     if code is Status.STALLED and np.isfinite(best) and certified:

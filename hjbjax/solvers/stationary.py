@@ -24,6 +24,7 @@ from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_discounted
 from hjbjax.problem.pytree import altered, is_traced
+from hjbjax.problem.types import DType, Nodes, Number, Scalar
 from hjbjax.solution import transfer
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
@@ -31,11 +32,12 @@ from hjbjax.solution.status import Status
 from hjbjax.solvers import faults, memory, nested
 from hjbjax.solvers.host_loop import drive
 from hjbjax.solvers.nested import Settled
-from hjbjax.solvers.result import assemble, closed, finish, unstarted
+from hjbjax.solvers.result import assemble, finish, solution_at_start, with_last_phase
 from hjbjax.solvers.setup import choose, is_constrained, prepare_on_host, prepare_traced
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
 
+# no host looks on inside a transformation: far more steps than policy iteration takes, and an end for all others
 TRACED_STEPS = 10_000
 
 
@@ -47,8 +49,8 @@ def solve(
     method: Method | None = None,
     scheme: Scheme = Upwind(),
     tol: float = 1e-3,
-    guess: Any = None,
-    dtype: Any = None,
+    guess: Nodes | None = None,
+    dtype: DType | None = None,
     max_steps: int | None = None,
     time_limit: float | None = None,
     throw: bool = True,
@@ -103,10 +105,11 @@ def solve(
     grid.check_spacings(kind)
     method = method or choose(problem, grid, traced=False)
     clock = Clock(max_steps or 10**9, time_limit, progress)
+    # float64 for this call alone: another thread, and the caller's own programs, keep theirs
     with noting_interrupts(clock), jax.enable_x64(kind == np.float64):
         needed = memory.require(problem, grid, method, kind, max_memory)
-        with faults.explained(clock, needed, lambda kept: _partial(on, kept)):
-            solution = closed(_solve_on_host(on, method, tol, guess, clock), clock)
+        with faults.with_solution(clock, needed, lambda kept: _partial(on, kept)):
+            solution = with_last_phase(_solve_on_host(on, method, tol, guess, clock), clock)
     solution.stats.setdefault("method", method.described(problem.is_game))
     solution.stats.update(
         seconds=clock.stepping, compile_seconds=clock.elapsed() - clock.stepping,
@@ -117,18 +120,23 @@ def solve(
     return solution
 
 
-def _partial(on: Discretisation, kept: Any) -> Solution:
-    """The solution of a run that broke, from the value that was kept, maybe on a coarser grid; else zero."""
-    value = np.broadcast_to(np.zeros((), on.dtype), on.grid.shape) if kept is None else kept[0]  # takes no memory
-    if value.shape != on.grid.shape:
-        value = transfer.prolong(value, kept[1], on.grid)
-    return unstarted(on, value, Status.INTERRUPTED)
+def _partial(on: Discretisation, kept: faults.Kept | None) -> Solution:
+    """The solution of a run that broke, from the value that outlived it, maybe on a coarser grid; else zero."""
+    if kept is None:
+        value = np.broadcast_to(np.zeros((), on.dtype), on.grid.shape)  # one zero seen everywhere takes no memory
+    else:
+        value, grid = kept
+        value = value if grid.shape == on.grid.shape else transfer.prolong(value, grid, on.grid)
+    return solution_at_start(on, value, Status.INTERRUPTED)
 
 
-def _solve_on_host(on: Discretisation, method: Method, tol: float, guess: Any, clock: Clock) -> Solution:
-    """Checks, coarser grids, preparation and steps, in this order, as far as the clock lets them come."""
-    problem, grid, start = on.problem, on.grid, None if guess is None else np.asarray(guess, on.dtype)
+def _solve_on_host(on: Discretisation, method: Method, tol: float, guess: Nodes | None, clock: Clock) -> Solution:
+    """The solution by checks, coarser grids, preparation and steps, in this order, as far as the clock allows."""
+    problem, grid = on.problem, on.grid
+    start: Nodes | None = None if guess is None else np.asarray(guess, on.dtype)
     try:
+        # from cheap to dear: one state, all nodes, the ends of the box, the coarser grids, and only then what is
+        # compiled for the finest one
         checks.shapes(problem, grid, on.scheme)
         node_checks.values(problem, grid, on.dtype, clock)
         admissibility.values(problem, grid, on.dtype)
@@ -136,11 +144,11 @@ def _solve_on_host(on: Discretisation, method: Method, tol: float, guess: Any, c
         start, shapes = nested.start(on.chain, method, tol, known, clock)
         task, assumptions, reached = prepare_on_host(on.chain, method=method.inner, tol=tol, clock=clock)
     except Stopped as stop:
-        return unstarted(on, np.zeros(grid.shape) if start is None else np.array(start), stop.status)
+        return solution_at_start(on, np.zeros(grid.shape) if start is None else np.array(start), stop.status)
     settled = nested.settle(task, assumptions, reached, start, clock)
     about: dict[str, Any] = {"levels": [*shapes, grid.shape]}
     if not on.scheme.monotone:
-        settled, apart = sharpened(settled, on.scheme, clock)
+        settled, apart = second_order(settled, on.scheme, clock)
         about |= apart
     solution = finish(settled, grid)
     if type(settled.task.method.evaluation) is not type(method.evaluation):
@@ -149,7 +157,7 @@ def _solve_on_host(on: Discretisation, method: Method, tol: float, guess: Any, c
     return solution
 
 
-def sharpened(settled: Settled, scheme: Scheme, clock: Clock) -> tuple[Settled, dict[str, Any]]:
+def second_order(settled: Settled, scheme: Scheme, clock: Clock) -> tuple[Settled, dict[str, Any]]:
     """The second-order answer, from the monotone one, and how far apart they are.
 
     Its scheme is not monotone, so that no certificate of the chain holds for it.
@@ -157,6 +165,7 @@ def sharpened(settled: Settled, scheme: Scheme, clock: Clock) -> tuple[Settled, 
     task, state, over = settled.task, settled.state, clock.over()
     if over is not None:
         return settled._replace(code=over), {}
+    # the matrix stays that of the chain, the residual is of the better slopes: defect correction
     higher = dataclasses.replace(task, certificate=Certificate.RESIDUAL, on=dataclasses.replace(task.on, scheme=scheme))
     better, ended, more = drive(higher, state.value, clock)
     if int(better.step) < 0:  # it was stopped before its first look, and the monotone answer stands
@@ -168,8 +177,10 @@ def sharpened(settled: Settled, scheme: Scheme, clock: Clock) -> tuple[Settled, 
     return sharp, {"from_monotone": float(np.max(apart, initial=0))}
 
 
-def _solve_traced(on: Discretisation, method: Any, tol: Any, guess: Any, max_steps: Any) -> Solution:
-    """The iteration inside a JAX transformation: no chunks, no files, no exceptions, no checks of values."""
+def _solve_traced(
+    on: Discretisation, method: Method | None, tol: Number, guess: Nodes | None, max_steps: int | None
+) -> Solution:
+    """The solution inside a JAX transformation: no chunks, no files, no exceptions, no checks of values."""
     if not on.scheme.monotone:
         name = type(on.scheme).__name__
         raise ValueError(f"solve: {name}() runs at host level only; inside jit, vmap and grad use Upwind()")
@@ -177,21 +188,23 @@ def _solve_traced(on: Discretisation, method: Any, tol: Any, guess: Any, max_ste
     if method.coarsest is not None:
         raise ValueError("solve: Nested(...) runs at host level only; inside jit, vmap and grad use its inner method")
     task, assumptions = prepare_traced(on, method=method, tol=tol)
+    # the derivative is that of the fixed point, by the implicit function theorem, and not of the steps that led there
     frozen = jax.lax.stop_gradient(task)
     start = frozen.start() if guess is None else jax.lax.stop_gradient(jnp.asarray(guess, on.dtype))
     state = fixed_point.run(frozen, fixed_point.begin(frozen, start), max_steps or TRACED_STEPS)
     wrong = jnp.zeros((), bool)
     if assumptions.may_rest:
-        state, wrong = _doubted(frozen, state)
+        state, wrong = _without_rests_to_leave(frozen, state)
     solution, value = assemble(task, state, assumptions), adjoint.attach(task, state)
     wrong |= state.code == Status.NONFINITE
     value = value * jnp.where(wrong, jnp.nan, 1).astype(value.dtype)  # a derivative drops the code, and is NaN, too
     return altered(solution, value=jnp.where(task.counted, value, jnp.inf) if task.has_lost else value)
 
 
-def _doubted(task: Task, state: State) -> tuple[State, jax.Array]:
-    """The state, stalled and without bounds where leaving a held rest node would pay: the host alone goes on then."""
+def _without_rests_to_leave(task: Task, state: State) -> tuple[State, Scalar]:
+    """The state and a flag: stalled, without bounds, where it pays to leave a held rest node; only the host goes on."""
     pays = resting.leaving_pays(task.on.chain, task.obstacles, task.counted, state.value)
+    # under a discount, which may be traced, no node was held for being at rest
     wrong = jnp.any(pays) & (state.code == Status.CONVERGED) & (task.problem.discount == 0)
     gap, infinite = state.bound, jnp.asarray(jnp.inf, state.value.dtype)
     gap = dataclasses.replace(
@@ -202,8 +215,9 @@ def _doubted(task: Task, state: State) -> tuple[State, jax.Array]:
     return dataclasses.replace(state, bound=gap, code=code), wrong
 
 
-def as_dtype(dtype: Any) -> np.dtype:
+def as_dtype(dtype: DType | None) -> np.dtype:
     """The floating-point type that a user asked for; None is float64."""
+    # np.dtype reads many spellings, and raises TypeError at others
     for kind in (np.dtype(np.float64), np.dtype(np.float32)):
         with contextlib.suppress(TypeError):
             if kind == (np.float64 if dtype is None else np.dtype(dtype)):
@@ -211,16 +225,18 @@ def as_dtype(dtype: Any) -> np.dtype:
     raise ValueError(f"dtype: got {dtype!r}, wanted 'float64' or 'float32'")
 
 
-def check_limits(max_steps: Any, time_limit: Any) -> None:
-    """Refuse what limits no run."""
+def check_limits(max_steps: object, time_limit: object) -> None:
+    """Refuse a number of steps or of seconds that limits no run."""
     if max_steps is not None:
         arguments.count(max_steps, "solve: max_steps")
     if time_limit is not None:
         arguments.positive(time_limit, "solve: time_limit", "in seconds", endless=True)
 
 
-def check_arguments(problem: Any, grid: Any, method: Any, scheme: Any, tol: Any, guess: Any = None) -> None:
-    """Refuse what no solve can start with; needs no values of the problem's functions."""
+def check_arguments(
+    problem: object, grid: object, method: object, scheme: object, tol: object, guess: object = None
+) -> None:
+    """Refuse arguments with which no solve can start; needs no values of the problem's functions."""
     if not isinstance(problem, Problem) or not isinstance(grid, Grid):
         raise TypeError(f"solve: got {type(problem).__name__}, {type(grid).__name__}; wanted a Problem and a Grid")
     if method is not None:
@@ -238,8 +254,8 @@ def check_arguments(problem: Any, grid: Any, method: Any, scheme: Any, tol: Any,
         raise ValueError("solve: a time-dependent problem has no stationary value; it needs a finite horizon")
 
 
-def check_node_values(values: Any, grid: Grid, name: str) -> None:
-    """Refuse what cannot be a value at the nodes; None is none."""
+def check_node_values(values: object, grid: Grid, name: str) -> None:
+    """Refuse values that are not one finite real number a node; None passes."""
     if values is None:
         return
     try:
@@ -248,7 +264,7 @@ def check_node_values(values: Any, grid: Grid, name: str) -> None:
         raise ValueError(
             f"{name} is {arguments.shown(values)}; wanted real node values of shape {grid.shape}"
         ) from None
-    if array.dtype.kind not in "fiu":
+    if array.dtype.kind not in "fiu":  # truth values and complex numbers are none
         raise ValueError(f"{name} holds {array.dtype}; wanted real node values of shape {grid.shape}")
     if array.shape != grid.shape:
         hint = "; it looks transposed" if array.shape == grid.shape[::-1] else ""

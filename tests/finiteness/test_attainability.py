@@ -109,9 +109,9 @@ def test_paths_followed_on_the_device_are_those_of_the_search(monkeypatch, surel
     np.testing.assert_array_equal(reached(problem, PLANE, held, surely), searched)
     with jax.enable_x64(True):
         jumps = attainability._open_jumps(Discretisation(problem, PLANE, hjb.Upwind(), np.float64), None, Clock())
-        found = attainability._spread(held, jumps, PLANE, Clock(), long * sum(PLANE.shape))
+        found = attainability._reach_on_device(held, jumps, PLANE, Clock(), long * sum(PLANE.shape))
     if long:
-        np.testing.assert_array_equal(found, attainability._searched(held, jumps, PLANE))
+        np.testing.assert_array_equal(found, attainability._reach_on_host(held, jumps, PLANE))
     else:
         assert found is None
 
@@ -129,7 +129,7 @@ def test_how_often_the_clock_is_looked_at_changes_no_node(monkeypatch, surely):
     monkeypatch.setattr(attainability, "LOOK", 2 * PLANE.size)
     monkeypatch.setattr(attainability, "LONG", 0)
     monkeypatch.setattr(attainability, "SEARCHABLE", 0)
-    monkeypatch.setattr(attainability, "_searched", None)
+    monkeypatch.setattr(attainability, "_reach_on_host", None)
     np.testing.assert_array_equal(reached(problem, PLANE, held, surely), searched)
     assert sum("jumps of the chain" in phase for phase in phases) >= len(MOVES) // 2
     assert sum("paths of" in phase for phase in phases) > 2

@@ -65,21 +65,21 @@ def test_a_callback_that_raises_in_a_solve(trouble, monkeypatch):
     seen = []
     first = host_loop._first_chunk
     monkeypatch.setattr(host_loop, "_first_chunk", lambda *a: first(*a) and 1)
-    look = host_loop._ended
+    look = host_loop._stop_status
 
     def arm(clock, done, *rest):
         trouble.armed = done >= 2
         seen.append(done)
         return look(clock, done, *rest)
 
-    monkeypatch.setattr(host_loop, "_ended", arm)
+    monkeypatch.setattr(host_loop, "_stop_status", arm)
     # float32: JAX runs callbacks in a thread of its own, which knows nothing of float64 inside a ``with``
     options = {"method": hjb.ValueIteration(), "tol": 1e-5, "dtype": "float32"}
     with pytest.raises(Exception, match="my own trouble") as caught:
         hjb.solve(trouble.problem, GRID, **options)
     kept = broken(caught).value
     trouble.armed = False
-    monkeypatch.setattr(host_loop, "_ended", look)
+    monkeypatch.setattr(host_loop, "_stop_status", look)
     steps = max(done for done in seen)
     known = hjb.solve(trouble.problem, GRID, max_steps=steps, throw=False, **options)
     np.testing.assert_array_equal(kept, known.value)

@@ -61,7 +61,7 @@ def test_the_estimate_is_what_the_compiled_loop_needs(n, noise, method):
     with jax.enable_x64(True):
         problem, grid = cast((problem, grid), np.float64)
         on = Discretisation(problem, grid, hjb.Upwind(), np.float64)
-        options = {"method": method, "tol": 1e-3, "verdict": assumptions_of(on)}
+        options = {"method": method, "tol": 1e-3, "assumptions": assumptions_of(on)}
         task = jax.eval_shape(lambda on: prepare(on, **options), on)
         state = jax.eval_shape(fixed_point.begin, task, jax.ShapeDtypeStruct(grid.shape, np.float64))
         found = host_loop.run.lower(task, state, 1).compile().memory_analysis()

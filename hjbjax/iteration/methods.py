@@ -70,7 +70,7 @@ class Method(Protocol):
 
     @property
     def relaxes(self) -> bool:
-        """Whether it takes the largest rate for the matrix: V then climbs or falls to its fixed point step by step."""
+        """True if it takes the largest rate for the matrix: V climbs or falls to its fixed point step by step."""
 
     @property
     def evaluation(self) -> Evaluation | None:
@@ -78,7 +78,7 @@ class Method(Protocol):
 
     @property
     def inner(self) -> "Method":
-        """What runs on one grid: the method itself, if it knows nothing of coarser grids."""
+        """The method that runs on one grid: itself, if it knows nothing of coarser grids."""
 
     @property
     def coarsest(self) -> int | None:
@@ -91,7 +91,7 @@ class Method(Protocol):
         """The steps without progress after which the solve has stalled."""
 
     def described(self, game: bool) -> str:
-        """The method as one would write it, without what only matters in a game."""
+        """The method as one would write it, without the numbers that only matter in a game."""
 
 
 @pytree_dataclass()
@@ -201,11 +201,12 @@ class Nested:
 
 
 def check_method(method: object, name: str) -> None:
-    """Refuse, by ``name``, what corrects no value.
+    """Refuse, by ``name``, anything that is no method of a stationary solve.
 
     Raises:
       TypeError: with the methods that there are.
     """
+    # a class has the attributes of its instances: Nested(ValueIteration) without brackets would pass the protocol
     if isinstance(method, type) or not isinstance(method, Method):
         wanted = "hjb.PolicyIteration(...) or hjb.ValueIteration()"
         raise TypeError(f"{name} is {arguments.shown(method)}; wanted {wanted}")

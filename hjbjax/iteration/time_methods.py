@@ -27,12 +27,12 @@ import jax.numpy as jnp
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import bellman, certificates, hoffman_karp
 from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
-from hjbjax.iteration.certificates import Certificate
+from hjbjax.iteration.certificates import Certificate, Iterate
 from hjbjax.iteration.evaluation import Evaluation, check_evaluation, evaluate
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import altered, is_traced, pytree_dataclass
-from hjbjax.problem.types import DType, Field, Number, Numbers, Scalar
+from hjbjax.problem.types import DType, Field, Number, Scalar
 
 ROUNDING = 16  # residuals below this many units in the last place of max|V| are rounding
 REPLIES = 20  # of the inner player to one policy of the outer one, at most
@@ -46,20 +46,20 @@ class Marching(Protocol):
         """The problem on its grid."""
 
     @property
-    def horizon(self) -> Scalar:
+    def horizon(self) -> Number:
         """The time at which the terminal cost is paid."""
 
     def obstacles_at(self, t: Number) -> Obstacles:
         """Fixed nodes and constraints at the time t."""
 
     def rate(self, value: Field, t: Number) -> tuple[Field, Any]:
-        """F = min max H − β V, cost per unit time, and what the optimal actions show."""
+        """F = min max H − β V, cost per unit time, and the rates and the noise under the optimal actions."""
 
     def look(self, u: list, d: list, t: Number) -> Any:
-        """What these actions show: the fastest rate, and noise that the chain cannot represent."""
+        """The fastest rate under these actions, and noise that the chain cannot represent."""
 
     def nothing_seen(self) -> Any:
-        """What is shown before anything was looked at."""
+        """The outcome before the first look."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,6 +97,7 @@ class Tableau:
         """Where each stage evaluates F, and where the last one ends, in steps."""
         found = [0.0]
         for share in self.means:
+            # 1/3 and 2/3 are no binary numbers: at 12 digits the last stage of a sound tableau ends at 1 exactly
             found.append(round((1 - share) * (found[-1] + self.euler), 12))
         return tuple(found)
 
@@ -114,11 +115,11 @@ class TimeMethod(Protocol):
 
     @property
     def halves(self) -> bool:
-        """If it steps with each player's drift upwinded by itself, see ``splitting``."""
+        """True if it steps with each player's drift upwinded by itself, see ``splitting``."""
 
     @property
     def limited(self) -> bool:
-        """If steps longer than 1/(max Q + β) over ``courant`` are unstable."""
+        """True if steps longer than 1/(max Q + β) over ``courant`` are unstable."""
 
     @property
     def courant(self) -> Number:
@@ -130,13 +131,13 @@ class TimeMethod(Protocol):
 
     @property
     def monotone_only(self) -> bool:
-        """If it wants the matrix of a chain, and so a monotone scheme."""
+        """True if it wants the matrix of a chain, and so a monotone scheme."""
 
     def filled(self, on: Discretisation, evaluation: Evaluation | None = None) -> "TimeMethod":
-        """The method with what was left open, by the scheme and by the ``evaluation`` that suits the problem."""
+        """The method with its open settings taken from the scheme and from the ``evaluation`` of the problem."""
 
     def step(self, march: Marching, value: Field, t: Number, end: Number, dt: Number) -> tuple[Field, Scalar, Any]:
-        """V at ``end`` = t − Δt from V at t, if that came to its end, and what was seen on the way."""
+        """V at ``end`` = t − Δt from V at t, true if the step came to its end, and the rates and the noise seen."""
 
     def described(self) -> str:
         """The method as one would write it."""
@@ -154,11 +155,12 @@ class Explicit:
     """
 
     stages: int | Tableau | None = None
-    fraction: Any = 0.9
+    fraction: Number = 0.9
     halves = True  # players who meet in a component are upwinded each by itself, see ``splitting``
     limited, monotone_only = True, False
 
     def __post_init__(self):
+        # True is 1 to Python, and would be taken for Euler's method
         named = not isinstance(self.stages, bool) and self.stages in (None, *TABLEAUX)
         if not named and not isinstance(self.stages, Tableau):
             raise ValueError(f"Explicit: got stages = {self.stages!r}, wanted 1, 2, 3, 4, a Tableau or None")
@@ -171,7 +173,7 @@ class Explicit:
         return self.stages if isinstance(self.stages, Tableau) else TABLEAUX[self.stages]
 
     @property
-    def courant(self) -> Any:
+    def courant(self) -> Number:
         """The length of a step times max Q + β."""
         return self.fraction / self.tableau.euler
 
@@ -215,7 +217,7 @@ class Implicit:
     """
 
     evaluation: Evaluation | None = None
-    tol: Any = 1e-6
+    tol: Number = 1e-6
     max_steps: int = 100
     halves = False  # a chain has one drift, the sum of both players'
     limited, monotone_only = False, True
@@ -232,7 +234,7 @@ class Implicit:
         return Implicit(self.evaluation or evaluation, _as(self.tol, on.dtype), self.max_steps)
 
     def step(self, march: Marching, value: Field, t: Number, end: Number, dt: Number) -> tuple[Field, Scalar, Any]:
-        """V at ``end`` from V at t, if the policy iteration came to its end, and what its last policy saw."""
+        """V at ``end`` from V at t, true if the policy iteration came to its end, and a look at its last policy."""
         question = ImplicitStep.of(march.on.at(end), march.obstacles_at(end), value, dt)
         assert self.evaluation is not None
         # what a step leaves adds up over the march, so that each has its share of the tolerance
@@ -245,7 +247,7 @@ class Implicit:
         return f"Implicit({self.evaluation!r}, tol={float(self.tol):g})"
 
 
-def _as(number: Numbers, dtype: DType) -> Numbers:
+def _as(number: Number, dtype: DType) -> Number:
     """A number in the type of a march; one that is traced keeps its own."""
     return number if is_traced(number) else jnp.asarray(number, dtype)
 
@@ -257,12 +259,12 @@ class ImplicitStep:
     Args:
       on: the problem with discount β + 1/Δt on its grid at the time of W.
       obstacles: fixed nodes and constraints at that time.
-      arriving: V/Δt, what is added to the running cost.
+      arriving: V/Δt, a part of the running cost.
     """
 
     on: Discretisation
     obstacles: Obstacles
-    arriving: jax.Array
+    arriving: Field
 
     @classmethod
     def of(cls, on: Discretisation, obstacles: Obstacles, value: Field, dt: Number) -> "ImplicitStep":
@@ -294,8 +296,8 @@ class ImplicitStep:
 
     def solve(
         self, value: Field, evaluation: Evaluation, tol: Number, max_steps: int
-    ) -> tuple[jax.Array, Greedy, jax.Array]:
-        """W, its policy, and if it is known to ``tol`` or to rounding.
+    ) -> tuple[Field, Greedy, jax.Array]:
+        """W, its policy, and true if W is known to ``tol`` or to rounding.
 
         Args:
           value: where to start.
@@ -307,10 +309,9 @@ class ImplicitStep:
         def look(value):
             policy = self._complete(bellman.greedy(self.on, value, self.obstacles.fixed))
             equation = self.equation(value, policy)
-            bound = certificates.error_bound(
-                Certificate.ADDITIVE, value, policy, equation, self.obstacles, discount=self.on.problem.discount,
-                least_cost=None, counted=True, moved=0,
-            )  # fmt: skip
+            iterate = Iterate(value, policy, equation, self.obstacles, counted=True)
+            bound = certificates.error_bound(Certificate.ADDITIVE, iterate, discount=self.on.problem.discount)
+            # a short step's share of the tolerance may be less than the rounding of V, and would never be reached
             rounding = ROUNDING * jnp.finfo(value.dtype).eps * jnp.max(jnp.abs(value))
             return policy, bound.residual, (bound.error <= tol) | (bound.residual <= rounding)
 
@@ -323,7 +324,7 @@ class ImplicitStep:
             value = self._evaluated(value, policy, residual, evaluation)
             return value, *look(value), count + 1
 
-        start = self.impose(value)
+        start = self.impose(value)  # V at t is a guess for W that is wrong by O(Δt) only
         carry = (start, *look(start), jnp.zeros((), jnp.int32))
         value, policy, _, done, _ = jax.lax.while_loop(unfinished, improve, carry)
         return value, policy, done

@@ -126,8 +126,8 @@ def actions(problem: Problem) -> np.ndarray:
     if problem.time_dependent:
         raise ValueError("transition_arrays: got time_dependent=True, wanted a stationary problem")
     if problem.controls is None:
-        return np.zeros((1, 0))
-    if not isinstance(problem.controls, Finite):
+        return np.zeros((1, 0))  # one action without inputs: a chain that nobody controls
+    if not isinstance(problem.controls, Finite):  # how finely a continuum is sampled is the user's choice
         kind = type(problem.controls).__name__
         raise ValueError(f"transition_arrays: got controls in a {kind}, wanted Finite: sample it, as by Box.grid(num)")
     return np.asarray(problem.controls.points, np.float64)
@@ -139,6 +139,7 @@ def surcharge(links: Sequence[stencil.Links], given: np.ndarray, grid: Grid) -> 
     for axis, link in enumerate(links):
         for step, meets in ((1, link.meets_up), (-1, link.meets_down)):
             if meets is not None:
+                # the table pays the exit cost of the node beyond, the cut link that of the crossing
                 offset = stencil.unit(grid, axis, step)
                 beyond = np.asarray(stencil.neighbour(jax.numpy.asarray(given), grid, offset))
                 crosses, there = (np.asarray(entry) for entry in meets)

@@ -30,7 +30,7 @@ COORDINATES = 8  # units of eps by which a coordinate may be off
 
 @dataclasses.dataclass(frozen=True)
 class Rounding:
-    """Size of what rounding leaves of a drift component that vanishes at a node; both entries broadcast.
+    """Rounding of a drift component that vanishes at a node; both entries broadcast.
 
     Attributes:
       idle: the component without actions: what the actions have to cancel.
@@ -69,12 +69,12 @@ def slack(on: Discretisation) -> list[Rounding]:
 
 
 def leaves(f: PerNode, grid: Grid, axis: int, step: int, rounding: Rounding, coarser: Numbers = 1) -> Array:
-    """Where a drift component leaves across one end of its axis by more than rounding; broadcasts."""
+    """The nodes where a drift component leaves across one end of its axis by more than rounding; broadcasts."""
     return stencil.on_edge(grid, axis, step) & (step * f > coarser * rounding.of(f))
 
 
 def barred(f: PerNode, grid: Grid, axis: int, rounding: Rounding, coarser: Numbers = 1) -> Array | None:
-    """Where a drift component leaves across a constrained end of its axis; None if the axis has none."""
+    """The nodes where a drift component leaves across a constrained end of its axis; None if it has none."""
     steps = [step for which, step in grid.sides("constrained") if which == axis]
     found = [leaves(f, grid, axis, step, rounding, coarser) for step in steps]
     return None if not found else found[0] if len(found) == 1 else found[0] | found[1]
@@ -88,7 +88,7 @@ def beside(lost: jax.Array, grid: Grid) -> tuple[tuple[jax.Array, jax.Array], ..
 
 
 def strays(f: PerNode, beside: tuple[jax.Array, jax.Array], rounding: Rounding) -> jax.Array:
-    """Where a drift component that is only rounding points to a lost node beside."""
+    """The nodes where a drift component that is only rounding points to a lost node beside."""
     up, down = beside
     return ((up & (f > 0)) | (down & (f < 0))) & (jnp.abs(f) <= rounding.of(f))
 

@@ -52,7 +52,7 @@ def inverse(number: PerNode) -> jax.Array:
 
 def inverse_root(number: PerNode) -> jax.Array:
     """1/√number, 0 for zero, with a derivative of zero there."""
-    zero = number == 0
+    zero = number == 0  # likewise, and the derivative of a root at zero is infinite
     return jnp.where(zero, 0, 1 / jnp.sqrt(jnp.where(zero, 1, number)))
 
 

@@ -59,7 +59,7 @@ class Obstacles:
 
     def acting(self, value: Nodes) -> jax.Array:
         """The nodes at which actions matter, bool (*grid): not fixed, and no constraint is the active branch."""
-        acts = ~self.fixed
+        acts = ~self.fixed  # where V = ψ one stops, and where V = g the maximum is here: no action matters
         if self.upper is not None:
             acts &= value < self.upper
         return acts if self.lower is None else acts & (value > self.lower)
@@ -120,7 +120,7 @@ def greedy(
     return _with_defect(on, value, held, *discrete.optimise(_around(on, value, incumbent, lost)))
 
 
-def kept(on: Discretisation, value: Field, fixed: jax.Array, new: Greedy, old: Greedy) -> Greedy:
+def improvement(on: Discretisation, value: Field, fixed: jax.Array, new: Greedy, old: Greedy) -> Greedy:
     """The new policy where it is better by more than rounding or where nodes are ``fixed``, else the old one.
 
     From a policy that ends, one improvement after the other then keeps it so: among actions that are worth the same
@@ -141,6 +141,7 @@ def respond(
 ) -> Greedy:
     """The inner player's best answer to the outer player's current policy, in a game."""
     players = players_of(on)
+    # the current answer among the candidates: a sampled player then never answers worse than before
     hamiltonian = _around(on, value, current, lost)
     u, d = list(current.controls), list(current.disturbances)
     if on.problem.isaacs == "upper":  # min max: the control moves first, and the disturbance knows it
@@ -182,6 +183,7 @@ def policy_equation(
     fastest = jnp.max(leaving) if fastest is None else fastest
     moves = leaving > 8 * jnp.finfo(value.dtype).eps * fastest  # a drift that cancels leaves rounding
     outflow = jnp.where(moves, leaving, jnp.where(fastest > 0, fastest, 1))  # where nothing moves the cost piles up
+    # s, then min(s, ψ − V), then max(·, g − V); a row whose branch is a constraint reads δ = source
     source, free = policy.defect / outflow, ~obstacles.fixed
     if obstacles.upper is not None:
         stops = free & (obstacles.upper - value < source)
@@ -199,7 +201,7 @@ def policy_equation(
 
 
 def leaks(on: Discretisation, policy: Greedy, held: jax.Array, lost: jax.Array) -> jax.Array:
-    """Whether the policy leads from a node that counts to one that is ``lost``, by more than rounding."""
+    """True if the policy leads from a node that counts to one that is ``lost``, by more than rounding."""
     grid, u, d = on.grid, list(policy.controls), list(policy.disturbances)
     rates, beside = chain.rates(on, u, d), edges.beside(lost, grid)
     strays = [edges.strays(*each) for each in zip(on.drift(u, d), beside, edges.slack(on), strict=True)]
@@ -209,6 +211,7 @@ def leaks(on: Discretisation, policy: Greedy, held: jax.Array, lost: jax.Array) 
         if on.problem.noise is None:  # jumps go along one axis
             axis = next(axis for axis, step in enumerate(offset) if step)
             leak = jnp.where(strays[axis], 0, leak)
-        leaking = leaking + leak
+        leaking = leaking + leak  # rates per unit time, (*grid): several small leaks are one
+    # next to all rates of the node, since the drift is made of parts that cancel down to their rounding
     limit = LEAK * jnp.finfo(on.dtype).eps * rates.total()
     return jnp.any(~lost & ~held & (leaking > limit))

@@ -64,7 +64,7 @@ class ErrorBound:
 
 @dataclasses.dataclass(frozen=True)
 class Iterate:
-    """A value function with what it leaves in its equation.
+    """A value function with its policy and the residual of its equation.
 
     Attributes:
       value: V, (*grid).
@@ -156,6 +156,7 @@ def _multiplicative(iterate: Iterate, least_cost: Field, residual: Scalar) -> Er
 def lowest_end(obstacles: Obstacles, counted: Mask | bool) -> Scalar:
     """The least payment at the end of a run, at most zero: exit costs, between nodes as well, and ψ."""
     lowest = jnp.minimum(jnp.min(jnp.where(counted & obstacles.fixed, obstacles.fixed_value, 0)), obstacles.least_exit)
+    # ψ is paid where one stops, which may be anywhere
     return lowest if obstacles.upper is None else jnp.minimum(lowest, jnp.min(jnp.where(counted, obstacles.upper, 0)))
 
 

@@ -97,7 +97,7 @@ class Sweeps:
 
     def bytes_per_node(self, weights: int, word: int) -> int:
         """Weights and source twice in single precision, as they are and sheared."""
-        return 4 * (2 * weights + 2) + 2 * word
+        return 4 * (2 * weights + 2) + 2 * word  # and the equation's source and δ in their own type
 
 
 @pytree_dataclass(static=("max_steps",))
@@ -188,7 +188,7 @@ def evaluate(method: Evaluation, equation: PolicyEquation, grid: Grid) -> Field:
             "value from inside; use hjb.PolicyIteration(hjb.Direct()) or Krylov(), in a march Implicit(hjb.Direct())"
         )
     delta = method.solve(equation, grid)
-    if method.rough:
+    if method.rough:  # its residual is looked at in the next step anyway
         return delta
     size, left = jnp.max(jnp.abs(equation.source)), jnp.max(jnp.abs(left_over(equation, grid, delta)))
     # an improper policy has no value, and BiCGStab may break down: then relax, which always makes sense
@@ -208,7 +208,7 @@ def left_over(equation: PolicyEquation, grid: Grid, delta: Field) -> Field:
 def jacobi(equation: PolicyEquation, grid: Grid, sweeps: int) -> Field:
     """Damped Jacobi sweeps, ½(I + T): the star stencil alone has an eigenvalue near −1."""
 
-    def sweep(_, delta):
+    def sweep(_, delta):  # by half: I − W has eigenvalues up to 2, which a whole step would turn round for ever
         return delta + 0.5 * left_over(equation, grid, delta)
 
     return jax.lax.fori_loop(0, sweeps, sweep, jnp.zeros_like(equation.source))
@@ -233,7 +233,7 @@ def _walled(equation: PolicyEquation, grid: Grid) -> PolicyEquation:
         return equation
     inside, outside = [], jnp.zeros_like(equation.source)
     for offset, w in zip(equation.weights.offsets, equation.weights.values, strict=True):
-        leaves = np.zeros((1,) * grid.ndim, bool)
+        leaves = np.zeros((1,) * grid.ndim, bool)  # broadcasts; a diagonal jump may leave across two ends
         for axis, step in grid.sides("open"):
             if offset[axis] == step:
                 leaves = leaves | stencil.on_edge(grid, axis, step)
@@ -275,6 +275,7 @@ def _factor_and_solve(
     """δ of (I − W) δ = s, or of its transpose; NaN where the matrix is singular."""
     from scipy.sparse.linalg import splu
 
+    # I − W with the nodes in C order; CSC is what SuperLU factors
     matrix = stencil.sparse(offsets, [-w for w in weights], np.ones(grid.shape), grid)
     try:
         delta = splu(matrix.tocsc()).solve(source.ravel(), "T" if transposed else "N")

@@ -81,7 +81,7 @@ class Task:
 
     @property
     def scheme(self) -> Scheme:
-        """How derivatives are made."""
+        """The scheme of the derivatives."""
         return self.on.scheme
 
     def asking(self, problem: Problem) -> "Task":
@@ -122,7 +122,7 @@ class Task:
         return jnp.max(jnp.where(self.counted, jnp.abs(equation.source), 0))
 
     def start(self) -> Field:
-        """Where to start without a guess: zero, or without discount ψ, above all fixed points, or g, below them."""
+        """The value without a guess: zero, or without discount ψ, above all fixed points, or g, below them."""
         zero = jnp.zeros(self.grid.shape, self.tol.dtype)
         if not self.constrained or self.certificate is Certificate.ADDITIVE:
             return zero
@@ -174,7 +174,7 @@ def begin(task: Task, guess: Nodes) -> State:
 
 def run(task: Task, state: State, until: Number) -> State:
     """Steps until the state is no longer running or ``until`` steps are done; at most ``HISTORY`` at a time."""
-    start = state.step
+    start = state.step  # the first place of this chunk's history
 
     def goes_on(state):
         return (state.code == Status.RUNNING) & (state.step < until)
@@ -191,11 +191,12 @@ def run(task: Task, state: State, until: Number) -> State:
 
 def advance(task: Task, state: State, start: Scalar) -> State:
     """One step; a step that ends in numbers that are not finite is taken back."""
-    stay = jnp.zeros_like(state.value)
+    stay = jnp.zeros_like(state.value)  # of step −1, which only looks at the guess
     delta = jax.lax.cond(state.step < 0, lambda: stay, lambda: _correction(task, state))
     if not task.scheme.monotone:
         delta = jnp.where(state.step < FULL_STEPS, 1.0, 0.5).astype(delta.dtype) * delta
     value = task.impose(state.value + delta)
+    # a node that does not count may move for ever
     moved = jnp.max(jnp.abs(jnp.where(task.counted, value - state.value, 0)))
     if task.certificate is Certificate.OPEN and not task.method.relaxes:
         moved = moved * _shift_factor(task, state)
@@ -204,6 +205,7 @@ def advance(task: Task, state: State, start: Scalar) -> State:
     measures = jnp.stack([bound.error, bound.residual])
     since = jnp.where(jnp.any(measures < state.best), 0, state.since_best + 1)
     code = _judge(task, value, bound, state.best, since)
+    # counted and recorded even where it is taken back: ``broken`` makes that step again
     history = state.history.at[state.step - start].set(bound.residual)
     best = jnp.fmin(state.best, measures)  # fmin, which a NaN does not win
     new = State(value, policy, fastest, bound, state.step + 1, best, since, code, history)
@@ -252,7 +254,7 @@ def _look(
     policy = bellman.greedy(task.on, value, task.obstacles.fixed, incumbent=incumbent, lost=task.lost)
     if problem.stopping_cost is not None and not problem.is_game and task.certificate in TO_THE_END:
         fixed = task.obstacles.fixed | first  # nobody has chosen the actions before the first look
-        policy = bellman.kept(task.on, value, fixed, policy, incumbent)
+        policy = bellman.improvement(task.on, value, fixed, policy, incumbent)
     left = task.equation(value, policy)
     assert left.fastest is not None
     iterate = Iterate(value, policy, left, task.obstacles, task.counted)
@@ -281,6 +283,7 @@ def _judge(task: Task, value: Field, bound: ErrorBound, best: jax.Array, since: 
     if to_the_end:  # a front moves V by a spacing times its slope a step, whatever the tolerance, past every node
         tol = jnp.where(task.problem.discount > 0, tol, rounding)
         longest = max(longest, 100 + 4 * task.grid.size)
+    # a residual that is rounding has nowhere to go: ten steps tell, in place of the thousands of a slow climb
     patience = jnp.where(bound.residual <= rounding, PATIENCE, longest)
     code = jnp.where(since >= patience, Status.STALLED, Status.RUNNING)
     grew = bound.residual > GROWTH * jnp.maximum(best[1], rounding)
@@ -342,5 +345,5 @@ def _outflow(task: Task, state: State) -> Field:
     if players.control.fastest_at_ends and players.disturbance.fastest_at_ends:
         return task.outflow
     u, d = list(state.policy.controls), list(state.policy.disturbances)
-    chosen = chain.rates(task.on, u, d).total()
+    chosen = chain.rates(task.on, u, d).total()  # a fast action between the samples
     return jnp.maximum(task.outflow, chosen + task.problem.discount)

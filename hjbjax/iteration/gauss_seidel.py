@@ -116,7 +116,7 @@ def _towards(equation: PolicyEquation, grid: Grid, axis: int, flips: list[jax.Ar
 
 
 def _wrapped(planes: jax.Array, grid: Grid) -> jax.Array:
-    """The margin filled with what lies across the fold of the shear and across the seams of periodic axes."""
+    """The planes with a margin of values from across the fold of the shear and the seams of periodic axes."""
     for axis in range(1, grid.ndim):  # before the first axis, whose margins hold the corners of the others as well
         if grid.periodic[axis]:  # type: ignore[index]
             planes = _with_margins(planes, axis)

@@ -101,7 +101,7 @@ class ValueIteration:
     The error falls by 1/(1 + βΔt) a step: many cheap steps. For reference, for games, and where memory rules.
     """
 
-    relaxes, evaluation, coarsest = True, None, None
+    relaxes, evaluation, coarsest = True, None, None  # no fields: answers to the loop, and not choices of the user
 
     @property
     def inner(self) -> "ValueIteration":
@@ -149,7 +149,7 @@ class PolicyIteration:
 
     def patience(self, grid: Grid) -> int:
         """A good policy moves one cell an improvement, and a wave may cross the box four times."""
-        return 100 + 4 * sum(grid.shape)
+        return 100 + 4 * sum(grid.shape)  # a hundred for grids so small that crossing them takes no time
 
     def described(self, game: bool) -> str:
         """As it is written, without the replies where there is no opponent."""
@@ -173,7 +173,7 @@ class Nested:
 
     def __post_init__(self):
         check_method(self.inner, "Nested: inner")
-        if self.inner.coarsest is not None:
+        if self.inner.coarsest is not None:  # nested in nested: every level would start at the coarsest grid anew
             raise TypeError(f"Nested: inner is {self.inner!r}; wanted what runs on one grid")
         arguments.count(self.coarsest, "Nested: coarsest")
 

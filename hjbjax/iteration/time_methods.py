@@ -94,7 +94,7 @@ class Tableau:
 
     @property
     def times(self) -> tuple[float, ...]:
-        """Where each stage evaluates F, and where the last one ends, in steps."""
+        """The times at which the stages evaluate F, and the end of the last one, in steps."""
         found = [0.0]
         for share in self.means:
             # 1/3 and 2/3 are no binary numbers: at 12 digits the last stage of a sound tableau ends at 1 exactly
@@ -103,10 +103,10 @@ class Tableau:
 
 
 TABLEAUX = {
-    1: Tableau((0.0,)),
-    2: Tableau((0.0, 1 / 2)),
-    3: Tableau((0.0, 3 / 4, 1 / 3)),
-    4: Tableau((0.0, 0.0, 2 / 3, 0.0), 1 / 2),
+    1: Tableau((0.0,)),  # Euler
+    2: Tableau((0.0, 1 / 2)),  # Heun
+    3: Tableau((0.0, 3 / 4, 1 / 3)),  # Shu and Osher's
+    4: Tableau((0.0, 0.0, 2 / 3, 0.0), 1 / 2),  # Spiteri and Ruuth's, of order 3
 }
 
 
@@ -182,9 +182,9 @@ class Explicit:
         return Explicit(self.stages or on.scheme.stages, _as(self.fraction, on.dtype))
 
     def step(self, march: Marching, value: Field, t: Number, end: Number, dt: Number) -> tuple[Field, Scalar, Any]:
-        """V at ``end`` = t − Δt from V at t by the stages of the tableau, true, and what the stages saw."""
+        """V at ``end`` = t − Δt from V at t by the stages of the tableau, true, and the rates and the noise seen."""
         dtype, tableau, fine = value.dtype, self.tableau, jnp.ones((), bool)
-        if len(tableau.means) == 1:
+        if len(tableau.means) == 1:  # Euler: no loop of one turn
             rate, seen = march.rate(value, t)
             return march.obstacles_at(t - dt).impose(value + dt * rate), fine, seen
         means, starts, ends = (
@@ -194,6 +194,7 @@ class Explicit:
         def stage(k, carry):
             w, seen = carry
             rate, now = march.rate(w, t - starts[k] * dt)
+            # a mean of V and of one Euler step with weights ≥ 0: what Euler's step keeps, this keeps
             moved = means[k] * value + (1 - means[k]) * (w + tableau.euler * dt * rate)
             return march.obstacles_at(t - ends[k] * dt).impose(moved), seen.joined(now)
 
@@ -221,7 +222,7 @@ class Implicit:
     max_steps: int = 100
     halves = False  # a chain has one drift, the sum of both players'
     limited, monotone_only = False, True
-    courant, tableau = math.inf, TABLEAUX[1]
+    courant, tableau = math.inf, TABLEAUX[1]  # any length; the rates are looked at once
 
     def __post_init__(self):
         if self.evaluation is not None:
@@ -235,6 +236,7 @@ class Implicit:
 
     def step(self, march: Marching, value: Field, t: Number, end: Number, dt: Number) -> tuple[Field, Scalar, Any]:
         """V at ``end`` from V at t, true if the policy iteration came to its end, and a look at its last policy."""
+        # the chain, the costs and the constraints of the time at which W is asked for, and V/Δt from the time before
         question = ImplicitStep.of(march.on.at(end), march.obstacles_at(end), value, dt)
         assert self.evaluation is not None
         # what a step leaves adds up over the march, so that each has its share of the tolerance
@@ -317,7 +319,7 @@ class ImplicitStep:
 
         def unfinished(carry):
             _, _, residual, done, count = carry
-            return ~done & (count < max_steps) & jnp.isfinite(residual)
+            return ~done & (count < max_steps) & jnp.isfinite(residual)  # a NaN is the march's to report
 
         def improve(carry):
             value, policy, residual, _, count = carry
@@ -331,6 +333,7 @@ class ImplicitStep:
 
     def _complete(self, policy: Greedy) -> Greedy:
         """A policy of the problem with its defect, V/Δt included."""
+        # V/Δt is no part of the problem's cost: it is the same for all actions, and chooses none
         return dataclasses.replace(policy, defect=jnp.where(self.obstacles.fixed, 0, policy.defect + self.arriving))
 
     def _evaluated(self, value: Field, policy: Greedy, residual: Number, evaluation: Evaluation) -> Field:

@@ -85,7 +85,7 @@ class March:
         """The largest Q + β under these actions, and the first node whose noise the chain cannot represent."""
         on, dtype = self.on.at(t), self.on.dtype
         seen = self.nothing_seen()
-        if self.checks_rates:
+        if self.checks_rates:  # a pass over all rates, which is spared where the limit of the step is known
             fastest = jnp.max(splitting.rate(on, u, d)) + jnp.asarray(on.problem.discount, dtype)
             seen = dataclasses.replace(seen, fastest=fastest)
         if self.checks_noise:
@@ -142,6 +142,7 @@ class Seen:
 def stable(on: Discretisation) -> Scalar:
     """The longest step for which explicit Euler is monotone, 1/(max Q + β); inf where nothing moves."""
     rate = jnp.max(splitting.fastest_rate(on)) + on.problem.discount
+    # the inner where keeps 1/0 out of the branch not taken, whose NaN a derivative would bring back
     return jnp.where(rate > 0, 1 / jnp.where(rate > 0, rate, 1), jnp.inf)
 
 
@@ -151,7 +152,7 @@ def terminal(on: Discretisation, start: Nodes | None = None) -> Field:
     Without either a stopping cost is paid at the latest then, and a running maximum is g itself; else nothing is paid.
     """
     obstacles, problem = bellman.obstacles(on), on.problem
-    if start is not None:
+    if start is not None:  # the user's, which need not respect the constraints
         return obstacles.impose(jnp.asarray(start, on.dtype))
     cost = problem.terminal_cost
     if cost is None:
@@ -181,7 +182,7 @@ def run(march: March, front: Front, until: Number, most: Number) -> Front:
 
 
 def advance(march: March, front: Front, until: Number) -> Front:
-    """One step towards ``until``; what is left is cut into equal steps."""
+    """One step towards ``until``: the first of equal ones in the time that is left."""
     dtype = front.value.dtype
     until, left = jnp.asarray(until, dtype), front.t - until
     longest = march.longest(front.t)
@@ -196,6 +197,7 @@ def advance(march: March, front: Front, until: Number) -> Front:
         value, ok, seen = march.method.step(march, front.value, front.t, t, front.t - t)
     # finite only if all values are: ∞ − ∞ is a NaN
     low, high = jnp.min(value), jnp.max(value)
+    # each fault overrules those before it
     code = jnp.where(ok, Status.RUNNING, Status.STALLED)
     if march.watched is not None:
         code = jnp.where(_saturates(march, value, t), Status.DIVERGED, code)
@@ -232,6 +234,7 @@ def _short_enough(march: March, front: Front, until: Scalar, count: Scalar) -> t
     endless = dataclasses.replace(nothing, fastest=jnp.full_like(nothing.fastest, jnp.inf))
     start = (count, jnp.zeros((), jnp.int32), front.value, endless)
     carry = jax.lax.while_loop(too_long, attempt, start)
+    # with no tries counted: true if the last attempt was short enough, false where the loop only ran out of them
     return carry[2], end(carry[0]), ~too_long((carry[0], 0, *carry[2:])), carry[3]
 
 
@@ -240,7 +243,7 @@ def repeat(march: March, value: Field, start: float, end: float, count: int) -> 
     dt = (start - end) / max(count, 1)
 
     def step(value, k):
-        t = jnp.asarray(start, value.dtype) - k * dt
+        t = jnp.asarray(start, value.dtype) - k * dt  # from the start, so that roundings of Δt do not add up
         return march.method.step(march, value, t, t - dt, jnp.asarray(dt, value.dtype))[0], None
 
     # a scan and no while loop, which has no reverse mode
@@ -250,7 +253,7 @@ def repeat(march: March, value: Field, start: float, end: float, count: int) -> 
 def greedy(march: March, value: Field, t: Number) -> tuple[tuple[Field, ...], tuple[Field, ...]]:
     """The control and the disturbance at the time t, each component of shape (*grid), of the H that steps solve."""
     on = march.on.at(t)
-    if march.method.halves:
+    if march.method.halves:  # policies of the H that was stepped with, or they would not fit the value
         _, u, d = splitting.optimise(on, value)
     else:
         _, u, d = discrete.optimise(discrete.around(on, value))

@@ -30,7 +30,7 @@ def level(on: Discretisation) -> Field:
     found, grid, slack = on.at_nodes(on.problem.target), on.grid, jnp.zeros((), on.dtype)
     for axis in range(grid.ndim):
         up, down = stencil.one_sided(found, grid, axis)
-        # a coordinate is lo plus a multiple of h: off by roundings of the larger end, however near zero it is
+        # a coordinate is made of lo and hi: off by roundings of the larger of them, however near zero it is itself
         farthest = jnp.maximum(jnp.abs(grid.lo[axis]), jnp.abs(grid.hi[axis]))
         up, down = jnp.abs(up), jnp.abs(down)
         end = stencil.on_edge(grid, axis, 1) | stencil.on_edge(grid, axis, -1)  # where one of them is none

@@ -55,7 +55,7 @@ def slack(on: Discretisation) -> list[Rounding]:
     nothing = ([jnp.zeros((), dtype)] * m, [jnp.zeros((), dtype)] * k)
     found = []
     for entry in on.drift(*nothing):
-        # where zero is no admissible action the formula may have no value there; it says nothing then
+        # zero need not be an admissible action: a formula without a value there leaves nothing to cancel
         idle = jnp.broadcast_to(jnp.where(jnp.isfinite(entry), entry, 0), grid.shape)
         shift = jnp.zeros((), dtype)
         for axis in range(grid.ndim):

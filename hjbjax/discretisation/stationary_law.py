@@ -35,7 +35,7 @@ def classes(generator: "csr_array") -> list[np.ndarray]:
     # states that lead to one another are the strong components of the graph of jumps
     count, label = connected_components(generator, directed=True, connection="strong")
     entries = generator.tocoo()
-    # stored zeros, as of a rate that is 0 at a node, lead nowhere
+    # an entry that is stored although it is zero leads nowhere
     leads_out = (label[entries.row] != label[entries.col]) & (entries.data != 0)
     closed = np.ones(count, bool)
     closed[label[entries.row[leads_out]]] = False

@@ -35,7 +35,7 @@ NEWTON = 24  # steps for the multiplier of a ball, monotone and at last quadrati
 
 @dataclasses.dataclass(frozen=True)
 class Rule:
-    """How H is minimised, read from the jaxpr; hashable, so that it may be a static argument.
+    """The way to the minimum of H, read from the jaxpr; hashable, so that it may be a static argument.
 
     Attributes:
       exact: true if the formulas above hold; else a search has to do.
@@ -54,7 +54,7 @@ class Rule:
 
 
 def rule_of(problem: Problem, n: int) -> Rule:
-    """Read from the functions themselves how H depends on the control."""
+    """The rule for a problem's H, from the jaxprs of its drift and cost."""
     if isinstance(problem.controls, Finite):
         return Rule(exact=True, finite=True)
     assert problem.controls is not None
@@ -66,7 +66,7 @@ def rule_of(problem: Problem, n: int) -> Rule:
         return Rule(exact=False)
     # without a square in either function H is affine in that input: bang-bang
     straight = tuple(j for j in inputs if not any(each.has_square((j,)) for each in found))
-    # in a ball an affine H still has its minimum inside a direction: u* = −r b/|b| turns and does not jump
+    # over a ball the minimum of an affine H, −r b/|b|, turns with b and does not jump
     return Rule(exact=True, jumping=straight if isinstance(problem.controls, Box) else ())
 
 

@@ -33,7 +33,7 @@ LOST = 4  # roundings of numbers of the size lift · max(factor, 1) in factor ·
 
 
 class Certificate(enum.Enum):
-    """Which bound a problem admits; the value says so in words."""
+    """The bound that a problem admits; the value says it in words."""
 
     ADDITIVE = "from the discount, V + min r/β ≤ V_h ≤ V + max r/β"
     MULTIPLICATIVE = "from the running cost, V/(1 + η) ≤ V_h ≤ V/(1 − ρ)"

@@ -51,7 +51,7 @@ OPEN_FRACTION = 1e-8  # of the residual, to which a Krylov method goes with open
 
 @runtime_checkable
 class Evaluation(Protocol):
-    """How the linear equation of a policy is solved: a value, frozen and hashable or a pytree."""
+    """A solver of the linear equation of a policy: a value, frozen and hashable or a pytree."""
 
     @property
     def rough(self) -> bool:
@@ -150,7 +150,7 @@ class Direct:
         return direct(equation, grid)
 
     def bytes_per_node(self, weights: int, word: int) -> int:
-        """The weights twice; what the factors fill on the host depends on the order of the nodes and is not counted."""
+        """The weights twice; the fill of the factors on the host depends on the order of the nodes and is not counted."""
         return word * (2 * weights + 4)
 
 

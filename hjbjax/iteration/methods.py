@@ -66,7 +66,7 @@ class Step(Protocol):
 
 @runtime_checkable
 class Method(Protocol):
-    """How V is corrected, as a value: frozen and hashable or a pytree."""
+    """A method of a stationary solve, which corrects V; a value, frozen and hashable or a pytree."""
 
     @property
     def relaxes(self) -> bool:
@@ -74,7 +74,7 @@ class Method(Protocol):
 
     @property
     def evaluation(self) -> Evaluation | None:
-        """How the equation of a policy is solved; also for derivatives. None where it never is."""
+        """The solver of the equation of a policy, also for derivatives. None where it is never solved."""
 
     @property
     def inner(self) -> "Method":
@@ -123,7 +123,7 @@ class ValueIteration:
 
 @pytree_dataclass(static=("replies",))
 class PolicyIteration:
-    """Improve the policy, evaluate it, repeat; the evaluation is what distinguishes the methods of this family.
+    """Improve the policy, evaluate it, repeat; the methods of this family differ in the evaluation.
 
     Args:
       evaluation: ``Sweeps(count)`` is modified policy iteration; ``Krylov()`` and ``Direct()`` are Howard's.
@@ -196,7 +196,7 @@ class Nested:
         return self.inner.patience(grid)
 
     def described(self, game: bool) -> str:
-        """As it is written, with what runs on each level."""
+        """As it is written, with the method of each level."""
         return f"Nested({self.inner.described(game)})"
 
 

@@ -111,7 +111,7 @@ TABLEAUX = {
 
 
 class TimeMethod(Protocol):
-    """How V is carried from t to t − Δt, as a value: frozen and hashable or a pytree."""
+    """A method that carries V from t to t − Δt; a value, frozen and hashable or a pytree."""
 
     @property
     def halves(self) -> bool:
@@ -127,7 +127,7 @@ class TimeMethod(Protocol):
 
     @property
     def tableau(self) -> Tableau:
-        """Its stages: how often, and after what time, a step looks at the rates."""
+        """Its stages: the times within a step at which the rates are looked at."""
 
     @property
     def monotone_only(self) -> bool:

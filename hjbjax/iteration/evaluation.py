@@ -150,7 +150,7 @@ class Direct:
         return direct(equation, grid)
 
     def bytes_per_node(self, weights: int, word: int) -> int:
-        """The weights twice; the fill of the factors on the host depends on the order of the nodes and is not counted."""
+        """The weights twice, without the fill of the factors on the host: that depends on the order of the nodes."""
         return word * (2 * weights + 4)
 
 

@@ -12,15 +12,17 @@ there always are: h₁/h₂ = √(a₁₁/a₂₂).
 import functools
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.problem.grid import Grid
 from hjbjax.tracing import checks
 
 
-def spacings(a: Any, now: Any) -> np.ndarray | None:
+def spacings(a: ArrayLike, now: ArrayLike) -> np.ndarray | None:
     """Spacings h close to the given ones with a_ii/h_i ≥ Σ_j |a_ij|/h_j on every axis, if there are any.
 
     Args:
@@ -35,15 +37,18 @@ def spacings(a: Any, now: Any) -> np.ndarray | None:
       [0.353553, 0.707107]
     """
     a, result = np.asarray(a, dtype=float), np.array(now, dtype=float)
+    # an axis without noise has a zero row in a positive semidefinite matrix: any scale does for it
     root = np.sqrt(np.diag(a))
     scale = np.where(root > 0, root, 1.0)
     b = np.abs(a - np.diag(np.diag(a))) / np.outer(scale, scale)
+    # (I + |B|)ⁿ > 0 where a path of correlations leads from axis to axis: the blocks of B
     linked = np.linalg.matrix_power(np.eye(len(a)) + (b > 0), len(a)) > 0
     for block in {tuple(np.flatnonzero(row)) for row in linked}:
         if len(block) == 1:
             continue
         axes = np.array(block)
         inner = b[np.ix_(axes, axes)]
+        # B is symmetric and non-negative: its spectral radius is its largest eigenvalue, the Perron vector the last
         radii, vectors = np.linalg.eigh(inner)
         if radii[-1] > 1 + 1e-12:
             return None
@@ -51,12 +56,13 @@ def spacings(a: Any, now: Any) -> np.ndarray | None:
             v = np.linalg.solve(np.eye(len(axes)) - inner, np.ones(len(axes)))
         else:
             v = np.maximum(np.abs(vectors[:, -1]), 1e-9)
-        new = scale[axes] / v
+        new = scale[axes] / v  # 1/h = D^(−1/2) v
+        # the inequality has no unit: the block keeps the geometric mean of its spacings, and so the count of nodes
         result[axes] = new * np.exp(np.mean(np.log(result[axes] / new)))
     return result
 
 
-def shape(a: Any, grid: Grid, wanted: Any) -> tuple[int, ...] | None:
+def shape(a: ArrayLike, grid: Grid, wanted: np.ndarray) -> tuple[int, ...] | None:
     """Numbers of nodes for which the chain represents ``a`` on the same box, if there are any near the present ones.
 
     Args:
@@ -67,21 +73,23 @@ def shape(a: Any, grid: Grid, wanted: Any) -> tuple[int, ...] | None:
     a, lengths = np.asarray(a, dtype=float), np.asarray(grid.hi) - np.asarray(grid.lo)
     ends = 1 - np.array(grid.periodic, dtype=int)
     off = np.abs(a - np.diag(np.diag(a)))
+    # counts are whole numbers, which few factors hit well: nearest to the present size first, half to twice as many
     for factor in sorted(np.geomspace(0.5, 2.0, 2001), key=lambda factor: abs(np.log(factor))):
         intervals = np.maximum(np.round(lengths / wanted * factor), 1)
         density = intervals / lengths
+        # 1e-15: where equality is meant, as between two axes of correlation one, products differ in the last place
         if np.all(np.diag(a) * density * (1 + 1e-15) >= off @ density) and np.all(intervals + ends >= 2):
             return tuple(int(count) for count in intervals + ends)
     return None
 
 
-def advice(a: Any, grid: Grid, *, everywhere: bool) -> str:
-    """What the chain needs to represent ``a``, and the shape or the spacings that would do, in two sentences.
+def advice(a: ArrayLike, grid: Grid, *, everywhere: bool) -> str:
+    """Two sentences for a message: the condition on ``a``, and a shape or spacings that meet it.
 
     Args:
       a: the diffusion matrix at one node, shape (n, n).
       grid: the grid.
-      everywhere: whether it is the matrix of all nodes.
+      everywhere: true if it is the matrix of all nodes.
     """
     h = np.array([grid.spacing(axis) for axis in range(grid.ndim)], dtype=float)
     head = (
@@ -103,26 +111,27 @@ def advice(a: Any, grid: Grid, *, everywhere: bool) -> str:
     )
 
 
-def _numbers(entries: Any) -> str:
+def _numbers(entries: ArrayLike) -> str:
+    """Numbers as they stand in a message, to six digits."""
     return "[" + ", ".join(f"{entry:.6g}" for entry in np.asarray(entries, dtype=float)) + "]"
 
 
-def along_axis(a: dict[tuple[int, int], Any], grid: Grid, axis: int) -> Any:
-    """What is left of a_ii for jumps along axis i once the diagonal jumps have taken Σ_j |a_ij| h_i/h_j."""
+def along_axis(a: dict[tuple[int, int], jax.Array], grid: Grid, axis: int) -> Any:
+    """a_ii − Σ_j |a_ij| h_i/h_j: the noise that the diagonal jumps leave for jumps along axis i; None without any."""
     left = a.get((axis, axis))
     if left is None:
         return None
     for (i, j), entry in a.items():
         if i != j:
-            checks.refuse_stretched(grid)
+            checks.refuse_stretched(grid)  # a diagonal between unequal cells is no diagonal
         if i != j and axis in (i, j):
             other = j if axis == i else i
             left = left - jnp.abs(entry) * (grid.spacing(axis) / grid.spacing(other))
     return left
 
 
-def lacking(on: Discretisation, a: dict[tuple[int, int], Any]) -> Any:
-    """Where the diagonal jumps take more than there is along some axis, per node; None without correlation."""
+def lacking(on: Discretisation, a: dict[tuple[int, int], jax.Array]) -> jax.Array | None:
+    """The nodes at which the diagonal jumps take more than an axis has, bool; None without correlation."""
     if all(i == j for i, j in a):
         return None
     slack = 16 * on.grid.ndim * jnp.finfo(on.dtype).eps  # rounding of σσᵀ and of the spacings

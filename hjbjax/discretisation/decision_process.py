@@ -5,10 +5,11 @@ ask of a problem and a policy, and how their arrays are laid out.
 """
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Protocol
 
 import jax
 import numpy as np
+from numpy.typing import ArrayLike
 
 from hjbjax.discretisation import cut_cells, stationary_law, stencil
 from hjbjax.discretisation.discretisation import Discretisation
@@ -17,25 +18,40 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import AdmissibleSet, Finite
 
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
 Offsets = tuple[tuple[int, ...], ...]
-Table = tuple[Offsets, Sequence[Any], Any, np.ndarray]
+Table = tuple[Offsets, Sequence[np.ndarray], np.ndarray, np.ndarray]
+
+
+class Jumps(Protocol):
+    """The jumps of a chain and the rate of each at every node, as ``chain.Rates`` holds them."""
+
+    @property
+    def offsets(self) -> Offsets:
+        """The steps along the axes."""
+
+    @property
+    def values(self) -> Sequence[np.ndarray]:
+        """For each jump its rates per unit time, (*grid)."""
 
 
 def time_step(leaving: np.ndarray) -> float:
-    """Δt = 1/max Q; 1 where nothing moves."""
+    """Δt = 1/max Q, the longest with which no probability is negative; 1 where nothing moves."""
     fastest = float(np.max(leaving))
     return 1 / fastest if fastest > 0 else 1.0
 
 
 def refuse(what: str, where: np.ndarray, grid: Grid) -> None:
-    """Raise a ValueError that says ``what``, at how many nodes and at which first, if it is true of any."""
+    """Raise a ValueError that names the fault ``what``, its count of nodes and the first, if it is at any."""
     if np.any(where):
         first = tuple(int(i) for i in np.argwhere(where)[0])
         state = np.array2string(grid.state(first), separator=", ")
         raise ValueError(f"chain: {what} at {int(np.sum(where))} nodes, the first {first} with state {state}")
 
 
-def single_law(classes: list[np.ndarray], generator: Any, grid: Grid) -> np.ndarray:
+def single_law(classes: list[np.ndarray], generator: "csr_array", grid: Grid) -> np.ndarray:
     """The stationary probabilities of a chain with one recurrent class, shape (S,).
 
     Raises:
@@ -59,7 +75,8 @@ def single_law(classes: list[np.ndarray], generator: Any, grid: Grid) -> np.ndar
 
 
 def target(problem: Problem, grid: Grid, t: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Which nodes lie on the target, and the exit cost; both (*grid)."""
+    """The nodes on the target, bool, and the exit cost; both (*grid)."""
+    # in double precision whatever the session's: an export is read by others, who solve in double
     with jax.enable_x64(True):
         on = Discretisation(problem, grid, Upwind(), np.dtype(np.float64), t)
         paid = np.asarray(on.at_nodes(problem.exit_cost))
@@ -69,15 +86,19 @@ def target(problem: Problem, grid: Grid, t: float = 0.0) -> tuple[np.ndarray, np
     return inside, paid
 
 
-def policies(problem: Problem, grid: Grid, policy: Any, disturbance: Any) -> tuple[list, list, np.ndarray]:
+def policies(
+    problem: Problem, grid: Grid, policy: ArrayLike | None, disturbance: ArrayLike | None
+) -> tuple[list, list, np.ndarray]:
     """The components of both players' policies, each (*grid), and the nodes where no entry is NaN."""
     u = _entries(policy, problem.controls, grid, "policy")
     d = _entries(disturbance, problem.disturbances, grid, "disturbance")
+    # a solution marks nodes without an action by NaN; drift and cost are evaluated there all the same, at zero
     active = ~np.any(np.isnan(np.concatenate([u, d], axis=-1)), axis=-1)
     return *(list(np.moveaxis(np.where(active[..., None], action, 0), -1, 0)) for action in (u, d)), active
 
 
-def _entries(action: Any, admissible: AdmissibleSet | None, grid: Grid, name: str) -> np.ndarray:
+def _entries(action: ArrayLike | None, admissible: AdmissibleSet | None, grid: Grid, name: str) -> np.ndarray:
+    """One player's action at every node, (*grid, m); of no inputs where there is no such player."""
     wanted = (*grid.shape, 0 if admissible is None else admissible.dim)
     entries = np.zeros(wanted) if action is None and admissible is None else np.asarray(action, np.float64)
     if entries.shape != wanted:
@@ -105,19 +126,20 @@ def actions(problem: Problem) -> np.ndarray:
     if problem.time_dependent:
         raise ValueError("transition_arrays: got time_dependent=True, wanted a stationary problem")
     if problem.controls is None:
-        return np.zeros((1, 0))
-    if not isinstance(problem.controls, Finite):
+        return np.zeros((1, 0))  # one action without inputs: a chain that nobody controls
+    if not isinstance(problem.controls, Finite):  # how finely a continuum is sampled is the user's choice
         kind = type(problem.controls).__name__
         raise ValueError(f"transition_arrays: got controls in a {kind}, wanted Finite: sample it, as by Box.grid(num)")
     return np.asarray(problem.controls.points, np.float64)
 
 
 def surcharge(links: Sequence[stencil.Links], given: np.ndarray, grid: Grid) -> dict[tuple[int, ...], np.ndarray]:
-    """For each jump what it costs more to end on the boundary of the target than on the node beyond it, (*grid)."""
+    """For each jump the exit cost on the boundary of the target minus that of the node beyond it, (*grid)."""
     extra = {}
     for axis, link in enumerate(links):
         for step, meets in ((1, link.meets_up), (-1, link.meets_down)):
             if meets is not None:
+                # the table pays the exit cost of the node beyond, the cut link that of the crossing
                 offset = stencil.unit(grid, axis, step)
                 beyond = np.asarray(stencil.neighbour(jax.numpy.asarray(given), grid, offset))
                 crosses, there = (np.asarray(entry) for entry in meets)
@@ -125,14 +147,14 @@ def surcharge(links: Sequence[stencil.Links], given: np.ndarray, grid: Grid) -> 
     return extra
 
 
-def paid(jumps: Any, extra: dict[tuple[int, ...], np.ndarray]) -> Any:
+def paid(jumps: Jumps, extra: dict[tuple[int, ...], np.ndarray]) -> np.ndarray | float:
     """The surcharges per unit time: Σ_o c_o extra_o."""
     return sum(c * extra.get(offset, 0.0) for offset, c in zip(jumps.offsets, jumps.values, strict=True))
 
 
 def decision_problem(
     tables: Iterable[Table], grid: Grid, count: int, held: np.ndarray, given: np.ndarray, discount: float
-) -> tuple[np.ndarray, Any, np.ndarray, np.ndarray, float]:
+) -> tuple[np.ndarray, "csr_array", np.ndarray, np.ndarray, float]:
     """Costs, probabilities, indices and factor over pairs of state and action; see ``chain.transition_arrays``.
 
     Args:
@@ -155,13 +177,17 @@ def decision_problem(
         costs[:, k], admissible[:, k] = cost.ravel(), allowed.ravel()
         for column, c in enumerate(values):
             entries[:, k, column] = c.ravel()
+    # (S, K, offsets + 1): one Δt for all states and actions, as a decision problem with one factor wants it
     leaving = entries[..., :-1].sum(axis=-1)
     dt = time_step(leaving)
     entries[..., :-1] *= dt
-    entries[..., -1] = np.maximum(1 - leaving * dt, 0)
+    entries[..., -1] = np.maximum(1 - leaving * dt, 0)  # of the fastest row 1 − 1, which may round below zero
     factor = 1 / (1 + discount * dt)
+    # a target keeps its state: (1 − γ) g a step for ever is worth g
     paid = np.where(held.reshape(-1, 1), (1 - factor) * given.reshape(-1, 1), factor * dt * costs)
+    # 32-bit indices halve the memory; SciPy wants 64 bits where the row pointers outgrow them
     number = np.arange(grid.size, dtype=np.int32 if entries.size < 2**31 else np.int64).reshape(grid.shape)
+    # every row has the entries of all jumps, so that the row pointers are an arithmetic sequence
     ends = [np.roll(number, [-step for step in offset], axis=range(grid.ndim)) for offset in offsets]
     columns = np.stack([end.ravel() for end in (*ends, number)], axis=-1)[:, None, :]
     starts = np.arange(0, entries.size + 1, entries.shape[-1], dtype=number.dtype)
@@ -174,7 +200,7 @@ def decision_problem(
         np.logical_not(np.any(admissible, axis=1)).reshape(grid.shape),
         grid,
     )
-    pairs = np.flatnonzero(admissible)
+    pairs = np.flatnonzero(admissible)  # rows of the matrix, sorted by state and then by action
     state, action = np.divmod(pairs, count)
     if pairs.size < costs.size:
         probabilities = probabilities[pairs]

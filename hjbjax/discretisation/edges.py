@@ -10,7 +10,6 @@ the node's coordinates. What counts as leaving is held against these, so that it
 """
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,8 +17,10 @@ import numpy as np
 
 from hjbjax.discretisation import stencil
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.stencil import PerNode
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
+from hjbjax.problem.types import Array, DType, Number, Numbers
 from hjbjax.tracing import components, dependence
 
 PLANES = 5  # coordinates of an axis at which the size of the drift is looked at, for the count of what is cut
@@ -29,29 +30,32 @@ COORDINATES = 8  # units of eps by which a coordinate may be off
 
 @dataclasses.dataclass(frozen=True)
 class Rounding:
-    """What rounding may leave of a drift component that vanishes at a node; both entries broadcast.
+    """Rounding of a drift component that vanishes at a node; both entries broadcast.
 
     Attributes:
       idle: the component without actions: what the actions have to cancel.
-      shift: what a shift of the node by the rounding of its coordinates makes of that.
+      shift: by how much it changes when the node moves by the rounding of its coordinates.
     """
 
-    idle: Any
-    shift: Any
+    idle: jax.Array
+    shift: jax.Array
 
-    def of(self, f: Any) -> Any:
+    def of(self, f: PerNode) -> jax.Array:
         """The size of ``f`` below which it is rounding."""
         eps = jnp.finfo(jnp.result_type(f)).eps
+        # |f₀| + |f − f₀| ≥ |f|, and much more where the parts cancel: a unit that shrinks with f would call
+        # every remainder of a cancellation a drift
         return ROUNDINGS * eps * (jnp.abs(self.idle) + jnp.abs(f - self.idle)) + self.shift
 
 
 def slack(on: Discretisation) -> list[Rounding]:
-    """What is rounding of the drift along every axis, node by node."""
+    """The rounding of the drift along every axis, node by node."""
     problem, grid, dtype = on.problem, on.grid, on.dtype
     m, k = (0 if admissible is None else admissible.dim for admissible in (problem.controls, problem.disturbances))
     nothing = ([jnp.zeros((), dtype)] * m, [jnp.zeros((), dtype)] * k)
     found = []
     for entry in on.drift(*nothing):
+        # zero need not be an admissible action: a formula without a value there leaves nothing to cancel
         idle = jnp.broadcast_to(jnp.where(jnp.isfinite(entry), entry, 0), grid.shape)
         shift = jnp.zeros((), dtype)
         for axis in range(grid.ndim):
@@ -64,37 +68,38 @@ def slack(on: Discretisation) -> list[Rounding]:
     return found
 
 
-def leaves(f: Any, grid: Grid, axis: int, step: int, rounding: Rounding, coarser: Any = 1) -> Any:
-    """Where a drift component leaves across one end of its axis by more than rounding; broadcasts."""
+def leaves(f: PerNode, grid: Grid, axis: int, step: int, rounding: Rounding, coarser: Numbers = 1) -> Array:
+    """The nodes where a drift component leaves across one end of its axis by more than rounding; broadcasts."""
     return stencil.on_edge(grid, axis, step) & (step * f > coarser * rounding.of(f))
 
 
-def barred(f: Any, grid: Grid, axis: int, rounding: Rounding, coarser: Any = 1) -> Any:
-    """Where a drift component leaves across a constrained end of its axis; None if the axis has none."""
+def barred(f: PerNode, grid: Grid, axis: int, rounding: Rounding, coarser: Numbers = 1) -> Array | None:
+    """The nodes where a drift component leaves across a constrained end of its axis; None if it has none."""
     steps = [step for which, step in grid.sides("constrained") if which == axis]
     found = [leaves(f, grid, axis, step, rounding, coarser) for step in steps]
     return None if not found else found[0] if len(found) == 1 else found[0] | found[1]
 
 
 def beside(lost: jax.Array, grid: Grid) -> tuple[tuple[jax.Array, jax.Array], ...]:
-    """For every axis whether the next node up, and the next one down, is among the ``lost`` ones, bool (*grid)."""
+    """For every axis the nodes whose next one up, and whose next one down, is ``lost``, each bool (*grid)."""
     up, down = ([stencil.unit(grid, axis, step) for axis in range(grid.ndim)] for step in (1, -1))
     pairs = zip(up, down, strict=True)
     return tuple((stencil.neighbour(lost, grid, p), stencil.neighbour(lost, grid, q)) for p, q in pairs)
 
 
-def strays(f: Any, beside: tuple[Any, Any], rounding: Rounding) -> Any:
-    """Where a drift component that is only rounding points to a lost node beside."""
+def strays(f: PerNode, beside: tuple[jax.Array, jax.Array], rounding: Rounding) -> jax.Array:
+    """The nodes where a drift component that is only rounding points to a lost node beside."""
     up, down = beside
     return ((up & (f > 0)) | (down & (f < 0))) & (jnp.abs(f) <= rounding.of(f))
 
 
-def inadmissible(on: Discretisation, u: list, d: list | None = None, *, eps: Any = None) -> jax.Array:
+def inadmissible(on: Discretisation, u: list, d: list | None = None, *, eps: Number | None = None) -> jax.Array:
     """The nodes at which these actions lead out across a constrained end, bool (*grid); ``eps`` is their rounding."""
     bad = jnp.zeros(on.grid.shape, bool)
     if not on.grid.sides("constrained"):
         return bad
     f = on.drift(u, d)
+    # a policy found in single precision and looked at in double: its own rounding decides what leaves
     coarser = 1 if eps is None else eps / jnp.finfo(on.dtype).eps
     for axis, rounding in enumerate(slack(on)):
         out = barred(f[axis], on.grid, axis, rounding, coarser)
@@ -103,9 +108,9 @@ def inadmissible(on: Discretisation, u: list, d: list | None = None, *, eps: Any
 
 
 def cut(
-    problem: Problem, grid: Grid, value: np.ndarray, u: list, d: list, acting: np.ndarray, t: Any = 0.0
+    problem: Problem, grid: Grid, value: np.ndarray, u: list, d: list, acting: np.ndarray, t: Number = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """At how many nodes of each projected end the drift under these actions is cut off, and how many there are.
+    """Counts of nodes on each projected end: those where the drift under these actions is cut off, and all.
 
     Where the value does not change towards the end, next to its range over the box, and nobody's actions cost or earn
     anything, the cut takes nothing away. Host level: one small program for the drift at the ends and on a coarse
@@ -125,20 +130,25 @@ def cut(
     acting, earning = np.broadcast_to(acting, grid.shape), _actions_cost(problem, grid.ndim, value.dtype)
     number = np.arange(grid.size).reshape(grid.shape)
     coarse = number[np.ix_(*(np.linspace(0, count - 1, min(count, PLANES)).astype(int) for count in grid.shape))]
+    # one call of one program for the sample and all ends: a program each would be compiled each
     sides = grid.sides("projected")
     faces = [np.take(number, grid.shape[axis] - 1 if step > 0 else 0, axis).ravel() for axis, step in sides]
     places = np.unravel_index(np.concatenate([coarse.ravel(), *faces]), grid.shape)
     x = [np.asarray(grid.axis(axis), value.dtype)[index] for axis, index in enumerate(places)]
     actions = ([np.broadcast_to(entry, grid.shape)[places] for entry in each] for each in (u, d))
     f = np.asarray(_drift(problem, x, *actions, t))
+    # the sample tells the size of the drift over the box, next to which a remainder at an end may be rounding
     least = ROUNDINGS * np.finfo(value.dtype).eps * np.max(np.abs(f[:, : coarse.size]), axis=1)
     extent = np.ptp(value[acting]) if acting.any() else 0.0
     first = coarse.size
     for (axis, step), face in zip(sides, faces, strict=True):
         inner = face - step * number.strides[axis] // number.itemsize
+        # the slope at the end times the length of the axis, in the units of V
         change = np.abs(value.ravel()[face] - value.ravel()[inner]) * (grid.shape[axis] - 1)
         leaves_there = step * f[axis, first : first + face.size] > least[axis]
+        # where V is flat towards the end but for rounding, the cut takes nothing from anybody
         matters = earning | (change > np.sqrt(np.finfo(value.dtype).eps) * extent)
+        # column 0 is the lower end, 1 the upper; ``first`` walks along the faces behind the coarse sample
         side, first = (step + 1) // 2, first + face.size
         counts[axis, side] = np.sum(acting.ravel()[face] & leaves_there & matters)
         totals[axis, side] = np.sum(acting.ravel()[face])
@@ -146,14 +156,14 @@ def cut(
 
 
 @jax.jit
-def _drift(problem: Problem, x: list, u: list, d: list, t: Any) -> jax.Array:
+def _drift(problem: Problem, x: list, u: list, d: list, t: Number) -> jax.Array:
     """The drift at states (K,) an entry, shape (n, K)."""
     f = components.components(problem.drift, *problem.arguments(x, u, d, t), dtype=x[0].dtype)
     return jnp.stack([jnp.broadcast_to(entry, x[0].shape) for entry in f])
 
 
-def _actions_cost(problem: Problem, n: int, dtype: Any) -> bool:
-    """Whether the running cost depends on what a player does."""
+def _actions_cost(problem: Problem, n: int, dtype: DType) -> bool:
+    """True if the running cost depends on an action of either player."""
     if problem.cost is None:
         return False
     m, k = (0 if admissible is None else admissible.dim for admissible in (problem.controls, problem.disturbances))

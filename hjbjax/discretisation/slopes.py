@@ -19,46 +19,50 @@ schemes for Hamilton–Jacobi equations, SIAM J. Sci. Comput. 21.
 """
 
 import itertools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from hjbjax.discretisation import stencil
+from hjbjax.discretisation.stencil import PerNode
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.types import Field
 
 EPSILON = 1e-6  # of a squared slope over the typical one: what counts as equally smooth
 
 
-def eno2(values: jax.Array, grid: Grid) -> list[tuple[jax.Array, jax.Array]]:
+def eno2(values: Field, grid: Grid) -> list[tuple[Field, Field]]:
     """The slopes from above and from below along every axis, each of shape (*grid); zero across a wall."""
     result = []
     for axis in range(grid.ndim):
         far_down, down, up, far_up = _differences(values, grid, axis, 2, 1 / grid.spacing(axis))
-        bend = up - down
+        bend = up - down  # h V'': half of it is h/2 V'', the leading error of a one-sided difference
         above, below = up - _smaller(bend, far_up - up) / 2, down + _smaller(bend, down - far_down) / 2
         result.append(stencil.stopped(above, below, grid, axis))
     return result
 
 
-def weno5(values: jax.Array, grid: Grid) -> list[tuple[jax.Array, jax.Array]]:
+def weno5(values: Field, grid: Grid) -> list[tuple[Field, Field]]:
     """The slopes from above and from below along every axis, each of shape (*grid); zero across a wall."""
+    # it only sets the unit of ε: no derivative goes through the nodes of the largest and the least V
     extent = jax.lax.stop_gradient(jnp.max(values) - jnp.min(values))
-    extent = jnp.where(extent > 0, extent, 1)
+    extent = jnp.where(extent > 0, extent, 1)  # a constant V has slopes zero in any unit
     result = []
     for axis in range(grid.ndim):
         typical = extent / (grid.hi[axis] - grid.lo[axis])
         steps = _differences(values, grid, axis, 3, 1 / (grid.spacing(axis) * typical))
+        # six differences: the last five from above are the mirror image of the first five from below
         above, below = typical * _weighted(*steps[:0:-1]), typical * _weighted(*steps[:-1])
         result.append(stencil.stopped(above, below, grid, axis))
     return result
 
 
-def _smaller(a: jax.Array, b: jax.Array) -> jax.Array:
+def _smaller(a: Field, b: Field) -> Field:
+    """m(a, b): of two second differences the smaller in size, which belongs to the smoother stencil."""
     return jnp.where(jnp.abs(a) < jnp.abs(b), a, b)
 
 
-def _differences(values: jax.Array, grid: Grid, axis: int, reach: int, scale: Any) -> list[jax.Array]:
+def _differences(values: Field, grid: Grid, axis: int, reach: int, scale: PerNode) -> list[Field]:
     """The differences between neighbours times ``scale``, from ``reach`` nodes below a node to ``reach`` above."""
     # kept apart: fused into the loop over the nodes, the ends would be branches in it
     wide, count = jax.lax.optimization_barrier(_continued(values, grid, axis, reach)), grid.shape[axis]
@@ -66,7 +70,7 @@ def _differences(values: jax.Array, grid: Grid, axis: int, reach: int, scale: An
     return [(right - left) * scale for left, right in itertools.pairwise(nodes)]
 
 
-def _continued(values: jax.Array, grid: Grid, axis: int, reach: int) -> jax.Array:
+def _continued(values: Field, grid: Grid, axis: int, reach: int) -> jax.Array:
     """``values`` with ``reach`` more entries at both ends of an axis."""
 
     def part(start, stop):
@@ -78,18 +82,21 @@ def _continued(values: jax.Array, grid: Grid, axis: int, reach: int) -> jax.Arra
 
     def beyond(a, b, c):
         """The parabola through three entries, at the three places before the first, farthest first."""
+        # Lagrange's polynomials on the places 0, 1, 2, at −3, −2 and −1
         return [10 * a - 15 * b + 6 * c, 6 * a - 8 * b + 3 * c, 3 * a - 3 * b + c]
 
+    # of the three places the nearest ``reach``; at the upper end the mirror image
     first = beyond(*(part(k, k + 1) for k in range(3)))[3 - reach :]
     last = beyond(*(part(count - 1 - k, count - k) for k in range(3)))[3 - reach :]
     return jnp.concatenate([*first, values, *last[::-1]], axis)
 
 
-def _weighted(a: Any, b: Any, c: Any, d: Any, e: Any) -> Any:
+def _weighted(a: Field, b: Field, c: Field, d: Field, e: Field) -> Field:
     """The weighted slope between c and d from five differences in order, upwind first."""
     p, q, r, s = b - a, c - b, d - c, e - d
     first = (13 / 12 * (q - p) ** 2 + (3 * q - p) ** 2 / 4 + EPSILON) ** 2
     middle = (13 / 12 * (r - q) ** 2 + (q + r) ** 2 / 4 + EPSILON) ** 2
     last = (13 / 12 * (s - r) ** 2 + (s - 3 * r) ** 2 / 4 + EPSILON) ** 2
+    # c_k/(ε + S_k)² over one common denominator, so that a slope takes one quotient and not four
     w0, w1, w2 = 0.1 * (middle * last), 0.6 * (first * last), 0.3 * (first * middle)
     return c + (w0 * (5 * q - 2 * p) + w1 * (2 * r + q) + w2 * (4 * r - s)) / (6 * (w0 + w1 + w2))

@@ -7,19 +7,26 @@ parabola through its last three nodes, V_{N+1} = 3V_N − 3V_{N−1} + V_{N−2}
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.types import Field, Number
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
+PerNode: TypeAlias = float | jax.Array | np.ndarray  # a number a node, as one number or as an array that broadcasts
 
 LONGER = 4  # axes up to which neighbours along the last one are slices of a longer array
 
 
 def on_edge(grid: Grid, axis: int, step: int) -> np.ndarray:
-    """Which nodes have no neighbour in direction ``step`` along ``axis``; broadcasts against the node axes."""
+    """The nodes without a neighbour in direction ``step`` along ``axis``, bool; broadcasts against the node axes."""
+    # (1, …, N, …, 1) and on the host: as a constant of the size of the grid it would stand in every program
     mask = np.zeros(grid.shape[axis], dtype=bool)
     mask[-1 if step > 0 else 0] = not grid.periodic[axis]  # type: ignore[index]
     return mask.reshape([-1 if i == axis else 1 for i in range(grid.ndim)])
@@ -36,12 +43,12 @@ def walls(grid: Grid, axis: int) -> np.ndarray:
     return wall(grid, axis, 1) | wall(grid, axis, -1)
 
 
-def stopped(up: jax.Array, down: jax.Array, grid: Grid, axis: int) -> tuple[jax.Array, jax.Array]:
+def stopped(up: Field, down: Field, grid: Grid, axis: int) -> tuple[Field, Field]:
     """Slopes of a scheme from above and from below along one axis, with those across walls made zero."""
     return jnp.where(wall(grid, axis, 1), 0, up), jnp.where(wall(grid, axis, -1), 0, down)
 
 
-def parabola(grid: Grid, axis: int, step: int) -> tuple[Any, Any, Any]:
+def parabola(grid: Grid, axis: int, step: int) -> tuple[Number, Number, Number]:
     """The weights of the last node and of the two before it in the value beyond an end; their sum is one.
 
     The next gap is taken as long as the last one.
@@ -50,15 +57,16 @@ def parabola(grid: Grid, axis: int, step: int) -> tuple[Any, Any, Any]:
         return 3.0, -3.0, 1.0
     gaps = jnp.diff(jnp.asarray(grid.axis(axis)))
     last, before = (gaps[-1], gaps[-2]) if step > 0 else (gaps[0], gaps[1])
+    # Newton's form of the parabola at a distance ``last`` beyond the end; equal gaps make it 3, −3, 1
     ratio, bend = last / before, 2 * last / (last + before)
     return 2 + bend, -(1 + bend + bend * ratio), bend * ratio
 
 
-def continued(values: jax.Array, grid: Grid, offset: tuple[int, ...]) -> jax.Array:
-    """V at x + offset for every node x, shape (*grid), as ``neighbour`` has it, and extrapolated beyond open ends."""
+def continued(values: Field, grid: Grid, offset: tuple[int, ...]) -> Field:
+    """V at x + offset for every node x, shape (*grid): beyond open ends the parabola, else as in ``neighbour``."""
     if not grid.sides("open"):
         return neighbour(values, grid, offset)
-    for axis, step in enumerate(offset):
+    for axis, step in enumerate(offset):  # beyond a corner: the parabola of one axis through those of the other
         moved = neighbour(values, grid, unit(grid, axis, step))
         if step and (axis, step) in grid.sides("open"):
             moved = jnp.where(on_edge(grid, axis, step), _beyond(values, grid, axis, step), moved)
@@ -67,11 +75,14 @@ def continued(values: jax.Array, grid: Grid, offset: tuple[int, ...]) -> jax.Arr
 
 
 def inward(
-    offsets: Sequence[tuple[int, ...]], values: Sequence[Any], grid: Grid
-) -> tuple[list[tuple[int, ...]], list[Any]]:
-    """Offsets and entries of the same operator without any beyond an open end: they go to the parabola's nodes."""
+    offsets: Sequence[tuple[int, ...]], values: Sequence[jax.Array], grid: Grid
+) -> tuple[list[tuple[int, ...]], list[jax.Array]]:
+    """Offsets and entries of an operator with those beyond open ends moved to the nodes of the parabola inside.
+
+    Row sums stay, since the weights of a parabola sum to one. Offsets may come twice; their entries add up.
+    """
     pairs = list(zip(offsets, values, strict=True))
-    for axis in range(grid.ndim):
+    for axis in range(grid.ndim):  # one after the other: a diagonal jump over a corner is turned inwards twice
         kept = []
         for offset, value in pairs:
             step = offset[axis]
@@ -81,14 +92,14 @@ def inward(
             outside = on_edge(grid, axis, step)
             kept.append((offset, jnp.where(outside, 0, value)))
             for k, weight in enumerate(parabola(grid, axis, step)):
-                place = (*offset[:axis], -k * step, *offset[axis + 1 :])
+                place = (*offset[:axis], -k * step, *offset[axis + 1 :])  # the end itself, one before it, two
                 kept.append((place, jnp.where(outside, jnp.asarray(weight, value.dtype) * value, 0)))
         pairs = kept
     return [offset for offset, _ in pairs], [value for _, value in pairs]
 
 
-def _beyond(values: jax.Array, grid: Grid, axis: int, step: int) -> jax.Array:
-    """What stands beyond the end of an ordinary axis, one slice: a copy of the end, or the parabola's continuation."""
+def _beyond(values: Field, grid: Grid, axis: int, step: int) -> jax.Array:
+    """The values beyond the end of an ordinary axis, one slice: a copy of the end, or the parabola's continuation."""
     last = grid.shape[axis] - 1 if step > 0 else 0
     if (axis, step) not in grid.sides("open"):
         return jax.lax.slice_in_dim(values, last, last + 1, axis=axis)
@@ -97,7 +108,7 @@ def _beyond(values: jax.Array, grid: Grid, axis: int, step: int) -> jax.Array:
     return sum((w * v for w, v in zip(weights[1:], nodes[1:], strict=True)), start=weights[0] * nodes[0])
 
 
-def neighbour(values: jax.Array, grid: Grid, offset: tuple[int, ...], *, ghost: bool = True) -> jax.Array:
+def neighbour(values: Field, grid: Grid, offset: tuple[int, ...], *, ghost: bool = True) -> Field:
     """The values at x + offset for every node x, shape (*grid).
 
     Args:
@@ -110,6 +121,7 @@ def neighbour(values: jax.Array, grid: Grid, offset: tuple[int, ...], *, ghost: 
         if step == 0:
             continue
         last = grid.shape[axis] - 1
+        # the slice that stands beyond: the edge's own copy, or across the seam the other end of the axis
         end = last if (step > 0) != bool(grid.periodic[axis]) else 0  # type: ignore[index]
         beyond = jax.lax.slice_in_dim(values, end, end + 1, axis=axis)
         if not ghost and not grid.periodic[axis]:  # type: ignore[index]
@@ -129,7 +141,7 @@ def unit(grid: Grid, axis: int, step: int) -> tuple[int, ...]:
 
 @dataclasses.dataclass(frozen=True)
 class Links:
-    """How every node hangs together with its two neighbours along one axis; all entries broadcast.
+    """Distances from each node to its two neighbours along one axis; all entries broadcast.
 
     Attributes:
       up, down: the distances.
@@ -137,10 +149,10 @@ class Links:
         the value there; None where no link does.
     """
 
-    up: Any
-    down: Any
-    meets_up: tuple[Any, Any] | None = None
-    meets_down: tuple[Any, Any] | None = None
+    up: PerNode
+    down: PerNode
+    meets_up: tuple[jax.Array, jax.Array] | None = None
+    meets_down: tuple[jax.Array, jax.Array] | None = None
 
 
 def links(grid: Grid, axis: int) -> Links:
@@ -149,21 +161,22 @@ def links(grid: Grid, axis: int) -> Links:
         return Links(grid.spacing(axis), grid.spacing(axis))
     gaps = jnp.diff(jnp.asarray(grid.axis(axis)))
     along = [-1 if i == axis else 1 for i in range(grid.ndim)]
+    # N − 1 gaps for N nodes: what an end's missing link is divided into is zero, or a parabola over a gap as long
     return Links(jnp.append(gaps, gaps[-1:]).reshape(along), jnp.append(gaps[:1], gaps).reshape(along))
 
 
-def one_sided(values: jax.Array, grid: Grid, axis: int, link: Links | None = None) -> tuple[jax.Array, jax.Array]:
+def one_sided(values: Field, grid: Grid, axis: int, link: Links | None = None) -> tuple[Field, Field]:
     """The differences D⁺ = (V(x+h⁺) − V(x))/h⁺ and D⁻ = (V(x) − V(x−h⁻))/h⁻ along one axis; zero across a wall."""
     link = link or links(grid, axis)
     up, down = _neighbours(values, grid, axis)
-    if link.meets_up is not None:
+    if link.meets_up is not None:  # the link ends on a target: the exit cost there takes the neighbour's place
         up = jnp.where(*link.meets_up, up)
     if link.meets_down is not None:
         down = jnp.where(*link.meets_down, down)
     return (up - values) / link.up, (values - down) / link.down
 
 
-def _neighbours(values: jax.Array, grid: Grid, axis: int) -> tuple[jax.Array, jax.Array]:
+def _neighbours(values: Field, grid: Grid, axis: int) -> tuple[Field, Field]:
     """The values one step up and one step down along an axis.
 
     XLA fuses a concatenation into the loop over the nodes, except one along the last axis. There two slices of a
@@ -174,41 +187,49 @@ def _neighbours(values: jax.Array, grid: Grid, axis: int) -> tuple[jax.Array, ja
     count = grid.shape[axis]
     first, last = (_beyond(values, grid, axis, step) for step in (-1, 1))
     if grid.periodic[axis]:  # type: ignore[index]
-        first, last = last, first
+        first, last = last, first  # across the seam stands the other end
     wide = jax.lax.optimization_barrier(jnp.concatenate([first, values, last], axis=axis))
     return jax.lax.slice_in_dim(wide, 2, count + 2, axis=axis), jax.lax.slice_in_dim(wide, 0, count, axis=axis)
 
 
-def limited(up: jax.Array, down: jax.Array, grid: Grid, axis: int, link: Links) -> tuple[jax.Array, jax.Array]:
+def limited(up: Field, down: Field, grid: Grid, axis: int, link: Links) -> tuple[Field, Field]:
     """Second-order one-sided slopes from the differences D⁺, D⁻ along one axis; zero across a wall as they are.
 
     Next to an edge, and to the boundary of a target, the second difference is continued as a constant.
     """
     upper, lower = on_edge(grid, axis, 1), on_edge(grid, axis, -1)
-    bend = 2 * (up - down) / (link.up + link.down)
+    bend = 2 * (up - down) / (link.up + link.down)  # V'' on two gaps of any length
+    # D⁺ or D⁻ is missing on an edge, and with it the bend: that of the node before is taken
     bend = jnp.where(upper, neighbour(bend, grid, unit(grid, axis, -1)), bend)
     bend = jnp.where(lower, neighbour(bend, grid, unit(grid, axis, 1)), bend)
     above, below = (neighbour(bend, grid, unit(grid, axis, step)) for step in (1, -1))
+    # nodes inside a target hold no smooth continuation of V: the bend of this side is taken for both
     if link.meets_up is not None:
         above = jnp.where(link.meets_up[0], bend, above)
     if link.meets_down is not None:
         below = jnp.where(link.meets_down[0], bend, below)
+    # V(x ± h) = V ± h V' + h²/2 V'': half a gap times the bend is the leading error of a one-sided difference
     up, down = up - link.up / 2 * _van_albada(bend, above), down + link.down / 2 * _van_albada(bend, below)
     return stopped(up, down, grid, axis)
 
 
-def _van_albada(a: jax.Array, b: jax.Array) -> jax.Array:
+def _van_albada(a: Field, b: Field) -> Field:
+    """The mean a b (a + b)/(a² + b²) of two bends, zero where their signs differ: G. D. van Albada's limiter."""
     agree = a * b > 0
+    # the inner where keeps 0/0 out of the branch not taken, whose NaN a derivative would bring back
     return jnp.where(agree, a * b * (a + b) / jnp.where(agree, a * a + b * b, 1), 0)
 
 
 def numbers(grid: Grid, offset: Sequence[int]) -> np.ndarray:
     """The number in C order of the node x + offset for every node x, shape (*grid), round all axes; host level."""
     number = np.arange(grid.size).reshape(grid.shape)
+    # round axes that are not periodic as well: whoever asks has zero entries there
     return np.roll(number, [-step for step in offset], axis=range(grid.ndim))
 
 
-def sparse(offsets: Sequence[tuple[int, ...]], values: Sequence[np.ndarray], diagonal: np.ndarray, grid: Grid) -> Any:
+def sparse(
+    offsets: Sequence[tuple[int, ...]], values: Sequence[np.ndarray], diagonal: np.ndarray, grid: Grid
+) -> "csr_array":
     """The matrix with ``diagonal`` and, for every offset o, entry values_o(x) in row x and column x + o.
 
     Host level. Nodes are numbered in C order. Entries whose column lies outside the box must be zero.
@@ -226,4 +247,5 @@ def sparse(offsets: Sequence[tuple[int, ...]], values: Sequence[np.ndarray], dia
         columns.append(numbers(grid, offset).ravel()[nonzero])
         entries.append(np.asarray(value, np.float64).ravel()[nonzero])
     index = (np.concatenate(rows), np.concatenate(columns))
+    # entries at one place add up, as of two jumps over the seam of an axis with two nodes
     return coo_array((np.concatenate(entries), index), shape=(grid.size, grid.size)).tocsr()

@@ -7,45 +7,65 @@ minimise and −1 to maximise; all numbers are per-node scalars.
 
 import itertools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Generic, TypeAlias, TypeVar
 
+import jax
 import jax.numpy as jnp
 
+from hjbjax.discretisation.stencil import PerNode
 from hjbjax.hamiltonian.search import Action, better, pick
 
+Pair: TypeAlias = Sequence[PerNode]  # one number a node for each of two inputs
+Slope = TypeVar("Slope")
 
-class Kinked:
+
+class Kinked(Generic[Slope]):
     """A piecewise linear function gain(f) of one drift component f = offset + slope·u, with its kinks in order.
 
     ``derivatives`` holds the slope of the gain between consecutive kinks: one more than there are kinks. ``slope`` is
     a number a node, or one for each of two inputs.
     """
 
-    def __init__(self, gain: Callable, offset: Any, slope: Any, kinks: Sequence[Any], derivatives: Sequence[Any]):
+    def __init__(
+        self,
+        gain: Callable[[PerNode], PerNode],
+        offset: PerNode,
+        slope: Slope,
+        kinks: Sequence[PerNode],
+        derivatives: Sequence[PerNode],
+    ):
         self.gain, self.offset, self.slope = gain, offset, slope
         self.kinks, self.derivatives = tuple(kinks), tuple(derivatives)
 
-    def on_line(self, point: Sequence[Any], direction: Sequence[Any]) -> "Kinked":
-        """The same along point + t · direction, as a function of one input t."""
+    def on_line(self: "Kinked[Pair]", point: Pair, direction: Pair) -> "Kinked[PerNode]":
+        """The gain along point + t · direction, as a function of one input t."""
+        # f = b + G·(point + t direction): only offset and slope change, the kinks are places of f
         at, along = (sum(g * c for g, c in zip(self.slope, vector, strict=True)) for vector in (point, direction))
         return Kinked(self.gain, self.offset + at, along, self.kinks, self.derivatives)
 
 
-def inverse(number: Any) -> Any:
+def inverse(number: PerNode) -> jax.Array:
     """1/number, 0 for zero. Slopes vary along few axes, and a product is fused where a quotient fills an array."""
-    zero = number == 0
+    zero = number == 0  # the inner where: 1/0 in the branch not taken would be a NaN of the derivative
     return jnp.where(zero, 0, 1 / jnp.where(zero, 1, number))
 
 
-def inverse_root(number: Any) -> Any:
+def inverse_root(number: PerNode) -> jax.Array:
     """1/√number, 0 for zero, with a derivative of zero there."""
-    zero = number == 0
+    zero = number == 0  # likewise, and the derivative of a root at zero is infinite
     return jnp.where(zero, 0, 1 / jnp.sqrt(jnp.where(zero, 1, number)))
 
 
 def piecewise_input(
-    sign: int, lo: Any, hi: Any, linear: Any, square: Any, pieces: Sequence[Kinked], *, curved: bool
-) -> Any:
+    sign: int,
+    lo: PerNode,
+    hi: PerNode,
+    linear: PerNode,
+    square: PerNode,
+    pieces: Sequence[Kinked[PerNode]],
+    *,
+    curved: bool,
+) -> jax.Array:
     """The exact optimum over one input u ∈ [lo, hi] of  l u + q u² + Σ_i gain_i(b_i + G_i u).
 
     Each gain is linear between its kinks, so the optimum is an end, a kink, or the stationary point of one choice of
@@ -57,20 +77,22 @@ def piecewise_input(
       lo, hi: the bounds of the input.
       linear, square: l and q, per-node scalars.
       pieces: the gains that this input drives.
-      curved: whether q may differ from zero.
+      curved: true if q may differ from zero.
     """
 
-    def total(u):
+    def total(u: PerNode) -> PerNode:
         value = linear * u + square * u * u if curved else linear * u
         return sum((piece.gain(piece.offset + piece.slope * u) for piece in pieces), start=value)
 
     candidates = [lo, hi]
-    for piece in pieces:
+    for piece in pieces:  # where b + G u meets a kink; with G = 0 it is 0, which is clipped and harmless
         candidates += [jnp.clip((kink - piece.offset) * inverse(piece.slope), lo, hi) for kink in piece.kinks]
     if curved:
+        # 0 = l + 2 q u + Σ G_i d_i for each choice of a piece a gain: all cells, K kinks make (K + 1)^pieces of them
         for choice in itertools.product(*(piece.derivatives for piece in pieces)):
             slope = linear + sum(piece.slope * d for piece, d in zip(pieces, choice, strict=True))
             candidates.append(jnp.clip(-slope * inverse(2 * square), lo, hi))
+    # judged by the objective itself: which choice of pieces a candidate belongs to need not be known
     best_u, best_value = jnp.asarray(candidates[0]), total(candidates[0])
     for u in candidates[1:]:
         value = total(u)
@@ -81,14 +103,14 @@ def piecewise_input(
 
 def piecewise_pair(
     sign: int,
-    lo: Sequence[Any],
-    hi: Sequence[Any],
-    linear: Sequence[Any],
-    square: Sequence[Any],
-    pieces: Sequence[Kinked],
+    lo: Pair,
+    hi: Pair,
+    linear: Pair,
+    square: Pair,
+    pieces: Sequence[Kinked[Pair]],
     *,
     curved: bool,
-) -> list[Any]:
+) -> list[jax.Array]:
     """The exact optimum over two inputs of  l·u + q₁u₁² + q₂u₂² + Σ_i gain_i(b_i + G_i·u)  in a box.
 
     The lines on which a gain has its kink cut the box into cells, in each of which the objective is one quadratic.
@@ -100,28 +122,34 @@ def piecewise_pair(
       lo, hi: the bounds of the two inputs.
       linear, square: l and q for both, per-node scalars.
       pieces: the gains; their slopes are pairs.
-      curved: whether a q may differ from zero.
+      curved: true if a q may differ from zero.
     """
 
-    def clipped(u: Sequence[Any]) -> list[Any]:
+    def clipped(u: Pair) -> list[jax.Array]:
         return [jnp.clip(v, low, high) for v, low, high in zip(u, lo, hi, strict=True)]
 
-    def total(u: Sequence[Any]) -> Any:
+    def total(u: Pair) -> PerNode:
         terms = [b * v + c * v * v if curved else b * v for b, c, v in zip(linear, square, u, strict=True)]
         return sum(
             (p.gain(p.offset + p.slope[0] * u[0] + p.slope[1] * u[1]) for p in pieces), start=terms[0] + terms[1]
         )
 
-    def best_on_line(point: Sequence[Any], direction: Sequence[Any], ends: tuple[Any, Any], others: Any) -> list[Any]:
+    def best_on_line(
+        point: Pair, direction: Pair, ends: tuple[PerNode, PerNode], others: Sequence[Kinked[Pair]]
+    ) -> list[jax.Array]:
+        # l·(x + t v) + Σ q (x + t v)² has the slope Σ (l + 2 q x) v at t = 0 and the coefficient Σ q v² of t²
         slope = sum((b + 2 * c * x) * v for b, c, x, v in zip(linear, square, point, direction, strict=True))
         bend = sum(c * v * v for c, v in zip(square, direction, strict=True))
         restricted = [piece.on_line(point, direction) for piece in others]
         t = piecewise_input(sign, *ends, slope, bend, restricted, curved=curved)
+        # a kink's line may miss the box, and rounding may carry a point over a side: admissible in any case
         return clipped([x + t * v for x, v in zip(point, direction, strict=True)])
 
+    # the four sides of the box
     candidates = [best_on_line((0.0, bound), (1.0, 0.0), (lo[0], hi[0]), pieces) for bound in (lo[1], hi[1])] + [
         best_on_line((bound, 0.0), (0.0, 1.0), (lo[1], hi[1]), pieces) for bound in (lo[0], hi[0])
     ]
+    # the kinks' lines; on its own line a gain is constant and drops out
     for index, piece in enumerate(pieces):
         others = [other for k, other in enumerate(pieces) if k != index]
         for kink in piece.kinks:
@@ -129,7 +157,7 @@ def piecewise_pair(
             candidates.append(best_on_line(point, direction, _within(point, direction, lo, hi), others))
     if curved:
         for choice in itertools.product(*(piece.derivatives for piece in pieces)):
-            slopes = [
+            slopes = [  # the inputs decouple within a cell, where the gains are linear and the cost is separable
                 b + sum(piece.slope[j] * d for piece, d in zip(pieces, choice, strict=True))
                 for j, b in enumerate(linear)
             ]
@@ -145,42 +173,46 @@ def piecewise_pair(
     return best_u
 
 
-def _kink_line(piece: Kinked, kink: Any) -> tuple[list[Any], list[Any]]:
+def _kink_line(piece: Kinked[Pair], kink: PerNode) -> tuple[Pair, Pair]:
     """A point and a unit direction of the line b + G·u = kink; the origin and no direction where G = 0."""
     g1, g2 = piece.slope
+    # unit length, so that t is a distance in the box whatever the units of G
     shrink = inverse_root(g1 * g1 + g2 * g2)
     g1, g2 = g1 * shrink, g2 * shrink
     away = (kink - piece.offset) * shrink
     return [away * g1, away * g2], [-g2, g1]
 
 
-def _within(point: Sequence[Any], direction: Sequence[Any], lo: Sequence[Any], hi: Sequence[Any]) -> tuple[Any, Any]:
+def _within(point: Pair, direction: Pair, lo: Pair, hi: Pair) -> tuple[jax.Array, jax.Array]:
     """The range of t in which point + t · direction lies in the box; a line that misses the box gives one t."""
-    first: Any = -jnp.inf
-    last: Any = jnp.inf
+    first: PerNode = -jnp.inf
+    last: PerNode = jnp.inf
     for x, v, low, high in zip(point, direction, lo, hi, strict=True):
-        moves = v != 0
+        moves = v != 0  # a line along the other axis is bounded by that one alone
         ends = [(bound - x) * inverse(v) for bound in (low, high)]
         first = jnp.maximum(first, jnp.where(moves, jnp.minimum(*ends), -jnp.inf))
         last = jnp.minimum(last, jnp.where(moves, jnp.maximum(*ends), jnp.inf))
+    # no direction at all, where G = 0, leaves both ends infinite: t = 0 then
     first = jnp.where(jnp.isfinite(first), first, 0)
     return first, jnp.maximum(first, jnp.where(jnp.isfinite(last), last, 0))
 
 
-def ball_directions(gradients: Sequence[Any], radius: Any, sign: int) -> Action:
+def ball_directions(gradients: Sequence[PerNode], radius: PerNode, sign: int) -> Action:
     """The optimum of g·u over |u| ≤ radius: −sign · radius · g/|g|; the centre where g = 0."""
     scale = -sign * radius * inverse_root(sum(g * g for g in gradients))
     return [scale * g for g in gradients]
 
 
-def kinked_ball(sign: int, radius: Any, linear: Sequence[Any], pieces: Sequence[Kinked | None]) -> Action:
+def kinked_ball(
+    sign: int, radius: PerNode, linear: Sequence[PerNode], pieces: Sequence[Kinked[PerNode] | None]
+) -> Action:
     """The exact optimum over |u| ≤ radius of Σ_j (l_j u_j + gain_j(b_j + G_j u_j)), one gain an input at most.
 
     On each combination of pieces the objective is linear, so its optimum lies on the sphere, or where some
     inputs sit at kinks and the others on the sphere that is left; all combinations are tried.
     """
 
-    def total(action):
+    def total(action: Action) -> PerNode:
         terms = [g * u for g, u in zip(linear, action, strict=True)]
         terms += [p.gain(p.offset + p.slope * u) for p, u in zip(pieces, action, strict=True) if p is not None]
         return sum(terms[1:], start=terms[0])
@@ -188,9 +220,11 @@ def kinked_ball(sign: int, radius: Any, linear: Sequence[Any], pieces: Sequence[
     best = None
     for choice in itertools.product(*(_branches(g, piece) for g, piece in zip(linear, pieces, strict=True))):
         fixed = {j: u for j, (kind, u) in enumerate(choice) if kind == "kink"}
+        # the kinks alone may lie outside of the ball: then their point on the sphere stands for them
         spent = sum((u * u for u in fixed.values()), start=jnp.zeros(()))
         shrink = jnp.minimum(1, radius / jnp.sqrt(jnp.where(spent == 0, 1, spent))) if fixed else 1
         left = jnp.sqrt(jnp.maximum(radius * radius - spent, 0))
+        # without a gradient left the inputs at kinks are all: one zero, so that there is something to sum
         free = ball_directions([g for kind, g in choice if kind == "slope"] or [jnp.zeros(())], left, sign)
         moving = iter(free)
         action = [shrink * fixed[j] if j in fixed else next(moving) for j in range(len(choice))]
@@ -200,8 +234,8 @@ def kinked_ball(sign: int, radius: Any, linear: Sequence[Any], pieces: Sequence[
     return best[1]
 
 
-def _branches(linear: Any, piece: Kinked | None) -> list[tuple[str, Any]]:
-    """What one input may do: follow the gradient of a piece, or sit at a kink."""
+def _branches(linear: PerNode, piece: Kinked[PerNode] | None) -> list[tuple[str, PerNode]]:
+    """The choices of one input: to follow the gradient of a piece, or to sit at a kink."""
     if piece is None:
         return [("slope", linear)]
     kinks = [(k - piece.offset) * inverse(piece.slope) for k in piece.kinks]

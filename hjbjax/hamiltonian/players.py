@@ -28,7 +28,7 @@ class Player:
     """What one player may do and how the Hamiltonian depends on it; static, known from the jaxpr.
 
     Attributes:
-      choices: the admissible set, or None.
+      admissible: the admissible set, or None.
       sign: +1 minimises, −1 maximises.
       exact: whether the optimum is found exactly rather than by samples.
       driven: for every input the drift components that it drives.

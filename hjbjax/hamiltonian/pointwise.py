@@ -16,6 +16,7 @@ controls it jumps, too. Everything else is a differentiable function of (x, p) a
 
 import dataclasses
 import itertools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -24,7 +25,8 @@ import numpy as np
 
 from hjbjax.hamiltonian.search import enumerate_actions, refine
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.sets import Ball, Box, Finite, samples, spacing
+from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite, samples, spacing
+from hjbjax.problem.types import Control, Costate, DType, Number, Scalar, State
 from hjbjax.tracing.dependence import dependence
 
 BUDGET = 64  # samples that start a search
@@ -33,12 +35,12 @@ NEWTON = 24  # steps for the multiplier of a ball, monotone and at last quadrati
 
 @dataclasses.dataclass(frozen=True)
 class Rule:
-    """How H is minimised, read from the jaxpr; hashable, so that it may be a static argument.
+    """The way to the minimum of H, read from the jaxpr; hashable, so that it may be a static argument.
 
     Attributes:
-      exact: whether the formulas above hold, or a search has to do.
+      exact: true if the formulas above hold; else a search has to do.
       jumping: the inputs of a box in which H is affine.
-      finite: whether the controls are enumerated.
+      finite: true if the controls are enumerated.
     """
 
     exact: bool
@@ -47,12 +49,12 @@ class Rule:
 
     @property
     def jumps(self) -> bool:
-        """Whether u* is no continuous function of the costate."""
+        """True if u* is no continuous function of the costate."""
         return self.finite or bool(self.jumping)
 
 
 def rule_of(problem: Problem, n: int) -> Rule:
-    """Read from the functions themselves how H depends on the control."""
+    """The rule for a problem's H, from the jaxprs of its drift and cost."""
     if isinstance(problem.controls, Finite):
         return Rule(exact=True, finite=True)
     assert problem.controls is not None
@@ -62,22 +64,24 @@ def rule_of(problem: Problem, n: int) -> Rule:
     found = [dependence(function, *lengths, dtype=jnp.result_type(float)) for function in functions]
     if not all(each.separable_quadratic_in(inputs) for each in found):
         return Rule(exact=False)
+    # without a square in either function H is affine in that input: bang-bang
     straight = tuple(j for j in inputs if not any(each.has_square((j,)) for each in found))
+    # over a ball the minimum of an affine H, −r b/|b|, turns with b and does not jump
     return Rule(exact=True, jumping=straight if isinstance(problem.controls, Box) else ())
 
 
-def hamiltonian(problem: Problem, t: Any, x: Any, p: Any, u: Any) -> Any:
+def hamiltonian(problem: Problem, t: Number, x: State, p: Costate, u: Control | None) -> Scalar:
     """H(t, x, p, u) in cost units per unit time; ``x`` as the problem's functions want it."""
     arguments = problem.arguments(x, u, t=t)
     return running_cost(problem, t, x, u) + jnp.asarray(problem.drift(*arguments), p.dtype) @ p
 
 
-def running_cost(problem: Problem, t: Any, x: Any, u: Any) -> Any:
-    """L, zero without one."""
+def running_cost(problem: Problem, t: Number, x: State, u: Control | None) -> Scalar:
+    """L(t, x, u) in cost per unit time; zero where the problem has none."""
     return jnp.asarray(0.0 if problem.cost is None else problem.cost(*problem.arguments(x, u, t=t)), x.dtype)
 
 
-def corners(problem: Problem, rule: Rule) -> Any:
+def corners(problem: Problem, rule: Rule) -> jax.Array:
     """The values between which u* jumps, shape (K, m); NaN in inputs of a box that do not jump."""
     if isinstance(problem.controls, Finite):
         return jnp.asarray(problem.controls.points)
@@ -90,16 +94,17 @@ def corners(problem: Problem, rule: Rule) -> Any:
     return jnp.stack(rows)
 
 
-def at_corner(problem: Problem, rule: Rule, t: Any, x: Any, p: Any, corner: Any) -> Any:
+def at_corner(problem: Problem, rule: Rule, t: Number, x: State, p: Costate, corner: Control) -> Any:
     """The control with its jumping inputs as in ``corner``, and the others at their minimum."""
     if rule.finite or len(rule.jumping) == np.shape(corner)[-1]:
         return corner
+    # H is separable in its inputs, so that the others' minimum does not depend on the corner
     chosen = jnp.array([j in rule.jumping for j in range(np.shape(corner)[-1])])
     return jnp.where(chosen, corner, minimiser(problem, rule, t, x, p))
 
 
-def minimiser(problem: Problem, rule: Rule, t: Any, x: Any, p: Any) -> Any:
-    """u*, shape (m,)."""
+def minimiser(problem: Problem, rule: Rule, t: Number, x: State, p: Costate) -> jax.Array:
+    """The control u* that minimises H, shape (m,)."""
     admissible = problem.controls
 
     def energy(u):
@@ -111,6 +116,7 @@ def minimiser(problem: Problem, rule: Rule, t: Any, x: Any, p: Any) -> Any:
     if not rule.exact:
         return _searched(admissible, energy, p.dtype)
     assert admissible is not None
+    # exactly quadratic by the rule: gradient and second derivatives at zero are its coefficients
     zero = jnp.zeros(admissible.dim, p.dtype)
     slope, square = jax.grad(energy)(zero), jnp.diagonal(jax.hessian(energy)(zero)) / 2
     if isinstance(admissible, Box):
@@ -118,24 +124,28 @@ def minimiser(problem: Problem, rule: Rule, t: Any, x: Any, p: Any) -> Any:
     return _in_ball(jnp.asarray(admissible.radius, p.dtype), slope, square)
 
 
-def _in_box(lo: Any, hi: Any, slope: Any, square: Any) -> Any:
+def _in_box(lo: Control, hi: Control, slope: Control, square: Control) -> jax.Array:
     """The minimum of b·u + Σ c_j u_j², input by input."""
     convex = square > 0
     inner = jnp.clip(-slope / jnp.where(convex, 2 * square, 1), lo, hi)
+    # affine or concave: the better end, and the lower one where both are worth as much
     end = jnp.where(slope * lo + square * lo * lo <= slope * hi + square * hi * hi, lo, hi)
     return jnp.where(convex, inner, end)
 
 
-def _in_ball(radius: Any, slope: Any, square: Any) -> Any:
+def _in_ball(radius: Scalar, slope: Control, square: Control) -> jax.Array:
     """The minimum of b·u + Σ c_j u_j², c ≥ 0, over |u| ≤ r: u = −b/(2c + μ); the centre where b = 0.
 
     1/|u| − 1/r is concave and increasing in μ, so Newton's method from the left rises to the root. Where c is one
     number it is linear, and the first μ is the root.
     """
     curvature = jnp.maximum(2 * square, 0)
+    # tiny: √0 has an infinite derivative, and b = 0 is no rare case
     size = jnp.sqrt(jnp.maximum(slope @ slope, jnp.finfo(slope.dtype).tiny))
     inner = -slope / jnp.where(curvature > 0, curvature, 1)
+    # the free minimum counts only where it exists: an input without curvature but with a slope runs to the sphere
     inside = jnp.all((curvature > 0) | (slope == 0)) & (inner @ inner <= radius * radius)
+    # |u| ≥ |b|/(max 2c + μ): at this μ the norm is at least r, so that Newton's method starts left of the root
     mu = jnp.maximum(size / radius - jnp.max(curvature), 0)
 
     def newton(_, mu):
@@ -150,16 +160,18 @@ def _in_ball(radius: Any, slope: Any, square: Any) -> Any:
     return jnp.where(inside, inner, bound)
 
 
-def _searched(admissible: Any, energy: Any, dtype: Any) -> Any:
-    """Samples, a pattern search, and Newton's method in the free inputs.
+def _searched(admissible: AdmissibleSet | None, energy: Callable[[jax.Array], jax.Array], dtype: DType) -> jax.Array:
+    """The minimum of H by samples, a pattern search, and Newton's method in the free inputs.
 
     The last Newton step carries the derivative of the implicit function, which the search has not.
     """
+    assert isinstance(admissible, (Box, Ball))
     count = admissible.dim
 
     def project(action):
         u = jnp.stack(action)
         if isinstance(admissible, Ball):
+            # 1e-300 keeps the quotient finite at the centre, which stays where it is
             return list(u * jnp.minimum(1, admissible.radius / jnp.maximum(jnp.linalg.norm(u), 1e-300)))
         return list(jnp.clip(u, admissible.lo, admissible.hi))
 
@@ -168,15 +180,18 @@ def _searched(admissible: Any, energy: Any, dtype: Any) -> Any:
 
     best = enumerate_actions(objective, jnp.asarray(samples(admissible, BUDGET), dtype), 1)
     u = jnp.stack(refine(objective, best, spacing(admissible, BUDGET), project, 1)[1])
+    # each starts from a number without a derivative, so that only the last step carries one
     for _ in range(3):
         u = jax.lax.stop_gradient(u)
         gradient, bend = jax.grad(energy)(u), jax.hessian(energy)(u)
+        # an input at its bound stays there: its row becomes the identity's with no right-hand side
         if isinstance(admissible, Ball):
             free = jnp.full(count, jnp.linalg.norm(u) < admissible.radius * (1 - 1e-6))
         else:
             room = 1e-6 * (admissible.hi - admissible.lo)
             free = (u > admissible.lo + room) & (u < admissible.hi - room)
         matrix = jnp.where(free[:, None] & free[None, :], bend, jnp.eye(count, dtype=dtype))
+        # elsewhere than at a minimum Newton's step may lead uphill; the search's answer stands then
         convex = jnp.all(jnp.linalg.eigvalsh(jax.lax.stop_gradient(matrix)) > 0)
         step = jnp.linalg.solve(matrix, jnp.where(free, gradient, 0))
         u = jnp.where(convex, jnp.stack(project(list(u - step))), u)

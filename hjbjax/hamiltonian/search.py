@@ -7,33 +7,37 @@ returns a pair (value, extra): the value at every node, and whatever is worth ke
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hjbjax.discretisation.stencil import PerNode
+
+T = TypeVar("T")
 Action = list
 Objective = Callable[[Action], tuple[jax.Array, list]]
+Best: TypeAlias = tuple[jax.Array, Action, list]  # the best value so far, the action there, and the extra there
 
 UNROLL = 80  # evaluations written out in one fused kernel; beyond that XLA's compile time grows and its speed falls
 CHUNK = 20  # evaluations in one step of the scan that takes over
 REFINEMENTS = 24  # halvings of the sample spacing: 2⁻²⁴ of it is below the rounding of float32
 
 
-def better(sign: int, challenger: Any, incumbent: Any) -> Any:
-    """Whether ``challenger`` is strictly better; NaN never is."""
+def better(sign: int, challenger: PerNode, incumbent: PerNode) -> PerNode:
+    """The nodes where ``challenger`` is strictly better, bool; NaN never is."""
     return challenger < incumbent if sign > 0 else challenger > incumbent
 
 
-def pick(condition: Any, first: Any, second: Any) -> Any:
+def pick(condition: PerNode, first: T, second: T) -> T:
     """``where`` on trees whose leaves broadcast against the nodes."""
     return jax.tree.map(lambda p, q: jnp.where(condition, p, q), first, second)
 
 
 def enumerate_actions(
-    objective: Objective, points: Any, sign: int, *, weight: int = 1, most: int = UNROLL
-) -> tuple[Any, Action, list]:
+    objective: Objective, points: jax.Array, sign: int, *, weight: int = 1, most: int = UNROLL
+) -> Best:
     """The best of the rows of ``points``, in order; the first of equals wins.
 
     Args:
@@ -50,11 +54,12 @@ def enumerate_actions(
     if count * weight <= most:
         return best_of(objective, [[points[k, j] for j in range(inputs)] for k in range(count)], sign, None)
     chunk = max(1, min(CHUNK, most) // weight)
-    padded = -(-count // chunk) * chunk
+    padded = -(-count // chunk) * chunk  # the last row again, which is never strictly better than itself
     rows = jnp.concatenate([points, jnp.broadcast_to(points[-1:], (padded - count, inputs))])
     # shapes alone: evaluated once more in front of the loop, the objective would be compiled once more
     value, extra = jax.eval_shape(lambda row: objective(list(row)), points[0])
     everywhere = functools.partial(jnp.full, value.shape, dtype=value.dtype)
+    # the worst that there is: whatever comes first wins
     best = everywhere(sign * jnp.inf), [everywhere(points[0, j]) for j in range(inputs)], [everywhere(0) for _ in extra]
 
     def step(best, block):
@@ -63,8 +68,8 @@ def enumerate_actions(
     return jax.lax.scan(step, best, rows.reshape(padded // chunk, chunk, inputs))[0]
 
 
-def best_of(objective: Objective, actions: Sequence[Action], sign: int, best: Any) -> Any:
-    """The best of ``best``, as ``enumerate_actions`` returns it, or None, and of some more actions."""
+def best_of(objective: Objective, actions: Sequence[Action], sign: int, best: Best | None) -> Best:
+    """The best of some actions and of ``best``, as ``enumerate_actions`` returns it; None where there is none yet."""
     for action in actions:
         value, extra = objective(action)
         chosen = ([jnp.asarray(entry, value.dtype) for entry in action], extra)
@@ -73,18 +78,19 @@ def best_of(objective: Objective, actions: Sequence[Action], sign: int, best: An
             continue
         wins = better(sign, value, best[0]) | jnp.isnan(value)  # so that the action found has a NaN, too
         best = pick(wins, (value, *chosen), best)
+    assert best is not None
     return best
 
 
 def refine(
     objective: Objective,
-    best: Any,
-    spacing: Sequence[Any],
+    best: Best,
+    spacing: Sequence[PerNode],
     project: Callable[[Action], Action],
     sign: int,
     *,
     weight: int = 1,
-) -> Any:
+) -> Best:
     """Pattern search around the best sample: one input at a time, up and down, halving the step.
 
     Args:
@@ -98,10 +104,11 @@ def refine(
     """
     value, action, extra = best
     dtype, shape = value.dtype, value.shape
+    # the carry of a loop has fixed shapes: actions that are one number for all nodes become arrays first
     best = jax.tree.map(lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, dtype), shape), (value, action, extra))
 
     def one_round(k, best):
-        scale = jnp.asarray(0.5, dtype) ** (k + 1)
+        scale = jnp.asarray(0.5, dtype) ** (k + 1)  # from half the distance between two samples downwards
         for j, width in enumerate(spacing):
             for direction in (1, -1):
                 moved = list(best[1])
@@ -110,7 +117,7 @@ def refine(
         return best
 
     def one_move(k, best):
-        turn = k // moves
+        turn = k // moves  # k counts inputs and directions within a round: 2j upwards, 2j + 1 downwards
         length = (1 - 2 * (k % 2)) * jnp.asarray(0.5, dtype) ** (turn + 1)
         moved = [
             entry + jnp.where(k % moves // 2 == j, length * width, 0)

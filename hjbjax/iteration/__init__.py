@@ -1,6 +1,6 @@
 """Steps, pure and jittable: from a value to a better one, and what bounds its error.
 
 Read ``bellman`` for one step and its linear equation, ``evaluation`` with ``gauss_seidel`` for how that is solved,
-``fixed_point`` for value and policy iteration, ``hoffman_karp`` for games, ``certificates`` for bounds,
-``time_methods`` and ``time_stepping`` for steps in time, and ``adjoint`` for derivatives of a fixed point.
+``fixed_point`` for value and policy iteration, ``hoffman_karp`` for the inner player of a game, ``certificates`` for
+bounds, ``time_methods`` and ``time_stepping`` for steps in time, and ``adjoint`` for derivatives of a fixed point.
 """

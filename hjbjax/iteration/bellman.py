@@ -11,7 +11,6 @@ where the constraint is the active branch. That correction is what every method 
 """
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +20,9 @@ from hjbjax.discretisation.chain import Rates
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.hamiltonian import discrete
 from hjbjax.hamiltonian.players import players_of
+from hjbjax.hamiltonian.search import Action
 from hjbjax.problem.pytree import pytree_dataclass
+from hjbjax.problem.types import Field, Nodes, Number, Scalar
 
 LEAK = 64  # units of eps of Q: a smaller rate towards a lost node is rounding
 ROUNDING = 8  # units of eps in (Q + β)|V|, below which one action is no better than another
@@ -40,24 +41,25 @@ class Obstacles:
       least_exit: the least exit cost on boundaries between the nodes, a number; zero if none is negative.
     """
 
-    fixed: Any
-    fixed_value: Any
-    upper: Any = None
-    lower: Any = None
-    ended: Any = False
-    least_exit: Any = 0.0
+    fixed: jax.Array
+    fixed_value: Field | Scalar
+    upper: Field | None = None
+    lower: Field | None = None
+    ended: jax.Array | bool = False
+    least_exit: Number = 0.0
 
-    def impose(self, value: jax.Array) -> jax.Array:
+    def impose(self, value: Field) -> Field:
         """``value`` with the given values put in and the constraints respected: max(g, min(ψ, V))."""
+        # ψ before g: where g > ψ the running maximum has the last word, as in the residual
         if self.upper is not None:
             value = jnp.minimum(value, self.upper)
         if self.lower is not None:
             value = jnp.maximum(value, self.lower)
         return jnp.where(self.fixed, self.fixed_value, value)
 
-    def acting(self, value: jax.Array) -> Any:
+    def acting(self, value: Nodes) -> jax.Array:
         """The nodes at which actions matter, bool (*grid): not fixed, and no constraint is the active branch."""
-        acts = ~self.fixed
+        acts = ~self.fixed  # where V = ψ one stops, and where V = g the maximum is here: no action matters
         if self.upper is not None:
             acts &= value < self.upper
         return acts if self.lower is None else acts & (value > self.lower)
@@ -73,21 +75,21 @@ class Greedy:
       disturbances: the components of d, each (*grid).
     """
 
-    defect: jax.Array
-    controls: tuple[jax.Array, ...]
-    disturbances: tuple[jax.Array, ...]
+    defect: Field
+    controls: tuple[Field, ...]
+    disturbances: tuple[Field, ...]
 
 
 @pytree_dataclass()
 class PolicyEquation:
     """The linear equation δ = source + Σ_o weights_o δ(x + o) for a correction δ of the value, in cost units.
 
-    ``fastest`` is the largest Q + β of its policy, per unit time, or what ``policy_equation`` was told.
+    ``fastest`` is the largest Q + β of its policy, per unit time, or the number that ``policy_equation`` was given.
     """
 
-    source: jax.Array
+    source: Field
     weights: Rates
-    fastest: Any = None
+    fastest: Scalar | None = None
 
 
 def obstacles(on: Discretisation) -> Obstacles:
@@ -98,13 +100,14 @@ def obstacles(on: Discretisation) -> Obstacles:
         for ingredient in (problem.exit_cost, problem.stopping_cost, problem.running_max)
     )
     held = jnp.zeros(on.grid.shape, bool) if problem.target is None else cut_cells.level(on) <= 0
+    # off the target an exit cost says nothing, and may be no number
     given = jnp.zeros((), on.dtype) if exit_cost is None else jnp.where(held, exit_cost, 0)
     return Obstacles(held, given, stop, floor, ended=held)
 
 
 def greedy(
     on: Discretisation,
-    value: jax.Array,
+    value: Field,
     held: jax.Array,
     *,
     incumbent: Greedy | None = None,
@@ -114,10 +117,10 @@ def greedy(
 
     To the nodes that are ``lost``, bool (*grid), no drift leads that is only rounding.
     """
-    return _left_over(on, value, held, *discrete.optimise(_around(on, value, incumbent, lost)))
+    return _with_defect(on, value, held, *discrete.optimise(_around(on, value, incumbent, lost)))
 
 
-def kept(on: Discretisation, value: jax.Array, fixed: jax.Array, new: Greedy, old: Greedy) -> Greedy:
+def improvement(on: Discretisation, value: Field, fixed: jax.Array, new: Greedy, old: Greedy) -> Greedy:
     """The new policy where it is better by more than rounding or where nodes are ``fixed``, else the old one.
 
     From a policy that ends, one improvement after the other then keeps it so: among actions that are worth the same
@@ -125,6 +128,7 @@ def kept(on: Discretisation, value: jax.Array, fixed: jax.Array, new: Greedy, ol
     """
     hamiltonian, u, discount = _around(on, value, None), list(old.controls), on.problem.discount
     rates = chain.rates(on, u, [])
+    # H − β V is a sum of c V(x + o) − c V(x): terms of the size of (Q + β)|V|, each rounded
     rounding = ROUNDING * jnp.finfo(on.dtype).eps * (rates.total() + discount) * jnp.abs(value)
     rate = hamiltonian.at(u, []) - discount * value
     stays = ~fixed & (rate <= new.defect + rounding)
@@ -133,34 +137,40 @@ def kept(on: Discretisation, value: jax.Array, fixed: jax.Array, new: Greedy, ol
 
 
 def respond(
-    on: Discretisation, value: jax.Array, held: jax.Array, current: Greedy, *, lost: jax.Array | None = None
+    on: Discretisation, value: Field, held: jax.Array, current: Greedy, *, lost: jax.Array | None = None
 ) -> Greedy:
     """The inner player's best answer to the outer player's current policy, in a game."""
     players = players_of(on)
+    # the current answer among the candidates: a sampled player then never answers worse than before
     hamiltonian = _around(on, value, current, lost)
     u, d = list(current.controls), list(current.disturbances)
-    if on.problem.isaacs == "upper":
+    if on.problem.isaacs == "upper":  # min max: the control moves first, and the disturbance knows it
         best, d = discrete.best_response(hamiltonian, players.disturbance, lambda d: (u, d))
     else:
         best, u = discrete.best_response(hamiltonian, players.control, lambda u: (u, d))
-    return _left_over(on, value, held, best, u, d)
+    return _with_defect(on, value, held, best, u, d)
 
 
-def _around(on: Discretisation, value: Any, policy: Greedy | None, lost: Any = None) -> discrete.DiscreteHamiltonian:
+def _around(
+    on: Discretisation, value: Field, policy: Greedy | None, lost: jax.Array | None = None
+) -> discrete.DiscreteHamiltonian:
+    """The Hamiltonian around V, with the actions of a policy among the candidates of a search."""
     hamiltonian = discrete.around(on, value, lost)
     if policy is None:
         return hamiltonian
     return dataclasses.replace(hamiltonian, tried=(list(policy.controls), list(policy.disturbances)))
 
 
-def _left_over(on: Discretisation, value: Any, held: Any, best: Any, u: list, d: list) -> Greedy:
+def _with_defect(on: Discretisation, value: Field, held: jax.Array, best: Field, u: Action, d: Action) -> Greedy:
+    """The policy u, d with its defect r = H − β V, zero where held; ``best`` is H."""
     rate = jnp.where(held, 0, best - on.problem.discount * value)
+    # an action that is one number for all nodes becomes an array: the carry of a loop has fixed shapes
     full = [tuple(jnp.broadcast_to(jnp.asarray(c, on.dtype), on.grid.shape) for c in action) for action in (u, d)]
     return Greedy(rate, *full)
 
 
 def policy_equation(
-    on: Discretisation, value: jax.Array, policy: Greedy, obstacles: Obstacles, *, fastest: Any = None
+    on: Discretisation, value: Field, policy: Greedy, obstacles: Obstacles, *, fastest: Scalar | None = None
 ) -> PolicyEquation:
     """The linear equation for δ under one policy; the active branch of the constraints is chosen node by node.
 
@@ -173,6 +183,7 @@ def policy_equation(
     fastest = jnp.max(leaving) if fastest is None else fastest
     moves = leaving > 8 * jnp.finfo(value.dtype).eps * fastest  # a drift that cancels leaves rounding
     outflow = jnp.where(moves, leaving, jnp.where(fastest > 0, fastest, 1))  # where nothing moves the cost piles up
+    # s, then min(s, ψ − V), then max(·, g − V); a row whose branch is a constraint reads δ = source
     source, free = policy.defect / outflow, ~obstacles.fixed
     if obstacles.upper is not None:
         stops = free & (obstacles.upper - value < source)
@@ -190,7 +201,7 @@ def policy_equation(
 
 
 def leaks(on: Discretisation, policy: Greedy, held: jax.Array, lost: jax.Array) -> jax.Array:
-    """Whether the policy leads from a node that counts to one that is ``lost``, by more than rounding."""
+    """True if the policy leads from a node that counts to one that is ``lost``, by more than rounding."""
     grid, u, d = on.grid, list(policy.controls), list(policy.disturbances)
     rates, beside = chain.rates(on, u, d), edges.beside(lost, grid)
     strays = [edges.strays(*each) for each in zip(on.drift(u, d), beside, edges.slack(on), strict=True)]
@@ -200,6 +211,7 @@ def leaks(on: Discretisation, policy: Greedy, held: jax.Array, lost: jax.Array) 
         if on.problem.noise is None:  # jumps go along one axis
             axis = next(axis for axis, step in enumerate(offset) if step)
             leak = jnp.where(strays[axis], 0, leak)
-        leaking = leaking + leak
+        leaking = leaking + leak  # rates per unit time, (*grid): several small leaks are one
+    # next to all rates of the node, since the drift is made of parts that cancel down to their rounding
     limit = LEAK * jnp.finfo(on.dtype).eps * rates.total()
     return jnp.any(~lost & ~held & (leaking > limit))

@@ -17,6 +17,7 @@ and it says nothing anyway. Both follow from the comparison principle of a monot
 error and not the error of the grid, hold where the minimum over the actions is exact, and want float64.
 """
 
+import dataclasses
 import enum
 from typing import Any
 
@@ -26,12 +27,13 @@ import numpy as np
 
 from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
+from hjbjax.problem.types import Array, Field, Mask, Number, Scalar
 
 LOST = 4  # roundings of numbers of the size lift · max(factor, 1) in factor · V + shift
 
 
 class Certificate(enum.Enum):
-    """Which bound a problem admits; the value says so in words."""
+    """The bound that a problem admits; the value says it in words."""
 
     ADDITIVE = "from the discount, V + min r/β ≤ V_h ≤ V + max r/β"
     MULTIPLICATIVE = "from the running cost, V/(1 + η) ≤ V_h ≤ V/(1 − ρ)"
@@ -46,111 +48,135 @@ class ErrorBound:
     """Bounds on V_h − V, and how far they are from V.
 
     Args:
-      below, above: what bounds V_h: V + shift where additive, (V + lift) · factor − lift where multiplicative.
-      lift: what makes every exit cost non-negative.
+      below, above: the bounds on V_h: V + shift where additive, (V + lift) · factor − lift where multiplicative.
+      lift: the constant that makes every exit cost non-negative.
       error: the largest |bound − V| over the nodes that count, cost units; without a certificate the size of the
         last correction or of the residual.
       residual: the largest |residual| in cost units.
     """
 
-    below: jax.Array
-    above: jax.Array
-    lift: jax.Array
-    error: jax.Array
-    residual: jax.Array
+    below: Scalar
+    above: Scalar
+    lift: Scalar
+    error: Scalar
+    residual: Scalar
+
+
+@dataclasses.dataclass(frozen=True)
+class Iterate:
+    """A value function with its policy and the residual of its equation.
+
+    Attributes:
+      value: V, (*grid).
+      policy: the greedy policy at V with its rate r, zero where held.
+      equation: the correction equation there, whose source is the residual.
+      obstacles: held nodes and constraints.
+      counted: bool (*grid), the nodes whose error counts (those that reach the target).
+    """
+
+    value: Field
+    policy: Greedy
+    equation: PolicyEquation
+    obstacles: Obstacles
+    counted: Mask | bool
 
 
 def error_bound(
-    kind: Certificate,
-    value: jax.Array,
-    policy: Greedy,
-    equation: PolicyEquation,
-    obstacles: Obstacles,
-    *,
-    discount: Any,
-    least_cost: Any,
-    counted: Any,
-    moved: Any,
+    kind: Certificate, iterate: Iterate, *, discount: Number, least_cost: Field | None = None, moved: Number = 0
 ) -> ErrorBound:
-    """The certificate of ``value``.
+    """The certificate of a value.
 
     Args:
       kind: which bound applies.
-      value: V.
-      policy: the greedy policy at V with its rate r, zero where held.
-      equation: the correction equation there, whose source is the residual.
-      rules: held nodes and constraints.
+      iterate: the value, its policy and their residual.
       discount: β.
       least_cost: L at every node, for the multiplicative bound.
-      counted: bool (*grid), the nodes whose error counts (those that reach the target).
       moved: the size of the last correction, the fallback measure.
     """
-    residual = jnp.max(jnp.where(counted, jnp.abs(equation.source), 0))
-    free = counted & ~obstacles.fixed
+    residual = jnp.max(jnp.where(iterate.counted, jnp.abs(iterate.equation.source), 0))
     zero = jnp.zeros_like(residual)
     if kind is Certificate.BY_DISCOUNT:
         other = Certificate.NONE if least_cost is None else Certificate.MULTIPLICATIVE
-        known = {"least_cost": least_cost, "counted": counted, "moved": moved}
+        # β is traced, so that both bounds are made and one is chosen; r/1 in place of r/0 where it is not
         rate = jnp.where(discount > 0, discount, 1)
         with_it, without = (
-            error_bound(each, value, policy, equation, obstacles, discount=rate, **known)
+            error_bound(each, iterate, discount=rate, least_cost=least_cost, moved=moved)
             for each in (Certificate.ADDITIVE, other)
         )
         if other is Certificate.NONE:  # bounds that say nothing
             without = ErrorBound(zero, zero + jnp.inf, zero + jnp.inf, without.error, residual)
         return jax.tree.map(lambda mine, theirs: jnp.where(discount > 0, mine, theirs), with_it, without)
     if kind is Certificate.ADDITIVE:
-        if obstacles.upper is None and obstacles.lower is None:
-            below, above = jnp.min(policy.defect) / discount, jnp.max(policy.defect) / discount
-        else:
-            shift = policy.defect / discount
-            if obstacles.upper is not None:
-                shift = jnp.minimum(shift, obstacles.upper - value)
-            if obstacles.lower is not None:
-                shift = jnp.maximum(shift, obstacles.lower - value)
-            shift = jnp.where(obstacles.fixed, 0, shift)
-            below, above = jnp.min(shift), jnp.max(shift)
+        below, above = _additive(iterate, discount)
         return ErrorBound(below, above, zero, jnp.maximum(jnp.abs(below), jnp.abs(above)), residual)
     if kind is Certificate.MULTIPLICATIVE:
-        safe = jnp.where(free & (least_cost > 0), least_cost, 1)
-        relative = jnp.where(
-            free, jnp.where(least_cost > 0, policy.defect / safe, jnp.sign(policy.defect) * jnp.inf), 0
-        )
-        rising = relative if obstacles.upper is None else jnp.where(value < obstacles.upper, relative, 0)
-        rho, eta = jnp.maximum(jnp.max(rising), 0), jnp.maximum(jnp.max(-relative), 0)
-        priced = jnp.all(~free | (least_cost > 0))
-        sound = priced & (1 - rho > jnp.sqrt(jnp.finfo(rho.dtype).eps))  # a V flat somewhere has r = L up to rounding
-        below, above = 1 / (1 + eta), jnp.where(sound, 1 / jnp.where(sound, 1 - rho, 1), jnp.inf)
-        lift = jnp.maximum(-lowest_end(obstacles, counted), 0)
-        lifted = jnp.where(counted, value + lift, 0)
-        apart = jnp.where(jnp.isinf(above), 0, jnp.maximum(above - 1, 1 - below))  # no 0 · inf
-        error = jnp.where(jnp.isinf(above), jnp.inf, jnp.max(lifted) * apart)
-        error = jnp.where(jnp.all(lifted >= 0), error, jnp.inf) + 0 * residual  # a NaN stays one
-        return ErrorBound(below, above, jnp.where(priced, lift, jnp.inf), error, residual)
+        assert least_cost is not None
+        return _multiplicative(iterate, least_cost, residual)
     return ErrorBound(zero, zero, zero, jnp.maximum(residual, moved), residual)
 
 
-def lowest_end(obstacles: Obstacles, counted: Any) -> jax.Array:
-    """The least of zero and of what may be paid at the end of a run: exit costs, between nodes as well, and ψ."""
+def _additive(iterate: Iterate, discount: Number) -> tuple[Scalar, Scalar]:
+    """min ρ and max ρ of ρ = max(min(r/β, ψ − V), g − V)."""
+    value, policy, obstacles = iterate.value, iterate.policy, iterate.obstacles
+    if obstacles.upper is None and obstacles.lower is None:  # two reductions first, and no array r/β
+        return jnp.min(policy.defect) / discount, jnp.max(policy.defect) / discount
+    shift = policy.defect / discount
+    if obstacles.upper is not None:
+        shift = jnp.minimum(shift, obstacles.upper - value)
+    if obstacles.lower is not None:
+        shift = jnp.maximum(shift, obstacles.lower - value)
+    # r is zero where held, the obstacles are not: there V is given and exact
+    shift = jnp.where(obstacles.fixed, 0, shift)
+    return jnp.min(shift), jnp.max(shift)
+
+
+def _multiplicative(iterate: Iterate, least_cost: Field, residual: Scalar) -> ErrorBound:
+    """V/(1 + η) ≤ V_h ≤ V/(1 − ρ), of a V lifted until no exit cost is negative."""
+    value, policy, obstacles, counted = iterate.value, iterate.policy, iterate.obstacles, iterate.counted
+    free = counted & ~obstacles.fixed
+    safe = jnp.where(free & (least_cost > 0), least_cost, 1)
+    # where nothing is paid any rate that is left is infinitely much next to the cost; r = 0 makes a NaN of sign · ∞,
+    # and ``priced`` says no there anyway
+    relative = jnp.where(free, jnp.where(least_cost > 0, policy.defect / safe, jnp.sign(policy.defect) * jnp.inf), 0)
+    # where V = ψ nothing bounds V_h from above but ψ, which is imposed
+    rising = relative if obstacles.upper is None else jnp.where(value < obstacles.upper, relative, 0)
+    rho, eta = jnp.maximum(jnp.max(rising), 0), jnp.maximum(jnp.max(-relative), 0)
+    priced = jnp.all(~free | (least_cost > 0))
+    sound = priced & (1 - rho > jnp.sqrt(jnp.finfo(rho.dtype).eps))  # a V flat somewhere has r = L up to rounding
+    below, above = 1 / (1 + eta), jnp.where(sound, 1 / jnp.where(sound, 1 - rho, 1), jnp.inf)
+    lift = jnp.maximum(-lowest_end(obstacles, counted), 0)
+    lifted = jnp.where(counted, value + lift, 0)
+    apart = jnp.where(jnp.isinf(above), 0, jnp.maximum(above - 1, 1 - below))  # no 0 · inf
+    error = jnp.where(jnp.isinf(above), jnp.inf, jnp.max(lifted) * apart)
+    # the scaling argument wants V ≥ 0; without that there is no bound
+    error = jnp.where(jnp.all(lifted >= 0), error, jnp.inf) + 0 * residual  # a NaN stays one
+    return ErrorBound(below, above, jnp.where(priced, lift, jnp.inf), error, residual)
+
+
+def lowest_end(obstacles: Obstacles, counted: Mask | bool) -> Scalar:
+    """The least payment at the end of a run, at most zero: exit costs, between nodes as well, and ψ."""
     lowest = jnp.minimum(jnp.min(jnp.where(counted & obstacles.fixed, obstacles.fixed_value, 0)), obstacles.least_exit)
+    # ψ is paid where one stops, which may be anywhere
     return lowest if obstacles.upper is None else jnp.minimum(lowest, jnp.min(jnp.where(counted, obstacles.upper, 0)))
 
 
-def enclosure(kind: Certificate, bound: ErrorBound, discount: Any = None) -> Any:
+def enclosure(kind: Certificate, bound: ErrorBound, discount: Number | None = None) -> Any:
     """Both bounds as affine functions of V: rows lower and upper, columns factor and shift, shape (2, 2).
 
     (V + lift) · factor − lift cancels where V is near −lift, as on a target with a negative exit cost; the shift is
     rounded outwards by what that costs. ``None`` without a certificate.
     """
     if kind is Certificate.BY_DISCOUNT:
+        assert discount is not None
         with_it, without = (enclosure(each, bound) for each in (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE))
         return jnp.where(discount > 0, with_it, without)
     if kind not in (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE):
         return None
+    # NumPy where the numbers are known: JAX would round doubles to its default type, and compile
     xp: Any = jnp if is_traced(bound) else np
     below, above, lift = (xp.asarray(number) for number in (bound.below, bound.above, bound.lift))
 
-    def line(side: Any, outwards: int) -> Any:
+    def line(side: Array, outwards: int) -> Array:
         one = xp.ones_like(side)
         if kind is Certificate.ADDITIVE:
             return xp.stack([one, side])

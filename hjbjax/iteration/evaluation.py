@@ -31,7 +31,8 @@ It goes into compiled programs as a pytree, here one without numbers, and what i
 """
 
 import dataclasses
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -43,28 +44,29 @@ from hjbjax.iteration.bellman import PolicyEquation
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import pytree_dataclass
+from hjbjax.problem.types import Field, Number
 
 OPEN_FRACTION = 1e-8  # of the residual, to which a Krylov method goes with open ends
 
 
 @runtime_checkable
 class Evaluation(Protocol):
-    """How the linear equation of a policy is solved: a value, frozen and hashable or a pytree."""
+    """A solver of the linear equation of a policy: a value, frozen and hashable or a pytree."""
 
     @property
     def rough(self) -> bool:
-        """Whether it only relaxes: a step is cheap, and the loop goes over to a linear solve where it comes to a halt.
+        """True if it only relaxes: a step is cheap, and the loop goes over to a linear solve where it comes to a halt.
 
-        What is not rough is held against its residual, and relaxed where it fails, as for a policy without a value.
+        One that is not rough is held against its residual, and relaxed where it fails, as for a policy without a value.
         """
 
     @property
     def open_ends(self) -> bool:
-        """Whether it holds where a value is continued from inside beyond open ends."""
+        """True if it holds where a value is continued from inside beyond open ends."""
 
     @property
     def calls_back(self) -> bool:
-        """Whether it runs Python on the host in the middle of a compiled program."""
+        """True if it runs Python on the host in the middle of a compiled program."""
 
     def solve(self, equation: PolicyEquation, grid: Grid) -> jax.Array:
         """δ with δ = s + Σ_o w_o δ(x + o), roughly or not, (*grid), in the type of the equation."""
@@ -89,12 +91,13 @@ class Sweeps:
 
     def solve(self, equation: PolicyEquation, grid: Grid) -> jax.Array:
         """Rounds of Gauss–Seidel in single precision."""
+        # half the memory; a rough correction holds few digits anyway, and V + δ is made in those of V
         single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), equation)
         return relaxed(single, grid, self.count).astype(equation.source.dtype)
 
     def bytes_per_node(self, weights: int, word: int) -> int:
         """Weights and source twice in single precision, as they are and sheared."""
-        return 4 * (2 * weights + 2) + 2 * word
+        return 4 * (2 * weights + 2) + 2 * word  # and the equation's source and δ in their own type
 
 
 @pytree_dataclass(static=("max_steps",))
@@ -106,7 +109,7 @@ class Krylov:
       max_steps: at most so many steps, two products and two preconditionings each.
     """
 
-    fraction: Any = 1e-3
+    fraction: Number = 1e-3
     max_steps: int = 200
     rough, open_ends, calls_back = False, True, False
 
@@ -117,7 +120,7 @@ class Krylov:
     def solve(self, equation: PolicyEquation, grid: Grid) -> jax.Array:
         """BiCGStab on (I − W) δ = s with one Gauss–Seidel round as preconditioner."""
 
-        def matvec(delta):
+        def matvec(delta):  # (I − W) δ: the residual of a zero right-hand side, negative
             return -left_over(PolicyEquation(jnp.zeros_like(delta), equation.weights), grid, delta)
 
         def precondition(residual):
@@ -147,16 +150,17 @@ class Direct:
         return direct(equation, grid)
 
     def bytes_per_node(self, weights: int, word: int) -> int:
-        """The weights twice; what the factors fill on the host depends on the order of the nodes and is not counted."""
+        """The weights twice, without the fill of the factors on the host: that depends on the order of the nodes."""
         return word * (2 * weights + 4)
 
 
-def check_evaluation(evaluation: Any, name: str) -> None:
-    """Refuse, by ``name``, what evaluates no policy.
+def check_evaluation(evaluation: object, name: str) -> None:
+    """Refuse, by ``name``, anything that is no evaluation of a policy.
 
     Raises:
       TypeError: with the evaluations that there are.
     """
+    # a class has the attributes of its instances: PolicyIteration(Krylov) without brackets would pass the protocol
     if isinstance(evaluation, type) or not isinstance(evaluation, Evaluation):
         wanted = "hjb.Sweeps(...), hjb.Krylov(...) or hjb.Direct()"
         raise TypeError(f"{name} is {arguments.shown(evaluation)}; wanted {wanted}")
@@ -176,7 +180,7 @@ def check_pytree(value: object, name: str) -> None:
         )
 
 
-def evaluate(method: Evaluation, equation: PolicyEquation, grid: Grid) -> jax.Array:
+def evaluate(method: Evaluation, equation: PolicyEquation, grid: Grid) -> Field:
     """An approximate solution δ, shape (*grid), in the dtype of the equation."""
     if grid.sides("open") and not method.open_ends:
         raise ValueError(
@@ -184,15 +188,15 @@ def evaluate(method: Evaluation, equation: PolicyEquation, grid: Grid) -> jax.Ar
             "value from inside; use hjb.PolicyIteration(hjb.Direct()) or Krylov(), in a march Implicit(hjb.Direct())"
         )
     delta = method.solve(equation, grid)
-    if method.rough:
+    if method.rough:  # its residual is looked at in the next step anyway
         return delta
     size, left = jnp.max(jnp.abs(equation.source)), jnp.max(jnp.abs(left_over(equation, grid, delta)))
     # an improper policy has no value, and BiCGStab may break down: then relax, which always makes sense
     return jax.lax.cond(left <= size, lambda: delta, lambda: relaxed(equation, grid, 2))
 
 
-def left_over(equation: PolicyEquation, grid: Grid, delta: jax.Array) -> jax.Array:
-    """s + Σ_o w_o δ(x + o) − δ: what a correction leaves."""
+def left_over(equation: PolicyEquation, grid: Grid, delta: Field) -> Field:
+    """s + Σ_o w_o δ(x + o) − δ: the residual that a correction leaves."""
     jumps = zip(equation.weights.offsets, equation.weights.values, strict=True)
     if grid.sides("open"):
         terms = [w * stencil.continued(delta, grid, offset) for offset, w in jumps]
@@ -201,24 +205,25 @@ def left_over(equation: PolicyEquation, grid: Grid, delta: jax.Array) -> jax.Arr
     return sum(terms, start=equation.source - delta)
 
 
-def jacobi(equation: PolicyEquation, grid: Grid, sweeps: int) -> jax.Array:
+def jacobi(equation: PolicyEquation, grid: Grid, sweeps: int) -> Field:
     """Damped Jacobi sweeps, ½(I + T): the star stencil alone has an eigenvalue near −1."""
 
-    def sweep(_, delta):
+    def sweep(_, delta):  # by half: I − W has eigenvalues up to 2, which a whole step would turn round for ever
         return delta + 0.5 * left_over(equation, grid, delta)
 
     return jax.lax.fori_loop(0, sweeps, sweep, jnp.zeros_like(equation.source))
 
 
-def relaxed(equation: PolicyEquation, grid: Grid, rounds: int) -> jax.Array:
+def relaxed(equation: PolicyEquation, grid: Grid, rounds: int) -> Field:
     """Rounds of wavefront Gauss–Seidel from zero; damped Jacobi where diagonal jumps break the wavefront.
 
     At open ends the correction is continued as a constant: of an equation with a parabola beyond them this is a
     preconditioner and no solver, since what is outside is told by the change of δ inside.
     """
     equation = _walled(equation, grid)
+    # a diagonal jump may stay on its hyperplane i₀ + i₁ + … = const, whose nodes are updated at once
     if any(sum(map(abs, offset)) > 1 for offset in equation.weights.offsets):
-        return jacobi(equation, grid, 4 * rounds * 2**grid.ndim)
+        return jacobi(equation, grid, 4 * rounds * 2**grid.ndim)  # four for each relaxation of a round
     return gauss_seidel.sweep(equation, grid, rounds)
 
 
@@ -228,18 +233,19 @@ def _walled(equation: PolicyEquation, grid: Grid) -> PolicyEquation:
         return equation
     inside, outside = [], jnp.zeros_like(equation.source)
     for offset, w in zip(equation.weights.offsets, equation.weights.values, strict=True):
-        leaves = np.zeros((1,) * grid.ndim, bool)
+        leaves = np.zeros((1,) * grid.ndim, bool)  # broadcasts; a diagonal jump may leave across two ends
         for axis, step in grid.sides("open"):
             if offset[axis] == step:
                 leaves = leaves | stencil.on_edge(grid, axis, step)
         inside.append(jnp.where(leaves, 0, w))
         outside = outside + jnp.where(leaves, w, 0)
+    # δ = s + w_in δ_in + w_out δ, solved for the node's own δ; a node that only leads out keeps its row
     scale = 1 / jnp.where(outside < 1, 1 - outside, 1)
     weights = dataclasses.replace(equation.weights, values=tuple(scale * w for w in inside))
     return PolicyEquation(scale * equation.source, weights)
 
 
-def direct(equation: PolicyEquation, grid: Grid, *, transposed: bool = False) -> jax.Array:
+def direct(equation: PolicyEquation, grid: Grid, *, transposed: bool = False) -> Field:
     """(I − W)⁻¹ s, or its transpose times s, by SuperLU through a host callback; a batch goes lane after lane.
 
     Numbers travel as 32-bit words: the callback's thread does not know of ``jax.enable_x64``.
@@ -255,20 +261,24 @@ def direct(equation: PolicyEquation, grid: Grid, *, transposed: bool = False) ->
         delta = _factor_and_solve(offsets, [numbers(w) for w in weights], numbers(source), grid, transposed)
         return np.ascontiguousarray(delta.astype(dtype)).view(word).reshape(source.shape)
 
+    # a double is two words on one more axis, a single is one
     words = [jax.lax.bitcast_convert_type(array, word) for array in (equation.source, *weights)]
     result = jax.ShapeDtypeStruct(words[0].shape, word)
+    # a callback, since XLA has no sparse LU; lane after lane, since SuperLU factors one matrix at a time
     delta = jax.pure_callback(on_host, result, *words, vmap_method="sequential")
     return jax.lax.bitcast_convert_type(delta, dtype)
 
 
 def _factor_and_solve(
-    offsets: Any, weights: list[np.ndarray], source: np.ndarray, grid: Grid, transposed: bool
+    offsets: Sequence[tuple[int, ...]], weights: list[np.ndarray], source: np.ndarray, grid: Grid, transposed: bool
 ) -> np.ndarray:
+    """δ of (I − W) δ = s, or of its transpose; NaN where the matrix is singular."""
     from scipy.sparse.linalg import splu
 
+    # I − W with the nodes in C order; CSC is what SuperLU factors
     matrix = stencil.sparse(offsets, [-w for w in weights], np.ones(grid.shape), grid)
     try:
         delta = splu(matrix.tocsc()).solve(source.ravel(), "T" if transposed else "N")
-    except RuntimeError:  # exactly singular
+    except RuntimeError:  # exactly singular, as a policy that never ends without discount; NaN, which a solve sees
         delta = np.full(grid.size, np.nan)
     return delta.reshape(grid.shape)

@@ -22,13 +22,13 @@ from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import bellman, certificates, hoffman_karp
 from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
-from hjbjax.iteration.certificates import Certificate, ErrorBound
+from hjbjax.iteration.certificates import Certificate, ErrorBound, Iterate
 from hjbjax.iteration.evaluation import Evaluation, evaluate
 from hjbjax.iteration.methods import Method
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, is_traced, pytree_dataclass
-from hjbjax.problem.types import Field, Scalar
+from hjbjax.problem.types import Field, Nodes, Number, Scalar
 from hjbjax.solution.status import Status
 
 FULL_STEPS = 10  # corrections of a limited scheme before they are halved, which ends limit cycles of the limiter
@@ -43,7 +43,7 @@ ROUNDING = 64  # residuals below this many units in the last place of max|V| are
 
 @pytree_dataclass(static=("certificate", "has_lost"))
 class Task:
-    """All that stays the same during a solve.
+    """The constants of a solve: the problem on its grid, the method, and how its error is bounded.
 
     Args:
       on: the problem on its grid.
@@ -55,7 +55,7 @@ class Task:
       tol: certified error to reach, cost units.
       certificate: which bound on the error applies.
       crossing: the time that it takes to cross the box at the largest speeds, where that was asked for; else None.
-      has_lost: whether nodes that do not count may lie beside others, so that no action may lead there.
+      has_lost: true if nodes that do not count may lie beside others, so that no action may lead there.
     """
 
     on: Discretisation
@@ -64,7 +64,7 @@ class Task:
     counted: jax.Array
     least_cost: jax.Array | None
     outflow: jax.Array | None
-    tol: Any
+    tol: Scalar
     certificate: Certificate
     crossing: Any = None
     has_lost: bool = False
@@ -81,7 +81,7 @@ class Task:
 
     @property
     def scheme(self) -> Scheme:
-        """How derivatives are made."""
+        """The scheme of the derivatives."""
         return self.on.scheme
 
     def asking(self, problem: Problem) -> "Task":
@@ -95,18 +95,19 @@ class Task:
 
     @property
     def constrained(self) -> bool:
-        """Whether the problem has a stopping cost or a running maximum."""
+        """True if the problem has a stopping cost or a running maximum."""
         return self.problem.stopping_cost is not None or self.problem.running_max is not None
 
-    def impose(self, value: jax.Array) -> jax.Array:
-        """``value`` with what is given put in, and with nodes that are lost far above all others."""
+    def impose(self, value: Field) -> Field:
+        """``value`` with the given values put in, and with nodes that are lost far above all others."""
         value = self.obstacles.impose(value)
         if not self.has_lost:
             return value
+        # 1/√eps above: no minimum chooses it, and a difference with it still has half of its digits
         largest = jnp.max(jnp.where(self.counted, jnp.abs(value), 0))
         return jnp.where(self.counted, value, largest / jnp.sqrt(jnp.finfo(value.dtype).eps))
 
-    def equation(self, value: Field, policy: Greedy, fastest: Any = None) -> PolicyEquation:
+    def equation(self, value: Field, policy: Greedy, fastest: Scalar | None = None) -> PolicyEquation:
         """The linear equation of a policy; ``fastest``, its largest Q + β, spares a pass where it is known."""
         if self.certificate is Certificate.ADDITIVE:  # no rate is only rounding: there is a discount
             fastest = jnp.zeros((), value.dtype)
@@ -120,36 +121,37 @@ class Task:
         """The largest |source| at the nodes that count, in cost units."""
         return jnp.max(jnp.where(self.counted, jnp.abs(equation.source), 0))
 
-    def start(self) -> jax.Array:
-        """Where to start without a guess: zero, or without discount ψ, above all fixed points, or g, below them."""
+    def start(self) -> Field:
+        """The value without a guess: zero, or without discount ψ, above all fixed points, or g, below them."""
         zero = jnp.zeros(self.grid.shape, self.tol.dtype)
         if not self.constrained or self.certificate is Certificate.ADDITIVE:
             return zero
         floor, stop = self.obstacles.lower, self.obstacles.upper
         start = floor if stop is None else stop if floor is None else jnp.maximum(floor, stop)
+        assert start is not None
         return jnp.asarray(jnp.broadcast_to(start, self.grid.shape), self.tol.dtype)
 
 
 @pytree_dataclass()
 class State:
-    """Where the iteration stands: a value, its greedy policy, its certificate, and the loop's book-keeping.
+    """State of a solve: a value, its greedy policy, its certificate, and the loop's book-keeping.
 
     ``fastest`` is the policy's largest Q + β, zero where every rate counts (under a discount), infinite before the look
     at a guess.
     """
 
-    value: jax.Array
+    value: Field
     policy: Greedy
-    fastest: jax.Array
+    fastest: Scalar
     bound: ErrorBound
-    step: jax.Array
-    best: jax.Array
-    since_best: jax.Array
-    code: jax.Array
-    history: jax.Array
+    step: Scalar
+    best: jax.Array  # the least error and the least residual so far, (2,): either one is progress
+    since_best: Scalar
+    code: Scalar
+    history: jax.Array  # residuals of this chunk, (HISTORY,), −1 where there was no step
 
 
-def begin(task: Task, guess: Any) -> State:
+def begin(task: Task, guess: Nodes) -> State:
     """The state before the first look at a guess; step −1 of ``run`` is that look, so that all is one program.
 
     The guess is copied, since states are donated. At host level there is nothing to compile.
@@ -170,9 +172,9 @@ def begin(task: Task, guess: Any) -> State:
     return State(value, policy, infinite, bound, counter - 1, xp.stack([infinite] * 2), counter, code, history)
 
 
-def run(task: Task, state: State, until: Any) -> State:
+def run(task: Task, state: State, until: Number) -> State:
     """Steps until the state is no longer running or ``until`` steps are done; at most ``HISTORY`` at a time."""
-    start = state.step
+    start = state.step  # the first place of this chunk's history
 
     def goes_on(state):
         return (state.code == Status.RUNNING) & (state.step < until)
@@ -187,30 +189,32 @@ def run(task: Task, state: State, until: Any) -> State:
     return jax.lax.while_loop(goes_on, step, state)
 
 
-def advance(task: Task, state: State, start: Any) -> State:
+def advance(task: Task, state: State, start: Scalar) -> State:
     """One step; a step that ends in numbers that are not finite is taken back."""
-    stay = jnp.zeros_like(state.value)
+    stay = jnp.zeros_like(state.value)  # of step −1, which only looks at the guess
     delta = jax.lax.cond(state.step < 0, lambda: stay, lambda: _correction(task, state))
     if not task.scheme.monotone:
         delta = jnp.where(state.step < FULL_STEPS, 1.0, 0.5).astype(delta.dtype) * delta
     value = task.impose(state.value + delta)
+    # a node that does not count may move for ever
     moved = jnp.max(jnp.abs(jnp.where(task.counted, value - state.value, 0)))
     if task.certificate is Certificate.OPEN and not task.method.relaxes:
-        moved = moved * _held_back(task, state)
+        moved = moved * _shift_factor(task, state)
     policy, fastest, bound = _look(task, value, state.policy, moved=moved, first=state.step < 0)
-    bound = dataclasses.replace(bound, error=jnp.where(_unmeasured(task, state), jnp.inf, bound.error))
+    bound = dataclasses.replace(bound, error=jnp.where(_lacks_measure(task, state), jnp.inf, bound.error))
     measures = jnp.stack([bound.error, bound.residual])
     since = jnp.where(jnp.any(measures < state.best), 0, state.since_best + 1)
     code = _judge(task, value, bound, state.best, since)
+    # counted and recorded even where it is taken back: ``broken`` makes that step again
     history = state.history.at[state.step - start].set(bound.residual)
-    best = jnp.fmin(state.best, measures)
+    best = jnp.fmin(state.best, measures)  # fmin, which a NaN does not win
     new = State(value, policy, fastest, bound, state.step + 1, best, since, code, history)
     old = dataclasses.replace(state, step=new.step, since_best=since, code=code, history=history)
     return jax.tree.map(lambda after, before: jnp.where(code == Status.NONFINITE, before, after), new, old)
 
 
 def broken(task: Task, state: State) -> jax.Array:
-    """Where value or rate are not finite in the step that a NONFINITE state took back, bool (*grid)."""
+    """The nodes where value or rate are not finite in the step that a NONFINITE state took back, bool (*grid)."""
     state = dataclasses.replace(state, step=state.step - 1)
     stay = jnp.zeros_like(state.value)
     delta = jax.lax.cond(state.step < 0, lambda: stay, lambda: _correction(task, state))
@@ -219,12 +223,12 @@ def broken(task: Task, state: State) -> jax.Array:
     return task.counted & ~(jnp.isfinite(value) & jnp.isfinite(rate))
 
 
-def _unmeasured(task: Task, state: State) -> Any:
-    """Without a certificate a step must have been taken before its size says anything."""
+def _lacks_measure(task: Task, state: State) -> jax.Array:
+    """True before the first step where the error is measured by the size of a step, without a certificate."""
     return (state.step < 0) & (task.certificate not in (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE))
 
 
-def _shift(task: Task, state: State) -> Any:
+def _shift(task: Task, state: State) -> Scalar:
     """κ, per unit time, by which the discount of a correction is raised: with open ends; it dies geometrically.
 
     Each correction is then an implicit step in time of length 1/κ. The equation with open ends has several solutions,
@@ -235,32 +239,27 @@ def _shift(task: Task, state: State) -> Any:
     return jnp.where(state.step < SHIFTS, jnp.max(task.outflow) * dying, 0)
 
 
-def _held_back(task: Task, state: State) -> Any:
-    """By how much longer a step would have been about, if no shift had held it back."""
+def _shift_factor(task: Task, state: State) -> Scalar:
+    """The factor, about, by which a step without the shift would have been longer: 1 + κ/β."""
     shift, discount = _shift(task, state), jnp.asarray(task.problem.discount, state.value.dtype)
     safe = jnp.where(discount > 0, discount, 1)
     return jnp.where(shift == 0, 1, jnp.where(discount > 0, 1 + shift / safe, jnp.inf))
 
 
 def _look(
-    task: Task, value: jax.Array, incumbent: Greedy, *, moved: jax.Array, first: jax.Array
-) -> tuple[Greedy, jax.Array, ErrorBound]:
+    task: Task, value: Field, incumbent: Greedy, *, moved: Scalar, first: jax.Array
+) -> tuple[Greedy, Scalar, ErrorBound]:
+    """The greedy policy at a value, its largest Q + β, and the bound on the value's error."""
     problem = task.problem
     policy = bellman.greedy(task.on, value, task.obstacles.fixed, incumbent=incumbent, lost=task.lost)
     if problem.stopping_cost is not None and not problem.is_game and task.certificate in TO_THE_END:
         fixed = task.obstacles.fixed | first  # nobody has chosen the actions before the first look
-        policy = bellman.kept(task.on, value, fixed, policy, incumbent)
+        policy = bellman.improvement(task.on, value, fixed, policy, incumbent)
     left = task.equation(value, policy)
+    assert left.fastest is not None
+    iterate = Iterate(value, policy, left, task.obstacles, task.counted)
     bound = certificates.error_bound(
-        task.certificate,
-        value,
-        policy,
-        left,
-        task.obstacles,
-        discount=problem.discount,
-        least_cost=task.least_cost,
-        counted=task.counted,
-        moved=moved,
+        task.certificate, iterate, discount=problem.discount, least_cost=task.least_cost, moved=moved
     )
     if task.has_lost:
         leaks = bellman.leaks(task.on, policy, task.obstacles.fixed, ~task.counted)
@@ -268,7 +267,8 @@ def _look(
     return policy, left.fastest, bound
 
 
-def _judge(task: Task, value: jax.Array, bound: ErrorBound, best: jax.Array, since: jax.Array) -> jax.Array:
+def _judge(task: Task, value: Field, bound: ErrorBound, best: jax.Array, since: Scalar) -> Scalar:
+    """The status after a step; each line overrules those before it."""
     finite = jnp.isfinite(bound.residual)
     matters = (since >= PATIENCE) | (bound.residual > GROWTH * best[1])  # else it changes no answer below
     climbs = task.constrained or task.method.relaxes
@@ -283,6 +283,7 @@ def _judge(task: Task, value: jax.Array, bound: ErrorBound, best: jax.Array, sin
     if to_the_end:  # a front moves V by a spacing times its slope a step, whatever the tolerance, past every node
         tol = jnp.where(task.problem.discount > 0, tol, rounding)
         longest = max(longest, 100 + 4 * task.grid.size)
+    # a residual that is rounding has nowhere to go: ten steps tell, in place of the thousands of a slow climb
     patience = jnp.where(bound.residual <= rounding, PATIENCE, longest)
     code = jnp.where(since >= patience, Status.STALLED, Status.RUNNING)
     grew = bound.residual > GROWTH * jnp.maximum(best[1], rounding)
@@ -309,11 +310,11 @@ class Look:
         """The linear equation of the greedy policy, whose rates are known."""
         return self.task.equation(self.state.value, self.state.policy, self.state.fastest)
 
-    def relaxed(self) -> jax.Array:
+    def relaxed(self) -> Field:
         """r/(Q + β): one relaxation of every node."""
         return self.state.policy.defect / _outflow(self.task, self.state)
 
-    def evaluated(self, evaluation: Evaluation, replies: int) -> jax.Array:
+    def evaluated(self, evaluation: Evaluation, replies: int) -> Field:
         """The correction of policy iteration: by the linear equation of the policy, in a game by the inner problem."""
         task, state = self.task, self.state
         if task.certificate is Certificate.OPEN:  # in a game, too: steps in time improve both players at once
@@ -327,7 +328,7 @@ class Look:
         return evaluate(evaluation, self.equation(), task.grid)
 
 
-def _correction(task: Task, state: State) -> jax.Array:
+def _correction(task: Task, state: State) -> Field:
     """δ of the method, cost units, (*grid)."""
     look = Look(task, state)
     if task.method.relaxes or task.outflow is None or task.certificate is Certificate.OPEN:
@@ -337,12 +338,12 @@ def _correction(task: Task, state: State) -> jax.Array:
     )
 
 
-def _outflow(task: Task, state: State) -> jax.Array:
+def _outflow(task: Task, state: State) -> Field:
     """Q + β for value iteration: of the fastest action, which the policy shows where it is not known beforehand."""
     assert task.outflow is not None
     players = players_of(task.on)
     if players.control.fastest_at_ends and players.disturbance.fastest_at_ends:
         return task.outflow
     u, d = list(state.policy.controls), list(state.policy.disturbances)
-    chosen = chain.rates(task.on, u, d).total()
+    chosen = chain.rates(task.on, u, d).total()  # a fast action between the samples
     return jnp.maximum(task.outflow, chosen + task.problem.discount)

@@ -13,7 +13,7 @@ across the seam of a periodic axis, is as old as the last sweep.
 Where the arrays outgrow a processor's cache, slabs of slices take the place of single sweeps through all of them.
 """
 
-from typing import Any
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -21,15 +21,17 @@ import jax.numpy as jnp
 from hjbjax.discretisation import stencil
 from hjbjax.iteration.bellman import PolicyEquation
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.types import Field, Scalar
 
+Index: TypeAlias = int | Scalar  # of a slice; traced inside a loop
 Weights = list[tuple[jax.Array, ...]]  # for each axis, as ``_towards`` gives them
 
 CACHE = 2**25  # bytes that a processor keeps near by
-SLAB = 64  # slices
+SLAB = 64  # slices that are swept to and fro while they are in the cache
 FOLDS = 4  # up to so many comparisons take the place of a division, which XLA would not fuse
 
 
-def sweep(equation: PolicyEquation, grid: Grid, rounds: int) -> jax.Array:
+def sweep(equation: PolicyEquation, grid: Grid, rounds: int) -> Field:
     """Sweeps from zero, in every order ``rounds`` times forward and backward; for jumps along the axes alone.
 
     The orders are one loop, so that one program serves them all and its operands are arrays in memory: a fused
@@ -37,6 +39,7 @@ def sweep(equation: PolicyEquation, grid: Grid, rounds: int) -> jax.Array:
     """
 
     def order(index: jax.Array, delta: jax.Array) -> jax.Array:
+        # one bit an axis beyond the first; forward and backward sweeps are the two ways along the first
         flips = [(index >> axis) & 1 for axis in range(grid.ndim - 1)]
         source = _sheared(equation.source, flips)
         weights = [_towards(equation, grid, axis, flips) for axis in range(grid.ndim)]
@@ -47,6 +50,7 @@ def sweep(equation: PolicyEquation, grid: Grid, rounds: int) -> jax.Array:
         def in_slabs(planes: jax.Array) -> jax.Array:
             return _in_slabs(source, weights, planes, grid, rounds)
 
+        # a margin of one entry on every side, so that neighbours are slices without a branch at the ends
         planes = jnp.pad(_sheared(delta, flips), 1)
         if _outgrows_the_cache(source, weights):
             planes = jax.lax.platform_dependent(planes, cpu=in_slabs, default=whole)
@@ -58,16 +62,17 @@ def sweep(equation: PolicyEquation, grid: Grid, rounds: int) -> jax.Array:
 
 
 def _outgrows_the_cache(source: jax.Array, weights: Weights) -> bool:
-    """Whether all slices do, and a slab of them does not."""
-    arrays = 2 + sum(map(len, weights))
+    """True if all slices outgrow a processor's cache and a slab of them does not."""
+    arrays = 2 + sum(map(len, weights))  # source and planes beside the weights
     size = arrays * source.size * source.dtype.itemsize
+    # half of the cache: the slab before and the one after pass through it, too
     return size > CACHE and SLAB * size / len(source) < CACHE / 2
 
 
 def _in_turns(source: jax.Array, weights: Weights, planes: jax.Array, grid: Grid, rounds: int) -> jax.Array:
     """All slices upwards and downwards, ``rounds`` times."""
 
-    def pair(_: Any, planes: jax.Array) -> jax.Array:
+    def pair(_: Index, planes: jax.Array) -> jax.Array:
         for up in (True, False):
             planes = _sweep(source, weights, _wrapped(planes, grid), 0, len(source), up=up)
         return planes
@@ -82,7 +87,7 @@ def _in_slabs(source: jax.Array, weights: Weights, planes: jax.Array, grid: Grid
     while it is at hand, three at least.
     """
     count = len(source)
-    slabs = -(-count // SLAB)
+    slabs = -(-count // SLAB)  # the last one may be shorter
     for up in (True, False):
 
         def slab(index: jax.Array, planes: jax.Array, up: bool = up) -> jax.Array:
@@ -94,6 +99,7 @@ def _in_slabs(source: jax.Array, weights: Weights, planes: jax.Array, grid: Grid
 
             return jax.lax.fori_loop(0, max(2 * rounds - 1, 3), sweep, planes)
 
+        # margins once a way: filling them between slabs would read all planes
         planes = jax.lax.fori_loop(0, slabs, slab, _wrapped(planes, grid))
     return planes
 
@@ -103,14 +109,15 @@ def _towards(equation: PolicyEquation, grid: Grid, axis: int, flips: list[jax.Ar
     table = dict(zip(equation.weights.offsets, equation.weights.values, strict=True))
     up, down = (table[stencil.unit(grid, axis, step)] for step in (1, -1))
     flipped = flips[axis - 1] == 1 if axis else False
+    # one array in place of two halves what a sweep reads, and memory is what it waits for; the sign tells the side
     if equation.weights.one_way:
         return (_sheared((up - down) * jnp.where(flipped, -1, 1).astype(up.dtype), flips),)
     return _sheared(jnp.where(flipped, down, up), flips), _sheared(jnp.where(flipped, up, down), flips)
 
 
 def _wrapped(planes: jax.Array, grid: Grid) -> jax.Array:
-    """The margin filled with what lies across the fold of the shear and across the seams of periodic axes."""
-    for axis in range(1, grid.ndim):
+    """The planes with a margin of values from across the fold of the shear and the seams of periodic axes."""
+    for axis in range(1, grid.ndim):  # before the first axis, whose margins hold the corners of the others as well
         if grid.periodic[axis]:  # type: ignore[index]
             planes = _with_margins(planes, axis)
     return _with_margins(planes, 0)
@@ -126,8 +133,9 @@ def _with_margins(planes: jax.Array, axis: int) -> jax.Array:
     def fill(side: jax.Array, planes: jax.Array) -> jax.Array:
         above = side == 0
         inner = jax.lax.dynamic_slice_in_dim(planes, jnp.where(above, 1, count), 1, axis)
-        start: list[Any] = [0] * planes.ndim
+        start: list[Index] = [0] * planes.ndim
         if axis > 0:
+            # S[d, j] with d − Σ j: a step of a whole axis to the side is as many slices further
             inner = jnp.roll(inner[1:-1], jnp.where(above, count, -count), axis=0)
             start[0] = 1
         start[axis] = jnp.where(above, count + 1, 0)
@@ -136,10 +144,13 @@ def _with_margins(planes: jax.Array, axis: int) -> jax.Array:
     return jax.lax.fori_loop(0, 2, fill, planes)
 
 
-def _sweep(source: jax.Array, weights: Weights, planes: jax.Array, first: Any, last: Any, *, up: Any) -> jax.Array:
+def _sweep(
+    source: jax.Array, weights: Weights, planes: jax.Array, first: Index, last: Index, *, up: bool | jax.Array
+) -> jax.Array:
     """One pass over the slices from ``first`` to ``last``; ``planes`` has a margin of one entry on every side."""
 
-    def row(values: jax.Array, d: Any) -> jax.Array:
+    def row(values: jax.Array, d: Index) -> jax.Array:
+        # d is never negative: JAX would add a comparison and a select to every start
         return jax.lax.dynamic_slice_in_dim(values, d, 1, allow_negative_indices=False)
 
     def core(slab: jax.Array, axis: int, step: int) -> jax.Array:
@@ -150,14 +161,16 @@ def _sweep(source: jax.Array, weights: Weights, planes: jax.Array, first: Any, l
 
     def relax(k: jax.Array, planes: jax.Array) -> jax.Array:
         d = jnp.where(up, k, first + last - 1 - k)
+        # with the margin slice d stands at d + 1: its neighbours at d and d + 2
         below, above, new = row(planes, d), row(planes, d + 2), row(source, d)
         for axis, pair in enumerate(weights):
             rows, up_there, down_there = [row(w, d) for w in pair], core(above, axis, 1), core(below, axis, -1)
             if len(rows) == 2:
                 new = new + rows[0] * up_there + rows[1] * down_there
             else:
+                # up − down: positive goes up; a negative one goes down by its size
                 new = new + rows[0] * jnp.where(rows[0] > 0, up_there, -down_there)
-        start: tuple[Any, ...] = (d + 1, *(1 for _ in source.shape[1:]))
+        start: tuple[Index, ...] = (d + 1, *(1 for _ in source.shape[1:]))
         return jax.lax.dynamic_update_slice(planes, new, start, allow_negative_indices=False)
 
     return jax.lax.fori_loop(first, last, relax, planes)
@@ -172,7 +185,9 @@ def _sheared(values: jax.Array, flips: list[jax.Array], *, back: bool = False) -
         jnp.where(flip == 1, size - 1 - column, column)
         for column, size, flip in zip(columns, counts, flips, strict=True)
     ]
+    # a place in the flat array, in bounds by construction: one gather that clamps nothing
     place = row + sum(flipped) if back else row - sum(columns)
+    # Σ j ranges over Σ (n_k − 1): how often that may wrap round the first axis
     folds = -(-(sum(counts) - len(counts)) // count)
     step = -count if back else count
     if folds > FOLDS:

@@ -56,10 +56,12 @@ def evaluated(
         delta = evaluate(evaluation, question.equation(value, policy), question.grid)
         value = question.impose(value + delta)
         policy = question.reply(value, policy)
+        # the answer at the new value leaves a residual of the inner problem alone: the outer policy is kept
         return value, policy, question.residual(question.equation(value, policy)), count + 1
 
     def unfinished(carry):
         return (carry[2] > SHARE * residual) & (carry[3] < replies)
 
+    # infinite: the outer player's policy is evaluated once at least, against the answer that it was found with
     start = (value, policy, jnp.asarray(jnp.inf, value.dtype), jnp.zeros((), jnp.int32))
-    return jax.lax.while_loop(unfinished, reply, start)[0]
+    return jax.lax.while_loop(unfinished, reply, start)[0]  # the policy is found anew by whoever asks

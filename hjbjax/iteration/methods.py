@@ -66,19 +66,19 @@ class Step(Protocol):
 
 @runtime_checkable
 class Method(Protocol):
-    """How V is corrected, as a value: frozen and hashable or a pytree."""
+    """A method of a stationary solve, which corrects V; a value, frozen and hashable or a pytree."""
 
     @property
     def relaxes(self) -> bool:
-        """Whether it takes the largest rate for the matrix: V then climbs or falls to its fixed point step by step."""
+        """True if it takes the largest rate for the matrix: V climbs or falls to its fixed point step by step."""
 
     @property
     def evaluation(self) -> Evaluation | None:
-        """How the equation of a policy is solved; also for derivatives. None where it never is."""
+        """The solver of the equation of a policy, also for derivatives. None where it is never solved."""
 
     @property
     def inner(self) -> "Method":
-        """What runs on one grid: the method itself, if it knows nothing of coarser grids."""
+        """The method that runs on one grid: itself, if it knows nothing of coarser grids."""
 
     @property
     def coarsest(self) -> int | None:
@@ -91,7 +91,7 @@ class Method(Protocol):
         """The steps without progress after which the solve has stalled."""
 
     def described(self, game: bool) -> str:
-        """The method as one would write it, without what only matters in a game."""
+        """The method as one would write it, without the numbers that only matter in a game."""
 
 
 @pytree_dataclass()
@@ -101,7 +101,7 @@ class ValueIteration:
     The error falls by 1/(1 + βΔt) a step: many cheap steps. For reference, for games, and where memory rules.
     """
 
-    relaxes, evaluation, coarsest = True, None, None
+    relaxes, evaluation, coarsest = True, None, None  # no fields: answers to the loop, and not choices of the user
 
     @property
     def inner(self) -> "ValueIteration":
@@ -123,7 +123,7 @@ class ValueIteration:
 
 @pytree_dataclass(static=("replies",))
 class PolicyIteration:
-    """Improve the policy, evaluate it, repeat; the evaluation is what distinguishes the methods of this family.
+    """Improve the policy, evaluate it, repeat; the methods of this family differ in the evaluation.
 
     Args:
       evaluation: ``Sweeps(count)`` is modified policy iteration; ``Krylov()`` and ``Direct()`` are Howard's.
@@ -149,7 +149,7 @@ class PolicyIteration:
 
     def patience(self, grid: Grid) -> int:
         """A good policy moves one cell an improvement, and a wave may cross the box four times."""
-        return 100 + 4 * sum(grid.shape)
+        return 100 + 4 * sum(grid.shape)  # a hundred for grids so small that crossing them takes no time
 
     def described(self, game: bool) -> str:
         """As it is written, without the replies where there is no opponent."""
@@ -173,7 +173,7 @@ class Nested:
 
     def __post_init__(self):
         check_method(self.inner, "Nested: inner")
-        if self.inner.coarsest is not None:
+        if self.inner.coarsest is not None:  # nested in nested: every level would start at the coarsest grid anew
             raise TypeError(f"Nested: inner is {self.inner!r}; wanted what runs on one grid")
         arguments.count(self.coarsest, "Nested: coarsest")
 
@@ -196,16 +196,17 @@ class Nested:
         return self.inner.patience(grid)
 
     def described(self, game: bool) -> str:
-        """As it is written, with what runs on each level."""
+        """As it is written, with the method of each level."""
         return f"Nested({self.inner.described(game)})"
 
 
 def check_method(method: object, name: str) -> None:
-    """Refuse, by ``name``, what corrects no value.
+    """Refuse, by ``name``, anything that is no method of a stationary solve.
 
     Raises:
       TypeError: with the methods that there are.
     """
+    # a class has the attributes of its instances: Nested(ValueIteration) without brackets would pass the protocol
     if isinstance(method, type) or not isinstance(method, Method):
         wanted = "hjb.PolicyIteration(...) or hjb.ValueIteration()"
         raise TypeError(f"{name} is {arguments.shown(method)}; wanted {wanted}")

@@ -27,12 +27,12 @@ import jax.numpy as jnp
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import bellman, certificates, hoffman_karp
 from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
-from hjbjax.iteration.certificates import Certificate
+from hjbjax.iteration.certificates import Certificate, Iterate
 from hjbjax.iteration.evaluation import Evaluation, check_evaluation, evaluate
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import altered, is_traced, pytree_dataclass
-from hjbjax.problem.types import DType, Field, Number, Numbers, Scalar
+from hjbjax.problem.types import DType, Field, Number, Scalar
 
 ROUNDING = 16  # residuals below this many units in the last place of max|V| are rounding
 REPLIES = 20  # of the inner player to one policy of the outer one, at most
@@ -46,20 +46,20 @@ class Marching(Protocol):
         """The problem on its grid."""
 
     @property
-    def horizon(self) -> Scalar:
+    def horizon(self) -> Number:
         """The time at which the terminal cost is paid."""
 
     def obstacles_at(self, t: Number) -> Obstacles:
         """Fixed nodes and constraints at the time t."""
 
     def rate(self, value: Field, t: Number) -> tuple[Field, Any]:
-        """F = min max H − β V, cost per unit time, and what the optimal actions show."""
+        """F = min max H − β V, cost per unit time, and the rates and the noise under the optimal actions."""
 
     def look(self, u: list, d: list, t: Number) -> Any:
-        """What these actions show: the fastest rate, and noise that the chain cannot represent."""
+        """The fastest rate under these actions, and noise that the chain cannot represent."""
 
     def nothing_seen(self) -> Any:
-        """What is shown before anything was looked at."""
+        """The outcome before the first look."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,27 +94,28 @@ class Tableau:
 
     @property
     def times(self) -> tuple[float, ...]:
-        """Where each stage evaluates F, and where the last one ends, in steps."""
+        """The times at which the stages evaluate F, and the end of the last one, in steps."""
         found = [0.0]
         for share in self.means:
+            # 1/3 and 2/3 are no binary numbers: at 12 digits the last stage of a sound tableau ends at 1 exactly
             found.append(round((1 - share) * (found[-1] + self.euler), 12))
         return tuple(found)
 
 
 TABLEAUX = {
-    1: Tableau((0.0,)),
-    2: Tableau((0.0, 1 / 2)),
-    3: Tableau((0.0, 3 / 4, 1 / 3)),
-    4: Tableau((0.0, 0.0, 2 / 3, 0.0), 1 / 2),
+    1: Tableau((0.0,)),  # Euler
+    2: Tableau((0.0, 1 / 2)),  # Heun
+    3: Tableau((0.0, 3 / 4, 1 / 3)),  # Shu and Osher's
+    4: Tableau((0.0, 0.0, 2 / 3, 0.0), 1 / 2),  # Spiteri and Ruuth's, of order 3
 }
 
 
 class TimeMethod(Protocol):
-    """How V is carried from t to t − Δt, as a value: frozen and hashable or a pytree."""
+    """A method that carries V from t to t − Δt; a value, frozen and hashable or a pytree."""
 
     @property
     def limited(self) -> bool:
-        """If steps longer than 1/(max Q + β) over ``courant`` are unstable."""
+        """True if steps longer than 1/(max Q + β) over ``courant`` are unstable."""
 
     @property
     def courant(self) -> Number:
@@ -122,17 +123,17 @@ class TimeMethod(Protocol):
 
     @property
     def tableau(self) -> Tableau:
-        """Its stages: how often, and after what time, a step looks at the rates."""
+        """Its stages: the times within a step at which the rates are looked at."""
 
     @property
     def monotone_only(self) -> bool:
-        """If it wants the matrix of a chain, and so a monotone scheme."""
+        """True if it wants the matrix of a chain, and so a monotone scheme."""
 
     def filled(self, on: Discretisation, evaluation: Evaluation | None = None) -> "TimeMethod":
-        """The method with what was left open, by the scheme and by the ``evaluation`` that suits the problem."""
+        """The method with its open settings taken from the scheme and from the ``evaluation`` of the problem."""
 
     def step(self, march: Marching, value: Field, t: Number, end: Number, dt: Number) -> tuple[Field, Scalar, Any]:
-        """V at ``end`` = t − Δt from V at t, if that came to its end, and what was seen on the way."""
+        """V at ``end`` = t − Δt from V at t, true if the step came to its end, and the rates and the noise seen."""
 
     def described(self) -> str:
         """The method as one would write it."""
@@ -150,10 +151,11 @@ class Explicit:
     """
 
     stages: int | Tableau | None = None
-    fraction: Any = 0.9
+    fraction: Number = 0.9
     limited, monotone_only = True, False
 
     def __post_init__(self):
+        # True is 1 to Python, and would be taken for Euler's method
         named = not isinstance(self.stages, bool) and self.stages in (None, *TABLEAUX)
         if not named and not isinstance(self.stages, Tableau):
             raise ValueError(f"Explicit: got stages = {self.stages!r}, wanted 1, 2, 3, 4, a Tableau or None")
@@ -166,7 +168,7 @@ class Explicit:
         return self.stages if isinstance(self.stages, Tableau) else TABLEAUX[self.stages]
 
     @property
-    def courant(self) -> Any:
+    def courant(self) -> Number:
         """The length of a step times max Q + β."""
         return self.fraction / self.tableau.euler
 
@@ -175,9 +177,9 @@ class Explicit:
         return Explicit(self.stages or on.scheme.stages, _as(self.fraction, on.dtype))
 
     def step(self, march: Marching, value: Field, t: Number, end: Number, dt: Number) -> tuple[Field, Scalar, Any]:
-        """V at ``end`` = t − Δt from V at t by the stages of the tableau, true, and what the stages saw."""
+        """V at ``end`` = t − Δt from V at t by the stages of the tableau, true, and the rates and the noise seen."""
         dtype, tableau, fine = value.dtype, self.tableau, jnp.ones((), bool)
-        if len(tableau.means) == 1:
+        if len(tableau.means) == 1:  # Euler: no loop of one turn
             rate, seen = march.rate(value, t)
             return march.obstacles_at(t - dt).impose(value + dt * rate), fine, seen
         means, starts, ends = (
@@ -187,6 +189,7 @@ class Explicit:
         def stage(k, carry):
             w, seen = carry
             rate, now = march.rate(w, t - starts[k] * dt)
+            # a mean of V and of one Euler step with weights ≥ 0: what Euler's step keeps, this keeps
             moved = means[k] * value + (1 - means[k]) * (w + tableau.euler * dt * rate)
             return march.obstacles_at(t - ends[k] * dt).impose(moved), seen.joined(now)
 
@@ -210,10 +213,10 @@ class Implicit:
     """
 
     evaluation: Evaluation | None = None
-    tol: Any = 1e-6
+    tol: Number = 1e-6
     max_steps: int = 100
     limited, monotone_only = False, True
-    courant, tableau = math.inf, TABLEAUX[1]
+    courant, tableau = math.inf, TABLEAUX[1]  # any length; the rates are looked at once
 
     def __post_init__(self):
         if self.evaluation is not None:
@@ -226,7 +229,8 @@ class Implicit:
         return Implicit(self.evaluation or evaluation, _as(self.tol, on.dtype), self.max_steps)
 
     def step(self, march: Marching, value: Field, t: Number, end: Number, dt: Number) -> tuple[Field, Scalar, Any]:
-        """V at ``end`` from V at t, if the policy iteration came to its end, and what its last policy saw."""
+        """V at ``end`` from V at t, true if the policy iteration came to its end, and a look at its last policy."""
+        # the chain, the costs and the constraints of the time at which W is asked for, and V/Δt from the time before
         question = ImplicitStep.of(march.on.at(end), march.obstacles_at(end), value, dt)
         assert self.evaluation is not None
         # what a step leaves adds up over the march, so that each has its share of the tolerance
@@ -239,7 +243,7 @@ class Implicit:
         return f"Implicit({self.evaluation!r}, tol={float(self.tol):g})"
 
 
-def _as(number: Numbers, dtype: DType) -> Numbers:
+def _as(number: Number, dtype: DType) -> Number:
     """A number in the type of a march; one that is traced keeps its own."""
     return number if is_traced(number) else jnp.asarray(number, dtype)
 
@@ -251,12 +255,12 @@ class ImplicitStep:
     Args:
       on: the problem with discount β + 1/Δt on its grid at the time of W.
       obstacles: fixed nodes and constraints at that time.
-      arriving: V/Δt, what is added to the running cost.
+      arriving: V/Δt, a part of the running cost.
     """
 
     on: Discretisation
     obstacles: Obstacles
-    arriving: jax.Array
+    arriving: Field
 
     @classmethod
     def of(cls, on: Discretisation, obstacles: Obstacles, value: Field, dt: Number) -> "ImplicitStep":
@@ -288,8 +292,8 @@ class ImplicitStep:
 
     def solve(
         self, value: Field, evaluation: Evaluation, tol: Number, max_steps: int
-    ) -> tuple[jax.Array, Greedy, jax.Array]:
-        """W, its policy, and if it is known to ``tol`` or to rounding.
+    ) -> tuple[Field, Greedy, jax.Array]:
+        """W, its policy, and true if W is known to ``tol`` or to rounding.
 
         Args:
           value: where to start.
@@ -301,29 +305,29 @@ class ImplicitStep:
         def look(value):
             policy = self._complete(bellman.greedy(self.on, value, self.obstacles.fixed))
             equation = self.equation(value, policy)
-            bound = certificates.error_bound(
-                Certificate.ADDITIVE, value, policy, equation, self.obstacles, discount=self.on.problem.discount,
-                least_cost=None, counted=True, moved=0,
-            )  # fmt: skip
+            iterate = Iterate(value, policy, equation, self.obstacles, counted=True)
+            bound = certificates.error_bound(Certificate.ADDITIVE, iterate, discount=self.on.problem.discount)
+            # a short step's share of the tolerance may be less than the rounding of V, and would never be reached
             rounding = ROUNDING * jnp.finfo(value.dtype).eps * jnp.max(jnp.abs(value))
             return policy, bound.residual, (bound.error <= tol) | (bound.residual <= rounding)
 
         def unfinished(carry):
             _, _, residual, done, count = carry
-            return ~done & (count < max_steps) & jnp.isfinite(residual)
+            return ~done & (count < max_steps) & jnp.isfinite(residual)  # a NaN is the march's to report
 
         def improve(carry):
             value, policy, residual, _, count = carry
             value = self._evaluated(value, policy, residual, evaluation)
             return value, *look(value), count + 1
 
-        start = self.impose(value)
+        start = self.impose(value)  # V at t is a guess for W that is wrong by O(Δt) only
         carry = (start, *look(start), jnp.zeros((), jnp.int32))
         value, policy, _, done, _ = jax.lax.while_loop(unfinished, improve, carry)
         return value, policy, done
 
     def _complete(self, policy: Greedy) -> Greedy:
         """A policy of the problem with its defect, V/Δt included."""
+        # V/Δt is no part of the problem's cost: it is the same for all actions, and chooses none
         return dataclasses.replace(policy, defect=jnp.where(self.obstacles.fixed, 0, policy.defect + self.arriving))
 
     def _evaluated(self, value: Field, policy: Greedy, residual: Number, evaluation: Evaluation) -> Field:

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from hjbjax.discretisation import chain, correlated_noise
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.hamiltonian import discrete
+from hjbjax.hamiltonian.search import Action
 from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import Obstacles
 from hjbjax.iteration.time_methods import TimeMethod
@@ -21,7 +22,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Box
-from hjbjax.problem.types import Field, Number
+from hjbjax.problem.types import Field, Mask, Nodes, Number, Scalar
 from hjbjax.solution.status import Status
 
 TRIES = 30  # of a step that is shortened, at most; what its first stage sees does not depend on its length
@@ -30,7 +31,7 @@ NEAR = 1e-3  # of a bound's distance: a disturbance so near its bound sits on it
 
 @pytree_dataclass(static=("checks_rates", "checks_noise"))
 class March:
-    """All that stays the same during a march.
+    """The constants of a march: the problem on its grid, the method, and the limits of its steps.
 
     Args:
       on: the problem on its grid, with the slopes of a scheme.
@@ -40,17 +41,17 @@ class March:
       step: the longest step wanted; inf where the limit alone counts.
       horizon: the time at which the terminal cost is paid.
       watched: bool (*grid), nodes where a disturbance at its bound means that the value blows up; or ``None``.
-      checks_rates: whether explicit steps look at Q under the actions that they chose.
-      checks_noise: whether steps look for correlated noise that the chain cannot represent.
+      checks_rates: true if explicit steps look at Q under the actions that they chose.
+      checks_noise: true if steps look for correlated noise that the chain cannot represent.
     """
 
     on: Discretisation
     method: TimeMethod
     obstacles: Obstacles | None
-    limit: Any
-    step: Any
-    horizon: Any
-    watched: Any
+    limit: Number | None
+    step: Number
+    horizon: Any  # an array in the type of the values where the host drives the march, a float inside transformations
+    watched: Mask | None
     checks_rates: bool = False
     checks_noise: bool = False
 
@@ -68,7 +69,7 @@ class March:
         """Held nodes and constraints at the time t."""
         return bellman.obstacles(self.on.at(t)) if self.obstacles is None else self.obstacles
 
-    def longest(self, t: Any) -> Any:
+    def longest(self, t: Number) -> Scalar:
         """The longest step that may start at the time t."""
         limit = self.limit
         if limit is None:
@@ -76,21 +77,22 @@ class March:
         return jnp.minimum(self.step, limit)
 
     def rate(self, value: Field, t: Number) -> tuple[Field, "Seen"]:
-        """F = min max H − β V, cost per unit time, and what the optimal actions show."""
+        """F = min max H − β V, cost per unit time, and the rates and the noise under the optimal actions."""
         best, u, d = discrete.optimise(discrete.around(self.on.at(t), value))
         return best - self.problem.discount * value, self.look(u, d, t)
 
-    def look(self, u: list, d: list, t: Number) -> "Seen":
-        """How fast the chain leaves a node under these actions, and where it cannot represent the noise."""
+    def look(self, u: Action, d: Action, t: Number) -> "Seen":
+        """The largest Q + β under these actions, and the first node whose noise the chain cannot represent."""
         on, dtype = self.on.at(t), self.on.dtype
         seen = self.nothing_seen()
-        if self.checks_rates:
+        if self.checks_rates:  # a pass over all rates, which is spared where the limit of the step is known
             fastest = jnp.max(chain.rates(on, u, d).total()) + jnp.asarray(on.problem.discount, dtype)
             seen = dataclasses.replace(seen, fastest=fastest)
         if self.checks_noise:
             lacking = correlated_noise.lacking(on, on.diffusion(u, d))
             if lacking is None:
                 return seen
+            # at a fixed node nothing moves, whatever the noise is there
             lacking = jnp.broadcast_to(lacking, on.grid.shape) & ~self.obstacles_at(t).fixed
             first = jnp.where(jnp.any(lacking), jnp.argmax(lacking), -1).astype(jnp.int32)
             seen = dataclasses.replace(seen, lacking=first, t=jnp.asarray(t, dtype))
@@ -104,18 +106,18 @@ class March:
 
 @pytree_dataclass()
 class Front:
-    """Where a march stands: V at the time t, the steps so far, how it is going, and what the last step saw."""
+    """State of a march: V at the time t, step count, status, and the rates and the noise that the last step saw."""
 
-    value: jax.Array
-    t: jax.Array
-    steps: jax.Array
-    code: jax.Array
+    value: Field
+    t: Scalar
+    steps: Scalar
+    code: Scalar
     seen: "Seen"
 
 
 @pytree_dataclass()
 class Seen:
-    """What is found out on the way; nothing where nothing is looked for.
+    """Rates and noise under the actions of a step; zero and −1 where they are not looked for.
 
     Args:
       fastest: the largest Q + β under the actions that were chosen, per unit time.
@@ -123,12 +125,12 @@ class Seen:
       t: the time of that.
     """
 
-    fastest: jax.Array
-    lacking: jax.Array
-    t: jax.Array
+    fastest: Scalar
+    lacking: Scalar
+    t: Scalar
 
     def joined(self, other: "Seen") -> "Seen":
-        """What was seen in both of two looks, the first fault of the noise first."""
+        """The larger rate of two looks, and the fault of the noise that was found first."""
         first = self.lacking >= 0
         return Seen(
             jnp.maximum(self.fastest, other.fastest),
@@ -137,19 +139,20 @@ class Seen:
         )
 
 
-def stable(on: Discretisation) -> jax.Array:
+def stable(on: Discretisation) -> Scalar:
     """The longest step for which explicit Euler is monotone, 1/(max Q + β); inf where nothing moves."""
     rate = jnp.max(chain.fastest_rate(on)) + on.problem.discount
+    # the inner where keeps 1/0 out of the branch not taken, whose NaN a derivative would bring back
     return jnp.where(rate > 0, 1 / jnp.where(rate > 0, rate, 1), jnp.inf)
 
 
-def terminal(on: Discretisation, start: Any = None) -> jax.Array:
+def terminal(on: Discretisation, start: Nodes | None = None) -> Field:
     """V at the horizon, the time of ``on``: ``start`` or the terminal cost, with given values and constraints put in.
 
     Without either a stopping cost is paid at the latest then, and a running maximum is g itself; else nothing is paid.
     """
     obstacles, problem = bellman.obstacles(on), on.problem
-    if start is not None:
+    if start is not None:  # the user's, which need not respect the constraints
         return obstacles.impose(jnp.asarray(start, on.dtype))
     cost = problem.terminal_cost
     if cost is None:
@@ -157,14 +160,14 @@ def terminal(on: Discretisation, start: Any = None) -> jax.Array:
     return obstacles.impose(on.at_nodes(cost))
 
 
-def begin(march: March, value: jax.Array) -> Front:
+def begin(march: March, value: Field) -> Front:
     """The front at the horizon."""
     zero = jnp.zeros((), jnp.int32)
     t = jnp.asarray(march.horizon, value.dtype)
     return Front(value, t, zero, zero + int(Status.RUNNING), march.nothing_seen())
 
 
-def run(march: March, front: Front, until: Any, most: Any) -> Front:
+def run(march: March, front: Front, until: Number, most: Number) -> Front:
     """At most ``most`` steps towards the time ``until``, as long as the values are finite."""
 
     def goes_on(carry):
@@ -178,20 +181,23 @@ def run(march: March, front: Front, until: Any, most: Any) -> Front:
     return jax.lax.while_loop(goes_on, step, (front, jnp.asarray(most, jnp.int32)))[0]
 
 
-def advance(march: March, front: Front, until: Any) -> Front:
-    """One step towards ``until``; what is left is cut into equal steps."""
+def advance(march: March, front: Front, until: Number) -> Front:
+    """One step towards ``until``: the first of equal ones in the time that is left."""
     dtype = front.value.dtype
     until, left = jnp.asarray(until, dtype), front.t - until
     longest = march.longest(front.t)
     if march.checks_rates:  # a step like the last one rather than one that is done again
         longest = jnp.minimum(longest, march.method.courant / front.seen.fastest)
+    # 1e-4 of a step: a remainder that is rounding of the time makes no step of its own
     count = jnp.maximum(jnp.ceil(left / longest - 1e-4), 1)
-    t = until + left * ((count - 1) / count)
+    t = until + left * ((count - 1) / count)  # the last step, count = 1, ends on ``until`` to the bit
     if march.checks_rates:
         value, t, ok, seen = _short_enough(march, front, until, count)
     else:
         value, ok, seen = march.method.step(march, front.value, front.t, t, front.t - t)
+    # finite only if all values are: ∞ − ∞ is a NaN
     low, high = jnp.min(value), jnp.max(value)
+    # each fault overrules those before it
     code = jnp.where(ok, Status.RUNNING, Status.STALLED)
     if march.watched is not None:
         code = jnp.where(_saturates(march, value, t), Status.DIVERGED, code)
@@ -203,8 +209,8 @@ def advance(march: March, front: Front, until: Any) -> Front:
     return Front(value, t, front.steps + 1, code.astype(jnp.int32), seen)
 
 
-def _short_enough(march: March, front: Front, until: Any, count: Any) -> tuple[jax.Array, jax.Array, jax.Array, Seen]:
-    """V after one of ``count`` or more equal steps, its time, whether Δt (Q + β) ≤ 1 held in every stage, and Q."""
+def _short_enough(march: March, front: Front, until: Scalar, count: Scalar) -> tuple[Field, Scalar, jax.Array, Seen]:
+    """V after one of ``count`` or more equal steps, its time, true if Δt (Q + β) ≤ 1 held in every stage, and Q."""
     left = front.t - until
 
     def end(count):
@@ -212,11 +218,13 @@ def _short_enough(march: March, front: Front, until: Any, count: Any) -> tuple[j
 
     def too_long(carry):
         count, tries, _, seen = carry
+        # with Q = ∞ before the first attempt this is true; 1e-6 is rounding of the product, no instability
         euler = march.method.tableau.euler * (front.t - end(count))
         return (seen.fastest * euler > 1 + 1e-6) & (tries < TRIES)
 
     def attempt(carry):
         count, tries, _, seen = carry
+        # from the rates just seen, and one step more at least, so that every attempt is shorter
         more = jnp.maximum(jnp.ceil(left * seen.fastest / march.method.courant - 1e-4), count + 1)
         count = jnp.where(tries > 0, more, count)
         value, _, seen = march.method.step(march, front.value, front.t, end(count), front.t - end(count))
@@ -226,21 +234,23 @@ def _short_enough(march: March, front: Front, until: Any, count: Any) -> tuple[j
     endless = dataclasses.replace(nothing, fastest=jnp.full_like(nothing.fastest, jnp.inf))
     start = (count, jnp.zeros((), jnp.int32), front.value, endless)
     carry = jax.lax.while_loop(too_long, attempt, start)
+    # with no tries counted: true if the last attempt was short enough, false where the loop only ran out of them
     return carry[2], end(carry[0]), ~too_long((carry[0], 0, *carry[2:])), carry[3]
 
 
-def repeat(march: March, value: jax.Array, start: float, end: float, count: int) -> jax.Array:
+def repeat(march: March, value: Field, start: float, end: float, count: int) -> Field:
     """``count`` equal steps from the time ``start`` to ``end``, with known numbers: differentiable both ways."""
     dt = (start - end) / max(count, 1)
 
     def step(value, k):
-        t = jnp.asarray(start, value.dtype) - k * dt
+        t = jnp.asarray(start, value.dtype) - k * dt  # from the start, so that roundings of Δt do not add up
         return march.method.step(march, value, t, t - dt, jnp.asarray(dt, value.dtype))[0], None
 
+    # a scan and no while loop, which has no reverse mode
     return jax.lax.scan(step, value, jnp.arange(count).astype(value.dtype))[0]
 
 
-def greedy(march: March, value: jax.Array, t: Any) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, ...]]:
+def greedy(march: March, value: Field, t: Number) -> tuple[tuple[Field, ...], tuple[Field, ...]]:
     """The control and the disturbance at the time t, each component of shape (*grid), of the H that steps solve."""
     on = march.on.at(t)
     _, u, d = discrete.optimise(discrete.around(on, value))
@@ -251,11 +261,12 @@ def greedy(march: March, value: jax.Array, t: Any) -> tuple[tuple[jax.Array, ...
     return full(u), full(d)
 
 
-def _saturates(march: March, value: jax.Array, t: Any) -> jax.Array:
-    """Whether the worst disturbance sits on its bound at a watched node."""
+def _saturates(march: March, value: Field, t: Number) -> jax.Array:
+    """True if the worst disturbance sits on its bound at a watched node."""
     admissible = march.problem.disturbances
     assert isinstance(admissible, Box)
-    on_bound: Any = False
+    assert march.watched is not None
+    on_bound: jax.Array | bool = False
     for j, entry in enumerate(greedy(march, value, t)[1]):
         slack = NEAR * (admissible.hi[j] - admissible.lo[j])
         on_bound |= (entry <= admissible.lo[j] + slack) | (entry >= admissible.hi[j] - slack)

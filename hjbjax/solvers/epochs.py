@@ -17,7 +17,7 @@ from hjbjax.iteration import time_stepping
 from hjbjax.iteration.time_stepping import Front, March
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.sets import Finite
-from hjbjax.problem.types import Field, Mask, Nodes, Number, Scalar
+from hjbjax.problem.types import Field, Nodes, Number, Scalar
 from hjbjax.solution.clock import CHUNK_SECONDS, CUT, Clock
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
@@ -41,7 +41,9 @@ _terminal = jax.jit(time_stepping.terminal)
 
 
 @jax.jit
-def _greedy(march: March, value: Field, t: Number) -> tuple[tuple[tuple[Field, ...], tuple[Field, ...]], Mask, Mask]:
+def _greedy(
+    march: March, value: Field, t: Number
+) -> tuple[tuple[tuple[Field, ...], tuple[Field, ...]], jax.Array | bool, jax.Array]:
     """The players' actions at the time t, the nodes on the target, and those at which actions matter."""
     u, d = time_stepping.greedy(march, value, t)
     obstacles = march.obstacles_at(t)

@@ -126,7 +126,7 @@ def _partial(on: Discretisation, kept: faults.Kept | None) -> Solution:
         value = np.broadcast_to(np.zeros((), on.dtype), on.grid.shape)  # one zero seen everywhere takes no memory
     else:
         value, grid = kept
-        value = value if grid.shape == on.grid.shape else transfer.prolong(value, grid, on.grid)
+        value = value if grid.shape == on.grid.shape else np.asarray(transfer.prolong(value, grid, on.grid))
     return solution_at_start(on, value, Status.INTERRUPTED)
 
 

@@ -38,8 +38,9 @@ def measured(kind, problem, grid, value, obstacles, least_cost, counted, moved):
     on = Discretisation(problem, grid, Upwind(), value.dtype)
     policy = bellman.greedy(on, value, obstacles.fixed)
     equation = bellman.policy_equation(on, value, policy, obstacles)
-    settings_ = {"discount": problem.discount, "least_cost": least_cost, "counted": counted, "moved": moved}
-    return certificates.error_bound(kind, value, policy, equation, obstacles, **settings_), equation
+    iterate = certificates.Iterate(value, policy, equation, obstacles, counted)
+    bound = certificates.error_bound(kind, iterate, discount=problem.discount, least_cost=least_cost, moved=moved)
+    return bound, equation
 
 
 def bounds_of(kind, problem, grid, value, obstacles, least_cost=None, counted=None):

@@ -255,7 +255,7 @@ def test_a_derivative_that_is_not_found_is_nan_and_the_value_stays(monkeypatch):
 def test_a_constraint_that_rounds_otherwise_is_the_same_constraint():
     psi = jnp.asarray(np.array([0.3, 1e9, -2.0, 0.0]), jnp.float32)
     one_off = jnp.nextafter(psi, jnp.float32(-1e30))
-    assert np.all(adjoint._same(psi, one_off)[:3])
-    assert np.all(adjoint._same(one_off, psi)[:3])
-    assert np.all(adjoint._same(psi, psi))
-    assert not np.any(adjoint._same(psi * 1.001 - 1e-3, psi))
+    assert np.all(adjoint._is_constraint(psi, one_off)[:3])
+    assert np.all(adjoint._is_constraint(one_off, psi)[:3])
+    assert np.all(adjoint._is_constraint(psi, psi))
+    assert not np.any(adjoint._is_constraint(psi * 1.001 - 1e-3, psi))

@@ -140,9 +140,11 @@ def _cut(what: str, field: np.ndarray, grid: Grid, axis: int, place: float, near
     lo, hi, last = float(grid.lo[axis]), float(grid.hi[axis]), grid.intervals(axis)
     if grid.periodic[axis] and math.isfinite(place):  # type: ignore[index]
         place = lo + (place - lo) % (hi - lo)
-    position = (place - lo) / (hi - lo) * last
-    if not -ON_NODE <= position <= last + ON_NODE:  # written so that NaN is refused
+    slack = ON_NODE * (hi - lo) / last
+    if not lo - slack <= place <= hi + slack:  # written so that NaN is refused
         raise ValueError(f"{what}: got {grid.names[axis]} = {place:g}, which is outside the grid, [{lo:g}, {hi:g}]")
+    nodes = _closed_axis(grid, axis)  # where an axis is stretched cells are not of one width
+    position = float(np.interp(place, nodes, np.arange(len(nodes))))
     # on a node but for rounding; otherwise 0·∞ of the neighbour without weight would grey out a whole slice
     if nearest or abs(position - round(position)) < ON_NODE:
         return np.take(field, round(position) % grid.shape[axis], axis)

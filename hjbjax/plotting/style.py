@@ -118,10 +118,11 @@ def bands(ax: Axes, x: np.ndarray, mask: np.ndarray, label: str) -> list[Artist]
     """Grey bands over the runs of masked nodes, half a cell beyond each end; the first one is labelled."""
     # a zero at either end, so that every run has a beginning (even entries) and an end (odd ones)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
-    half = (x[1] - x[0]) / 2 if len(x) > 1 else 0.5
+    cells = np.diff(x) / 2 if len(x) > 1 else np.array([0.5])  # half of each; an axis may be stretched
+    borders = np.concatenate([[x[0] - cells[0]], x[:-1] + cells[: len(x) - 1], [x[-1] + cells[-1]]])
     runs = zip(edges[::2], edges[1::2], strict=True)
     return [
-        ax.axvspan(x[a] - half, x[b - 1] + half, color=GREY, linewidth=0, zorder=0, label=None if k else label)
+        ax.axvspan(borders[a], borders[b], color=GREY, linewidth=0, zorder=0, label=None if k else label)
         for k, (a, b) in enumerate(runs)
     ]
 

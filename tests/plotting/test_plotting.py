@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from hjbjax import plotting
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.stretching import Sinh
 from hjbjax.solution.solution import Solution
 
 
@@ -219,6 +220,27 @@ def test_a_slice_on_a_node_is_that_node_and_between_nodes_the_mean():
     expected = [float(solution.value_at([0.1, b, 0.6])) for b in solution.grid.axis(1)]
     np.testing.assert_allclose(artists[0].get_ydata(), expected, rtol=1e-12)
     assert (artists[0].axes.get_xlabel(), artists[0].axes.get_title(loc="right")) == ("b", "a = 0.1, c = 0.6")
+
+
+def test_a_slice_of_a_stretched_axis_is_where_value_at_is():
+    """Cells are not of one width there: the field x₁ + x₂² cut at x₁ = ½ is ½ + x₂²."""
+    grid = Grid([-1.0, -1.0], [1.0, 1.0], (21, 9), stretch=(Sinh(3.0, 0.0), None))
+    solution = made(grid, lambda x: x[..., 0] + x[..., 1] ** 2)
+    for place in (0.5, -0.83, -1.0, 1.0, 0.0):
+        curve, *_ = plotting.value(solution, fixed={0: place})
+        np.testing.assert_allclose(curve.get_ydata(), place + np.linspace(-1, 1, 9) ** 2, atol=1e-12)
+        np.testing.assert_allclose(curve.get_ydata()[3], solution.value_at([place, -0.25]), atol=1e-12)
+
+
+def test_bands_on_a_stretched_axis_end_half_way_to_the_next_node():
+    grid = Grid([-1.0], [1.0], (9,), stretch=(Sinh(3.0, 0.0),))
+    value = np.zeros(9)
+    value[[1, 2, 8]] = np.inf
+    _, *bands = plotting.value(made(grid, lambda x: value))
+    x = grid.nodes()[:, 0]
+    found = [(band.get_x(), band.get_x() + band.get_width()) for band in bands]
+    wanted = [((x[0] + x[1]) / 2, (x[2] + x[3]) / 2), ((x[7] + x[8]) / 2, x[8] + (x[8] - x[7]) / 2)]
+    np.testing.assert_allclose(found, wanted, atol=1e-12)
 
 
 def test_enumerated_controls_are_cut_at_the_nearest_node():

@@ -97,7 +97,12 @@ def same(found, known, cost):
     np.testing.assert_allclose(found[finite] / cost, known[finite], atol=2e-6, rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", QUESTIONS)
+def some(names, fast):
+    """The ``fast`` ones by default, the others among the slow tests."""
+    return [name if name in fast else pytest.param(name, marks=pytest.mark.slow) for name in names]
+
+
+@pytest.mark.parametrize("name", some(QUESTIONS, ["noisy", "minimum time", "rest", "tube", "pursuit"]))
 def test_a_solve_knows_no_units(name):
     known = hjb.solve(asked(name, Units()), GRID, tol=1e-6)
     for time, cost in UNITS:
@@ -109,7 +114,7 @@ def test_a_solve_knows_no_units(name):
             assert found.error <= 1e-6 * cost or known.error > 1e-6
 
 
-@pytest.mark.parametrize("name", ["discounted", "minimum time", "rest", "tube", "game"])
+@pytest.mark.parametrize("name", some(["discounted", "minimum time", "rest", "tube", "game"], ["minimum time"]))
 def test_nor_does_a_second_order_solve_or_a_batch(name):
     problems = [asked(name, Units(*units)) for units in [(1.0, 1.0), UNITS[0]]]
     known = hjb.solve(problems[0], GRID, scheme=hjb.Limited(), tol=1e-6, throw=False)
@@ -122,12 +127,16 @@ def test_nor_does_a_second_order_solve_or_a_batch(name):
 
 
 @pytest.mark.parametrize("method", [hjb.Explicit(), hjb.Implicit()])
-@pytest.mark.parametrize("name", ["discounted", "noisy", "minimum time", "stopping", "kept off", "game"])
+@pytest.mark.parametrize(
+    "name", some(["discounted", "noisy", "minimum time", "stopping", "kept off", "game"], ["noisy", "game"])
+)
 def test_nor_does_a_march(name, method):
-    known = hjb.march(asked(name, Units()), GRID, 1.0, method=method, times=[0.0, 0.5])
+    known = hjb.march(asked(name, Units()), GRID, 1.0, method=method, times=[0.0, 0.5], inner=0)
     for time, cost in UNITS:
         tuned = hjb.Implicit(tol=1e-6 * cost) if isinstance(method, hjb.Implicit) else method
-        found = hjb.march(asked(name, Units(time, cost)), GRID, 1.0 / time, method=tuned, times=[0.0, 0.5 / time])
+        found = hjb.march(
+            asked(name, Units(time, cost)), GRID, 1.0 / time, method=tuned, times=[0.0, 0.5 / time], inner=0
+        )
         assert found.steps == known.steps
         np.testing.assert_allclose(found.value / cost, known.value, rtol=1e-6, atol=1e-5)
 

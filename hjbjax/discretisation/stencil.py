@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.types import Field, Number
+from hjbjax.problem.types import AtNodes, Field, Number
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -98,7 +98,7 @@ def inward(
     return [offset for offset, _ in pairs], [value for _, value in pairs]
 
 
-def _beyond(values: Field, grid: Grid, axis: int, step: int) -> jax.Array:
+def _beyond(values: AtNodes, grid: Grid, axis: int, step: int) -> jax.Array:
     """The values beyond the end of an ordinary axis, one slice: a copy of the end, or the parabola's continuation."""
     last = grid.shape[axis] - 1 if step > 0 else 0
     if (axis, step) not in grid.sides("open"):
@@ -108,7 +108,7 @@ def _beyond(values: Field, grid: Grid, axis: int, step: int) -> jax.Array:
     return sum((w * v for w, v in zip(weights[1:], nodes[1:], strict=True)), start=weights[0] * nodes[0])
 
 
-def neighbour(values: Field, grid: Grid, offset: tuple[int, ...], *, ghost: bool = True) -> Field:
+def neighbour(values: AtNodes, grid: Grid, offset: tuple[int, ...], *, ghost: bool = True) -> AtNodes:
     """The values at x + offset for every node x, shape (*grid).
 
     Args:

@@ -42,7 +42,7 @@ class Obstacles:
     """
 
     fixed: jax.Array
-    fixed_value: Field | Scalar
+    fixed_value: Scalar | Field
     upper: Field | None = None
     lower: Field | None = None
     ended: jax.Array | bool = False

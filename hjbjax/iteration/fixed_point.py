@@ -165,11 +165,11 @@ def begin(task: Task, guess: Nodes) -> State:
     ]
     policy = Greedy(xp.zeros(shape, dtype), *(tuple(xp.zeros(shape, dtype) for _ in range(m)) for m in inputs))
     infinite = xp.asarray(xp.inf, dtype)
-    bound = ErrorBound(-infinite, infinite, xp.zeros((), dtype), infinite, infinite)
-    counter = xp.zeros((), xp.int32)
+    bound = ErrorBound(xp.asarray(-infinite), infinite, xp.zeros((), dtype), infinite, infinite)
+    counter, first = xp.zeros((), xp.int32), xp.full((), -1, xp.int32)
     code = xp.asarray(int(Status.RUNNING), xp.int32)
     history = xp.full(HISTORY, -1, dtype)  # no NaN, which jax_debug_nans would take for a fault
-    return State(value, policy, infinite, bound, counter - 1, xp.stack([infinite] * 2), counter, code, history)
+    return State(value, policy, infinite, bound, first, xp.stack([infinite] * 2), counter, code, history)
 
 
 def run(task: Task, state: State, until: Number) -> State:

@@ -8,7 +8,7 @@ from typing import TypeAlias
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Num
+from jaxtyping import Bool, Float, Num, Shaped
 
 Array: TypeAlias = jax.Array | np.ndarray  # on the host NumPy's, in a compiled program JAX's
 Number: TypeAlias = float | Num[Array, ""]  # a number, which inside a JAX transformation is traced
@@ -20,6 +20,7 @@ Control: TypeAlias = Float[Array, " m"]
 Disturbance: TypeAlias = Float[Array, " k"]
 Nodes: TypeAlias = Float[Array, "*grid"]
 Field: TypeAlias = Float[jax.Array, "*grid"]  # the values at all nodes inside a compiled program
+AtNodes: TypeAlias = Shaped[jax.Array, "*grid"]  # of any kind, truth values as well
 Scalar: TypeAlias = Num[jax.Array, ""]  # and a number there
 Mask: TypeAlias = Bool[Array, "*grid"]
 Key: TypeAlias = jax.Array  # of a random number generator

@@ -174,7 +174,8 @@ class Nested:
     def __post_init__(self):
         check_method(self.inner, "Nested: inner")
         if self.inner.coarsest is not None:  # nested in nested: every level would start at the coarsest grid anew
-            raise TypeError(f"Nested: inner is {self.inner!r}; wanted what runs on one grid")
+            wanted = "hjb.PolicyIteration(...) or hjb.ValueIteration(), which run on one grid"
+            raise TypeError(f"Nested: inner is {self.inner!r}; wanted {wanted}")
         arguments.count(self.coarsest, "Nested: coarsest")
 
     @property

@@ -51,16 +51,6 @@ def count(value: object, name: str, least: int = 1) -> int:
     return int(value)
 
 
-def one_of(value: object, name: str, kinds: tuple[type, ...], wanted: str) -> None:
-    """Refuse a value that is none of the admissible kinds.
-
-    Raises:
-      TypeError: ``value`` is an instance of none of the ``kinds``, which ``wanted`` spells out.
-    """
-    if not isinstance(value, kinds):
-        raise TypeError(f"{name} is {shown(value)}; wanted {wanted}")
-
-
 def is_number(value: object) -> bool:
     """True if ``value`` is one real number; truth values and text that looks like one are none."""
     if isinstance(value, (bool, str, bytes)) or value is None:

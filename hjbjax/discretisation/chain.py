@@ -51,11 +51,12 @@ class Rates:
 
     def total(self) -> Any:
         """Q = Σ_o c_o, the rate at which the chain leaves each node, shape (*grid)."""
-        return sum(self.values[1:], start=self.values[0])
+        return sum(self.values[1:], start=self.values[0])  # no 0 to start from, which would be one more array
 
     def apply(self, grid: Grid, values: jax.Array) -> jax.Array:
         """𝓛V for node values V, shape (*grid); cost per unit time."""
         jumps = zip(self.offsets, self.values, strict=True)
+        # differences first: c V(x + o) and c V(x) are both large where h is small, and their difference is not
         terms = [c * (stencil.continued(values, grid, offset) - values) for offset, c in jumps]
         return sum(terms[1:], start=terms[0])
 
@@ -65,6 +66,7 @@ class Rates:
 
     def inflow(self, grid: Grid) -> "Rates":
         """The off-diagonal part of the transposed generator: what flows into x from x + o, as rates."""
+        # what jumps by o arrives from −o: the transposed entry of (x, x + o) stands in the row of x + o
         opposite = [tuple(-step for step in offset) for offset in self.offsets]
         arriving = [
             stencil.neighbour(c, grid, offset, ghost=False) for offset, c in zip(opposite, self.values, strict=True)
@@ -79,6 +81,7 @@ def axis_rates(f: Any, a: Any, scheme: Chain, link: Links, wall: Any) -> tuple[A
         return jnp.maximum(f, 0) / h_up, jnp.maximum(-f, 0) / h_down
     a = 0 if a is None else jnp.maximum(a, 0)  # along_axis may leave a rounding error below zero
     e = scheme.excess(f, a, link, wall)
+    # e = h⁺ f in exact arithmetic, a rounding below it in floating point: a rate of −1e-17 is a negative probability
     upward, downward = jnp.maximum(e + h_down * f, 0), jnp.maximum(e - h_up * f, 0)
     return upward / (h_up * (h_up + h_down)), downward / (h_down * (h_up + h_down))
 
@@ -98,6 +101,7 @@ def rates(on: Discretisation, u: list, d: list | None = None) -> Rates:
     for other in others:  # jumps of one chain or of the other
         for offset, rate in _table(on, other, {}).items():
             table[offset] = table[offset] + rate
+    # full arrays, as whoever sweeps over them slices planes out of each
     values = tuple(jnp.broadcast_to(jnp.asarray(rate, on.dtype), grid.shape) for rate in table.values())
     return Rates(tuple(table), values, one_way=on.problem.noise is None and on.scheme.chain.one_way and not others)
 
@@ -111,6 +115,7 @@ def _table(on: Discretisation, f: list, a: dict[tuple[int, int], Any]) -> dict[O
             f[axis], correlated_noise.along_axis(a, grid, axis), on.scheme.chain, link, stencil.walls(grid, axis)
         )
         for step, rate in zip((1, -1), pair, strict=True):
+            # the projection: drift out of the box is dropped, and noise stays where the wall throws it back
             table[stencil.unit(grid, axis, step)] = jnp.where(stencil.wall(grid, axis, step), 0, rate)
     for (i, j), entry in a.items():
         if i != j:
@@ -124,6 +129,7 @@ def fastest_rate(on: Discretisation) -> jax.Array:
     Q is convex in u for a drift affine in u, so that corners of the sets suffice; samples are added for others.
     """
     result = jnp.zeros(on.grid.shape, on.dtype)
+    # in Python, since the probes are few: the corners of a box and nine samples, of a game their pairs
     for u in sets.probes(on.problem.controls, on.dtype):
         for d in sets.probes(on.problem.disturbances, on.dtype):
             result = jnp.maximum(result, rates(on, u, d).total())
@@ -134,7 +140,7 @@ def _add_diagonal_jumps(table: dict[Offset, Any], entry: Any, grid: Grid, i: int
     """A diagonal jump that would leave the box across one axis slides along the other: noise reflects."""
     scale = 2 * grid.spacing(i) * grid.spacing(j)
     for step_i, step_j in itertools.product((1, -1), repeat=2):
-        rate = jnp.maximum(entry * (step_i * step_j), 0) / scale
+        rate = jnp.maximum(entry * (step_i * step_j), 0) / scale  # a_ij⁺ along the diagonal, a_ij⁻ across it
         along_i, along_j = stencil.unit(grid, i, step_i), stencil.unit(grid, j, step_j)
         off_i, off_j = stencil.wall(grid, i, step_i), stencil.wall(grid, j, step_j)
         table[tuple(p + q for p, q in zip(along_i, along_j, strict=True))] = jnp.where(off_i | off_j, 0, rate)
@@ -238,7 +244,7 @@ def stationary_density(
       >>> float(round(density[80], 3)), float(round(np.sum(density * grid.volumes()), 12))  # 1/√π
       (0.564, 1.0)
     """
-    if problem.target is not None:
+    if problem.target is not None:  # the law would be a point at the target, which is no density
         raise ValueError(
             "stationary_density: got a problem with a target, where paths end, so that nothing goes on for ever; leave "
             "it out, or ask for hjb.reach_probability or hjb.expected_exit_time"
@@ -301,6 +307,7 @@ def _under_policy(problem: Problem, grid: Grid, policy: Any, disturbance: Any, s
     """The rates under a policy; zero on the target and where there is no action."""
     u, d, active = decision_process.policies(problem, grid, policy, disturbance)
     active &= ~decision_process.target(problem, grid, t)[0]
+    # what is rounding is told by the type in which the policy was found: one of float32 is off by 1e-7 at an end
     kinds = [np.asarray(array).dtype for array in (policy, disturbance) if array is not None]
     eps = max([np.finfo(kind).eps for kind in kinds if kind.kind == "f"], default=np.finfo(np.float64).eps)
     jumps, _, leaving = _checked(Discretisation(problem, grid, scheme, np.float64, t), u, d, active, eps)

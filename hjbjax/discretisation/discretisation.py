@@ -103,6 +103,7 @@ class Discretisation:
     t: Any = 0.0
 
     def __post_init__(self):
+        # jnp.float32 and "float32" are other keys than np.dtype: one program would be compiled for each
         object.__setattr__(self, "dtype", np.dtype(self.dtype))
 
     @property
@@ -151,8 +152,10 @@ class Discretisation:
             return [self.drift(u, d, x)]
         found = dependence.influence(self.problem, self.grid.ndim, self.dtype)
         driven, zero = found.drift.driven_by(found.disturbance), jnp.zeros((), self.dtype)
+        # at zero even where that is not admissible: a sum of two parts is told apart by any point
         no_u, no_d = ([zero] * len(inputs) for inputs in (found.control, found.disturbance))
         still, pushed = self.drift(no_u, no_d, x), self.drift(no_u, d, x)
+        # an exact zero, and not pushed − still = 1e-17, where the disturbance does not act: its sign would be upwinded
         theirs = [pushed[i] - still[i] if i in driven else zero for i in range(self.grid.ndim)]
         return [self.drift(u, no_d, x), theirs]
 
@@ -165,15 +168,16 @@ class Discretisation:
     def diffusion(self, u: list, d: list | None = None, x: list | None = None) -> dict[tuple[int, int], Any]:
         """The entries a_ij, i ≤ j, of a = σσᵀ; those that are zero by construction are left out."""
         noise, n = self.problem.noise, self.grid.ndim
-        if noise is None:
+        if noise is None:  # and no zeros: what is not there costs no pass over the nodes
             return {}
         if callable(noise):
             sigma = components.components(noise, *self._arguments(u, d, x), dtype=self.dtype)
         else:
             places = self.coordinates() if x is None else x
             sigma = components.components(lambda x: jnp.asarray(noise, self.dtype), places, dtype=self.dtype)
-        if sigma.ndim < 2:
+        if sigma.ndim < 2:  # one number, or one an axis: independent noise, a diagonal a
             return {(i, i): s * s for i, s in enumerate(np.broadcast_to(sigma, (n,)))}
+        # σ of shape (n, k): a_ij = Σ_l σ_il σ_jl, of which the half i ≤ j says all
         pairs = itertools.combinations_with_replacement(range(n), 2)
         return {(i, j): sum(p * q for p, q in zip(sigma[i], sigma[j], strict=True)) for i, j in pairs}
 

@@ -89,8 +89,17 @@ def beside(lost: jax.Array, grid: Grid) -> tuple[tuple[jax.Array, jax.Array], ..
 
 def strays(f: PerNode, beside: tuple[jax.Array, jax.Array], rounding: Rounding) -> jax.Array:
     """The nodes where a drift component that is only rounding points to a lost node beside."""
+    return _points(f, beside) & (jnp.abs(f) <= rounding.of(f))
+
+
+def leads(f: PerNode, beside: tuple[jax.Array, jax.Array], rounding: Rounding) -> jax.Array:
+    """The nodes where a drift component that is more than rounding points to a lost node beside."""
+    return _points(f, beside) & (jnp.abs(f) > rounding.of(f))
+
+
+def _points(f: PerNode, beside: tuple[jax.Array, jax.Array]) -> jax.Array:
     up, down = beside
-    return ((up & (f > 0)) | (down & (f < 0))) & (jnp.abs(f) <= rounding.of(f))
+    return (up & (f > 0)) | (down & (f < 0))
 
 
 def inadmissible(on: Discretisation, u: list, d: list | None = None, *, eps: Number | None = None) -> jax.Array:

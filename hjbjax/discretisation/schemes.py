@@ -180,13 +180,14 @@ class Limited:
 
     def slopes(self, around: Differences) -> Slopes:
         """Limited slopes; central ones where noise keeps those monotone, a_ii ≥ h |f_i| for all actions."""
+        # limited slopes from the one-sided differences that are there: no further node is read
         grid, pairs = around.on.grid, list(zip(around.one_sided, around.links, strict=True))
         found = [stencil.limited(*pair, grid, axis, link) for axis, (pair, link) in enumerate(pairs)]
         if around.on.problem.noise is None:
             return found
         for axis, calm in enumerate(_calm(around)):
             (up, down), link = pairs[axis]
-            inner = calm & ~stencil.walls(grid, axis)
+            inner = calm & ~stencil.walls(grid, axis)  # at a wall one of the two neighbours is not there
             middle = (link.down * up + link.up * down) / (link.up + link.down)
             found[axis] = (jnp.where(inner, middle, found[axis][0]), jnp.where(inner, middle, found[axis][1]))
         return found
@@ -195,6 +196,7 @@ class Limited:
 def _calm(around: Differences) -> list:
     """Where central differences are monotone under all representative actions, along every axis."""
     on, problem = around.on, around.on.problem
+    # whether H is central must not depend on the action that is tried, or its kinks would move with it
     calm: list = [True] * on.grid.ndim
     for u, d in itertools.product(sets.probes(problem.controls, on.dtype), sets.probes(problem.disturbances, on.dtype)):
         f, a = on.drift(u, d, around.x), on.diffusion(u, d, around.x)

@@ -74,6 +74,7 @@ class DiscreteHamiltonian:
         So every candidate for an optimum is judged by what it may do: the kink at f = 0 is among them. A drift that is
         rounding leads to no lost node, whose value is far above all others.
         """
+        # sin π is 1e-16 and not 0: times a lost node's value, 1e8 times all others, that would count
         if self.lost is not None:
             assert self.slack is not None
             f = jnp.where(edges.strays(f, self.lost[axis], self.slack[axis]), 0, f)
@@ -83,13 +84,14 @@ class DiscreteHamiltonian:
 
     def _free_gain(self, axis: int, f: Any, a: Any) -> Any:
         """What ``gain`` is away from constrained ends; with other slopes f⁺ P⁺ + f⁻ P⁻ + a (D⁺ − D⁻)/(h⁺ + h⁻)."""
+        # f > 0 sees the node above, f < 0 the one below: every neighbour enters with a weight that is not negative
         upwind = jnp.maximum(f, 0) * self.up[axis] + jnp.minimum(f, 0) * self.down[axis]
         scheme, link = self.on.scheme, self.links[axis]
         if a is None and (scheme.chain.one_way or not scheme.monotone):
             return upwind
         h_up, h_down = link.up, link.down
         a = 0 if a is None else jnp.maximum(a, 0)  # correlated noise may leave a rounding error below zero
-        if not scheme.monotone:
+        if not scheme.monotone:  # noise is central already: only the drift has slopes of higher order
             return upwind + a * self.bends[axis] / (h_up + h_down)
         e = scheme.chain.excess(f, a, link, stencil.walls(self.on.grid, axis))
         upward, downward = (e + h_down * f) / (h_up + h_down), (e - h_up * f) / (h_up + h_down)
@@ -100,6 +102,7 @@ class DiscreteHamiltonian:
         a, grid = self.on.diffusion(u, d, self.x), self.on.grid
         first, *others = self.on.drifts(u, d, self.x)
         total = self.on.running_cost(u, d, self.x)
+        # axis after axis, so that XLA fuses all of H into one pass over V
         for axis in range(grid.ndim):
             total = total + self.gain(axis, first[axis], correlated_noise.along_axis(a, grid, axis))
             for other in others:
@@ -110,11 +113,13 @@ class DiscreteHamiltonian:
         return jnp.broadcast_to(total, grid.shape)
 
     def _diagonal(self, i: int, j: int, entry: Any) -> Any:
+        """What the jumps along the two diagonals of a pair of axes add for a_ij = ``entry``."""
         grid = self.on.grid
         ends = {
             (p, q): stencil.continued(self.value, grid, tuple(p * (k == i) + q * (k == j) for k in range(grid.ndim)))
             for p, q in itertools.product((1, -1), repeat=2)
         }
+        # for a_ij > 0 the state moves along (1, 1) and (−1, −1), else along (1, −1) and (−1, 1)
         same, opposite = ends[1, 1] + ends[-1, -1], ends[1, -1] + ends[-1, 1]
         scale = 2 * grid.spacing(i) * grid.spacing(j)
         return (
@@ -136,11 +141,13 @@ def at_rest(on: Discretisation, slopes: jax.Array) -> DiscreteHamiltonian:
 def around(on: Discretisation, value: jax.Array, lost: jax.Array | None = None) -> DiscreteHamiltonian:
     """Coordinates and differences around ``value``, tied together so that no loop hoists tables out of itself."""
     grid = on.grid
+    # without it XLA hoists products of coordinates out of the loop, as arrays of all nodes, one an action
     x, value = jax.lax.optimization_barrier((on.coordinates(), value))
     links = tuple(cut_cells.links(on))
     differences = tuple(stencil.one_sided(value, grid, axis, link) for axis, link in enumerate(links))
     bends = tuple(up - down for up, down in differences)
     up, down = zip(*on.scheme.slopes(Differences(on, x, value, links, differences)), strict=True)
+    # only constrained ends and lost nodes ask what of a drift is rounding, which costs a look at its terms
     careful = lost is not None or grid.sides("constrained")
     slack = tuple(edges.slack(on)) if careful else None
     beside = None if lost is None else edges.beside(lost, grid)
@@ -153,7 +160,7 @@ def optimise(hamiltonian: DiscreteHamiltonian, isaacs: str | None = None) -> tup
     if players.disturbance.admissible is None:
         value, u = best_response(hamiltonian, players.control, lambda u: (u, []))
         return value, u, []
-    if players.decoupled:
+    if players.decoupled:  # H is a sum: each optimum is the same whatever the other does, and so any action serves
         start = _any_action(players.disturbance.admissible)
         _, u = best_response(hamiltonian, players.control, lambda u: (u, start))
         value, d = best_response(hamiltonian, players.disturbance, lambda d: (u, d))
@@ -187,10 +194,12 @@ def best_response(
 def _nested(
     hamiltonian: DiscreteHamiltonian, outer: Player, inner: Player, join: Callable
 ) -> tuple[jax.Array, Action, Action]:
+    """The outer player's optimum, who moves first and knows that the inner one answers."""
+
     def objective(action):
         return best_response(hamiltonian, inner, lambda reply: join(action, reply), most=INNER)
 
-    if outer.admissible is None:
+    if outer.admissible is None:  # a lower game without controls, say: nobody moves first
         value, answer = objective([])
         return value, [], answer
     return _sampled(hamiltonian, outer, objective, weight=inner.weight)
@@ -200,6 +209,7 @@ def _admissible(hamiltonian: DiscreteHamiltonian, player: Player, join: Callable
     """At constrained ends an action of a sampled control that does not leave, where that can be found exactly."""
     if hamiltonian.slack is None or player.sign < 0:
         return None
+    # without the cost H is the gain alone, infinite outside: the least of it is exact where the drift is affine
     free = altered(hamiltonian.on.problem, cost=None)
     alone = players_of(hamiltonian.asking(free).on).control
     return _exact(hamiltonian.asking(free), alone, join) if alone.exact else None
@@ -213,12 +223,14 @@ def _sampled(
     most: int = UNROLL,
     start: Action | None = None,
 ) -> Any:
+    """The best of samples, refined by a pattern search between them; of finitely many actions the best of all."""
     assert player.admissible is not None
     points = jnp.asarray(sets.samples(player.admissible, SAMPLES), hamiltonian.on.dtype)
     best = enumerate_actions(objective, points, player.sign, weight=weight, most=most)
     if isinstance(player.admissible, Finite):
         return best
     project = _projection(player.admissible)
+    # samples may miss a part of the set in which the drift stays inside, or the action of the last step
     if start is not None:
         best = best_of(objective, [start], player.sign, best)
     if hamiltonian.tried is not None:
@@ -227,6 +239,7 @@ def _sampled(
 
 
 def _projection(admissible: Box | Ball) -> Callable[[Action], Action]:
+    """The map of an action onto its set: a step of the search may leave it."""
     if isinstance(admissible, Box):
         return lambda action: [jnp.clip(u, admissible.lo[j], admissible.hi[j]) for j, u in enumerate(action)]
 
@@ -238,6 +251,7 @@ def _projection(admissible: Box | Ball) -> Callable[[Action], Action]:
 
 
 def _any_action(admissible: AdmissibleSet) -> Action:
+    """Some action of the set; zero need not be one."""
     if isinstance(admissible, Ball):
         return [jnp.zeros(())] * admissible.dim
     first = admissible.lo if isinstance(admissible, Box) else admissible.points[0]
@@ -249,13 +263,13 @@ def _exact(hamiltonian: DiscreteHamiltonian, player: Player, join: Callable) -> 
     admissible = player.admissible
     assert isinstance(admissible, (Box, Ball))
     problem, dtype = hamiltonian.on.problem, hamiltonian.on.dtype
+    # at zero even if that is not admissible: an affine drift is known by its offset and its slopes there
     zero = [jnp.zeros((), dtype)] * admissible.dim
     u, d = join(zero)
     arguments = problem.arguments(hamiltonian.x, u, d, hamiltonian.on.t)
     parts = hamiltonian.on.drifts(u, d, hamiltonian.x)
-    part = (
-        0 if player.sign > 0 else len(parts) - 1
-    )  # where drifts are upwinded apart, the noise goes with the control's
+    # where drifts are upwinded apart, the noise goes with the control's
+    part = 0 if player.sign > 0 else len(parts) - 1
     noise = hamiltonian.on.diffusion(u, d, hamiltonian.x) if part == 0 else {}
     slopes = [
         components.components(player.derivative(problem, problem.drift, j), *arguments, dtype=dtype)
@@ -293,7 +307,7 @@ def _cost_coefficients(hamiltonian: DiscreteHamiltonian, player: Player, argumen
         return none, none
     slope = player.derivative(hamiltonian.on.problem, cost, j)
     linear = components.scalar(slope, *arguments, dtype=hamiltonian.on.dtype)
-    if not player.curved[j]:
+    if not player.curved[j]:  # known to be linear: the second derivative would be traced to find a zero
         return linear, none
     return linear, components.scalar(
         player.derivative(hamiltonian.on.problem, slope, j), *arguments, dtype=hamiltonian.on.dtype
@@ -311,7 +325,7 @@ def _kinked(
         return hamiltonian.gain(axis, f, left)
 
     scheme, link = hamiltonian.on.scheme, hamiltonian.links[axis]
-    if not scheme.monotone or (left is None and scheme.chain.one_way):
+    if not scheme.monotone or (left is None and scheme.chain.one_way):  # f⁺ P⁺ + f⁻ P⁻ has its kink where f turns
         return Kinked(gain, offset, slope, (0.0,), (down, up))
     width = 0 if left is None else jnp.maximum(left, 0)
     wall = stencil.walls(hamiltonian.on.grid, axis)

@@ -75,7 +75,7 @@ class Player:
             return 1
         if isinstance(self.admissible, Finite):
             return len(self.admissible.points)
-        if not self.exact:
+        if not self.exact:  # the pattern search between samples is a loop, which is compiled once
             return SAMPLES
         return sum(
             3 + cells if len(group) == 1 else 10 * cells for group, cells in zip(self.groups, self.cells, strict=True)
@@ -140,6 +140,7 @@ def _player(admissible: AdmissibleSet | None, sign: int, found: dependence.Influ
     cells = tuple(branches ** len(shared(driven, group)) for group in groups)
     convex = drift.affine_in(inputs) and noise.free_of(inputs)  # so is the rate of leaving a node
     at_ends = convex or isinstance(admissible, (Finite, type(None)))
+    # a minimum of pieces that are quadratic in each input; a product u₀u₁ in the cost has no such pieces
     suits = convex and cost.separable_quadratic_in(inputs)
     if isinstance(admissible, Box):
         suits &= all(count <= CELLS.get(len(group), 0) for group, count in zip(groups, cells, strict=True))
@@ -156,6 +157,7 @@ def _groups(driven: tuple[tuple[int, ...], ...]) -> tuple[tuple[int, ...], ...]:
     groups: list[list[int]] = []
     for j, components in enumerate(driven):
         meets = [group for group in groups if set(shared(driven, group)) & set(components)]
+        # an input that drives what two groups drive makes them one: their pieces depend on one another
         joined = [*(k for group in meets for k in group), j]
         groups = [group for group in groups if group not in meets] + [joined]
     return tuple(tuple(sorted(group)) for group in sorted(groups))

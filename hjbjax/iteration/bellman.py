@@ -11,6 +11,7 @@ where the constraint is the active branch. That correction is what every method 
 """
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -203,14 +204,18 @@ def policy_equation(
 def leaks(on: Discretisation, policy: Greedy, held: jax.Array, lost: jax.Array) -> jax.Array:
     """True if the policy leads from a node that counts to one that is ``lost``, by more than rounding."""
     grid, u, d = on.grid, list(policy.controls), list(policy.disturbances)
-    rates, beside = chain.rates(on, u, d), edges.beside(lost, grid)
-    strays = [edges.strays(*each) for each in zip(on.drift(u, d), beside, edges.slack(on), strict=True)]
+    rates, ends = chain.rates(on, u, d), list(zip(edges.beside(lost, grid), edges.slack(on), strict=True))
+    # each part of the drift by itself: of players upwinded apart one may lead where their sum does not
+    leads = [
+        functools.reduce(jnp.logical_or, (edges.leads(part[axis], *end) for part in on.drifts(u, d)))
+        for axis, end in enumerate(ends)
+    ]
     leaking = jnp.zeros(grid.shape, on.dtype)
     for offset, c in zip(rates.offsets, rates.values, strict=True):
         leak = jnp.where(stencil.neighbour(~lost, grid, offset), 0, c)
         if on.problem.noise is None:  # jumps go along one axis
             axis = next(axis for axis, step in enumerate(offset) if step)
-            leak = jnp.where(strays[axis], 0, leak)
+            leak = jnp.where(leads[axis], leak, 0)
         leaking = leaking + leak  # rates per unit time, (*grid): several small leaks are one
     # next to all rates of the node, since the drift is made of parts that cancel down to their rounding
     limit = LEAK * jnp.finfo(on.dtype).eps * rates.total()

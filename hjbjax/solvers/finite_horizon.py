@@ -67,7 +67,7 @@ def march(
 
     min{ max{ β V − V_t − H(x, DV, D²V), V − ψ }, V − g } = 0,  V(·, horizon) = terminal cost (else ψ, else g, else 0).
 
-    Order 1 in space with ``Upwind()``, monotone, which never leaves the range that the data allow; 2 with
+    Order 1 in space with ``Upwind(...)``, monotone, which never leaves the range that the data allow; 2 with
     ``Limited()`` or ``Eno2()`` and 5 with ``Weno5()`` where V is smooth. In time see ``Explicit`` and ``Implicit``.
 
     Args:
@@ -76,7 +76,8 @@ def march(
       horizon: T > 0, in units of time.
       times: the times to keep, increasing, in [0, horizon]; ``None`` is (0.0,). Nothing else is kept.
       start: node values at the horizon in place of the terminal cost, shape (*grid), to go on from another march.
-      scheme: ``Upwind(...)``, ``Limited()``, ``Eno2()`` or ``Weno5()``.
+      scheme: ``Upwind(...)``, ``Limited()``, ``Eno2()`` or ``Weno5()``; by default a game whose players drive one
+        component is upwinded player by player, see ``Upwind``.
       method: ``Explicit(...)``, the default, whose steps the grid limits, or ``Implicit(...)``, of any step.
       step: the longest time step; ``None`` is the stable one, and a hundredth of the horizon if implicit, if the
         functions depend on the time, or if the fastest action may be between the samples of its set.

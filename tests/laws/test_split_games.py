@@ -161,3 +161,20 @@ def test_two_axes_one_of_them_shared():
     left = cost + moves @ solution.value.ravel() - solution.value.ravel()
     assert np.max(np.abs(left)) < 1e-6
     assert solution.isaacs_gap == 0
+
+
+@pytest.mark.filterwarnings("ignore:.*cannot reach the target")
+def test_a_target_that_is_kept_off_is_reached_in_the_end_where_players_are_upwinded_apart():
+    """f = u + d, |u| ≤ 1 towards the target, |d| ≤ 3/2 away from it; T_k − T_{k−1} = h + 3/2 (T_{k+1} − T_k)."""
+    grid = hjb.Grid([0.0], [1.0], (11,))
+    problem = hjb.Problem(
+        lambda x, u, d: u + d, lambda x, u, d: 1.0, hjb.Box([-1.0], [1.0]),
+        disturbances=hjb.Box([-1.5], [1.5]), target=lambda x: x[0],
+    )  # fmt: skip
+    whole = hjb.solve(problem, grid)
+    np.testing.assert_array_equal(np.isinf(whole.value), np.arange(11) > 0)
+    steps = [H]
+    for _ in range(9):
+        steps.insert(0, H + 1.5 * steps[0])
+    split = hjb.solve(problem, grid, scheme=hjb.Upwind(split=True), tol=1e-8)
+    np.testing.assert_allclose(split.value, np.concatenate([[0], np.cumsum(steps)]), rtol=1e-8)

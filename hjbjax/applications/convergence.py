@@ -40,6 +40,7 @@ from hjbjax.solvers.stationary import solve
 REFINED = 1.1  # the factors by which the axes are refined over one another, at most
 
 
+# no ==: it would compare arrays, which have no single truth value
 @dataclasses.dataclass(frozen=True, eq=False)
 class Study:
     """Spacings, errors and seconds of a study, one entry a grid from coarse to fine; ``print`` shows the table.
@@ -86,6 +87,7 @@ class Study:
     def fitted(self) -> np.ndarray:
         """A mask of the grids that count for the orders: converged, and with an error above the tolerance."""
         converged = np.array([status is Status.CONVERGED for status in self.statuses])
+        # an error at or below the tolerance may be what the iteration left, and says nothing of the grid
         return converged & np.isfinite(self.errors) & (self.errors > self.tol)
 
     @property
@@ -128,7 +130,7 @@ class Study:
                 "estimated": self.estimated,
                 "seconds": float(self.seconds[k]),
                 "compile_seconds": float(self.compile_seconds[k]),
-                "fitted": bool(self.fitted[k]),
+                "fitted": bool(self.fitted[k]),  # JSON takes no truth value of NumPy
                 "status": self.statuses[k].name,
             }
             for k, grid in enumerate(self.grids)
@@ -147,6 +149,7 @@ class Study:
             lines.append(
                 f"{' x '.join(map(str, grid.shape)):>14} {self.h[k]:>9.3g} {self.errors[k]:>10.3e}"
                 f"{' ' if self.fitted[k] else '*'} {orders[k]:>6} {self.mean_errors[k]:>10.3e} {means[k]:>6}"
+                # the sum is the first solve, compiling included
                 f" {self.seconds[k]:>8.3g} {self.seconds[k] + self.compile_seconds[k]:>6.3g}  {self.statuses[k].name}"
             )
         lines.append(f"{'fitted':>14} {'':>9} {'':>11} {_order(self.order):>6} {'':>10} {_order(self.mean_order):>6}")
@@ -200,10 +203,10 @@ def convergence_study(
       >>> study.nodes.tolist(), abs(study.order - 1) < 0.15
       ([21, 41, 81], True)
     """
-    if is_traced(problem, grids, reference):
+    if is_traced(problem, grids, reference):  # seconds, statuses and masks are read as plain values
         raise ValueError("convergence_study: it runs at host level only, outside of jit, vmap and grad")
     ordered = _sort(grids)
-    check_reference(reference, ordered)
+    check_reference(reference, ordered)  # before any solve: a refusal after them would throw their time away
     compared = ordered if reference is not None else ordered[:1] * len(ordered)  # the estimate lives on the coarsest
     masks = [mask_of(region, grid) for grid in compared]
     # the reference at all nodes before the first solve: what cannot be measured against is refused at once
@@ -211,6 +214,7 @@ def convergence_study(
     clock, timed = Clock(), []
     with noting_interrupts(clock):
         for grid in ordered:
+            # no raise: a grid that does not converge keeps its row, with its status
             timed.append(_solve_twice(problem, grid, clock, scheme=scheme, method=method, tol=tol, throw=False))
             if clock.interrupted:  # the solve has handed back what it had, not raised
                 break
@@ -218,7 +222,7 @@ def convergence_study(
     whole = len(timed) == len(ordered)
     ordered, masks, exact = ordered[: len(timed)], masks[: len(timed)], exact[: len(timed)]
     solutions = tuple(solution for solution, _, _ in timed)
-    values = [np.asarray(solution.value) for solution in solutions]
+    values = [np.asarray(solution.value) for solution in solutions]  # one array a grid, of its own shape
     h = np.array([mean_spacing(grid) for grid in ordered])
     extrapolated, words = None, words_for(reference, ordered)
     if reference is None:
@@ -228,6 +232,7 @@ def convergence_study(
             words = "nothing: the study was interrupted"
         else:
             extrapolated, words = richardson(values[-3:], h[-3:], masks[0], tol)
+        # without an estimate NaN: every error is then NaN, and no grid is fitted
         exact = [np.full(masks[0].shape, np.nan) if extrapolated is None else extrapolated] * len(values)
     # one row of distances a grid, over the nodes of its region
     off = [distance(*pair)[mask] for *pair, mask in zip(values, exact, masks, strict=True)]
@@ -239,6 +244,7 @@ def convergence_study(
         reference=words,
         estimated=reference is None,
         h=h,
+        # no nanmax: a node without a value must show, and takes its grid out of the fit
         errors=np.array([np.max(each) for each in off]),
         mean_errors=np.array([np.mean(each) for each in off]),
         seconds=np.array([warm for _, _, warm in timed]),
@@ -254,6 +260,7 @@ def convergence_study(
 
 def fitted_order(h: Numbers | Sequence[float], errors: Numbers | Sequence[float]) -> float:
     """The slope of log error over log h by least squares; NaN unless two errors are positive and finite."""
+    # log e = p log h + log c of e = c h^p: the slope is p, in whatever units h is
     h, errors = np.asarray(h, float), np.asarray(errors, float)
     usable = np.isfinite(errors) & (errors > 0)
     if np.count_nonzero(usable) < 2:  # a line through one point has every slope
@@ -267,7 +274,7 @@ def _solve_twice(problem: Problem, grid: Grid, clock: Clock, **options: Any) -> 
     solution = solve(problem, grid, **options)  # compiles, unless a grid of this shape was solved before
     marks.append(time.perf_counter())
     if not clock.interrupted:
-        solve(problem, grid, **options)
+        solve(problem, grid, **options)  # nothing is left to compile
         marks.append(time.perf_counter())
     if clock.interrupted:
         return solution, marks[1] - marks[0], math.nan
@@ -282,12 +289,13 @@ def _sort(grids: Sequence[Grid] | Grid) -> tuple[Grid, ...]:
             raise TypeError(f"convergence_study: got {grid!r} among the grids, wanted Grid objects")
     if len(grids) < 2:
         raise ValueError(f"convergence_study: got {len(grids)} grid, wanted at least two to see an order")
+    # by the geometric mean of the spacings, so that the order does not depend on the units of the axes
     first, *rest = ordered = sorted(grids, key=mean_spacing, reverse=True)
     for grid in rest:
         check_box("grids of different boxes", first, grid)
         if repr(grid.stretch) != repr(first.stretch):  # by their text: they compare as objects
             raise ValueError(f"convergence_study: got stretch {first.stretch} and {grid.stretch}; wanted one for all")
-        ratios = spacings(first) / spacings(grid)
+        ratios = spacings(first) / spacings(grid)  # (n,), how many times finer along every axis
         # intervals are integers: 10 % lets an odd axis be refined by almost the factor of the others
         if ratios.max() > REFINED * ratios.min():
             raise ValueError(

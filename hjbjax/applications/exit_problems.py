@@ -41,17 +41,20 @@ class ClosedLoop:
     def drift(self, *arguments: Array) -> jax.Array:
         """f(x, control(x), d), shape (n,)."""
         t, x, u, d, acts = self._actions(arguments)
+        # without an action the state stays, which for a probability is: it never arrives
         return jnp.where(acts, jnp.asarray(self.problem.drift(*self.problem.arguments(x, u, d, t))), 0)
 
     def noise(self, *arguments: Array) -> jax.Array:
         """σ there, in the shape in which the problem gives it."""
         t, x, u, d, acts = self._actions(arguments)
+        # noise is switched off there as well, or it might carry the state into the target by chance
         sigma = self.problem.noise
         return jnp.where(acts, jnp.asarray(sigma(*self.problem.arguments(x, u, d, t)) if callable(sigma) else sigma), 0)
 
     def _actions(self, arguments: tuple[Array, ...]) -> tuple[Number, State, Control, Disturbance | None, jax.Array]:
         """The time, the state, the control, the disturbance, and True where there is a control."""
         # the problem without controls is called with u of shape (0,) in the control's place
+        # a time that is not passed is read by nobody, so any number will do
         t, rest = (arguments[0], arguments[1:]) if self.timed else (0.0, arguments)
         x, d = rest[0], rest[2] if self.problem.is_game else None
         u = jnp.asarray(self.control(t, x) if self.marched else self.control(x))
@@ -73,6 +76,7 @@ def close_loop(problem: Problem, feedback: GridFeedback | Callable, horizon: Num
       ValueError: there is no control to replace; a marched feedback that is not known up to the horizon.
       TypeError: the feedback cannot be called.
     """
+    # without controls the feedback would be ignored, and the answer that of another question
     if problem.controls is None:
         raise ValueError(f"{name}: got a feedback, but problem.controls is None; leave out feedback")
     if not is_grid_feedback(feedback) and not callable(feedback):
@@ -80,6 +84,7 @@ def close_loop(problem: Problem, feedback: GridFeedback | Callable, horizon: Num
         raise TypeError(f"{name}: feedback is {feedback!r}, wanted a Solution or a function {signature}")
     if is_grid_feedback(feedback):
         marched = feedback.times is not None
+        # under jit neither the horizon nor the times are known
         if marched and isinstance(horizon, (int, float, np.number)) and not is_traced(feedback.times):
             check_kept(feedback, float(horizon), f"{name}: horizon")
         look: Callable | None = jax.tree_util.Partial(_control, as_partial(feedback.control_at))
@@ -91,6 +96,7 @@ def close_loop(problem: Problem, feedback: GridFeedback | Callable, horizon: Num
     # that is a number what it is
     looped = problem.noise is not None and (is_grid_feedback(feedback) or callable(problem.noise))
     return Problem(
+        # no cost, no controls; the disturbance still plays, against the closed loop
         loop.drift, None, None, disturbances=problem.disturbances,
         noise=loop.noise if looped else problem.noise,
         isaacs=problem.isaacs,
@@ -114,6 +120,7 @@ def exit_problem(
     # a cost of zero is None: of a function nobody would know that it is zero
     paid = jax.tree_util.Partial(_exit_cost, exit_cost, sets) if exit_cost else None
     return Problem(
+        # no discount is passed on: a probability and a time are not discounted
         problem.drift, jax.tree_util.Partial(_constant, cost) if cost else None, problem.controls,
         disturbances=problem.disturbances, noise=problem.noise, target=jax.tree_util.Partial(_nearest, sets),
         exit_cost=paid, isaacs=problem.isaacs, time_dependent=problem.time_dependent,
@@ -127,6 +134,7 @@ def complement(region: Callable, *where: Place) -> Array:
 
 def with_time(function: T, needed: bool) -> T | jax.tree_util.Partial:
     """A function of the state as one of time and state, where that is needed."""
+    # a Partial and no lambda: the numbers of the user's function stay leaves
     return jax.tree_util.Partial(_timeless, function) if needed and function is not None else function
 
 
@@ -142,6 +150,7 @@ def _control(look_up: Callable, *where: Place) -> Array:
 
 def _constant(value: Number, *arguments: Array) -> jax.Array:
     """The cost per unit time, whatever state and actions are."""
+    # the precision in force, float64 only where it is switched on: a float32 solve is not promoted
     return jnp.asarray(value, jnp.result_type(float))
 
 

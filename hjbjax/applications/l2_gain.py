@@ -60,6 +60,7 @@ def attenuation(
     level = float(level) if isinstance(level, np.ndarray) else level
     enters = as_partial(enters) if callable(enters) else None if enters is None else numbers(enters, "enters")
     # Partials that hold γ and E as leaves: another level is another number in the same compiled program
+    # the problem keeps its isaacs: u and d stand in separate terms, so that min max and max min agree
     return dataclasses.replace(
         problem,
         drift=jax.tree_util.Partial(_drift, problem.drift, enters),
@@ -73,7 +74,7 @@ def _drift(drift: Callable, enters: Callable | Array | None, *arguments: Array) 
     """f(x, u) + E(x) d; the time may go first."""
     *seen, d = arguments
     if enters is None:
-        return drift(*seen) + d
+        return drift(*seen) + d  # E = I: as many disturbances as states
     # the state is the last but one of (t, x, u) and of (x, u)
     return drift(*seen) + jnp.matmul(enters(seen[-2]) if callable(enters) else enters, d)
 
@@ -81,6 +82,7 @@ def _drift(drift: Callable, enters: Callable | Array | None, *arguments: Array) 
 def _cost(cost: Callable, gamma: Number, *arguments: Array) -> Array:
     """L(x, u) − ½γ²|d|²."""
     *seen, d = arguments
+    # unbounded, the worst d is E'DV/γ²: the lower the level, the wider the set has to be
     return cost(*seen) - 0.5 * gamma**2 * (d @ d)
 
 
@@ -133,6 +135,7 @@ def saturation(solution: Solution, problem: Problem, *, inner: float = 0.5) -> S
     admissible = problem.disturbances
     if admissible is None or solution.disturbance is None:
         raise ValueError("saturation: the problem has no disturbances; give Problem(disturbances=hjb.Box(...))")
+    # points have no bound that could be wide enough: of a finite set every worst case is one of them
     if isinstance(admissible, Finite):
         raise ValueError(f"saturation: the disturbances are {len(admissible.points)} points; wanted a Box or a Ball")
     if not 0 < inner <= 1:
@@ -153,6 +156,7 @@ def saturation(solution: Solution, problem: Problem, *, inner: float = 0.5) -> S
 def _share_of_bound(admissible: Box | Ball, d: np.ndarray) -> np.ndarray:
     """|d| over its bound at every node; inputs that cannot move do not count."""
     if isinstance(admissible, Ball):
+        # d has shape (*grid, l), the share (*grid)
         return np.linalg.norm(d, axis=-1) / np.where(admissible.radius > 0, admissible.radius, np.inf)
     # of a box the nearest bound decides, input by input, and d is measured from the middle
     lo, hi = np.asarray(admissible.lo), np.asarray(admissible.hi)

@@ -69,12 +69,14 @@ class Series:
         lines = [f"{self.name:>9} {'value':>10} {'feedback':>10}  status"]
         rows = zip(self.parameters, self.errors, self.feedback_errors, self.fitted, self.solutions, strict=True)
         for parameter, value, feedback, counts, solution in rows:
+            # the mark is that of the value: an order of the feedback may use fewer entries still
             mark = " " if counts else "*"
             lines.append(f"{parameter:>9.4g} {value:>10.3e}{mark}{feedback:>10.3e}  {solution.status.name}")
         lines.append(f"{'order':>9} {self.order:>10.2f} {self.feedback_order:>10.2f}")
         return "\n".join(lines)
 
 
+# no ==: the fields are arrays
 @dataclasses.dataclass(frozen=True, eq=False)
 class Perturbation:
     """A value beside those with noise and with disturbances; ``print`` shows the tables.
@@ -88,8 +90,8 @@ class Perturbation:
     """
 
     nominal: Solution
-    noise: Series
-    gain: Series
+    noise: Series  # with ½ε²ΔV in the equation
+    gain: Series  # with ½γ⁻²|E'DV|² in the equation
     scheme: str
     tol: float
 
@@ -148,6 +150,7 @@ def perturbation_study(
     levels = _parameters("noises", noises), _parameters("gammas", gammas)
     if problem.is_game or problem.noise is not None:
         raise ValueError("perturbation_study: the problem has noise or disturbances already; leave them out")
+    # noise leaves no state at rest: the running cost goes on for ever, and only a discount sums it
     if not np.asarray(problem.discount) > 0:
         raise ValueError("perturbation_study: with noise and no discount the cost has no end; give a discount > 0")
     mask = mask_of(region, grid, "perturbation_study")
@@ -160,6 +163,7 @@ def perturbation_study(
     with jax.enable_x64(True):
         checks.shapes(games[0], grid, scheme)
 
+    # no raise for a perturbed one: it keeps its row and stays out of the fit
     def solution_of(which: Problem, throw: bool = False) -> Solution:
         return solve(which, grid, scheme=scheme, method=method, tol=tol, throw=throw)
 
@@ -172,12 +176,14 @@ def perturbation_study(
             if not clock.interrupted:
                 found.append(solution_of(perturbed))
     noise = _series("ε", levels[0], found[: len(noisy)], nominal, mask, tol)
+    # over 1/γ, so that both parameters go to zero and both slopes are to be 2
     gain = _series("1/γ", 1 / levels[1][::-1], found[len(noisy) :], nominal, mask, tol)
     study = Perturbation(nominal, noise, gain, str(scheme), tol)
     if clock.interrupted:
         came = f"{len(found)} of {len(noisy) + len(games)} perturbed problems"
         raise SolveError(f"perturbation_study: interrupted after {came}; .solution is the study so far", study)
     # the lowest level has the strongest worst case: if that does not come to its bound, none does
+    # the share of all nodes of the region, which need not be a box: inner=1 over a disturbance cut to it
     watched = dataclasses.replace(found[-1], disturbance=_disturbance_within(found[-1], mask))
     felt = saturation(watched, games[-1], inner=1.0)
     if felt.share > 0:
@@ -187,6 +193,7 @@ def perturbation_study(
 
 def _parameters(name: str, numbers: Sequence[float]) -> np.ndarray:
     """The parameters in increasing order, each once."""
+    # unique sorts; a number given twice would weigh twice in the fit
     values = np.unique(np.asarray(numbers, np.float64))
     if values.size < 2 or not np.all(np.isfinite(values) & (values > 0)):
         raise ValueError(f"perturbation_study: got {name} = {numbers!r}, wanted at least two finite numbers > 0")
@@ -195,6 +202,7 @@ def _parameters(name: str, numbers: Sequence[float]) -> np.ndarray:
 
 def _disturbance_within(solution: Solution, mask: Mask) -> np.ndarray:
     """The disturbance in the region, NaN outside."""
+    # (*grid, l); ``saturation`` passes over nodes of NaN
     return np.where(mask[..., None], solution.disturbance, np.nan)
 
 
@@ -212,6 +220,7 @@ def _series(
     converged = np.array([each.status is Status.CONVERGED for each in solutions], bool)
     # a change within the tolerance may be the iteration's
     fitted = converged & np.isfinite(errors) & (errors > tol)
+    # over the smallest spacing: there an error of V makes the largest one of its slope
     finest = min(float(nominal.grid.spacing(axis)) for axis in range(nominal.grid.ndim))
     seen = fitted & (feedback > tol / finest)  # a slope of V is known no better than that
     return Series(name, parameters, errors, feedback, tuple(solutions), fitted, seen)

@@ -86,10 +86,12 @@ def reach_probability(
     """
     name = "reach_probability"
     _refuse_open(grid, name)
+    # a path that ends on the target gets 1, one that ends in the obstacle 0, one that never ends 0
     problem, inside, hit = _system(problem, target, obstacle, feedback, horizon, name)
     sign = 1.0 if least else -1.0  # the control minimises: the greatest probability is minus the least of −P
-    question = exit_problems.exit_problem(problem, inside, hit, 0.0, sign)
+    question = exit_problems.exit_problem(problem, inside, hit, 0.0, sign)  # no running cost: V is the exit cost alone
     with _no_fallback_warning(feedback):
+        # over a horizon every path ends: the solution is unique, and no chain has to be surveyed
         if horizon is None:
             question, options = _without_end(question, grid, least, options)
         return _answer(question, grid, horizon, options, sign)
@@ -133,10 +135,12 @@ def stay_probability(
       >>> round(float(kept.value_at(0.0, [0.0])), 2)  # (4/π) e^{−π²/8} − ...
       0.37
     """
+    # r ≤ 0 inside becomes −r ≤ 0 outside; both hold on the boundary, which so counts as left
     leaving = jax.tree_util.Partial(exit_problems.complement, as_partial(region, "stay_probability: region"))
     # P(stays) = 1 − P(leaves), also of a partial solution; the least probability of leaving is the greatest of staying
     with _map_errors(1.0, -1.0):
         left = reach_probability(problem, grid, leaving, horizon=horizon, least=not least, feedback=feedback, **options)
+    # the policy needs no change: what makes leaving least likely makes staying most likely
     return _affine(left, 1.0, -1.0)
 
 
@@ -185,10 +189,12 @@ def expected_exit_time(
     _refuse_open(grid, name)
     problem, inside, _ = _system(problem, target, None, feedback, horizon, name)
     sign = -1.0 if greatest else 1.0  # max E τ = −min E(−τ): a cost of −1 per unit time
-    question = exit_problems.exit_problem(problem, inside, None, sign, 0.0)
+    question = exit_problems.exit_problem(problem, inside, None, sign, 0.0)  # no exit cost: V is the time alone
     with _no_fallback_warning(feedback):
         if horizon is None:
+            # what the user gives wins; a march has no tolerance
             options = {"tol": TOL} | options
+            # the least time is inf where the target is out of reach, and is found; the greatest would grow without end
             if greatest:
                 _refuse_staying(question, grid, options)
         return _answer(question, grid, horizon, options, sign)
@@ -212,6 +218,7 @@ def _system(
     name: str,
 ) -> tuple[Problem, Callable, Callable | None]:
     """The system that runs, with its loop closed if there is a feedback, its target and its obstacle."""
+    # here, since its target is read before ``solve`` would look at it
     if not isinstance(problem, Problem):
         raise TypeError(f"{name}: got {type(problem).__name__}, wanted a Problem")
     inside = problem.target if target is None else as_partial(target, f"{name}: target")
@@ -245,7 +252,9 @@ def _without_end(question: Problem, grid: Grid, least: bool, options: dict) -> t
     """
     options = {"tol": TOL} | options
     if not _count_staying(question, grid, options):
+        # no node can stay away: the equation has one solution, and the user's or the default method finds it
         return question, options
+    # +P is never below zero and −P never above it: neither bound changes the value
     bound: dict[str, Any] = {"running_max" if least else "stopping_cost": jax.tree_util.Partial(_zero)}
     # another method may find another of the solutions; who asks for one by name gets it
     return dataclasses.replace(question, **bound), {"method": ValueIteration()} | options
@@ -261,6 +270,7 @@ def _count_staying(question: Problem, grid: Grid, options: dict) -> int:
     # the checks of ``solve``, in its order: the survey of all nodes must not be the first to meet a bad argument
     scheme, kind = options.get("scheme", Upwind()), as_dtype(options.get("dtype"))
     check_arguments(question, grid, options.get("method"), scheme, options["tol"])
+    # as the docstring of the module says: then it is taken for granted that every pair must end
     if is_traced(question, grid):  # values of the problem's functions are needed, which there are none of
         return 0
     method = options.get("method") or ValueIteration()  # needs the least; solve asks again for what it takes
@@ -277,6 +287,7 @@ def _refuse_staying(question: Problem, grid: Grid, options: dict) -> None:
     """Refuse to ask for the greatest time where it may be infinite, which no iteration would find."""
     count = _count_staying(question, grid, options)
     if count:
+        # in a game the players may have to help each other to stay: then the time need not be infinite
         how, who = ("may be", "actions of both players keep") if question.is_game else ("is", "action keeps")
         raise ValueError(
             f"expected_exit_time: the greatest time {how} infinite: at {count} of {grid.size} nodes some {who} the "
@@ -286,6 +297,7 @@ def _refuse_staying(question: Problem, grid: Grid, options: dict) -> None:
 
 def _answer(question: Problem, grid: Grid, horizon: float | None, options: dict, sign: float) -> Solution:
     """sign · V of the question, also for a partial solution."""
+    # a partial solution is handed to the user, who must not see the changed sign of the question
     with _map_errors(0.0, sign):
         found = solve(question, grid, **options) if horizon is None else march(question, grid, horizon, **options)
     return _affine(found, 0.0, sign)

@@ -30,7 +30,7 @@ def reach(
     disturbances: AdmissibleSet | None = None,
     tube: bool = True,
     forward: bool = False,
-    isaacs: str = "upper",
+    isaacs: str = "upper",  # the disturbance sees the control: no set is larger than the control can guarantee
     time_dependent: bool = False,
 ) -> Problem:
     """From where the control can bring the state into the target, whatever the disturbance: {V ≤ 0}.
@@ -59,6 +59,7 @@ def reach(
     # a tube may stop at any s and pays l there, V ≤ l; a set pays l at the end alone
     stop, end = (inside, None) if tube else (None, inside)
     return Problem(
+        # no running cost and no discount: V takes no values but those of l
         _drift(drift, forward, time_dependent), None, controls, disturbances=disturbances, stopping_cost=stop,
         terminal_cost=end, isaacs=isaacs, time_dependent=time_dependent,
     )  # fmt: skip
@@ -92,6 +93,7 @@ def avoid(
     """
     depth = jax.tree_util.Partial(_negative, as_partial(obstacle, "avoid: obstacle"))
     # −l is largest where the path is deepest in the obstacle: the running maximum keeps it, V ≥ −l
+    # a set looks at the end alone: what the path touched on the way does not count
     most, end = (depth, None) if tube else (None, depth)
     return Problem(
         _drift(drift, forward, time_dependent), None, controls, disturbances=disturbances, running_max=most,
@@ -127,9 +129,11 @@ def reach_avoid(
     Returns:
       The problem; V is in the units of the distances.
     """
+    # Partials: numbers in the distances are leaves, and another radius compiles nothing
     inside, hit = as_partial(target, "reach_avoid: target"), as_partial(obstacle, "reach_avoid: obstacle")
     depth = jax.tree_util.Partial(_negative, hit)
     # both at once: max{·, −o} is outermost, so that l ≤ 0 inside the obstacle is no success
+    # the running maximum stays for a set as well: the obstacle counts at all times, the target at the end
     stop, end = (inside, None) if tube else (None, inside)
     return Problem(
         _drift(drift, forward, time_dependent), None, controls, disturbances=disturbances, stopping_cost=stop,
@@ -140,7 +144,7 @@ def reach_avoid(
 def _drift(drift: Callable, forward: bool, time_dependent: bool) -> Callable:
     """The drift, backwards for a forward set."""
     if not forward:
-        return drift
+        return drift  # a backward set: V at x tells of paths that start there
     # x(T) is reached from the target exactly if the target is reached from x(T) with time running backwards
     if time_dependent:
         raise ValueError(
@@ -152,6 +156,7 @@ def _drift(drift: Callable, forward: bool, time_dependent: bool) -> Callable:
 
 def _backwards(drift: Callable, *arguments: Array) -> jax.Array:
     """The drift with its sign changed."""
+    # jnp first: a drift may return a list, which has no minus
     return -jnp.asarray(drift(*arguments))
 
 

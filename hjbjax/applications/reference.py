@@ -24,7 +24,7 @@ FLATTEST, STEEPEST = 1e-3, 16.0  # orders between which Richardson's is sought; 
 
 def mean_spacing(grid: Grid) -> float:
     """The geometric mean of the axes' mean spacings: a change of units changes no ratio of two of them."""
-    return float(np.prod(spacings(grid)) ** (1 / grid.ndim))
+    return float(np.prod(spacings(grid)) ** (1 / grid.ndim))  # n-th root of the cell's volume
 
 
 def spacings(grid: Grid) -> np.ndarray:
@@ -36,6 +36,7 @@ def spacings(grid: Grid) -> np.ndarray:
 
 def check_box(what: str, first: Grid, second: Grid) -> None:
     """Refuse two grids of different boxes."""
+    # a periodic axis joins its ends: of equal corners it makes another box
     alike = first.periodic == second.periodic
     if not (alike and np.array_equal(first.lo, second.lo) and np.array_equal(first.hi, second.hi)):
         boxes = [f"{grid.lo} to {grid.hi}, periodic {grid.periodic}" for grid in (first, second)]
@@ -50,8 +51,9 @@ def check_reference(reference: object, grids: tuple[Grid, ...]) -> None:
                 f"convergence_study: got {len(grids)} grids and no reference; Richardson's estimate needs three"
             )
         for grid in grids[1:]:
-            strides(grid, grids[0])
+            strides(grid, grids[0])  # for its refusal alone
     elif isinstance(reference, Solution):
+        # a marched value has a time axis in front
         if reference.times is not None or np.shape(reference.value) != reference.grid.shape:
             raise ValueError(
                 f"convergence_study: the reference has values of shape {np.shape(reference.value)} on a grid of shape "
@@ -90,6 +92,7 @@ def at_nodes_of(reference: Solution | Callable, grid: Grid, mask: Mask) -> np.nd
         values = np.asarray(reference.value_at(grid.nodes(), clamp=True))
     else:
         values = evaluate(reference, grid, "the reference")
+    # only where it counts: outside of the region the reference need not be known; inf is a value
     missing = np.isnan(values) & mask
     if missing.any():
         index = tuple(int(i) for i in np.argwhere(missing)[0])
@@ -103,6 +106,7 @@ def at_nodes_of(reference: Solution | Callable, grid: Grid, mask: Mask) -> np.nd
 def evaluate(function: Callable, grid: Grid, what: str, name: str = "convergence_study") -> np.ndarray:
     """A function of one state at all nodes, in float64; ``name`` is who asks, for refusals."""
     with jax.enable_x64(True):  # the reference must not be what limits the errors seen
+        # abstractly: a wrong shape is refused before anything is compiled
         got = jax.eval_shape(function, jax.ShapeDtypeStruct((grid.ndim,), np.float64))
         if getattr(got, "shape", None) != ():
             shape = getattr(got, "shape", got)
@@ -118,6 +122,7 @@ def mask_of(region: Callable | float | None, grid: Grid, name: str = "convergenc
     if callable(region):
         inside = evaluate(region, grid, "the region", name).astype(bool)
     elif isinstance(region, (int, float)) and not isinstance(region, bool):
+        # a truth value, which is an int as well, has been kept out: True would be the whole box
         if not 0 < region <= 1:
             raise ValueError(f"{name}: got region = {region!r}; wanted a share of the box in (0, 1]")
         inside = grid.inner(region)
@@ -130,6 +135,7 @@ def mask_of(region: Callable | float | None, grid: Grid, name: str = "convergenc
 
 def is_nested(fine: Grid, coarse: Grid) -> bool:
     """True if every node of the coarse grid is a node of the fine one, in grids of one box."""
+    # intervals, not nodes: so the rule is the same for periodic axes, which have as many of both
     multiple = all(fine.intervals(axis) % coarse.intervals(axis) == 0 for axis in range(coarse.ndim))
     return multiple and repr(fine.stretch) == repr(coarse.stretch)
 
@@ -146,6 +152,7 @@ def strides(fine: Grid, coarse: Grid) -> tuple[slice, ...]:
 
 def restrict(value: np.ndarray, fine: Grid, coarse: Grid) -> np.ndarray:
     """The values at the nodes that both grids have."""
+    # no interpolation: it would add an error of its own, of the order that is to be measured
     return value[strides(fine, coarse)]
 
 
@@ -171,10 +178,12 @@ def richardson(values: list[np.ndarray], h: np.ndarray, mask: np.ndarray, tol: f
             "nothing: no Richardson estimate, since from grid to grid the mean "
             f"changes by {wide:.3g} and {narrow:.3g}, which shows no order"
         )
+    # here: only a study without a reference needs it
     from scipy.optimize import brentq
 
     order = brentq(excess, FLATTEST, STEEPEST)
     with np.errstate(invalid="ignore"):  # nodes that are infinite on all grids stay so
         step = np.where(fine == middle, 0.0, fine - middle)
+    # the second line of the module's; h is over the coarsest spacing, which cancels in the quotient
     extrapolated = fine + step * h[2] ** order / (h[1] ** order - h[2] ** order)
     return extrapolated, f"Richardson's estimate from the three finest grids, which show order {order:.2f}"

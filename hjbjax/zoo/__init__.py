@@ -62,6 +62,7 @@ _ENTRIES = (
         "bring a mass to rest at the origin in the least time",
         double_integrator,
         double_integrator_exact,
+        # from rest at 1 the least time is 2, half of the picture
         start=(1.0, 0.0),
         duration=4.0,
     ),
@@ -106,9 +107,11 @@ _ENTRIES = (
         "steer a boat through a current in the least time",
         zermelo,
         zermelo_exact,
+        # downstream of the origin: the boat has to make its way against the current
         start=(1.0, -1.0),
         duration=5.0,
     ),
+    # the time from there is the norm, less than 1
     Entry("eikonal", "the shortest way to the origin", eikonal, eikonal_exact, start=(0.8, 0.5), duration=2.0),
     Entry("dubins", "drive a car that cannot turn on the spot to a disc", dubins, start=(-1.5, 0.5, 0.0), duration=8.0),
     # from the limit cycle, whose amplitude is 2
@@ -119,6 +122,7 @@ _ENTRIES = (
         "consume and invest under constant relative risk aversion",
         merton,
         merton_exact,
+        # the logarithm of a wealth of 1
         start=(0.0,),
         duration=10.0,
     ),
@@ -127,9 +131,10 @@ _ENTRIES = (
         "land a rocket with the least fuel: when to start the engine",
         moon_landing,
         moon_landing_exact,
+        # at rest at height 1 with the full mass: a coast, then the burn
         start=(1.0, 0.0, 1.0),
         duration=2.0,
-        finish=moon_landing_burn,
+        finish=moon_landing_burn,  # the grid's problem ends where the burn begins
     ),
     Entry("smooth", "a smooth nonlinear problem made for a known value", smooth, smooth_exact, start=(0.8, 0.5)),
 )

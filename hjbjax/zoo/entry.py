@@ -45,8 +45,10 @@ class Entry:
     @property
     def parameters(self) -> dict[str, Any]:  # numbers, tuples of them, truth values or None
         """The keywords of ``build`` with their defaults."""
+        # of the function itself: the command line offers exactly what it takes
         return {name: argument.default for name, argument in inspect.signature(self.build).parameters.items()}
 
     def initial_state(self, ndim: int) -> tuple[float, ...]:
         """``start`` in ``ndim`` dimensions: cut, or filled up with zeros, where a parameter chose another number."""
+        # zero is the target, or the middle of the box, in the entries whose dimension a parameter chooses
         return (self.start + (0.0,) * ndim)[:ndim]

@@ -44,12 +44,13 @@ class Merton:
 
     def __post_init__(self):
         positive("merton", volatility=self.volatility, aversion=self.aversion, discount=self.discount)
+        # C^{1−γ}/(1−γ) divides by zero there; its limit, less a constant, is log C, another problem
         if not is_traced(self.aversion) and np.any(np.asarray(self.aversion) == 1):
             raise ValueError("merton: got aversion = 1 (logarithmic utility), wanted another number > 0")
 
     def drift(self, x: State, u: Control) -> State:
         """The mean growth of the logarithm of wealth."""
-        spread = u[0] * self.volatility
+        spread = u[0] * self.volatility  # πσ
         # −½π²σ² is Itô's correction of the logarithm: it makes growth concave in π, though wealth's is linear
         growth = self.interest + u[0] * (self.growth - self.interest) - u[1] - 0.5 * spread * spread
         return jnp.stack([growth])
@@ -67,6 +68,7 @@ class Merton:
     @property
     def share(self) -> Number:
         """π*, the best share in the risky asset."""
+        # Merton's share: it depends neither on wealth nor on the discount
         return (self.growth - self.interest) / (self.aversion * self.volatility * self.volatility)
 
     @property
@@ -75,11 +77,13 @@ class Merton:
         premium = self.growth - self.interest
         # the riskless rate that is worth as much as the best portfolio: r + (μ−r)²/(2γσ²)
         certain = self.interest + premium * premium / (2 * self.aversion * self.volatility * self.volatility)
+        # k* ≤ 0 means that the utility of waiting outgrows the discount: the value is not finite
         return (self.discount - (1 - self.aversion) * certain) / self.aversion
 
     def value(self, x: State) -> Scalar:
         """The value at one state, while the best controls are admissible and k* > 0."""
         power = 1 - self.aversion
+        # homogeneous of degree 1 − γ in wealth, as the utility is, hence the exponential in its logarithm
         return -(self.consumption**-self.aversion) * jnp.exp(power * jnp.asarray(x)[0]) / power
 
 
@@ -108,10 +112,12 @@ def merton(
     problem = Problem(
         system.drift,
         system.cost,
+        # with the defaults π* = .5 and k* = .045, both inside: the bounds are slack
         Box([0.0, 0.01], [1.0, 0.1]),  # no short sale, no credit; at k = 0 the cost is infinite for γ > 1
         noise=system.noise,
         discount=discount,
         target=OutsideCube(1.0).level,
+        # at the ends the value of going on without the box, which the exact answer knows
         exit_cost=system.value,
     )
     return problem, Grid([-1.0], [1.0], shape, names=("log wealth",))

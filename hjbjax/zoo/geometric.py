@@ -33,6 +33,7 @@ class OneWay:
 
     def drift(self, x: State, u: Control) -> State:
         """(u, s x₁²)."""
+        # no control enters ẋ₂, which never changes its sign: the bracket spans that direction, one way only
         return jnp.stack([u[0], self.speed * x[0] * x[0]])
 
     def frontier(self, x: State) -> Number:
@@ -67,6 +68,7 @@ class Unicycle:
         return jnp.stack([u[0] * jnp.cos(x[2]), u[0] * jnp.sin(x[2]), u[1]])
 
 
+# static: their number fixes the dimension of the state, 3 + n
 @pytree_dataclass(static=("trailers",))
 class CarWithTrailers:
     """A unicycle that pulls n trailers, each hooked to the middle of the axle before it.
@@ -83,10 +85,11 @@ class CarWithTrailers:
     lengths: Number | Sequence[Number] | Array = 1.0
 
     def __post_init__(self):
+        # True would pass for an int, and be one trailer
         if isinstance(self.trailers, bool) or not isinstance(self.trailers, int) or self.trailers < 1:
             raise ValueError(f"CarWithTrailers: got trailers = {self.trailers!r}, wanted a positive integer")
         if np.ndim(cast(Array, self.lengths)) == 0:
-            object.__setattr__(self, "lengths", (self.lengths,) * self.trailers)
+            object.__setattr__(self, "lengths", (self.lengths,) * self.trailers)  # past the lock of a frozen dataclass
         if len(self._lengths) != self.trailers:
             raise ValueError(f"CarWithTrailers.lengths: got {len(self._lengths)} numbers, wanted {self.trailers}")
         positive("CarWithTrailers", lengths=self.lengths)
@@ -115,11 +118,13 @@ class Pomet:
 
     def drift(self, x: State, u: Control) -> State:
         """(6.6): (u₁, x₁u₂, u₂)."""
+        # (0, ε, 0) is no velocity near the origin: Brockett's condition fails, hence the time in the feedback
         return jnp.stack([u[0], x[0] * u[1], u[1]])
 
     def feedback(self, t: Number, x: State) -> Control:
         """(6.7): (x₂ sin t − z, −z x₁ cos t − (x₁x₂ + x₃)) with z = x₁ + x₂ cos t; for ``time_varying=True``."""
         z = x[0] + x[1] * jnp.cos(t)
+        # dV/dt = z(u₁ − x₂ sin t) + u₂(x₁z cos t + x₁x₂ + x₃): each input turns its own term into minus a square
         return jnp.stack([x[1] * jnp.sin(t) - z, -z * x[0] * jnp.cos(t) - (x[0] * x[1] + x[2])])
 
     def closed_loop(self, t: Number, x: State) -> State:

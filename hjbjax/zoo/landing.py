@@ -57,6 +57,7 @@ class Lander:
         """Duration, first velocity and first height of the burn that leaves the share e^{−q} of a mass."""
         left, k = jnp.exp(-q), self.consumption
         duration = mass * (1 - left) / (k * self.thrust)
+        # the rocket equation: a burn to the share e^{−q} gives q/k, with 1/k the speed of the exhaust
         velocity = self.gravity * duration - q / k
         # ∫(τ − s)·U/m(s) ds: what thrust alone would lift the rocket by, from rest
         climbed = mass * (1 - left * (1 + q)) / (k * k * self.thrust)

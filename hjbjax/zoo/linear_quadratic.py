@@ -46,6 +46,7 @@ class LinearScalar:
 
     def contested_drift(self, x: State, u: Control, d: Disturbance) -> State:
         """ax + u + d."""
+        # u and d enter alike: in the Riccati equation they combine to the one weight 1 − γ⁻²
         return self.rate * x + u + d
 
 
@@ -82,6 +83,7 @@ class ScalarQuadratic:
     @property
     def curvature(self) -> Scalar:
         """The root p, written so that it stays finite where the weight vanishes."""
+        # βp on the left takes β/2 from the drift on the right, 2ap − βp = 2(a − β/2)p
         shifted = self.rate - 0.5 * self.discount
         # q/(√(s² + wq) − s) in place of (√(s² + wq) + s)/w: the game's weight 1 − γ⁻² is zero at γ = 1
         return self.state / (jnp.sqrt(shifted * shifted + self.weight * self.state) - shifted)
@@ -91,6 +93,7 @@ class ScalarQuadratic:
         x, p = jnp.asarray(x), self.curvature
         # no divisor is ever zero: derivatives pass through both branches of a where, and 0/0 makes them NaN
         beta = jnp.where(self.discount == 0, 1.0, self.discount)
+        # ½σ²V″ = σ²p is paid per unit time for ever, worth σ²p/β now; none without noise, whatever β is
         constant = jnp.where(jnp.asarray(self.noise) == 0, 0.0, self.noise * self.noise * p / beta)
         return p * jnp.sum(x * x) + constant
 
@@ -120,7 +123,7 @@ def double_integrator_lq(
         DoubleIntegrator(mass).drift,
         QuadraticCost(1.0, control_weight).rate,
         Box([-bound], [bound]),  # with the defaults the best force is −x₁ − √3x₂, at most 5.5 on the box
-        noise=noise_or_none(noise),
+        noise=noise_or_none(noise),  # σ times the identity
         discount=discount,
     )
     return problem, Grid([-2.0, -2.0], [2.0, 2.0], shape, names=("position", "velocity"))
@@ -140,13 +143,15 @@ def double_integrator_lq_exact(
       discount: β, positive where there is noise.
       bound: taken to be slack.
     """
+    # here: no other answer of this file needs it
     from scipy.linalg import solve_continuous_are
 
     a = np.array([[0.0, 1.0], [0.0, 0.0]]) - 0.5 * discount * np.eye(2)  # SciPy's equation knows no discount
-    b = np.array([[0.0], [1.0 / mass]])
+    b = np.array([[0.0], [1.0 / mass]])  # (2, 1), the force acts on the velocity
     matrix = solve_continuous_are(a, b, np.eye(2), control_weight * np.eye(1))
     constant = 0.0  # of V = x'Px + c the noise changes c alone: ½ tr(σσ'·2P) = βc
     if noise:
+        # undiscounted, noise would cost ½ tr(σσ'·2P) per unit time for ever
         positive("double_integrator_lq with noise", discount=discount)
         constant = noise**2 * np.trace(matrix) / discount
     return answer(QuadraticValue(matrix, constant).value)
@@ -184,6 +189,7 @@ def stochastic_lq(
         Box([-bound], [bound]),  # with the defaults |u| = p|x| is at most 1.3
         noise=noise_or_none(noise),
         discount=discount,
+        # the ends of the box alone; there the run ends, and pays what it would cost to go on
         target=OutsideCube(2.0).level,
         exit_cost=exact,
     )
@@ -209,6 +215,7 @@ def stochastic_lq_exact(
       discount: β > 0.
       bound: taken to be slack.
     """
+    # 1/r weighs p², and c = σ²p/β is infinite without a discount
     positive("stochastic_lq", control_weight=control_weight, discount=discount)
     return answer(ScalarQuadratic(state_weight, 1.0 / control_weight, rate, discount, noise).value)
 
@@ -238,6 +245,7 @@ def lq_game(
         Box([-bound], [bound]),  # with the defaults u = −px and d = px/γ² are at most 1.2 and .3
         disturbances=Box([-bound], [bound]),
         discount=discount,
+        # no exit cost: V(0) = 0, and of all the solutions V + constant that one is singled out
         target=Disc(0.0, 1).level,  # the node at the origin alone
     )
     return problem, Grid([-1.0], [1.0], shape, names=("x",))
@@ -256,7 +264,9 @@ def lq_game_exact(*, gamma: Number = 2.0, rate: Number = 0.0, discount: Number =
       ValueError: the level is at or below the least one that can be attained, so there is no finite value.
     """
     positive("lq_game", gamma=gamma)
+    # of traced numbers no sign is known: below the level the formula then gives NaN or a wrong root
     if not is_traced(gamma, rate, discount):
+        # the coefficients of the equation of ``ScalarQuadratic`` with q = 1: 1 + 2·shifted·p − weight·p² = 0
         shifted, weight = rate - 0.5 * discount, 1 - gamma**-2
         # no real root, or one that does not stabilise: the Riccati equation loses its solution at this level
         if shifted**2 + weight < 0 or (weight <= 0 and shifted >= 0):
@@ -264,4 +274,5 @@ def lq_game_exact(*, gamma: Number = 2.0, rate: Number = 0.0, discount: Number =
                 f"lq_game_exact: got gamma = {gamma:g}, wanted a level above the least attainable one "
                 f"(1 where rate ≥ discount/2): below it the disturbance makes the cost infinite"
             )
+    # no noise, hence no constant: V = px²
     return answer(ScalarQuadratic(1.0, 1 - gamma**-2, rate, discount).value)

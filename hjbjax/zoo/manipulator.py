@@ -54,9 +54,11 @@ class Manipulator:
     links: int = 1
     lengths: Number | Joints | None = None
     masses: Number | Joints | None = None
+    # m/s²; lengths and masses are in metres and kilograms then, torques in newton metres
     g: Number = 9.81
 
     def __post_init__(self):
+        # True would pass for an int, and be one link
         if isinstance(self.links, bool) or not isinstance(self.links, int) or self.links < 1:
             raise ValueError(f"Manipulator: got links = {self.links!r}, wanted a positive integer")
         for name in ("lengths", "masses"):
@@ -89,6 +91,7 @@ class Manipulator:
             angle, rate = angle + q[i], rate + w[i]
             across = across + self._lengths[i] * jnp.cos(angle) * rate
             up = up - self._lengths[i] * jnp.sin(angle) * rate
+            # point masses: no term of a link that turns about its own middle
             total = total + 0.5 * self._masses[i] * (across * across + up * up)
         return total
 
@@ -99,6 +102,7 @@ class Manipulator:
         height: Number = 0.0
         for i in range(self.links):
             angle = angle + q[i]
+            # angles from upright: U is largest at q = 0, which is the unstable rest
             height = height + self._lengths[i] * jnp.cos(angle)
             total = total + self._masses[i] * self.g * height
         return total
@@ -110,6 +114,7 @@ class Manipulator:
     def mass_matrix(self, q: Joints) -> jax.Array:
         """M(q), shape (n, n), symmetric and positive definite."""
         columns = self._mass(_scalars(q, self.links))
+        # columns stacked as rows: M is symmetric
         return jnp.stack([jnp.stack(column) for column in columns])
 
     def coriolis(self, q: Joints, w: Joints) -> jax.Array:
@@ -121,6 +126,7 @@ class Manipulator:
         # (i, j, k); the swaps below put ∂M_ik/∂q_j and ∂M_jk/∂q_i at that place
         slopes = jax.jacfwd(self.mass_matrix)(jnp.stack(_scalars(q, self.links)))  # ∂M_ij/∂q_k
         symbols = slopes + slopes.swapaxes(1, 2) - slopes.transpose(2, 1, 0)
+        # the sum over k, the last axis of (n, n, n)
         return 0.5 * symbols @ jnp.stack(_scalars(w, self.links))
 
     def gravity(self, q: Joints) -> jax.Array:
@@ -155,6 +161,7 @@ class Manipulator:
           stiffness: per unit of time squared.
         """
         # Partials, so that the arm's numbers and the gains are leaves: another mass recompiles no simulation
+        # the default gains make λ² + 3λ + 2, with the roots −1 and −2, as (2.8) does for the pendulum
         if reference is None:
             return jax.tree_util.Partial(_hold_upright, self, damping, stiffness)
         return jax.tree_util.Partial(_track, self, damping, stiffness, as_partial(reference, "Manipulator.tracking"))
@@ -165,6 +172,7 @@ class Manipulator:
         numbers = _scalars(x, 2 * n)
         q, w = numbers[:n], numbers[n:]
         bias, weight = self._coriolis(q, w), self._gravity(q)
+        # (5.5) for q̈: what torque is left to accelerate
         rest = [tau[i] - bias[i] - weight[i] for i in range(n)]
         return jnp.stack([*w, *_solve_positive(self._mass(q), rest)])
 
@@ -172,6 +180,7 @@ class Manipulator:
         """The columns of M(q)."""
         # T is quadratic in w, so its gradient at the unit vector e_j is the column j of M.
         zero, one = jnp.zeros((), q[0].dtype), jnp.ones((), q[0].dtype)
+        # in the dtype of q: mixed ones would promote a float32 solve
         units = ([one if i == j else zero for i in range(self.links)] for j in range(self.links))
         return [jax.grad(self.kinetic_energy, argnums=1)(q, unit) for unit in units]
 
@@ -212,6 +221,7 @@ def _track(
 
     q, w = x[: arm.links], x[arm.links :]
     acceleration = jax.jvp(rate, (t,), (jnp.ones_like(t),))[1]
+    # ë + damping·ė + stiffness·e = 0 for e = q − q*, joint by joint
     wanted = acceleration - damping * (w - rate(t)) - stiffness * (q - reference(t))
     return arm.computed_torque(q, w, wanted)
 
@@ -230,10 +240,12 @@ def _solve_positive(matrix: list[list[jax.Array]], rest: list[jax.Array]) -> lis
     n, matrix, rest = len(rest), [list(row) for row in matrix], list(rest)
     for k in range(n):
         for i in range(k + 1, n):
+            # entries below the pivot are not set to zero, since nothing reads them again
             factor = matrix[i][k] / matrix[k][k]
             rest[i] = rest[i] - factor * rest[k]
             for j in range(k + 1, n):
                 matrix[i][j] = matrix[i][j] - factor * matrix[k][j]
+    # upper triangular by now: from the last unknown back
     for k in reversed(range(n)):
         for j in range(k + 1, n):
             rest[k] = rest[k] - matrix[k][j] * rest[j]
@@ -270,10 +282,12 @@ def manipulator(
     system = Manipulator(links=links, lengths=lengths, masses=masses, g=g)
     if shape is None:  # an even number of angles has a node upright, an odd number of velocities one at rest
         shape = (60, 61) if links == 1 else (20,) * links + (21,) * links
+    # with lengths and masses of 1 the level arm asks g of one link, 3g = 29.4 of the first of two: 30 holds it
     controls = Box([-torque] * links, [torque] * links)
     problem = Problem(system.drift, QuadraticCost(0.5, 0.5).rate, controls, discount=discount)
     names = ("angle", "velocity")
     grid = Grid(
+        # n angles, then n velocities, as in the state; a free fall of one link reaches 2√g = 6.3 at the bottom
         [-math.pi] * links + [-8.0] * links,
         [math.pi] * links + [8.0] * links,
         shape,

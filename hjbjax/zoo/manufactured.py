@@ -41,6 +41,7 @@ class Smooth:
         # u² + c V₂ u is least at u = −½cV₂ and −¼c²V₂² there, which the cost has to make up for
         best = self.gain(x) * slope[1]
         return (
+            # βV = q + f₀·DV − ¼c²V₂² solved for q
             self.discount * self.value(x) - (free[0] * slope[0] + free[1] * slope[1]) + 0.25 * best * best + u[0] * u[0]
         )
 
@@ -48,6 +49,7 @@ class Smooth:
         """The chosen value."""
         x = jnp.asarray(x)
         product = x[0] * x[1]
+        # cosh has derivatives of every order, so that no scheme is exact by chance; zero and least at the origin
         return jnp.cosh(x[0]) - 1 + x[1] * x[1] + 0.25 * product * product
 
     def slope(self, x: State) -> tuple[Scalar, Scalar]:

@@ -46,6 +46,7 @@ class Pendulum:
     @property
     def gain(self) -> Number:
         """θ̈ per unit of torque."""
+        # 1/(m·1²): the inertia at unit length
         return (self.g if self.as_printed else 1.0) / self.mass
 
     def drift(self, x: State, u: Control) -> State:
@@ -60,6 +61,7 @@ class Pendulum:
 
     def linear_torque(self, x: State) -> Control:
         """The design of (2.8) for the pendulum linearised upright, τ = −mgθ − 3mθ̇ − 2mθ."""
+        # leaves g(sin θ − θ) in the loop, of third order: good near upright only
         return jnp.stack([-(self.g * x[0] + 3 * x[1] + 2 * x[0]) / self.gain])
 
 
@@ -90,6 +92,7 @@ class BallAndBeam:
       g: gravity; 9.81 m/s².
     """
 
+    # 5/7 = 1/(1 + 2/5), from the moment of inertia ⅖·mass·radius² that a rolling solid ball has to overcome
     inertia: Number = 5 / 7
     g: Number = 9.81
 
@@ -122,12 +125,14 @@ class FlexibleJoint:
     stiffness: Number = 10.0
 
     def __post_init__(self):
+        # the inertias are divided by; no weight is an arm that moves in a level plane, and is allowed
         positive("FlexibleJoint", link=self.link, motor=self.motor)
 
     def drift(self, x: State, u: Control) -> State:
         """(q̇₁, −(MgL sin q₁ + k(q₁ − q₂))/I, q̇₂, (k(q₁ − q₂) + u)/J)."""
         spring = self.stiffness * (x[0] - x[2])  # the torque that slows the link and turns the motor
         return jnp.stack(
+            # the spring acts on both with opposite signs, the control on the motor alone
             [x[1], -(self.weight * jnp.sin(x[0]) + spring) / self.link, x[3], (spring + u[0]) / self.motor]
         )
 
@@ -161,8 +166,10 @@ def pendulum(
     # for m = 1 either bound raises the pendulum without swinging: 30 > g, and printed, with the gain g/m, 6g > g
     bound = (6.0 if as_printed else 30.0) if torque is None else torque
     system = Pendulum(mass=mass, g=g, as_printed=as_printed)
+    # the cost does not see that θ is periodic: θ² has its kink at hanging, where both ways up are equal
     problem = Problem(system.drift, QuadraticCost(0.5, 0.5).rate, Box([-bound], [bound]), discount=discount)
     # the angle omits π, which is −π: hanging is one node
+    # 8: a free fall from upright reaches 2√g = 6.3 at the bottom
     return problem, Grid([-math.pi, -8.0], [math.pi, 8.0], shape, periodic=(True, False), names=("angle", "velocity"))
 
 
@@ -179,9 +186,10 @@ def pendulum_near_upright(
       g: gravity.
       discount: β.
     """
+    # here: only this answer needs it
     from scipy.linalg import solve_continuous_are
 
-    gain = Pendulum(mass, g, as_printed).gain
+    gain = Pendulum(mass, g, as_printed).gain  # refuses a mass ≤ 0 as the problem does
     # sin θ ≈ θ upright; βV in the equation acts like the drift A − ½βI
     a = np.array([[0.0, 1.0], [g, 0.0]]) - 0.5 * discount * np.eye(2)
     matrix = solve_continuous_are(a, np.array([[0.0], [gain]]), np.eye(2), np.eye(1))
@@ -204,4 +212,5 @@ def van_der_pol(
     problem = Problem(
         VanDerPol(stiffness).drift, QuadraticCost(0.5, 0.5).rate, Box([-bound], [bound]), discount=discount
     )
+    # wide enough for the limit cycle, whose amplitude in position is 2
     return problem, Grid([-3.0, -3.0], [3.0, 3.0], shape, names=("position", "velocity"))

@@ -37,7 +37,7 @@ class DoubleIntegrator:
 
     def drift(self, x: State, u: Control) -> State:
         """(x₂, u/m)."""
-        return jnp.stack([x[1], u[0] / self.mass])
+        return jnp.stack([x[1], u[0] / self.mass])  # mẍ = u
 
     def arrival_time(self, x: State) -> Scalar:
         """The least time to rest at the origin under |u| ≤ 1."""
@@ -47,6 +47,7 @@ class DoubleIntegrator:
         side = position + 0.5 * velocity * jnp.abs(velocity)
         sign = jnp.where(side >= 0, 1.0, -1.0)  # left of the curve the plane is mirrored; no jnp.sign, which is 0 on it
         # On the switching curve the root is |velocity|; rounding must not make its argument negative.
+        # x₂ + 2√(x₁ + ½x₂²), the two arcs together, with the 2 under the root
         return sign * velocity + jnp.sqrt(jnp.maximum(4 * sign * position + 2 * velocity * velocity, 0.0))
 
     def switching_position(self, velocity: Number) -> Number:
@@ -67,6 +68,7 @@ class Boat:
     current: Sequence[Number] | Array = (0.5, 0.0)
 
     def __post_init__(self):
+        # of the current nothing is asked: it may be zero, or stronger than the boat
         positive("Boat", speed=self.speed)
 
     def drift(self, x: State, u: Control) -> State:
@@ -84,6 +86,7 @@ class Boat:
         below = jnp.sqrt(jnp.maximum(inside, 0.0)) - along
         # inside < 0: the disc of radius sT around the drifting boat never holds the origin; below ≤ 0: only in the past
         reachable = (inside >= 0) & (below > 0)
+        # a divisor of 1 where out of reach: the branch not taken is differentiated too
         time = jnp.where(reachable, square / jnp.where(reachable, below, 1.0), jnp.inf)
         return jnp.where(square == 0, 0.0, time)  # at the origin both are 0, which reads as out of reach above
 
@@ -103,6 +106,7 @@ def double_integrator(
     problem = Problem(
         DoubleIntegrator(mass).drift,
         unit_cost,
+        # the closed form is for |u| ≤ 1: a stronger force is a smaller mass
         Box([-1.0], [1.0]),
         discount=discount,
         target=Disc(radius, 2).level,
@@ -139,6 +143,7 @@ def zermelo(
       radius: the exact value is held within it; 0 leaves the node at the origin alone.
       shape: nodes; odd numbers put one at the origin.
     """
+    # the exit cost as well, which does not depend on the radius
     exact = zermelo_exact(speed=speed, current=current, discount=discount, radius=radius)
     problem = Problem(
         Boat(speed, current).drift,

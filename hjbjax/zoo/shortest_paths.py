@@ -19,6 +19,7 @@ from hjbjax.problem.types import Control, Number, State
 from hjbjax.zoo.ingredients import Arrival, Disc, Exact, Scalar, answer, positive, unit_cost
 
 
+# static: it chooses a formula, not a number in one
 @pytree_dataclass(static=("norm",))
 class SingleIntegrator:
     """A point that moves at will, ẋ = s·u, with u in the unit ball of ``norm``.
@@ -36,7 +37,7 @@ class SingleIntegrator:
 
     def drift(self, x: State, u: Control) -> State:
         """s·u."""
-        return self.speed * u
+        return self.speed * u  # the set of u, not the drift, carries the norm
 
     def arrival_time(self, x: State) -> Scalar:
         """‖x‖/s."""
@@ -61,6 +62,7 @@ class Dubins:
 
     def drift(self, x: State, u: Control) -> State:
         """(s cos θ, s sin θ, u)."""
+        # at full speed always: it can neither stop nor back up
         return jnp.stack([self.speed * jnp.cos(x[2]), self.speed * jnp.sin(x[2]), u[0]])
 
 
@@ -94,9 +96,11 @@ def eikonal(
         unit_cost,
         _unit_ball(norm, dim, directions),
         discount=discount,
+        # Euclidean for every norm: only where the exact value is held, not what the distance is
         target=Disc(radius, dim).level,
         exit_cost=exact,
     )
+    # odd: a node at the origin, which for radius 0 is the whole target
     return problem, Grid([-1.0] * dim, [1.0] * dim, (81,) * dim if shape is None else shape)
 
 
@@ -125,12 +129,14 @@ def eikonal_exact(
 
 def _unit_ball(norm: float, dim: int, directions: int | None) -> Ball | Box | Finite:
     """The admissible velocities at unit speed: the unit ball of ``norm``."""
+    # for other norms no set of the library is the unit ball
     if norm not in (1, 2, math.inf):
         raise ValueError(f"eikonal: got norm = {norm!r}, wanted 1, 2 or infinity")
     if directions is not None:
         if (dim, norm) != (2, 2):
             raise ValueError(f"eikonal: got directions with dim = {dim} and norm = {norm:g}, wanted 2 and 2")
         angles = 2 * np.pi * np.arange(directions) / directions  # the last is not the first once more
+        # between two of n directions a path zigzags, and is longer than straight by up to 1/cos(π/n)
         return Finite(np.stack([np.cos(angles), np.sin(angles)], axis=-1))
     if norm == 1:
         # H is linear in u, so of the unit ball Σ|u_i| ≤ 1 its 2·dim corners are enough
@@ -160,6 +166,7 @@ def dubins(
     problem = Problem(
         Dubins(speed).drift,
         unit_cost,
+        # for fastest paths none but −turn, 0 and turn are used: arcs and straight lines
         Box([-turn], [turn]),
         discount=discount,
         target=Disc(radius, 2).level,  # in any heading; with no exact value beside it zero is held there

@@ -21,7 +21,7 @@ TERMS = 200  # of the series for the square, whose tail falls like k⁻³ at the
 
 def no_drift(x: State, u: Control) -> State:
     """Zero: only the noise moves the state."""
-    return jnp.zeros_like(x)
+    return jnp.zeros_like(x)  # the solver passes a u of shape (0,)
 
 
 @pytree_dataclass(static=("dim",))
@@ -38,6 +38,7 @@ class CubeExit:
     dim: int
 
     def __post_init__(self):
+        # of the discount nothing is asked: 0 is the mean exit time itself
         positive("brownian_exit", noise=self.noise, half_width=self.half_width)
 
     def value(self, x: State) -> Scalar:
@@ -64,6 +65,7 @@ class CubeExit:
 def _interval(x: Number, kappa: Number) -> Scalar:
     """2(1 − cosh κx/cosh κ)/κ², as (1 − x²) times factors that are 1 at κ = 0 and never cancel or overflow."""
     near, far = 0.5 * kappa * (1 - x), 0.5 * kappa * (1 + x)  # their sum is κ
+    # cosh κ − cosh κx = 2 sinh near · sinh far, and 1/cosh κ brings the e^{−κ} that the factors share
     return (1 - x * x) * _sinhc(near) * _sinhc(far) * 2 / (1 + jnp.exp(-2 * kappa))
 
 
@@ -87,6 +89,7 @@ class BallExit:
     def value(self, x: State) -> Scalar:
         """The value at one state; outside the ball the formula goes on and is negative."""
         x = jnp.asarray(x)
+        # ½σ²ΔV = −1, since Δ|x|² = 2n
         return (self.radius * self.radius - jnp.sum(x * x)) / (self.dim * self.noise * self.noise)
 
 
@@ -107,6 +110,7 @@ def brownian_exit(
       half_width: R.
       shape: nodes; ``None`` is 101 in one dimension, 41 an axis in more.
     """
+    # first: of a half width ≤ 0 the grid would complain of its corners
     positive("brownian_exit", noise=noise, half_width=half_width)
     problem = Problem(no_drift, unit_cost, noise=noise, discount=discount, target=OutsideCube(half_width).level)
     # odd numbers put a node at the centre
@@ -151,6 +155,7 @@ def brownian_ball(
         unit_cost,
         noise=noise,
         target=OutsideBall(radius).level,  # the corners of the box, too
+        # no discount: with one the answer would be a Bessel function
         exit_cost=brownian_ball_exact(dim=dim, noise=noise, radius=radius),
     )
     return problem, Grid([-radius] * dim, [radius] * dim, (41,) * dim if shape is None else shape)
@@ -182,6 +187,7 @@ class BangBang:
     noise: Number = 0.0
 
     def __post_init__(self):
+        # every term of V divides by λ; the noise may be zero
         positive("bang_bang", discount=self.discount)
 
     def drift(self, x: State, u: Control) -> State:
@@ -190,6 +196,7 @@ class BangBang:
 
     def cost(self, x: State, u: Control) -> Number:
         """x²."""
+        # nothing is paid for u: the equation is linear in it, and its best value is at an end of the set
         return jnp.sum(x * x)
 
     def value(self, x: State) -> Scalar:

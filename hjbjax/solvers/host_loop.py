@@ -63,10 +63,8 @@ def drive(task: Task, guess: Nodes, clock: Clock, most: int | None = None) -> tu
                 clock.phase = f"step {done + 1} on {nodes} nodes" + ", on the way to a guess" * (most is not None)
                 # the look at the guess, step −1, comes with the first chunk unless that is of no steps
                 until = min(max(done, 0) + chunk, limit)
-                before, state = (
-                    state,
-                    step(task, state, int(until)),
-                )  # at once a state: an interrupt may come from here on
+                # in one assignment: an interrupt may come from here on, and the state before may be donated
+                before, state = state, step(task, state, int(until))
                 code, steps = Status(int(state.code)), int(state.step) - done
                 residuals.append(np.asarray(state.history)[:steps])
                 clock.count(time.perf_counter() - began, steps, task.grid.size)

@@ -198,7 +198,7 @@ def _two_players(chain, eps):
     assert model.discount > 0, "games without discount are tubes here"
     _, u, d = saddle(chain, value)
     stopped = np.zeros(chain.size, bool)
-    for _ in range(300):
+    for _ in range(5000):  # along a ridge of the outer player's H it only falls by 3 % a step: 700 steps, seed 11080
         value, u, d, stopped = _inner(chain, value, u, d, stopped)
         best, new_u, new_d = saddle(chain, value)
         here = chain.hamiltonian(value, u, d)

@@ -15,6 +15,7 @@ and P. Dupuis, Numerical Methods for Stochastic Control Problems in Continuous T
 """
 
 import dataclasses
+import functools
 import itertools
 from typing import Any
 
@@ -66,7 +67,6 @@ class Rates:
 
     def inflow(self, grid: Grid) -> "Rates":
         """The off-diagonal part of the transposed generator: what flows into x from x + o, as rates."""
-        # what jumps by o arrives from −o: the transposed entry of (x, x + o) stands in the row of x + o
         opposite = [tuple(-step for step in offset) for offset in self.offsets]
         arriving = [
             stencil.neighbour(c, grid, offset, ghost=False) for offset, c in zip(opposite, self.values, strict=True)
@@ -101,7 +101,6 @@ def rates(on: Discretisation, u: list, d: list | None = None) -> Rates:
     for other in others:  # jumps of one chain or of the other
         for offset, rate in _table(on, other, {}).items():
             table[offset] = table[offset] + rate
-    # full arrays, as whoever sweeps over them slices planes out of each
     values = tuple(jnp.broadcast_to(jnp.asarray(rate, on.dtype), grid.shape) for rate in table.values())
     return Rates(tuple(table), values, one_way=on.problem.noise is None and on.scheme.chain.one_way and not others)
 
@@ -111,9 +110,8 @@ def _table(on: Discretisation, f: list, a: dict[tuple[int, int], Any]) -> dict[O
     grid = on.grid
     table: dict[Offset, Any] = {}
     for axis, link in enumerate(links(on.chain)):
-        pair = axis_rates(
-            f[axis], correlated_noise.along_axis(a, grid, axis), on.scheme.chain, link, stencil.walls(grid, axis)
-        )
+        left = correlated_noise.along_axis(a, grid, axis)
+        pair = axis_rates(f[axis], left, on.scheme.chain, link, stencil.walls(grid, axis))
         for step, rate in zip((1, -1), pair, strict=True):
             # the projection: drift out of the box is dropped, and noise stays where the wall throws it back
             table[stencil.unit(grid, axis, step)] = jnp.where(stencil.wall(grid, axis, step), 0, rate)
@@ -129,10 +127,14 @@ def fastest_rate(on: Discretisation) -> jax.Array:
     Q is convex in u for a drift affine in u, so that corners of the sets suffice; samples are added for others.
     """
     result = jnp.zeros(on.grid.shape, on.dtype)
-    # in Python, since the probes are few: the corners of a box and nine samples, of a game their pairs
-    for u in sets.probes(on.problem.controls, on.dtype):
-        for d in sets.probes(on.problem.disturbances, on.dtype):
-            result = jnp.maximum(result, rates(on, u, d).total())
+    us, ds = (list(sets.probes(each, on.dtype)) for each in (on.problem.controls, on.problem.disturbances))
+    if on.apart:  # Q is a sum of what each player adds: pairs of probes would take twice the time to compile
+        mine = (_table(on, on.drifts(u, ds[0])[0], on.diffusion(u, ds[0])) for u in us)
+        theirs = (_table(on, on.drifts(us[0], d)[1], {}) for d in ds)
+        tables = ([sum(table.values()) for table in each] for each in (mine, theirs))
+        return result + sum(functools.reduce(jnp.maximum, totals) for totals in tables)
+    for u, d in itertools.product(us, ds):
+        result = jnp.maximum(result, rates(on, u, d).total())
     return result
 
 

@@ -160,19 +160,18 @@ def check_evaluation(evaluation: object, name: str) -> None:
     Raises:
       TypeError: with the evaluations that there are.
     """
-    # a class has the attributes of its instances: PolicyIteration(Krylov) without brackets would pass the protocol
-    if isinstance(evaluation, type) or not isinstance(evaluation, Evaluation):
-        wanted = "hjb.Sweeps(...), hjb.Krylov(...) or hjb.Direct()"
-        raise TypeError(f"{name} is {arguments.shown(evaluation)}; wanted {wanted}")
-    check_pytree(evaluation, name)
+    check_choice(evaluation, Evaluation, name, "hjb.Sweeps(...), hjb.Krylov(...) or hjb.Direct()")
 
 
-def check_pytree(value: object, name: str) -> None:
-    """Refuse, by ``name``, a class of the user's own that JAX takes for a leaf.
+def check_choice(value: object, protocol: type, name: str, wanted: str) -> None:
+    """Refuse, by ``name``, a value that lacks what a protocol asks for, or that JAX takes for a leaf.
 
     Raises:
-      TypeError: with the decorators that mend it.
+      TypeError: with the choices that are ``wanted``, or with the decorators that make a pytree of a class.
     """
+    # a class has the attributes of its instances: PolicyIteration(Krylov) without brackets would pass the protocol
+    if isinstance(value, type) or not isinstance(value, protocol):
+        raise TypeError(f"{name} is {arguments.shown(value)}; wanted {wanted}")
     if any(leaf is value for leaf in jax.tree.leaves(value)):
         raise TypeError(
             f"{name}: {type(value).__name__} is no pytree, which compiled programs want; decorate the class with "

@@ -39,7 +39,7 @@ from typing import Protocol, runtime_checkable
 import jax
 
 from hjbjax.iteration.bellman import PolicyEquation
-from hjbjax.iteration.evaluation import Evaluation, Sweeps, check_evaluation, check_pytree
+from hjbjax.iteration.evaluation import Evaluation, Sweeps, check_choice, check_evaluation
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import pytree_dataclass
@@ -207,8 +207,4 @@ def check_method(method: object, name: str) -> None:
     Raises:
       TypeError: with the methods that there are.
     """
-    # a class has the attributes of its instances: Nested(ValueIteration) without brackets would pass the protocol
-    if isinstance(method, type) or not isinstance(method, Method):
-        wanted = "hjb.PolicyIteration(...) or hjb.ValueIteration()"
-        raise TypeError(f"{name} is {arguments.shown(method)}; wanted {wanted}")
-    check_pytree(method, name)
+    check_choice(method, Method, name, "hjb.PolicyIteration(...) or hjb.ValueIteration()")

@@ -87,7 +87,7 @@ def drive(task: Task, guess: Nodes, clock: Clock, most: int | None = None) -> tu
 
 def _calls_back(task: Task) -> bool:
     """True if a step calls Python on the host, be it for a solve or in a function of the user's."""
-    evaluation = getattr(task.method, "evaluation", None)
+    evaluation = task.method.evaluation
     return (evaluation is not None and evaluation.calls_back) or checks.calls_back(task.problem, task.grid.ndim)
 
 
@@ -113,7 +113,7 @@ def _first_chunk(task: Task, clock: Clock) -> int:
     # the look is one pass over the nodes, a step with a linear solve hundreds: it is timed before one is begun
     if clock.per_node is None and nodes > MANY_NODES:
         return 0
-    evaluation = getattr(method, "evaluation", None)
+    evaluation = method.evaluation
     # a Krylov or direct solve takes more passes on finer grids, and so do the replies of a game: what a step took on a
     # coarser grid says nothing
     if task.problem.is_game or (evaluation is not None and not evaluation.rough):

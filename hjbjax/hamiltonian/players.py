@@ -88,7 +88,6 @@ class Players:
 
     Attributes:
       control, disturbance: the players.
-      separable: whether drift and cost are sums of what each player does, and noise is neither's.
       decoupled: whether H is a sum of what each player does on the grid, too: they drive different components, or each
         one's drift is upwinded by itself; then the Isaacs condition holds on every grid.
       disturbance_costs: whether the running cost depends on the disturbance.
@@ -98,7 +97,6 @@ class Players:
 
     control: Player
     disturbance: Player
-    separable: bool
     decoupled: bool
     disturbance_costs: bool
     steers_noise: bool
@@ -125,7 +123,7 @@ def find_players(problem: Problem, n: int, dtype: Any) -> Players:
     branches = 2 if problem.noise is None else 4  # central differences have three kinks a component
     return Players(
         _player(problem.controls, 1, found, branches), _player(problem.disturbances, -1, found, branches),
-        found.separable, found.separable and not found.meet, not found.cost.free_of(found.disturbance),
+        found.separable and not found.meet, not found.cost.free_of(found.disturbance),
         not found.noise.is_constant, problem.isaacs,
     )  # fmt: skip
 

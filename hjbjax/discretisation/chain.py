@@ -10,8 +10,9 @@ far as they stay monotone. Correlated noise moves along diagonals: a pair i, j g
 c^{±(e_i + e_j)} = a_ij⁺/(2 h_i h_j), c^{±(e_i − e_j)} = a_ij⁻/(2 h_i h_j), and takes |a_ij| h_i/h_j from a_ii.
 
 Q = Σ c, Δt = 1/max_u Q, the transition probabilities are c Δt, and the self-transition is 1 − Q Δt (the chapter
-prints (13.3) without the "1 −"). Drift that points out of the box is zeroed, noise reflects. Source: H. J. Kushner
-and P. Dupuis, Numerical Methods for Stochastic Control Problems in Continuous Time.
+prints (13.3) without the "1 −"). At a wall drift that points out of the box is cut off and noise reflects on the node:
+inwards at (e(n⁺) − h n)/h², n the drift outwards, see ``schemes``; a diagonal jump across goes to its mirror image.
+Source: H. J. Kushner and P. Dupuis, Numerical Methods for Stochastic Control Problems in Continuous Time.
 """
 
 import dataclasses
@@ -23,11 +24,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import correlated_noise, decision_process, edges, stationary_law, stencil
+from hjbjax.discretisation import correlated_noise, decision_process, edges, schemes, stationary_law, stencil
 from hjbjax.discretisation.cut_cells import links
 from hjbjax.discretisation.discretisation import Chain, Discretisation
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.discretisation.stencil import Links
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
@@ -74,18 +74,6 @@ class Rates:
         return Rates(tuple(opposite), tuple(arriving))
 
 
-def axis_rates(f: Any, a: Any, scheme: Chain, link: Links, wall: Any) -> tuple[Any, Any]:
-    """c_i^+ and c_i^- before the projection at the edges; where e and h f cancel, rounding leaves nothing negative."""
-    h_up, h_down = link.up, link.down
-    if a is None and scheme.one_way:  # the same numbers, without a difference
-        return jnp.maximum(f, 0) / h_up, jnp.maximum(-f, 0) / h_down
-    a = 0 if a is None else jnp.maximum(a, 0)  # along_axis may leave a rounding error below zero
-    e = scheme.excess(f, a, link, wall)
-    # e = h⁺ f in exact arithmetic, a rounding below it in floating point: a rate of −1e-17 is a negative probability
-    upward, downward = jnp.maximum(e + h_down * f, 0), jnp.maximum(e - h_up * f, 0)
-    return upward / (h_up * (h_up + h_down)), downward / (h_down * (h_up + h_down))
-
-
 def rates(on: Discretisation, u: list, d: list | None = None) -> Rates:
     """The jump rates under a policy of the monotone chain that goes with the scheme.
 
@@ -111,10 +99,10 @@ def _table(on: Discretisation, f: list, a: dict[tuple[int, int], Any]) -> dict[O
     table: dict[Offset, Any] = {}
     for axis, link in enumerate(links(on.chain)):
         left = correlated_noise.along_axis(a, grid, axis)
-        pair = axis_rates(f[axis], left, on.scheme.chain, link, stencil.walls(grid, axis))
-        for step, rate in zip((1, -1), pair, strict=True):
-            # the projection: drift out of the box is dropped, and noise stays where the wall throws it back
-            table[stencil.unit(grid, axis, step)] = jnp.where(stencil.wall(grid, axis, step), 0, rate)
+        upward, downward = schemes.weights(on.scheme.chain, f[axis], left, link, grid, axis)
+        for step, weight, length in ((1, upward, link.up), (-1, downward, link.down)):
+            beyond = stencil.wall(grid, axis, step)
+            table[stencil.unit(grid, axis, step)] = jnp.where(beyond, 0, weight / length)
     for (i, j), entry in a.items():
         if i != j:
             _add_diagonal_jumps(table, entry, grid, i, j)
@@ -139,15 +127,19 @@ def fastest_rate(on: Discretisation) -> jax.Array:
 
 
 def _add_diagonal_jumps(table: dict[Offset, Any], entry: Any, grid: Grid, i: int, j: int) -> None:
-    """A diagonal jump that would leave the box across one axis slides along the other: noise reflects."""
+    """A diagonal jump that would leave the box goes to the mirror image of its end: noise reflects."""
     scale = 2 * grid.spacing(i) * grid.spacing(j)
-    for step_i, step_j in itertools.product((1, -1), repeat=2):
-        rate = jnp.maximum(entry * (step_i * step_j), 0) / scale  # a_ij⁺ along the diagonal, a_ij⁻ across it
-        along_i, along_j = stencil.unit(grid, i, step_i), stencil.unit(grid, j, step_j)
-        off_i, off_j = stencil.wall(grid, i, step_i), stencil.wall(grid, j, step_j)
-        table[tuple(p + q for p, q in zip(along_i, along_j, strict=True))] = jnp.where(off_i | off_j, 0, rate)
-        table[along_j] = table[along_j] + jnp.where(off_i & ~off_j, rate, 0)
-        table[along_i] = table[along_i] + jnp.where(off_j & ~off_i, rate, 0)
+    pairs = list(itertools.product((1, -1), repeat=2))
+    # a_ij⁺ along the diagonal, a_ij⁻ across it
+    rate = {(p, q): jnp.maximum(entry * (p * q), 0) / scale for p, q in pairs}
+    for p, q in pairs:  # first across the walls of axis i, then, at a corner once more, across those of axis j
+        off = stencil.wall(grid, i, p)
+        rate[-p, q], rate[p, q] = rate[-p, q] + jnp.where(off, rate[p, q], 0), jnp.where(off, 0, rate[p, q])
+    for p, q in pairs:
+        off = stencil.wall(grid, j, q)
+        rate[p, -q], rate[p, q] = rate[p, -q] + jnp.where(off, rate[p, q], 0), jnp.where(off, 0, rate[p, q])
+    for p, q in pairs:
+        table[tuple(p * (k == i) + q * (k == j) for k in range(grid.ndim))] = rate[p, q]
 
 
 # --- exports, for other people's solvers: host level, float64, nodes in C order ---
@@ -227,10 +219,11 @@ def stationary_density(
 ) -> np.ndarray:
     """The density in which the chain under one policy is found after a long time: 𝓛*p = 0, integral one.
 
-    The chain's law over the nodes, divided by the cells that its rates belong to, in which a wall that reflects
-    stands half a spacing beyond the end of the box; then scaled to the integral one over the box itself,
-    ``np.sum(density * grid.volumes())``. Second order where central differences are monotone, first elsewhere; by
-    a sparse LU factorisation, see ``stationary_law``. Arguments are those of ``generator``.
+    The chain's law over the nodes, divided by the cells that its rates belong to: half cells at a wall on which noise
+    reflects, whole ones at an end of an axis without noise, which drift enters and leaves at |f|/h as inside. Then
+    scaled to the integral one over the box, ``np.sum(density * grid.volumes())``. Second order, up to the walls, where
+    central differences are monotone, first elsewhere; by a sparse LU factorisation, see ``stationary_law``. Arguments
+    are those of ``generator``.
 
     Returns:
       The density at the nodes, shape (*grid), in 1/(units of the states); zero where the chain never comes back.
@@ -254,10 +247,14 @@ def stationary_density(
     jumps = _under_policy(problem, grid, policy, disturbance, scheme, t)
     moves = stencil.sparse(jumps.offsets, jumps.values, -jumps.total(), grid)
     probabilities = decision_process.single_law(stationary_law.classes(moves), moves, grid)
-    density = probabilities.reshape(grid.shape)
+    u, d, _ = decision_process.policies(problem, grid, policy, disturbance)
     with jax.enable_x64(True):
-        for link in (stencil.links(cast(grid, np.float64), axis) for axis in range(grid.ndim)):
-            density = density / np.asarray((link.up + link.down) / 2)
+        on = Discretisation(*cast((problem, grid), np.float64), scheme, np.dtype(np.float64), t)
+        noise = on.diffusion(*cast((u, d), np.float64))
+        density = probabilities.reshape(grid.shape) / grid.volumes()
+        for axis in range(grid.ndim):
+            still = np.asarray(stencil.walls(grid, axis) & ~(jnp.asarray(noise.get((axis, axis), 0.0)) > 0))
+            density = np.where(still, density / 2, density)
     return density / np.sum(density * grid.volumes())
 
 

@@ -7,6 +7,8 @@ that is linear there. The link is cut to θh and ends on the boundary, where the
 chain: it jumps to the boundary at rates for the distance θh.
 """
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 
@@ -17,6 +19,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.types import Field
 from hjbjax.tracing import components
 
+KEPT = 200_000  # nodes up to which cut links are kept: 34 bytes a node and axis, and half the time of compiling
 SHORTEST = 1e-2  # of a spacing: a shorter link would only make the rates large
 ROUNDINGS = 16  # units of eps of the largest coordinate: 6 of a stretched axis, and a distance made of a few operations
 
@@ -46,6 +49,8 @@ def links(on: Discretisation) -> list[Links]:
     plain = [stencil.links(grid, axis) for axis in range(grid.ndim)]
     if not on.scheme.subcell or problem.target is None:
         return plain
+    if on.cut is not None:
+        return list(on.cut)
     x, here = on.coordinates(), level(on)
 
     def cut(axis: int, step: int, length: PerNode) -> tuple[Field, tuple[Field, Field]]:
@@ -64,8 +69,16 @@ def links(on: Discretisation) -> list[Links]:
     result = []
     for axis, link in enumerate(plain):
         (up, meets_up), (down, meets_down) = cut(axis, 1, link.up), cut(axis, -1, link.down)
-        result.append(Links(up, down, meets_up, meets_down))
+        # beyond a wall stands the mirror image of a link that is cut
+        mirrored = jnp.where(stencil.wall(grid, axis, 1), down, up), jnp.where(stencil.wall(grid, axis, -1), up, down)
+        result.append(Links(*mirrored, meets_up, meets_down))
     return result
+
+
+def kept(on: Discretisation) -> Discretisation:
+    """The discretisation with its cut links at hand, on grids where they take little room."""
+    wanted = on.scheme.subcell and on.problem.target is not None and on.grid.size <= KEPT
+    return dataclasses.replace(on, cut=tuple(links(on))) if wanted else on
 
 
 def _across_seam(coordinate: jax.Array, grid: Grid, axis: int) -> jax.Array:

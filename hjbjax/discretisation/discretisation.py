@@ -64,17 +64,18 @@ class Chain(Scheme, Protocol):
 
         [(e + h⁻ f) D⁺ − (e − h⁺ f) D⁻]/(h⁺ + h⁻),    e ≥ max(a, h⁺ f, −h⁻ f),
 
-    with distances h⁺ and h⁻ to the two neighbours. ``schemes`` tells how to write one.
+    with distances h⁺ and h⁻ to the two neighbours; e(f) rises by at most h|f|. What a wall makes of it, and how to
+    write one, is told in ``schemes``.
     """
 
     @property
     def one_way(self) -> bool:
         """Whether e = max(h⁺ f, −h⁻ f) without noise, so that of two opposite jumps one has no rate."""
 
-    def excess(self, f: Any, a: Any, link: Links, wall: Any) -> Any:
-        """e, the diffusion along an axis; at a ``wall``, bool (*grid), noise reflects and drift out of it drops."""
+    def excess(self, f: Any, a: Any, link: Links) -> Any:
+        """e, the diffusion along an axis."""
 
-    def kinks(self, a: Any, slopes: tuple[Any, Any], link: Links, wall: Any) -> tuple[Sequence[Any], Sequence[Any]]:
+    def kinks(self, a: Any, slopes: tuple[Any, Any], link: Links) -> tuple[Sequence[Any], Sequence[Any]]:
         """The drifts f, in order, at which the gain's derivative jumps, and the derivatives between them: one more.
 
         ``slopes`` are D⁺ and D⁻. At most three kinks.
@@ -94,6 +95,10 @@ class Discretisation:
       scheme: how derivatives are made.
       dtype: the floating-point type of all node values.
       t: the time, which matters if the problem's functions depend on it.
+      plain: whether the one-sided differences take the place of the scheme's slopes, as a number, so that one program
+        serves the scheme and, without noise, its chain; None: never.
+      cut: the links that end on the boundary of a target, kept by ``cut_cells``; None: made anew wherever they are
+        wanted.
     """
 
     problem: Problem
@@ -101,6 +106,8 @@ class Discretisation:
     scheme: Scheme
     dtype: Any
     t: Any = 0.0
+    plain: Any = None
+    cut: tuple[Links, ...] | None = None
 
     def __post_init__(self):
         # jnp.float32 and "float32" are other keys than np.dtype: one program would be compiled for each
@@ -109,19 +116,20 @@ class Discretisation:
     @property
     def chain(self) -> "Discretisation":
         """The monotone chain that goes with the scheme."""
-        return dataclasses.replace(self, scheme=self.scheme.chain)
+        return dataclasses.replace(self, scheme=self.scheme.chain, plain=None)
 
     def at(self, t: Any) -> "Discretisation":
         """The discretisation at another time."""
-        return dataclasses.replace(self, t=t)
+        return dataclasses.replace(self, t=t, cut=None)
 
     def asking(self, problem: Problem) -> "Discretisation":
         """The discretisation of another problem."""
-        return dataclasses.replace(self, problem=problem)
+        same = problem.target is self.problem.target and problem.exit_cost is self.problem.exit_cost
+        return dataclasses.replace(self, problem=problem, cut=self.cut if same else None)
 
     def on_grid(self, grid: Grid) -> "Discretisation":
         """The discretisation on another grid."""
-        return dataclasses.replace(self, grid=grid)
+        return dataclasses.replace(self, grid=grid, cut=None)
 
     def coordinates(self) -> list:
         """The n coordinates of all nodes, each of a shape that broadcasts to (*grid)."""
@@ -200,6 +208,7 @@ class Differences:
       value: V, (*grid).
       links: the distances to the neighbours along every axis.
       one_sided: D⁺ and D⁻ along every axis, each (*grid); zero across a wall.
+      lost: the nodes without a finite value, far above all others, bool (*grid); None where there is none.
     """
 
     on: Discretisation
@@ -207,3 +216,4 @@ class Differences:
     value: jax.Array
     links: tuple[Links, ...]
     one_sided: tuple[tuple[jax.Array, jax.Array], ...]
+    lost: jax.Array | None = None

@@ -47,10 +47,10 @@ and where the gain of a drift component has kinks; its answers are certified. On
     ...     def slopes(self, around):
     ...         return around.one_sided
     ...
-    ...     def excess(self, f, a, link, wall):
+    ...     def excess(self, f, a, link):
     ...         return a + self.speed * link.up + 0 * f
     ...
-    ...     def kinks(self, a, slopes, link, wall):
+    ...     def kinks(self, a, slopes, link):
     ...         return (), (sum(slopes) / 2,)  # central differences, whatever the drift
     >>> problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x + u @ u, hjb.Box([-2.0], [2.0]), discount=1.0)
     >>> solution = hjb.solve(problem, hjb.Grid([-1.0], [1.0], (201,)), scheme=LaxFriedrichs(2.0))
@@ -59,6 +59,17 @@ and where the gain of a drift component has kinks; its answers are certified. On
 
 The exact value is (√5 − 1)/8 = .155: so much diffusion is dear. Such a class must be hashable, for
 compiled programs are remembered by it, and its methods are traced: no branches on numbers.
+
+What happens at a wall is not the scheme's to say. The wall stands on the node, whose cell is half a cell. With noise a,
+drift n out of the box (f at an upper end, −f at a lower one) and ∂V/∂n = 0 on the wall, the balance over that cell is
+
+    (h/2)(βV − L) = −(a/2h − n/2)(V_N − V_{N−1}),      so that the chain leaves inwards at the rate (a − h n)/h²:
+
+the mirrored neighbour V_{N+1} = V_{N−1}, a/h² (V_{N−1} − V_N), and the drift on the inner difference. In V the drift
+matters little, O(h) at one node and so O(h²), whichever way it is taken. In the law of the chain outward drift has to
+hold noise back as inward drift helps it: then p_N/p_{N−1} = (a + h n)/(a − h n), as between two nodes inside. A chain
+takes (e(n⁺) − h n)/h², with e for as much of the drift as leaves: never negative, |n|/h for n < 0 without noise, and
+zero for n > 0, which is cut off.
 """
 
 import itertools
@@ -69,13 +80,47 @@ import jax
 import jax.numpy as jnp
 
 from hjbjax.discretisation import correlated_noise, slopes, stencil
-from hjbjax.discretisation.discretisation import Differences, Scheme
+from hjbjax.discretisation.discretisation import Chain, Differences, Discretisation, Scheme
 from hjbjax.discretisation.stencil import Links
 from hjbjax.problem import arguments, sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import pytree_dataclass
 
 Slopes = Sequence[tuple[jax.Array, jax.Array]]
+
+
+def weights(scheme: Chain, f: Any, a: Any, link: Links, grid: Grid, axis: int) -> tuple[Any, Any]:
+    """The weights w⁺, w⁻ of the gain w⁺ D⁺ − w⁻ D⁻ of drift f and noise a (None: none) along an axis, not negative.
+
+    (e + h⁻ f)/(h⁺ + h⁻) and (e − h⁺ f)/(h⁺ + h⁻), at a wall over h; the chain jumps at the rates w⁺/h⁺ and w⁻/h⁻. What
+    leads across a wall has no meaning: the difference is zero there.
+    """
+    if a is None and scheme.one_way:  # the same numbers, without a difference
+        return jnp.maximum(f, 0), jnp.maximum(-f, 0)
+    a = 0 if a is None else jnp.maximum(a, 0)  # correlated noise may leave a rounding error below zero
+    leaving, span = f, link.up + link.down
+    lower, upper = stencil.wall(grid, axis, -1), stencil.wall(grid, axis, 1)
+    if lower.any() or upper.any():  # the link beyond is the mirror image of the one inside
+        leaving = jnp.where(upper, jnp.maximum(f, 0), jnp.where(lower, jnp.minimum(f, 0), f))
+        span = jnp.where(upper | lower, link.up, span)
+    e = scheme.excess(leaving, a, link)
+    # e = h⁺ f in exact arithmetic may be a rounding below it: a rate of −1e-17 is a negative probability
+    return jnp.maximum(e + link.down * f, 0) / span, jnp.maximum(e - link.up * f, 0) / span
+
+
+def kinks(
+    scheme: Chain, a: Any, slopes: tuple[Any, Any], link: Links, grid: Grid, axis: int
+) -> tuple[Sequence[Any], Sequence[Any]]:
+    """The drifts at which the derivative of the gain of ``weights`` jumps, and its derivatives: one more."""
+    found, derivatives = scheme.kinks(a, slopes, link)
+    wall = stencil.walls(grid, axis)
+    if not wall.any():
+        return found, derivatives
+    # over half a cell twice the derivative where drift leaves, the inner difference where it does not: the lesser,
+    # since e rises by at most h n
+    inner = slopes[0] + slopes[1]
+    doubled = [jnp.where(jnp.abs(2 * d) > jnp.abs(inner), inner, 2 * d) for d in derivatives]
+    return found, [jnp.where(wall, new, d) for new, d in zip(doubled, derivatives, strict=True)]
 
 
 def check(scheme: Any, name: str, grid: Grid, *, stationary: bool = False) -> None:
@@ -87,7 +132,7 @@ def check(scheme: Any, name: str, grid: Grid, *, stationary: bool = False) -> No
     """
     own = isinstance(scheme, Scheme) and not isinstance(scheme, type) and type(scheme).__hash__ is not None
     if not own or (stationary and not scheme.stationary):
-        offered = "hjb.Upwind(...) or hjb.Limited()" if stationary else "hjb.Upwind(), Limited(), Eno2() or Weno5()"
+        offered = f"hjb.Upwind(), Limited(), {'Eno2() ' * (not stationary)}or Weno5()"
         raise TypeError(f"{name} is {arguments.shown(scheme)}; wanted {offered}")
     if scheme.even and any(each is not None for each in grid.stretch or ()):
         caller = name.partition(":")[0]
@@ -135,20 +180,18 @@ class Upwind:
         """The one-sided differences as they are."""
         return around.one_sided
 
-    def excess(self, f: Any, a: Any, link: Links, wall: Any) -> Any:
+    def excess(self, f: Any, a: Any, link: Links) -> Any:
         """a + h⁺ f⁺ + h⁻ f⁻, or as far as the chain stays monotone with central differences the larger of the two."""
         least = jnp.maximum(link.up * f, -link.down * f)
-        # at a wall the projection of the drift wants drift and noise apart
-        return jnp.where(wall, a + least, jnp.maximum(a, least)) if self.central else a + least
+        return jnp.maximum(a, least) if self.central else a + least
 
-    def kinks(self, a: Any, slopes: tuple[Any, Any], link: Links, wall: Any) -> tuple[Sequence[Any], Sequence[Any]]:
+    def kinks(self, a: Any, slopes: tuple[Any, Any], link: Links) -> tuple[Sequence[Any], Sequence[Any]]:
         """f = 0; with central differences also f = −a/h⁻ and a/h⁺, between which the derivative is their mean."""
         up, down = slopes
         if not self.central:
             return (0.0,), (down, up)
         middle = (link.down * up + link.up * down) / (link.up + link.down)
-        kinks = (jnp.where(wall, 0, -a / link.down), 0.0, jnp.where(wall, 0, a / link.up))
-        return kinks, (down, jnp.where(wall, down, middle), jnp.where(wall, up, middle), up)
+        return (-a / link.down, 0.0, a / link.up), (down, middle, middle, up)
 
 
 @pytree_dataclass(static=("subcell", "split"))
@@ -185,25 +228,26 @@ class Limited:
         found = [stencil.limited(*pair, grid, axis, link) for axis, (pair, link) in enumerate(pairs)]
         if around.on.problem.noise is None:
             return found
-        for axis, calm in enumerate(_calm(around)):
+        for axis, quiet in enumerate(calm(around.on, around.x, around.links)):
             (up, down), link = pairs[axis]
-            inner = calm & ~stencil.walls(grid, axis)  # at a wall one of the two neighbours is not there
             middle = (link.down * up + link.up * down) / (link.up + link.down)
-            found[axis] = (jnp.where(inner, middle, found[axis][0]), jnp.where(inner, middle, found[axis][1]))
+            # at a wall the inner difference, as in ``weights``; the other one is zero
+            middle = jnp.where(stencil.walls(grid, axis), up + down, middle)
+            found[axis] = (jnp.where(quiet, middle, found[axis][0]), jnp.where(quiet, middle, found[axis][1]))
         return found
 
 
-def _calm(around: Differences) -> list:
+def calm(on: Discretisation, x: list, links: Sequence[Links]) -> list:
     """Where central differences are monotone under all representative actions, along every axis."""
-    on, problem = around.on, around.on.problem
+    problem = on.problem
     # whether H is central must not depend on the action that is tried, or its kinks would move with it
-    calm: list = [True] * on.grid.ndim
+    found: list = [True] * on.grid.ndim
     for u, d in itertools.product(sets.probes(problem.controls, on.dtype), sets.probes(problem.disturbances, on.dtype)):
-        f, a = on.drift(u, d, around.x), on.diffusion(u, d, around.x)
-        for axis, link in enumerate(around.links):
+        f, a = on.drift(u, d, x), on.diffusion(u, d, x)
+        for axis, link in enumerate(links):
             left = correlated_noise.along_axis(a, on.grid, axis)
-            calm[axis] &= left >= jnp.maximum(link.up, link.down) * jnp.abs(f[axis])
-    return calm
+            found[axis] &= left >= jnp.maximum(link.up, link.down) * jnp.abs(f[axis])
+    return found
 
 
 @pytree_dataclass()
@@ -228,22 +272,35 @@ class Eno2:
         return slopes.eno2(around.value, around.on.grid)
 
 
-@pytree_dataclass()
+@pytree_dataclass(static=("subcell", "split"))
 class Weno5:
-    """Fifth order where the value is smooth, for ``march``: weighted essentially non-oscillatory slopes.
+    """Fifth order where the value is smooth: weighted essentially non-oscillatory slopes.
 
     Each one-sided slope is a mean of three third-order ones with weights that favour the smoothest (see ``slopes``).
-    Wants equal spacings and at least seven points an axis.
+    Wants equal spacings and at least seven points an axis. Where some of the seven nodes around one lie in a target, or
+    have no finite value, the slopes are those of ``Limited``. A stationary problem is solved as by ``Limited``, without
+    a certificate; noise is seen by central differences, of order 2.
+
+    Args:
+      subcell: as for ``Limited``.
+      split: as for ``Upwind``.
     """
 
-    monotone, stationary, even, subcell, split = False, False, True, False, True
+    subcell: bool = True
+    split: bool = True
+    monotone, stationary, even = False, True, True
     stages, points = 3, 7
 
     @property
     def chain(self) -> Upwind:
-        """The monotone chain with the same fastest rate."""
-        return Upwind(split=True)
+        """The monotone chain with the same fastest rate, whose matrix makes the corrections."""
+        return Upwind(subcell=self.subcell, split=self.split)
 
     def slopes(self, around: Differences) -> Slopes:
-        """A mean of three stencils with weights that favour the smoothest."""
-        return slopes.weno5(around.value, around.on.grid)
+        """A mean of three stencils with weights that favour the smoothest; limited slopes beside what breaks them."""
+        grid, found = around.on.grid, slopes.weno5(around.value, around.on.grid, around.lost)
+        for axis, (pair, link) in enumerate(zip(around.one_sided, around.links, strict=True)):
+            if (broken := slopes.broken(link, grid, axis, around.lost)) is not None:
+                near, (up, down) = stencil.limited(*pair, grid, axis, link), found[axis]
+                found[axis] = jnp.where(broken, near[0], up), jnp.where(broken, near[1], down)
+        return found

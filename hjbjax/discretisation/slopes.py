@@ -1,4 +1,4 @@
-"""One-sided slopes of order 2 and 5 on equal spacings, for marching: ENO and WENO.
+"""One-sided slopes of order 2 and 5 on equal spacings: ENO and WENO.
 
 With the differences D to both sides of a node and their differences s, second order takes the smoother stencil,
 
@@ -24,9 +24,9 @@ import jax
 import jax.numpy as jnp
 
 from hjbjax.discretisation import stencil
-from hjbjax.discretisation.stencil import PerNode
+from hjbjax.discretisation.stencil import Links, PerNode
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.types import Field
+from hjbjax.problem.types import AtNodes, Field, Mask
 
 EPSILON = 1e-6  # of a squared slope over the typical one: what counts as equally smooth
 
@@ -42,10 +42,14 @@ def eno2(values: Field, grid: Grid) -> list[tuple[Field, Field]]:
     return result
 
 
-def weno5(values: Field, grid: Grid) -> list[tuple[Field, Field]]:
-    """The slopes from above and from below along every axis, each of shape (*grid); zero across a wall."""
+def weno5(values: Field, grid: Grid, lost: Mask | None = None) -> list[tuple[Field, Field]]:
+    """The slopes from above and from below along every axis, each of shape (*grid); zero across a wall.
+
+    Values at the nodes that are ``lost`` are no values and set no unit.
+    """
+    most, least = (values, values) if lost is None else (jnp.where(lost, fill, values) for fill in (-jnp.inf, jnp.inf))
     # it only sets the unit of ε: no derivative goes through the nodes of the largest and the least V
-    extent = jax.lax.stop_gradient(jnp.max(values) - jnp.min(values))
+    extent = jax.lax.stop_gradient(jnp.max(most) - jnp.min(least))
     extent = jnp.where(extent > 0, extent, 1)  # a constant V has slopes zero in any unit
     result = []
     for axis in range(grid.ndim):
@@ -55,6 +59,23 @@ def weno5(values: Field, grid: Grid) -> list[tuple[Field, Field]]:
         above, below = typical * _weighted(*steps[:0:-1]), typical * _weighted(*steps[:-1])
         result.append(stencil.stopped(above, below, grid, axis))
     return result
+
+
+def broken(link: Links, grid: Grid, axis: int, lost: Mask | None = None) -> AtNodes | None:
+    """The nodes whose seven values along an axis are not of one piece: some lie in a target, or are ``lost``."""
+    found = None if lost is None else _spread(jnp.asarray(lost), grid, axis, 3)
+    if link.meets_up is None or link.meets_down is None:
+        return found
+    near = _spread(link.meets_up[0] | link.meets_down[0], grid, axis, 2)  # of the last free node before a target
+    return near if found is None else found | near
+
+
+def _spread(mask: AtNodes, grid: Grid, axis: int, reach: int) -> AtNodes:
+    """The nodes at most ``reach`` away along an axis from one of a mask."""
+    for _ in range(reach):
+        up, down = (stencil.neighbour(mask, grid, stencil.unit(grid, axis, step)) for step in (1, -1))
+        mask = mask | up | down
+    return mask
 
 
 def _smaller(a: Field, b: Field) -> Field:

@@ -1,11 +1,12 @@
 """Neighbours and one-sided differences on a grid, with ghost cells.
 
-Beyond an edge that is not periodic stands a copy of the edge node: a one-sided difference across the edge is
-zero, which projects outward drift back onto the box and reflects noise. Beyond an open end the value goes on as the
-parabola through its last three nodes, V_{N+1} = 3V_N − 3V_{N−1} + V_{N−2} where they are equally spaced.
+An edge that is neither periodic nor open is a wall on its node. Drift sees a copy of the node beyond it, a one-sided
+difference of zero, which projects outward drift back onto the box. Noise sees the mirror image, V_{N+1} = V_{N−1}: the
+reflected path has ∂V/∂n = 0 there, and a value that is even about the wall has it to second order, where the copy
+puts the wall half a spacing further out. Beyond an open end the value goes on as the parabola through its last three
+nodes, V_{N+1} = 3V_N − 3V_{N−1} + V_{N−2} where they are equally spaced.
 """
 
-import dataclasses
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -14,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import AtNodes, Field, Number
 
 if TYPE_CHECKING:
@@ -48,6 +50,12 @@ def stopped(up: Field, down: Field, grid: Grid, axis: int) -> tuple[Field, Field
     return jnp.where(wall(grid, axis, 1), 0, up), jnp.where(wall(grid, axis, -1), 0, down)
 
 
+def bends(up: Field, down: Field, grid: Grid, axis: int) -> Field:
+    """D⁺ − D⁻, which noise sees: across a wall stands the mirror image, −D⁻ for D⁺ and −D⁺ for D⁻."""
+    bend = up - down
+    return jnp.where(walls(grid, axis), 2 * bend, bend)  # one of the two is zero there
+
+
 def parabola(grid: Grid, axis: int, step: int) -> tuple[Number, Number, Number]:
     """The weights of the last node and of the two before it in the value beyond an end; their sum is one.
 
@@ -62,14 +70,21 @@ def parabola(grid: Grid, axis: int, step: int) -> tuple[Number, Number, Number]:
     return 2 + bend, -(1 + bend + bend * ratio), bend * ratio
 
 
-def continued(values: Field, grid: Grid, offset: tuple[int, ...]) -> Field:
-    """V at x + offset for every node x, shape (*grid): beyond open ends the parabola, else as in ``neighbour``."""
-    if not grid.sides("open"):
+def continued(values: Field, grid: Grid, offset: tuple[int, ...], *, mirror: bool = False) -> Field:
+    """V at x + offset for every node x, shape (*grid): beyond open ends the parabola, else as in ``neighbour``.
+
+    With ``mirror`` beyond a wall the mirror image, which noise sees.
+    """
+    if not (grid.sides("open") or mirror):
         return neighbour(values, grid, offset)
-    for axis, step in enumerate(offset):  # beyond a corner: the parabola of one axis through those of the other
+    for axis, step in enumerate(offset):  # beyond a corner: what one axis says through what the other says
         moved = neighbour(values, grid, unit(grid, axis, step))
         if step and (axis, step) in grid.sides("open"):
             moved = jnp.where(on_edge(grid, axis, step), _beyond(values, grid, axis, step), moved)
+        elif step and mirror and not grid.periodic[axis]:  # type: ignore[index]
+            inside = grid.shape[axis] - 2 if step > 0 else 1
+            image = jax.lax.slice_in_dim(values, inside, inside + 1, axis=axis)
+            moved = jnp.where(on_edge(grid, axis, step), image, moved)
         values = moved
     return values
 
@@ -139,7 +154,7 @@ def unit(grid: Grid, axis: int, step: int) -> tuple[int, ...]:
     return tuple(step if i == axis else 0 for i in range(grid.ndim))
 
 
-@dataclasses.dataclass(frozen=True)
+@pytree_dataclass()
 class Links:
     """Distances from each node to its two neighbours along one axis; all entries broadcast.
 
@@ -161,7 +176,7 @@ def links(grid: Grid, axis: int) -> Links:
         return Links(grid.spacing(axis), grid.spacing(axis))
     gaps = jnp.diff(jnp.asarray(grid.axis(axis)))
     along = [-1 if i == axis else 1 for i in range(grid.ndim)]
-    # N − 1 gaps for N nodes: what an end's missing link is divided into is zero, or a parabola over a gap as long
+    # N − 1 gaps for N nodes: beyond an end stands the mirror image, or a parabola over a gap as long
     return Links(jnp.append(gaps, gaps[-1:]).reshape(along), jnp.append(gaps[:1], gaps).reshape(along))
 
 

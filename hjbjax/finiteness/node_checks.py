@@ -19,7 +19,7 @@ from hjbjax.discretisation.schemes import Upwind
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.types import Array, DType, Mask, Numbers, Scalar
+from hjbjax.problem.types import Array, DType, Mask, Numbers, Scalar, Verdict
 from hjbjax.solution.clock import Clock
 from hjbjax.tracing import components
 from hjbjax.tracing.checks import OF_ACTION, STATE_COSTS, call
@@ -103,7 +103,7 @@ def _all_pass(on: Discretisation, actions: tuple[np.ndarray, np.ndarray], clock:
 
 
 @jax.jit
-def _actions_pass(on: Discretisation, actions: tuple[Array, Array], first: int | Scalar, last: int | Scalar) -> Scalar:
+def _actions_pass(on: Discretisation, actions: tuple[Array, Array], first: int | Scalar, last: int | Scalar) -> Verdict:
     """True if nothing is refused of the actions from ``first`` to before ``last``; with the first, of the state."""
     # the state is looked at once, with the first lot
     amiss = jax.lax.cond(first == 0, lambda: _state_fails(on), lambda: jnp.zeros((), bool))
@@ -117,7 +117,7 @@ def _actions_pass(on: Discretisation, actions: tuple[Array, Array], first: int |
     return ~jax.lax.fori_loop(first, last, look, amiss)
 
 
-def _state_fails(on: Discretisation) -> Scalar:
+def _state_fails(on: Discretisation) -> Verdict:
     """True if ``values`` refuses numbers that the functions of the state alone return."""
     problem = on.problem
     amiss, inside = jnp.zeros((), bool), jnp.ones((), bool)

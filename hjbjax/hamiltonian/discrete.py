@@ -22,7 +22,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax.discretisation import correlated_noise, cut_cells, edges, stencil
+from hjbjax.discretisation import correlated_noise, cut_cells, edges, schemes, stencil
 from hjbjax.discretisation.discretisation import Differences, Discretisation
 from hjbjax.hamiltonian.piecewise import Kinked, inverse_root, kinked_ball, piecewise_input, piecewise_pair
 from hjbjax.hamiltonian.players import SAMPLES, Player, players_of, shared
@@ -46,7 +46,7 @@ class DiscreteHamiltonian:
       value: V at the nodes.
       up, down: the slopes that drift sees; D⁺ and D⁻, or those of a scheme of higher order.
       links: the distances to the neighbours along every axis.
-      bends: D⁺ − D⁻ along every axis, which noise sees.
+      bends: D⁺ − D⁻ along every axis, which noise sees, with the mirror image across a wall.
       tried: an action of each player that is a candidate beside the samples; with the actions of the last step
         among them a sampled policy never gets worse.
       slack: for every axis what is rounding of the drift; None without constrained ends and lost nodes.
@@ -89,12 +89,10 @@ class DiscreteHamiltonian:
         scheme, link = self.on.scheme, self.links[axis]
         if a is None and (scheme.chain.one_way or not scheme.monotone):
             return upwind
-        h_up, h_down = link.up, link.down
-        a = 0 if a is None else jnp.maximum(a, 0)  # correlated noise may leave a rounding error below zero
         if not scheme.monotone:  # noise is central already: only the drift has slopes of higher order
-            return upwind + a * self.bends[axis] / (h_up + h_down)
-        e = scheme.chain.excess(f, a, link, stencil.walls(self.on.grid, axis))
-        upward, downward = (e + h_down * f) / (h_up + h_down), (e - h_up * f) / (h_up + h_down)
+            # correlated noise may leave a rounding error below zero
+            return upwind + jnp.maximum(a, 0) * self.bends[axis] / (link.up + link.down)
+        upward, downward = schemes.weights(scheme.chain, f, a, link, self.on.grid, axis)
         return upward * self.up[axis] - downward * self.down[axis]
 
     def at(self, u: Action, d: Action) -> Any:
@@ -116,7 +114,9 @@ class DiscreteHamiltonian:
         """What the jumps along the two diagonals of a pair of axes add for a_ij = ``entry``."""
         grid = self.on.grid
         ends = {
-            (p, q): stencil.continued(self.value, grid, tuple(p * (k == i) + q * (k == j) for k in range(grid.ndim)))
+            (p, q): stencil.continued(
+                self.value, grid, tuple(p * (k == i) + q * (k == j) for k in range(grid.ndim)), mirror=True
+            )
             for p, q in itertools.product((1, -1), repeat=2)
         }
         # for a_ij > 0 the state moves along (1, 1) and (−1, −1), else along (1, −1) and (−1, 1)
@@ -145,8 +145,11 @@ def around(on: Discretisation, value: jax.Array, lost: jax.Array | None = None) 
     x, value = jax.lax.optimization_barrier((on.coordinates(), value))
     links = tuple(cut_cells.links(on))
     differences = tuple(stencil.one_sided(value, grid, axis, link) for axis, link in enumerate(links))
-    bends = tuple(up - down for up, down in differences)
-    up, down = zip(*on.scheme.slopes(Differences(on, x, value, links, differences)), strict=True)
+    bends = tuple(stencil.bends(*pair, grid, axis) for axis, pair in enumerate(differences))
+    slopes = on.scheme.slopes(Differences(on, x, value, links, differences, lost))
+    if on.plain is not None:
+        slopes = jax.tree.map(lambda first, better: jnp.where(on.plain, first, better), list(differences), list(slopes))
+    up, down = zip(*slopes, strict=True)
     # only constrained ends and lost nodes ask what of a drift is rounding, which costs a look at its terms
     careful = lost is not None or grid.sides("constrained")
     slack = tuple(edges.slack(on)) if careful else None
@@ -328,5 +331,4 @@ def _kinked(
     if not scheme.monotone or (left is None and scheme.chain.one_way):  # f⁺ P⁺ + f⁻ P⁻ has its kink where f turns
         return Kinked(gain, offset, slope, (0.0,), (down, up))
     width = 0 if left is None else jnp.maximum(left, 0)
-    wall = stencil.walls(hamiltonian.on.grid, axis)
-    return Kinked(gain, offset, slope, *scheme.chain.kinks(width, (up, down), link, wall))
+    return Kinked(gain, offset, slope, *schemes.kinks(scheme.chain, width, (up, down), link, hamiltonian.on.grid, axis))

@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.problem.problem import Problem
@@ -53,7 +54,7 @@ class Player:
 
         def along(*arguments: Any) -> Any:
             action = jnp.asarray(arguments[position])
-            unit = jnp.zeros_like(action).at[j].set(1)
+            unit = np.asarray(np.arange(action.size) == j, action.dtype)
 
             def moved(s: Any) -> Any:
                 result = function(*arguments[:position], action + s * unit, *arguments[position + 1 :])

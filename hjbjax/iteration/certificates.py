@@ -38,7 +38,7 @@ class Certificate(enum.Enum):
     ADDITIVE = "from the discount, V + min r/β ≤ V_h ≤ V + max r/β"
     MULTIPLICATIVE = "from the running cost, V/(1 + η) ≤ V_h ≤ V/(1 − ρ)"
     BY_DISCOUNT = "from the discount where that is positive, else from the running cost"
-    RESIDUAL = "the second-order equation, whose residual this is, has no comparison principle"
+    RESIDUAL = "the high-order equation, whose residual this is, has no comparison principle"
     OPEN = "open ends continue the value from inside, and have no comparison principle"
     NONE = "without discount and positive running cost the residual bounds nothing"
 

@@ -51,7 +51,7 @@ OPEN_FRACTION = 1e-8  # of the residual, to which a Krylov method goes with open
 
 @runtime_checkable
 class Evaluation(Protocol):
-    """A solver of the linear equation of a policy: a value, frozen and hashable or a pytree."""
+    """A solver of the linear equation of a policy: a value that JAX knows as a pytree."""
 
     @property
     def rough(self) -> bool:
@@ -167,11 +167,20 @@ def check_choice(value: object, protocol: type, name: str, wanted: str) -> None:
     """Refuse, by ``name``, a value that lacks what a protocol asks for, or that JAX takes for a leaf.
 
     Raises:
-      TypeError: with the choices that are ``wanted``, or with the decorators that make a pytree of a class.
+      TypeError: with the choices that are ``wanted``, or how to make a pytree of a class.
     """
     # a class has the attributes of its instances: PolicyIteration(Krylov) without brackets would pass the protocol
     if isinstance(value, type) or not isinstance(value, protocol):
         raise TypeError(f"{name} is {arguments.shown(value)}; wanted {wanted}")
+    check_pytree(value, name)
+
+
+def check_pytree(value: object, name: str) -> None:
+    """Refuse, by ``name``, a value that JAX takes for a leaf.
+
+    Raises:
+      TypeError: with the decorators that make a pytree of a class.
+    """
     if any(leaf is value for leaf in jax.tree.leaves(value)):
         raise TypeError(
             f"{name}: {type(value).__name__} is no pytree, which compiled programs want; decorate the class with "

@@ -3,14 +3,14 @@
 Every method repeats the same step. At V the greedy policy leaves a residual; the linear equation of that
 policy gives a correction δ; V + δ is the next value. What differs is how well the equation is solved: value
 iteration takes its diagonal with the largest rate (monotone, a contraction), modified policy iteration a few
-Gauss–Seidel sweeps, policy iteration (Howard; semismooth Newton) solves it. In a game the outer player's policy
-is kept while the inner player's problem is improved (Hoffman–Karp); improving both at once may cycle.
+Gauss–Seidel sweeps, policy iteration (Howard; semismooth Newton) solves it. In a game see ``hoffman_karp``.
 
 The loop stops by the certificate of the value it returns, not by the size of a step, and tests finiteness: a
 NaN residual is never taken for convergence.
 """
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -89,6 +89,11 @@ class Task:
         return dataclasses.replace(self, on=self.on.asking(problem))
 
     @property
+    def plain(self) -> Any:
+        """Whether this is the chain, to which the certificate belongs; traced where one program serves both."""
+        return self.scheme.monotone if self.on.plain is None else self.on.plain
+
+    @property
     def lost(self) -> jax.Array | None:
         """The nodes to which no action may lead, bool (*grid), or None."""
         return ~self.counted if self.has_lost else None
@@ -126,23 +131,18 @@ class Task:
         zero = jnp.zeros(self.grid.shape, self.tol.dtype)
         if not self.constrained or self.certificate is Certificate.ADDITIVE:
             return zero
-        floor, stop = self.obstacles.lower, self.obstacles.upper
-        start = floor if stop is None else stop if floor is None else jnp.maximum(floor, stop)
-        assert start is not None
+        limits = [limit for limit in (self.obstacles.lower, self.obstacles.upper) if limit is not None]
+        start = functools.reduce(jnp.maximum, limits)
         return jnp.asarray(jnp.broadcast_to(start, self.grid.shape), self.tol.dtype)
 
 
 @pytree_dataclass()
 class State:
-    """State of a solve: a value, its greedy policy, its certificate, and the loop's book-keeping.
-
-    ``fastest`` is the policy's largest Q + β, zero where every rate counts (under a discount), infinite before the look
-    at a guess.
-    """
+    """State of a solve: a value, its greedy policy, its certificate, and the loop's book-keeping."""
 
     value: Field
     policy: Greedy
-    fastest: Scalar
+    fastest: Scalar  # the policy's largest Q + β; zero where every rate counts, infinite before the look at a guess
     bound: ErrorBound
     step: Scalar
     best: jax.Array  # the least error and the least residual so far, (2,): either one is progress
@@ -160,9 +160,8 @@ def begin(task: Task, guess: Nodes) -> State:
     xp: Any = jnp if traced else np
     value = jnp.array(guess) if traced else jax.device_put(guess, may_alias=False)
     dtype, shape = guess.dtype, task.grid.shape
-    inputs = [
-        0 if admissible is None else admissible.dim for admissible in (task.problem.controls, task.problem.disturbances)
-    ]
+    players = (task.problem.controls, task.problem.disturbances)
+    inputs = [0 if admissible is None else admissible.dim for admissible in players]
     policy = Greedy(xp.zeros(shape, dtype), *(tuple(xp.zeros(shape, dtype) for _ in range(m)) for m in inputs))
     infinite = xp.asarray(xp.inf, dtype)
     bound = ErrorBound(xp.asarray(-infinite), infinite, xp.zeros((), dtype), infinite, infinite)
@@ -176,9 +175,6 @@ def run(task: Task, state: State, until: Number) -> State:
     """Steps until the state is no longer running or ``until`` steps are done; at most ``HISTORY`` at a time."""
     start = state.step  # the first place of this chunk's history
 
-    def goes_on(state):
-        return (state.code == Status.RUNNING) & (state.step < until)
-
     def step(state):
         # loop variant, or XLA compiles a kernel for every scalar of every action that it can hoist
         controls, grid, count = jax.lax.optimization_barrier((task.problem.controls, task.grid, state.step))
@@ -186,15 +182,14 @@ def run(task: Task, state: State, until: Number) -> State:
         here = dataclasses.replace(task, on=on)
         return advance(here, dataclasses.replace(state, step=count), start)
 
-    return jax.lax.while_loop(goes_on, step, state)
+    return jax.lax.while_loop(lambda at: (at.code == Status.RUNNING) & (at.step < until), step, state)
 
 
 def advance(task: Task, state: State, start: Scalar) -> State:
     """One step; a step that ends in numbers that are not finite is taken back."""
-    stay = jnp.zeros_like(state.value)  # of step −1, which only looks at the guess
-    delta = jax.lax.cond(state.step < 0, lambda: stay, lambda: _correction(task, state))
+    delta = _correction(task, state)
     if not task.scheme.monotone:
-        delta = jnp.where(state.step < FULL_STEPS, 1.0, 0.5).astype(delta.dtype) * delta
+        delta = jnp.where((state.step < FULL_STEPS) | task.plain, 1.0, 0.5).astype(delta.dtype) * delta
     value = task.impose(state.value + delta)
     # a node that does not count may move for ever
     moved = jnp.max(jnp.abs(jnp.where(task.counted, value - state.value, 0)))
@@ -216,16 +211,15 @@ def advance(task: Task, state: State, start: Scalar) -> State:
 def broken(task: Task, state: State) -> jax.Array:
     """The nodes where value or rate are not finite in the step that a NONFINITE state took back, bool (*grid)."""
     state = dataclasses.replace(state, step=state.step - 1)
-    stay = jnp.zeros_like(state.value)
-    delta = jax.lax.cond(state.step < 0, lambda: stay, lambda: _correction(task, state))
-    value = task.impose(state.value + delta)
+    value = task.impose(state.value + _correction(task, state))
     rate = bellman.greedy(task.on, value, task.obstacles.fixed, lost=task.lost).defect
     return task.counted & ~(jnp.isfinite(value) & jnp.isfinite(rate))
 
 
 def _lacks_measure(task: Task, state: State) -> jax.Array:
     """True before the first step where the error is measured by the size of a step, without a certificate."""
-    return (state.step < 0) & (task.certificate not in (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE))
+    certified = task.certificate in (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE)
+    return (state.step < 0) & ~(certified & jnp.asarray(task.plain))
 
 
 def _shift(task: Task, state: State) -> Scalar:
@@ -258,9 +252,11 @@ def _look(
     left = task.equation(value, policy)
     assert left.fastest is not None
     iterate = Iterate(value, policy, left, task.obstacles, task.counted)
-    bound = certificates.error_bound(
-        task.certificate, iterate, discount=problem.discount, least_cost=task.least_cost, moved=moved
-    )
+    known = {"discount": problem.discount, "least_cost": task.least_cost, "moved": moved}
+    bound = certificates.error_bound(task.certificate, iterate, **known)
+    if task.on.plain is not None:  # the chain's certificate is no other scheme's
+        measured = certificates.error_bound(Certificate.RESIDUAL, iterate, **known)
+        bound = jax.tree.map(functools.partial(jnp.where, task.plain), bound, measured)
     if task.has_lost:
         leaks = bellman.leaks(task.on, policy, task.obstacles.fixed, ~task.counted)
         bound = dataclasses.replace(bound, error=jnp.where(leaks, jnp.inf, bound.error))
@@ -321,15 +317,19 @@ class Look:
             later = altered(task.problem, discount=task.problem.discount + _shift(task, state))
             return evaluate(evaluation, task.asking(later).equation(state.value, state.policy), task.grid)
         if task.problem.is_game:
-            value = hoffman_karp.evaluated(
-                task, state.value, state.policy, evaluation, residual=state.bound.residual, replies=replies
-            )
-            return value - state.value
+            left, outer = state.bound.residual, (state.value, state.policy)
+            return hoffman_karp.evaluated(task, *outer, evaluation, residual=left, replies=replies) - state.value
         return evaluate(evaluation, self.equation(), task.grid)
 
 
 def _correction(task: Task, state: State) -> Field:
-    """δ of the method, cost units, (*grid)."""
+    """δ of the method, cost units, (*grid); zero in step −1, which only looks at the guess."""
+    stay = jnp.zeros_like(state.value)
+    return jax.lax.cond(state.step < 0, lambda: stay, lambda: _by_method(task, state))
+
+
+def _by_method(task: Task, state: State) -> Field:
+    """δ of the method in any other step."""
     look = Look(task, state)
     if task.method.relaxes or task.outflow is None or task.certificate is Certificate.OPEN:
         return task.method.correct(look)

@@ -16,6 +16,9 @@ One of damped Jacobi sweeps:
     ...     def inner(self):
     ...         return self
     ...
+    ...     def filled(self, evaluation):
+    ...         return self
+    ...
     ...     def correct(self, step):
     ...         from hjbjax.iteration.evaluation import jacobi
     ...
@@ -39,7 +42,7 @@ from typing import Protocol, runtime_checkable
 import jax
 
 from hjbjax.iteration.bellman import PolicyEquation
-from hjbjax.iteration.evaluation import Evaluation, Sweeps, check_choice, check_evaluation
+from hjbjax.iteration.evaluation import Evaluation, check_choice, check_evaluation
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import pytree_dataclass
@@ -66,7 +69,7 @@ class Step(Protocol):
 
 @runtime_checkable
 class Method(Protocol):
-    """A method of a stationary solve, which corrects V; a value, frozen and hashable or a pytree."""
+    """A method of a stationary solve, which corrects V; a value that JAX knows as a pytree."""
 
     @property
     def relaxes(self) -> bool:
@@ -83,6 +86,9 @@ class Method(Protocol):
     @property
     def coarsest(self) -> int | None:
         """The nodes of the coarsest grid; None for a method of one grid."""
+
+    def filled(self, evaluation: Evaluation) -> "Method":
+        """The method with the evaluation that suits the problem, where it has none and wants one; else itself."""
 
     def correct(self, step: Step) -> jax.Array:
         """δ, (*grid), in cost units."""
@@ -108,6 +114,10 @@ class ValueIteration:
         """The method itself."""
         return self
 
+    def filled(self, evaluation: Evaluation) -> "ValueIteration":
+        """The method itself, which evaluates no policy."""
+        return self
+
     def correct(self, step: Step) -> jax.Array:
         """One relaxation of every node."""
         return step.relaxed()
@@ -126,16 +136,18 @@ class PolicyIteration:
     """Improve the policy, evaluate it, repeat; the methods of this family differ in the evaluation.
 
     Args:
-      evaluation: ``Sweeps(count)`` is modified policy iteration; ``Krylov()`` and ``Direct()`` are Howard's.
+      evaluation: ``Sweeps(count)`` is modified policy iteration; ``Krylov()`` and ``Direct()`` are Howard's; ``None``
+        picks by the problem, as ``solve`` does: a linear solve with noise or open ends, else sweeps.
       replies: in a game, the inner player's improvements for each of the outer player's, at most.
     """
 
-    evaluation: Evaluation = Sweeps()
+    evaluation: Evaluation | None = None
     replies: int = 20
     relaxes, coarsest = False, None
 
     def __post_init__(self):
-        check_evaluation(self.evaluation, "PolicyIteration: evaluation")
+        if self.evaluation is not None:
+            check_evaluation(self.evaluation, "PolicyIteration: evaluation")
         arguments.count(self.replies, "PolicyIteration: replies")
 
     @property
@@ -143,8 +155,13 @@ class PolicyIteration:
         """The method itself."""
         return self
 
+    def filled(self, evaluation: Evaluation) -> "PolicyIteration":
+        """The method with an evaluation, if none was asked for."""
+        return PolicyIteration(self.evaluation or evaluation, self.replies)
+
     def correct(self, step: Step) -> jax.Array:
         """The way to the value of the greedy policy."""
+        assert self.evaluation is not None
         return step.evaluated(self.evaluation, self.replies)
 
     def patience(self, grid: Grid) -> int:
@@ -153,7 +170,8 @@ class PolicyIteration:
 
     def described(self, game: bool) -> str:
         """As it is written, without the replies where there is no opponent."""
-        return f"PolicyIteration({self.evaluation!r}{f', replies={self.replies}' if game else ''})"
+        chosen = [] if self.evaluation is None else [repr(self.evaluation)]
+        return f"PolicyIteration({', '.join([*chosen, *[f'replies={self.replies}'] * game])})"
 
 
 @pytree_dataclass(static=("coarsest",))
@@ -187,6 +205,10 @@ class Nested:
     def evaluation(self) -> Evaluation | None:
         """As on every level."""
         return self.inner.evaluation
+
+    def filled(self, evaluation: Evaluation) -> "Nested":
+        """With an evaluation on every level."""
+        return Nested(self.inner.filled(evaluation), self.coarsest)
 
     def correct(self, step: Step) -> jax.Array:
         """As on every level."""

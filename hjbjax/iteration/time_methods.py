@@ -111,7 +111,7 @@ TABLEAUX = {
 
 
 class TimeMethod(Protocol):
-    """A method that carries V from t to t − Δt; a value, frozen and hashable or a pytree."""
+    """A method that carries V from t to t − Δt; a value that JAX knows as a pytree."""
 
     @property
     def limited(self) -> bool:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 # where axes are cut, by their numbers or names; three times, since a type checker takes no {0: 1.0} for the last
 Cuts: TypeAlias = Mapping[int, float] | Mapping[str, float] | Mapping[int | str, float]
-CHUNK = 1 << 16  # states for which a target is evaluated at once, which bounds the memory of its intermediate arrays
+CHUNK = 1 << 16  # states for which a function is evaluated at once, which bounds the memory of its intermediate arrays
 ON_NODE = 1e-9  # of a cell: a coordinate this near to a node is meant to be it, 0.1 + 0.2 as well as 0.3
 COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight")
 
@@ -51,10 +51,15 @@ def at_time(solution: "Solution", field: Array, time: float | None) -> tuple[np.
 
 def nodes_in(target: Callable[[State], Number], grid: Grid) -> np.ndarray:
     """The nodes that lie in a target, a bool (*grid)."""
-    states = grid.nodes().reshape(-1, grid.ndim)
-    with jax.enable_x64(True):  # the nodes are float64; in float32 a level at a face of the box would round either way
-        level = np.asarray(jax.lax.map(target, states, batch_size=CHUNK))
-    return level.reshape(grid.shape) <= 0
+    return at_states(target, grid.nodes()) <= 0
+
+
+def at_states(function: Callable[[State], Number], states: np.ndarray) -> np.ndarray:
+    """A function of one state at states of shape (..., n), as one program, shape (...)."""
+    # the states are float64; in float32 a level at a face of the box would round either way
+    with jax.enable_x64(True):
+        every = jax.jit(lambda states: jax.lax.map(function, states, batch_size=CHUNK))
+        return np.asarray(every(states.reshape(-1, states.shape[-1]))).reshape(states.shape[:-1])
 
 
 def feedback(solution: "Solution", input: int, fixed: Cuts | None, time: float | None) -> tuple[Section, str]:

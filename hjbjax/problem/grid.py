@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem import grid_arguments
-from hjbjax.problem.pytree import altered, is_traced, pytree_dataclass
+from hjbjax.problem.pytree import altered, is_traced, known, pytree_dataclass
 from hjbjax.problem.stretching import Stretching
 from hjbjax.problem.types import Array, DType, Number, Numbers, States
 
@@ -41,7 +41,7 @@ class Grid:
         "projected": the component that leaves is cut off, while the control keeps what it costs and earns.
         "constrained": actions whose drift leaves are not admissible: the state-constrained problem.
         "open": paths may leave; the value goes on beyond the end as the parabola through its last three nodes.
-        Noise reflects at a projected and at a constrained end, and goes on at an open one.
+        Noise reflects at a projected and at a constrained end, on the node itself, and goes on at an open one.
 
     Raises:
       ValueError: bounds that are not finite or not increasing, lengths that differ, or an unknown kind of end.
@@ -152,7 +152,7 @@ class Grid:
         stretching = self.stretch[axis]  # type: ignore[index]
         if stretching is not None:
             index = last * stretching.place(index / last)
-        return (self.lo[axis] * (last - index) + self.hi[axis] * index) / last
+        return (known(self.lo)[axis] * (last - index) + known(self.hi)[axis] * index) / last
 
     def components(self, dtype: DType) -> list[jax.Array]:
         """The coordinates as n arrays, the i-th of which varies along axis i alone and broadcasts."""

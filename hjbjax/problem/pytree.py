@@ -100,6 +100,11 @@ def is_traced(*trees: Any) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
 
 
+def known(number: Any) -> Any:
+    """The number, or the array, in NumPy unless it is traced: every operation on JAX arrays is a program to compile."""
+    return number if is_traced(number) else np.asarray(number)
+
+
 def remembered(function: Callable[..., T]) -> Callable[..., T]:
     """Decorator that keeps answers by the first argument, a pytree, with the numbers in it; while traced asks anew.
 

@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.problem.pytree import numbers, pytree_dataclass
+from hjbjax.problem.pytree import known, numbers, pytree_dataclass
 from hjbjax.problem.types import Array, DType, Number
 
 
@@ -73,7 +73,7 @@ class Box:
         # indices k, shape (K, m), in the order of nested loops: the last input changes fastest
         rows = np.array(list(itertools.product(*(range(int(n)) for n in counts))), dtype=np.float64)
         last = np.maximum(np.asarray(counts, dtype=np.float64) - 1, 1)  # one value alone is lo, not 0/0
-        return Finite((self.lo * (last - rows) + self.hi * rows) / last)
+        return Finite((known(self.lo) * (last - rows) + known(self.hi) * rows) / last)
 
 
 @pytree_dataclass(static=("dim",))
@@ -145,7 +145,7 @@ def samples(admissible: AdmissibleSet, budget: int) -> Array:
         per_input = _values_an_input(admissible, budget)
         return admissible.grid(per_input).points
     unit = _unit_ball(admissible.dim, budget)
-    return admissible.radius * unit
+    return known(admissible.radius) * unit
 
 
 def _values_an_input(box: Box, budget: int) -> int:

@@ -22,6 +22,7 @@ Nodes: TypeAlias = Float[Array, "*grid"]
 Field: TypeAlias = Float[jax.Array, "*grid"]  # the values at all nodes inside a compiled program
 AtNodes: TypeAlias = Shaped[jax.Array, "*grid"]  # of any kind, truth values as well
 Scalar: TypeAlias = Num[jax.Array, ""]  # and a number there
+Verdict: TypeAlias = Bool[jax.Array, ""]  # and a truth value
 Mask: TypeAlias = Bool[Array, "*grid"]
 Key: TypeAlias = jax.Array  # of a random number generator
 DType: TypeAlias = np.dtype | type | str

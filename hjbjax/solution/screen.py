@@ -47,6 +47,10 @@ class _Answer(Protocol):
     @property
     def error(self) -> Number | None: ...
     @property
+    def grid_error(self) -> Array | None: ...
+    @property
+    def monotone_error(self) -> Number | None: ...
+    @property
     def isaacs_gap(self) -> Number | None: ...
     @property
     def status(self) -> Status: ...
@@ -70,7 +74,8 @@ def show(solution: _Answer) -> str:
         "times": "" if solution.times is None else str(np.size(solution.times)),
         "method": ", ".join(number(stats[name]) for name in ("method", "scheme") if name in stats),
         "steps": f"{int(solution.steps)}{last}",
-        "error": _error(solution),
+        "algebraic error": _error(solution),
+        "grid error": _grid_error(solution),
         "reached": f"{percent(reached)} of the nodes" if reached < 1 else "",
         "cut": _cuts(solution),
         "isaacs gap": "" if solution.isaacs_gap is None else number(solution.isaacs_gap),
@@ -81,7 +86,7 @@ def show(solution: _Answer) -> str:
     said = plain(f"{solution.status.name}: {solution.message or solution.status.message}")
     head = textwrap.wrap(said, WIDTH)
     lines = head if len(head) < 4 else [*head[:2], one_line(" ".join(head[2:]))]
-    return encodable("\n".join(lines + [f"  {name:10}  {one_line(text)}" for name, text in rows.items() if text]))
+    return encodable("\n".join(lines + [f"  {name:15}  {one_line(text)}" for name, text in rows.items() if text]))
 
 
 def _cuts(solution: _Answer) -> str:
@@ -98,12 +103,26 @@ def _cuts(solution: _Answer) -> str:
 
 
 def _error(solution: _Answer) -> str:
-    """The certified error and its certificate, or why there is none."""
+    """The certified error and its certificate, or why there is none; beside it that of the monotone answer."""
     error, tol = solution.error, solution.stats.get("tol")
+    if error is None and solution.monotone_error is not None and tol is not None:
+        return (
+            f"residual at most {number(tol)} at high order; of the monotone start at most "
+            f"{number(solution.monotone_error)}"
+        )
     what = "no certificate" if error is None else f"at most {error:.3g}"
     asked = "" if error is None or tol is None else f" (tol {number(tol)})"
     why = solution.stats.get("certificate")
     return what + asked + (f": {number(why)}" if why else "")
+
+
+def _grid_error(solution: _Answer) -> str:
+    """The estimated distance to the exact value, the largest and the mean over the nodes."""
+    if solution.grid_error is None:
+        return ""
+    found = np.asarray(solution.grid_error)
+    found = found[np.isfinite(found)]
+    return f"about {np.max(found):.3g}, {np.mean(found):.3g} in the mean" if found.size else ""
 
 
 def one_line(text: str, width: int = WIDTH) -> str:

@@ -39,6 +39,7 @@ KINDS: dict[str, tuple[type, ...]] = {  # what a file's header holds, as JSON ha
     "code": (int,),
     "steps": (int,),
     "isaacs_gap": (float, type(None)),
+    "monotone_error": (float, type(None)),
     "discrete": (bool,),
     "discrete_disturbance": (bool,),
     "message": (str,),
@@ -73,6 +74,10 @@ class Solution:
       isaacs_gap: the largest min-max minus max-min over the nodes, in cost units per unit time, in a game.
       reached: the nodes from which the target can be reached, bool (*grid); ``None`` means all.
       times: shape (k,) when marched; value and policy then have a leading axis.
+      grid_error: an estimate of |V − V_exact| at the nodes, shape (*grid), in cost units, with V_exact the solution of
+        the equation itself and not of the discrete one; NaN where V is infinite. ``None`` where none was made.
+      monotone_error: of a value of second order the certified bound on the error of the monotone answer from which it
+        started, against the exact solution of the monotone scheme; ``None`` without one.
       cut: at how many nodes of each end of the box the optimal drift is cut off, shape (n, 2), lower and upper; when
         marched, at each kept time, (k, n, 2). Zero at ends that are not projected; ``None`` where it was not counted.
       discrete: whether the controls are enumerated, so that a mean of two need not be admissible.
@@ -99,6 +104,8 @@ class Solution:
     isaacs_gap: Any = None
     reached: Any = None
     times: Any = None
+    grid_error: Any = None
+    monotone_error: Any = None
     cut: Any = None
     discrete: bool = False
     discrete_disturbance: bool = False
@@ -249,6 +256,7 @@ class Solution:
             },
             "marched": None if self.times is None else int(np.shape(self.times)[0]),
             "isaacs_gap": np.asarray(self.isaacs_gap).tolist(),
+            "monotone_error": np.asarray(self.monotone_error).tolist(),
             "code": np.asarray(self.code).tolist(),
             "steps": np.asarray(self.steps).tolist(),
             **{name: getattr(self, name) for name in ("discrete", "discrete_disturbance", "message", "stats")},
@@ -300,6 +308,7 @@ def _plan(header: dict) -> dict[str, Expected]:
         "disturbance": controls,
         "enclosure": Expected(((2, 2),)),
         "reached": Expected((shape, lead + shape), (np.bool_,)),
+        "grid_error": Expected((shape,)),
         "residuals": Expected((many,)),
         "cut": Expected(((*lead, len(shape), 2),), (np.int64, np.int32)),
         **({} if marched is None else {"times": Expected((lead,), optional=False)}),
@@ -314,6 +323,7 @@ def _rebuild(header: dict, arrays: dict[str, np.ndarray]) -> Solution:
         arrays.pop("lo"), arrays.pop("hi"), tuple(about["shape"]), about["periodic"], tuple(about["names"]), stretch,
         about.get("edges", "projected"),  # older files have none, as all ends were projected
     )  # fmt: skip
+    header = {"monotone_error": None, **header}  # older files have none
     for name, kinds in KINDS.items():  # ``type`` and not ``isinstance``: true is no number of steps
         if type(header[name]) not in kinds:
             raise FileError(f"its header has {name} = {header[name]!r:.60}, wanted {kinds[0].__name__}")

@@ -7,7 +7,7 @@ changes no bit of the others. Ctrl-C and the time limit end the lanes that still
 
 import dataclasses
 from collections.abc import Hashable, Iterable, Sequence
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,16 +22,17 @@ from hjbjax.iteration.methods import Method
 from hjbjax.problem.arguments import shown
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.types import DType, Mask
-from hjbjax.solution.clock import CHUNK_SECONDS, CUT, Clock, Stopped, noting_interrupts
+from hjbjax.problem.types import Array, DType, Mask, Nodes
+from hjbjax.solution.clock import CUT, Clock, Stopped, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
-from hjbjax.solvers import faults, memory, nested
-from hjbjax.solvers.host_loop import FIRST_NODES, with_obstacles
+from hjbjax.solvers import host_loop, memory, nested
+from hjbjax.solvers.host_loop import FIRST_NODES
 from hjbjax.solvers.nested import Settled
 from hjbjax.solvers.result import finish, solution_at_start, with_last_phase
-from hjbjax.solvers.setup import Assumptions, choose, prepare_on_host
-from hjbjax.solvers.stationary import as_dtype, check_arguments, check_limits, second_order
+from hjbjax.solvers.setup import Assumptions, choose, choose_scheme, prepare_on_host
+from hjbjax.solvers.stationary import as_dtype, check_arguments, check_limits
+from hjbjax.solvers.stationary_run import with_obstacles
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
 
@@ -50,12 +51,13 @@ def solve_batch(
     grid: Grid,
     *,
     method: Method | None = None,
-    scheme: Scheme = Upwind(),
+    scheme: Scheme | None = None,
     tol: float = 1e-3,
     dtype: DType | None = None,
     max_steps: int | None = None,
     time_limit: float | None = None,
     throw: bool = True,
+    progress: bool | None = None,
     max_memory: int | None = None,
 ) -> list[Solution]:
     """Solve many problems on one grid; each answer is that of ``solve`` by this method.
@@ -64,12 +66,13 @@ def solve_batch(
       problems: problems; those with the same functions and shapes run together, whatever their numbers.
       grid: the nodes.
       method: as in ``solve``, without nesting; ``None`` picks by the problem.
-      scheme: the discretisation; ``Limited()`` goes on from the chain's answer lane by lane.
+      scheme: as in ``solve``; no error of the grid is estimated.
       tol: as in ``solve``.
       dtype: as in ``solve``.
       max_steps: at most so many steps for each lane.
       time_limit: at most so many seconds for all lanes, checks and compilation included.
       throw: raise when a lane does not converge; otherwise its status says it.
+      progress: as in ``solve``.
       max_memory: bytes that one round of lanes may take; a batch that needs more runs in several.
 
     Returns:
@@ -88,19 +91,20 @@ def solve_batch(
     kind = as_dtype(dtype)
     grid.check_spacings(kind)
     solutions: list[Any] = [None] * len(lanes)
-    clock = Clock(max_steps or 10**9, time_limit)
+    clock = Clock(max_steps or 10**9, time_limit, progress)
     with noting_interrupts(clock), jax.enable_x64(kind == np.float64):
         for members in _same_program(lanes):
             first = lanes[members[0]]
             # without nesting, whose levels the host drives one by one
-            chosen = (method or choose(first, grid, traced=False)).inner
-            checks.shapes(first, grid, scheme)
-            on = Discretisation(first, grid, scheme, kind)
+            chosen = choose(first, grid, traced=False, method=method).inner
+            on, sharpen = Discretisation(first, grid, scheme or Upwind(subcell=True), kind), scheme is None
+            checks.shapes(first, grid, on.scheme)
             needed = memory.require(first, grid, chosen, kind, max_memory)
             # one lane by itself has been held against the memory above, so that a round is never empty
             for some in _rounds(members, needed, max_memory):
-                with faults.with_solution(clock, needed * len(some), lambda _: next(filter(None, solutions), None)):
-                    together = _solve_together({i: on.asking(lanes[i]) for i in some}, chosen, tol, clock)
+                with host_loop.with_solution(clock, needed * len(some), lambda _: next(filter(None, solutions), None)):
+                    members_of = {i: on.asking(lanes[i]) for i in some}
+                    together = _solve_together(members_of, chosen, tol, clock, sharpen=sharpen)
                 for index, solution in zip(some, together, strict=True):
                     solutions[index] = solution
         if solutions and not any(solution.status in CUT for solution in solutions):
@@ -134,104 +138,169 @@ def _rounds(members: Sequence[int], bytes_each: int, limit: int | None) -> list[
     return [members[start : start + most] for start in range(0, len(members), most)]
 
 
-def _solve_together(lanes: dict[int, Discretisation], method: Method, tol: float, clock: Clock) -> list[Solution]:
-    """The solutions of problems that run together, by the numbers of their lanes."""
+def _solve_together(
+    lanes: dict[int, Discretisation], method: Method, tol: float, clock: Clock, *, sharpen: bool
+) -> list[Solution]:
+    """The solutions of problems that run together, by the numbers of their lanes; ``sharpen`` as in ``solve``."""
     began, names, asked = clock.elapsed(), list(lanes), list(lanes.values())
     prepared: list[tuple[Task, Assumptions, Mask | None]] = []
-    for name, on in lanes.items():
+    for i, on in enumerate(asked):
         try:
             node_checks.values(on.problem, on.grid, on.dtype, clock)
             admissibility.values(on.problem, on.grid, on.dtype)
+            if sharpen:
+                on = asked[i] = dataclasses.replace(on, scheme=choose_scheme(on, method))
             prepared.append(prepare_on_host(on.chain, method=method, tol=tol, clock=clock))
         except ValueError as refusal:
-            raise ValueError(f"lane {name}: {refusal}") from refusal
+            raise ValueError(f"lane {names[i]}: {refusal}") from refusal
         except Stopped as stop:
             nothing = [solution_at_start(each, np.zeros(each.grid.shape), stop.status) for each in asked]
             return [with_last_phase(solution, clock) for solution in nothing]
-    clock.phase = f"the steps of lanes {names[0]} to {names[-1]}"
     # a static flag, set for all lanes as soon as one has nodes out of reach, so that they share a program
     has_lost = any(task.has_lost for task, _, _ in prepared)
-    prepared = [
-        (dataclasses.replace(task, has_lost=has_lost), assumptions, reached) for task, assumptions, reached in prepared
+    tasks = [dataclasses.replace(task, has_lost=has_lost) for task, _, _ in prepared]
+    # from zero, or from the constraint of a tube; a lane that is caught there goes on alone, see _settled
+    ended = _iterate(tasks, [task.start() for task in tasks], names, clock)
+    settled = [
+        _settled(Settled(task, assumptions, reached, *end), clock)
+        for task, (_, assumptions, reached), end in zip(tasks, prepared, ended, strict=True)
     ]
-    solutions: list[Any] = [None] * len(lanes)
-    for members in _groups(jax.tree.structure(task) for task, _, _ in prepared):  # by certificate, too
-        # lanes whose certificates differ stop by different rules, which are part of the structure
-        tasks = _stack([prepared[i][0] for i in members])
-        # from zero, or from the constraint of a tube; a lane that is caught there goes on alone, see _lane_solution
-        states = _begin(tasks, jax.vmap(Task.start)(tasks))
-        ended, histories = _finish_lanes(tasks, states, len(members), clock)
-        for i, (state, code), residuals in zip(members, ended, histories, strict=True):
-            history = np.concatenate(residuals)[: int(state.step) + 1]
-            solutions[i] = _lane_solution(Settled(*prepared[i], state, code, history), asked[i], clock)
+    further = [
+        i
+        for i, each in enumerate(settled)
+        if not asked[i].scheme.monotone and each.code not in CUT and (each.code is Status.CONVERGED or not sharpen)
+    ]
+    raised = [nested.raised(settled[i], asked[i].scheme) for i in further]
+    better = _iterate(
+        [task for task, _ in raised], [settled[i].state.value for i in further], [names[i] for i in further], clock
+    )
+    for i, (task, assumptions), end in zip(further, raised, better, strict=True):
+        sharp = Settled(task, assumptions, settled[i].reached, *end, settled[i])
+        settled[i] = nested.better_of(settled[i], sharp, sharpen=sharpen)
+    solutions = [finish(each, on.grid, cut=clock.over() is not None) for each, on in zip(settled, asked, strict=True)]
     about = {"seconds": clock.elapsed() - began, "lanes": len(lanes), "tol": tol}
     for on, solution in zip(asked, solutions, strict=True):
         solution.stats.update(method=method.described(on.problem.is_game), **about)
-    return solutions
+    return [with_last_phase(each, clock) if each.status in CUT else each for each in solutions]
 
 
-def _lane_solution(settled: Settled, on: Discretisation, clock: Clock) -> Solution:
-    """The solution of one lane, which may go on by itself: off a node where it rests, or to second order."""
-    task, assumptions, reached, state, code, history = settled
-    apart: dict[str, Any] = {}
-    if code in CUT:
-        settled = settled._replace(state=with_obstacles(task, state))
-    elif nested.may_go_on(task, assumptions, state, code):
-        # an answer, and a game that failed, go on from where they are; whoever was caught at rest starts anew, by the
-        # answers for vanishing discounts
-        onwards = code is Status.CONVERGED or task.problem.is_game
-        guess = state.value if onwards else None
-        settled = nested.settle(task, assumptions, reached, guess, clock)
-        if onwards:
-            settled = settled._replace(residuals=np.concatenate([history, settled.residuals]))
-    if not on.scheme.monotone and settled.code not in CUT:
-        settled, apart = second_order(settled, on.scheme, clock)
-    solution = finish(settled, on.grid, cut=clock.over() is not None)
-    solution.stats.update(apart)
-    return with_last_phase(solution, clock) if settled.code in CUT else solution
+def _iterate(
+    tasks: Sequence[Task], starts: Sequence[Nodes], names: Sequence[int], clock: Clock
+) -> list[tuple[State, Status, np.ndarray]]:
+    """The last state, the status and the residuals of each lane; lanes whose tasks share a structure run together."""
+    found: list[Any] = [None] * len(tasks)
+    # lanes whose certificates differ stop by different rules, which are part of the structure
+    for members in _groups(jax.tree.structure(task) for task in tasks):
+        run = LanesRun(_stack([tasks[i] for i in members]), _stack([starts[i] for i in members]), clock.max_steps)
+        run.name = f"lanes {names[members[0]]} to {names[members[-1]]}, {tasks[0].grid.size} nodes each"
+        run.between(host_loop.drive(run, clock), clock)  # once more, for lanes that were cut short
+        for i, (state, code), residuals in zip(members, run.final, run.histories, strict=True):
+            # a run that ended before its first look still holds the guess as it came
+            state = with_obstacles(tasks[i], state) if code in CUT else state
+            found[i] = state, code, np.concatenate(residuals)[: int(state.step) + 1]
+    return found
 
 
-def _finish_lanes(tasks: Task, states: State, count: int, clock: Clock) -> tuple[list[tuple], list[list]]:
-    """The last state and the status of each lane, and its residuals, by chunks of steps until all are done or cut.
+def _settled(settled: Settled, clock: Clock) -> Settled:
+    """The end of one lane, which may go on by itself: off a node where it rests, or by vanishing discounts."""
+    task, assumptions, reached, state, code, history, *_ = settled
+    if code in CUT or not nested.may_go_on(task, assumptions, state, code):
+        return settled
+    # an answer, and a game that failed, go on from where they are; whoever was caught at rest starts anew, by the
+    # answers for vanishing discounts
+    onwards = code is Status.CONVERGED or task.problem.is_game
+    settled = nested.settle(task, assumptions, reached, state.value if onwards else None, clock)
+    return settled._replace(residuals=np.concatenate([history, settled.residuals])) if onwards else settled
 
-    Lanes that are done are taken out where that halves the work.
-    """
-    final: list[Any] = [None] * count
-    histories: list[list] = [[np.zeros(0)] for _ in range(count)]
-    lanes = np.arange(count)  # which lane each row holds; −1 in rows that only fill up
-    nodes = states.value[0].size
-    chunk = int(np.clip(FIRST_NODES / (nodes * count), 1, CHUNK))  # nothing has been timed yet
-    if clock.over() is None:
-        states = _run(tasks, states, np.full(count, -1))  # compiles and does nothing
-    while lanes.size:
-        began, before, cut = clock.elapsed(), np.asarray(states.step), clock.over()
-        if cut is None:
-            # an array: lanes that are done stand where they stopped
-            states = _run(tasks, states, np.minimum(before + chunk, clock.max_steps))
-        codes, steps, history = jax.device_get((states.code, states.step, states.history))
-        if cut is None:  # the loop ran as long as its slowest lane, over rows that only fill up as well
-            clock.count(clock.elapsed() - began, max(int(np.max(steps - before)), 1), nodes * len(lanes))
-            chunk = int(np.clip(clock.steps_in(CHUNK_SECONDS, nodes * len(lanes)), 1, CHUNK))
-        going = (codes == Status.RUNNING) & (steps < clock.max_steps) & (lanes >= 0) & (cut is None)
-        live = [row for row, lane in enumerate(lanes) if lane >= 0 and final[lane] is None]
+
+class Rows(NamedTuple):
+    """The rows of the arrays in which lanes run together; one value, so that an interrupt finds all of it or none."""
+
+    lanes: np.ndarray  # which lane each row holds; −1 in rows that only fill up
+    tasks: Task
+    states: State
+    before: np.ndarray  # the steps of each row before the last chunk
+
+
+class LanesRun:
+    """The iterations of lanes that run together; those that are done are taken out where that halves the work."""
+
+    longest, bar = CHUNK, {"desc": "solve_batch", "unit": " steps"}
+
+    def __init__(self, tasks: Task, starts: Array, limit: int):
+        count, self.name = len(starts), f"{len(starts)} lanes"
+        self.rows = Rows(np.arange(count), tasks, _begin(tasks, starts), np.full(count, -1))
+        self.limit, self.steps = limit, -1
+        self.final: list[Any] = [None] * count  # the last state and the status of each lane
+        self.histories: list[list] = [[np.zeros(0)] for _ in range(count)]
+
+    @property
+    def nodes(self) -> int:
+        """The nodes of all rows: the loop runs over those that only fill up as well."""
+        return self.rows.states.value.size
+
+    def compile(self) -> None:
+        """Run no step."""
+        rows = self.rows
+        self.rows = rows._replace(states=_run(rows.tasks, rows.states, rows.before))
+
+    def first_chunk(self, clock: Clock) -> int:
+        """Steps of the first chunk: nothing has been timed yet."""
+        return int(np.clip(FIRST_NODES / self.nodes, 1, CHUNK))
+
+    def advance(self, count: int) -> Status:
+        """Take ``count`` steps at most in every row; the loop runs as long as its slowest lane."""
+        rows, before = self.rows, np.asarray(self.rows.states.step)
+        # an array: rows that are done stand where they stopped
+        until = np.minimum(np.maximum(before, 0) + count, self.limit)
+        self.rows = rows._replace(states=jax.block_until_ready(_run(rows.tasks, rows.states, until)), before=before)
+        self.steps += max(int(np.max(np.asarray(self.rows.states.step) - before)), 1)
+        return Status.RUNNING
+
+    def between(self, status: Status, clock: Clock) -> Status:
+        """Take out the lanes that are done, with all of them CONVERGED; one that is cut short ends them all."""
+        rows = self.rows
+        if not rows.lanes.size:
+            return status
+        codes, steps, history = jax.device_get((rows.states.code, rows.states.step, rows.states.history))
+        going = (codes == Status.RUNNING) & (steps < self.limit) & (status is Status.RUNNING)
+        live = [row for row, lane in enumerate(rows.lanes) if lane >= 0 and self.final[lane] is None]
         for row in live:
-            histories[lanes[row]].append(history[row, : steps[row] - before[row]])
+            self._note(rows.lanes[row], history[row, : steps[row] - rows.before[row]], steps[row] + 1)
         ended = [row for row in live if not going[row]]
         if ended:
-            on_host = jax.device_get(states)
+            on_host = jax.device_get(rows.states)
             for row in ended:
                 # copied, or a view would keep the arrays of all lanes alive
                 last = jax.tree.map(lambda leaf, row=row: leaf[row].copy(), on_host)
                 own = Status(int(last.code))
-                final[lanes[row]] = last, own if own is not Status.RUNNING else cut or Status.MAX_STEPS
-        left = np.flatnonzero(going)
+                cut = status if status is not Status.RUNNING else Status.MAX_STEPS
+                self.final[rows.lanes[row]] = last, own if own is not Status.RUNNING else cut
+        self._narrow(np.flatnonzero(going & (rows.lanes >= 0)))
+        return status if self.rows.lanes.size else Status.CONVERGED
+
+    def _note(self, lane: int, chunk: np.ndarray, residuals: int) -> None:
+        """Write down the residuals of a lane's last chunk, so that there are so many of them: once."""
+        missing = residuals - sum(map(len, self.histories[lane]))
+        self.histories[lane].append(chunk[len(chunk) - missing :])
+
+    def _narrow(self, left: np.ndarray) -> None:
+        """Go on with these rows alone, where that halves the work."""
+        rows, before = self.rows, np.asarray(self.rows.states.step)
         # powers of two, since every width is compiled for itself: a thousand lanes take eleven programs at most
         width = 1 << (left.size - 1).bit_length() if left.size else 0
-        if width < lanes.size:
+        if width < rows.lanes.size:
             kept = np.resize(left, width)
-            lanes = np.where(np.arange(width) < left.size, lanes[kept], -1)
-            tasks, states = _take(tasks, kept), _take(states, kept)
-    return final, histories
+            lanes = np.where(np.arange(width) < left.size, rows.lanes[kept], -1)
+            rows, before = Rows(lanes, _take(rows.tasks, kept), _take(rows.states, kept), before[kept]), before[kept]
+        self.rows = rows._replace(before=before)
+
+    def show(self, bar: Any) -> None:
+        """Move the progress bar."""
+        bar.update(max(self.steps, 0) - bar.n)
+
+    def keep(self, error: Exception) -> None:
+        """Nothing: the lanes that were done before this round are what is left."""
 
 
 def _stack(trees: Sequence[T]) -> T:

@@ -14,11 +14,11 @@ import numpy as np
 
 from hjbjax.discretisation import schemes
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
-from hjbjax.discretisation.schemes import Upwind
+from hjbjax.discretisation.schemes import Limited, Upwind
 from hjbjax.finiteness import admissibility, node_checks
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import bellman, time_stepping
-from hjbjax.iteration.evaluation import Evaluation, Krylov, Sweeps
+from hjbjax.iteration.evaluation import Evaluation, Krylov, Sweeps, check_pytree
 from hjbjax.iteration.methods import PolicyIteration
 from hjbjax.iteration.time_methods import Explicit, TimeMethod
 from hjbjax.iteration.time_stepping import March
@@ -31,9 +31,9 @@ from hjbjax.problem.types import Array, DType, Mask, Nodes, Scalar
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
-from hjbjax.solvers import epochs, faults, memory
+from hjbjax.solvers import host_loop, march_run, memory
 from hjbjax.solvers.result import solution_at_start, with_last_phase
-from hjbjax.solvers.setup import choose
+from hjbjax.solvers.setup import choose_evaluation
 from hjbjax.solvers.stationary import as_dtype, check_node_values
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
@@ -53,7 +53,7 @@ def march(
     *,
     times: Sequence[float] | Array | None = None,
     start: Nodes | None = None,
-    scheme: Scheme = Upwind(split=True),
+    scheme: Scheme | None = None,
     method: TimeMethod | None = None,
     step: float | None = None,
     inner: float | None = None,
@@ -76,8 +76,9 @@ def march(
       horizon: T > 0, in units of time.
       times: the times to keep, increasing, in [0, horizon]; ``None`` is (0.0,). Nothing else is kept.
       start: node values at the horizon in place of the terminal cost, shape (*grid), to go on from another march.
-      scheme: ``Upwind(...)``, ``Limited()``, ``Eno2()`` or ``Weno5()``; by default a game whose players drive one
-        component is upwinded player by player, see ``Upwind``.
+      scheme: ``Upwind(...)``, ``Limited()``, ``Eno2()`` or ``Weno5()``; ``None`` is ``Limited(split=True)``, of second
+        order, or ``Upwind(split=True)`` for implicit steps: a game whose players drive one component is upwinded player
+        by player, see ``Upwind``.
       method: ``Explicit(...)``, the default, whose steps the grid limits, or ``Implicit(...)``, of any step.
       step: the longest time step; ``None`` is the stable one, and a hundredth of the horizon if implicit, if the
         functions depend on the time, or if the fastest action may be between the samples of its set.
@@ -109,12 +110,17 @@ def march(
       0.7616
     """
     method = Explicit() if method is None else method
+    if scheme is None:
+        implicit = getattr(method, "monotone_only", False)  # what is no method is refused below
+        scheme = Upwind(split=True) if implicit else Limited(split=True)
     _check(problem, grid, scheme, method, step, time_limit)
     horizon, kept = _times(horizon, times)
     if is_traced(problem, grid, method, start):
         traced = jnp.result_type(float) if dtype is None else jnp.dtype(dtype)
         return _march_traced(Discretisation(problem, grid, scheme, traced), horizon, kept, start, method, step)
     kind = as_dtype(dtype)
+    if np.any(np.diff(kept.astype(kind)) <= 0):
+        raise ValueError(f"march: two of the times {kept.tolist()} are the same number in {kind}; leave one out")
     check_node_values(start, grid, "march: start")
     grid.check_spacings(kind)
     clock = Clock(seconds=time_limit, progress=progress)
@@ -123,7 +129,7 @@ def march(
         # before anything is compiled: a grid that does not fit is refused within a second
         needed = memory.fitting(_bytes(problem, grid, kept, method, kind), grid, max_memory)
         on = Discretisation(problem, grid, scheme, kind)
-        with faults.with_solution(
+        with host_loop.with_solution(
             clock, needed, lambda _: _solution_at_horizon(on, horizon, start, Status.INTERRUPTED)
         ):
             try:
@@ -134,8 +140,8 @@ def march(
                     admissibility.values(problem, grid, kind, t)
                 clock.enter("the preparation")
                 task = _prepare(on, horizon, method, step, inner)
-                slices, front, code = epochs.drive(task, kept, start, clock)
-                solution = epochs.assemble(task, grid, slices, front, code)
+                slices, front, code = march_run.drive(task, kept, start, clock)
+                solution = march_run.assemble(task, grid, slices, front, code)
             except Stopped as stop:
                 solution = _solution_at_horizon(on, horizon, start, stop.status)
         solution = with_last_phase(solution, clock)
@@ -150,7 +156,7 @@ def march(
 def _solution_at_horizon(on: Discretisation, horizon: float, start: Nodes | None, code: Status) -> Solution:
     """The solution of a march that ended before its first step: the value it was to start from; NaN if not known."""
     value = np.full((1, *on.grid.shape), np.nan if start is None else np.asarray(start), on.dtype)
-    message = f"The march did not leave t = {horizon:g}. {epochs.ADVICE[code]}"
+    message = f"The march did not leave t = {horizon:g}. {march_run.ADVICE[code]}"
     return altered(solution_at_start(on, value, code), times=np.array([horizon]), message=message)
 
 
@@ -160,8 +166,10 @@ def _check(problem: object, grid: object, scheme: Scheme, method: TimeMethod, st
         raise TypeError(f"march: got {type(problem).__name__}, {type(grid).__name__}; wanted a Problem and a Grid")
     schemes.check(scheme, "march: scheme", grid)
     # a class has all these names as well: hjb.Explicit without its brackets
-    if isinstance(method, type) or not all(hasattr(method, name) for name in ("filled", "step", "described")):
+    names = ("limited", "monotone_only", "filled", "step", "described")
+    if isinstance(method, type) or not all(hasattr(method, name) for name in names):
         raise TypeError(f"march: method is {method!r}; wanted hjb.Explicit(...) or hjb.Implicit(...)")
+    check_pytree(method, "march: method")
     if method.monotone_only and not scheme.monotone:
         raise ValueError(f"march: Implicit(...) solves with the matrix of a chain; got {scheme!r}, wanted Upwind(...)")
     if step is not None:
@@ -265,8 +273,7 @@ def _check_step(step: float | None, limit: float) -> None:
 def _evaluation(problem: Problem, grid: Grid) -> Evaluation:
     """The evaluation of policies in an implicit step that suits the problem."""
     if grid.sides("open"):
-        chosen = choose(problem, grid, traced=False)
-        return chosen.evaluation or Krylov()
+        return choose_evaluation(problem, grid, traced=False)
     # sweeps follow the drift and are slow where noise spreads news both ways
     return Sweeps() if problem.noise is None else Krylov()
 

@@ -1,32 +1,38 @@
-"""The way of a solve on the host: coarser grids, vanishing discounts, rest nodes that one had better leave."""
+"""The way of a solve on the host: coarser grids, vanishing discounts, rest nodes that one had better leave.
+
+And from the monotone answer to the second-order one, and from that to the one on the next coarser grid, which tells the
+error of the grid.
+"""
 
 import dataclasses
 import itertools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation import cut_cells
+from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.finiteness import resting
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import Method, PolicyIteration
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.pytree import altered
+from hjbjax.problem.pytree import altered, known
 from hjbjax.problem.types import Mask, Nodes
 from hjbjax.solution import transfer
 from hjbjax.solution.clock import Clock, Stopped
 from hjbjax.solution.status import Status
-from hjbjax.solvers.host_loop import drive
 from hjbjax.solvers.setup import Assumptions, assumptions_of, forced_only, held_jit, linear_solve, prepare_jit
+from hjbjax.solvers.stationary_run import iterate
 
 VANISHING = (2.0, 0.2, 0.02)  # discounts on the way to none, over one by the time that crossing the box takes
 FURTHER = ((2e-3, 2e-4), (2e-5, 2e-6), (2e-7, 2e-8))  # where parts of the box are that much slower than the fastest
 FAILED = (Status.STALLED, Status.DIVERGED, Status.NONFINITE)
 # the last of the answers is a guess, and need not be exact
 WARM_STEPS = 60  # improvements for each of them
+FEWEST = 6  # intervals that an axis keeps on the coarser grid that tells the error of the finer one
 
 
 def start(
@@ -39,20 +45,31 @@ def start(
     """
     if guess is not None or method.coarsest is None:
         return guess, []
-    grids = levels(on, method, clock)
+    grids = levels(on.chain, method, clock)
     value: Nodes | None = None
     if clock.over() is not None:
         return None, []
     for coarse, fine in itertools.pairwise(grids):
         clock.phase = f"the preparation of {' x '.join(map(str, coarse.shape))} nodes"
-        level = on.on_grid(coarse)
+        level = on.chain.on_grid(coarse)
         # without the checks of the host: a coarser grid gives a guess, and is no reason to refuse or to warn
         task = prepare_jit(level, method=method.inner, tol=tol, assumptions=assumptions_of(level))
-        state, _, _ = drive(task, warm(task, value, clock), clock)
+        if fine is on.grid:  # the one that is asked again how far the answer is from the exact one
+            task = staged(task, on.scheme)
+        state, _, _ = iterate(task, warm(task, value, clock), clock)
         if clock.over() is not None:
             return transfer.prolong(np.asarray(state.value), coarse, on.grid), []
         value = transfer.prolong(state.value, coarse, fine)
     return value, [coarse.shape for coarse in grids[:-1]]
+
+
+def staged(task: Task, scheme: Scheme) -> Task:
+    """The task of the chain, in the program of a scheme of high order where that can be: without noise, certified."""
+    fits = task.problem.noise is None and min(task.grid.shape) >= scheme.points
+    certified = task.certificate in (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE)
+    if scheme.monotone or not (fits and certified):
+        return task
+    return dataclasses.replace(task, on=dataclasses.replace(task.on, scheme=scheme, plain=np.asarray(True)))
 
 
 def levels(on: Discretisation, method: Method, clock: Clock) -> list[Grid]:
@@ -93,8 +110,8 @@ def _vanishing(task: Task, value: Nodes, discounts: tuple[float, ...], clock: Cl
     """The last of the answers for some discounts, over one by the time of a crossing, one after the other."""
     for discount in discounts:
         # the number alone: structure and certificate stay, and the program of the solve itself serves on the way
-        problem = altered(task.problem, discount=jnp.asarray(discount / task.crossing, task.tol.dtype))
-        value = drive(task.asking(problem), value, clock, most=WARM_STEPS)[0].value
+        problem = altered(task.problem, discount=np.asarray(discount / known(task.crossing), task.tol.dtype))
+        value = iterate(task.asking(problem), value, clock, most=WARM_STEPS)[0].value
     return value
 
 
@@ -107,6 +124,8 @@ class Settled(NamedTuple):
     state: State
     code: Status
     residuals: np.ndarray
+    origin: "Settled | None" = None  # the monotone answer from which one of second order started
+    note: str = ""  # what else there is to say
 
 
 def may_go_on(task: Task, assumptions: Assumptions, state: State, code: Status) -> bool:
@@ -125,19 +144,19 @@ def settle(task: Task, assumptions: Assumptions, reached: Mask | None, guess: No
     under a small discount, give way to a linear solve.
     """
     value = warm(task, guess, clock)
-    state, code, residuals = drive(task, value, clock)
+    state, code, residuals = iterate(task, value, clock)
     if _needs_a_way(task):
         for discounts in FURTHER:  # a policy that stays where it is and pays, since the way takes too long for these
             if code not in FAILED:
                 break
             value = _vanishing(task, value, discounts, clock)
-            state, code, residuals = drive(task, value, clock)
+            state, code, residuals = iterate(task, value, clock)
     evaluation = task.method.evaluation
     # a sweep follows the drift from the target on; on a circle there is no first node, and under a discount β Δt ≪ 1 it
     # takes some 1/(β Δt) rounds
     if code is Status.STALLED and evaluation is not None and evaluation.rough:
         task = dataclasses.replace(task, method=PolicyIteration(linear_solve(task.grid)))
-        state, code, residuals = drive(task, state.value, clock)
+        state, code, residuals = iterate(task, state.value, clock)
     if code in FAILED:
         try:
             fewer, forced = forced_only(task, clock)
@@ -147,7 +166,7 @@ def settle(task: Task, assumptions: Assumptions, reached: Mask | None, guess: No
         if forced is not None and not forced.all():
             task, reached = fewer, forced
             # anew, since the value so far is that of the climb
-            state, code, residuals = drive(task, warm(task, None, clock), clock)
+            state, code, residuals = iterate(task, warm(task, None, clock), clock)
     while code is Status.CONVERGED and may_go_on(task, assumptions, state, code):
         pays = _leaving_pays(task, state.value)
         if not np.any(np.asarray(pays)):
@@ -157,9 +176,96 @@ def settle(task: Task, assumptions: Assumptions, reached: Mask | None, guess: No
         task = dataclasses.replace(
             task, obstacles=resting.release(task.obstacles, pays), certificate=Certificate.NONE, least_cost=None
         )
-        state, code, more = drive(task, state.value, clock)
+        state, code, more = iterate(task, state.value, clock)
         residuals = np.concatenate([residuals, more])
     return Settled(task, assumptions, reached, state, code, residuals)
+
+
+def raised(settled: Settled, scheme: Scheme) -> tuple[Task, Assumptions]:
+    """The task and the assumptions of a scheme of high order behind a monotone one, whose certificates it has not."""
+    # the matrix stays that of the chain, the residual is of the better slopes: defect correction
+    on = dataclasses.replace(settled.task.on, scheme=scheme, plain=None)
+    task = dataclasses.replace(settled.task, certificate=Certificate.RESIDUAL, on=on)
+    return task, dataclasses.replace(settled.assumptions, certificate=Certificate.RESIDUAL)
+
+
+def running(settled: Settled) -> Task:
+    """The task of an answer of high order as its program has it: that of the monotone answer, where both share one."""
+    if settled.origin is None or settled.origin.task.on.plain is None:
+        return settled.task
+    task = settled.origin.task
+    return dataclasses.replace(task, on=dataclasses.replace(task.on, plain=np.asarray(False)))
+
+
+def second_order(settled: Settled, scheme: Scheme, clock: Clock) -> Settled:
+    """The answer by a scheme of high order, from the monotone one.
+
+    The monotone answer stays beside it; where it was stopped before its first look that stands, with the reason.
+    """
+    over = clock.over()
+    if over is not None:
+        return settled._replace(code=over)
+    task, assumptions = raised(settled, scheme)
+    sharp = settled._replace(task=task, assumptions=assumptions, origin=settled)
+    state, ended, residuals = iterate(running(sharp), settled.state.value, clock)
+    if int(state.step) < 0:
+        return settled._replace(code=ended)
+    return sharp._replace(state=state, code=ended, residuals=residuals)
+
+
+def better_of(settled: Settled, sharp: Settled, *, sharpen: bool) -> Settled:
+    """The answer of second order; where nobody asked for it and it did not converge the monotone one, which says so."""
+    if sharpen and sharp.code is not Status.CONVERGED:
+        return settled._replace(note=f"It is of first order: the second-order iteration ended {sharp.code.name}.")
+    return sharp
+
+
+def plainly(settled: Settled) -> Settled:
+    """An answer of the chain, told as such, whatever program it comes from."""
+    task = settled.task
+    return settled if task.on.plain is None else settled._replace(task=dataclasses.replace(task, on=task.on.chain))
+
+
+def coarser_answer(settled: Settled, clock: Clock) -> tuple[Grid, np.ndarray] | None:
+    """The answer of the next coarser grid, with half of the intervals, by the scheme of ``settled`` and from its value.
+
+    None where an axis cannot do with so few, the coarser grid loses what is held, or the iteration does not converge.
+    """
+    task, fine = running(settled), settled.task.grid
+    coarse = transfer.coarser(fine, FEWEST)
+    if coarse is None or any(many == few for many, few in zip(fine.shape, coarse.shape, strict=True)):
+        return None
+    if clock.over() is not None or (level := _on_coarser(task, coarse)) is None:
+        return None
+    # infinite values are imposed anew by what is lost
+    value = np.where(np.asarray(task.counted), np.asarray(settled.state.value), 0)
+    state, code, _ = iterate(level, transfer.restrict(value, fine, coarse).astype(value.dtype), clock)
+    if code is not Status.CONVERGED:
+        return None
+    return coarse, np.where(np.asarray(level.counted), np.asarray(state.value), np.inf)
+
+
+def _on_coarser(task: Task, coarse: Grid) -> Task | None:
+    """The task on a coarser grid; None where that is another question."""
+    fine = task.grid
+    if all(2 * coarse.intervals(axis) == fine.intervals(axis) for axis in range(fine.ndim)):
+        # what is known of the nodes is known of every second one
+        every = tuple(slice(None, None, 2) for _ in fine.shape)
+        # without those of the problem and the grid, which may have the shape of the nodes by chance
+        bare: Any = dataclasses.replace(task, on=None)  # type: ignore[arg-type]
+        known = jax.tree.map(lambda leaf: leaf[every] if np.shape(leaf) == fine.shape else leaf, bare)
+        return dataclasses.replace(known, on=_kept(task.on.on_grid(coarse)))
+    level = task.on.chain.on_grid(coarse)
+    made = prepare_jit(level, method=task.method, tol=task.tol, assumptions=assumptions_of(level))
+    held, kept = (bool(np.any(np.asarray(each.obstacles.fixed))) for each in (task, made))
+    # which nodes cannot reach the target is not known of other ones
+    if task.has_lost or (held and not kept):
+        return None
+    on = dataclasses.replace(task.on.on_grid(coarse), cut=made.on.cut)
+    return dataclasses.replace(made, on=on, certificate=task.certificate)
+
+
+_kept = jax.jit(cut_cells.kept)
 
 
 @jax.jit

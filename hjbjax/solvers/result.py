@@ -20,6 +20,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import is_traced
 from hjbjax.problem.sets import AdmissibleSet, Finite
 from hjbjax.problem.types import Array, Field, Mask, Nodes, Scalar
+from hjbjax.solution import grid_error
 from hjbjax.solution.clock import CUT, Clock
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
@@ -27,6 +28,9 @@ from hjbjax.solvers.nested import Settled
 from hjbjax.solvers.setup import Assumptions, warn
 
 GAP = 0.05  # of what the actions matter; where Isaacs' condition holds, upwinding left up to .019 on 21 nodes
+# orders: of upwinding, of central differences, and of limited slopes, which is 2 where V is smooth and 1 at kinks
+FIRST, CENTRAL, LIMITED = 1.0, 2.0, 1.3
+COARSE = 0.1  # of the range of V: a larger error of the grid is worth a warning
 MOST = 2 / 3  # of an end's nodes: whatever has a velocity leaves by half of those where its position ends
 
 
@@ -35,7 +39,7 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
 
     The Isaacs gap is a program of its own, and nothing is compiled after a ``cut``.
     """
-    task, assumptions, reached, state, code, residuals = settled
+    task, assumptions, reached, state, code, residuals, origin, note = settled
     stopped = cut or code in CUT
     if not stopped:
         _refuse_noise(task, state, grid)
@@ -46,6 +50,7 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
     unanswered = stopped or code in (Status.DIVERGED, Status.NONFINITE)  # there is no optimal drift to speak of
     leaving = None if unanswered else _leaving(task, state, grid)
     state = jax.device_get(state)
+    message = _message(code, task, state, grid) if earning is None else _unbounded_message(earning, grid)
     solution = assemble(task, state, assumptions)
     lost = ~np.asarray(task.counted)
     arrays = {name: getattr(solution, name) for name in ("value", "policy", "disturbance")}
@@ -68,8 +73,10 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
         discrete=solution.discrete,
         discrete_disturbance=solution.discrete_disturbance,
         residuals=residuals,
-        message=_message(code, task, state, grid) if earning is None else _unbounded_message(earning, grid),
+        message=" ".join(filter(None, [message, note])),
+        monotone_error=None if origin is None else _certified(origin),
         stats={
+            **({} if origin is None else {"from_monotone": _apart(state, origin)}),
             "scheme": repr(task.scheme),
             "device": str(jax.devices()[0].device_kind),
             "dtype": str(state.value.dtype),
@@ -77,6 +84,42 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
             "versions": {"jax": jax.__version__, "numpy": np.__version__},
         },
     )
+
+
+def _certified(settled: Settled) -> float | None:
+    """The certified bound on the error of a monotone answer, or None."""
+    error = assemble(settled.task, jax.device_get(settled.state), settled.assumptions).error
+    return None if error is None else float(error)
+
+
+def _apart(state: State, origin: Settled) -> float:
+    """The largest change from the monotone answer to the one of second order, cost units."""
+    counted = np.asarray(origin.task.counted)
+    return float(np.max(np.abs(np.asarray(state.value) - np.asarray(origin.state.value))[counted], initial=0))
+
+
+def with_grid_error(solution: Solution, settled: Settled, coarser: tuple[Grid, np.ndarray] | None) -> Solution:
+    """The solution with an estimate of its distance to the exact value, and a warning where that is large.
+
+    From the answer of its scheme on a coarser grid, or, without one, from what its scheme changed of the monotone one.
+    """
+    value, origin = np.asarray(solution.value), settled.origin
+    if coarser is not None:
+        order = LIMITED if origin is not None else FIRST if settled.note else CENTRAL
+        found = grid_error.estimate(solution.grid, value, *coarser, order=order)
+    elif origin is not None and settled.task.problem.noise is None:
+        with np.errstate(invalid="ignore"):
+            found = np.abs(value - np.asarray(origin.state.value))
+    else:  # with noise both schemes may be one, and their difference says nothing
+        return solution
+    finite = np.isfinite(value)
+    found = np.where(finite, found, np.nan)
+    if finite.any() and (largest := np.max(found[finite])) > COARSE * np.ptp(value[finite]):
+        warn(
+            f"the grid is coarse for this problem: its error is about {largest:.3g}, over a tenth of the range of the "
+            "value; take more nodes, or gather them where the value bends: Grid(..., stretch=)"
+        )
+    return dataclasses.replace(solution, grid_error=found)
 
 
 def solution_at_start(on: Discretisation, value: Nodes, code: Status) -> Solution:
@@ -292,5 +335,5 @@ def _message(code: Status, task: Task, state: State, grid: Grid) -> str:
     if code is Status.CONVERGED and task.certificate in (Certificate.NONE, Certificate.OPEN):
         return f"Residual and last step are at most {tol:.2g}; no certificate bounds the error."
     if code is Status.CONVERGED and task.certificate is Certificate.RESIDUAL:
-        return f"Residual of the second-order equation and last step are at most {tol:.2g} in cost units."
+        return f"Residual of the high-order equation and last step are at most {tol:.2g} in cost units."
     return code.message

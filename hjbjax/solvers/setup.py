@@ -9,19 +9,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import chain, cut_cells
-from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation import chain, cut_cells, schemes
+from hjbjax.discretisation.discretisation import Discretisation, Scheme
+from hjbjax.discretisation.schemes import Limited, Upwind
 from hjbjax.finiteness import attainability, resting
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import bellman
 from hjbjax.iteration.certificates import Certificate
-from hjbjax.iteration.evaluation import Direct, Krylov, Sweeps
+from hjbjax.iteration.evaluation import Direct, Evaluation, Krylov, Sweeps
 from hjbjax.iteration.fixed_point import Task
 from hjbjax.iteration.methods import Method, Nested, PolicyIteration, ValueIteration
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_discounted
-from hjbjax.problem.pytree import cast
-from hjbjax.problem.types import Mask, Number, Scalar
+from hjbjax.problem.pytree import cast, known
+from hjbjax.problem.types import Mask, Number
 from hjbjax.solution.clock import Clock
 from hjbjax.tracing import checks
 
@@ -48,27 +49,58 @@ def is_constrained(problem: Problem) -> bool:
     return problem.stopping_cost is not None or problem.running_max is not None
 
 
-def choose(problem: Problem, grid: Grid, *, traced: bool) -> Method:
-    """The method that suits a problem.
+def choose(problem: Problem, grid: Grid, *, traced: bool, method: Method | None = None) -> Method:
+    """The method that suits a problem, or the one that was asked for with the evaluation that does.
 
-    Where transport rules, a few wavefront sweeps evaluate a policy well enough. Where there is noise they are
-    too slow and precondition a Krylov method; on a line a direct solve costs nothing. Large grids are nested. Tubes
-    without discount have policies without a value of their own: there value iteration alone keeps to the extreme
-    one of many fixed points.
+    Large grids are nested. Tubes without discount have policies without a value of their own: there value iteration
+    alone keeps to the extreme one of many fixed points.
     """
+    if method is not None:
+        return method.filled(choose_evaluation(problem, grid, traced=traced))
     # a policy that waits at ψ or g for nothing solves its own linear equation with any value
     if is_constrained(problem) and is_discounted(problem) is False:
         return ValueIteration()
-    if grid.sides("open"):  # what is continued from inside is no matter for sweeps; see relaxation
-        small = grid.ndim < 3 and grid.size <= DIRECT
-        return PolicyIteration(Direct() if small else Krylov())
-    if problem.noise is None:
-        method = PolicyIteration(Sweeps())
-    else:
-        method = PolicyIteration(Krylov() if traced else linear_solve(grid))
+    method = PolicyIteration(choose_evaluation(problem, grid, traced=traced))
     # from a cold start a good policy spreads by one cell an improvement: N of them on one grid, a few on nested ones;
     # on the zoo's pendulum with 400 x 401 nodes the steps of all levels took .2 s in place of .9
-    return Nested(method) if grid.size > NEST and not traced else method
+    return Nested(method) if grid.size > NEST and not (traced or grid.sides("open")) else method
+
+
+def choose_evaluation(problem: Problem, grid: Grid, *, traced: bool) -> Evaluation:
+    """The evaluation of policies that suits a problem.
+
+    Where transport rules, a few wavefront sweeps evaluate a policy well enough. Where there is noise they are too slow
+    and precondition a Krylov method; on a line a direct solve costs nothing.
+    """
+    if grid.sides("open"):  # what is continued from inside is no matter for sweeps; see relaxation
+        small = grid.ndim < 3 and grid.size <= DIRECT
+        return Direct() if small else Krylov()
+    if problem.noise is None:
+        return Sweeps()
+    return Krylov() if traced else linear_solve(grid)
+
+
+def choose_scheme(on: Discretisation, method: Method) -> Scheme:
+    """The scheme that suits a problem; host level.
+
+    Of second order, by limited slopes, unless noise lets central differences be monotone at every node, which are of
+    second order and certified. Value iteration is the chain's own operator, and a tube without discount must end where
+    V no longer changes: both stay with the chain.
+    """
+    problem, calm = on.problem, Limited().chain
+    if method.relaxes or (is_constrained(problem) and is_discounted(problem) is False):
+        return Upwind()
+    if problem.noise is not None and bool(_central(dataclasses.replace(on, scheme=calm))):
+        return calm
+    return Limited()
+
+
+@jax.jit
+def _central(on: Discretisation) -> jax.Array:
+    """True if central differences are monotone at all nodes, whatever the action."""
+    on = cast(on, on.dtype)
+    calm = schemes.calm(on, on.coordinates(), cut_cells.links(on))
+    return jnp.all(jnp.stack([jnp.all(axis) for axis in calm]))
 
 
 def linear_solve(grid: Grid) -> Direct | Krylov:
@@ -78,7 +110,7 @@ def linear_solve(grid: Grid) -> Direct | Krylov:
 
 def prepare(on: Discretisation, *, method: Method, tol: Number, assumptions: "Assumptions") -> Task:
     """The task of a solve, all arrays in its type; pure, so that it may be traced, batched and differentiated."""
-    on = cast(on, on.dtype)
+    on = cut_cells.kept(cast(on, on.dtype))
     obstacles, still = _obstacles(on, assumptions)
     # a tube with a traced discount takes relaxations if that is zero, which only the compiled program will see
     undecided = assumptions.certificate is Certificate.BY_DISCOUNT and is_constrained(on.problem)
@@ -251,12 +283,12 @@ def prepare_traced(on: Discretisation, *, method: Method, tol: Number) -> tuple[
     return _finite_part(task, reached | (known.problem.discount > 0)), assumptions
 
 
-def _least_rate(task: Task) -> Scalar:
+def _least_rate(task: Task) -> Number:
     """The rate up to which jumps are rounding beside those of the fastest motion on the grid; zero if unknown."""
     if task.crossing is None:
-        return jnp.zeros((), task.tol.dtype)
+        return np.zeros((), task.tol.dtype)
     # nodes of all axes over the time of a crossing: the rate of jumps of the fastest motion
-    return resting.ROUNDINGS * jnp.finfo(task.tol.dtype).eps * sum(task.grid.shape) / task.crossing
+    return resting.ROUNDINGS * jnp.finfo(task.tol.dtype).eps * sum(task.grid.shape) / known(task.crossing)
 
 
 def _finite_part(task: Task, reached: Mask) -> Task:

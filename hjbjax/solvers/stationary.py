@@ -17,7 +17,6 @@ from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.finiteness import admissibility, node_checks, resting
 from hjbjax.iteration import adjoint, fixed_point
-from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import Method, check_method
 from hjbjax.problem import arguments
@@ -29,11 +28,9 @@ from hjbjax.solution import transfer
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
-from hjbjax.solvers import faults, memory, nested
-from hjbjax.solvers.host_loop import drive
-from hjbjax.solvers.nested import Settled
-from hjbjax.solvers.result import assemble, finish, solution_at_start, with_last_phase
-from hjbjax.solvers.setup import choose, is_constrained, prepare_on_host, prepare_traced
+from hjbjax.solvers import host_loop, memory, nested
+from hjbjax.solvers.result import assemble, finish, solution_at_start, with_grid_error, with_last_phase
+from hjbjax.solvers.setup import choose, choose_scheme, is_constrained, prepare_on_host, prepare_traced
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
 
@@ -47,7 +44,7 @@ def solve(
     grid: Grid,
     *,
     method: Method | None = None,
-    scheme: Scheme = Upwind(),
+    scheme: Scheme | None = None,
     tol: float = 1e-3,
     guess: Nodes | None = None,
     dtype: DType | None = None,
@@ -65,10 +62,14 @@ def solve(
       problem: the question.
       grid: the nodes.
       method: ``PolicyIteration(...)`` or ``ValueIteration()``; ``None`` picks by the problem.
-      scheme: ``Upwind()``, first order and monotone, or ``Limited()``, second order where the value is smooth.
-      tol: bound to reach on |V − V_h|, in cost units, V_h the exact solution on the grid. Where no certificate
-        exists the solution says so, and the bound is on the residual and on the last step; a tube without discount
-        goes on until V no longer changes.
+      scheme: ``Upwind()``, first order and monotone; ``Limited()``, second order where the value is smooth; or
+        ``Weno5()``, fifth order there, on equal spacings, for a ``tol`` as small as its error. ``None`` is
+        ``Limited()`` where its iteration converges, with an estimate of the grid's error. It is ``Upwind()`` for value
+        iteration and tubes without discount, inside transformations, and wherever noise lets central differences be
+        monotone.
+      tol: bound to reach on |V − V_h|, in cost units, V_h the exact solution on the grid of the monotone scheme. Where
+        no certificate exists the solution says so, and the bound is on the residual and on the last step, as it is for
+        the high-order equation; a tube without discount goes on until V no longer changes.
       guess: node values to start from, shape (*grid); not for a tube without discount, which has many fixed points.
       dtype: ``None`` is float64; ``"float32"`` for memory, with a tolerance that float32 can reach.
       max_steps: at most so many steps.
@@ -91,25 +92,25 @@ def solve(
       >>> import hjbjax as hjb
       >>> problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), discount=1.0)
       >>> solution = hjb.solve(problem, hjb.Grid([-2.0], [2.0], (81,)))
-      >>> solution.status.name, solution.error <= 1e-3
-      ('CONVERGED', True)
+      >>> solution.status.name, solution.monotone_error <= 1e-3, bool(solution.grid_error.max() <= 1e-3)
+      ('CONVERGED', True, True)
     """
     check_limits(max_steps, time_limit)
     check_arguments(problem, grid, method, scheme, tol, guess)
     if is_traced(problem, grid, guess, tol):
         traced = jnp.result_type(float) if dtype is None else jnp.dtype(dtype)
-        return _solve_traced(Discretisation(problem, grid, scheme, traced), method, tol, guess, max_steps)
+        return _solve_traced(Discretisation(problem, grid, scheme or Upwind(), traced), method, tol, guess, max_steps)
     kind = as_dtype(dtype)
-    on = Discretisation(problem, grid, scheme, kind)
     check_node_values(guess, grid, "solve: the guess")
     grid.check_spacings(kind)
-    method = method or choose(problem, grid, traced=False)
+    method = choose(problem, grid, traced=False, method=method)
     clock = Clock(max_steps or 10**9, time_limit, progress)
+    on, sharpen = Discretisation(problem, grid, scheme or Upwind(subcell=True), kind), scheme is None
     # float64 for this call alone: another thread, and the caller's own programs, keep theirs
     with noting_interrupts(clock), jax.enable_x64(kind == np.float64):
         needed = memory.require(problem, grid, method, kind, max_memory)
-        with faults.with_solution(clock, needed, lambda kept: _partial(on, kept)):
-            solution = with_last_phase(_solve_on_host(on, method, tol, guess, clock), clock)
+        with host_loop.with_solution(clock, needed, lambda kept: _partial(on, kept)):
+            solution = with_last_phase(_solve_on_host(on, method, tol, guess, clock, sharpen=sharpen), clock)
     solution.stats.setdefault("method", method.described(problem.is_game))
     solution.stats.update(
         seconds=clock.stepping, compile_seconds=clock.elapsed() - clock.stepping,
@@ -120,7 +121,7 @@ def solve(
     return solution
 
 
-def _partial(on: Discretisation, kept: faults.Kept | None) -> Solution:
+def _partial(on: Discretisation, kept: host_loop.Kept | None) -> Solution:
     """The solution of a run that broke, from the value that outlived it, maybe on a coarser grid; else zero."""
     if kept is None:
         value = np.broadcast_to(np.zeros((), on.dtype), on.grid.shape)  # one zero seen everywhere takes no memory
@@ -130,8 +131,13 @@ def _partial(on: Discretisation, kept: faults.Kept | None) -> Solution:
     return solution_at_start(on, value, Status.INTERRUPTED)
 
 
-def _solve_on_host(on: Discretisation, method: Method, tol: float, guess: Nodes | None, clock: Clock) -> Solution:
-    """The solution by checks, coarser grids, preparation and steps, in this order, as far as the clock allows."""
+def _solve_on_host(
+    on: Discretisation, method: Method, tol: float, guess: Nodes | None, clock: Clock, *, sharpen: bool = False
+) -> Solution:
+    """The solution by checks, coarser grids, preparation and steps, in this order, as far as the clock allows.
+
+    ``sharpen``: by the scheme that suits the problem, with an estimate of the grid's error.
+    """
     problem, grid = on.problem, on.grid
     start: Nodes | None = None if guess is None else np.asarray(guess, on.dtype)
     try:
@@ -140,41 +146,26 @@ def _solve_on_host(on: Discretisation, method: Method, tol: float, guess: Nodes 
         checks.shapes(problem, grid, on.scheme)
         node_checks.values(problem, grid, on.dtype, clock)
         admissibility.values(problem, grid, on.dtype)
+        if sharpen:
+            on = dataclasses.replace(on, scheme=choose_scheme(on, method))
+            sharpen = on.scheme.subcell  # value iteration and tubes start from nowhere else, on a coarser grid neither
         known = None if start is None else jnp.asarray(start)
-        start, shapes = nested.start(on.chain, method, tol, known, clock)
+        start, shapes = nested.start(on, method, tol, known, clock)
         task, assumptions, reached = prepare_on_host(on.chain, method=method.inner, tol=tol, clock=clock)
     except Stopped as stop:
         return solution_at_start(on, np.zeros(grid.shape) if start is None else np.array(start), stop.status)
-    settled = nested.settle(task, assumptions, reached, start, clock)
+    settled = nested.settle(nested.staged(task, on.scheme), assumptions, reached, start, clock)
     about: dict[str, Any] = {"levels": [*shapes, grid.shape]}
-    if not on.scheme.monotone:
-        settled, apart = second_order(settled, on.scheme, clock)
-        about |= apart
+    if not on.scheme.monotone and (settled.code is Status.CONVERGED or not sharpen):
+        settled = nested.better_of(settled, nested.second_order(settled, on.scheme, clock), sharpen=sharpen)
+    settled = nested.plainly(settled)
     solution = finish(settled, grid)
+    if sharpen and solution.status is Status.CONVERGED:
+        solution = with_grid_error(solution, settled, nested.coarser_answer(settled, clock))
     if type(settled.task.method.evaluation) is not type(method.evaluation):
         about["method"] = settled.task.method.described(problem.is_game)
     solution.stats.update(about)
     return solution
-
-
-def second_order(settled: Settled, scheme: Scheme, clock: Clock) -> tuple[Settled, dict[str, Any]]:
-    """The second-order answer, from the monotone one, and how far apart they are.
-
-    Its scheme is not monotone, so that no certificate of the chain holds for it.
-    """
-    task, state, over = settled.task, settled.state, clock.over()
-    if over is not None:
-        return settled._replace(code=over), {}
-    # the matrix stays that of the chain, the residual is of the better slopes: defect correction
-    higher = dataclasses.replace(task, certificate=Certificate.RESIDUAL, on=dataclasses.replace(task.on, scheme=scheme))
-    better, ended, more = drive(higher, state.value, clock)
-    if int(better.step) < 0:  # it was stopped before its first look, and the monotone answer stands
-        return settled._replace(code=ended), {}
-    assumptions = dataclasses.replace(settled.assumptions, certificate=Certificate.RESIDUAL)
-    counted = np.asarray(task.counted)
-    apart = np.abs(np.asarray(better.value)[counted] - np.asarray(state.value)[counted])
-    sharp = Settled(higher, assumptions, settled.reached, better, ended, more)
-    return sharp, {"from_monotone": float(np.max(apart, initial=0))}
 
 
 def _solve_traced(
@@ -184,7 +175,7 @@ def _solve_traced(
     if not on.scheme.monotone:
         name = type(on.scheme).__name__
         raise ValueError(f"solve: {name}() runs at host level only; inside jit, vmap and grad use Upwind()")
-    method = method or choose(on.problem, on.grid, traced=True)
+    method = choose(on.problem, on.grid, traced=True, method=method)
     if method.coarsest is not None:
         raise ValueError("solve: Nested(...) runs at host level only; inside jit, vmap and grad use its inner method")
     task, assumptions = prepare_traced(on, method=method, tol=tol)
@@ -241,7 +232,8 @@ def check_arguments(
         raise TypeError(f"solve: got {type(problem).__name__}, {type(grid).__name__}; wanted a Problem and a Grid")
     if method is not None:
         check_method(method, "solve: method")
-    schemes.check(scheme, "solve: scheme", grid, stationary=True)
+    if scheme is not None:
+        schemes.check(scheme, "solve: scheme", grid, stationary=True)
     arguments.positive(tol, "solve: tol", "in the units of the cost")
     if guess is not None and is_constrained(problem) and is_discounted(problem) is False:
         raise ValueError(

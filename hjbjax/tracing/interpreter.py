@@ -17,7 +17,17 @@ import numpy as np
 from jax.extend import core as jex
 
 from hjbjax.problem.types import Numbers
-from hjbjax.tracing.primitives import CALLS, CUMULATIVE, ENTRYWISE, IN_NUMPY, MOVES, REDUCTIONS, SCATTERS, array_type
+from hjbjax.tracing.primitives import (
+    CALLS,
+    CUMULATIVE,
+    ENTRYWISE,
+    IN_NUMPY,
+    MOVES,
+    REDUCTIONS,
+    SCATTERS,
+    array_type,
+    in_numpy,
+)
 
 Operand: TypeAlias = Numbers  # of an equation: an object array of scalars, or numbers that hold at all nodes
 
@@ -135,6 +145,8 @@ def _bind_uniform(eqn: jex.JaxprEqn, operands: list) -> list:
     """Results of an equation none of whose operands varies over the nodes; concrete while these are."""
     if any(isinstance(value, jax.core.Tracer) for value in operands):
         return bind(eqn, operands)
+    if (result := in_numpy(eqn, operands)) is not None:
+        return [result]
     # inside ``jit`` an index that is computed from constants would become a tracer, and every move by it a fallback
     with jax.ensure_compile_time_eval():
         return bind(eqn, operands)

@@ -7,6 +7,8 @@ import jax
 import numpy as np
 from jax.extend import core as jex
 
+from hjbjax.problem.types import Numbers
+
 # Which of its n operands a data-moving primitive moves; the others are indices, and an index that varies from node to
 # node moves other entries at every node, for which only ``vmap`` has an answer.
 MOVES: dict[str, Callable[[int], Sequence[int]]] = {
@@ -28,14 +30,35 @@ MOVES: dict[str, Callable[[int], Sequence[int]]] = {
     "dynamic_update_slice": lambda n: (0, 1),
     "scatter": lambda n: (0, 2),
 }
-# The commonest of them for labels in NumPy: JAX would compile each on its first use.
+
+
+def _broadcast(
+    x: np.ndarray, *, shape: tuple[int, ...], broadcast_dimensions: tuple[int, ...], **_: object
+) -> np.ndarray:
+    """An array whose axes are some axes of ``shape``, repeated along the others."""
+    lengths = dict(zip(broadcast_dimensions, x.shape, strict=True))
+    return np.broadcast_to(x.reshape([lengths.get(axis, 1) for axis in range(len(shape))]), shape)
+
+
+# The commonest of them in NumPy, for labels and for constants: JAX would compile each on its first use.
 IN_NUMPY: dict[str, Callable[..., np.ndarray]] = {
+    "broadcast_in_dim": _broadcast,
     "slice": lambda x, start_indices, limit_indices, strides: x[
         tuple(map(slice, start_indices, limit_indices, strides or (None,) * x.ndim))
     ],
     "squeeze": lambda x, dimensions: np.squeeze(x, dimensions),
     "stack": lambda *xs, axis: np.stack(xs, axis),
     "concatenate": lambda *xs, dimension: np.concatenate(xs, dimension),
+}
+# Arithmetic with the same bits in NumPy, for the constants that a function computes from its parameters.
+_ARITHMETIC: dict[str, Callable[..., np.ndarray]] = {
+    "add": np.add,
+    "add_any": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "div": np.divide,
+    "neg": np.negative,
+    "convert_element_type": np.asarray,
 }
 
 # ``scatter`` alone moves entries, these compute: several updates may meet in one entry
@@ -64,6 +87,18 @@ CUMULATIVE = {"cumsum": jax.lax.add, "cumprod": jax.lax.mul, "cummax": jax.lax.m
 # A custom_vjp is none of them: to look inside would lose its rule, and ``vmap`` keeps it.
 CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr"}
 CALLS |= {"checkpoint": "jaxpr", "remat": "jaxpr", "remat2": "jaxpr", "custom_jvp_call": "call_jaxpr"}
+
+
+def in_numpy(eqn: jex.JaxprEqn, operands: Sequence[Numbers]) -> np.ndarray | None:
+    """Result of an equation on concrete numbers where NumPy gives the same bits, else None."""
+    name, dtypes = eqn.primitive.name, [array_type(var).dtype for var in (*eqn.invars, *eqn.outvars)]
+    if name not in IN_NUMPY and (name not in _ARITHMETIC or not all(np.issubdtype(d, np.floating) for d in dtypes)):
+        return None
+    arrays = [np.asarray(operand, dtype) for operand, dtype in zip(operands, dtypes[:-1], strict=True)]
+    if name in IN_NUMPY:
+        return IN_NUMPY[name](*arrays, **eqn.params)
+    with np.errstate(all="ignore"):
+        return np.asarray(_ARITHMETIC[name](*arrays), dtypes[-1])
 
 
 def array_type(var: jex.Var | jex.Literal) -> jax.core.ShapedArray:

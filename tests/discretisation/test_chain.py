@@ -50,17 +50,17 @@ def _drift_and_noise(problem, grid, policy):
 
 
 def dense_generator(f, a, grid, central):
-    """The rates of the module's docstring, node by node; what leaves the box stays, or slides along the edge."""
+    """The rates of the module's docstring, node by node; at a wall all noise goes inwards, diagonals to their image."""
     number = np.arange(grid.size).reshape(grid.shape)
     h = [grid.spacing(axis) for axis in range(grid.ndim)]
     result = np.zeros((grid.size, grid.size))
 
     def end(index, jump):
-        """Where a jump ends: axes across which it would leave keep their index."""
+        """Where a jump ends: across a wall at the mirror image."""
         reached = []
         for i, step, count, wraps in zip(index, jump, grid.shape, grid.periodic, strict=True):
             inside = 0 <= i + step < count
-            reached.append((i + step) % count if wraps else i + step if inside else i)
+            reached.append((i + step) % count if wraps else i + step if inside else i - step)
         return number[tuple(reached)]
 
     for index in np.ndindex(*grid.shape):
@@ -69,12 +69,16 @@ def dense_generator(f, a, grid, central):
         for i in range(grid.ndim):
             left = ax[i, i] - sum(abs(ax[i, j]) * h[i] / h[j] for j in range(grid.ndim) if j != i)
             left = max(left, 0.0)
-            at_edge = not grid.periodic[i] and index[i] in (0, grid.shape[i] - 1)
             unit = np.eye(grid.ndim, dtype=int)[i]
             for sign in (1, -1):
-                if central and left >= h[i] * abs(fx[i]) and not at_edge:
+                if not grid.periodic[i] and index[i] == (grid.shape[i] - 1 if sign > 0 else 0):
+                    rate = 0
+                elif not grid.periodic[i] and index[i] == (0 if sign > 0 else grid.shape[i] - 1):
+                    held = max(-sign * fx[i], 0) / h[i] if central else 0  # outward drift against the noise
+                    rate = max(sign * fx[i], 0) / h[i] + max(left / h[i] ** 2 - held, 0)
+                elif central and left >= h[i] * abs(fx[i]):
                     rate = left / (2 * h[i] ** 2) + sign * fx[i] / (2 * h[i])
-                elif central and not at_edge:
+                elif central:
                     rate = max(sign * fx[i], 0) / h[i]
                 else:
                     rate = max(sign * fx[i], 0) / h[i] + left / (2 * h[i] ** 2)
@@ -157,16 +161,18 @@ def test_steps_have_the_mean_and_the_covariance_of_the_diffusion(n, kind, seed):
 
 
 def test_numbers_by_hand():
-    """h = ½, f = 1 at the left node, −1 elsewhere, ε = 1: c⁺ = f⁺/h + 2, c⁻ = f⁻/h + 2."""
+    """h = ½, f = 1 at the left node, −1 elsewhere, ε = 1: c⁺ = f⁺/h + 2, c⁻ = f⁻/h + 2, at the walls |f|/h + 4."""
     problem = Problem(lambda x, u: u, None, Box([-1.0], [1.0]), noise=1.0)
     grid = Grid([0.0], [1.0], (3,))
     policy = np.array([[1.0], [-1.0], [-1.0]])
     plain = chain.generator(problem, grid, policy, scheme=PLAIN).toarray()
-    assert plain.tolist() == [[-4, 4, 0], [4, -6, 2], [0, 4, -4]]
-    assert chain.generator(problem, grid, policy).toarray().tolist() == [[-4, 4, 0], [3, -4, 1], [0, 4, -4]]
+    assert plain.tolist() == [[-6, 6, 0], [4, -6, 2], [0, 6, -6]]
+    assert chain.generator(problem, grid, policy).toarray().tolist() == [[-6, 6, 0], [3, -4, 1], [0, 6, -6]]
     outward = chain.generator(problem, grid, -policy, scheme=PLAIN).toarray()
-    assert outward[0].tolist() == [-2, 2, 0]  # the drift is gone, the noise reflects
-    assert outward[2].tolist() == [0, 2, -2]
+    assert outward[0].tolist() == [-4, 4, 0]  # the drift is gone, the noise reflects
+    assert outward[2].tolist() == [0, 4, -4]
+    against = chain.generator(problem, grid, -policy).toarray()
+    assert against[0].tolist() == [-2, 2, 0]  # (a − h n)/h²: central differences hold the noise back
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4])
@@ -333,7 +339,7 @@ def test_quantecon_finds_our_value(n, kind, with_target):
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".* of the nodes cannot reach the target")  # discounted: no matter
         warnings.filterwarnings("ignore", message="the optimal drift leaves")  # of a random system it may
-        ours = solve(problem, grid, tol=1e-9)
+        ours = solve(problem, grid, tol=1e-9, scheme=Upwind())
     assert np.max(np.abs(ours.value.ravel() + theirs.v)) <= 1e-8
     best = problem.controls.points[theirs.sigma]
     under = chain.matrix(problem, grid, ours.policy)  # both policies are optimal: check theirs by value

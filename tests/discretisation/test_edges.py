@@ -283,8 +283,8 @@ def slope_and_effort(x, u):
 @pytest.mark.slow
 def test_float32_leaves_by_a_rounding_of_float32_at_most():
     problem = hjb.Problem(pushed, slope_and_effort, hjb.Box([-1.0], [1.5]), discount=0.5)
-    single = hjb.solve(problem, LINE, tol=1e-3, dtype="float32")
-    np.testing.assert_allclose(single.value, hjb.solve(problem, LINE, tol=1e-9).value, atol=2e-3)
+    single = hjb.solve(problem, LINE, tol=1e-3, dtype="float32", scheme=hjb.Upwind())
+    np.testing.assert_allclose(single.value, hjb.solve(problem, LINE, tol=1e-9, scheme=hjb.Upwind()).value, atol=2e-3)
     chain.generator(problem, LINE, single.policy)
     with pytest.raises(ValueError, match="leaves the box across a constrained end at 1 nodes"):
         chain.generator(problem, LINE, single.policy - 0.01)
@@ -295,7 +295,7 @@ def test_the_derivative_at_a_wall_is_that_of_differences():
 
     def value(pull):
         problem = hjb.Problem(Partial(pulled, pull), effort, hjb.Box([-3.0], [3.0]), discount=0.5)
-        return hjb.solve(problem, LINE, tol=1e-11).value[-1]
+        return hjb.solve(problem, LINE, tol=1e-11, scheme=hjb.Upwind()).value[-1]
 
     with jax.enable_x64(True):
         slope = jax.grad(value)(1.0)
@@ -330,7 +330,7 @@ def test_growth_with_constrained_ends(most):
     """With γ = a the optimal consumption is k(ρ + (1 − a)δ)/a; projected ends give any c up to its bound."""
     problem = hjb.Problem(growth, minus_utility, hjb.Box([1e-3], [most]), discount=IMPATIENCE)
     grid = hjb.Grid([1.5], [9.5], (201,), edges="constrained")
-    solution = hjb.solve(problem, grid, tol=1e-6)
+    solution = hjb.solve(problem, grid, tol=1e-6, scheme=hjb.Upwind())
     exact = grid.axis(0) * (IMPATIENCE + (1 - CAPITAL_SHARE) * DECAY) / CAPITAL_SHARE
     assert np.max(np.abs(solution.policy[:, 0] / exact - 1)) <= 5e-3
     assert solution.error <= 1e-6
@@ -346,7 +346,7 @@ def test_growth_with_constrained_ends(most):
 def test_growth_with_projected_ends_warns_and_says_where():
     problem = hjb.Problem(growth, minus_utility, hjb.Box([1e-3], [2.0]), discount=IMPATIENCE)
     with pytest.warns(hjb.SolveWarning, match=r"(?s)lower end of x1 \(1 of 1 nodes\).*edges='constrained'"):
-        solution = hjb.solve(problem, hjb.Grid([1.5], [9.5], (201,)), tol=1e-6)
+        solution = hjb.solve(problem, hjb.Grid([1.5], [9.5], (201,)), tol=1e-6, scheme=hjb.Upwind())
     assert solution.cut.tolist() == [[1, 0]]
     assert "1 of the lower end of x1" in str(solution)
 
@@ -377,7 +377,7 @@ def test_merton_with_open_ends(most, sign):
         discount=RHO,
     )
     grid = hjb.Grid([-3.0], [3.0], (201,), edges="open")
-    solution = hjb.solve(problem, grid, tol=1e-6)
+    solution = hjb.solve(problem, grid, tol=1e-6, scheme=hjb.Upwind())
     share = (MU - R) / (GAMMA * SIGMA**2)
     rate = (RHO - (1 - GAMMA) * (R + (MU - R) ** 2 / (2 * GAMMA * SIGMA**2))) / GAMMA
     assert (share, rate) == pytest.approx((0.21333, 0.036178), rel=1e-4)
@@ -406,7 +406,7 @@ def test_units_change_nothing_else(edges):
             hjb.Box([-1.0], [1.5]),
             discount=0.5 * time,
         )
-        solutions.append(hjb.solve(problem, grid, tol=1e-8 * money))
+        solutions.append(hjb.solve(problem, grid, tol=1e-8 * money, scheme=hjb.Upwind()))
     for solution, money in zip(solutions[1:], (1e9, 1e-9), strict=True):
         np.testing.assert_allclose(solution.value / money, solutions[0].value, rtol=1e-7)
         np.testing.assert_allclose(solution.policy, solutions[0].policy, atol=1e-6)
@@ -421,7 +421,7 @@ def test_mirrored_problems_have_mirrored_answers(kind):
             hjb.Box([-1.0], [1.5]), discount=0.5, noise=0.1,
         )  # fmt: skip
         grid = hjb.Grid([-1.0], [1.0], (21,), edges=(ends,))
-        values.append(hjb.solve(problem, grid, tol=1e-9).value[::sign])
+        values.append(hjb.solve(problem, grid, tol=1e-9, scheme=hjb.Upwind()).value[::sign])
     np.testing.assert_allclose(*values, atol=2e-9)
 
 
@@ -469,9 +469,9 @@ def test_a_node_without_an_admissible_action_is_refused_with_its_state():
     grid = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (5, 5), edges=("constrained", "projected"))
     words = r"(?s)no action is admissible at 4 of 25 nodes, first at node \(0, 0\), x = \[-1., -1.\].*lower end of x1"
     for ask in (
-        lambda: hjb.solve(problem, grid),
-        lambda: hjb.solve_batch([problem], grid),
-        lambda: hjb.march(problem, grid, 1.0),
+        lambda: hjb.solve(problem, grid, scheme=hjb.Upwind()),
+        lambda: hjb.solve_batch([problem], grid, scheme=hjb.Upwind()),
+        lambda: hjb.march(problem, grid, 1.0, scheme=hjb.Upwind(split=True)),
     ):
         with pytest.raises(ValueError, match=words) as caught:
             ask()
@@ -483,9 +483,11 @@ def test_where_the_target_is_no_action_is_wanted():
     problem = hjb.Problem(lambda x, u: 1 + 0 * u, lambda x, u: 1.0, hjb.Box([-1.0], [1.0]))
     grid = hjb.Grid([0.0], [1.0], (11,), edges="constrained")
     with pytest.raises(ValueError, match="no action is admissible at 1 of 11 nodes"):
-        hjb.solve(problem, grid)
+        hjb.solve(problem, grid, scheme=hjb.Upwind())
     arriving = dataclasses.replace(problem, target=lambda x: 0.95 - x[0])
-    np.testing.assert_allclose(hjb.solve(arriving, grid, tol=1e-9).value, 1 - grid.axis(0), atol=1e-8)
+    np.testing.assert_allclose(
+        hjb.solve(arriving, grid, tol=1e-9, scheme=hjb.Upwind()).value, 1 - grid.axis(0), atol=1e-8
+    )
 
 
 def between_walls(x, u):
@@ -497,7 +499,7 @@ def test_a_corner_may_leave_one_action_alone(power):
     """Of two ends each forbids one side of u = .37, and no sample is .37; a cost in u⁴ is sampled."""
     grid = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (5, 5), edges="constrained")
     problem = hjb.Problem(between_walls, lambda x, u: jnp.sum(x) + u[0] ** power, hjb.Box([-1.0], [1.0]), discount=1.0)
-    solution = hjb.solve(problem, grid, tol=1e-9)
+    solution = hjb.solve(problem, grid, tol=1e-9, scheme=hjb.Upwind())
     assert solution.policy[-1, -1, 0] == pytest.approx(0.37, abs=1e-12)
     assert solution.policy[0, 0, 0] == pytest.approx(0.37, abs=1e-12)
     assert solution.policy[0, 2, 0] >= 0.37
@@ -615,7 +617,7 @@ def test_linear_quadratic_control_in_the_whole_space(evaluation):
     )  # fmt: skip
     grid = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (15, 13), edges="open")
     riccati = solve_continuous_are(a - 0.5 * np.eye(2), np.eye(2), np.eye(2), np.eye(2))
-    solution = hjb.solve(problem, grid, method=hjb.PolicyIteration(evaluation), tol=1e-6)
+    solution = hjb.solve(problem, grid, method=hjb.PolicyIteration(evaluation), tol=1e-6, scheme=hjb.Upwind())
     x = grid.nodes()
     exact = np.einsum("...i,ij,...j", x, riccati, x) + 0.25 * np.trace(riccati)
     np.testing.assert_allclose(solution.value, exact, atol=1e-6)
@@ -625,7 +627,7 @@ def test_sweeps_are_refused_at_open_ends():
     problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), discount=1.0)
     grid = hjb.Grid([-1.0], [1.0], (9,), edges="open")
     with pytest.raises(ValueError, match=r"Sweeps.*open ends.*Direct"):
-        hjb.solve(problem, grid, method=hjb.PolicyIteration(hjb.Sweeps()))
+        hjb.solve(problem, grid, method=hjb.PolicyIteration(hjb.Sweeps()), scheme=hjb.Upwind())
 
 
 @pytest.mark.slow
@@ -639,7 +641,7 @@ def test_derivatives_and_batches_with_open_ends():
     grid = hjb.Grid([-1.0], [1.0], (21,), edges="open")
 
     def at_one(rate):
-        return hjb.solve(question(rate), grid, tol=1e-9).value[-1]
+        return hjb.solve(question(rate), grid, tol=1e-9, scheme=hjb.Upwind()).value[-1]
 
     def exact(rate):  # V = s x − s²/2 with s = 1/(1 − rate)
         return 1 / (1 - rate) - 0.5 / (1 - rate) ** 2
@@ -647,7 +649,7 @@ def test_derivatives_and_batches_with_open_ends():
     with jax.enable_x64(True):
         for derivative in (jax.jacfwd, jax.grad):
             assert float(derivative(at_one)(0.4)) == pytest.approx(float(jax.grad(exact)(0.4)), rel=1e-5)
-    batch = hjb.solve_batch([question(rate) for rate in (0.3, 0.4)], grid, tol=1e-9)
+    batch = hjb.solve_batch([question(rate) for rate in (0.3, 0.4)], grid, tol=1e-9, scheme=hjb.Upwind())
     assert [solution.value[-1] for solution in batch] == pytest.approx([exact(0.3), exact(0.4)], abs=1e-6)
 
 
@@ -658,7 +660,7 @@ def test_what_is_cut_is_kept_in_the_file(tmp_path):
     grid = hjb.Grid([-1.0], [1.2], (21,), edges=(("projected", "constrained"),))
     problem = hjb.Problem(pushed, slope_and_effort, hjb.Box([-1.0], [1.5]), discount=0.5)
     with pytest.warns(hjb.SolveWarning, match="lower end of x1"):
-        solution = hjb.solve(problem, grid)
+        solution = hjb.solve(problem, grid, scheme=hjb.Upwind())
     solution.save(tmp_path / "run.npz")
     again = hjb.load(tmp_path / "run.npz")
     assert again.grid.edges == grid.edges
@@ -668,7 +670,7 @@ def test_what_is_cut_is_kept_in_the_file(tmp_path):
 def test_where_nobody_earns_by_it_nothing_is_cut():
     """A flat value and actions that cost nothing: which way the drift points there is chance."""
     problem = hjb.Problem(pushed, lambda x, u: 1.0, hjb.Box([-1.0], [1.5]), discount=0.5)
-    assert not hjb.solve(problem, hjb.Grid([-1.0], [1.2], (21,))).cut.any()
+    assert not hjb.solve(problem, hjb.Grid([-1.0], [1.2], (21,)), scheme=hjb.Upwind()).cut.any()
 
 
 @pytest.mark.parametrize("dtype", [None, "float32"])
@@ -682,5 +684,7 @@ def test_what_leaves_is_told_by_the_drift_there(bound, current, dtype):
         discount=1.0,
     )
     grid = hjb.Grid([0.0], [1.0], (11,), edges=(("constrained", "projected"),))
-    solution = hjb.solve(problem, grid, dtype=dtype, tol=1e-2, method=hjb.PolicyIteration(hjb.Direct()))
+    solution = hjb.solve(
+        problem, grid, dtype=dtype, tol=1e-2, method=hjb.PolicyIteration(hjb.Direct()), scheme=hjb.Upwind()
+    )
     assert abs(solution.value[0] - 1) <= 1e-2  # standing still costs 1 a unit time

@@ -68,7 +68,7 @@ def test_a_wall_that_reflects_has_the_density_of_the_inside(shape):
         errors.append(np.max(off[1:]))
         at_the_wall.append(off[0])
     assert order_of(errors) == pytest.approx(2, abs=0.15)
-    assert order_of(at_the_wall) == pytest.approx(1, abs=0.15)
+    assert order_of(at_the_wall) >= 1.85
     flat = chain.stationary_density(Problem(lambda x, u: 0 * x, noise=1.0), grid)
     np.testing.assert_allclose(flat, 0.25, rtol=1e-9)
 

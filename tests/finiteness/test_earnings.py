@@ -47,7 +47,7 @@ def problem(*, rate=1.0, speed=1.0, move=drift, cost=earn, **changes):
 @pytest.mark.parametrize("tol", [1e-3, 0.8, 11.0])
 def test_a_place_to_stay_and_earn(rate, speed, tol):
     question = problem(rate=rate, speed=speed)
-    solution = hjb.solve(question, GRID, tol=tol * rate / speed, throw=False)
+    solution = hjb.solve(question, GRID, tol=tol * rate / speed, throw=False, scheme=hjb.Upwind())
     assert solution.status is Status.DIVERGED
     assert "The value is −∞" in solution.message
     assert f"pays {-rate:.3g} a unit time" in solution.message
@@ -60,7 +60,7 @@ def test_a_place_to_stay_and_earn(rate, speed, tol):
 def test_stopping_is_put_off_for_ever(tol):
     question = hjb.Problem(lambda x, u: jnp.stack([x[1], u[0]]), lambda x, u: -1.0, U, stopping_cost=lambda x: x @ x)
     with pytest.raises(hjb.SolveError, match="DIVERGED: The value is −∞") as caught:
-        hjb.solve(question, PLANE, tol=tol)
+        hjb.solve(question, PLANE, tol=tol, scheme=hjb.Upwind())
     assert caught.value.solution.value.shape == PLANE.shape
 
 
@@ -73,7 +73,7 @@ def test_a_round_that_pays_on_the_average():
 
     def on_the_ring(mean):
         question = hjb.Problem(lambda x, u: 1.0 + 0 * u, P(swing, mean), U, stopping_cost=lambda x: 3.0)
-        return hjb.solve(question, ring, throw=False)
+        return hjb.solve(question, ring, throw=False, scheme=hjb.Upwind())
 
     lost, won = on_the_ring(-0.1), on_the_ring(0.1)
     assert lost.status is Status.DIVERGED
@@ -83,13 +83,15 @@ def test_a_round_that_pays_on_the_average():
 
 
 def test_earning_on_a_way_that_ends():
-    solution = hjb.solve(problem(move=uphill, cost=lambda rate, x, u: -rate, target=goal), GRID, tol=1e-6)
+    solution = hjb.solve(
+        problem(move=uphill, cost=lambda rate, x, u: -rate, target=goal), GRID, tol=1e-6, scheme=hjb.Upwind()
+    )
     assert solution.status is Status.CONVERGED
     assert solution.value_at([-1.0]) == pytest.approx(-1.8 / 0.3)  # as slowly as one can
 
 
 def test_with_a_discount_it_is_finite():
-    solution = hjb.solve(problem(discount=0.5), GRID, tol=1e-6)
+    solution = hjb.solve(problem(discount=0.5), GRID, tol=1e-6, scheme=hjb.Upwind())
     assert solution.value_at([1.0]) == pytest.approx(-2.0)
 
 
@@ -98,7 +100,7 @@ def test_in_a_batch_only_the_lane_that_earns():
         return rate
 
     lanes = [problem(cost=level, target=goal, rate=rate) for rate in (1.0, -1.0)]
-    first, earns = hjb.solve_batch(lanes, GRID, throw=False)
+    first, earns = hjb.solve_batch(lanes, GRID, throw=False, scheme=hjb.Upwind())
     assert first.status is Status.CONVERGED
     assert earns.status is Status.DIVERGED
     assert "−∞" in earns.message

@@ -26,7 +26,7 @@ timid.defjvps(lambda tangent, answer, u: 0.1 * tangent)
 
 def value_of(drift, cost, controls=UNIT):
     problem = hjb.Problem(drift, cost, controls, discount=1.0)
-    return hjb.solve(problem, LINE, tol=1e-6).value_at([1.5])
+    return hjb.solve(problem, LINE, tol=1e-6, scheme=hjb.Upwind()).value_at([1.5])
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def test_a_derivative_rule_of_the_users_moves_no_worst_disturbance():
         problem = hjb.Problem(
             lambda x, u, d: -x + seen(d), lambda x, u, d: x @ x - d @ d, disturbances=hjb.Box([-2.0], [2.0])
         )
-        return hjb.march(problem, LINE, 0.5, inner=0, step=0.01).value
+        return hjb.march(problem, LINE, 0.5, inner=0, step=0.01, scheme=hjb.Upwind(split=True)).value
 
     np.testing.assert_allclose(march(timid), march(lambda d: d), rtol=0, atol=1e-7)
 
@@ -140,14 +140,14 @@ def shared(x, u, d):
 )
 def test_a_bounded_disturbance_is_no_blow_up(cost):
     problem = hjb.Problem(shared, cost, UNIT, disturbances=hjb.Box([-0.3], [0.3]))
-    assert hjb.march(problem, LINE, 0.5).status is hjb.Status.CONVERGED
+    assert hjb.march(problem, LINE, 0.5, scheme=hjb.Upwind(split=True)).status is hjb.Status.CONVERGED
 
 
 def test_a_disturbance_with_a_square_is_watched_whatever_the_control_costs():
     problem = hjb.Problem(
         shared, lambda x, u, d: 9 * x @ x + jnp.abs(u[0]) - 0.1 * d @ d, UNIT, disturbances=hjb.Box([-9.0], [9.0])
     )
-    assert hjb.march(problem, LINE, 1.0, throw=False).status is hjb.Status.DIVERGED
+    assert hjb.march(problem, LINE, 1.0, throw=False, scheme=hjb.Upwind(split=True)).status is hjb.Status.DIVERGED
 
 
 # --- Isaacs' condition ---
@@ -163,7 +163,7 @@ def test_a_failing_condition_of_isaacs_is_told_beside_what_the_actions_matter(si
         PAIR, disturbances=PAIR, discount=1.0,
     )  # fmt: skip
     with pytest.warns(hjb.SolveWarning, match=r"Isaacs condition fails.*100% of what the actions matter") as caught:
-        solution = hjb.solve(problem, LINE, tol=1e-3 * size)
+        solution = hjb.solve(problem, LINE, tol=1e-3 * size, scheme=hjb.Upwind())
     assert caught[0].filename == __file__
     assert solution.isaacs_gap == pytest.approx((1 - np.cos(6)) * size, rel=1e-6)
 
@@ -177,7 +177,7 @@ def test_a_march_tells_it_too():
         lambda x, u, d: -x, jax.tree_util.Partial(differing, np.array([0.0, 1.0])), PAIR, disturbances=PAIR
     )
     with pytest.warns(hjb.SolveWarning, match=r"Isaacs condition fails") as caught:
-        hjb.march(problem, LINE, 0.5)
+        hjb.march(problem, LINE, 0.5, scheme=hjb.Upwind(split=True))
     assert caught[0].filename == __file__
 
 
@@ -186,4 +186,4 @@ def test_what_upwinding_leaves_is_no_failure():
     problem = hjb.Problem(
         lambda x, u, d: u + 0.5 * d, lambda x, u, d: jnp.abs(x[0]), UNIT, disturbances=PAIR, discount=1.0
     )
-    assert 0 < hjb.solve(problem, LINE, tol=1e-6).isaacs_gap < 0.2
+    assert 0 < hjb.solve(problem, LINE, tol=1e-6, scheme=hjb.Upwind()).isaacs_gap < 0.2

@@ -158,13 +158,16 @@ FOR_EVER = hjb.Problem(controlled, costs, hjb.Box([-1.0], [1.0]), noise=0.5, dis
 
 
 def test_another_evaluation_solves_marches_and_goes_lane_by_lane():
-    method, known = hjb.PolicyIteration(Gmres()), hjb.solve(FOR_EVER, LINE, tol=1e-8)
-    alone = hjb.solve(FOR_EVER, LINE, method=method, tol=1e-6)
-    (lane,) = hjb.solve_batch([FOR_EVER], LINE, method=method, tol=1e-6)
+    method, known = hjb.PolicyIteration(Gmres()), hjb.solve(FOR_EVER, LINE, tol=1e-8, scheme=hjb.Upwind())
+    alone = hjb.solve(FOR_EVER, LINE, method=method, tol=1e-6, scheme=hjb.Upwind())
+    (lane,) = hjb.solve_batch([FOR_EVER], LINE, method=method, tol=1e-6, scheme=hjb.Upwind())
     for found in (alone, lane):
         assert found.status is hjb.Status.CONVERGED
         np.testing.assert_allclose(found.value, known.value, rtol=0, atol=found.error + known.error)
-    steps = [hjb.march(WALK, LINE, 1.0, step=0.1, method=hjb.Implicit(each)).value for each in (Gmres(), Direct())]
+    steps = [
+        hjb.march(WALK, LINE, 1.0, step=0.1, method=hjb.Implicit(each), scheme=hjb.Upwind(split=True)).value
+        for each in (Gmres(), Direct())
+    ]
     np.testing.assert_allclose(*steps, rtol=0, atol=1e-5)
 
 
@@ -173,13 +176,13 @@ def test_another_evaluation_inside_a_derivative():
         problem = hjb.Problem(
             controlled, lambda x, u: weight * x @ x + u @ u, FOR_EVER.controls, noise=0.5, discount=0.3
         )
-        return hjb.solve(problem, LINE, method=method).value[20]
+        return hjb.solve(problem, LINE, method=method, scheme=hjb.Upwind()).value[20]
 
     found, known = (jax.grad(value)(2.0, hjb.PolicyIteration(each)) for each in (Gmres(), hjb.Krylov()))
     assert float(found) == pytest.approx(float(known), rel=1e-6)
 
 
-@pytest.mark.parametrize("evaluation", [Gmres, hjb.Sweeps, None, "krylov", 3])
+@pytest.mark.parametrize("evaluation", [Gmres, hjb.Sweeps, "krylov", 3])
 def test_what_is_no_evaluation_is_refused(evaluation):
     with pytest.raises(TypeError, match=r"PolicyIteration: evaluation is .*; wanted hjb.Sweeps\("):
         hjb.PolicyIteration(evaluation)
@@ -188,3 +191,21 @@ def test_what_is_no_evaluation_is_refused(evaluation):
 def test_an_evaluation_that_is_no_pytree_is_told_how_to_become_one():
     with pytest.raises(TypeError, match=r"Unregistered is no pytree.*\n?.*jax.tree_util.register_static"):
         hjb.PolicyIteration(Unregistered())
+
+
+def test_policy_iteration_picks_its_evaluation_by_the_problem():
+    noisy = hjb.Problem(lambda x, u: u, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), noise=0.5, discount=1.0)
+    grid = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (31, 31))
+    plane = hjb.Problem(lambda x, u: jnp.stack([x[1], u[0]]), noisy.cost, noisy.controls, noise=0.5, discount=1.0)
+    quiet = hjb.Problem(plane.drift, plane.cost, plane.controls, discount=1.0)
+    for problem, evaluation in ((plane, hjb.Krylov()), (quiet, hjb.Sweeps())):
+        for method in (hjb.PolicyIteration(), hjb.Nested(coarsest=900)):
+            chosen = hjb.solve(problem, grid, method=method, scheme=hjb.Upwind())
+            assert repr(evaluation) in chosen.stats["method"]
+    named = hjb.solve(plane, grid, method=hjb.PolicyIteration(hjb.Krylov()), scheme=hjb.Upwind())
+    picked = hjb.solve(plane, grid, method=hjb.PolicyIteration(), scheme=hjb.Upwind())
+    np.testing.assert_array_equal(picked.value, named.value)
+    assert picked.steps == named.steps < 20  # sweeps take hundreds
+    line = hjb.solve(noisy, hjb.Grid([-1.0], [1.0], (41,)), method=hjb.PolicyIteration(), scheme=hjb.Upwind())
+    assert "Direct()" in line.stats["method"]
+    assert repr(hjb.PolicyIteration()) == "PolicyIteration(evaluation=None, replies=20)"

@@ -43,8 +43,8 @@ QUESTIONS = {
 )
 def test_no_step_is_longer_than_the_fastest_action_that_it_chose_allows(name):
     problem = QUESTIONS[name]
-    found = hjb.march(problem, LINE, 0.5)
-    fine = hjb.march(problem, LINE, 0.5, step=2e-3)
+    found = hjb.march(problem, LINE, 0.5, scheme=hjb.Upwind(split=True))
+    fine = hjb.march(problem, LINE, 0.5, step=2e-3, scheme=hjb.Upwind(split=True))
     assert found.steps >= 100
     for solution in (found, fine):  # no cost but the running one, which lies in [0, 1] or in [−1, 0]
         low, high = sorted([0.0, 0.5 * np.sign(np.sum(solution.value))])
@@ -56,7 +56,7 @@ def test_no_step_is_longer_than_the_fastest_action_that_it_chose_allows(name):
 def test_a_slow_run_of_samples_is_not_slowed_down():
     """Where the fastest action is at an end of the set nothing is looked at on the way."""
     problem = hjb.Problem(lambda x, u: -jnp.sign(x) * u, square, UNIT)
-    found = hjb.march(problem, LINE, 0.5)
+    found = hjb.march(problem, LINE, 0.5, scheme=hjb.Upwind(split=True))
     assert found.steps == np.ceil(0.5 / (0.9 * LINE.spacing(0)))
 
 
@@ -75,8 +75,8 @@ def test_a_drift_that_switches_on_within_a_step_is_not_outrun(scheme, stages):
 
 def test_value_iteration_does_not_outrun_a_fast_action_between_the_samples():
     problem = hjb.Problem(pulled, square, UNIT, discount=1.0)
-    by_policy = hjb.solve(problem, LINE, tol=1e-6)
-    by_value = hjb.solve(problem, LINE, tol=1e-6, method=hjb.ValueIteration())
+    by_policy = hjb.solve(problem, LINE, tol=1e-6, scheme=hjb.Upwind())
+    by_value = hjb.solve(problem, LINE, tol=1e-6, method=hjb.ValueIteration(), scheme=hjb.Upwind())
     np.testing.assert_allclose(by_value.value, by_policy.value, rtol=0, atol=2e-6)
     assert np.all(np.diff(by_value.residuals) <= 1e-12)  # a contraction
 
@@ -108,11 +108,11 @@ SWUNG = hjb.Problem(lambda x, u: -x, lambda x, u: x[0] * x[1], UNIT, noise=swung
 def test_a_march_stops_where_its_noise_cannot_be_represented(method):
     """The noise is fine at t = 0, where a problem is looked at before it starts."""
     with pytest.raises(hjb.SolveError, match="correlated noise that the chain cannot represent") as caught:
-        hjb.march(TURNED, PLANE, 0.5, method=method)
+        hjb.march(TURNED, PLANE, 0.5, method=method, scheme=hjb.Upwind(split=True))
     assert "node (0, 0), x = [-2.0, -2.0]" in str(caught.value)
     assert "Use Grid(..., shape=" in str(caught.value)
     assert caught.value.solution.status is hjb.Status.STALLED
-    early = hjb.march(TURNED, PLANE, 0.2, method=method)
+    early = hjb.march(TURNED, PLANE, 0.2, method=method, scheme=hjb.Upwind(split=True))
     assert early.value_at(0.0, [0.0, 0.0]) == pytest.approx(0.008, abs=1e-3)
 
 
@@ -122,7 +122,7 @@ def test_a_march_keeps_what_it_came_to_before_the_noise_turned():
         lambda t, x, u: 0 * x, noise=lambda t, x, u: turned(jnp.where(t == 0, 0, 0.5 - t), x, u),
         terminal_cost=lambda t, x: x[0] ** 2, time_dependent=True,
     )  # fmt: skip
-    stopped = hjb.march(problem, PLANE, 0.5, throw=False)
+    stopped = hjb.march(problem, PLANE, 0.5, throw=False, scheme=hjb.Upwind(split=True))
     assert stopped.status is hjb.Status.STALLED
     assert stopped.times[0] == pytest.approx(0.25, abs=0.02)
     assert np.all(np.isfinite(stopped.value))
@@ -131,9 +131,9 @@ def test_a_march_keeps_what_it_came_to_before_the_noise_turned():
 @pytest.mark.parametrize(
     "ask",
     [
-        lambda: hjb.solve(SWUNG, PLANE),
-        pytest.param(lambda: hjb.solve_batch([SWUNG], PLANE), marks=pytest.mark.slow),
-        pytest.param(lambda: hjb.march(SWUNG, PLANE, 0.1), marks=pytest.mark.slow),
+        lambda: hjb.solve(SWUNG, PLANE, scheme=hjb.Upwind()),
+        pytest.param(lambda: hjb.solve_batch([SWUNG], PLANE, scheme=hjb.Upwind()), marks=pytest.mark.slow),
+        pytest.param(lambda: hjb.march(SWUNG, PLANE, 0.1, scheme=hjb.Upwind(split=True)), marks=pytest.mark.slow),
     ],
     ids=["solve", "solve_batch", "march"],
 )

@@ -22,7 +22,7 @@ def exact_at_nodes(exact, grid):
 
 def largest_error(question, exact, where=None, **options):
     problem, grid = question
-    solution = hjb.solve(problem, grid, **({"tol": 1e-7} | options))
+    solution = hjb.solve(problem, grid, **({"tol": 1e-7, "scheme": hjb.Upwind()} | options))
     off = np.abs(solution.value - exact_at_nodes(exact, grid))
     return np.max(off if where is None else off[where(grid.nodes())])
 
@@ -99,7 +99,7 @@ def test_minimum_time_of_the_double_integrator_with_one_target_node():
     times = []
     for n in (41, 81):
         problem, grid = zoo.double_integrator(radius=0.0, shape=(n, n))
-        times.append(-np.log1p(-float(hjb.solve(problem, grid, tol=1e-5).value_at([1.0, 0.0]))))
+        times.append(-np.log1p(-float(hjb.solve(problem, grid, tol=1e-5, scheme=hjb.Upwind()).value_at([1.0, 0.0]))))
     np.testing.assert_allclose(times, (2.65, 2.60), atol=0.005)
 
 
@@ -120,7 +120,7 @@ def test_slowing_down_is_exact():
         grid = hjb.Grid([-1.0], [1.0], shape)
         x = grid.nodes()[:, 0]
         away = np.ones(shape, bool) if shape[0] % 2 else np.abs(x) > grid.spacing(0)
-        off = np.abs(hjb.solve(problem, grid, tol=1e-11).value - 1.5 * (1 - np.abs(x)))
+        off = np.abs(hjb.solve(problem, grid, tol=1e-11, scheme=hjb.Upwind()).value - 1.5 * (1 - np.abs(x)))
         assert np.max(off[away]) <= 1e-10
 
 
@@ -128,7 +128,7 @@ def test_slowing_down_is_exact():
 @pytest.mark.parametrize("discount", [0.0, 1.0])
 def test_moving_along_the_axes_is_exact(dim, discount):
     problem, grid = zoo.eikonal(norm=1, dim=dim, discount=discount, radius=0.0, shape=(11,) * dim)
-    solution = hjb.solve(problem, grid, tol=1e-10)
+    solution = hjb.solve(problem, grid, tol=1e-10, scheme=hjb.Upwind())
     steps = np.sum(np.abs(np.indices(grid.shape) - 5), axis=0)
     h = 0.2
     # each step costs h; discounted the chain's step is V = (h + V')/(1 + βh)
@@ -155,7 +155,9 @@ def test_discounted_brownian_exit_is_second_order():
 @pytest.mark.slow
 def test_brownian_exit_from_the_square():
     problem, grid = zoo.brownian_exit(dim=2, shape=(41, 41))
-    assert float(hjb.solve(problem, grid, tol=1e-9).value_at([0.0, 0.0])) == pytest.approx(0.5893708182, abs=3e-4)
+    assert float(hjb.solve(problem, grid, tol=1e-9, scheme=hjb.Upwind()).value_at([0.0, 0.0])) == pytest.approx(
+        0.5893708182, abs=3e-4
+    )
 
 
 RESTORING = np.array([[-1.0, 0.5], [0.0, -2.0]])
@@ -269,7 +271,7 @@ def test_perpetual_put_on_a_log_price_grid():
             exit_cost=-float(put_exact(500.0)),
         )
         grid = hjb.Grid([lo], [hi], (n,))
-        solution = hjb.solve(problem, grid, tol=1e-7)
+        solution = hjb.solve(problem, grid, tol=1e-7, scheme=hjb.Upwind())
         prices = np.exp(grid.nodes()[:, 0])
         errors.append(np.max(np.abs(-solution.value - put_exact(prices))))
         payoff = np.maximum(STRIKE - prices, 0)

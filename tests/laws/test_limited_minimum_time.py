@@ -65,7 +65,7 @@ def test_status_and_words():
     solution, _ = solved(161, hjb.Limited())
     assert solution.status is hjb.Status.CONVERGED
     assert solution.bounds is None
-    assert "second-order" in solution.stats["certificate"]
+    assert "high-order" in solution.stats["certificate"]
     assert "Limited" in solution.stats["scheme"]
     change = np.max(np.abs(solution.value - solved(161, hjb.Upwind(subcell=True))[0].value))
     assert solution.stats["from_monotone"] == pytest.approx(change, abs=1e-5)

@@ -120,3 +120,14 @@ def test_going_round_is_cheaper():
     plain = hjb.solve(problem, grid, scheme=hjb.Upwind(central=False), tol=1e-3)
     assert float(limited.value_at([np.pi / 4, 0.0])) == pytest.approx(ways[0][0], rel=5e-3)
     assert float(plain.value_at([np.pi / 4, 0.0])) > 1.2 * ways[0][0]
+
+
+@pytest.mark.slow
+def test_the_main_job_is_near_the_truth_and_says_how_near():
+    problem, grid = zoo.pendulum()
+    solution, oracle = hjb.solve(problem, grid), PENDULUMS["gain 1/m"][1]
+    for state in STATES:
+        assert float(solution.value_at(state)) == pytest.approx(oracle.extremals(state)[0][0], rel=1e-2), state
+    fine = hjb.solve(problem, zoo.pendulum(shape=(800, 801))[1], scheme=hjb.Limited())
+    true = np.mean(np.abs(solution.value - fine.value[::4, ::4]))
+    assert true / 3 <= np.mean(solution.grid_error) <= 3 * true

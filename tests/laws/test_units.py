@@ -104,9 +104,9 @@ def some(names, fast):
 
 @pytest.mark.parametrize("name", some(QUESTIONS, ["noisy", "minimum time", "rest", "tube", "pursuit"]))
 def test_a_solve_knows_no_units(name):
-    known = hjb.solve(asked(name, Units()), GRID, tol=1e-6)
+    known = hjb.solve(asked(name, Units()), GRID, tol=1e-6, scheme=hjb.Upwind())
     for time, cost in UNITS:
-        found = hjb.solve(asked(name, Units(time, cost)), GRID, tol=1e-6 * cost)
+        found = hjb.solve(asked(name, Units(time, cost)), GRID, tol=1e-6 * cost, scheme=hjb.Upwind())
         same(found.value, known.value, cost)
         assert found.stats["certificate"] == known.stats["certificate"]
         assert abs(found.steps - known.steps) <= 2 + known.steps // 20  # a rounding decides when it is enough
@@ -122,8 +122,8 @@ def test_nor_does_a_second_order_solve_or_a_batch(name):
         found = hjb.solve(problem, GRID, scheme=hjb.Limited(), tol=1e-6 * cost, throw=False)
         assert found.status is known.status
         same(found.value, known.value, cost)
-        (lane,) = hjb.solve_batch([problem], GRID, tol=1e-6 * cost)
-        same(lane.value, hjb.solve(problems[0], GRID, tol=1e-6).value, cost)
+        (lane,) = hjb.solve_batch([problem], GRID, tol=1e-6 * cost, scheme=hjb.Upwind())
+        same(lane.value, hjb.solve(problems[0], GRID, tol=1e-6, scheme=hjb.Upwind()).value, cost)
 
 
 @pytest.mark.parametrize("method", [hjb.Explicit(), hjb.Implicit()])
@@ -131,18 +131,28 @@ def test_nor_does_a_second_order_solve_or_a_batch(name):
     "name", some(["discounted", "noisy", "minimum time", "stopping", "kept off", "game"], ["noisy", "game"])
 )
 def test_nor_does_a_march(name, method):
-    known = hjb.march(asked(name, Units()), GRID, 1.0, method=method, times=[0.0, 0.5], inner=0)
+    known = hjb.march(
+        asked(name, Units()), GRID, 1.0, method=method, times=[0.0, 0.5], inner=0, scheme=hjb.Upwind(split=True)
+    )
     for time, cost in UNITS:
         tuned = hjb.Implicit(tol=1e-6 * cost) if isinstance(method, hjb.Implicit) else method
         found = hjb.march(
-            asked(name, Units(time, cost)), GRID, 1.0 / time, method=tuned, times=[0.0, 0.5 / time], inner=0
+            asked(name, Units(time, cost)),
+            GRID,
+            1.0 / time,
+            method=tuned,
+            times=[0.0, 0.5 / time],
+            inner=0,
+            scheme=hjb.Upwind(split=True),
         )
         assert found.steps == known.steps
         np.testing.assert_allclose(found.value / cost, known.value, rtol=1e-6, atol=1e-5)
 
 
 def test_nor_does_a_solve_in_float32():
-    known = hjb.solve(asked("discounted", Units()), GRID, tol=1e-4, dtype="float32").value
+    known = hjb.solve(asked("discounted", Units()), GRID, tol=1e-4, dtype="float32", scheme=hjb.Upwind()).value
     for time, cost in UNITS:
-        found = hjb.solve(asked("discounted", Units(time, cost)), GRID, tol=1e-4 * cost, dtype="float32").value
+        found = hjb.solve(
+            asked("discounted", Units(time, cost)), GRID, tol=1e-4 * cost, dtype="float32", scheme=hjb.Upwind()
+        ).value
         np.testing.assert_allclose(found / np.float32(cost), known, atol=3e-4)

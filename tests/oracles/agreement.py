@@ -46,7 +46,7 @@ def compare(case, rng):
             solution = hjb.solve(
                 case.problem, case.grid, tol=tol, throw=False, progress=False,
                 dtype="float32" if case.family.single else None, max_steps=100_000,
-            )  # fmt: skip
+            scheme=hjb.Upwind())  # fmt: skip
         except ValueError as error:
             return Verdict("refused", (f"refused: {str(error).splitlines()[0]}",))
     return _judged(solution, answer, finite, rounding, tol, lower=case.family.lower)
@@ -56,7 +56,9 @@ def _refused(case):
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            solution = hjb.solve(case.problem, case.grid, throw=False, progress=False, max_steps=1000)
+            solution = hjb.solve(
+                case.problem, case.grid, throw=False, progress=False, max_steps=1000, scheme=hjb.Upwind()
+            )
     except ValueError:
         return Verdict("refused", ())
     return Verdict("refused", (f"not refused but {solution.status.name}: {case.refusal}",))

@@ -5,9 +5,9 @@ what ends a path. On axis i with h⁺ and h⁻ to the neighbours, f = f_i and α
 
     c⁺ = (e + h⁻ f)/(h⁺ (h⁺ + h⁻)),   c⁻ = (e − h⁺ f)/(h⁻ (h⁺ + h⁻)),   e = max(α, h⁺ f, −h⁻ f),
 
-with e = α + max(h⁺ f, −h⁻ f) at an end of the axis, and along the diagonals of a pair of axes at |a_ij|/(2 h_i h_j)
-in the two directions that the sign of a_ij picks. A jump out of the box is dropped, a diagonal one slides along the
-other axis.
+and along the diagonals of a pair of axes at |a_ij|/(2 h_i h_j) in the two directions that the sign of a_ij picks. At an
+end of the axis, with n the drift outwards, it jumps inwards alone, at max(α/h − n, 0)/h: the noise of both directions.
+A diagonal jump out of the box ends where a mirror on the end node shows its end.
 """
 
 import dataclasses
@@ -102,12 +102,12 @@ class Chain:
         self.fixed = [np.zeros(self.size) for _ in self.leads]  # rates of what slides along an edge
         self.alpha = None if model.a is None else np.stack([model.a[:, i, i] for i in range(n)])
         for i, j in itertools.combinations(range(n), 2) if model.a is not None else ():
-            self._diagonals(i, j, go)
+            self._diagonals(i, j, index, number)
         if self.alpha is not None:
             self.representable = bool(np.all(self.alpha >= -64 * EPS * np.stack([model.a[:, i, i] for i in range(n)])))
             self.alpha = np.maximum(self.alpha, 0)
 
-    def _diagonals(self, i, j, go):
+    def _diagonals(self, i, j, index, number):
         entry = self.model.a[:, i, j]
         if not np.any(entry):
             return
@@ -115,11 +115,13 @@ class Chain:
         self.alpha[j] = self.alpha[j] - np.abs(entry) * self.mean[j] / self.mean[i]
         for step_i, step_j in itertools.product((1, -1), repeat=2):
             rate = np.maximum(entry * step_i * step_j, 0) / (2 * self.mean[i] * self.mean[j])
-            out_i, out_j = self.edge[i, UP if step_i > 0 else DOWN], self.edge[j, UP if step_j > 0 else DOWN]
-            self.leads.append(go(*[step_i * (k == i) + step_j * (k == j) for k in range(self.n)]))
-            self.fixed.append(np.where(out_i | out_j, 0, rate))
-            self.fixed[2 * j + (UP if step_j > 0 else DOWN)] += np.where(out_i & ~out_j, rate, 0)
-            self.fixed[2 * i + (UP if step_i > 0 else DOWN)] += np.where(out_j & ~out_i, rate, 0)
+            place = list(index)
+            for k, step in ((i, step_i), (j, step_j)):
+                last, there = self.model.shape[k] - 1, index[k] + step
+                wrapped, mirrored = there % (last + 1), last - np.abs(last - np.abs(there))
+                place[k] = wrapped if self.model.periodic[k] else mirrored
+            self.leads.append(number[tuple(place)])
+            self.fixed.append(rate)
 
     def drift(self, u, d=None):
         """f (..., S, n) under actions of shape (..., S, m)."""
@@ -140,15 +142,13 @@ class Chain:
         found = [np.broadcast_to(rate, f.shape[:-1]) for rate in self.fixed]
         for i in range(self.n):
             up, down, v = self.h[i, UP], self.h[i, DOWN], f[..., i]
-            plain = np.maximum(up * v, -down * v)
-            if self.alpha is None:
-                e = plain
-            else:
-                end = self.edge[i, UP] | self.edge[i, DOWN]
-                e = np.where(end, self.alpha[i] + plain, np.maximum(self.alpha[i], plain))
-            rise, fall = np.maximum(e + down * v, 0), np.maximum(e - up * v, 0)
-            found[2 * i + UP] = found[2 * i + UP] + np.where(self.edge[i, UP], 0, rise / (up * (up + down)))
-            found[2 * i + DOWN] = found[2 * i + DOWN] + np.where(self.edge[i, DOWN], 0, fall / (down * (up + down)))
+            alpha = 0 if self.alpha is None else self.alpha[i]
+            e = np.maximum(alpha, np.maximum(up * v, -down * v))
+            rise, fall = np.maximum(e + down * v, 0) / (up + down), np.maximum(e - up * v, 0) / (up + down)
+            rise = np.where(self.edge[i, DOWN], np.maximum(alpha / up + v, 0), rise)
+            fall = np.where(self.edge[i, UP], np.maximum(alpha / down - v, 0), fall)
+            found[2 * i + UP] = found[2 * i + UP] + np.where(self.edge[i, UP], 0, rise / up)
+            found[2 * i + DOWN] = found[2 * i + DOWN] + np.where(self.edge[i, DOWN], 0, fall / down)
         return np.stack(found)
 
     def forbidden(self, f):

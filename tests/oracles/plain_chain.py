@@ -44,7 +44,9 @@ def tables(axes, drift, cost, actions, sigma, constrained):
                 there = list(index)
                 there[i] += step
                 neighbours[row, 2 * i + side] = number[tuple(there)]
-                rates[row, :, 2 * i + side] = outward / gap + sigma[i] ** 2 / (gap * (up + down))
+                # at the other end all noise goes this way, over half a cell
+                cell = gap if index[i] == (0 if step > 0 else shape[i] - 1) else up + down
+                rates[row, :, 2 * i + side] = outward / gap + sigma[i] ** 2 / (gap * cell)
     return rates, costs, neighbours, admissible
 
 

@@ -94,10 +94,10 @@ QUESTIONS = {
 @pytest.mark.filterwarnings("ignore:the Isaacs condition fails")
 def test_all_methods_agree_and_their_bounds_hold_the_discrete_solution(name):
     problem, grid = QUESTIONS[name]
-    truth = hjb.solve(problem, grid, method=METHODS[-1], tol=1e-10).value
+    truth = hjb.solve(problem, grid, method=METHODS[-1], tol=1e-10, scheme=hjb.Upwind()).value
     values = []
     for method in METHODS:
-        solution = hjb.solve(problem, grid, method=method, tol=TOL)
+        solution = hjb.solve(problem, grid, method=method, tol=TOL, scheme=hjb.Upwind())
         lower, upper = solution.bounds
         slack = 1e-10 * (1 + np.max(np.abs(truth)))  # the truth has an error of its own
         assert np.all(lower - slack <= truth), method
@@ -115,7 +115,7 @@ def test_the_direct_solution_solves_the_linear_system_of_its_policy(name):
     from scipy.sparse.linalg import spsolve
 
     problem, grid = QUESTIONS[name]
-    solution = hjb.solve(problem, grid, method=METHODS[-1], tol=1e-10)
+    solution = hjb.solve(problem, grid, method=METHODS[-1], tol=1e-10, scheme=hjb.Upwind())
     generator = chain.generator(problem, grid, np.nan_to_num(solution.policy))
     states = grid.nodes().reshape(-1, grid.ndim)
     actions = np.nan_to_num(solution.policy).reshape(len(states), -1)
@@ -140,7 +140,7 @@ def test_quantecon_agrees_on_the_exported_chain(noise):
     costs, probabilities, states, actions, factor = chain.transition_arrays(problem, grid)
     process = DiscreteDP(-costs, probabilities, factor, states, actions)
     result = process.solve(method="policy_iteration", max_iter=200)
-    solution = hjb.solve(problem, grid, tol=1e-9)
+    solution = hjb.solve(problem, grid, tol=1e-9, scheme=hjb.Upwind())
     np.testing.assert_allclose(solution.value.reshape(-1), -result.v, rtol=0, atol=1e-8)
 
 
@@ -157,10 +157,13 @@ def test_two_decoupled_masses_in_four_dimensions():
     box, short = hjb.Box([-1.0, -1.0], [1.0, 1.0]), hjb.Box([-1.0], [1.0])
     shape = (9, 8)
     alone = hjb.solve(
-        hjb.Problem(one_mass, effort, short, discount=0.5), hjb.Grid([-1.0, -1.5], [1.0, 1.0], shape), tol=1e-7
+        hjb.Problem(one_mass, effort, short, discount=0.5),
+        hjb.Grid([-1.0, -1.5], [1.0, 1.0], shape),
+        tol=1e-7,
+        scheme=hjb.Upwind(),
     )
     grid = hjb.Grid([-1.0, -1.5] * 2, [1.0, 1.0] * 2, shape * 2)
-    together = hjb.solve(hjb.Problem(two_masses, effort, box, discount=0.5), grid, tol=1e-7)
+    together = hjb.solve(hjb.Problem(two_masses, effort, box, discount=0.5), grid, tol=1e-7, scheme=hjb.Upwind())
     wanted = alone.value[:, :, None, None] + alone.value[None, None]
     np.testing.assert_allclose(together.value, wanted, rtol=0, atol=4e-7)
 
@@ -170,7 +173,7 @@ def test_two_decoupled_masses_in_four_dimensions():
 def test_noise_in_any_dimension_is_the_sum_of_its_axes(dim):
     def solved(n):
         problem = hjb.Problem(unit_drift, effort, hjb.Box([-1.0] * n, [1.0] * n), noise=0.5, discount=1.0)
-        return hjb.solve(problem, hjb.Grid([-1.0] * n, [1.2] * n, (9,) * n), tol=1e-7).value
+        return hjb.solve(problem, hjb.Grid([-1.0] * n, [1.2] * n, (9,) * n), tol=1e-7, scheme=hjb.Upwind()).value
 
     line = solved(1)
     wanted = sum(np.expand_dims(line, tuple(k for k in range(dim) if k != axis)) for axis in range(dim))
@@ -196,7 +199,7 @@ def test_upper_and_lower_values_of_a_game_without_value(method):
         box = hjb.Box([-1.0], [1.0])
         problem = hjb.Problem(quarrel, position, box, disturbances=box, discount=1.0, isaacs=isaacs)
         with pytest.warns(hjb.SolveWarning, match=rf"(?s)Isaacs.*{isaacs}"):
-            solutions[isaacs] = hjb.solve(problem, grid, method=method, tol=1e-5)
+            solutions[isaacs] = hjb.solve(problem, grid, method=method, tol=1e-5, scheme=hjb.Upwind())
         # V is increasing, so min max (u − d)² V' = V' (u = 0) and max min = 0 (u = d)
         assert solutions[isaacs].isaacs_gap == pytest.approx(1.0, rel=0.2)
     upper, lower = solutions["upper"].value, solutions["lower"].value
@@ -222,7 +225,7 @@ def test_a_decoupled_game_has_no_gap():
     box, values = hjb.Box([-1.0], [1.0]), []
     for isaacs in ("upper", "lower"):
         problem = hjb.Problem(apart, tug, box, disturbances=box, discount=1.0, isaacs=isaacs)
-        solution = hjb.solve(problem, hjb.Grid([-1.0] * 2, [1.0] * 2, (11, 11)), tol=1e-6)
+        solution = hjb.solve(problem, hjb.Grid([-1.0] * 2, [1.0] * 2, (11, 11)), tol=1e-6, scheme=hjb.Upwind())
         assert abs(solution.isaacs_gap) <= 1e-9
         values.append(solution.value)
     np.testing.assert_allclose(values[0], values[1], atol=2e-6)
@@ -247,14 +250,16 @@ def test_precedence_of_target_running_maximum_and_stopping_cost():
 
     options = {"controls": hjb.Box([-1.0], [1.0]), "stopping_cost": goal, "running_max": obstacle}
     grid = hjb.Grid([-1.0], [1.0], (21,))
-    value = hjb.solve(hjb.Problem(unit_drift, **options), grid, tol=1e-6).value
+    value = hjb.solve(hjb.Problem(unit_drift, **options), grid, tol=1e-6, scheme=hjb.Upwind()).value
     x = grid.nodes()[:, 0]
     g, psi = 0.3 - np.abs(x - 0.5), np.abs(x - 0.5) - 0.2
     assert np.any(g > psi)
     np.testing.assert_allclose(value[g > psi], g[g > psi], atol=1e-12)
     assert np.all(value >= g - 1e-12)
     assert np.all(value[g <= psi] <= psi[g <= psi] + 1e-12)
-    held = hjb.solve(hjb.Problem(unit_drift, **options, target=bay, exit_cost=-7.0), grid, tol=1e-6)
+    held = hjb.solve(
+        hjb.Problem(unit_drift, **options, target=bay, exit_cost=-7.0), grid, tol=1e-6, scheme=hjb.Upwind()
+    )
     np.testing.assert_array_equal(held.value[x + 0.9 <= 0], -7.0)
     assert np.all(np.isnan(held.policy[x + 0.9 <= 0]))
 
@@ -278,7 +283,7 @@ def test_states_that_cannot_reach_the_target():
     problem = hjb.Problem(drifting_right, pay_time, hjb.Box([-1.0], [1.0]), target=in_the_middle)
     grid = hjb.Grid([-1.0], [1.0], (21,))
     with pytest.warns(hjb.SolveWarning, match=r"47\.6 % of the nodes cannot reach the target.*inf"):
-        solution = hjb.solve(problem, grid, tol=1e-8)
+        solution = hjb.solve(problem, grid, tol=1e-8, scheme=hjb.Upwind())
     x = grid.nodes()[:, 0]
     lost = x > 0.01
     np.testing.assert_array_equal(solution.reached, ~lost)
@@ -293,7 +298,7 @@ def test_discounted_states_that_never_arrive_keep_their_value():
     problem = hjb.Problem(drifting_right, pay_time, hjb.Box([-1.0], [1.0]), target=in_the_middle, discount=0.5)
     grid = hjb.Grid([-1.0], [1.0], (21,))
     with pytest.warns(hjb.SolveWarning, match=r"47\.6 % .*discounted cost of never arriving"):
-        solution = hjb.solve(problem, grid, tol=1e-8)
+        solution = hjb.solve(problem, grid, tol=1e-8, scheme=hjb.Upwind())
     np.testing.assert_allclose(solution.value[grid.nodes()[:, 0] > 0.01], 2.0, atol=1e-8)
     assert np.all(np.isfinite(solution.policy[grid.nodes()[:, 0] > 0.01]))
 
@@ -315,7 +320,7 @@ def test_a_current_stronger_than_the_boat():
     problem = hjb.Problem(swept, cost_of_time, hjb.Ball(1.0, 2), target=disc)
     grid = hjb.Grid([-2.0, -2.0], [2.0, 2.0], (21, 21))
     with pytest.warns(hjb.SolveWarning, match="cannot reach the target"):
-        solution = hjb.solve(problem, grid, tol=1e-5)
+        solution = hjb.solve(problem, grid, tol=1e-5, scheme=hjb.Upwind())
     x, y = np.moveaxis(grid.nodes(), -1, 0)
     assert not np.any(solution.reached[x > 0.5])  # downstream of the target nobody comes back
     assert np.all(solution.reached[(x < -1) & (np.abs(y) < 0.3)])

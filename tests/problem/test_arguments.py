@@ -68,14 +68,13 @@ def test_tracers_pass():
     assert jax.jit(lambda tol: hjb.Implicit(tol=tol).tol + hjb.Krylov(fraction=tol).fraction)(0.5) == 1.0
 
 
-@pytest.mark.parametrize("evaluation", ["x", None, hjb.Sweeps, hjb.Upwind(), hjb.PolicyIteration()], ids=repr)
+@pytest.mark.parametrize("evaluation", ["x", hjb.Sweeps, hjb.Upwind(), hjb.PolicyIteration()], ids=repr)
 def test_evaluations_are_named(evaluation):
     wanted = r"wanted hjb.Sweeps\(...\), hjb.Krylov\(...\) or hjb.Direct\(\)"
     with pytest.raises(TypeError, match="PolicyIteration: evaluation is .*; " + wanted):
         hjb.PolicyIteration(evaluation)
-    if evaluation is not None:
-        with pytest.raises(TypeError, match="Implicit: evaluation is .*; " + wanted):
-            hjb.Implicit(evaluation)
+    with pytest.raises(TypeError, match="Implicit: evaluation is .*; " + wanted):
+        hjb.Implicit(evaluation)
 
 
 @pytest.mark.parametrize("inner", [hjb.Nested(), hjb.Sweeps(), None, "x", hjb.PolicyIteration], ids=repr)

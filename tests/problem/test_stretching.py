@@ -91,7 +91,7 @@ def test_correlated_noise_wants_equal_spacings():
     problem = hjb.Problem(lambda x, u: -x, lambda x, u: x @ x, noise=np.array([[1.0, 0.2], [0.0, 1.0]]), discount=1.0)
     grid = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (9, 9), stretch=(hjb.Sinh(2.0), None))
     with pytest.raises(ValueError, match="equal spacings"):
-        hjb.solve(problem, grid)
+        hjb.solve(problem, grid, scheme=hjb.Upwind())
 
 
 SHEAR = np.array([[0.5, 0.0], [0.3, 0.4]])
@@ -119,10 +119,12 @@ def product(x, *rest):
 def test_correlated_noise_is_refused_by_the_shape_that_it_returns(ask, noise):
     problem = hjb.Problem(calm, product, noise=noise, discount=1.0)
     asked = {
-        "solve": lambda: hjb.solve(problem, GATHERED),
-        "batch": lambda: hjb.solve_batch([problem], GATHERED),
-        "march": lambda: hjb.march(problem, GATHERED, 0.1),
-        "jit": lambda: jax.jit(lambda rate: hjb.solve(altered(problem, discount=rate), GATHERED).value)(1.0),
+        "solve": lambda: hjb.solve(problem, GATHERED, scheme=hjb.Upwind()),
+        "batch": lambda: hjb.solve_batch([problem], GATHERED, scheme=hjb.Upwind()),
+        "march": lambda: hjb.march(problem, GATHERED, 0.1, scheme=hjb.Upwind(split=True)),
+        "jit": lambda: jax.jit(
+            lambda rate: hjb.solve(altered(problem, discount=rate), GATHERED, scheme=hjb.Upwind()).value
+        )(1.0),
         "generator": lambda: hjb.chain.generator(problem, GATHERED),
         "matrix": lambda: hjb.chain.matrix(problem, GATHERED),
         "arrays": lambda: hjb.chain.transition_arrays(problem, GATHERED),
@@ -135,14 +137,16 @@ def test_correlated_noise_is_refused_by_the_shape_that_it_returns(ask, noise):
 def test_correlated_noise_of_the_time_is_refused_too():
     problem = hjb.Problem(lambda t, x, u: -x, noise=shear_by_time, terminal_cost=lambda t, x: x[0], time_dependent=True)
     with pytest.raises(ValueError, match="equal spacings"):
-        hjb.march(problem, GATHERED, 0.1)
+        hjb.march(problem, GATHERED, 0.1, scheme=hjb.Upwind(split=True))
 
 
 def test_one_state_has_nothing_to_correlate():
     """σ of shape (1, 2) on a stretched axis is the noise √(.09 + .16)."""
     grid = hjb.Grid([-1.0], [1.0], (9,), stretch=(hjb.Sinh(2.0),))
     values = [
-        hjb.solve(hjb.Problem(calm, lambda x, u: x @ x, noise=noise, discount=1.0), grid, tol=1e-9).value
+        hjb.solve(
+            hjb.Problem(calm, lambda x, u: x @ x, noise=noise, discount=1.0), grid, tol=1e-9, scheme=hjb.Upwind()
+        ).value
         for noise in (np.array([[0.3, 0.4]]), 0.5)
     ]
     np.testing.assert_allclose(*values, rtol=1e-12)
@@ -198,7 +202,7 @@ def test_nodes_where_the_value_bends_buy_accuracy():
 def test_a_stretched_solution_comes_back_from_its_file(tmp_path):
     problem, grid = zoo.bang_bang(shape=(21,))
     grid = hjb.Grid(grid.lo, grid.hi, (21,), stretch=(hjb.Sinh(2.0, 0.4),))
-    solution = hjb.solve(problem, grid)
+    solution = hjb.solve(problem, grid, scheme=hjb.Upwind())
     solution.save(tmp_path / "run.npz")
     again = hjb.load(tmp_path / "run.npz")
     np.testing.assert_array_equal(again.grid.axis(0), grid.axis(0))

@@ -195,15 +195,15 @@ def test_the_whole_screen():
     )
     assert str(solution).splitlines() == [
         "CONVERGED: The residual meets the tolerance; nothing is left to do.",
-        "  grid        angle (periodic) x speed: 8 x 3 = 24 nodes",
-        "  method      PolicyIteration(evaluation=Sweeps(3)), Upwind()",
-        "  steps       7, last residual 3e-08",
-        "  error       at most 2e-07 (tol 1e-06): residual over the discount rate",
-        "  reached     95.8 % of the nodes",
-        "  isaacs gap  0.125",
-        "  seconds     1.23, and 0.5 to check and compile",
-        "  memory      12.3 MB",
-        "  device      cpu, float64",
+        "  grid             angle (periodic) x speed: 8 x 3 = 24 nodes",
+        "  method           PolicyIteration(evaluation=Sweeps(3)), Upwind()",
+        "  steps            7, last residual 3e-08",
+        "  algebraic error  at most 2e-07 (tol 1e-06): residual over the discount rate",
+        "  reached          95.8 % of the nodes",
+        "  isaacs gap       0.125",
+        "  seconds          1.23, and 0.5 to check and compile",
+        "  memory           12.3 MB",
+        "  device           cpu, float64",
     ]
     assert repr(solution) == "Solution(CONVERGED after 7 steps on 24 nodes)"
 
@@ -222,7 +222,7 @@ def test_the_screen_copes_with_what_is_missing(missing):
 
 def test_the_screen_says_why_there_is_no_certificate():
     text = str(solution_of(lambda a, b: a, stats={"certificate": "no discount and\nno running cost"}))
-    assert "  error       no certificate: no discount and no running cost" in text.splitlines()
+    assert "  algebraic error  no certificate: no discount and no running cost" in text.splitlines()
 
 
 def test_the_screen_stays_one_screen():

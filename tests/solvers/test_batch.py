@@ -39,7 +39,7 @@ def problem(k, discount=0.5, **options):
 
 
 def alone(question, **options):
-    return hjb.solve(question, GRID, method=hjb.PolicyIteration(), tol=1e-6, **options)
+    return hjb.solve(question, GRID, method=hjb.PolicyIteration(), tol=1e-6, **({"scheme": hjb.Upwind()} | options))
 
 
 def same(left, right):
@@ -53,7 +53,7 @@ def test_each_lane_is_its_own_solve():
     questions = [
         problem(k, beta) for k, beta in zip((0.0, 1.0, 2.0, 0.5, 3.0), (5.0, 0.01, 1.0, 0.02, 9.0), strict=True)
     ]
-    together = hjb.solve_batch(questions, GRID, tol=1e-6)
+    together = hjb.solve_batch(questions, GRID, tol=1e-6, scheme=hjb.Upwind())
     assert len({solution.steps for solution in together}) > 2
     for solution, question in zip(together, questions, strict=True):
         single = alone(question)
@@ -69,7 +69,7 @@ def test_each_lane_is_its_own_solve():
 def test_problems_of_different_kinds_keep_their_places():
     finite = dataclasses.replace(problem(1.0), controls=hjb.Finite([[-1.0], [0.0], [1.0]]))
     questions = [problem(0.0), finite, problem(2.0), finite]
-    together = hjb.solve_batch(questions, GRID, tol=1e-6)
+    together = hjb.solve_batch(questions, GRID, tol=1e-6, scheme=hjb.Upwind())
     for solution, question in zip(together, questions, strict=True):
         assert same(solution.value, alone(question).value)
 
@@ -77,7 +77,9 @@ def test_problems_of_different_kinds_keep_their_places():
 @pytest.mark.slow
 def test_rounds_that_fit_into_memory_change_nothing():
     questions = [problem(k) for k in np.linspace(0, 2, 5)]
-    whole, parts = (hjb.solve_batch(questions, GRID, tol=1e-6, max_memory=limit) for limit in (None, 50_000))
+    whole, parts = (
+        hjb.solve_batch(questions, GRID, tol=1e-6, max_memory=limit, scheme=hjb.Upwind()) for limit in (None, 50_000)
+    )
     assert parts[0].stats["lanes"] < whole[0].stats["lanes"] == 5
     for left, right in zip(whole, parts, strict=True):
         assert same(left.value, right.value)
@@ -86,19 +88,19 @@ def test_rounds_that_fit_into_memory_change_nothing():
 def test_a_lane_that_runs_out_of_steps_is_named_and_the_others_are_whole():
     questions = [problem(1.0, 9.0), problem(1.0, 0.01)]
     steps = alone(questions[0]).steps
-    slow, unfinished = hjb.solve_batch(questions, GRID, tol=1e-6, max_steps=steps, throw=False)
+    slow, unfinished = hjb.solve_batch(questions, GRID, tol=1e-6, max_steps=steps, throw=False, scheme=hjb.Upwind())
     assert slow.status is hjb.Status.CONVERGED
     assert unfinished.status is hjb.Status.MAX_STEPS
     assert unfinished.steps == steps
     with pytest.raises(hjb.SolveError, match="lane 1: MAX_STEPS") as caught:
-        hjb.solve_batch(questions, GRID, tol=1e-6, max_steps=steps)
+        hjb.solve_batch(questions, GRID, tol=1e-6, max_steps=steps, scheme=hjb.Upwind())
     assert same(caught.value.solution.value, unfinished.value)
 
 
 def test_one_lane_that_goes_nan_leaves_the_others_unchanged():
     systems = [Oscillator(1.0, w) for w in (1.0, -1.0, 2.0)]  # the logarithm of −1 is no number
     questions = [hjb.Problem(s.drift, s.spoilt_cost, hjb.Finite(MANY[:, None]), discount=1.0) for s in systems]
-    first, spoiled, last = hjb.solve_batch(questions, GRID, tol=1e-6, throw=False)
+    first, spoiled, last = hjb.solve_batch(questions, GRID, tol=1e-6, throw=False, scheme=hjb.Upwind())
     assert spoiled.status is hjb.Status.NONFINITE
     for solution, question in ((first, questions[0]), (last, questions[2])):
         assert same(solution.value, alone(question).value)
@@ -120,7 +122,9 @@ def paid(x, u):
 
 def test_a_lane_without_an_answer_is_named():
     with pytest.raises(ValueError, match="lane 1: .*no finite solution"):
-        hjb.solve_batch([problem(1.0, 1.0), dataclasses.replace(problem(1.0), cost=paid, discount=0.0)], GRID)
+        hjb.solve_batch(
+            [problem(1.0, 1.0), dataclasses.replace(problem(1.0), cost=paid, discount=0.0)], GRID, scheme=hjb.Upwind()
+        )
 
 
 def lost(rate):
@@ -142,17 +146,17 @@ class Current:
 def test_lanes_that_arrive_and_lanes_that_do_not_go_together():
     line = hjb.Grid([-1.0], [1.0], (41,))
     with pytest.warns(hjb.SolveWarning, match="cannot reach the target"):
-        arrives, never = hjb.solve_batch([lost(0.5), lost(2.0)], line, tol=1e-6)
+        arrives, never = hjb.solve_batch([lost(0.5), lost(2.0)], line, tol=1e-6, scheme=hjb.Upwind())
     assert np.all(np.isfinite(arrives.value))
     assert np.array_equal(np.isinf(never.value), np.asarray(line.axis(0)) > 1e-12)
 
 
 def test_no_problems_have_no_solutions():
-    assert hjb.solve_batch([], GRID) == []
+    assert hjb.solve_batch([], GRID, scheme=hjb.Upwind()) == []
 
 
 @pytest.mark.slow
 def test_lanes_keep_single_precision():
-    (solution,) = hjb.solve_batch([problem(1.0)], GRID, tol=1e-2, dtype="float32")
+    (solution,) = hjb.solve_batch([problem(1.0)], GRID, tol=1e-2, dtype="float32", scheme=hjb.Upwind())
     assert solution.value.dtype == np.float32
     assert not jax.config.jax_enable_x64

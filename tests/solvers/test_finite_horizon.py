@@ -62,12 +62,17 @@ def test_riccati_in_time_has_the_order_of_its_stages():
 
 
 def test_four_stages_take_steps_twice_as_long():
-    steps = [hjb.march(LQ, line(41), 1.0, method=hjb.Explicit(stages)).steps for stages in (3, 4, TWICE_AS_LONG)]
+    steps = [
+        hjb.march(LQ, line(41), 1.0, method=hjb.Explicit(stages), scheme=hjb.Upwind(split=True)).steps
+        for stages in (3, 4, TWICE_AS_LONG)
+    ]
     assert steps[1] == steps[2] == -(-steps[0] // 2)
-    limit = 1.0 / (hjb.march(LQ, line(41), 1.0, method=hjb.Explicit(3, fraction=1.0)).steps + 1)
+    limit = 1.0 / (
+        hjb.march(LQ, line(41), 1.0, method=hjb.Explicit(3, fraction=1.0), scheme=hjb.Upwind(split=True)).steps + 1
+    )
     with pytest.raises(ValueError, match="stability limit"):
-        hjb.march(LQ, line(41), 1.0, method=hjb.Explicit(3), step=1.5 * limit)
-    hjb.march(LQ, line(41), 1.0, method=hjb.Explicit(4), step=1.5 * limit)
+        hjb.march(LQ, line(41), 1.0, method=hjb.Explicit(3), step=1.5 * limit, scheme=hjb.Upwind(split=True))
+    hjb.march(LQ, line(41), 1.0, method=hjb.Explicit(4), step=1.5 * limit, scheme=hjb.Upwind(split=True))
 
 
 @pytest.mark.parametrize(
@@ -125,7 +130,9 @@ def test_hopf_and_lax():
         return np.sum(x * x, -1) / 4
 
     grids = [hjb.Grid([-2.0, -2.0], [2.0, 2.0], (count, count)) for count in (17, 33, 65)]
-    assert order_of([error(hjb.march(problem, grid, 1.0), exact) for grid in grids]) == pytest.approx(1, abs=0.15)
+    assert order_of(
+        [error(hjb.march(problem, grid, 1.0, scheme=hjb.Upwind(split=True)), exact) for grid in grids]
+    ) == pytest.approx(1, abs=0.15)
     assert error(hjb.march(problem, grids[0], 1.0, scheme=hjb.Weno5()), exact) < 1e-4
 
 
@@ -171,7 +178,10 @@ def test_the_game_of_finite_horizon():
     """ẋ = u + d: V = tanh(kT)/k x² with k² = 1 − γ⁻²; both players drive one component."""
     k = np.sqrt(1 - 1 / 4)
     errors = [
-        error(hjb.march(game(2.0, 3.7), line(count), 1.0), lambda x: np.tanh(k) / k * x[..., 0] ** 2)
+        error(
+            hjb.march(game(2.0, 3.7), line(count), 1.0, scheme=hjb.Upwind(split=True)),
+            lambda x: np.tanh(k) / k * x[..., 0] ** 2,
+        )
         for count in (41, 81, 161)
     ]
     assert order_of(errors) == pytest.approx(1, abs=0.15)
@@ -213,7 +223,7 @@ def test_the_american_put():
 
     assert order_of([off(count, hjb.Upwind(central=False)) for count in (49, 97, 193)]) == pytest.approx(1, abs=0.15)
     assert off(193, hjb.Upwind()) < 5e-4
-    coarse = hjb.march(put(), line(193, 1.2), 1.0, method=hjb.Implicit(), step=1 / 200)
+    coarse = hjb.march(put(), line(193, 1.2), 1.0, method=hjb.Implicit(), step=1 / 200, scheme=hjb.Upwind(split=True))
     assert -coarse.value_at(0.0, [0.0]) == pytest.approx(2.31958, abs=5e-3)
 
 
@@ -222,10 +232,10 @@ def test_the_american_put():
 
 def test_implicit_steps_of_any_length_have_order_one_in_time():
     grid = line(41)
-    limit = hjb.march(LQ, grid, 1.0, method=hjb.Explicit(3)).value[0]
+    limit = hjb.march(LQ, grid, 1.0, method=hjb.Explicit(3), scheme=hjb.Upwind(split=True)).value[0]
     errors = []
     for count in (10, 20, 40):
-        solution = hjb.march(LQ, grid, 1.0, method=hjb.Implicit(), step=1 / count)
+        solution = hjb.march(LQ, grid, 1.0, method=hjb.Implicit(), step=1 / count, scheme=hjb.Upwind(split=True))
         assert solution.steps == count
         errors.append(np.max(np.abs(solution.value[0] - limit)))
     assert order_of(errors) == pytest.approx(1, abs=0.15)
@@ -234,8 +244,10 @@ def test_implicit_steps_of_any_length_have_order_one_in_time():
 @pytest.mark.slow
 def test_implicit_games_agree_with_explicit_ones():
     grid = line(41)
-    explicit = hjb.march(game(2.0, 3.7), grid, 1.0, method=hjb.Explicit(3)).value[0]
-    step = hjb.march(game(2.0, 3.7), grid, 1.0, method=hjb.Implicit(), step=1 / 400).value[0]
+    explicit = hjb.march(game(2.0, 3.7), grid, 1.0, method=hjb.Explicit(3), scheme=hjb.Upwind(split=True)).value[0]
+    step = hjb.march(
+        game(2.0, 3.7), grid, 1.0, method=hjb.Implicit(), step=1 / 400, scheme=hjb.Upwind(split=True)
+    ).value[0]
     assert np.max(np.abs(step - explicit)[inner(grid)]) < 0.01  # of first order in Δt
 
 
@@ -288,7 +300,7 @@ def test_a_moving_target_by_hand():
         grid = line(count, 3.0)
         x = np.asarray(grid.axis(0))
         exact = np.maximum(np.maximum((x - 0.25) / 1.5, (-0.25 - x) / 0.5), 0)
-        solution = hjb.march(problem, grid, 1.5)
+        solution = hjb.march(problem, grid, 1.5, scheme=hjb.Upwind(split=True))
         errors.append(np.mean(np.abs(solution.value[0] - np.minimum(exact, 1.5))))
     assert order_of(errors) > 0.6  # a kink that is carried along smears like √h
     assert errors[-1] < 0.01
@@ -358,7 +370,7 @@ def test_implicit_steps_take_what_changes_at_the_time_of_their_result():
         for k in range(count):
             t = 2.0 - (k + 1) * dt
             wave, paid = wave / (1 - dt * growth(t)), paid + dt * np.sin(t)
-        value = hjb.march(CHANGING, CIRCLE, 2.0, method=hjb.Implicit(), step=dt).value[0]
+        value = hjb.march(CHANGING, CIRCLE, 2.0, method=hjb.Implicit(), step=dt, scheme=hjb.Upwind(split=True)).value[0]
         np.testing.assert_allclose(value, np.imag(wave * np.exp(1j * x)) + paid, rtol=0, atol=2e-6)
         errors.append(np.max(np.abs(value - limit)))
     assert order_of(errors) == pytest.approx(1, abs=0.15)
@@ -392,7 +404,7 @@ def test_upwind_never_leaves_the_range_of_the_data(seed):
     grid = random_grid(rng, 2)
     k, floor = 3 * rng.normal(size=(2, 2))
     problem = with_waves(random_problem(rng, grid, "diagonal"), k, floor=floor)
-    value = hjb.march(problem, grid, 0.3, times=[0.0, 0.3]).value
+    value = hjb.march(problem, grid, 0.3, times=[0.0, 0.3], scheme=hjb.Upwind(split=True)).value
     assert value[0].min() >= value[1].min()
     assert value[0].max() <= value[1].max()
 
@@ -405,15 +417,20 @@ def test_a_higher_terminal_cost_gives_a_higher_value(seed):
     rng = np.random.default_rng(seed)
     grid = random_grid(rng, 2)
     base, k, more = random_problem(rng, grid, "diagonal"), rng.normal(size=2), rng.uniform(0, 1)
-    lower, upper = (hjb.march(with_waves(base, k, extra, cost=base.cost), grid, 0.3).value for extra in (0.0, more))
+    lower, upper = (
+        hjb.march(with_waves(base, k, extra, cost=base.cost), grid, 0.3, scheme=hjb.Upwind(split=True)).value
+        for extra in (0.0, more)
+    )
     assert np.all(upper >= lower - 1e-12)
 
 
 def test_upwind_and_its_steps_agree_with_the_stationary_solution():
     problem = hjb.Problem(plane, quadratic, Box([-3.0], [3.0]), discount=1.0)
     grid = line(41)
-    marched = hjb.march(problem, grid, 16.0, method=hjb.Implicit(), step=0.5)
-    np.testing.assert_allclose(marched.value[0], hjb.solve(problem, grid, tol=1e-9).value, rtol=0, atol=1e-4)
+    marched = hjb.march(problem, grid, 16.0, method=hjb.Implicit(), step=0.5, scheme=hjb.Upwind(split=True))
+    np.testing.assert_allclose(
+        marched.value[0], hjb.solve(problem, grid, tol=1e-9, scheme=hjb.Upwind()).value, rtol=0, atol=1e-4
+    )
 
 
 # --- closed loops ---
@@ -424,7 +441,7 @@ def test_closed_loops_with_noise_cost_what_the_value_says():
     """The mean over 500 paths, within three standard errors plus the error of the grid, V − V_exact."""
     sigma = 0.5
     problem = hjb.Problem(plane, quadratic, Box([-8.0], [8.0]), noise=sigma, terminal_cost=lambda x: x @ x)
-    solution = hjb.march(problem, line(81, 4.0), 1.0, times=np.linspace(0, 1, 21))
+    solution = hjb.march(problem, line(81, 4.0), 1.0, times=np.linspace(0, 1, 21), scheme=hjb.Upwind(split=True))
     keys = jax.random.split(jax.random.key(0), 500)
     paths = jax.vmap(
         lambda key: simulation.rollout(problem, solution, jnp.array([1.0]), jnp.linspace(0.0, 1.0, 21), key=key)

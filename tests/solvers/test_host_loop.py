@@ -13,7 +13,7 @@ import pytest
 import hjbjax as hjb
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.problem.pytree import pytree_dataclass
-from hjbjax.solvers import host_loop
+from hjbjax.solvers import host_loop, stationary_run
 from hjbjax.solvers.setup import prepare_on_host
 
 GRID = hjb.Grid([-1.0, -2.0], [1.0, 2.0], (17, 18))
@@ -48,7 +48,7 @@ def endless(tol=1e-13):
 
 
 def test_converged_history_has_one_residual_a_step_and_one_for_the_guess():
-    solution = hjb.solve(question(0.1), GRID, method=SLOW, tol=1e-6)
+    solution = hjb.solve(question(0.1), GRID, method=SLOW, tol=1e-6, scheme=hjb.Upwind())
     assert solution.status is hjb.Status.CONVERGED
     assert solution.residuals.shape == (solution.steps + 1,)
     assert solution.steps > 300  # more than one chunk can hold
@@ -61,14 +61,14 @@ def test_converged_history_has_one_residual_a_step_and_one_for_the_guess():
 @pytest.fixture
 def asked(monkeypatch):
     """Up to which step the driver runs, call by call."""
-    steps, run = [], host_loop.run
+    steps, run = [], stationary_run.run
 
     def watched(task, state, until):
         steps.append(int(until))
         return run(task, state, until)
 
-    monkeypatch.setattr(host_loop, "run", watched)
-    monkeypatch.setattr(host_loop, "_run_kept", watched)  # where Python is called on the way
+    monkeypatch.setattr(stationary_run, "run", watched)
+    monkeypatch.setattr(stationary_run, "_run_kept", watched)  # where Python is called on the way
     return steps
 
 
@@ -77,11 +77,12 @@ def test_a_first_chunk_is_as_long_as_coarser_grids_tell(asked):
     on = Discretisation(question(1e-3), GRID, hjb.Upwind(), np.float32)
     task, *_ = prepare_on_host(on, method=SLOW, tol=1e-13)
     histories = []
-    for per_node, first in [(1e-9, host_loop.HISTORY - 1), (host_loop.CHUNK_SECONDS / (20 * GRID.size), 10), (1.0, 1)]:
+    paces = [(1e-9, stationary_run.HISTORY - 1), (host_loop.CHUNK_SECONDS / (20 * GRID.size), 10), (1.0, 1)]
+    for per_node, first in paces:
         clock = host_loop.Clock(300, np.inf, False)
         clock.per_node = per_node
         asked.clear()
-        state, code, residuals = host_loop.drive(task, jnp.zeros(GRID.shape), clock)
+        state, code, residuals = stationary_run.iterate(task, jnp.zeros(GRID.shape), clock)
         assert asked[:2] == [-1, first]  # one call that compiles, and the first chunk
         assert (code, int(state.step)) == (hjb.Status.MAX_STEPS, 300)
         histories.append(residuals)
@@ -92,12 +93,12 @@ def test_a_first_chunk_is_as_long_as_coarser_grids_tell(asked):
 
 @pytest.mark.parametrize(
     ("method", "first"),
-    [(SLOW, host_loop.FIRST_NODES // GRID.size), (hjb.PolicyIteration(), host_loop.FIRST_NODES // GRID.size)]
+    [(method, host_loop.FIRST_NODES // GRID.size) for method in (SLOW, hjb.PolicyIteration(hjb.Sweeps()))]
     + [(hjb.PolicyIteration(evaluation), 1) for evaluation in (hjb.Krylov(), hjb.Direct())],
 )
 def test_where_nothing_is_known_a_first_chunk_is_short(asked, method, first):
     """Of one step where a step may take many passes over the nodes."""
-    hjb.solve(question(), GRID, method=method)
+    hjb.solve(question(), GRID, method=method, scheme=hjb.Upwind())
     assert asked[1] == first
 
 
@@ -114,8 +115,8 @@ def test_max_steps(steps):
 
 
 def test_bounds_hold_before_convergence():
-    truth = hjb.solve(question(), GRID, method=hjb.PolicyIteration(hjb.Direct()), tol=1e-10).value
-    solution = hjb.solve(question(), GRID, method=SLOW, max_steps=5, throw=False)
+    truth = hjb.solve(question(), GRID, method=hjb.PolicyIteration(hjb.Direct()), tol=1e-10, scheme=hjb.Upwind()).value
+    solution = hjb.solve(question(), GRID, method=SLOW, max_steps=5, throw=False, scheme=hjb.Upwind())
     lower, upper = solution.bounds
     assert np.all(lower <= truth)
     assert np.all(truth <= upper)
@@ -123,23 +124,25 @@ def test_bounds_hold_before_convergence():
 
 
 def test_chunks_change_no_bit():
-    together = hjb.solve(question(), GRID, method=SLOW, tol=1e-4)
-    half = hjb.solve(question(), GRID, method=SLOW, tol=1e-4, max_steps=together.steps // 2, throw=False)
-    rest = hjb.solve(question(), GRID, method=SLOW, tol=1e-4, guess=half.value)
+    together = hjb.solve(question(), GRID, method=SLOW, tol=1e-4, scheme=hjb.Upwind())
+    half = hjb.solve(
+        question(), GRID, method=SLOW, tol=1e-4, max_steps=together.steps // 2, throw=False, scheme=hjb.Upwind()
+    )
+    rest = hjb.solve(question(), GRID, method=SLOW, tol=1e-4, guess=half.value, scheme=hjb.Upwind())
     assert half.steps + rest.steps == together.steps
     np.testing.assert_array_equal(rest.value, together.value)
 
 
 def test_a_solution_as_guess_takes_no_more_than_one_step():
-    solution = hjb.solve(question(), GRID, tol=1e-6)
-    again = hjb.solve(question(), GRID, tol=1e-6, guess=solution.value)
+    solution = hjb.solve(question(), GRID, tol=1e-6, scheme=hjb.Upwind())
+    again = hjb.solve(question(), GRID, tol=1e-6, guess=solution.value, scheme=hjb.Upwind())
     assert again.steps <= 1 < solution.steps
     np.testing.assert_allclose(again.value, solution.value, rtol=0, atol=2e-6)
 
 
 def test_the_guess_is_left_alone():
     guess = np.ones(GRID.shape)
-    hjb.solve(question(), GRID, guess=guess)
+    hjb.solve(question(), GRID, guess=guess, scheme=hjb.Upwind())
     np.testing.assert_array_equal(guess, 1.0)
 
 
@@ -159,18 +162,18 @@ def test_time_limit():
 def test_a_tolerance_below_rounding_stalls_and_says_what_is_attainable(dtype):
     tol = 1e-10 if dtype == "float32" else 1e-17
     with pytest.raises(hjb.SolveError, match=r"(?s)STALLED.*within reach") as caught:
-        hjb.solve(question(), GRID, tol=tol, dtype=dtype)
+        hjb.solve(question(), GRID, tol=tol, dtype=dtype, scheme=hjb.Upwind())
     solution = caught.value.solution
     assert solution.status is hjb.Status.STALLED
     attainable = float(str(caught.value).split("a tolerance of ")[1].split()[0])
-    assert hjb.solve(question(), GRID, tol=attainable, dtype=dtype).status is hjb.Status.CONVERGED
+    assert hjb.solve(question(), GRID, tol=attainable, dtype=dtype, scheme=hjb.Upwind()).status is hjb.Status.CONVERGED
     assert attainable < (1e-3 if dtype == "float32" else 1e-10)
 
 
 def test_overflow_stops_with_the_last_finite_value():
     overflowing = question(1e-4, cost=Level(1e307).cost)  # V = L/β = 1e311
     with pytest.raises(hjb.SolveError, match=r"NONFINITE") as caught:
-        hjb.solve(overflowing, GRID, method=hjb.PolicyIteration(hjb.Sweeps()))
+        hjb.solve(overflowing, GRID, method=hjb.PolicyIteration(hjb.Sweeps()), scheme=hjb.Upwind())
     solution = caught.value.solution
     assert solution.status is hjb.Status.NONFINITE
     assert np.all(np.isfinite(solution.value))
@@ -184,7 +187,7 @@ def pressed(monkeypatch):
 
     A process that a shell started in the background ignores the signal; here it is in the foreground.
     """
-    times, run = [], host_loop.run
+    times, run = [], stationary_run.run
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def press():
@@ -199,7 +202,7 @@ def pressed(monkeypatch):
             timers[0].start()
         return run(task, state, until)
 
-    monkeypatch.setattr(host_loop, "run", watched)
+    monkeypatch.setattr(stationary_run, "run", watched)
     yield times
     signal.signal(signal.SIGINT, before)
 
@@ -235,7 +238,7 @@ def test_progress_when_asked_for_and_when_not(capfd):
 
 def test_dtype_and_host_arrays():
     for dtype, kind in [(None, np.float64), ("float64", np.float64), ("float32", np.float32), (np.float32, np.float32)]:
-        solution = hjb.solve(question(), GRID, tol=1e-2, dtype=dtype)
+        solution = hjb.solve(question(), GRID, tol=1e-2, dtype=dtype, scheme=hjb.Upwind())
         for array in (solution.value, solution.policy, *solution.bounds):
             assert type(array) is np.ndarray
             assert array.dtype == kind
@@ -245,7 +248,7 @@ def test_dtype_and_host_arrays():
 
 
 def test_statistics_of_a_solve():
-    stats = hjb.solve(question(), GRID, tol=1e-4).stats
+    stats = hjb.solve(question(), GRID, tol=1e-4, scheme=hjb.Upwind()).stats
     assert stats["tol"] == 1e-4
     assert stats["seconds"] >= 0
     assert stats["compile_seconds"] >= 0
@@ -262,7 +265,9 @@ def test_two_threads_in_different_dtypes_get_their_own():
     def work(dtype):
         gate.wait()
         for repeat in range(3):
-            found[dtype, repeat] = hjb.solve(question(), GRID, tol=1e-2, dtype=dtype, method=SLOW).value
+            found[dtype, repeat] = hjb.solve(
+                question(), GRID, tol=1e-2, dtype=dtype, method=SLOW, scheme=hjb.Upwind()
+            ).value
 
     threads = [threading.Thread(target=work, args=(dtype,)) for dtype in ("float32", "float64")]
     for thread in threads:
@@ -270,7 +275,7 @@ def test_two_threads_in_different_dtypes_get_their_own():
     for thread in threads:
         thread.join()
     for dtype in ("float32", "float64"):
-        alone = hjb.solve(question(), GRID, tol=1e-2, dtype=dtype, method=SLOW).value
+        alone = hjb.solve(question(), GRID, tol=1e-2, dtype=dtype, method=SLOW, scheme=hjb.Upwind()).value
         for repeat in range(3):
             assert found[dtype, repeat].dtype == dtype
             np.testing.assert_array_equal(found[dtype, repeat], alone)
@@ -288,7 +293,7 @@ def test_what_stops_before_the_first_look_keeps_what_is_given():
     )
     on = Discretisation(problem, hjb.Grid([-1.0], [1.0], (21,)), hjb.Upwind(), np.float32)
     task, _, _ = prepare_on_host(on, method=hjb.ValueIteration(), tol=1e-3)
-    state, code, _ = host_loop.drive(task, jnp.full(21, 7.0), host_loop.Clock(10, np.inf, False))
+    state, code, _ = stationary_run.iterate(task, jnp.full(21, 7.0), host_loop.Clock(10, np.inf, False))
     assert code is hjb.Status.NONFINITE
     assert np.all(np.isfinite(state.value))
     assert (state.value[0], state.value[10], state.value[-1]) == (3.0, 7.0, 3.0)

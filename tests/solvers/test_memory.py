@@ -15,7 +15,7 @@ import hjbjax as hjb
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import fixed_point
 from hjbjax.problem.pytree import cast
-from hjbjax.solvers import host_loop, memory
+from hjbjax.solvers import memory, stationary_run
 from hjbjax.solvers.setup import assumptions_of, prepare
 
 METHODS = [
@@ -64,7 +64,7 @@ def test_the_estimate_is_what_the_compiled_loop_needs(n, noise, method):
         options = {"method": method, "tol": 1e-3, "assumptions": assumptions_of(on)}
         task = jax.eval_shape(lambda on: prepare(on, **options), on)
         state = jax.eval_shape(fixed_point.begin, task, jax.ShapeDtypeStruct(grid.shape, np.float64))
-        found = host_loop.run.lower(task, state, 1).compile().memory_analysis()
+        found = stationary_run.run.lower(task, state, 1).compile().memory_analysis()
     together = found.argument_size_in_bytes + found.output_size_in_bytes + found.temp_size_in_bytes
     ratio = memory.estimate(problem, grid, method, np.float64) / (together - found.alias_size_in_bytes)
     assert 0.95 <= ratio <= 1.4
@@ -187,7 +187,7 @@ def test_limits_that_are_no_number_of_bytes(bad):
             with pytest.raises(ValueError, match=r"max_memory = .*; wanted a finite number > 0, in bytes"):
                 door(question, grid, max_memory=bad)
         with pytest.raises(ValueError, match=r"max_memory = "):
-            hjb.solve_batch([problem], grid, max_memory=bad)
+            hjb.solve_batch([problem], grid, max_memory=bad, scheme=hjb.Upwind())
 
 
 def test_hardly_any_memory():
@@ -200,7 +200,7 @@ def test_six_dimensions_are_refused_with_a_way_out():
     question = hjb.Problem(lambda x, u: jnp.concatenate([x[1:], u]), cost, hjb.Box([-1.0], [1.0]), discount=1.0)
     grid = hjb.Grid([-1.0] * 6, [1.0] * 6, (35,) * 6)
     with pytest.raises(MemoryError) as caught:
-        hjb.solve(question, grid, max_memory=64 * 10**9)
+        hjb.solve(question, grid, max_memory=64 * 10**9, scheme=hjb.Upwind())
     message = str(caught.value)
     assert 120 <= float(re.search(r"about (\d+) GB", message)[1]) <= 190
     assert len(message.splitlines()) <= 6

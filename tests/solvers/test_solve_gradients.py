@@ -66,20 +66,21 @@ def central_difference(function, at):
 
 
 def value_of(problem, grid=GRID):
-    return hjb.solve(problem, grid, tol=1e-11).value
+    return hjb.solve(problem, grid, tol=1e-11, scheme=hjb.Upwind()).value
 
 
 def test_changing_a_parameter_does_not_recompile():
-    hjb.solve(question(mass=1.0), GRID)
+    hjb.solve(question(mass=1.0), GRID, scheme=hjb.Upwind())
     TRACES.clear()
     values = [
-        hjb.solve(question(mass=mass, discount=discount), GRID).value for mass, discount in [(1.3, 0.8), (2.0, 1.0)]
+        hjb.solve(question(mass=mass, discount=discount), GRID, scheme=hjb.Upwind()).value
+        for mass, discount in [(1.3, 0.8), (2.0, 1.0)]
     ]
     two = len(TRACES)
     assert np.max(np.abs(values[0] - values[1])) > 0.01
     # what is left are the probes of one state, which compile nothing: the same number for every solve
     TRACES.clear()
-    hjb.solve(question(mass=3.0), GRID)
+    hjb.solve(question(mass=3.0), GRID, scheme=hjb.Upwind())
     assert two == 2 * len(TRACES)
     assert len(TRACES) <= 4  # of closures, shapes, structure and callbacks
 
@@ -109,7 +110,7 @@ def test_gradients_match_central_differences(name):
         return float(value_of(*build(parameter))[AT])
 
     def traced(parameter):
-        return hjb.solve(*build(parameter), tol=1e-11).value[AT]
+        return hjb.solve(*build(parameter), tol=1e-11, scheme=hjb.Upwind()).value[AT]
 
     with jax.enable_x64(True):
         slope = float(jax.jit(jax.grad(traced))(jnp.asarray(at, jnp.float64)))
@@ -122,7 +123,7 @@ def test_gradients_match_central_differences(name):
 def test_forward_and_reverse_mode_agree_and_a_game_is_differentiable():
     def traced(gamma):
         problem, grid = zoo.lq_game(gamma=gamma, discount=0.3, shape=(21,))
-        return hjb.solve(problem, grid, tol=1e-11).value[4]
+        return hjb.solve(problem, grid, tol=1e-11, scheme=hjb.Upwind()).value[4]
 
     with jax.enable_x64(True):
         gamma = jnp.asarray(2.0, jnp.float64)
@@ -130,7 +131,7 @@ def test_forward_and_reverse_mode_agree_and_a_game_is_differentiable():
 
         def host(gamma):
             problem, grid = zoo.lq_game(gamma=gamma, discount=0.3, shape=(21,))
-            return float(hjb.solve(problem, grid, tol=1e-11).value[4])
+            return float(hjb.solve(problem, grid, tol=1e-11, scheme=hjb.Upwind()).value[4])
 
         wanted = central_difference(host, 2.0)
     assert float(forward) == pytest.approx(float(reverse), rel=1e-9)
@@ -147,7 +148,7 @@ def test_jit_and_vmap_over_a_parameter_equal_single_solves(method):
     masses = np.array([0.8, 1.0, 1.7])
 
     def solved(mass):
-        return hjb.solve(question(mass=mass), GRID, method=method, tol=1e-8)
+        return hjb.solve(question(mass=mass), GRID, method=method, tol=1e-8, scheme=hjb.Upwind())
 
     single = [solved(mass) for mass in masses]
     with jax.enable_x64(True):
@@ -163,13 +164,15 @@ def test_jit_and_vmap_over_a_parameter_equal_single_solves(method):
 
 
 def test_traced_solves_take_the_dtype_of_their_inputs():
-    result = jax.jit(lambda mass: hjb.solve(question(mass=mass), GRID, tol=1e-2))(jnp.float32(1.2))
+    result = jax.jit(lambda mass: hjb.solve(question(mass=mass), GRID, tol=1e-2, scheme=hjb.Upwind()))(jnp.float32(1.2))
     assert result.value.dtype == jnp.float32
-    assert np.max(np.abs(result.value - hjb.solve(question(), GRID, tol=1e-6).value)) <= 1e-2
+    assert np.max(np.abs(result.value - hjb.solve(question(), GRID, tol=1e-6, scheme=hjb.Upwind()).value)) <= 1e-2
 
 
 def test_fixed_steps_under_jit_report_that_they_ran_out():
-    result = jax.jit(lambda mass: hjb.solve(question(mass=mass), GRID, tol=1e-6, max_steps=1))(jnp.float32(1.2))
+    result = jax.jit(lambda mass: hjb.solve(question(mass=mass), GRID, tol=1e-6, max_steps=1, scheme=hjb.Upwind()))(
+        jnp.float32(1.2)
+    )
     assert hjb.Status(int(result.code)) is not hjb.Status.CONVERGED
 
 
@@ -194,7 +197,7 @@ def test_the_gradient_is_that_of_the_policy_that_was_found():
     def value(gain):
         wavy = Wavy(gain)
         problem = hjb.Problem(wavy.drift, wavy.cost, hjb.Box([-1.0], [1.0]), discount=0.5)
-        return jnp.sum(hjb.solve(problem, line, tol=1e-11).value)
+        return jnp.sum(hjb.solve(problem, line, tol=1e-11, scheme=hjb.Upwind()).value)
 
     with jax.enable_x64(True):
         slope = float(jax.jit(jax.grad(value))(1.0))
@@ -226,7 +229,7 @@ def spun_value(numbers):
         jax.tree_util.Partial(spun_drift, rate), spun_cost, hjb.Box([-1.0], [1.0]), discount=discount,
         stopping_cost=jax.tree_util.Partial(spun_stop, scale),
     )  # fmt: skip
-    return hjb.solve(problem, hjb.Grid([-2.0, -2.0], [2.0, 2.0], (9, 9)), tol=1e-9).value[5, 6]
+    return hjb.solve(problem, hjb.Grid([-2.0, -2.0], [2.0, 2.0], (9, 9)), tol=1e-9, scheme=hjb.Upwind()).value[5, 6]
 
 
 @pytest.mark.filterwarnings("ignore:the optimal drift leaves")

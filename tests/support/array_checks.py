@@ -28,6 +28,11 @@ def arrays_of(hint):
     return tuple(each for kind in kinds for each in widened(kind)) if named else ()
 
 
+def fits(value, kinds):
+    """True if a value is of one of the classes; a number of NumPy's is an array without axes."""
+    return isinstance(np.asarray(value) if isinstance(value, np.generic) else value, kinds)
+
+
 def check(function):
     """The function with the arrays among its arguments and its result held against their annotations."""
     signature, hints = inspect.signature(function), None
@@ -51,10 +56,10 @@ def check(function):
         if hints:
             SEEN.add(f"{function.__module__}.{function.__qualname__}")
         for name, value in signature.bind(*arguments, **options).arguments.items():
-            if name in hints and not isinstance(value, hints[name]):
+            if name in hints and not fits(value, hints[name]):
                 raise TypeError(f"{name}: got {value!r}, wanted {hints[name]}")
         result = function(*arguments, **options)
-        if "return" in hints and not isinstance(result, hints["return"]):
+        if "return" in hints and not fits(result, hints["return"]):
             raise TypeError(f"{function.__qualname__} returned {result!r}, wanted {hints['return']}")
         return result
 

@@ -24,7 +24,7 @@ def steer(x, u):
 
 def value(drift, cost=square, **options):
     problem = hjb.Problem(drift, cost, UNIT, discount=1.0, **options)
-    return hjb.solve(problem, LINE, tol=1e-6).value[2]
+    return hjb.solve(problem, LINE, tol=1e-6, scheme=hjb.Upwind()).value[2]
 
 
 class Car:
@@ -85,9 +85,9 @@ def test_a_changed_object_is_seen_in_batches_marches_and_tubes():
         problem = hjb.Problem(car.drift, square, UNIT, discount=1.0)
         tube = hjb.reach(car.drift, UNIT, lambda x: jnp.abs(x[0]) - 0.1)
         return (
-            hjb.solve_batch([problem], LINE, tol=1e-6)[0].value[2],
-            hjb.march(problem, LINE, 1.0).value[0, 2],
-            hjb.solve(tube, LINE, tol=1e-6).value[2],
+            hjb.solve_batch([problem], LINE, tol=1e-6, scheme=hjb.Upwind())[0].value[2],
+            hjb.march(problem, LINE, 1.0, scheme=hjb.Upwind(split=True)).value[0, 2],
+            hjb.solve(tube, LINE, tol=1e-6, scheme=hjb.Upwind()).value[2],
         )
 
     before = asked()
@@ -144,15 +144,15 @@ def test_the_arguments_of_a_method_are_still_counted():
 
 def test_front_doors_are_called_by_names_too_and_refuse_like_any_function():
     problem = hjb.Problem(steer, square, UNIT, discount=1.0)
-    assert hjb.solve(grid=LINE, problem=problem).status is hjb.Status.CONVERGED
+    assert hjb.solve(grid=LINE, problem=problem, scheme=hjb.Upwind()).status is hjb.Status.CONVERGED
     with pytest.raises(TypeError, match=r"solve\(\) got multiple values for argument 'problem'"):
-        hjb.solve(problem, problem=problem)
+        hjb.solve(problem, problem=problem, scheme=hjb.Upwind())
     with pytest.raises(TypeError, match=r"solve\(\) missing 1 required positional argument: 'grid'"):
-        hjb.solve(problem)
+        hjb.solve(problem, scheme=hjb.Upwind())
     with pytest.raises(TypeError, match=r"march\(\) takes 3 positional arguments but 4 were given"):
         hjb.march(problem, LINE, 1.0, 2.0)
     with pytest.raises(ValueError, match=r"dtype: got 'flaot64'"):
-        hjb.solve(hjb.Problem(Car().drift, square, UNIT, discount=1.0), LINE, dtype="flaot64")
+        hjb.solve(hjb.Problem(Car().drift, square, UNIT, discount=1.0), LINE, dtype="flaot64", scheme=hjb.Upwind())
 
 
 # --- traced numbers ---
@@ -183,7 +183,7 @@ def test_gradients_batches_and_compilation_see_what_is_closed_over():
 def test_a_closure_beside_a_leaf_and_inside_a_march():
     def marched(a):
         problem = hjb.Problem(jax.tree_util.Partial(lambda b, x, u: b * u, a), lambda x, u: a * (x @ x), UNIT)
-        return hjb.march(problem, LINE, 0.5, step=0.05).value[0, 2]
+        return hjb.march(problem, LINE, 0.5, step=0.05, scheme=hjb.Upwind(split=True)).value[0, 2]
 
     slope = jax.grad(marched)(1.0)
     assert slope == pytest.approx((marched(1.001) - marched(0.999)) / 0.002, rel=1e-2)
@@ -192,9 +192,9 @@ def test_a_closure_beside_a_leaf_and_inside_a_march():
 def test_known_problems_are_solved_at_once_inside_a_transformation():
     problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x, UNIT, discount=1.0)
     for ask in (
-        lambda: hjb.solve(problem, LINE),
-        lambda: hjb.solve_batch([problem], LINE)[0],
-        lambda: hjb.march(problem, LINE, 0.5, times=[0.0, 0.5]),
+        lambda: hjb.solve(problem, LINE, scheme=hjb.Upwind()),
+        lambda: hjb.solve_batch([problem], LINE, scheme=hjb.Upwind())[0],
+        lambda: hjb.march(problem, LINE, 0.5, times=[0.0, 0.5], scheme=hjb.Upwind(split=True)),
     ):
         outside = ask()
         place = (0.0,) if outside.times is not None else ()

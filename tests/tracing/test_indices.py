@@ -78,11 +78,13 @@ def test_every_player_and_the_time():
 def test_every_front_door():
     wrong = hjb.Problem(BEYOND["x[2]"][0], lambda x, u: x @ x, U, discount=1.0)
     doors = {
-        "solve": lambda: hjb.solve(wrong, ALONG),
-        "march": lambda: hjb.march(wrong, ALONG, 1.0),
-        "solve_batch": lambda: hjb.solve_batch([wrong], ALONG),
+        "solve": lambda: hjb.solve(wrong, ALONG, scheme=hjb.Upwind()),
+        "march": lambda: hjb.march(wrong, ALONG, 1.0, scheme=hjb.Upwind(split=True)),
+        "solve_batch": lambda: hjb.solve_batch([wrong], ALONG, scheme=hjb.Upwind()),
         "pontryagin": lambda: hjb.pontryagin(wrong, [1.0, 0.0], horizon=1.0),
-        "jit": lambda: jax.jit(lambda k: hjb.solve(hjb.Problem(wrong.drift, None, U, discount=k), ALONG).value)(1.0),
+        "jit": lambda: jax.jit(
+            lambda k: hjb.solve(hjb.Problem(wrong.drift, None, U, discount=k), ALONG, scheme=hjb.Upwind()).value
+        )(1.0),
         "chain": lambda: hjb.chain.generator(wrong, ALONG, np.zeros((5, 5, 1))),
     }
     for door in doors.values():

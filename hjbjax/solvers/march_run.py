@@ -1,10 +1,6 @@
-"""The host's loop over the kept times of a march, and the solution that comes of it.
+"""A march in chunks of steps from one kept time to the next, and the solution that comes of it."""
 
-Between two kept times the compiled ``run`` is called in chunks of about half a second; progress, Ctrl-C, time
-limits and stops at NaN live between two chunks. How long a chunk is changes no bit of the answer.
-"""
-
-import time
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,10 +14,10 @@ from hjbjax.iteration.time_stepping import Front, March
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.sets import Finite
 from hjbjax.problem.types import Field, Nodes, Number, Scalar
-from hjbjax.solution.clock import CHUNK_SECONDS, CUT, Clock
+from hjbjax.solution.clock import CUT, Clock
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
-from hjbjax.solvers.host_loop import ticker
+from hjbjax.solvers import host_loop
 from hjbjax.solvers.result import isaacs_gap, warn_of_cuts, warn_of_gap
 
 CERTIFICATE = "of a march there is none; halve the spacings and the step to see its error"
@@ -89,85 +85,107 @@ class Slices:
     def keep(self, task: March, value: Field, t: Number, *, feedback: bool = True) -> None:
         """Fill the next slice; the policy is NaN on the target, and everywhere without ``feedback``."""
         # one program for all kept times: the time is an argument
-        answer = jax.device_get(_greedy(task, value, t)) if feedback else None
-        self.first -= 1
-        self.times[self.first] = float(t)
-        self.value[self.first] = value
+        answer, place = (jax.device_get(_greedy(task, value, t)) if feedback else None), self.first - 1
+        self.value[place] = value
         if answer is None:
-            self.policy[self.first] = self.disturbance[self.first] = np.nan
-            return
-        (u, d), ended, acting = answer
-        found = edges.cut(task.problem, task.grid, self.value[self.first], list(u), list(d), acting, t)
-        self.cut[self.first], self.ends[self.first] = found
-        for array, action in ((self.policy, u), (self.disturbance, d)):
-            for j, entry in enumerate(action):
-                array[self.first, ..., j] = np.where(ended, np.nan, entry)  # the run is over there: no action
+            self.policy[place] = self.disturbance[place] = np.nan
+        else:
+            (u, d), ended, acting = answer
+            found = edges.cut(task.problem, task.grid, self.value[place], list(u), list(d), acting, t)
+            self.cut[place], self.ends[place] = found
+            for array, action in ((self.policy, u), (self.disturbance, d)):
+                for j, entry in enumerate(action):
+                    array[place, ..., j] = np.where(ended, np.nan, entry)  # the run is over there: no action
+        self.times[place] = float(t)
+        self.first = place  # at last: an interrupt on the way leaves no slice half filled
+
+    def misses(self, t: Number) -> bool:
+        """True if the time t, which the march came to, is not among the times that are kept."""
+        return self.first > 0 and (self.first == len(self.times) or float(t) < self.times[self.first])
 
 
 def drive(task: March, kept: np.ndarray, start: Nodes | None, clock: Clock) -> tuple[Slices, Front, Status]:
     """The slices at the kept times, the last front and its status; ends at a code, at the time limit, or at Ctrl-C."""
-    dtype, slices, chunk = np.dtype(task.horizon.dtype), Slices(task, kept), 1
-    start = None if start is None else jnp.asarray(start, dtype)
-    front = time_stepping.begin(task, _terminal(task.on.at(task.horizon), start))
-    code = Status.RUNNING if bool(jnp.all(jnp.isfinite(front.value))) else Status.NONFINITE
-    with ticker(clock.progress, float(task.horizon), "march") as show:
-        try:
-            code = _stop_status(clock, code)
-            if code is Status.RUNNING:
-                clock.phase = "compiling the steps"
-                # no steps: it compiles, so that the first chunk is timed without that
-                jax.block_until_ready(_run(task, front, jnp.asarray(0, dtype), 0))
-            for t in kept[::-1]:
-                until = jnp.asarray(t, dtype)
-                while code is Status.RUNNING and float(front.t) > float(until):
-                    code = _stop_status(clock, code)
-                    if code is Status.RUNNING:
-                        clock.phase = f"step {int(front.steps)}"
-                        front, code, chunk = _chunk(task, front, until, chunk, clock)
-                        show(float(task.horizon) - float(front.t), int(front.steps))
-                # at the last kept time nothing is missing any more, and a time limit that passes now takes nothing away
-                code = _stop_status(clock, code, arrived=t == kept[0])
-                if code is not Status.RUNNING:
-                    break
-                slices.keep(task, front.value, front.t)
-        except KeyboardInterrupt:  # the second one, or by a handler of the user's own
-            clock.interrupted, code = True, Status.INTERRUPTED
-        except Exception as error:
-            if slices.first > 0:
-                # without a feedback: its program calls the function that raised once more
-                slices.keep(task, front.value, front.t, feedback=False)
-            error.solution = assemble(task, task.grid, slices, front, Status.INTERRUPTED)  # type: ignore[attr-defined]
-            raise
+    start = None if start is None else jnp.asarray(start, np.dtype(task.horizon.dtype))
+    value = _terminal(task.on.at(task.horizon), start)
+    run = MarchRun(task, time_stepping.begin(task, value), kept)
+    finite = bool(jnp.all(jnp.isfinite(value)))
+    status = host_loop.drive(run, clock) if finite else Status.NONFINITE
+    slices, front = run.slices, run.front
     # after a cut nothing is compiled, and the feedback has its program only if a slice was kept before
-    if code is not Status.RUNNING and slices.first > 0 and bool(jnp.all(jnp.isfinite(front.value))):
-        slices.keep(task, front.value, front.t, feedback=code not in CUT or slices.first < len(kept))  # how far it came
-    return slices, front, Status.CONVERGED if code is Status.RUNNING else code
+    if status is not Status.CONVERGED and slices.misses(front.t) and bool(jnp.all(jnp.isfinite(front.value))):
+        feedback = status not in CUT or slices.first < len(kept)
+        slices.keep(task, front.value, front.t, feedback=feedback)  # how far it came
+    return slices, front, status
 
 
-def _stop_status(clock: Clock, code: Status, *, arrived: bool = False) -> Status:
-    """The code of a front, or the status by which the clock stops it; one that has arrived is only interrupted."""
-    cut = clock.over()
-    # how it ended comes before the clock: a march that blew up did so, however late it is
-    if code is not Status.RUNNING or cut is None or (arrived and cut is Status.TIME_LIMIT):
-        return code
-    return cut
+class MarchRun:
+    """A march from one kept time to the next: its front, and the slices that are kept so far."""
 
+    limit, longest = np.inf, 10**9  # of steps: none
 
-def _chunk(task: March, front: Front, until: Scalar, chunk: int, clock: Clock) -> tuple[Front, Status, int]:
-    """The front after one chunk of steps, its status, and the steps of the next chunk.
+    def __init__(self, task: March, front: Front, kept: np.ndarray):
+        self.task, self.front, self.slices = task, front, Slices(task, kept)
+        self.nodes, self.name = task.grid.size, f"{' x '.join(map(str, task.grid.shape))} nodes"
+        form = "{desc}: {percentage:3.0f}% |{bar}| t {n:.3g} of {total:.3g}{postfix} [{elapsed}<{remaining}]"
+        self.bar = {"desc": "march", "total": float(task.horizon), "bar_format": form}
 
-    A chunk that ends in numbers that are not finite is taken back to the last step before.
-    """
-    began = time.perf_counter()
-    after = jax.block_until_ready(_run(task, front, until, chunk))
-    took, done = time.perf_counter() - began, int(after.steps) - int(front.steps)
-    clock.stepping += took
-    code = Status(int(after.code))
-    if code is Status.NONFINITE:
-        after = _run(task, front, until, done - 1)  # the steps are the same ones, so that it ends just before the last
-    # a chunk of a step or two is timed badly, hence not more than eight times as many steps
-    chunk = int(np.clip(done * CHUNK_SECONDS / max(took, 1e-4), 1, 8 * chunk))
-    return after, code, chunk
+    @property
+    def steps(self) -> int:
+        """The steps that are done."""
+        return int(self.front.steps)
+
+    @property
+    def until(self) -> Scalar:
+        """The kept time that comes next, in the type of the values."""
+        return jnp.asarray(self.slices.times[self.slices.first - 1], np.dtype(self.task.horizon.dtype))
+
+    def compile(self) -> None:
+        """Run no step."""
+        jax.block_until_ready(_run(self.task, self.front, jnp.zeros_like(self.until), 0))
+
+    def first_chunk(self, clock: Clock) -> int:
+        """One step: none is timed."""
+        return 1
+
+    def advance(self, count: int) -> Status:
+        """Take ``count`` steps at most towards the next kept time.
+
+        A chunk that ends in numbers that are not finite is taken back to the last step before.
+        """
+        after = jax.block_until_ready(_run(self.task, self.front, self.until, count))
+        status = Status(int(after.code))
+        if status is Status.NONFINITE:
+            # the steps are the same ones, so that it ends just before the last
+            after = _run(self.task, self.front, self.until, int(after.steps) - self.steps - 1)
+        self.front = after
+        return status
+
+    def between(self, status: Status, clock: Clock) -> Status:
+        """Keep the slices at the times that the front has reached; CONVERGED after the last of them."""
+        slices, front = self.slices, self.front
+        while status is Status.RUNNING and float(front.t) <= float(self.until):
+            cut = clock.over()
+            # at the last kept time nothing is missing any more, and a time limit that passes now takes nothing away
+            if cut is not None and not (slices.first == 1 and cut is Status.TIME_LIMIT):
+                return cut
+            slices.keep(self.task, front.value, front.t)
+            if slices.first == 0:
+                return Status.CONVERGED
+        return status
+
+    def show(self, bar: Any) -> None:
+        """Move the progress bar, which runs over the problem's own time."""
+        bar.update(float(self.task.horizon) - float(self.front.t) - bar.n)
+        bar.set_postfix_str(f"{self.steps} steps", refresh=False)
+
+    def keep(self, error: Exception) -> None:
+        """Attach the solution so far to an exception."""
+        if self.slices.misses(self.front.t):
+            # without a feedback: its program calls the function that raised once more
+            self.slices.keep(self.task, self.front.value, self.front.t, feedback=False)
+        solution = assemble(self.task, self.task.grid, self.slices, self.front, Status.INTERRUPTED)
+        error.solution = solution  # type: ignore[attr-defined]
 
 
 def assemble(task: March, grid: Grid, slices: Slices, front: Front, code: Status) -> Solution:

@@ -1,0 +1,254 @@
+"""The default scheme: second order from a certified monotone answer, and how far that is from the exact value."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hjbjax as hjb
+from hjbjax import zoo
+from hjbjax.applications.reference import at_nodes_of, mask_of
+from hjbjax.solvers import nested, stationary_run
+
+U = hjb.Box([-1.0], [1.0])
+
+
+def line(**options):
+    return hjb.Problem(lambda x, u: u, lambda x, u: x @ x + u @ u, U, discount=1.0, **options)
+
+
+def test_it_is_the_limited_answer_with_the_certificate_of_the_monotone_one():
+    problem, grid = zoo.smooth(shape=(25, 25))
+    solution, sharp, first = (
+        hjb.solve(problem, grid, scheme=scheme, tol=1e-5) for scheme in (None, hjb.Limited(), hjb.Upwind(subcell=True))
+    )
+    np.testing.assert_array_equal(solution.value, sharp.value)
+    assert solution.error is None  # nothing certifies the second order
+    assert solution.monotone_error == sharp.monotone_error == first.error <= 1e-5
+    assert first.monotone_error is None
+    assert first.grid_error is sharp.grid_error is None  # who names a scheme gets that, and nothing beside
+    assert np.max(np.abs(solution.value - first.value)) == pytest.approx(solution.stats["from_monotone"], rel=1e-9)
+
+
+# name, nodes of an axis, the share of the box in which errors count, parameters
+KNOWN = [
+    ("bang-bang", 81, None, {}),
+    ("bang-bang", 41, None, {"noise": 0.5**0.5}),
+    ("smooth", 41, 0.5, {}),
+    ("zermelo", 81, 0.5, {}),
+    ("brownian-exit", 41, None, {"discount": 2.0}),
+]
+SLOW = [
+    ("smooth", 81, 0.5, {}),
+    ("eikonal", 161, None, {}),
+    ("double-integrator", 161, 0.5, {}),
+    ("zermelo", 161, 0.5, {}),
+    ("merton", 80, None, {}),
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "count", "share", "parameters"), [*KNOWN, *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW)]
+)
+def test_the_estimate_is_of_the_size_of_the_error(name, count, share, parameters):
+    entry = zoo.catalogue[name]
+    dim = entry.build(**parameters)[1].ndim
+    problem, grid = entry.build(shape=(count,) * dim, **parameters)
+    mask = mask_of(share, grid)
+    solution = hjb.solve(problem, grid, tol=1e-6)
+    true = np.max(np.abs(solution.value - at_nodes_of(entry.exact(**parameters), grid, mask))[mask])
+    assert solution.grid_error.shape == grid.shape
+    # the double integrator's optimal paths run along a kink, where no order shows
+    least = 1 / 10 if name == "double-integrator" else 1 / 3
+    assert least * true <= np.max(solution.grid_error[mask]) <= 5 * true
+
+
+@pytest.fixture
+def iterations(monkeypatch):
+    """The schemes and shapes of all iterations on the host."""
+    seen, run = [], stationary_run.StationaryRun.__init__
+
+    def noted(self, task, *rest):
+        scheme = task.scheme.chain if task.plain else task.scheme
+        seen.append((type(scheme).__name__, task.grid.shape))
+        run(self, task, *rest)
+
+    monkeypatch.setattr(stationary_run.StationaryRun, "__init__", noted)
+    return seen
+
+
+def test_each_grid_is_solved_once_by_each_scheme(iterations):
+    hjb.solve(line(), hjb.Grid([-1.0], [1.0], (41,)))
+    assert iterations == [("Upwind", (41,)), ("Limited", (41,)), ("Limited", (21,))]
+
+
+def test_one_program_serves_the_chain_and_the_second_order(caplog):
+    grid = hjb.Grid([-1.0], [1.0], (43,))
+    with jax.log_compiles(True), caplog.at_level("WARNING"):
+        solution = hjb.solve(line(), grid)
+    loops = [r for r in caplog.records if r.getMessage().startswith("Finished XLA compilation of jit(run)")]
+    assert len(loops) == 2  # this grid's and that of the coarser one
+    chain = hjb.solve(line(), grid, scheme=hjb.Upwind(subcell=True))
+    assert solution.monotone_error == pytest.approx(chain.error, rel=1e-6)
+    assert solution.stats["from_monotone"] == pytest.approx(np.max(np.abs(solution.value - chain.value)), rel=1e-6)
+
+
+def test_where_noise_makes_central_differences_monotone_nothing_is_run_twice(iterations):
+    solution = hjb.solve(line(noise=0.5), hjb.Grid([-1.0], [1.0], (41,)))
+    assert iterations == [("Upwind", (41,)), ("Upwind", (21,))]
+    assert solution.error <= 1e-3
+    assert np.max(solution.grid_error) > 0
+    iterations.clear()
+    hjb.solve(line(noise=0.05), hjb.Grid([-1.0], [1.0], (41,)))  # h |f| = .05 is more than ε² = .0025
+    assert iterations[1][0] == "Limited"
+
+
+@pytest.mark.parametrize(
+    ("problem", "method"),
+    [
+        (line(), hjb.ValueIteration()),
+        (hjb.Problem(lambda x, u: u, None, U, stopping_cost=lambda x: x @ x - 0.1), None),
+    ],
+    ids=["value iteration", "tube"],
+)
+def test_value_iteration_and_tubes_stay_with_the_chain(problem, method):
+    solution = hjb.solve(problem, hjb.Grid([-1.0], [1.0], (21,)), method=method)
+    assert solution.stats["scheme"] == repr(hjb.Upwind())
+    assert solution.monotone_error is None
+
+
+def test_transformations_stay_with_the_chain():
+    grid = hjb.Grid([-1.0], [1.0], (21,))
+
+    def at(discount):
+        problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x + u @ u, U, discount=discount)
+        return hjb.solve(problem, grid, dtype="float32").value_at(jnp.array([0.5]))
+
+    problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x + u @ u, U, discount=1.0)
+    chain = hjb.solve(problem, grid, scheme=hjb.Upwind(), dtype="float32").value_at([0.5])
+    assert float(jax.jit(at)(1.0)) == pytest.approx(float(chain), abs=1e-3)
+
+
+@pytest.fixture
+def failing(monkeypatch):
+    """A second-order iteration that ends STALLED."""
+    iterate = nested.iterate
+
+    def stalled(task, *rest, **options):
+        state, code, residuals = iterate(task, *rest, **options)
+        return state, code if task.plain else hjb.Status.STALLED, residuals
+
+    monkeypatch.setattr(nested, "iterate", stalled)
+
+
+def test_where_the_second_order_does_not_converge_the_monotone_answer_stands(failing):
+    problem, grid = line(), hjb.Grid([-1.0], [1.0], (41,))
+    solution = hjb.solve(problem, grid)
+    first = hjb.solve(problem, grid, scheme=hjb.Upwind(subcell=True))
+    assert solution.status is hjb.Status.CONVERGED
+    assert solution.message.endswith("It is of first order: the second-order iteration ended STALLED.")
+    np.testing.assert_allclose(solution.value, first.value, rtol=1e-14, atol=1e-15)  # another program rounds otherwise
+    assert solution.error == pytest.approx(first.error, rel=1e-6)
+    with pytest.raises(hjb.SolveError, match="STALLED"):  # who asks for it is told
+        hjb.solve(problem, grid, scheme=hjb.Limited())
+
+
+def test_a_limit_that_only_the_first_order_keeps_to():
+    problem, grid = zoo.smooth(shape=(25, 25))
+    first = hjb.solve(problem, grid, scheme=hjb.Upwind(subcell=True), tol=1e-9)
+    after = hjb.solve(problem, grid, scheme=hjb.Limited(), tol=1e-9)
+    assert after.steps > first.steps
+    solution = hjb.solve(problem, grid, tol=1e-9, max_steps=first.steps)
+    assert solution.status is hjb.Status.CONVERGED
+    assert "ended MAX_STEPS" in solution.message
+    np.testing.assert_allclose(solution.value, first.value, rtol=1e-14, atol=1e-15)  # another program rounds otherwise
+
+
+def test_a_coarse_grid_warns():
+    problem, grid = zoo.pendulum(shape=(24, 25))
+    with pytest.warns(hjb.SolveWarning, match=r"the grid is coarse for this problem: its error is about \d"):
+        hjb.solve(problem, grid)
+
+
+def test_without_a_coarser_grid_the_change_of_the_scheme_is_the_estimate():
+    grid = hjb.Grid([-1.0], [1.0], (11,))  # half of its intervals are too few
+    solution = hjb.solve(line(), grid)
+    first = hjb.solve(line(), grid, scheme=hjb.Upwind(subcell=True))
+    np.testing.assert_allclose(solution.grid_error, np.abs(solution.value - first.value), rtol=0, atol=1e-12)
+    # with noise both schemes may be one, and their difference says nothing
+    assert hjb.solve(line(noise=0.3), grid).grid_error is None
+
+
+@pytest.mark.parametrize("parameters", [{}, {"noise": 0.5**0.5}])
+def test_an_odd_number_of_intervals_has_no_half(parameters):
+    entry = zoo.catalogue["bang-bang"]
+    problem, grid = entry.build(shape=(80,), **parameters)  # 40 on the coarser grid, whose nodes are others
+    solution = hjb.solve(problem, grid, tol=1e-6)
+    true = np.max(np.abs(solution.value - at_nodes_of(entry.exact(**parameters), grid, np.ones(80, bool))))
+    assert true / 3 <= np.max(solution.grid_error) <= 5 * true
+
+
+def test_the_screen_says_both_errors_and_files_keep_them(tmp_path):
+    solution = hjb.solve(line(), hjb.Grid([-1.0], [1.0], (41,)))
+    text, first, off = str(solution), solution.monotone_error, solution.grid_error
+    said = f"residual at most 0.001 at high order; of the monotone start at most {first:.3g}"
+    assert f"  algebraic error  {said}" in text
+    assert f"  grid error       about {np.max(off):.3g}, {np.mean(off):.3g} in the mean" in text
+    solution.save(tmp_path / "run.npz")
+    again = hjb.load(tmp_path / "run.npz")
+    np.testing.assert_array_equal(again.grid_error, solution.grid_error)
+    assert again.monotone_error == solution.monotone_error
+    assert str(again) == text
+
+
+def test_nodes_that_do_not_reach_the_target_have_no_estimate():
+    problem = hjb.Problem(
+        lambda x, u: jnp.where(x[0] > 0.5, 1.0, u[0])[None], lambda x, u: 1.0, U, target=lambda x: jnp.abs(x[0]) - 0.1
+    )
+    with pytest.warns(hjb.SolveWarning, match="cannot reach the target"):
+        solution = hjb.solve(problem, hjb.Grid([-1.0], [1.0], (41,)))
+    assert np.array_equal(np.isnan(solution.grid_error), np.isinf(solution.value))
+    assert np.isinf(solution.value).any()
+
+
+def test_lanes_are_solves():
+    grid = hjb.Grid([-1.0], [1.0], (31,))
+    problems = [hjb.Problem(lambda x, u: u, lambda x, u: x @ x + u @ u, U, discount=beta) for beta in (0.5, 1.0, 4.0)]
+    for found, problem in zip(hjb.solve_batch(problems, grid), problems, strict=True):
+        alone = hjb.solve(problem, grid)
+        np.testing.assert_allclose(found.value, alone.value, rtol=0, atol=1e-12)
+        assert found.monotone_error == pytest.approx(alone.monotone_error)
+        assert found.stats["scheme"] == alone.stats["scheme"] == repr(hjb.Limited())
+        assert found.grid_error is None
+
+
+def test_lanes_with_enough_noise_keep_their_certificates():
+    grid = hjb.Grid([-1.0], [1.0], (31,))
+    loud, quiet = hjb.solve_batch([line(noise=0.5), line(noise=0.05)], grid)
+    assert loud.error <= 1e-3
+    assert quiet.error is None
+    assert quiet.monotone_error <= 1e-3
+
+
+@pytest.mark.parametrize(
+    ("method", "scheme"),
+    [(None, hjb.Limited(split=True)), (hjb.Implicit(), hjb.Upwind(split=True))],
+    ids=["explicit", "implicit"],
+)
+def test_marches(method, scheme):
+    problem, grid = line(), hjb.Grid([-1.0], [1.0], (31,))
+    found, named = (hjb.march(problem, grid, 0.5, method=method, **each) for each in ({}, {"scheme": scheme}))
+    np.testing.assert_array_equal(found.value, named.value)
+    assert found.stats["scheme"] == repr(scheme)
+
+
+def test_a_path_says_what_the_value_promised():
+    problem, grid = zoo.smooth(shape=(41, 41))
+    solution = hjb.solve(problem, grid, tol=1e-6)
+    path = hjb.simulate(problem, solution, [0.5, -0.3], 30.0)
+    assert path.promised == solution.value_at([0.5, -0.3])
+    assert path.cost == pytest.approx(path.promised, abs=3 * np.max(solution.grid_error))
+    assert f"cost {path.cost:.6g} (V promised {path.promised:.6g})" in path.message
+    greedy = hjb.simulate(problem, hjb.greedy_feedback(problem, solution), [0.5, -0.3], 1.0)
+    assert greedy.promised == path.promised
+    assert hjb.simulate(problem, lambda x: -x[:1], [0.5, -0.3], 1.0).promised is None

@@ -19,7 +19,7 @@ import numpy as np
 
 from hjbjax.problem import arguments
 from hjbjax.problem.pytree import as_partial, cast, is_traced, pytree_dataclass
-from hjbjax.problem.types import Array, Control, Number, State
+from hjbjax.problem.types import Array, Control, DType, Number, State
 
 T = TypeVar("T")
 Field: TypeAlias = Callable[[State], State]
@@ -149,20 +149,36 @@ def stack_fields(fields: Sequence[Field]) -> Callable[[State], jax.Array]:
     return every
 
 
+def root_eps(dtype: DType) -> float:
+    """The tolerance unless one is given: √eps, 1.5e-8 in float64."""
+    # above what rounding leaves of a bracket, 1e-12, below clear ranks, 0.1 for a car with trailers
+    return float(jnp.finfo(dtype).eps) ** 0.5
+
+
+def rounding_of_terms(dtype: DType) -> float:
+    """What counts as zero relative to its terms unless a tolerance is given: 2e-13 in float64."""
+    # what rounding leaves of five derivatives is below 100 eps; a true feedthrough of 1e-8 is to count
+    return 1024 * float(jnp.finfo(dtype).eps)
+
+
 def decide(
-    rule: Callable[..., T], functions: tuple, x: State | Sequence[float], tolerance: Number | None, **static: float
+    rule: Callable[..., T],
+    functions: tuple,
+    x: State | Sequence[float],
+    tolerance: Number | None,
+    default: Callable[[DType], float] = root_eps,
+    **static: float | tuple[float, ...],
 ) -> T:
     """``rule(functions, x, tolerance, **static)``: in float64 at the host, in its own dtype under a tracer."""
     if is_traced(functions, x, tolerance):
         x = as_state(x)
-        return rule(functions, x, jnp.finfo(x.dtype).eps ** 0.5 if tolerance is None else tolerance, **static)
+        return rule(functions, x, default(x.dtype) if tolerance is None else tolerance, **static)
     # float64 whatever the session has: in float32 √eps is 3.5e-4, and that would decide ranks
     with jax.enable_x64(True):
         state = np.asarray(x, np.float64)
         if state.ndim != 1 or not np.all(np.isfinite(state)):
             raise ValueError(f"got x = {x!r}, wanted finite numbers of shape (n,): one state")
-        # √eps, 1.5e-8: above what rounding leaves of a bracket, 1e-12, below clear ranks, 0.1 for a car with trailers
-        allowed = 2.0**-26 if tolerance is None else float(tolerance)
+        allowed = default(np.float64) if tolerance is None else float(tolerance)
         if not 0 < allowed < 1:
             raise ValueError(f"got tolerance = {tolerance!r}, wanted a number between 0 and 1")
         try:
@@ -181,7 +197,9 @@ def decide(
 
 
 @functools.lru_cache(maxsize=256)
-def _compiled_rule(rule: Callable[..., T], static: tuple[tuple[str, float], ...]) -> Callable[..., T]:
+def _compiled_rule(
+    rule: Callable[..., T], static: tuple[tuple[str, float | tuple[float, ...]], ...]
+) -> Callable[..., T]:
     # jit knows its programs by the identity of the function, and a new partial in every call would compile anew
     return jax.jit(functools.partial(rule, **dict(static)))
 
@@ -198,6 +216,51 @@ def as_fields(f: Field | None, gs: Field | Sequence[Field]) -> tuple[jax.tree_ut
     """The drift, if any, and one or several input fields, as pytrees."""
     drift = () if f is None else (f,)
     return tuple(as_pytree(field) for field in (*drift, *([gs] if callable(gs) else gs)))
+
+
+def stack_outputs(h: Callable[[State], Array | Number]) -> Callable[[State], jax.Array]:
+    """The outputs with shape (outputs,), one or several."""
+    return lambda x: jnp.atleast_1d(in_state_dtype(h)(x))
+
+
+def output_derivatives(
+    drifts: Sequence[Callable[[State], jax.Array]], h: Callable[[State], jax.Array]
+) -> Callable[[State], tuple[jax.Array, ...]]:
+    """x ↦ (h, L_f h, L_f L_f h, …), each of shape (outputs,): one derivative for every f, each of shape (1, n)."""
+
+    def ladder(x):
+        return (h(x),)
+
+    def longer(shorter, f):
+        def step(x):
+            found, changes = along(shorter, x, f(x))
+            return (*found, changes[-1][0])  # [0]: the one direction, f
+
+        return step
+
+    for f in drifts:
+        ladder = longer(ladder, f)
+    return ladder
+
+
+def as_half_widths(radius: float | Array, states: int, name: str) -> tuple[float, ...]:
+    """The half widths of the cube that is near, one a state."""
+    widths = np.asarray(radius, np.float64)
+    if widths.shape not in ((), (states,)) or not np.all(np.isfinite(widths) & (widths >= 0)):
+        raise ValueError(f"{name}: got radius = {radius!r}, wanted a finite number ≥ 0, or {states} of them")
+    return tuple(np.broadcast_to(widths, states).tolist())
+
+
+def near(x: State, radius: tuple[float, ...], samples: int) -> jax.Array:
+    """The state and points around it, shape (samples + 1, n)."""
+    # a fixed seed: a verdict must not change from call to call, nor between a trace and the host
+    spread = np.random.default_rng(0).uniform(-1.0, 1.0, (samples, x.shape[0])) * np.asarray(radius)
+    return jnp.asarray(x) + jnp.asarray(np.concatenate([np.zeros((1, x.shape[0])), spread]), x.dtype)
+
+
+def as_bool(verdict: bool | Array) -> bool | jax.Array:
+    """A verdict as a bool; inside a trace as it is."""
+    return verdict if isinstance(verdict, jax.core.Tracer) else bool(verdict)
 
 
 def as_state(x: State | Sequence[float]) -> jax.Array:

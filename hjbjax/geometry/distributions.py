@@ -4,8 +4,9 @@
     observability      span of d(L_{X_1} … L_{X_k} h_j)                                      (4.11)
 
 with X_i out of f, g_1, …, g_m. Right-nested brackets are enough: they span the whole Lie algebra. A rank is decided by
-singular values: those above ``tolerance`` times the largest count, and the tolerance is √eps of the dtype (1.5e-8 in
-float64) unless given. It is the rank at one state.
+singular values in units in which vectors and states compare (``scaling``), without what is rounding: those above
+``tolerance`` times the largest count, and the tolerance is √eps of the dtype (1.5e-8 in float64) unless given. It is
+the rank at one state.
 
 Cost: the program of depth k holds 2^k derivatives, and the number of brackets grows like (number of fields)^k.
 """
@@ -14,8 +15,10 @@ from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from hjbjax.geometry.brackets import Field, along, as_fields, as_pytree, decide, in_state_dtype, stack_fields
+from hjbjax.geometry.brackets import Field, along, as_fields, as_pytree, decide, stack_fields, stack_outputs
+from hjbjax.geometry.scaling import balance, with_terms, without_rounding
 from hjbjax.problem import arguments
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
 from hjbjax.problem.types import Array, Number, State
@@ -27,8 +30,9 @@ class Distribution:
 
     Args:
       vectors: what spans it, shape (p, n).
-      directions: orthonormal, the left singular vectors in the order of ``singular_values``, shape (n, min(n, p)).
-      singular_values: of ``vectors``, falling, shape (min(n, p),).
+      directions: orthonormal; the first k span what the k largest singular values belong to, shape (n, min(n, p)).
+      singular_values: of the directions of ``vectors``, each scaled to length 1 in units in which the states compare;
+        falling, shape (min(n, p),).
       tolerance: what counts, as a part of the largest singular value.
     """
 
@@ -157,14 +161,18 @@ def observability_codistribution(
 
 def _reach(fields: tuple[Field, ...], x: State, tolerance: Number, *, depth: int) -> Distribution:
     """The span of the fields and of ``depth`` generations of brackets."""
-    field = stack_fields(fields)
 
-    def generations(state):
-        return (field(state),)
+    def build(copies, y):
+        (first, *others) = copies[0]
 
-    for _ in range(depth):
-        generations = _with_brackets(field, generations)
-    return span(jnp.concatenate(generations(x)), tolerance)
+        def generations(state):
+            return (first(state),)
+
+        for field in others:
+            generations = _with_brackets(field, generations)
+        return generations(y)
+
+    return _span_of_generations(*with_terms(build, [stack_fields(fields)], x, depth + 1), tolerance)
 
 
 def _with_brackets(
@@ -184,14 +192,21 @@ def _with_brackets(
 def _observe(functions: tuple[tuple[Field, ...], Callable], x: State, tolerance: Number, *, depth: int) -> Distribution:
     """The span of the differentials of the outputs and of ``depth`` generations of their Lie derivatives."""
     fields, h = functions
+    depth = depth if fields else 0
 
-    def generations(state):
-        return (jnp.atleast_1d(in_state_dtype(h)(state)),)
+    def build(copies, y):
+        outputs, *others = copies
 
-    for _ in range(depth if fields else 0):
-        generations = _with_derivatives(stack_fields(fields), generations)
-    # one Jacobian of all generations, each (members, n): taken of each alone it would evaluate the shorter ones again
-    return span(jnp.concatenate(jax.jacfwd(generations)(x)), tolerance)
+        def generations(state):
+            return (outputs[0](state),)
+
+        for field in others[0][:depth] if others else ():
+            generations = _with_derivatives(field, generations)
+        # one Jacobian of all generations, each (members, n): taken of each alone it would evaluate the shorter again
+        return jax.jacfwd(generations)(y)
+
+    stacked = [stack_outputs(h), stack_fields(fields)] if fields else [stack_outputs(h)]
+    return _span_of_generations(*with_terms(build, stacked, x, max(depth, 1)), tolerance)
 
 
 def _with_derivatives(
@@ -206,8 +221,24 @@ def _with_derivatives(
     return longer
 
 
-def span(vectors: Array, tolerance: Number) -> Distribution:
-    """The Distribution of row vectors, shape (p, n)."""
+def _span_of_generations(values: Sequence[Array], terms: Sequence[Array], tolerance: Number) -> Distribution:
+    """The Distribution of all generations, with the directions of the first ones that have the highest rank."""
+    vectors, sizes = jnp.concatenate(values), jnp.concatenate(terms)
+    # Many long brackets near one direction make the others small beside it: what shorter ones span stays spanned.
+    ends = np.cumsum([len(generation) for generation in values])
+    first = jnp.asarray(np.arange(ends[-1]) < ends[:, None])
+    spans = jax.vmap(lambda kept: span(jnp.where(kept[:, None], vectors, 0), tolerance, sizes))(first)
+    best = jnp.argmax(jnp.sum(jax.vmap(lambda one: one.counted)(spans), axis=-1))
+    directions, singular_values = spans.directions[best], spans.singular_values[best]
+    return Distribution(vectors, directions, singular_values, jnp.asarray(tolerance, vectors.dtype))
+
+
+def span(vectors: Array, tolerance: Number, terms: Array) -> Distribution:
+    """The Distribution of row vectors made of terms of the sizes given, both of shape (p, n)."""
+    kept = without_rounding(vectors, terms)
+    rows, columns = balance(kept)
     # singular values and not a QR decomposition: they say how far the rank is from another one
-    directions, values, _ = jnp.linalg.svd(vectors.T, full_matrices=False)
+    scaled, values, _ = jnp.linalg.svd((rows[:, None] * kept * columns).T, full_matrices=False)
+    # Back in the units of the states: QR keeps the span of the first columns, however many of them count.
+    directions, _ = jnp.linalg.qr(scaled / columns[:, None])
     return Distribution(vectors, directions, values, jnp.asarray(tolerance, vectors.dtype))

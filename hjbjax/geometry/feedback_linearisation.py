@@ -9,8 +9,8 @@ makes ξ a chain of integrators that ends in v. What n − r other coordinates d
 dynamics. With several inputs and as many outputs r is a vector and β an inverse matrix.
 
 "Near x" is decided at x and at points spread over the cube of half width ``radius`` around it, the same in every
-call; for analytic fields that misses a set of measure zero. What counts as zero is ``tolerance``, √eps unless given,
-relative to what it is made of; the margin of a verdict is to be compared with it.
+call; for analytic fields that misses a set of measure zero. What counts as zero is ``tolerance``, 2e-13 unless given,
+relative to the terms it is made of (``scaling``); margin and residue of a verdict are to be compared with it.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,7 +19,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.geometry.brackets import Field, along, as_fields, as_pytree, as_state, decide, in_state_dtype, stack_fields
+from hjbjax.geometry.brackets import (
+    Field,
+    along,
+    as_bool,
+    as_fields,
+    as_half_widths,
+    as_pytree,
+    as_state,
+    decide,
+    near,
+    output_derivatives,
+    rounding_of_terms,
+    stack_fields,
+    stack_outputs,
+)
+from hjbjax.geometry.scaling import balance, with_terms
 from hjbjax.problem import arguments
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
 from hjbjax.problem.types import Array, Control, DType, Number, State
@@ -30,17 +45,19 @@ class RelativeDegree:
     """The relative degree: how often each output is differentiated before an input appears.
 
     Args:
-      degrees: r_i, one an output; 0 where no input ever appears.
+      degrees: r_i, one an output; 0 where no input appears above the tolerance.
       decoupling: the matrix of L_{g_j} L_f^{r_i − 1} h_i at the state, shape (outputs, m).
-      margin: its smallest singular value, each row relative to what it is made of; above ``tolerance`` where the
-        relative degree is defined.
-      tolerance: what the margin is compared with.
+      margin: its smallest singular value, in units in which the terms of every row and column are of size 1; above
+        ``tolerance`` where the relative degree is defined.
+      residue: the largest L_{g_j} L_f^k h_i that counts as zero, k < r_i − 1, relative to its terms.
+      tolerance: what margin and residue are compared with.
       states: n.
     """
 
     degrees: Array
     decoupling: Array
     margin: Number
+    residue: Number
     tolerance: Number
     states: int
 
@@ -59,7 +76,7 @@ class RelativeDegree:
         """The verdict in words; it names the zero dynamics where there are any."""
         degrees = np.asarray(self.degrees)
         if np.any(degrees == 0):
-            return f"not defined: no input ever reaches output {int(np.argmin(degrees))}"
+            return f"not defined: no input above the tolerance reaches output {int(np.argmin(degrees))}"
         if not self.defined:
             return (
                 f"not defined: nearby {_in_words(degrees)}, but at this state the decoupling matrix is singular "
@@ -139,7 +156,7 @@ class Linearisation:
         """L_f^{r_i} h_i, the decoupling matrix, and ξ."""
         degrees = self._known_degrees(x.shape[0], x.dtype)
         # values[k] is L_f^k h, shape (outputs,), and slopes[k] its derivatives along f, g_1, …, shape (1 + m, outputs)
-        ladder = _derivatives(self.fields[0], self.output, max(degrees))
+        ladder = output_derivatives([stack_fields(self.fields[:1])] * (max(degrees) - 1), stack_outputs(self.output))
         values, slopes = along(ladder, x, stack_fields(self.fields)(x))
         top = [(r - 1, i) for i, r in enumerate(degrees)]
         last = jnp.stack([slopes[k][0, i] for k, i in top])
@@ -157,9 +174,10 @@ class Linearisation:
 
             # radius and samples as ``relative_degree`` has them by default
             def rule(depth: int) -> RelativeDegree:
-                tolerance = np.asarray(jnp.finfo(origin.dtype).eps ** 0.5)
+                tolerance = np.asarray(rounding_of_terms(origin.dtype))
+                radius = (0.1,) * states
                 return _relative_degree(
-                    (self.fields, self.output), origin, tolerance, radius=0.1, samples=16, depth=depth
+                    (self.fields, self.output), origin, tolerance, radius=radius, samples=16, depth=depth
                 )
 
             return _degrees_or_refuse(_deepen(rule, states), "the origin")
@@ -171,7 +189,7 @@ def relative_degree(
     h: Callable,
     x: State | Sequence[float],
     *,
-    radius: float = 0.1,
+    radius: float | Array = 0.1,
     samples: int = 16,
     tolerance: Number | None = None,
 ) -> RelativeDegree:
@@ -186,15 +204,15 @@ def relative_degree(
       x: the state, shape (n,).
 
     Keyword Args:
-      radius: how far from x is near, in the units of the state.
+      radius: how far from x is near, in the units of the state; one number, or one a state, shape (n,).
       samples: how many points near x are looked at.
-      tolerance: what counts as zero, relative to what it is made of; ``None`` is √eps.
+      tolerance: what counts as zero, relative to the terms it is made of; ``None`` is 1024 eps, 2e-13 in float64.
 
     Returns:
       A RelativeDegree, with ``degree``, ``defined`` and a ``message`` that names the zero dynamics.
 
     Raises:
-      ValueError: a field of the wrong shape, or a derivative that is not finite near x.
+      ValueError: a field or a radius of the wrong shape, or a derivative that is not finite near x.
 
     Example:
       >>> drift = lambda x: jnp.stack([x[1], -x[0], x[0] - x[2]])
@@ -203,12 +221,23 @@ def relative_degree(
     """
     arguments.count(samples, "relative_degree: samples", least=0)
     functions = (as_fields(f, g), as_pytree(h))
-    settings = {"radius": float(radius), "samples": int(samples)}
     states = np.shape(x)[0] if np.ndim(x) else 1
-    if is_traced(functions, x, tolerance):
-        # under a tracer no verdict can be looked at, so that all n derivatives go into the program
-        return decide(_relative_degree, functions, x, tolerance, **settings, depth=states)
-    return _deepen(lambda depth: decide(_relative_degree, functions, x, tolerance, **settings, depth=depth), states)
+    half_widths = as_half_widths(radius, states, "relative_degree")
+
+    def rule(depth: int) -> RelativeDegree:
+        return decide(
+            _relative_degree,
+            functions,
+            x,
+            tolerance,
+            rounding_of_terms,
+            radius=half_widths,
+            samples=int(samples),
+            depth=depth,
+        )
+
+    # under a tracer no verdict can be looked at, so that all n derivatives go into the program
+    return rule(states) if is_traced(functions, x, tolerance) else _deepen(rule, states)
 
 
 def linearising_feedback(
@@ -282,66 +311,39 @@ def _verdict(degrees: Sequence[int] | np.ndarray, states: int) -> str:
     return text + f"zero dynamics of dimension {states - total} on {{{place}}}"
 
 
-def near(x: State, radius: float, samples: int) -> jax.Array:
-    """The state and points around it, shape (samples + 1, n)."""
-    # a fixed seed: a verdict must not change from call to call, nor between a trace and the host
-    spread = np.random.default_rng(0).uniform(-1.0, 1.0, (samples, x.shape[0]))
-    return jnp.asarray(x) + radius * jnp.asarray(np.concatenate([np.zeros((1, x.shape[0])), spread]), x.dtype)
-
-
-def _derivatives(
-    f: Field, h: Callable[[State], Array | Number], count: int
-) -> Callable[[State], tuple[jax.Array, ...]]:
-    """x ↦ (h, L_f h, …, L_f^{count − 1} h), each of shape (outputs,)."""
-
-    def ladder(x):
-        return (jnp.atleast_1d(in_state_dtype(h)(x)),)
-
-    def longer(shorter):
-        def step(x):
-            found, changes = along(shorter, x, stack_fields([f])(x))
-            return (*found, changes[-1][0])  # [0]: the one direction, f
-
-        return step
-
-    for _ in range(count - 1):
-        ladder = longer(ladder)
-    return ladder
-
-
 def _relative_degree(
     functions: tuple[tuple[Field, ...], Callable],
     x: State,
     tolerance: Number,
     *,
-    radius: float,
+    radius: tuple[float, ...],
     samples: int,
     depth: int,
 ) -> RelativeDegree:
     """The relative degree as far as L_g L_f^k h shows it for k < depth."""
     (f, *gs), h = functions
-    n, ladder = x.shape[0], _derivatives(f, h, depth)
+    stacked = [stack_fields([f]), stack_fields(gs), stack_outputs(h)]
 
-    def at(y):
-        inputs = stack_fields(gs)(y)
-        slopes = jnp.stack(jax.jacfwd(ladder)(y))  # (depth, outputs, n)
-        # the steepest L_f^j h so far: one that vanishes identically has a slope of rounding, large relative to itself
-        steepness = jax.lax.cummax(jnp.sqrt(jnp.sum(slopes * slopes, axis=-1)), axis=0)
-        return slopes @ inputs.T, steepness * jnp.sqrt(jnp.sum(inputs * inputs))
+    def build(copies, y):
+        drifts, inputs, outputs = copies
+        slopes = jnp.stack(jax.jacfwd(output_derivatives(drifts[1:], outputs[0]))(y))  # (depth, outputs, n)
+        return slopes @ inputs[0](y).T
 
-    effects, scales = jax.vmap(at)(near(x, radius, samples))  # (points, depth, outputs, m); without m
+    # both (points, depth, outputs, m)
+    effects, terms = jax.vmap(lambda y: with_terms(build, stacked, y, depth))(near(x, radius, samples))
+    ratios = jnp.abs(effects) / jnp.where(terms > 0, terms, 1)
     # at any point near x: on the ball and beam L_g L_f² h = 2B r θ̇ is 0 at rest alone, which makes no degree of 4
-    appears = jnp.any(jnp.max(jnp.abs(effects), axis=-1) > tolerance * scales, axis=0)
+    ratio = jnp.max(ratios, axis=(0, -1))  # (depth, outputs)
+    appears = ratio > tolerance
     # argmax of truth values is the first True, and 0 without one, which ``reached`` tells apart
     first, reached = jnp.argmax(appears, axis=0), jnp.any(appears, axis=0)
     outputs = jnp.arange(first.shape[0])
-    decoupling, scale = effects[0][first, outputs], scales[0][first, outputs]
-    rows = decoupling / jnp.where(scale > 0, scale, 1)[:, None]
+    decoupling, sizes = effects[0][first, outputs], terms[0][first, outputs]
+    rows, columns = balance(sizes)
+    scaled = rows[:, None] * decoupling * columns
     # with more outputs than inputs the rows are dependent, and the margin is 0 without any SVD
-    margin = jnp.linalg.svd(rows, compute_uv=False)[-1] if rows.shape[0] <= rows.shape[1] else jnp.zeros((), x.dtype)
-    return RelativeDegree(jnp.where(reached, first + 1, 0), decoupling, margin, jnp.asarray(tolerance, x.dtype), n)
-
-
-def as_bool(verdict: bool | Array) -> bool | jax.Array:
-    """A verdict as a bool; inside a trace as it is."""
-    return verdict if isinstance(verdict, jax.core.Tracer) else bool(verdict)
+    dependent = scaled.shape[0] > scaled.shape[1]
+    margin = jnp.zeros((), x.dtype) if dependent else jnp.linalg.svd(scaled, compute_uv=False)[-1]
+    zeros = ~reached | (jnp.arange(depth)[:, None] < first)
+    degrees, residue = jnp.where(reached, first + 1, 0), jnp.max(jnp.where(zeros, ratio, 0))
+    return RelativeDegree(degrees, decoupling, margin, residue, jnp.asarray(tolerance, x.dtype), x.shape[0])

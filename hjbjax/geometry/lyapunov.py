@@ -5,8 +5,7 @@ A function V proves that ẋ = f(t, x) is stable at x_e in a region when there
     V(t, x) > V(t, x_e) for x ≠ x_e,      dV/dt = ∂V/∂t + (∂V/∂x) f ≤ 0
 
 ``lyapunov_check`` evaluates both at points spread evenly over the region and its corners, and climbs from the worst of
-them along the gradient. A violation that it returns is one, up to rounding. That it finds none is evidence, no proof:
-a violation much narrower than the distance of the points can be missed.
+them. A violation that it returns is one, up to rounding; that it finds none is evidence: a narrow one can be missed.
 """
 
 import itertools
@@ -27,7 +26,8 @@ Place: TypeAlias = tuple[Box | Ball, Array, Array | None]  # the region, the equ
 
 CLIMBS = 32  # starts of the local search, for each of the three measures
 STEPS = 80  # its steps; a step that does not climb is halved
-NEAR = 0.01  # closer to the equilibrium than this part of the region's size, V is not compared with zero
+NEAR = 0.01  # closer to the equilibrium than this part of the region's half widths, V is not compared with zero
+AT_REST = 1e-8  # of the drift in the region; an equilibrium comes from a root finder or a rounded formula
 
 
 @pytree_dataclass()
@@ -40,7 +40,7 @@ class LyapunovReport:
       worst_state: where dV/dt is largest; where it is never positive, where it is largest relative to its terms.
       worst_time: the time of that, ``None`` without times.
       rate: dV/dt there.
-      lowest_state: where V − V(x_e) is smallest relative to |x − x_e|².
+      lowest_state: where V − V(x_e) is smallest relative to |x − x_e|², each state in half widths of the region.
       lowest_time: the time of that, ``None`` without times.
       lowest: V − V(x_e) there.
       evaluations: how many points were looked at.
@@ -113,14 +113,15 @@ def lyapunov_check(
     Keyword Args:
       equilibrium: x_e, shape (n,); ``None`` is the origin.
       samples: how many points the search starts with.
-      tolerance: how much of the terms of dV/dt, or of V elsewhere at the same distance from x_e, counts as zero.
+      tolerance: how much of the terms of dV/dt counts as zero.
 
     Returns:
       A LyapunovReport, with ``holds``, ``worst_state`` and ``rate``.
 
     Raises:
       TypeError: a region that is neither Box nor Ball.
-      ValueError: a number that is not admissible, or V or f not finite at a point of the region.
+      ValueError: a number that is not admissible, an x_e outside of the region or where f is not zero, or V or f
+        not finite at a point of the region.
 
     Example:
       >>> oscillator = lambda x: jnp.stack([x[1], -x[0] - (1 - x[0] ** 2) * x[1]])      # unstable beyond |x| = 1
@@ -144,6 +145,7 @@ def lyapunov_check(
     # float64 whatever the session has: the default tolerance of 1e-9 is below the rounding of float32
     with jax.enable_x64(True):
         place = cast((region, rest, span_of_times), np.float64)
+        _check_inside(place[0], rest)
         starts = _starts(region.dim + (times is not None), int(samples))
         functions = cast((as_partial(V), as_partial(f)), np.float64)
         found = jax.tree.map(np.asarray, _search(functions, place, starts, tolerance))
@@ -151,12 +153,22 @@ def lyapunov_check(
         raise ValueError(
             "lyapunov_check: V or f is not finite at a point of the region; choose a region where both are"
         )
+    if not (moved := found.pop("moved").item()) <= AT_REST:
+        raise ValueError(
+            f"lyapunov_check: f is not zero at the equilibrium {rest.tolist()}: it is {moved:.2g} of its size in the "
+            "region; give the equilibrium= of this closed loop"
+        )
     numbers = {name: found[name].item() for name in ("positive", "decreasing", "rate", "lowest")}
     found |= numbers
     if times is None:
         found |= {"worst_time": None, "lowest_time": None}
-    # every climb of the three measures looks at one point a step
     return LyapunovReport(**found, evaluations=len(starts) + 3 * min(CLIMBS, len(starts)) * STEPS)
+
+
+def _check_inside(region: Box | Ball, rest: np.ndarray) -> None:
+    """Refuse an equilibrium outside of the region: nothing near it would be looked at."""
+    if not np.all(np.abs(_inside(region, rest) - rest) <= AT_REST * _half_widths(region)):
+        raise ValueError(f"lyapunov_check: got equilibrium = {rest.tolist()}, wanted a state in {region!r}")
 
 
 def _check_times(times: Sequence[float] | np.ndarray | None) -> np.ndarray | None:
@@ -182,7 +194,6 @@ def _starts(dim: int, samples: int) -> np.ndarray:
     for _ in range(60):
         root = (1 + root) ** (1 / (dim + 1))
     steps = root ** -np.arange(1.0, dim + 1)
-    # any number of points fills the cube evenly; Sobol's sequence wants a power of two
     inner = (0.5 + np.arange(1, samples + 1)[:, None] * steps) % 1
     # dV/dt is often worst in a corner, as in the example above; with 12 axes there would be as many as samples, 4096
     return np.concatenate([inner, np.array(list(itertools.product((0.0, 1.0), repeat=dim)))]) if dim <= 10 else inner
@@ -192,7 +203,7 @@ def _starts(dim: int, samples: int) -> np.ndarray:
 def _search(functions: Functions, place: Place, starts: Array, tolerance: float) -> dict[str, jax.Array | None]:
     """The fields of a LyapunovReport, and ``finite``: whether V and dV/dt are so at all starts."""
     region, rest, times = place
-    size = _size(region)
+    half = _half_widths(region)
 
     def at(z):
         return _state_of(region, times, z)
@@ -210,10 +221,10 @@ def _search(functions: Functions, place: Place, starts: Array, tolerance: float)
 
     def low(z):
         x = at(z)[1]
-        square = jnp.sum((x - rest) ** 2)
+        square = jnp.sum(((x - rest) / half) ** 2)
         above = value(z) - _value(functions[0], times, z, rest)
         # over the square, a quadratic form's measure of definiteness: V − V(x_e) alone is least at x_e for any good V
-        return jnp.where(square > (NEAR * size) ** 2, -above / jnp.where(square > 0, square, 1), -jnp.inf)
+        return jnp.where(square > NEAR**2, -above / jnp.where(square > 0, square, 1), -jnp.inf)
 
     highest, nearest, lowest = (_best(f, starts) for f in (lambda z: rates(z)[0], relative, low))
     rate, terms = rates(highest)
@@ -222,20 +233,36 @@ def _search(functions: Functions, place: Place, starts: Array, tolerance: float)
     decreasing &= relative(nearest) <= tolerance
     # the point in the report is the largest rate where that is a violation, and else the clearest one
     worst = jnp.where((rate > tolerance * terms), highest, nearest)
-    above, around = _compare(functions[0], place, lowest, at(lowest)[1])
+    above, rounding = _compare(functions[0], place, lowest, at(lowest)[1])
     # a sum of both, to have NaN and infinity of either
     everywhere = jax.vmap(lambda z: value(z) + rates(z)[0])(starts)
+    moved = _share_of_drift(functions[1], place, jax.vmap(at)(starts))
     (worst_time, worst_state), (lowest_time, lowest_state) = at(worst), at(lowest)
     return {
-        "finite": jnp.all(jnp.isfinite(everywhere)), "positive": above > tolerance * around, "decreasing": decreasing,
+        "finite": jnp.all(jnp.isfinite(everywhere)) & jnp.isfinite(moved), "moved": moved,
+        "positive": above > rounding, "decreasing": decreasing,
         "worst_state": worst_state, "worst_time": worst_time, "rate": rates(worst)[0],
         "lowest_state": lowest_state, "lowest_time": lowest_time, "lowest": above,
     }  # fmt: skip
 
 
-def _size(region: Box | Ball) -> Number:
-    """The radius, or half the longest side."""
-    return region.radius if isinstance(region, Ball) else jnp.max(region.hi - region.lo) / 2
+def _half_widths(region: Box | Ball) -> jax.Array:
+    """Half the width of the region in every state: what distances are measured in."""
+    if isinstance(region, Ball):
+        return jnp.broadcast_to(jnp.asarray(region.radius), region.dim)
+    width = jnp.asarray(region.hi - region.lo) / 2
+    return jnp.where(width > 0, width, 1)
+
+
+def _share_of_drift(f: Callable, place: Place, points: tuple[Array | None, Array]) -> jax.Array:
+    """The largest |f_i(x_e)| as a part of the largest |f_i| at the points."""
+    rest, (times, states) = place[1], points
+    if times is None:
+        rates, stay = jax.vmap(f)(states), jnp.asarray(f(rest))[None]
+    else:
+        rates, stay = jax.vmap(f)(times, states), jax.vmap(lambda t: f(t, rest))(times)
+    largest, left = jnp.max(jnp.abs(rates), axis=0), jnp.max(jnp.abs(stay), axis=0)
+    return jnp.max(left / jnp.where(largest > 0, largest, 1))
 
 
 def _state_of(region: Box | Ball, times: Array | None, z: Array) -> tuple[jax.Array | None, jax.Array]:
@@ -302,12 +329,22 @@ def _best(measure: Callable[[Array], jax.Array], starts: Array) -> jax.Array:
 
 
 def _compare(V: Callable, place: Place, z: Array, x: State) -> tuple[jax.Array, jax.Array]:
-    """V − V(x_e) at a point, and the largest |V − V(x_e)| along the axes at that distance from x_e."""
+    """V − V(x_e) at a point, and the rounding of V along the axes as many half widths from x_e."""
     region, rest, times = place
     axes = np.concatenate([np.eye(region.dim), -np.eye(region.dim)])
-    base = _value(V, times, z, rest)
-    # what V is elsewhere at this distance is the scale in which V − V(x_e) counts as zero: 2n points and x itself
-    ring = jnp.concatenate([rest + jnp.sqrt(jnp.sum((x - rest) ** 2)) * axes, x[None]])
+    here, base = _value(V, times, z, x), _value(V, times, z, rest)
+    half = _half_widths(region)
+    # The terms of V are as large as V is elsewhere at this distance: 2n points, those inside of the region.
+    distance = jnp.sqrt(jnp.sum(((x - rest) / half) ** 2))
+    ring = jax.vmap(lambda y: _inside(region, y))(rest + distance * half * axes)
     around = jax.vmap(lambda y: jnp.abs(_value(V, times, z, y) - base))(ring)
-    # some of these points may lie outside of the region, where V need not be defined
-    return _value(V, times, z, x) - base, jnp.max(jnp.where(jnp.isfinite(around), around, 0))
+    size = jnp.max(jnp.where(jnp.isfinite(around), around, 0)) + jnp.abs(here) + jnp.abs(base)
+    return here - base, 4 * jnp.finfo(size.dtype).eps * size
+
+
+def _inside(region: Box | Ball, x: State) -> jax.Array:
+    """The state, or the nearest one of the region."""
+    if isinstance(region, Box):
+        return jnp.clip(x, region.lo, region.hi)
+    length = jnp.sqrt(jnp.sum(x * x))
+    return jnp.where(length > region.radius, x * region.radius / jnp.where(length > 0, length, 1), x)

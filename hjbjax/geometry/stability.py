@@ -9,15 +9,16 @@ Kvalheim and D. E. Koditschek, Necessary conditions for feedback stabilization a
 states Brockett's theorem of 1983.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.geometry.brackets import Field, as_fields, decide, stack_fields
+from hjbjax.geometry.brackets import Field, as_fields, decide, near, stack_fields
 from hjbjax.geometry.distributions import Distribution, span
 from hjbjax.geometry.lyapunov import LyapunovReport, lyapunov_check, lyapunov_derivative
+from hjbjax.geometry.scaling import balance, with_terms, without_rounding
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import Number, State
 
@@ -46,8 +47,9 @@ def brockett_check(
 ) -> BrockettVerdict:
     """Brockett's necessary condition for a continuous feedback u(x) that makes a rest point asymptotically stable.
 
-    Decided where it can be from first derivatives at x: without drift by the fields themselves, with drift by
-    the rank of the linearisation (∂f/∂x, ∂f/∂u), which satisfies it where it is n.
+    Decided where it can be from first derivatives at x: without drift, or with one that is zero at all points near
+    x, by the fields themselves; with drift by the rank of the linearisation (∂f/∂x, ∂f/∂u), which satisfies it
+    where it is n.
 
     Args:
       f: the drift; ``None`` for a system without drift.
@@ -70,7 +72,7 @@ def brockett_check(
       violated: 2 independent fields move 3 states without drift; no continuous u(x) makes this state stable
     """
     fields = as_fields(f, gs)
-    linear, unbalanced = decide(_linearisation, fields, x, tolerance, drift=f is not None)
+    linear, unbalanced, driftless = decide(_linearisation, fields, x, tolerance, drift=f is not None)
     n, m, rank = linear.vectors.shape[1], len(fields) - (f is not None), int(linear.rank)
     # about √eps of float64: a rest point is known to rounding of the root finder or the formula it comes from
     if unbalanced > 1e-8:
@@ -83,7 +85,7 @@ def brockett_check(
     if rank == n:
         satisfied, reason = True, "satisfied: the linearisation moves the state in every direction"
     # the module's docstring has the argument; with dependent fields it says nothing, for they may span more nearby
-    elif f is None and rank == m:
+    elif driftless and rank == m:
         fields_and_states = f"{m} independent fields move {n} states without drift"
         satisfied, reason = False, f"violated: {fields_and_states}; no continuous u(x) makes this state stable"
     else:
@@ -93,17 +95,31 @@ def brockett_check(
 
 def _linearisation(
     fields: tuple[Field, ...], x: State, tolerance: Number, *, drift: bool
-) -> tuple[Distribution, jax.Array]:
-    """(∂f/∂x, ∂f/∂u) at x and the input that balances the drift best, and the share of the drift left unbalanced."""
-    vectors = stack_fields(fields)(x)
+) -> tuple[Distribution, jax.Array, jax.Array]:
+    """(∂f/∂x, ∂f/∂u) at x and the input that balances the drift best, the share of the drift left, whether it is 0."""
+    field = stack_fields(fields)
     # without drift u = 0 keeps every state at rest, where ∂f/∂x = Σ u_j ∂g_j/∂x is zero: the fields are all there is
     if not drift:
-        return span(vectors, tolerance), jnp.zeros((), x.dtype)
-    gs = vectors[1:].T
+        vectors, terms = with_terms(lambda copies, y: copies[0][0](y), [field], x, 1)
+        return span(vectors, tolerance, terms), jnp.zeros((), x.dtype), jnp.asarray(True)
+    u, left = _balancing_input(field, x)
+
+    def build(copies, y):
+        # ∂f/∂x + Σ u_j ∂g_j/∂x; its columns and the fields are the rows of which the span is taken
+        slopes = jnp.einsum("k,kij->ij", jnp.append(1.0, u).astype(x.dtype), jax.jacfwd(copies[0][0])(y))
+        return jnp.concatenate([slopes.T, copies[0][0](y)[1:]])
+
+    vectors, terms = with_terms(build, [field], x, 1)
+    around = jax.vmap(lambda y: field(y)[0])(near(x, (0.1,) * x.shape[0], 16))
+    return span(vectors, tolerance, terms), left, jnp.all(around == 0)
+
+
+def _balancing_input(field: Callable[[State], jax.Array], x: State) -> tuple[jax.Array, jax.Array]:
+    """The input that balances the drift best, shape (m,), and the share of the drift that it leaves."""
+    vectors = without_rounding(*with_terms(lambda copies, y: copies[0][0](y), [field], x, 1))
+    rows, columns = balance(vectors)
+    scaled = rows[:, None] * vectors * columns  # of length 1: neither states nor fields are small by their units
+    f, gs = scaled[0], scaled[1:].T
     # least squares: the balancing input need not be unique, and where there is none its residual says so
-    u, *_ = jnp.linalg.lstsq(gs, -vectors[0])
-    size = jnp.sqrt(jnp.sum(vectors[0] ** 2))
-    left = jnp.sqrt(jnp.sum((vectors[0] + gs @ u) ** 2))
-    # ∂f/∂x + Σ u_j ∂g_j/∂x; its columns and the fields are the rows of which the span is taken
-    slopes = jnp.einsum("k,kij->ij", jnp.append(1.0, u).astype(x.dtype), jax.jacfwd(stack_fields(fields))(x))
-    return span(jnp.concatenate([slopes.T, vectors[1:]]), tolerance), left / jnp.where(size > 0, size, 1)
+    u, *_ = jnp.linalg.lstsq(gs, -f)
+    return u * rows[1:] / rows[0], jnp.sqrt(jnp.sum((f + gs @ u) ** 2))

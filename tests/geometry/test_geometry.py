@@ -489,13 +489,13 @@ def chain_of(wave, x, v):
 
 
 def test_a_rank_tells_how_clear_it_is():
-    wobble = [constant([1.0, 0.0]), constant([1.0, 1e-6])]
+    wobble = [constant([1.0, 1.0]), constant([1.0, 1.0 + 1e-6])]  # not (1, 1e-6): that is clear in other units
     clear = geometry.reachability_distribution(None, wobble, np.zeros(2), 0)
     assert clear.rank == 2
-    assert clear.margin == pytest.approx(5e-7, rel=1e-3)
+    assert clear.margin == pytest.approx(2.5e-7, rel=1e-3)
     blunt = geometry.reachability_distribution(None, wobble, np.zeros(2), 0, tolerance=1e-3)
     assert blunt.rank == 1
-    assert blunt.residue == pytest.approx(5e-7, rel=1e-3)
+    assert blunt.residue == pytest.approx(2.5e-7, rel=1e-3)
     nothing = geometry.reachability_distribution(None, constant([0.0, 0.0]), np.zeros(2), 1)
     assert (nothing.rank, nothing.margin, nothing.basis.shape) == (0, 0.0, (2, 0))
 
@@ -520,7 +520,10 @@ def flat(x):
         (lambda: geometry.reachability_distribution(lambda x: x if x[0] > 0 else -x, [], np.zeros(2), 1), "jnp.where"),
         (lambda: geometry.affine_fields(lambda x, u: x, True), "inputs = True"),
         (lambda: geometry.linearising_feedback(flat, flat, lambda x: x[:2], np.ones(2)), "2 outputs and 1 inputs"),
-        (lambda: geometry.linearising_feedback(flat, flat, lambda x: 0 * x[0], np.ones(2)), "no input ever reaches"),
+        (
+            lambda: geometry.linearising_feedback(flat, flat, lambda x: 0 * x[0], np.ones(2)),
+            "no input above the tolerance",
+        ),
         (lambda: geometry.linearising_feedback(flat, flat, lambda x: 0 * x[0]).alpha(jnp.ones(2)), "at the origin"),
     ],
 )

@@ -22,7 +22,6 @@ the switches: on an arc everything is smooth, so the switching times have the ac
 import dataclasses
 import enum
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -34,12 +33,8 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import Array, Control, Costate, Number, State
-from hjbjax.solution.clock import Clock, Stopped
+from hjbjax.solution.clock import Clock
 
-if TYPE_CHECKING:
-    from scipy.optimize import OptimizeResult
-
-FEWEST = 64  # columns to which meshes are padded, and twice as many from there on: few shapes, few compilations
 ROUGH, COARSE = 1e-3, 1000  # tolerance and nodes on the way
 
 
@@ -278,69 +273,3 @@ def _closing(bvp: BoundaryValueProblem, t: Number, z: Array, theta: Array) -> ja
     elif bvp.count > 1:  # the durations are sought, and only their sum is given
         left.append(jnp.reshape(t - bvp.horizon, 1))
     return jnp.concatenate(left)
-
-
-# Exact slopes: SciPy's differences take k·(2n+1) evaluations of the right-hand side, and have half of the digits.
-# vmapped over the nodes of the mesh, the last axis of y.
-_rates = jax.jit(jax.vmap(rates, (None, 0, 1, None), 1))
-_slopes = jax.jit(jax.vmap(jax.jacfwd(rates, (2, 3)), (None, 0, 1, None), 2))
-_conditions = jax.jit(conditions)
-_condition_slopes = jax.jit(jax.jacfwd(conditions, (1, 2, 3)))
-
-
-def _pad_mesh(s: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The mesh and its columns with the last one repeated, up to the next width that is compiled for."""
-    # repeated and not zero: drift and cost need not be defined at the origin
-    width = FEWEST
-    while width < len(s):
-        width *= 2
-    more = width - len(s)
-    return np.append(s, np.full(more, s[-1])), np.concatenate([y, np.repeat(y[:, -1:], more, 1)], 1)
-
-
-def collocate(bvp: BoundaryValueProblem, s: Array, y: Array, theta: Array, limits: Limits) -> "OptimizeResult":
-    """SciPy's answer from a first guess; float64 has to be on.
-
-    Every call of the right-hand side looks at the clock; ``Stopped`` brings the last iterate along, (s, y, theta).
-
-    Args:
-      bvp: the boundary-value problem.
-      s: the first mesh on [0, 1].
-      y: the first guess on it, shape (k·(2n+1), len(s)).
-      theta: the first guess of what else is sought.
-      limits: how far to go.
-    """
-    from scipy.integrate import solve_bvp
-
-    arrays = jax.tree.map(jnp.asarray, bvp)  # once, and not in every call: leaves that are NumPy's are copied each time
-    nothing = np.zeros(0)
-    last = (np.asarray(s), np.asarray(y), np.asarray(theta))
-
-    def function(s, y, theta=nothing):
-        nonlocal last
-        if s[0] == 0 and s[-1] == 1:  # else between the nodes of the mesh
-            last = (np.array(s), np.array(y), np.array(theta))
-        limits.clock.look()
-        return np.asarray(_rates(arrays, *_pad_mesh(s, y), theta))[:, : len(s)]
-
-    def function_slopes(s, y, theta=nothing):
-        limits.clock.look()
-        # copies: SciPy adds to the slopes at the middles of the mesh in place, and arrays of JAX are read-only
-        by_state, by_theta = (np.array(part)[..., : len(s)] for part in _slopes(arrays, *_pad_mesh(s, y), theta))
-        return (by_state, by_theta) if len(theta) else by_state
-
-    def ends(first, last, theta=nothing):
-        return np.asarray(_conditions(arrays, first, last, theta))
-
-    def end_slopes(first, last, theta=nothing):
-        parts = tuple(np.array(part) for part in _condition_slopes(arrays, first, last, theta))
-        return parts if len(theta) else parts[:2]
-
-    try:
-        with np.errstate(all="ignore"):  # what is not finite is looked for in the answer
-            return solve_bvp(
-                function, ends, s, y, p=theta if len(theta) else None, fun_jac=function_slopes, bc_jac=end_slopes,
-                tol=limits.tol, max_nodes=limits.max_nodes,
-            )  # fmt: skip
-    except Stopped as stop:
-        raise Stopped(stop.status, last) from None

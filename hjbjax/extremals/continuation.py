@@ -11,16 +11,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.extremals import initial_guess, periodic_arcs
-from hjbjax.extremals.boundary_value import BoundaryValueProblem, Closing, Limits, collocate
-from hjbjax.extremals.necessary_conditions import Extremal, assemble, last_iterate
+from hjbjax.extremals import initial_guess, periodic_arcs, second_order
+from hjbjax.extremals.boundary_value import BoundaryValueProblem, Closing, Limits
+from hjbjax.extremals.collocation import collocate
+from hjbjax.extremals.necessary_conditions import Extremal, assemble, entry_time, last_iterate, only_touches
 from hjbjax.problem.types import Array, Number, State
 from hjbjax.solution.clock import CUT, Stopped
 from hjbjax.solution.status import Status
 
 SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)  # of the way, in a continuation
 HUGE = 1e6  # times the guess: what grows so much has no limit
-SETTLED = 1e-3  # how far from a rest its quadratic value is trusted, relative to 1 + |x̄|; what is left is its cube
+SETTLED = 1e-3  # how far from a rest its quadratic value is trusted, relative to |x₀| + |x̄|; what is left is its cube
 LONGER, EXTENSIONS = 1.5, 6  # factor, and how often, an infinite horizon is lengthened
 GAP = 1e-6  # by how much the Hamiltonian may miss its minimum, relative to its terms
 ENDINGS = {1: Status.MAX_STEPS, 2: Status.DIVERGED, 3: Status.STALLED}
@@ -86,7 +87,7 @@ def attempt(bvp: BoundaryValueProblem, s: Array, y: Array, theta: Array, limits:
     code = Status.CONVERGED if result.success else ENDINGS[result.status]
     if not (np.all(np.isfinite(result.y)) and np.all(np.isfinite(sought))):
         code = Status.NONFINITE
-    elif np.max(np.abs(result.y)) > HUGE * (1 + np.max(np.abs(y))):
+    elif np.max(np.abs(result.y / result.units)) > HUGE * (1 + np.max(np.abs(y / result.units))):
         code = Status.DIVERGED  # a jump sharper than the mesh can look like a solution
     trouble = "" if code is Status.CONVERGED else f"the boundary-value problem was not solved: {ADVICE[code]}"
     found = Outcome(bvp, result.x, result.y, sought, code, trouble)
@@ -148,16 +149,6 @@ def _multiplier(bvp: BoundaryValueProblem, t: Number, z: Array) -> jax.Array:
     return jnp.nan_to_num((p - slope) @ normal / jnp.maximum(normal @ normal, 1e-300))
 
 
-@jax.jit
-def _levels(bvp: BoundaryValueProblem, s: Array, y: Array, theta: Array) -> jax.Array:
-    """The target's function along every arc, each in its own coordinates: the target knows no unwound angles."""
-    lengths = bvp.durations(theta)
-    begins = jnp.cumsum(lengths) - lengths
-    states = y.reshape(bvp.count, -1, len(s))[:, : bvp.n]
-    along = jax.vmap(bvp.level, (0, 1))
-    return jax.vmap(lambda begin, length, x: along(begin + s * length, x))(begins, lengths, states)
-
-
 def _by_continuation(failed: Outcome, limits: Limits) -> Outcome:
     """The problem's solution by way of easier ones; the failure itself where there are none, or they fail, too."""
     bvp = failed.bvp
@@ -196,7 +187,8 @@ def _refuse_unsettled(found: Outcome) -> Outcome:
 def _is_near_rest(bvp: BoundaryValueProblem, last: State) -> bool:
     """Whether the last state is so near to the rest that its quadratic value may be trusted."""
     assert bvp.rest is not None
-    return bool(np.linalg.norm(last - bvp.rest.state) <= SETTLED * (1 + np.linalg.norm(bvp.rest.state)))
+    size = np.linalg.norm(bvp.start) + np.linalg.norm(bvp.rest.state)
+    return bool(np.linalg.norm(last - bvp.rest.state) <= SETTLED * size)
 
 
 def _lengthen(found: Outcome, limits: Limits) -> Outcome:
@@ -228,17 +220,34 @@ def report(found: Outcome) -> Extremal:
     if np.min(found.lengths) < -GAP * found.horizon:
         missed = "an arc came out with a negative duration; give another guess"
         return dataclasses.replace(extremal, code=int(Status.STALLED), message=missed)
-    # the equations know only the end: that the path is outside until then has to be seen
-    if found.bvp.closing is Closing.TARGET:
-        inside = np.asarray(_levels(found.bvp, found.s, found.y, found.theta))
-        if np.min(inside) < -GAP * (1 + np.max(np.abs(inside))):
-            missed = "the path crosses the target before its end, where it would have stopped; give another guess"
-            return dataclasses.replace(extremal, code=int(Status.STALLED), message=missed)
+    entered = entry_time(found.bvp, found.s, found.y, np.asarray(found.theta))
+    if entered is not None:
+        missed = _entry(found.bvp, entered)
+        return dataclasses.replace(extremal, code=int(Status.STALLED), message=missed)
     # Pontryagin's principle wants the global minimum, and a search may have followed a local one
-    if not check.gap <= GAP * (1 + check.scale):
+    if not check.gap <= GAP * check.scale:
         missed = f"the Hamiltonian misses its minimum by {check.gap:.3g}: no extremal; give another guess"
         return dataclasses.replace(extremal, code=int(Status.STALLED), message=missed)
+    if found.bvp.closing is Closing.TARGET and only_touches(found.bvp, found.s, found.y, np.asarray(found.theta)):
+        grazed = "an extremal, not a minimum: it touches the edge of the target and does not enter; give another guess"
+        return dataclasses.replace(extremal, code=int(Status.STALLED), message=grazed)
+    worse = second_order.verdict(found.bvp, found.s, found.y, np.asarray(found.theta), float(check.scale))
+    if worse:
+        return dataclasses.replace(extremal, code=int(Status.STALLED), message=worse)
     count = len(extremal.switches)
     jumps = f", {count} switch{'es' * (count != 1)}" if found.bvp.rule.jumps else ""
     said = f"an extremal of cost {extremal.cost:.6g} over {extremal.horizon:.6g}{jumps}, {len(found.s)} nodes"
     return dataclasses.replace(extremal, message=said)
+
+
+def _entry(bvp: BoundaryValueProblem, time: float) -> str:
+    """The verdict on a path that enters the target before its end."""
+    if bvp.closing is Closing.TARGET:
+        return (
+            f"the path crosses the target before its end, at t = {time:.4g}, where it would have stopped; "
+            "give another guess"
+        )
+    return (
+        f"the path enters the problem's target at t = {time:.4g}, where it would have stopped; give another guess, or "
+        "leave the target out: dataclasses.replace(problem, target=None, exit_cost=None)"
+    )

@@ -21,6 +21,7 @@ from hjbjax.problem.sets import Ball, Box
 from hjbjax.problem.types import Array, Costate, State
 
 NEAR = 1e-8  # what counts as at rest, relative to 1 + |x̄| + |p̄|
+FREE_OF_CHARGE = 1e-10  # what counts as no cost at a rest, relative to L: rests are found to some 1e-13
 FREE = 1e-9  # an input this close to an end of its range, relative to its width, is at a bound
 
 
@@ -78,8 +79,8 @@ def find(bvp: BoundaryValueProblem, near: State, costate: Costate) -> tuple[Rest
     x, p = found.x[:n], found.x[n:]
     at = {name: np.asarray(part) for name, part in _expansion(bvp, x, p).items()}
     beta = float(bvp.problem.discount)
-    # any cost of the rest, however small, is paid for ever
-    if beta == 0 and abs(at["cost"]) > NEAR:
+    # any cost of the rest, however small, is paid for ever: only rounding, of the rest as well, is none
+    if beta == 0 and abs(at["cost"]) > FREE_OF_CHARGE * _cost_size(bvp, x, at):
         raise ValueError(
             f"pontryagin: the rest x = {x.tolist()} costs {at['cost']:.3g} per unit time, without discount; the cost "
             "of an infinite horizon is infinite: shift the cost, or give a discount or a horizon"
@@ -106,6 +107,14 @@ def find(bvp: BoundaryValueProblem, near: State, costate: Costate) -> tuple[Rest
         )
     value = at["cost"] / beta if beta else 0.0
     return Rest(x, p, np.asarray(value), matrix), slowest
+
+
+def _cost_size(bvp: BoundaryValueProblem, rest: State, at: dict[str, np.ndarray]) -> float:
+    """The size of L in cost units per unit time: at the start, and of the squares it is made of near the rest."""
+    x, u = np.maximum(np.abs(rest), np.abs(bvp.start)), np.abs(at["u"])
+    squares = x @ np.abs(at["xx"]) @ x + u @ np.abs(at["uu"]) @ u
+    start = pointwise.running_cost(bvp.problem, 0.0, bvp.wrap(jnp.asarray(bvp.start)), jnp.asarray(at["u"]))
+    return max(abs(float(start)), float(squares) / 2)
 
 
 def _on_host(

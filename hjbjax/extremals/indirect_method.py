@@ -3,13 +3,16 @@
 The boundary-value problem and what closes it are in ``boundary_value``, the pointwise minimum in ``pointwise``, the
 rest of an infinite horizon in ``equilibria``. SciPy's ``solve_bvp`` solves it by collocation of order 4 on a mesh of
 its own, to a relative residual below ``tol``. An extremal is a candidate: its path is admissible, so its cost bounds
-the value from above, and the value is that of the best one.
+the value from above, and the value is that of the best one. A path that enters the problem's target on its way would
+have stopped there and is no answer: for the problem without its target give
+``dataclasses.replace(problem, target=None, exit_cost=None)``.
 """
 
 import dataclasses
 from collections.abc import Callable, Sequence
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.extremals import continuation, equilibria, initial_guess, switching
@@ -69,13 +72,14 @@ def pontryagin(
 
     Args:
       problem: deterministic, with one player, and neither ``stopping_cost`` nor ``running_max``.
-      x0: the state at time 0, shape (n,).
+      x0: the state at time 0, shape (n,), outside of the target.
 
     Keyword Args:
       horizon: the final time; ``FreeTime(guess)`` where it is sought. ``None``: free if the problem has a target or
         ``terminal`` gives states, otherwise infinite, closed by the Riccati costate of a rest.
       terminal: how the path ends: an array (n,) of end states, NaN for those that are free; or a function ψ, paid at
-        the end in place of ``terminal_cost``. ``None``: without a horizon on the target, with ``exit_cost``.
+        the end in place of ``terminal_cost``. ``None``: without a horizon on the target, with ``exit_cost``. The
+        problem's target ends the path all the same: end states within it need a problem without.
       guess: a Solution, whose closed loop and DV are the first guess, or another extremal. ``None``: a line to the end
         states, or the loop under the Riccati costate.
       rest: a state near the rest of an infinite horizon; ``None``: the least node of a Solution, else the origin.
@@ -116,6 +120,7 @@ def pontryagin(
     with noting_interrupts(clock), jax.enable_x64(True):
         try:
             bvp = _pose(problem, start, horizon, terminal, guess.grid if isinstance(guess, Solution) else grid)
+            _check_start(bvp)
             if bvp.closing is Closing.REST:
                 bvp, times, columns = _to_rest(bvp, guess, rest, clock)
             else:
@@ -234,6 +239,18 @@ def _pose(
         closing=closing,
         held=held,
         free=free,
+    )
+
+
+def _check_start(bvp: BoundaryValueProblem) -> None:
+    """Refuse a start from which nothing runs."""
+    problem, start = bvp.problem, jnp.asarray(bvp.start)
+    if problem.target is None or float(bvp.level(0.0, start)) > 0:
+        return
+    paid = float(dataclasses.replace(bvp, final=problem.exit_cost).psi(0.0, start))
+    raise ValueError(
+        f"pontryagin: got x0 = {bvp.start.tolist()}, in the target, where a run ends at once and costs {paid:.6g}; "
+        "start outside, or leave the target out: dataclasses.replace(problem, target=None, exit_cost=None)"
     )
 
 

@@ -1,10 +1,14 @@
-"""The answer of ``pontryagin``: the extremal, how its solve ended, and how well it meets the necessary conditions."""
+"""The answer of ``pontryagin``: the extremal, how its solve ended, and how well it meets the necessary conditions.
+
+Also where the path meets the problem's target: the equations know only its end, and a run stops at the first entry.
+"""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.extremals.boundary_value import BoundaryValueProblem
+from hjbjax.extremals.collocation import on_mesh, pad_mesh
 from hjbjax.hamiltonian import pointwise
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import samples
@@ -14,6 +18,9 @@ from hjbjax.solution.status import Status
 
 EMPTY = 1e-9  # share of the time below which an arc is left out of the path
 BUDGET = 200  # controls with which the minimiser is compared
+PARTS = 8  # samples in an interval of the mesh, which is wide where the path is smooth, whatever the target
+ROUNDING = 1e-6  # depth in the target that counts as its edge, relative to the largest |l| along the path
+FLAT = 1e-5  # −l̇ times the final time below which a path ends along the edge, relative to the largest |l|
 
 
 @pytree_dataclass()
@@ -186,3 +193,59 @@ def last_iterate(
         code=int(code),
         message="this is the last iterate, without controls; nothing says how well it meets the conditions",
     )
+
+
+def only_touches(bvp: BoundaryValueProblem, s: np.ndarray, y: np.ndarray, theta: np.ndarray) -> bool:
+    """Whether the path ends along the edge of the target, or on its way out of it: l̇ ≥ 0 up to rounding.
+
+    A path enters because waiting costs; where H = βψ − ψ_t − ν l_t holds with l̇ = 0 it does for every ν, and to end is
+    worth as much as to go on: the condition of a free time says nothing.
+    """
+    arrays = jax.tree.map(jnp.asarray, bvp)
+    lengths = np.asarray(bvp.durations(theta))
+    begins = np.cumsum(lengths) - lengths
+    states, rates = (z.reshape(bvp.count, -1, len(s))[:, : bvp.n] for z in (y, on_mesh(arrays, s, y, theta)[0]))
+    levels = _levels(arrays, *pad_mesh(s, y), theta)
+    # the last arc that takes any time
+    last = np.flatnonzero(lengths > ROUNDING * lengths.sum())[-1]
+    velocity = rates[last, :, -1] / lengths[last]
+    time = jnp.asarray(begins[last] + lengths[last])
+    _, falling = jax.jvp(
+        bvp.level, (time, jnp.asarray(states[last, :, -1])), (jnp.ones_like(time), jnp.asarray(velocity))
+    )
+    return bool(falling * lengths.sum() >= -FLAT * np.max(np.abs(levels)))
+
+
+def entry_time(bvp: BoundaryValueProblem, s: np.ndarray, y: np.ndarray, theta: np.ndarray) -> float | None:
+    """The time at which the path enters the interior of the target, to a sample; None where it stays outside."""
+    if bvp.problem.target is None:
+        return None
+    arrays = jax.tree.map(jnp.asarray, bvp)
+    fine, dense = _interpolate(s, y, on_mesh(arrays, s, y, theta)[0])
+    levels = np.asarray(_levels(arrays, *pad_mesh(fine, dense), theta))[:, : len(fine)]
+    lengths = np.asarray(bvp.durations(theta))
+    times = (np.cumsum(lengths) - lengths)[:, None] + fine * lengths[:, None]
+    # the edge itself is no entry: paths end on it, and may follow it
+    inside = np.flatnonzero(levels.ravel() < -ROUNDING * np.max(np.abs(levels)))
+    return float(times.ravel()[inside[0]]) if len(inside) else None
+
+
+def _interpolate(s: np.ndarray, y: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A finer mesh and the cubic of the collocation on it, from values and slopes at the nodes."""
+    r, h = np.arange(PARTS) / PARTS, np.diff(s)[:, None]
+    first, last = y[:, :-1, None], y[:, 1:, None]
+    # Hermite's four polynomials on [0, 1]
+    dense = first * (1 + 2 * r) * (1 - r) ** 2 + last * r * r * (3 - 2 * r)
+    dense += h * r * (1 - r) * (slopes[:, :-1, None] * (1 - r) - slopes[:, 1:, None] * r)
+    fine = np.append((s[:-1, None] + h * r).ravel(), s[-1])
+    return fine, np.concatenate([dense.reshape(len(y), -1), y[:, -1:]], 1)
+
+
+@jax.jit
+def _levels(bvp: BoundaryValueProblem, s: Array, y: Array, theta: Array) -> jax.Array:
+    """The target's function along every arc, each in its own coordinates: the target knows no unwound angles."""
+    lengths = bvp.durations(theta)
+    begins = jnp.cumsum(lengths) - lengths
+    states = y.reshape(bvp.count, -1, len(s))[:, : bvp.n]
+    along = jax.vmap(bvp.level, (0, 1))
+    return jax.vmap(lambda begin, length, x: along(begin + s * length, x))(begins, lengths, states)

@@ -1,0 +1,173 @@
+"""Collocation of a boundary-value problem by SciPy, in units of its own, and the exact slopes of its equations.
+
+Its tolerances are absolute: a length of 1e-9 is below every one, and one of 1e9 has no digits left for it. Sizes near
+one keep their unit; others are measured along the guess, in powers of two, which round nothing.
+"""
+
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.extremals.boundary_value import BoundaryValueProblem, Closing, Limits, conditions, rates
+from hjbjax.hamiltonian import pointwise
+from hjbjax.problem.sets import samples
+from hjbjax.problem.types import Array
+from hjbjax.solution.clock import Stopped
+
+if TYPE_CHECKING:
+    from scipy.optimize import OptimizeResult
+
+FEWEST = 64  # columns to which meshes are padded, and twice as many from there on: few shapes, few compilations
+ORDINARY = 1e3  # a size up to so far from one, on either side, has the tolerance as it is
+ROUNDING = 1e-12  # a state that moves so little, relative to how far it could, is at rest up to rounding
+BUDGET = 16  # controls that tell what moves, and costs, where the guess stands still
+
+# Exact slopes: SciPy's differences take k·(2n+1) evaluations of the right-hand side, and have half of the digits.
+# vmapped over the nodes of the mesh, the last axis of y.
+_rates = jax.jit(jax.vmap(rates, (None, 0, 1, None), 1))
+_slopes = jax.jit(jax.vmap(jax.jacfwd(rates, (2, 3)), (None, 0, 1, None), 2))
+_conditions = jax.jit(conditions)
+_condition_slopes = jax.jit(jax.jacfwd(conditions, (1, 2, 3)))
+
+
+def on_mesh(
+    bvp: BoundaryValueProblem, s: np.ndarray, y: np.ndarray, theta: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """dy/ds at every node, shape (k·(2n+1), len(s)), and its slopes in y and in theta, with the nodes last."""
+    padded = (bvp, *pad_mesh(s, y), theta)
+    value, (by_state, by_theta) = np.asarray(_rates(*padded)), map(np.asarray, _slopes(*padded))
+    return value[..., : len(s)], by_state[..., : len(s)], by_theta[..., : len(s)]
+
+
+def at_ends(bvp: BoundaryValueProblem, y: np.ndarray, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Slopes of the conditions in the first column, the last one and theta."""
+    by_first, by_last, by_theta = map(np.asarray, _condition_slopes(bvp, y[:, 0], y[:, -1], theta))
+    return by_first, by_last, by_theta
+
+
+def pad_mesh(s: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh and its columns with the last one repeated, up to the next width that is compiled for."""
+    # repeated and not zero: drift and cost need not be defined at the origin
+    width = FEWEST
+    while width < len(s):
+        width *= 2
+    more = width - len(s)
+    return np.append(s, np.full(more, s[-1])), np.concatenate([y, np.repeat(y[:, -1:], more, 1)], 1)
+
+
+def collocate(bvp: BoundaryValueProblem, s: Array, y: Array, theta: Array, limits: Limits) -> "OptimizeResult":
+    """SciPy's answer from a first guess, with the ``units`` of its rows; float64 has to be on.
+
+    Every call of the right-hand side looks at the clock; ``Stopped`` brings the last iterate along, (s, y, theta).
+
+    Args:
+      bvp: the boundary-value problem.
+      s: the first mesh on [0, 1].
+      y: the first guess on it, shape (k·(2n+1), len(s)).
+      theta: the first guess of what else is sought.
+      limits: how far to go.
+    """
+    from scipy.integrate import solve_bvp
+
+    arrays = jax.tree.map(jnp.asarray, bvp)  # once, and not in every call: leaves that are NumPy's are copied each time
+    nothing = np.zeros(0)
+    last = (np.asarray(s), np.asarray(y), np.asarray(theta))
+    with np.errstate(all="ignore"):  # a guess may lie where drift and cost are not defined
+        mesh, guess, sought = last
+        slopes = np.asarray(_rates(arrays, *pad_mesh(mesh, guess), sought))[:, : len(mesh)]
+        missed = np.asarray(_conditions(arrays, guess[:, 0], guess[:, -1], sought))
+        unit, rows = units_of(bvp, guess, slopes, missed, sought)
+    column = unit[:, None]
+
+    def function(s, y, theta=nothing):
+        nonlocal last
+        y = y * column
+        if s[0] == 0 and s[-1] == 1:  # else between the nodes of the mesh
+            last = (np.array(s), np.array(y), np.array(theta))
+        limits.clock.look()
+        return np.asarray(_rates(arrays, *pad_mesh(s, y), theta))[:, : len(s)] / column
+
+    def function_slopes(s, y, theta=nothing):
+        limits.clock.look()
+        # copies: SciPy adds to the slopes at the middles of the mesh in place, and arrays of JAX are read-only
+        by_state, by_theta = _slopes(arrays, *pad_mesh(s, y * column), theta)
+        by_state = np.array(by_state)[..., : len(s)] * (unit / column)[..., None]
+        by_theta = np.array(by_theta)[..., : len(s)] / column[..., None]
+        return (by_state, by_theta) if len(theta) else by_state
+
+    def ends(first, last, theta=nothing):
+        return np.asarray(_conditions(arrays, first * unit, last * unit, theta)) / rows
+
+    def end_slopes(first, last, theta=nothing):
+        by_first, by_last, by_theta = _condition_slopes(arrays, first * unit, last * unit, theta)
+        scaled = (np.asarray(by_first) * unit, np.asarray(by_last) * unit, np.asarray(by_theta))
+        parts = tuple(part / rows[:, None] for part in scaled)
+        return parts if len(theta) else parts[:2]
+
+    try:
+        with np.errstate(all="ignore"):  # what is not finite is looked for in the answer
+            result = solve_bvp(
+                function, ends, s, y / column, p=theta if len(theta) else None, fun_jac=function_slopes,
+                bc_jac=end_slopes, tol=limits.tol, max_nodes=limits.max_nodes,
+            )  # fmt: skip
+        result.y, result.units = result.y * column, column
+        return result
+    except Stopped as stop:
+        raise Stopped(stop.status, last) from None
+
+
+def units_of(
+    bvp: BoundaryValueProblem, y: np.ndarray, slopes: np.ndarray, missed: np.ndarray, theta: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Units of the rows of y, shape (k·(2n+1),), and of the conditions.
+
+    Args:
+      bvp: the boundary-value problem.
+      y: the guess.
+      slopes: its dy/ds.
+      missed: the residuals of its conditions.
+      theta: the guess of the durations and ν.
+    """
+    n, arrays = bvp.n, jax.tree.map(jnp.asarray, bvp)
+    horizon = abs(float(np.sum(bvp.durations(theta))))
+    seen = np.max(np.abs(np.stack([y, slopes])).reshape(2, bvp.count, 2 * n + 1, -1), axis=(0, 1, 3))
+    given = [bvp.start, np.where(bvp.held, bvp.ends, 0)] + ([] if bvp.rest is None else [bvp.rest.state])
+    lengths, cost = np.max(np.abs([seen[:n], *given]), axis=0), seen[-1]
+    target, timed = bvp.closing is Closing.TARGET, bvp.free or bvp.count > 1
+    # before l, and H or the time: what the guess lacks of the cost at the end
+    cost = max(cost, abs(missed[len(missed) - 1 - target - timed]))
+    if np.min(lengths) < 1 / ORDINARY or not cost:
+        moved, spent = (horizon * np.asarray(part) for part in _reach(arrays))
+        lengths, cost = np.where(lengths > ROUNDING * moved, lengths, moved), cost or spent
+    x, c, t = (_unit(part) for part in (lengths, cost, horizon))
+    column = np.concatenate([x, c / x, c[None]])
+    closing = np.where(bvp.held, x, c / x) if bvp.closing is Closing.STATE else c / x
+    joints = [column] * (bvp.count - 1)
+    joints += [x[list(bvp.seams)]] if bvp.places is not None else [np.full(bvp.count - 1, c / t)]
+    ends = [closing, c[None]]
+    if target:
+        # at the start: a guess may end on the edge to the last digit
+        ends.append(_unit(abs(float(arrays.level(0.0, arrays.start))))[None])
+    if timed:
+        ends.append(np.asarray(c / t if bvp.free else t)[None])
+    return np.tile(column, bvp.count), np.concatenate([x, *joints, *ends])
+
+
+def _unit(size: np.ndarray | float) -> np.ndarray:
+    """One for an ordinary size, or none; else the size, to a power of two."""
+    ordinary = (np.asarray(size) >= 1 / ORDINARY) & (np.asarray(size) <= ORDINARY)
+    known = np.isfinite(size) & (np.asarray(size) > 0) & ~ordinary
+    return np.asarray(2.0 ** np.round(np.log2(np.where(known, size, 1.0))))
+
+
+@jax.jit
+def _reach(bvp: BoundaryValueProblem) -> tuple[Array, Array]:
+    """The fastest motion of every state at the start, shape (n,), and the largest running cost, over some controls."""
+    assert bvp.problem.controls is not None
+    x = bvp.wrap(jnp.asarray(bvp.start))
+    tried = jnp.asarray(samples(bvp.problem.controls, BUDGET), x.dtype)
+    drift = jax.vmap(lambda u: jnp.asarray(bvp.problem.drift(*bvp.problem.arguments(x, u, t=0.0)), x.dtype))(tried)
+    cost = jax.vmap(lambda u: pointwise.running_cost(bvp.problem, 0.0, x, u))(tried)
+    return jnp.max(jnp.abs(drift), axis=0), jnp.max(jnp.abs(cost))

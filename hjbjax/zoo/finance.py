@@ -5,6 +5,7 @@
 A utility to be maximised is minus a cost.
 """
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -13,7 +14,10 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
 from hjbjax.problem.sets import Box
 from hjbjax.problem.types import Control, Number, State
-from hjbjax.zoo.ingredients import Exact, OutsideCube, Scalar, answer, positive
+from hjbjax.zoo.ingredients import Exact, OutsideCube, Scalar, admissible, answer, positive
+
+SHARES = 0.0, 1.0  # no short sale, no credit
+RATES = 0.01, 0.1  # of consumption; at k = 0 the cost is infinite for γ > 1
 
 
 @pytree_dataclass()
@@ -86,6 +90,18 @@ class Merton:
         # homogeneous of degree 1 − γ in wealth, as the utility is, hence the exponential in its logarithm
         return -(self.consumption**-self.aversion) * jnp.exp(power * jnp.asarray(x)[0]) / power
 
+    def check(self) -> None:
+        """Refuse parameters for which ``value`` is not that of the box of controls.
+
+        Raises:
+          ValueError: the best share or the best consumption lies outside of it.
+        """
+        if is_traced(self):
+            return
+        with jax.ensure_compile_time_eval():  # known numbers are looked at within somebody's jit, too
+            admissible("merton", *SHARES, share=self.share)
+            admissible("merton", *RATES, consumption=self.consumption)
+
 
 def merton(
     *,
@@ -107,13 +123,17 @@ def merton(
       aversion: γ, not 1.
       discount: ρ.
       shape: nodes.
+
+    Raises:
+      ValueError: the best share or consumption lies outside the box, so that the ends have no exact value.
     """
     system = Merton(interest, growth, volatility, aversion, discount)
+    system.check()
     problem = Problem(
         system.drift,
         system.cost,
         # with the defaults π* = .5 and k* = .045, both inside: the bounds are slack
-        Box([0.0, 0.01], [1.0, 0.1]),  # no short sale, no credit; at k = 0 the cost is infinite for γ > 1
+        Box(*zip(SHARES, RATES, strict=True)),
         noise=system.noise,
         discount=discount,
         target=OutsideCube(1.0).level,
@@ -131,7 +151,7 @@ def merton_exact(
     aversion: Number = 2.0,
     discount: Number = 0.05,
 ) -> Exact:
-    """The value as a function of log-wealth; 493.8271605 at wealth 1 with the defaults.
+    """The value as a function of log-wealth, any of it; 493.8271605 at wealth 1 with the defaults.
 
     Args:
       interest: r.
@@ -139,5 +159,10 @@ def merton_exact(
       volatility: σ.
       aversion: γ, not 1.
       discount: ρ.
+
+    Raises:
+      ValueError: the best share lies outside [0, 1], or the best consumption outside [.01, .1].
     """
-    return answer(Merton(interest, growth, volatility, aversion, discount).value)
+    system = Merton(interest, growth, volatility, aversion, discount)
+    system.check()
+    return answer(system.value)

@@ -19,6 +19,8 @@ Scalar: TypeAlias = Num[Array, ""]
 Exact: TypeAlias = Callable[[State | Sequence[float]], Scalar]  # V at one state, an array or a plain list
 Feedback: TypeAlias = Callable[[State], Control]
 
+ROUNDING = 1e-6  # relative, of a best control that was computed in float32: one on its bound is admissible
+
 
 def unit_cost(x: State, u: Control) -> Number:
     """One per unit time: the cost is the time."""
@@ -153,3 +155,31 @@ def positive(owner: str, **numbers: object) -> None:
             raise TypeError(f"{owner}: got {name} = {value!r}, wanted a number") from None
         if not np.all(np.isfinite(array) & (array > 0)):
             raise ValueError(f"{owner}: got {name} = {value!r}, wanted a finite number > 0")
+
+
+def admissible(owner: str, lo: Number, hi: Number, where: str = "", **best: Number) -> None:
+    """Refuse a closed form whose best control lies outside its set, while the numbers are known.
+
+    Args:
+      owner: the name of the problem.
+      lo: the lower bound of the set.
+      hi: the upper one.
+      where: the states at which the control is the best one, for the message.
+      **best: the control that the closed form rests on.
+
+    Raises:
+      ValueError: a number outside of [lo, hi], or NaN.
+    """
+    if is_traced(lo, hi, best):
+        return
+    low, high = np.asarray(lo, np.float64), np.asarray(hi, np.float64)
+    slack = ROUNDING * (np.abs(low) + np.abs(high))
+    for name, number in best.items():
+        array = np.asarray(number, np.float64)
+        if not np.all((array >= low - slack) & (array <= high + slack)):
+            raise ValueError(
+                f"{owner}: got parameters whose best {name} is {array:.6g}{where}, wanted one within "
+                f"[{low:.6g}, {high:.6g}], the set of controls: beyond it the closed form is not the value"
+                if array.ndim == 0
+                else f"{owner}: got parameters whose best {name} lies outside the set of controls{where}"
+            )

@@ -100,6 +100,16 @@ class Lander:
         """v − v₁: how much faster it may yet fall; 0 where the burn has to begin, below it crashes."""
         return x[1] - self._ignition_point(self._log_ratio(x), x[2])[1]
 
+    def least_fuel(self, x: State) -> Scalar:
+        """The least fuel to land; infinite for a state that crashes, or is below the ground already."""
+        x = jnp.asarray(x)
+        # rounding, in units of the exhaust's speed 1/k: a state where the burn begins lands, and so does one at rest
+        slack = 64 * jnp.finfo(jnp.result_type(x, jnp.float32)).eps
+        exhaust = 1 / self.consumption
+        late = self.margin(x) < -slack * (jnp.abs(x[1]) + exhaust)
+        below = x[0] < -slack * (jnp.abs(x[0]) + exhaust * exhaust / self.gravity)
+        return jnp.where(late | below, jnp.inf, self.fuel(x))
+
     def sinking(self, x: State) -> Number:
         """−v: 0 where the rocket stands still, at the end of the burn."""
         return -x[1]
@@ -125,9 +135,10 @@ def moon_landing(
     """Land on the Moon with the least fuel, on [0, 1.5] × [−2, 0.5] × [0.3, 1]; 0 ≤ u ≤ thrust.
 
     The value is held where a soft landing takes full thrust or more; the grid has to find the coast, and a path on it
-    ends where the engine starts: ``moon_landing_burn`` goes on from there to the ground. Give
-    ``pontryagin`` the end ``terminal=[0, 0, nan]``, and it finds the burn as well. Close to the ceiling, rising, the
-    box is left.
+    ends where the engine starts: ``moon_landing_burn`` goes on from there to the ground. Give ``pontryagin`` the
+    problem without its target, ``dataclasses.replace(problem, target=None, exit_cost=None)``, and the end
+    ``terminal=[0, 0, nan]``, and it finds the burn as well; that one knows no ground, so look at h ≥ 0 along the path.
+    Close to the ceiling, rising, the box is left.
 
     Args:
       thrust: U, the largest.
@@ -165,11 +176,13 @@ def moon_landing_burn(
 
 
 def moon_landing_exact(*, thrust: Number = 2.0, consumption: Number = 0.3, gravity: Number = 1.0) -> Exact:
-    """m(1 − e^{−q}), with q of the burn that takes away the energy ½v² + gh.
+    """m(1 − e^{−q}), with q of the burn that takes away the energy ½v² + gh; infinite where no landing is possible.
+
+    There, where ``Lander.margin`` is negative, ``moon_landing`` holds the number of ``Lander.fuel``, no answer.
 
     Args:
       thrust: U.
       consumption: k.
       gravity: g.
     """
-    return answer(Lander(thrust, consumption, gravity).fuel)
+    return answer(Lander(thrust, consumption, gravity).least_fuel)

@@ -8,6 +8,7 @@ A discount β acts on the quadratic part like the drift A − ½βI. The answers
 is left, compare on its inner half, unless the problem holds its ends at the exact value.
 """
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -23,6 +24,7 @@ from hjbjax.zoo.ingredients import (
     QuadraticCost,
     QuadraticValue,
     Scalar,
+    admissible,
     answer,
     noise_or_none,
     positive,
@@ -107,7 +109,7 @@ def double_integrator_lq(
     bound: Number = 8.0,
     shape: tuple[int, ...] = (101, 101),
 ) -> tuple[Problem, Grid]:
-    """Bring a mass to rest at the cost |x|² + r u², on [−2, 2]²; the bound on u is there to be slack.
+    """Bring a mass to rest at the cost |x|² + r u², on [−2, 2]²; its answer holds where the bound on u is slack.
 
     Undiscounted by default: rest at the origin costs nothing. With noise it needs a discount.
 
@@ -132,7 +134,7 @@ def double_integrator_lq(
 def double_integrator_lq_exact(
     *, mass: float = 1.0, control_weight: float = 1.0, noise: float = 0.0, discount: float = 0.0, bound: float = 8.0
 ) -> Exact:
-    """x'Px + σ² tr(P)/β on the whole plane while the bound is slack, by SciPy's Riccati solver; host level.
+    """x'Px + σ² tr(P)/β where |u| stays below the bound, at least on [−2, 2]², by SciPy's Riccati solver; host level.
 
     With the defaults P = [[√3, 1], [1, √3]].
 
@@ -141,7 +143,10 @@ def double_integrator_lq_exact(
       control_weight: r.
       noise: σ.
       discount: β, positive where there is noise.
-      bound: taken to be slack.
+      bound: on |u|.
+
+    Raises:
+      ValueError: noise without a discount, or a bound that binds on the box.
     """
     # here: no other answer of this file needs it
     from scipy.linalg import solve_continuous_are
@@ -154,6 +159,9 @@ def double_integrator_lq_exact(
         # undiscounted, noise would cost ½ tr(σσ'·2P) per unit time for ever
         positive("double_integrator_lq with noise", discount=discount)
         constant = noise**2 * np.trace(matrix) / discount
+    # u = −b'Px/r, largest at two corners of the box
+    force = 2.0 * np.sum(np.abs(b.T @ matrix)) / control_weight
+    admissible("double_integrator_lq", -bound, bound, " at a corner of the box", force=force)
     return answer(QuadraticValue(matrix, constant).value)
 
 
@@ -177,8 +185,11 @@ def stochastic_lq(
       control_weight: r.
       noise: σ.
       discount: β > 0.
-      bound: on |u|, to be slack.
+      bound: on |u|, slack on the box.
       shape: nodes.
+
+    Raises:
+      ValueError: a weight or a discount that is not positive; a bound that binds, so that the ends have no exact value.
     """
     exact = stochastic_lq_exact(
         rate=rate, state_weight=state_weight, control_weight=control_weight, noise=noise, discount=discount, bound=bound
@@ -205,19 +216,27 @@ def stochastic_lq_exact(
     discount: Number = 1.0,
     bound: Number = 8.0,
 ) -> Exact:
-    """px² + σ²p/β while the bound is slack; with the defaults p = (√5 − 1)/2.
+    """px² + σ²p/β on [−2, 2], whose ends hold it, where u = −px/r is admissible; with the defaults p = (√5 − 1)/2.
 
     Args:
       rate: a.
-      state_weight: q.
-      control_weight: r.
+      state_weight: q > 0.
+      control_weight: r > 0.
       noise: σ.
       discount: β > 0.
-      bound: taken to be slack.
+      bound: on |u|.
+
+    Raises:
+      ValueError: a weight or a discount that is not positive, or a bound that binds on the box.
     """
-    # 1/r weighs p², and c = σ²p/β is infinite without a discount
-    positive("stochastic_lq", control_weight=control_weight, discount=discount)
-    return answer(ScalarQuadratic(state_weight, 1.0 / control_weight, rate, discount, noise).value)
+    # 1/r weighs p², and c = σ²p/β is infinite without a discount; without q rest costs nothing and p is 0/0 for 2a > β
+    positive("stochastic_lq", state_weight=state_weight, control_weight=control_weight, discount=discount)
+    quadratic = ScalarQuadratic(state_weight, 1.0 / control_weight, rate, discount, noise)
+    if not is_traced(quadratic, bound):
+        with jax.ensure_compile_time_eval():  # known numbers are looked at within somebody's jit, too
+            push = 2.0 * quadratic.curvature / control_weight
+            admissible("stochastic_lq", -bound, bound, " at the ends of the box", control=push)
+    return answer(quadratic.value)
 
 
 def lq_game(
@@ -252,16 +271,17 @@ def lq_game(
 
 
 def lq_game_exact(*, gamma: Number = 2.0, rate: Number = 0.0, discount: Number = 0.0, bound: Number = 4.0) -> Exact:
-    """px² with p = 1/(√(α² + 1 − γ⁻²) − α), α = a − β/2; with the defaults p = 2/√3.
+    """px² with p = 1/(√(α² + 1 − γ⁻²) − α), α = a − β/2, on [−1, 1]; with the defaults p = 2/√3.
 
     Args:
       gamma: the level γ.
       rate: a.
       discount: β.
-      bound: taken to be slack.
+      bound: on |u| and |d|.
 
     Raises:
-      ValueError: the level is at or below the least one that can be attained, so there is no finite value.
+      ValueError: the level is at or below the least one that can be attained, so there is no finite value; or u = −px
+        or d = px/γ² is beyond the bound.
     """
     positive("lq_game", gamma=gamma)
     # of traced numbers no sign is known: below the level the formula then gives NaN or a wrong root
@@ -275,4 +295,9 @@ def lq_game_exact(*, gamma: Number = 2.0, rate: Number = 0.0, discount: Number =
                 f"(1 where rate ≥ discount/2): below it the disturbance makes the cost infinite"
             )
     # no noise, hence no constant: V = px²
-    return answer(ScalarQuadratic(1.0, 1 - gamma**-2, rate, discount).value)
+    quadratic = ScalarQuadratic(1.0, 1 - gamma**-2, rate, discount)
+    if not is_traced(quadratic, gamma, bound):
+        with jax.ensure_compile_time_eval():
+            p = quadratic.curvature
+            admissible("lq_game", -bound, bound, " at the ends of the box", control=p, disturbance=p / gamma**2)
+    return answer(quadratic.value)

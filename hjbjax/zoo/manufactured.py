@@ -71,5 +71,5 @@ def smooth(*, discount: Number = 0.5, shape: tuple[int, ...] = (81, 81)) -> tupl
 
 
 def smooth_exact(*, discount: Number = 0.5) -> Exact:
-    """The value cosh x₁ − 1 + x₂² + ¼x₁²x₂², whatever the discount."""
+    """The value cosh x₁ − 1 + x₂² + ¼x₁²x₂², whatever the discount, where |½cV₂| ≤ 6: on [−1, 1]²."""
     return answer(Smooth(discount).value)

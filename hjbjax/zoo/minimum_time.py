@@ -96,6 +96,9 @@ def double_integrator(
 ) -> tuple[Problem, Grid]:
     """Bring a mass to rest at the origin in the least time, |u| ≤ 1, on [−2, 2]²; figures 8 and 9 of the chapter.
 
+    For ``pontryagin`` all the way to the origin leave the target out,
+    ``dataclasses.replace(problem, target=None, exit_cost=None)``, and give ``terminal=[0, 0]``.
+
     Args:
       mass: m.
       discount: β; 1 is S = 1 − e^{−T} of (8.14), 0 is T itself.

@@ -42,8 +42,14 @@ class CubeExit:
         positive("brownian_exit", noise=self.noise, half_width=self.half_width)
 
     def value(self, x: State) -> Scalar:
-        """The value at one state."""
+        """The value at one state; zero outside the cube, where the run has ended."""
         scaled = jnp.abs(jnp.asarray(x)) / self.half_width  # even in every coordinate, so on [0, 1]
+        outside = jnp.max(scaled) > 1
+        # outside the formula of the interval is negative and that of the square overflows, so it is asked inside alone
+        return jnp.where(outside, 0.0, self._inside(jnp.where(outside, 0.0, scaled)))
+
+    def _inside(self, scaled: State) -> Scalar:
+        """The value at the coordinates |x_i|/R ≤ 1."""
         # with R as the length and R²/σ² as the time one number κ is left
         time = (self.half_width / self.noise) ** 2
         kappa = jnp.sqrt(2 * self.discount * time)
@@ -121,7 +127,7 @@ def brownian_exit(
 def brownian_exit_exact(
     *, dim: int = 1, noise: Number = 1.0, discount: Number = 0.0, half_width: Number = 1.0
 ) -> Exact:
-    """(1 − x²)/σ² on the interval (−1, 1), .58937083 at the centre of the square for σ = 1.
+    """(1 − x²)/σ² on the interval (−1, 1), .58937083 at the centre of the square for σ = 1; zero outside.
 
     Args:
       dim: the number of states, 1 or 2.
@@ -162,7 +168,7 @@ def brownian_ball(
 
 
 def brownian_ball_exact(*, dim: int = 2, noise: Number = 1.0, radius: Number = 1.0) -> Exact:
-    """(R² − |x|²)/(nσ²).
+    """(R² − |x|²)/(nσ²) in the ball; outside it goes on, negative, as ``brownian_ball`` holds it there.
 
     Args:
       dim: the number n of states.

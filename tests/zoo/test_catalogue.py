@@ -189,6 +189,16 @@ def test_importing_the_zoo_loads_nothing_heavy():
         (lambda: zoo.brownian_ball(radius=0.0), "radius = 0.0"),
         (lambda: zoo.merton(volatility=0.0), "volatility = 0.0"),
         (lambda: zoo.manipulator(links=2, shape=(20, 21)), "lengths 4, 4, 2"),
+        (lambda: zoo.merton(growth=0.2), r"best share is 2.125, wanted one within \[0, 1\]"),
+        (lambda: zoo.merton_exact(aversion=0.5), "best share is 2,"),
+        (lambda: zoo.merton(discount=0.3), r"best consumption is 0.17, wanted one within \[0.01, 0.1\]"),
+        (lambda: zoo.merton_exact(discount=0.3), "best consumption is 0.17,"),
+        (lambda: zoo.stochastic_lq(bound=0.5), r"best control is 1.23607 at the ends of the box, wanted one within"),
+        (lambda: zoo.stochastic_lq_exact(bound=0.5), "best control is 1.23607"),
+        (lambda: zoo.stochastic_lq_exact(state_weight=0.0, rate=1.0), "state_weight = 0.0"),
+        (lambda: zoo.double_integrator_lq_exact(bound=2.0), "best force is 5.4641 at a corner"),
+        (lambda: zoo.lq_game_exact(bound=1.0), "best control is 1.1547 at the ends"),
+        (lambda: zoo.lq_game_exact(gamma=0.8, rate=-1.0, bound=0.7), "best disturbance is 0.94"),
     ],
 )
 def test_refusals(call, message):

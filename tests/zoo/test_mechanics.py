@@ -177,8 +177,10 @@ def test_the_manipulator_problem_grows_with_its_links():
 def test_one_link_is_raised_as_the_pendulum_is():
     shape = (24, 25)
     (arm, grid), (pendulum, _) = zoo.manipulator(shape=shape), zoo.pendulum(shape=shape)
-    solution = hjb.solve(arm, grid, tol=1e-3)
-    np.testing.assert_allclose(solution.value, hjb.solve(pendulum, grid, tol=1e-3).value, atol=2e-3)
+    solution = hjb.solve(arm, grid, tol=1e-3, scheme=hjb.Upwind())
+    np.testing.assert_allclose(
+        solution.value, hjb.solve(pendulum, grid, tol=1e-3, scheme=hjb.Upwind()).value, atol=2e-3
+    )
     path = hjb.simulate(arm, solution, [2.0, 0.0], 6.0, clamp=True, hold=0.02)
     assert np.cos(path.states[-1, 0]) > 0.999
     assert abs(path.states[-1, 1]) < 0.01
@@ -191,7 +193,7 @@ def test_the_manipulator_of_the_catalogue_raises_its_arm_and_with_a_discount_of_
     angles = []
     for parameters in ({}, {"discount": 0.5}):
         problem, grid = entry.build(**parameters)
-        solution = hjb.solve(problem, grid)
+        solution = hjb.solve(problem, grid, scheme=hjb.Upwind())
         path = hjb.simulate(problem, solution, entry.initial_state(grid.ndim), entry.duration)
         angles.append(np.cos(path.states[-40:, 0]))
     raised, hanging = angles
@@ -206,7 +208,7 @@ def test_two_links_are_solved_in_four_dimensions():
     problem = hjb.Problem(problem.drift, problem.cost, problem.controls.grid(5), discount=problem.discount)
     ends = np.array([np.pi, np.pi, 3.0, 3.0])
     grid = hjb.Grid(-ends, ends, (14, 14, 11, 11), periodic=(True, True, False, False))
-    solution = hjb.solve(problem, grid, tol=1e-1)
+    solution = hjb.solve(problem, grid, tol=1e-1, scheme=hjb.Upwind())
     assert solution.error <= 1e-1
     assert solution.value[7, 7, 5, 5] == 0.0
     mirrored = np.roll(np.flip(solution.value), 1, axis=(0, 1))

@@ -10,14 +10,16 @@ from hjbjax.feedback.path import PathStatus, joined
 
 
 def exact_solution(entry, **parameters):
-    """A Solution with the exact value at the nodes, and controls of zero outside the target."""
+    """A Solution with the exact value at the nodes, what is held in the target, and controls of zero outside of it."""
     problem, grid = entry.build(**parameters)
     parameters.pop("shape", None)
     x = grid.nodes().reshape(-1, grid.ndim)
     with jax.enable_x64(True):
-        value, level = (
-            np.asarray(jax.vmap(f)(x)).reshape(grid.shape) for f in (entry.exact(**parameters), problem.target)
+        held = problem.exit_cost if callable(problem.exit_cost) else lambda x: 0.0
+        value, level, held = (
+            np.asarray(jax.vmap(f)(x)).reshape(grid.shape) for f in (entry.exact(**parameters), problem.target, held)
         )
+    value = np.where(level <= 0, held, value)
     controls = 0 if problem.controls is None else problem.controls.dim
     policy = np.where(level[..., None] <= 0, np.nan, np.zeros((*grid.shape, controls)))
     return problem, Solution(grid, value, policy, code=Status.CONVERGED)

@@ -1,5 +1,6 @@
 """Feedback in use: closed loops, their paths, safety filters and the energies along paths.
 
 Read ``simulation`` for ``simulate``, ``feedback`` for the control between the nodes, ``closed_loop`` for what is
-integrated, ``path`` for what comes back; ``safety_filter`` filters a control and ``dissipation`` counts energies.
+integrated, ``first_passage`` for noise at a target, ``path`` for what comes back;
+``safety_filter`` filters a control and ``dissipation`` counts energies.
 """

@@ -17,7 +17,8 @@ The target, the edge of the box and the end of what the players know are looked 
 step, and located by bisection of that step's interpolant; the path ends on their far side, by rounding. Inside the
 target a Solution has no control, and a step that ends there still wants one at its stages: it is that of the last
 place on the straight way there where the players had an answer.
-With noise a target is met late, since what happens between two steps is not seen: by about .58 σ√dt in space.
+With noise a target is also met between the ends of a step, by a draw of its own: see ``first_passage``. A mean time
+to a target then has the order 1 in the step. The edge of the box is looked at at the ends of steps alone.
 """
 
 import functools
@@ -28,6 +29,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hjbjax.feedback import first_passage
 from hjbjax.feedback.loop import Actions, Loop, are_finite
 from hjbjax.feedback.path import Path, PathStatus
 from hjbjax.problem.pytree import pytree_dataclass
@@ -194,14 +196,18 @@ def _advance(
     else:
         # equal steps that end on the output time; the 1e-6 forgives a quotient that rounding lifts over an integer
         step = width / jnp.ceil(jnp.maximum(width / stepping.max_step, LEAST_STEPS) - 1e-6)
-    solved = solve(t0=t, t1=end, dt0=step, y0=y, args=(u, t, y[:-1]))
-    later, y = solved.ts[0], solved.ys[0]
+    beginning = (u, t, y[:-1])
+    solved = solve(t0=t, t1=end, dt0=step, y0=jnp.append(y, 1) if _is_bridged(loop) else y, args=beginning)
+    later, y, met = solved.ts[0], solved.ys[0], jnp.zeros((), bool)
+    if _is_bridged(loop):
+        y, met = y[:-1], (y[-1] < 1) & diffrax.is_event(solved.result)
+        y = jnp.append(jnp.where(met, _on_target(loop, stepping, later, y[:-1], beginning), y[:-1]), y[-1])
     target, margin = loop.target(later, y[:-1]), loop.margin(y[:-1])
     # the codes are laid over one another from the weakest reason to the strongest, each `where` overrules those before
-    code = jnp.where(target <= margin, PathStatus.TARGET, PathStatus.LEFT_BOX)
+    code = jnp.where(met | (target <= margin), PathStatus.TARGET, PathStatus.LEFT_BOX)
     if loop.guarded and not stepping.held:
         inside = (target > 0) & (margin > 0)
-        code = jnp.where(inside & ~are_finite(loop.players(later, y[:-1])), PathStatus.UNDEFINED, code)
+        code = jnp.where(inside & ~met & ~are_finite(loop.players(later, y[:-1])), PathStatus.UNDEFINED, code)
     code = jnp.where(diffrax.is_event(solved.result), code, PathStatus.DURATION)
     code = jnp.where(jnp.all(jnp.isfinite(y)), code, PathStatus.NONFINITE)
     # diffrax hands back infinity where it ran out of steps, and the state need not have been
@@ -214,22 +220,21 @@ def _solver(ivp: InitialValueProblem, stepping: Stepping) -> Callable:
     import diffrax
 
     loop, x0, start, duration = ivp.loop, ivp.x0, ivp.times[0], ivp.times[-1] - ivp.times[0]
-
-    def act(t: Number, y: Array, beginning: Beginning) -> Actions:
-        u, d = loop.actions(t, y[:-1], beginning[1:])
-        return (beginning[0] if stepping.held else u), d
+    n, bridged = len(x0), _is_bridged(loop)  # behind the n states the cost, and then the flag of a bridge
 
     def rate(t: Number, y: Array, beginning: Beginning) -> jax.Array:
-        return loop.rate(t, y[:-1], *act(t, y, beginning), loop.discount(t - start))
+        acts = _acting(loop, stepping, t, y[:n], beginning)
+        return jnp.pad(loop.rate(t, y[:n], *acts, loop.discount(t - start)), (0, int(bridged)))
 
     def noise(t: Number, y: Array, beginning: Beginning) -> jax.Array:
-        return loop.noise(t, y[:-1], *act(t, y, beginning))
+        sigma = loop.noise(t, y[:n], *_acting(loop, stepping, t, y[:n], beginning))
+        return jnp.pad(sigma, ((0, int(bridged)), (0, 0)))
 
     def margin(t: Number, y: Array, args: Beginning, **kwargs: object) -> jax.Array:
-        inside = jnp.minimum(loop.target(t, y[:-1]), loop.margin(y[:-1]))
-        if not loop.guarded or stepping.held:  # under a hold the players are asked at its samples only
-            return inside
-        return jnp.where(are_finite(loop.players(t, y[:-1])), inside, jnp.minimum(inside, -1))
+        inside = jnp.minimum(loop.target(t, y[:n]), loop.margin(y[:n]))
+        if loop.guarded and not stepping.held:  # under a hold the players are asked at its samples only
+            inside = jnp.where(are_finite(loop.players(t, y[:n])), inside, jnp.minimum(inside, -1))
+        return jnp.where(y[-1] < 1, y[-1], inside) if bridged else inside  # below 1 in a step that meets the target
 
     terms: diffrax.AbstractTerm = diffrax.ODETerm(rate)
     solver: diffrax.AbstractSolver
@@ -246,7 +251,8 @@ def _solver(ivp: InitialValueProblem, stepping: Stepping) -> Callable:
         brownian = _brownian(ivp, stepping.max_step, additive)
         terms = diffrax.MultiTerm(terms, diffrax.ControlTerm(noise, brownian))
         # SRA1 has its order for additive noise alone; a function may depend on the state, and is not asked
-        solver, controller = diffrax.SRA1() if additive else diffrax.Euler(), diffrax.ConstantStepSize()
+        kind, controller = diffrax.SRA1 if additive else diffrax.Euler, diffrax.ConstantStepSize()
+        solver = first_passage.bridging(kind)(flag=_flag_of_steps(ivp, stepping)) if bridged else kind()
     event = None
     if (
         loop.guarded or loop.problem.target is not None or (loop.grid is not None and not loop.clamp)
@@ -258,6 +264,34 @@ def _solver(ivp: InitialValueProblem, stepping: Stepping) -> Callable:
         diffrax.diffeqsolve, terms, solver, stepsize_controller=controller, event=event,
         saveat=diffrax.SaveAt(t1=True), adjoint=diffrax.ForwardMode(), max_steps=stepping.max_steps, throw=False,
     )  # fmt: skip
+
+
+def _is_bridged(loop: Loop) -> bool:
+    """True if a path may meet a target between the ends of a step."""
+    return loop.problem.noise is not None and loop.problem.target is not None
+
+
+def _acting(loop: Loop, stepping: Stepping, t: Number, x: State, beginning: Beginning) -> Actions:
+    """What both players do at a stage of a step."""
+    u, d = loop.actions(t, x, beginning[1:])
+    return (beginning[0] if stepping.held else u), d
+
+
+def _on_target(loop: Loop, stepping: Stepping, t: Number, x: State, beginning: Beginning) -> State:
+    """The state in which a path meets the target, from the one on the straight way between the ends of the step."""
+    sigma = loop.noise(t, x, *_acting(loop, stepping, t, x, beginning))[:-1]
+    return first_passage.onto_edge(functools.partial(loop.target, t), x, sigma)
+
+
+def _flag_of_steps(ivp: InitialValueProblem, stepping: Stepping) -> Callable:
+    """The flag that ``first_passage.bridging`` writes at the end of a step."""
+    loop, n, draw = ivp.loop, len(ivp.x0), first_passage.Draw(ivp.key)
+
+    def flag(t: Array, later: Array, y: Array, moved: Array, beginning: Beginning) -> jax.Array:
+        sigma = loop.noise(t, y[:n], *_acting(loop, stepping, t, y[:n], beginning))[:-1]
+        return first_passage.flag(loop, draw, sigma, (t, y[:n]), (later, moved[:n]))
+
+    return flag
 
 
 def _brownian(ivp: InitialValueProblem, max_step: Number, additive: bool) -> "diffrax.VirtualBrownianTree":

@@ -8,6 +8,7 @@ with DV.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Protocol, TypeAlias
 
@@ -116,13 +117,16 @@ def lookups(feedback: GridFeedback) -> tuple[Callable, Callable]:
 
 
 # The loop clips every state into the box before it asks; clamp=True, or one on the edge is refused for a rounding.
+# An integrator traces its right-hand side some twenty times; within ``jit`` a lookup is traced once: 1 s in place of 2.
 
 
+@functools.partial(jax.jit, inline=True)
 def _look_up(looks: tuple[Callable, ...], t: Number, x: State) -> Array:
     """The first of several lookups at x that is not NaN, whatever the time."""
     return _first([look(x, clamp=True) for look in looks])
 
 
+@functools.partial(jax.jit, inline=True)
 def _look_up_in_time(looks: tuple[Callable, ...], t: Number, x: State) -> Array:
     """The first of several lookups at (t, x) that is not NaN."""
     return _first([look(t, x, clamp=True) for look in looks])
@@ -281,7 +285,7 @@ def _at(greedy: Greedy, when: tuple[Number, ...], x: State, p: Costate) -> tuple
     value, bends = jnp.zeros((3,) * n, x.dtype), (jnp.zeros((), x.dtype),) * n
     if problem.noise is not None:
         steps = np.stack(np.meshgrid(*[(-1, 0, 1)] * n, indexing="ij"), axis=-1)
-        value = greedy.solution.value_at(*when, x + h * steps, clamp=True)
+        value = greedy.solution.value_at(*when, _reflected(jnp.asarray(x + h * steps), grid), clamp=True)
         center = (1,) * n
         # D⁺ − D⁻ along every axis, the second difference times h: the form in which the Hamiltonian takes noise
         bends = tuple(
@@ -297,6 +301,15 @@ def _at(greedy: Greedy, when: tuple[Number, ...], x: State, p: Costate) -> tuple
     known = jnp.all(jnp.isfinite(p))  # a minimum over slopes of NaN would still be some admissible action
     control, disturbance = (jnp.where(known, _middle(action, x.dtype, n), jnp.nan) for action in (u, d))
     return control, disturbance
+
+
+def _reflected(points: jax.Array, grid: Grid) -> jax.Array:
+    """Points (..., n) with those beyond a wall at their mirror image, where noise sees V."""
+    for axis, step in grid.sides("projected") + grid.sides("constrained"):
+        wall = jnp.asarray((grid.hi if step > 0 else grid.lo)[axis], points.dtype)
+        along = points[..., axis]
+        points = points.at[..., axis].set(jnp.where(step * (along - wall) > 0, 2 * wall - along, along))
+    return points
 
 
 def _middle(action: list[Array], dtype: DType, n: int) -> jax.Array:

@@ -148,7 +148,7 @@ def check_shapes(loop: Loop, x0: Array) -> None:
     m = 0 if problem.controls is None else problem.controls.dim
     opponents = 0 if problem.disturbances is None else problem.disturbances.dim
     # zeros, and a number of the state's type for the time: nothing is computed, only shapes and types are asked for
-    u, d = jnp.zeros(m, x0.dtype), jnp.zeros(opponents, x0.dtype)
+    u, d = np.zeros(m, x0.dtype), np.zeros(opponents, x0.dtype)
     players, state = (x0[0], x0), problem.arguments(x0, u, d, x0[0])
     for name, function, fed, wanted in (
         ("feedback", loop.control, players, (m,)),

@@ -1,6 +1,7 @@
 """The answer of a simulation: a path, why it ends, and the line that says so."""
 
 import enum
+import math
 import warnings
 from typing import Any
 
@@ -11,6 +12,7 @@ from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box
 from hjbjax.problem.types import Array
 from hjbjax.solution.screen import encodable
+from hjbjax.solution.solution import Solution
 
 MANY = 1000  # internal steps, beside an eighth of those allowed: more of them tell of a feedback that jumps
 SLACK = 1e-9  # relative, of an admissible set: what interpolation between the nodes rounds a control by
@@ -67,6 +69,8 @@ class Path:
       code: a PathStatus number.
       steps: internal steps of the integrator, rejected ones included.
       message: one line on how the path ended.
+      promised: V at the start, where the feedback is a Solution or comes of one: up to errors of the grid and the
+        integrator, and what is paid after a path that is cut short, no path costs less in the mean. Else None.
     """
 
     times: Any  # NumPy arrays and numbers of `simulate`, JAX's of `rollout`, with more axes under vmap
@@ -78,6 +82,7 @@ class Path:
     code: Any
     steps: Any
     message: str = ""
+    promised: Any = None
 
     @property
     def status(self) -> PathStatus:
@@ -86,6 +91,16 @@ class Path:
 
     def __str__(self) -> str:
         return encodable(self.message)  # a terminal may lack a letter, and print would raise
+
+
+def promise(feedback: object, start: Array) -> float | None:
+    """V at the start of a path, by the solution of its feedback; None where there is none."""
+    solution = feedback if isinstance(feedback, Solution) else getattr(feedback, "solution", None)
+    if not isinstance(solution, Solution):
+        return None
+    where = (start,) if solution.times is None else (0.0, start)
+    value = float(solution.value_at(*where, clamp=True))
+    return value if math.isfinite(value) else None
 
 
 def joined(first: Path, then: Path, discount: float) -> Path:
@@ -113,8 +128,14 @@ def joined(first: Path, then: Path, discount: float) -> Path:
         reached=None if then.reached is None else end + then.reached,
         code=then.code,
         steps=steps,
-        message=f"{said}; cost {cost:.6g}; {steps} internal steps",
+        message=f"{said}; cost {cost:.6g}{_beside(first.promised)}; {steps} internal steps",
+        promised=first.promised,
     )
+
+
+def _beside(promised: float | None) -> str:
+    """The words for what V promised, behind the cost."""
+    return "" if promised is None else f" (V promised {promised:.6g})"
 
 
 def truncate(
@@ -137,7 +158,7 @@ def truncate(
         where += f", x = [{', '.join(f'{entry:.4g}' for entry in states[-1])}]"
     said = [
         f"{status.message} at {where}",
-        f"cost {float(path.cost):.6g}",
+        f"cost {float(path.cost):.6g}{_beside(path.promised)}",
         f"{int(path.steps)} internal steps",
     ]
     # only with clamp=True does a path go on outside; its states are unwound, so that a periodic entry may leave the box
@@ -161,6 +182,7 @@ def truncate(
         code=int(path.code),
         steps=int(path.steps),
         message="; ".join(said),
+        promised=path.promised,
     )
 
 

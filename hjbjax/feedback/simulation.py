@@ -1,6 +1,7 @@
 """Simulation: ``simulate`` at the host, with checks and a report; ``rollout``, its integration as a pure function."""
 
 import copy
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from typing import TypeAlias, TypeGuard
@@ -12,7 +13,7 @@ import numpy as np
 from hjbjax.feedback.closed_loop import InitialValueProblem, Stepping, blank_record, integrate, integrate_part
 from hjbjax.feedback.feedback import GridFeedback, check_kept, is_grid_feedback, lookups
 from hjbjax.feedback.loop import Loop, check_shapes
-from hjbjax.feedback.path import Interrupted, Path, PathStatus, truncate
+from hjbjax.feedback.path import Interrupted, Path, PathStatus, promise, truncate
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
@@ -73,8 +74,8 @@ def simulate(
       rtol: relative error of an internal step.
       atol: absolute error of an internal step, in the units of the state and of the cost.
       max_step: the longest internal step. ``None``: one output interval; a tenth of it with noise. A target
-        that the path crosses in less time than this may be missed; with noise it is met late, as if it began about
-        .58 σ√max_step farther off, which a fourth of the step halves.
+        that the path crosses in less time than this may be missed. With noise a target is met between the ends of a
+        step, too, by a draw of the Brownian bridge between them: mean times have the order 1 in this step.
       max_steps: no internal step is shorter than 2·duration/max_steps, and no more are made.
 
     Returns:
@@ -121,7 +122,7 @@ def simulate(
     ):  # after the end of a path its controls are NaN
         loop = cast(loop, np.float64)  # a solution of float32 closes the loop in float64, as the path is integrated
         check_shapes(loop, start)
-        if loop.grid is not None and not loop.margin(start) > 0:
+        if loop.grid is not None and not _margin(loop, start) > 0:
             lo, hi = np.asarray(loop.grid.lo).tolist(), np.asarray(loop.grid.hi).tolist()
             raise ValueError(
                 f"simulate: x0 = {start.tolist()} lies outside the box from {lo} to {hi}, where the feedback is not "
@@ -129,10 +130,14 @@ def simulate(
             )
         path, active = _in_chunks(InitialValueProblem(loop, start, times, key), stepping, clock)
         path, active, grid, controls = jax.tree.map(np.asarray, (path, active, loop.grid, problem.controls))
+        path = dataclasses.replace(path, promised=promise(feedback, start))
         path = truncate(path, int(np.sum(active)), max_steps, grid, controls, problem.noise is not None)
         if clock.interrupted:
             raise Interrupted(path)
     return path
+
+
+_margin = jax.jit(Loop.margin)
 
 
 def _in_chunks(ivp: InitialValueProblem, stepping: Stepping, clock: Clock) -> tuple[Path, jax.Array]:

@@ -144,3 +144,13 @@ def test_it_does_not_leave_across_a_constrained_end():
     path = simulate(problem, greedy, [0.7], 2.0)
     assert path.status.name == "DURATION"
     assert 0.999 < path.states[-1, 0] <= 1
+
+
+def test_at_a_wall_it_sees_the_mirror_image():
+    """w(u − 1)² + ½u²V″ with V = cos πx, even about both walls: u = 2w/(2w + V″), on the walls as inside."""
+    grid = Grid([0.0], [1.0], (81,))
+    problem = Problem(lambda x, u: 0 * x, lambda x, u: 9 * (u[0] - 1) ** 2, Box([0.0], [3.0]), noise=lambda x, u: u)
+    solution = exact_at_nodes(grid, lambda x: jnp.cos(jnp.pi * x[0]), np.ones((81, 1)))
+    x = np.array([0.0, 0.004, 0.3, 0.7, 0.996, 1.0])
+    found = [float(greedy_feedback(problem, solution)(jnp.array([place]))[0]) for place in x]
+    np.testing.assert_allclose(found, 18 / (18 - np.pi**2 * np.cos(np.pi * x)), rtol=0.02)

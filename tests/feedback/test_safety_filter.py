@@ -28,7 +28,7 @@ AVOID = hjb.avoid(braking, UNIT, wall)
 
 @pytest.fixture(scope="module")
 def tube():
-    return hjb.solve(AVOID, GRID)
+    return hjb.solve(AVOID, GRID, scheme=hjb.Upwind())
 
 
 def farthest(feedback, x0, duration=5.0, problem=AVOID, **options):
@@ -44,7 +44,11 @@ def deepest(x):
 def test_the_tube_is_what_braking_allows(tube):
     errors = []
     for count in (31, 61):
-        solved = tube if count == 61 else hjb.solve(AVOID, hjb.Grid([-3.0, -2.0], [1.0, 2.0], (count, count)))
+        solved = (
+            tube
+            if count == 61
+            else hjb.solve(AVOID, hjb.Grid([-3.0, -2.0], [1.0, 2.0], (count, count)), scheme=hjb.Upwind())
+        )
         exact = deepest(solved.grid.nodes())
         errors.append(np.max(np.abs(solved.value - exact)[exact < 0.4]))
     assert errors[1] < 0.6 * errors[0]
@@ -110,7 +114,7 @@ def test_a_wider_margin_stops_farther_away(tube):
 def test_the_nominal_control_may_be_a_solution(tube):
     """The fastest way through the wall."""
     race = hjb.Problem(braking, lambda x, u: 1.0, UNIT, target=lambda x: jnp.hypot(x[0] - 0.5, x[1]) - 0.2)
-    fastest = hjb.solve(race, hjb.Grid([-3.0, -2.0], [1.0, 2.0], (41, 41)), tol=0.1)
+    fastest = hjb.solve(race, hjb.Grid([-3.0, -2.0], [1.0, 2.0], (41, 41)), tol=0.1, scheme=hjb.Upwind())
     assert farthest(fastest, [-1.5, 0.0], grid=None) > 0
     assert farthest(hjb.least_restrictive(tube, fastest), [-1.5, 0.0]) < 0
 
@@ -129,7 +133,7 @@ def test_straight_ahead_left_or_right_is_safe_and_their_mean_is_not():
     """Carried towards a square: unsafe is |y| < ½ − (time until it is there), where the two ways round meet."""
     grid = hjb.Grid([-2.0, -1.5], [1.0, 1.5], (31, 31))
     problem = hjb.avoid(drifting, UNIT, box)
-    guarded = hjb.least_restrictive(hjb.solve(problem, grid), lambda x: jnp.zeros(1))
+    guarded = hjb.least_restrictive(hjb.solve(problem, grid, scheme=hjb.Upwind()), lambda x: jnp.zeros(1))
     for y in (0.0, 0.05, -0.02):
         path = hjb.simulate(problem, guarded, [-1.9, y], 2.4, grid=grid, hold=0.02)
         assert min(float(box(x)) for x in path.states) > 0
@@ -153,7 +157,7 @@ MOVING = hjb.avoid(lambda t, x, u: braking(x, u), UNIT, moving_wall, time_depend
 def test_a_wall_that_comes_nearer():
     """y = x − 1 + t/2 and w = v + ½ see a wall at rest: V = y + ½w² as long as there is time to brake."""
     grid = hjb.Grid([-3.0, -2.0], [2.0, 2.0], (51, 41))
-    tube = hjb.march(MOVING, grid, 3.0, times=np.linspace(0, 3, 31))
+    tube = hjb.march(MOVING, grid, 3.0, times=np.linspace(0, 3, 31), scheme=hjb.Upwind(split=True))
     y, w = grid.nodes()[..., 0] - 0.5, grid.nodes()[..., 1] + 0.5
     exact = y + np.maximum(w, 0) ** 2 / 2
     inner = (exact < 0.3) & (y > -2)
@@ -170,7 +174,7 @@ def test_a_wall_that_comes_nearer():
 
 @pytest.mark.slow
 def test_a_marched_tube_guards_a_system_that_does_not_know_the_time():
-    tube = hjb.march(AVOID, GRID, 3.0, times=np.linspace(0, 3, 31))
+    tube = hjb.march(AVOID, GRID, 3.0, times=np.linspace(0, 3, 31), scheme=hjb.Upwind(split=True))
     guarded = hjb.least_restrictive(tube, lambda t, x: full_throttle(x))
     assert farthest(guarded, [-2.0, 1.0], 3.0, time_varying=True) < 0
     late = jnp.array([-0.5, 1.2])  # would end ½·1.44 beyond: too late to brake for ever, not for the last tenth
@@ -186,8 +190,8 @@ def gust(x, u, d):
 def test_against_the_worst_disturbance():
     """Brakes at 1 − .4: V = x + v²/(2·.6); a filter that does not know of the wind is blown into the wall."""
     problem = hjb.avoid(gust, UNIT, wall, disturbances=UNIT)
-    windy = hjb.solve(problem, GRID)
-    calm = hjb.solve(AVOID, GRID)
+    windy = hjb.solve(problem, GRID, scheme=hjb.Upwind())
+    calm = hjb.solve(AVOID, GRID, scheme=hjb.Upwind())
     exact = GRID.nodes()[..., 0] + np.maximum(GRID.nodes()[..., 1], 0) ** 2 / 1.2
     assert np.max(np.abs(windy.value - exact)[exact < 0.3]) < 0.1
 
@@ -237,7 +241,7 @@ def test_traced_use_wants_a_margin(tube):
 
 
 def test_a_marched_filter_wants_the_time(tube):
-    marched = hjb.march(AVOID, GRID, 0.1, times=[0.0, 0.1])
+    marched = hjb.march(AVOID, GRID, 0.1, times=[0.0, 0.1], scheme=hjb.Upwind(split=True))
     guarded = hjb.least_restrictive(marched, full_throttle)
     with pytest.raises(ValueError, match=r"this solution is marched over times: call value_at\(t, x\)"):
         guarded(jnp.zeros(2))

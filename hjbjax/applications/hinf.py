@@ -3,8 +3,10 @@
     ẋ = f(x, u) + E d,  cost L(x, u) − ½γ²|d|²,  L = ½|z|²:   0 = min_u max_d [ L − ½γ²|d|² + (f + E d)·DV ]
 
 has a finite value V ≥ 0 exactly where some feedback keeps ∫|z|² ≤ γ²∫|d|² + 2V(x₀) for every d: the available
-storage. The H∞ level is the least such γ. For a linear plant with z = (C x, u) it is the least γ with a stabilising
-P ≥ 0 of A'P + PA − P(BB' − EE'/γ²)P + C'C = 0, and V = ½x'Px.
+storage. The H∞ level is the least such γ. For a linear plant with z = (C x, u) and (C, A) detectable it is the least γ
+with a stabilising P ≥ 0 of A'P + PA − P(BB' − EE'/γ²)P + C'C = 0, and V = ½x'Px. An unstable mode that z does not see
+costs nothing to leave alone: V is then finite at levels that no stabilising feedback holds. So at the end the loop is
+run with d = 0 from the corners of the inner box, and the answer says where it does not come back.
 
 How infeasible is told from feasible, where a bounded set of disturbances makes every γ finite: march from V = 0. The
 value V_T of the problem over the time T grows with T, since d = 0 is allowed and costs nothing, and its limit is V, so
@@ -34,6 +36,8 @@ from time import perf_counter
 import numpy as np
 
 from hjbjax.applications.l2_gain import Saturation, saturation
+from hjbjax.applications.level import Level, Trial
+from hjbjax.applications.undisturbed import comes_back
 from hjbjax.discretisation.discretisation import Scheme
 from hjbjax.discretisation.schemes import Weno5
 from hjbjax.problem import arguments
@@ -66,66 +70,6 @@ class Settling:
     horizon: float
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Trial:
-    """The verdict on one γ, and what it rests on.
-
-    Args:
-      gamma: γ.
-      feasible: True where the value settled.
-      reason: "settled", "saturated", "growing" or "not finite"; "interrupted" or "out of time" is no verdict.
-      time: the time T that was marched.
-      growth: what V grew by over the last doubling of T, over its size, in the inner box.
-      value: the largest V there.
-      saturation: how near the worst disturbance came to its bound at the end.
-      solution: V_T and both feedbacks, as a stationary solution; its status is that of the last march.
-    """
-
-    gamma: float
-    feasible: bool
-    reason: str
-    time: float
-    growth: float
-    value: float
-    saturation: Saturation
-    solution: Solution
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Level:
-    """The least γ found feasible, and all that was tried; ``print`` shows the table.
-
-    Args:
-      gamma: γ, the upper end of the bracket.
-      bracket: the largest γ not shown to be feasible, and the least that is; 0 and infinity before there is one.
-      trials: everything tried, by γ.
-      status: CONVERGED; of a search that was cut short, INTERRUPTED or TIME_LIMIT.
-    """
-
-    gamma: float
-    bracket: tuple[float, float]
-    trials: tuple[Trial, ...]
-    status: Status = Status.CONVERGED
-
-    @property
-    def solution(self) -> Solution:
-        """The value and the feedbacks at ``gamma``; without a feasible γ those of the last trial."""
-        return next((trial for trial in self.trials if trial.gamma == self.gamma), self.trials[-1]).solution
-
-    def __repr__(self) -> str:
-        return f"Level(gamma={self.gamma:.6g}, bracket=({self.bracket[0]:.6g}, {self.bracket[1]:.6g}))"
-
-    def __str__(self) -> str:
-        lines = [f"least level {self.gamma:.4g}, not shown at {self.bracket[0]:.4g}"]
-        lines.append(f"{'gamma':>9} {'':<11} {'time':>7} {'growth':>8} {'V':>9} {'|d|/bound':>9}")
-        for one in self.trials:
-            lines.append(
-                f"{one.gamma:>9.4g} {one.reason:<11} {one.time:>7.3g} {one.growth:>8.1e} {one.value:>9.3g} "
-                f"{one.saturation.largest:>9.2f}"
-            )
-        return "\n".join(lines)
-
-
 def hinf_level(
     problem_of_gamma: Callable[[float], Problem],
     grid: Grid,
@@ -143,7 +87,8 @@ def hinf_level(
 
     Each γ takes one march, which stops as soon as it is decided. The level comes out too high where a set of controls
     or disturbances is too narrow, where worst paths from the inner box leave the grid, or where the horizon is short;
-    the table says how the marches below it ended.
+    the table says how the marches below it ended. For a level with stability every unstable mode must be seen in L
+    (detectability); ``Level.stabilises`` is False where a run without a disturbance shows one that is not.
 
     Args:
       problem_of_gamma: γ to the game with cost L − ½γ²|d|², as ``lambda gamma: hjb.attenuation(plant, gamma, set)``.
@@ -192,10 +137,14 @@ def hinf_level(
 
     with noting_interrupts(clock):
         _bisect(at, lo, hi, tol, settle)
+        level = _level(trials)
+        if not clock.interrupted:
+            stabilises = comes_back(problem_of_gamma(level.gamma), level.solution, inner, horizon)
+            level = dataclasses.replace(level, stabilises=stabilises)
         if clock.interrupted:
-            whole = dataclasses.replace(_level(trials), status=Status.INTERRUPTED)
-            raise SolveError(f"hinf_level: interrupted after it had come to its end: {whole!r}", whole)
-    return _level(trials)
+            level = dataclasses.replace(level, status=Status.INTERRUPTED)
+            raise SolveError(f"hinf_level: interrupted after it had come to its end: {level!r}", level)
+    return level
 
 
 def _bisect(at: Callable[[float], Trial], lo: float, hi: float, tol: float, settle: float) -> None:

@@ -68,7 +68,8 @@ def reach_probability(
         Where a Solution has no action the state stays for ever. A marched one must have been kept at times that
         are dense enough up to the horizon.
       options: anything else that ``march`` takes, or ``solve`` without a horizon: times, scheme, method, ...; tol is
-        that of ``solve``, 1e-6 by default: a bound on the residual and the last step.
+        that of ``solve``, 1e-6 by default: a bound on the residual and the last step. By default ``Upwind()``, whose
+        answers are probabilities of a chain.
 
     Returns:
       A Solution whose value is the probability, and whose policy attains it.
@@ -297,6 +298,8 @@ def _refuse_staying(question: Problem, grid: Grid, options: dict) -> None:
 
 def _answer(question: Problem, grid: Grid, horizon: float | None, options: dict, sign: float) -> Solution:
     """sign · V of the question, also for a partial solution."""
+    # the chain's, unless it is asked for: slopes of high order may leave the range of a probability by a little
+    options = {"scheme": Upwind(split=horizon is not None)} | options
     # a partial solution is handed to the user, who must not see the changed sign of the question
     with _map_errors(0.0, sign):
         found = solve(question, grid, **options) if horizon is None else march(question, grid, horizon, **options)

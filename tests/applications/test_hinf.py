@@ -13,6 +13,7 @@ import hjbjax as hjb
 from hjbjax import zoo
 from hjbjax.applications import hinf
 from hjbjax.applications.hinf import Trial
+from hjbjax.applications.undisturbed import comes_back
 from hjbjax.feedback.path import PathStatus
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Ball, Box, Finite
@@ -105,6 +106,12 @@ def test_the_level_of_an_oscillator(oscillator):
     x = np.array([0.25, 0.25])
     assert top.value == pytest.approx(0.5 * x @ p @ x, rel=0.05)
     assert "least level 0.9" in str(oscillator)
+    assert oscillator.stabilises is True
+    assert oscillator.saturated == 0.0
+    cut = dataclasses.replace(oscillator.trials[0], reason="saturated")
+    beside = dataclasses.replace(oscillator, trials=(cut, *oscillator.trials[1:]))
+    assert f"at gamma = {cut.gamma:.4g} and below saturation decided, not growth" in str(beside)
+    assert "stabilise" not in str(oscillator)
     assert repr(oscillator).startswith("Level(gamma=0.9")
 
 
@@ -164,6 +171,30 @@ def test_the_level_of_any_stable_scalar_plant(a, e, c):
     assert level.gamma == pytest.approx(wanted, rel=0.02)
 
 
+UNSEEN = Linear([[0.5, 0.0], [0.0, -1.0]], [[1.0], [1.0]], [[0.0], [1.0]], [[0.0, 1.0]], bound=12.0)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the optimal drift leaves the box")
+def test_an_unstable_mode_that_the_cost_does_not_see():
+    """ẋ₁ = ½x₁ + u at no cost: 1/√2 is the level without stability, .8354 that of a stabilising feedback."""
+    grid = hjb.Grid([-2.0] * 2, [2.0] * 2, (21, 21))
+    level = hjb.hinf_level(UNSEEN.game(), grid, 0.6, 0.8, tol=0.15, horizon=32.0)
+    assert level.gamma < 0.99 * UNSEEN.level()
+    assert level.stabilises is False
+    assert "feasible, but the feedback does not stabilise" in str(level)
+
+
+@pytest.mark.parametrize(("rate", "stable"), [(-1.0, True), (0.0, False), (0.5, False)])
+def test_the_undisturbed_loop_of_a_mode_without_control(rate, stable):
+    """ẋ = a x comes back for a < 0 alone; resting is not coming back."""
+    plant = hjb.Problem(lambda x, u: rate * x + 0 * u, lambda x, u: 0.5 * (u @ u), Box([-1.0], [1.0]))
+    grid = cube(1, 5)
+    feedback = hjb.Solution(grid, np.zeros(5), np.zeros((5, 1)), np.zeros((5, 1)))
+    game = hjb.attenuation(plant, 1.0, Box([-1.0], [1.0]))
+    assert comes_back(game, feedback, 0.25, 8.0) is stable
+
+
 def test_a_bound_that_is_felt_is_infeasible():
     """At γ = 1.01 the worst disturbance is 7.1 x: with a bound of 1 it saturates within the inner quarter."""
     narrow = dataclasses.replace(INTEGRATOR, bound=1.0)
@@ -182,7 +213,7 @@ def test_a_march_goes_on_from_another():
     rest = hjb.march(problem, grid, 1.0, start=half.value[0], **options)
     np.testing.assert_allclose(rest.value[0], whole.value[0], rtol=0, atol=1e-12)
     with pytest.raises(ValueError, match=r"march: start has shape \(3,\), the grid \(21,\)"):
-        hjb.march(problem, grid, 1.0, start=np.zeros(3))
+        hjb.march(problem, grid, 1.0, start=np.zeros(3), scheme=hjb.Upwind(split=True))
 
 
 @pytest.mark.parametrize(

@@ -43,8 +43,10 @@ def test_a_floating_boat_has_its_light_cone():
 def test_the_stationary_tube_is_the_limit_of_marching():
     grid = hjb.Grid([-3.0, -3.0], [3.0, 3.0], (31, 31))
     problem = hjb.reach(boat, UNIT, square)
-    long = hjb.march(problem, grid, 40.0)
-    np.testing.assert_allclose(hjb.solve(problem, grid, tol=1e-8).value, long.value[0], rtol=0, atol=1e-5)
+    long = hjb.march(problem, grid, 40.0, scheme=hjb.Upwind(split=True))
+    np.testing.assert_allclose(
+        hjb.solve(problem, grid, tol=1e-8, scheme=hjb.Upwind()).value, long.value[0], rtol=0, atol=1e-5
+    )
 
 
 def gap(x):
@@ -75,8 +77,10 @@ def test_avoid_is_the_mirror_image_of_reach():
     def pursuer(x, u, d):
         return 0.5 * u + d
 
-    kept_away = hjb.march(hjb.avoid(pursuer, UNIT, gap, disturbances=UNIT), grid, 1.0).value
-    caught = hjb.march(hjb.reach(push, UNIT, gap, disturbances=UNIT), grid, 1.0).value
+    kept_away = hjb.march(
+        hjb.avoid(pursuer, UNIT, gap, disturbances=UNIT), grid, 1.0, scheme=hjb.Upwind(split=True)
+    ).value
+    caught = hjb.march(hjb.reach(push, UNIT, gap, disturbances=UNIT), grid, 1.0, scheme=hjb.Upwind(split=True)).value
     np.testing.assert_allclose(kept_away, -caught, rtol=0, atol=1e-12)
 
 
@@ -88,11 +92,18 @@ def test_a_set_is_not_a_tube():
         return jnp.ones(1)
 
     x = np.asarray(grid.axis(0))
-    at_the_end = x[hjb.march(hjb.reach(carried, None, gap, tube=False), grid, 1.0).value[0] <= 0.0]
-    at_some_time = x[hjb.march(hjb.reach(carried, None, gap), grid, 1.0).value[0] <= 0.0]
+    at_the_end = x[
+        hjb.march(hjb.reach(carried, None, gap, tube=False), grid, 1.0, scheme=hjb.Upwind(split=True)).value[0] <= 0.0
+    ]
+    at_some_time = x[hjb.march(hjb.reach(carried, None, gap), grid, 1.0, scheme=hjb.Upwind(split=True)).value[0] <= 0.0]
     assert (at_the_end[0], at_the_end[-1]) == pytest.approx((-1.5, -0.5), abs=0.06)
     assert (at_some_time[0], at_some_time[-1]) == pytest.approx((-1.5, 0.5), abs=0.06)
-    ahead = x[hjb.march(hjb.reach(carried, None, gap, tube=False, forward=True), grid, 1.0).value[0] <= 0.0]
+    ahead = x[
+        hjb.march(
+            hjb.reach(carried, None, gap, tube=False, forward=True), grid, 1.0, scheme=hjb.Upwind(split=True)
+        ).value[0]
+        <= 0.0
+    ]
     assert (ahead[0], ahead[-1]) == pytest.approx((0.5, 1.5), abs=0.06)
 
 
@@ -105,11 +116,11 @@ def test_a_goal_inside_an_obstacle_is_not_reached():
     """The goal |x| ≤ ½ is covered from ¼ on: from the left it is reached, from within the wall never."""
     grid = hjb.Grid([-2.0], [2.0], (81,))
     problem = hjb.reach_avoid(lambda x, u: u, UNIT, gap, wall)
-    value, x = hjb.march(problem, grid, 1.0).value[0], np.asarray(grid.axis(0))
+    value, x = hjb.march(problem, grid, 1.0, scheme=hjb.Upwind(split=True)).value[0], np.asarray(grid.axis(0))
     assert np.all(value[x > 0.26] > 0)
     assert np.all(value[(x > -1.4) & (x < 0.24)] <= 0)
     assert np.all(value[x < -1.6] > 0)
-    stationary = hjb.solve(problem, grid, tol=1e-8).value
+    stationary = hjb.solve(problem, grid, tol=1e-8, scheme=hjb.Upwind()).value
     assert np.all(stationary[x > 0.26] > 0)
     assert np.all(stationary[x < 0.24] <= 0.02)
 
@@ -142,7 +153,7 @@ def air3d_grid(shape):
 @pytest.mark.slow
 def test_air3d_never_leaves_the_range_of_the_distance():
     grid = air3d_grid((27, 21, 24))
-    solution = hjb.march(AIR3D, grid, 1.0, times=[0.0, 1.0])
+    solution = hjb.march(AIR3D, grid, 1.0, times=[0.0, 1.0], scheme=hjb.Upwind(split=True))
     assert solution.value[0].min() >= solution.value[1].min()
     assert solution.value[0].max() <= 5.0
     assert solution.value.shape == (2, 27, 21, 24)
@@ -153,7 +164,7 @@ def test_air3d_has_the_published_fraction():
     """hj_reachability 0.7.0 "very_high" finds .25941 of the nodes unsafe."""
     value = hjb.march(AIR3D, air3d_grid((51, 40, 50)), 2.8, scheme=hjb.Weno5()).value[0]
     assert np.mean(value >= 0) == pytest.approx(0.2594, abs=0.0005)
-    plain = hjb.march(AIR3D, air3d_grid((51, 40, 50)), 2.8, times=[0.0, 2.8]).value
+    plain = hjb.march(AIR3D, air3d_grid((51, 40, 50)), 2.8, times=[0.0, 2.8], scheme=hjb.Upwind(split=True)).value
     assert plain[0].min() >= plain[1].min()
     assert plain[0].max() <= plain[1].max()
 

@@ -33,24 +33,26 @@ def looking():
 @pytest.mark.filterwarnings("ignore:.*cannot reach the target")
 @pytest.mark.parametrize("problem", [PLAIN, TO_TARGET, LOST], ids=["plain", "target", "lost"])
 def test_solve(problem):
-    solution = hjb.solve(problem, GRID)
+    solution = hjb.solve(problem, GRID, scheme=hjb.Upwind())
     assert solution.status is hjb.Status.CONVERGED
     assert not np.any(np.isnan(solution.residuals))
 
 
 def test_value_iteration_of_a_tube():
     tube = hjb.reach(drift, U, lambda x: jnp.abs(x[0]) - 0.3)
-    assert hjb.solve(tube, GRID).status is hjb.Status.CONVERGED
+    assert hjb.solve(tube, GRID, scheme=hjb.Upwind()).status is hjb.Status.CONVERGED
 
 
 def test_solve_batch():
     problems = [hjb.Problem(drift, cost, U, discount=discount) for discount in (1.0, 2.0)]
-    assert all(solution.status is hjb.Status.CONVERGED for solution in hjb.solve_batch(problems, GRID))
+    assert all(
+        solution.status is hjb.Status.CONVERGED for solution in hjb.solve_batch(problems, GRID, scheme=hjb.Upwind())
+    )
 
 
 @pytest.mark.parametrize("method", [hjb.Explicit(), hjb.Implicit()])
 def test_march(method):
-    solution = hjb.march(TO_TARGET, GRID, 0.5, method=method)
+    solution = hjb.march(TO_TARGET, GRID, 0.5, method=method, scheme=hjb.Upwind(split=True))
     assert np.all(np.isnan(solution.policy[0, 8:13]))  # on the target there is no control
 
 
@@ -61,4 +63,4 @@ def test_simulate_past_the_target():
 
 def test_a_nan_of_the_users_own_is_found():
     with pytest.raises(ValueError, match="cost.* is NaN or infinite at 10 of 21 nodes"):
-        hjb.solve(hjb.Problem(drift, lambda x, u: jnp.sqrt(x[0]), U, discount=1.0), GRID)
+        hjb.solve(hjb.Problem(drift, lambda x, u: jnp.sqrt(x[0]), U, discount=1.0), GRID, scheme=hjb.Upwind())

@@ -10,7 +10,9 @@ import pytest
 
 import hjbjax as hjb
 from hjbjax.solution.status import Status
-from hjbjax.solvers import epochs, host_loop
+from hjbjax.solvers import march_run, stationary_run
+from hjbjax.solvers.march_run import MarchRun
+from hjbjax.solvers.stationary_run import StationaryRun
 from hjbjax.tracing import checks
 
 U = hjb.Box([-1.0], [1.0])
@@ -63,23 +65,22 @@ def test_what_calls_python_is_known(trouble):
 def test_a_callback_that_raises_in_a_solve(trouble, monkeypatch):
     """The value of the last chunk before it, on the way and at the very start."""
     seen = []
-    first = host_loop._first_chunk
-    monkeypatch.setattr(host_loop, "_first_chunk", lambda *a: first(*a) and 1)
-    look = host_loop._stop_status
+    first, between = StationaryRun.first_chunk, StationaryRun.between
+    monkeypatch.setattr(StationaryRun, "first_chunk", lambda *a: first(*a) and 1)
 
-    def arm(clock, done, *rest):
-        trouble.armed = done >= 2
-        seen.append(done)
-        return look(clock, done, *rest)
+    def arm(run, status, clock):
+        trouble.armed = run.steps >= 2
+        seen.append(run.steps)
+        return between(run, status, clock)
 
-    monkeypatch.setattr(host_loop, "_stop_status", arm)
+    monkeypatch.setattr(StationaryRun, "between", arm)
     # float32: JAX runs callbacks in a thread of its own, which knows nothing of float64 inside a ``with``
     options = {"method": hjb.ValueIteration(), "tol": 1e-5, "dtype": "float32"}
     with pytest.raises(Exception, match="my own trouble") as caught:
         hjb.solve(trouble.problem, GRID, **options)
     kept = broken(caught).value
     trouble.armed = False
-    monkeypatch.setattr(host_loop, "_stop_status", look)
+    monkeypatch.setattr(StationaryRun, "between", between)
     steps = max(done for done in seen)
     known = hjb.solve(trouble.problem, GRID, max_steps=steps, throw=False, **options)
     np.testing.assert_array_equal(kept, known.value)
@@ -92,15 +93,15 @@ def test_a_callback_that_raises_in_a_solve(trouble, monkeypatch):
 
 @pytest.mark.filterwarnings("ignore:the primitive 'pure_callback'")
 def test_a_callback_that_raises_in_a_march(trouble, monkeypatch):
-    chunk = epochs._chunk
+    advance = MarchRun.advance
 
-    def arm(task, front, until, steps, clock):
-        trouble.armed = int(front.steps) > 3
-        return chunk(task, front, until, 2, clock)
+    def arm(run, count):
+        trouble.armed = run.steps > 3
+        return advance(run, 2)
 
-    monkeypatch.setattr(epochs, "_chunk", arm)
+    monkeypatch.setattr(MarchRun, "advance", arm)
     with pytest.raises(Exception, match="my own trouble") as caught:
-        hjb.march(trouble.problem, GRID, 1.0, times=[0.0, 0.5], dtype="float32")
+        hjb.march(trouble.problem, GRID, 1.0, times=[0.0, 0.5], dtype="float32", scheme=hjb.Upwind(split=True))
     solution = broken(caught)
     assert 0 < solution.times[0] < 1
     assert solution.steps > 3
@@ -117,32 +118,32 @@ def plain(discount=1.0):
 
 @pytest.mark.parametrize("error", [out_of_memory, lambda *_: np.empty(2**55)], ids=["JAX", "NumPy"])
 def test_memory_that_runs_out(monkeypatch, error):
-    monkeypatch.setattr(host_loop, "run", error)
+    monkeypatch.setattr(stationary_run, "run", error)
     guess = np.arange(9.0)
     with pytest.raises(MemoryError, match=r"memory ran out: .*") as caught:
-        hjb.solve(plain(), GRID, guess=guess)
+        hjb.solve(plain(), GRID, guess=guess, scheme=hjb.Upwind())
     message = str(caught.value)
     for word in ("estimated at", "GB are free now", "float32", "hjb.pontryagin", "compiling for 9 nodes"):
         assert word in message
     assert len(message.splitlines()) <= 6
     np.testing.assert_array_equal(caught.value.solution.value, guess)
     assert caught.value.solution.message
-    monkeypatch.setattr(epochs, "_run", error)
+    monkeypatch.setattr(march_run, "_run", error)
     with pytest.raises(MemoryError, match="memory ran out") as caught:
-        hjb.march(plain(), GRID, 1.0, start=guess)
+        hjb.march(plain(), GRID, 1.0, start=guess, scheme=hjb.Upwind(split=True))
     np.testing.assert_array_equal(caught.value.solution.value[-1], guess)
 
 
 def test_memory_that_runs_out_on_a_coarser_grid(monkeypatch):
-    run, calls = host_loop.run, []
+    run, calls = stationary_run.run, []
 
     def later(task, state, until):
         calls.append(task.grid.shape)
         return out_of_memory() if len(set(calls)) == 2 else run(task, state, until)
 
-    monkeypatch.setattr(host_loop, "run", later)
+    monkeypatch.setattr(stationary_run, "run", later)
     with pytest.raises(MemoryError) as caught:
-        hjb.solve(plain(), hjb.Grid([-1.0], [1.0], (33,)), method=hjb.Nested(coarsest=5))
+        hjb.solve(plain(), hjb.Grid([-1.0], [1.0], (33,)), method=hjb.Nested(coarsest=5), scheme=hjb.Upwind())
     value = caught.value.solution.value
     assert value.shape == (33,)
     assert np.any(value != 0)  # what the coarsest grid found
@@ -153,12 +154,12 @@ def test_memory_that_runs_out_in_a_batch(monkeypatch):
 
     monkeypatch.setattr(batch, "_run", out_of_memory)
     with pytest.raises(MemoryError, match="memory ran out"):
-        hjb.solve_batch([plain(), plain(2.0)], GRID)
+        hjb.solve_batch([plain(), plain(2.0)], GRID, scheme=hjb.Upwind())
 
 
 def test_refusals_are_no_faults():
     with pytest.raises(ValueError, match="drift") as caught:
-        hjb.solve(hjb.Problem(lambda x, u: jnp.zeros(3), cost, U, discount=1.0), GRID)
+        hjb.solve(hjb.Problem(lambda x, u: jnp.zeros(3), cost, U, discount=1.0), GRID, scheme=hjb.Upwind())
     assert not hasattr(caught.value, "solution")
 
 

@@ -15,12 +15,15 @@ import pytest
 
 import hjbjax as hjb
 from hjbjax.applications import convergence, hinf, perturbations
-from hjbjax.extremals import boundary_value, continuation, equilibria
+from hjbjax.extremals import collocation, continuation, equilibria
 from hjbjax.feedback import simulation
 from hjbjax.finiteness import node_checks
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
-from hjbjax.solvers import batch, epochs, host_loop
+from hjbjax.solvers import batch, host_loop, march_run, stationary_run
+from hjbjax.solvers.batch import LanesRun
+from hjbjax.solvers.march_run import MarchRun
+from hjbjax.solvers.stationary_run import StationaryRun
 
 U = hjb.Box([-1.0], [1.0])
 GRID = hjb.Grid([-1.0], [1.0], (25,))
@@ -100,7 +103,7 @@ def calls(monkeypatch):
 
     The first call on a grid, up to step −1, compiles; the others are chunks.
     """
-    first, run = host_loop._first_chunk, host_loop.run
+    first, run = StationaryRun.first_chunk, stationary_run.run
 
     def calls(act, at):
         made, clocks = [], []
@@ -113,9 +116,9 @@ def calls(monkeypatch):
             return state
 
         monkeypatch.setattr(
-            host_loop, "_first_chunk", lambda task, clock: (clocks.append(clock), first(task, clock))[1]
+            StationaryRun, "first_chunk", lambda run, clock: (clocks.append(clock), first(run, clock))[1]
         )
-        monkeypatch.setattr(host_loop, "run", watched)
+        monkeypatch.setattr(stationary_run, "run", watched)
         return made
 
     return calls
@@ -211,9 +214,9 @@ PHASES = ["survey of the nodes", "preparation of 25 nodes", "jumps of the chain"
 def test_in_a_phase_before_the_steps(upon, monkeypatch, phase, act, status):
     """Nothing runs after the phase in which it ended, and the guess comes back."""
     met, ran = upon(phase, act), []
-    monkeypatch.setattr(host_loop, "run", lambda *_: ran.append(1))
+    monkeypatch.setattr(stationary_run, "run", lambda *_: ran.append(1))
     guess = np.arange(25.0)
-    solution = hjb.solve(to_rest(), GRID, guess=guess, throw=False)
+    solution = hjb.solve(to_rest(), GRID, guess=guess, throw=False, scheme=hjb.Upwind())
     assert (solution.status, solution.steps, ran) == (status, 0, [])
     assert met[0] in solution.message
     assert "guess=" in solution.message
@@ -228,7 +231,7 @@ def test_in_a_phase_before_the_steps(upon, monkeypatch, phase, act, status):
 def test_what_is_raised_brings_what_there_is(upon):
     upon("survey of the nodes", press)
     with pytest.raises(hjb.SolveError, match=r"INTERRUPTED: .*the survey of the nodes, 0 of \d+ actions") as caught:
-        hjb.solve(question(), GRID)
+        hjb.solve(question(), GRID, scheme=hjb.Upwind())
     np.testing.assert_array_equal(caught.value.solution.value, 0.0)
 
 
@@ -237,7 +240,7 @@ def test_what_is_raised_brings_what_there_is(upon):
 def test_before_the_steps_of_a_march(upon, phase, act, status):
     upon(phase, act)
     start = np.ones(GRID.shape)
-    solution = hjb.march(question(discount=0.0), GRID, 0.5, start=start, throw=False)
+    solution = hjb.march(question(discount=0.0), GRID, 0.5, start=start, throw=False, scheme=hjb.Upwind(split=True))
     assert solution.status is status
     np.testing.assert_array_equal(solution.times, [0.5])
     np.testing.assert_array_equal(solution.value[0], start)
@@ -247,7 +250,7 @@ def test_before_the_steps_of_a_march(upon, phase, act, status):
 
 def test_a_march_that_did_not_begin_knows_no_value(upon):
     upon("survey of the nodes", press)
-    solution = hjb.march(question(discount=0.0), GRID, 0.5, throw=False)
+    solution = hjb.march(question(discount=0.0), GRID, 0.5, throw=False, scheme=hjb.Upwind(split=True))
     assert np.all(np.isnan(solution.value))
     assert "did not leave t = 0.5" in solution.message
 
@@ -263,7 +266,7 @@ def test_a_survey_of_many_actions_is_cut_between_two_of_them(monkeypatch):
         enter(self, phase)
 
     monkeypatch.setattr(Clock, "enter", entered)
-    solution = hjb.solve(question(), GRID, throw=False)
+    solution = hjb.solve(question(), GRID, throw=False, scheme=hjb.Upwind())
     assert solution.status is TIME_LIMIT
     assert phases == [f"the survey of the nodes, {first} of 9 actions" for first in (0, 4, 8)]
     assert "4 of 9 actions" in solution.message
@@ -275,7 +278,7 @@ def test_some_actions_at_a_time_refuse_what_all_at_once_refuse(monkeypatch):
     bad = hjb.Problem(drift, lambda x, u: 1 / (u[0] - 1), hjb.Finite(points), discount=1.0)
     monkeypatch.setattr(node_checks, "LOOK", 4 * GRID.size)
     with pytest.raises(ValueError, match=r"cost\(x, u\) is NaN or infinite at 25 of 25.* with u = \[1\]"):
-        hjb.solve(bad, GRID)
+        hjb.solve(bad, GRID, scheme=hjb.Upwind())
 
 
 # --- during the steps ---
@@ -287,11 +290,11 @@ def test_on_a_coarser_grid_its_answer_comes_back_on_the_finest(calls, act, statu
     fine, coarse = hjb.Grid([-1.0], [1.0], (49,)), GRID
     made = calls(act, at=1)
     method = hjb.Nested(hjb.PolicyIteration(), coarsest=25)
-    solution = hjb.solve(question(), fine, method=method, throw=False)
+    solution = hjb.solve(question(), fine, method=method, throw=False, scheme=hjb.Upwind())
     assert solution.status is status
     assert {shape for shape, _ in made} == {coarse.shape}
     assert "on 25 nodes" in solution.message
-    once = hjb.solve(question(), coarse, max_steps=made[-1][1], throw=False)
+    once = hjb.solve(question(), coarse, max_steps=made[-1][1], throw=False, scheme=hjb.Upwind())
     np.testing.assert_allclose(solution.value[::2], once.value, rtol=1e-12)
     np.testing.assert_allclose(solution.value[1::2], (once.value[:-1] + once.value[1:]) / 2, rtol=1e-12)
 
@@ -300,7 +303,7 @@ def test_on_a_coarser_grid_its_answer_comes_back_on_the_finest(calls, act, statu
 def test_on_the_way_to_a_guess_nothing_follows(calls, act, status):
     """An undiscounted solve starts from those of three discounts: not the next one, and no look at the last value."""
     made = calls(act, at=1)
-    solution = hjb.solve(to_rest(), GRID, throw=False)
+    solution = hjb.solve(to_rest(), GRID, throw=False, scheme=hjb.Upwind())
     assert solution.status is status
     assert len(made) == 2  # one compilation, one chunk
     assert "on the way to a guess" in solution.message
@@ -314,7 +317,7 @@ def test_during_the_compilation_of_the_steps(calls, act, status):
     both = hjb.Box([-0.5], [0.5])
     game = hjb.Problem(push, effort, U, disturbances=both, discount=1.0, target=disc, exit_cost=3.0)
     made = calls(act, at=0)
-    solution = hjb.solve(game, GRID, throw=False)
+    solution = hjb.solve(game, GRID, throw=False, scheme=hjb.Upwind())
     assert (solution.status, made) == (status, [((25,), -1)])
     assert solution.value[12] == 3.0  # what is given is put in
     assert solution.isaacs_gap is None
@@ -324,18 +327,18 @@ def test_during_the_compilation_of_the_steps(calls, act, status):
 
 def test_a_step_that_would_come_too_late_is_not_begun(calls, monkeypatch):
     """By the pace of the look at the guess, which on many nodes is a chunk of its own."""
-    monkeypatch.setattr(host_loop, "MANY_NODES", 10)
+    monkeypatch.setattr(stationary_run, "MANY_NODES", 10)
 
     def slow(clock):
         clock.per_node, clock.seconds = 1.0, clock.elapsed() + 20.0  # 25 nodes take 25 seconds
 
     made = calls(None, at=NEVER)
-    whole = hjb.solve(question(), GRID)
+    whole = hjb.solve(question(), GRID, scheme=hjb.Upwind())
     assert [until for _, until in made][:2] == [-1, 0]
     count = Clock.count
     monkeypatch.setattr(Clock, "count", lambda clock, *rest: (count(clock, *rest), slow(clock)))
     made = calls(None, at=NEVER)
-    solution = hjb.solve(question(), GRID, throw=False)
+    solution = hjb.solve(question(), GRID, throw=False, scheme=hjb.Upwind())
     assert solution.status is TIME_LIMIT
     assert [until for _, until in made] == [-1, 0]
     assert solution.steps == 0
@@ -347,10 +350,10 @@ def test_a_step_that_would_come_too_late_is_not_begun(calls, monkeypatch):
 def test_ctrl_c_after_the_last_look_is_not_lost(calls):
     """The answer is whole, and the status says that somebody wanted an end."""
     made = calls(None, at=NEVER)
-    whole = hjb.solve(question(), GRID)
+    whole = hjb.solve(question(), GRID, scheme=hjb.Upwind())
     calls(press, at=len(made) - 1)  # in the last chunk
     with pytest.raises(hjb.SolveError, match=r"INTERRUPTED: It was interrupted after it had come to its end") as caught:
-        hjb.solve(question(), GRID)
+        hjb.solve(question(), GRID, scheme=hjb.Upwind())
     np.testing.assert_array_equal(caught.value.solution.value, whole.value)
     assert caught.value.solution.error <= 1e-3
 
@@ -358,7 +361,7 @@ def test_ctrl_c_after_the_last_look_is_not_lost(calls):
 @pytest.mark.parametrize(("act", "status"), WAYS)
 def test_before_the_second_order_steps_the_first_order_answer_stands(calls, act, status):
     made = calls(None, at=NEVER)
-    upwind = hjb.solve(question(), GRID)
+    upwind = hjb.solve(question(), GRID, scheme=hjb.Upwind())
     calls(act, at=len(made) - 1)
     solution = hjb.solve(question(), GRID, scheme=hjb.Limited(), throw=False)
     assert solution.status is status
@@ -374,18 +377,19 @@ def test_before_the_second_order_steps_the_first_order_answer_stands(calls, act,
 @pytest.mark.parametrize(("act", "status"), WAYS)
 def test_a_march_between_two_kept_times(monkeypatch, act, status):
     """The times that it came to keep their feedback; where it was cut nothing is compiled for one."""
-    chunk, seen = epochs._chunk, []
+    advance, first, seen, clocks = MarchRun.advance, MarchRun.first_chunk, [], []
 
-    def watched(task, front, until, count, clock):
-        seen.append(float(until))
-        if float(until) < 0.5:
-            act(clock)
-        return chunk(task, front, until, count, clock)
+    def watched(run, count):
+        seen.append(float(run.until))
+        if seen[-1] < 0.5:
+            act(*clocks)
+        return advance(run, count)
 
-    monkeypatch.setattr(epochs, "CHUNK_SECONDS", 0.0)
-    monkeypatch.setattr(epochs, "_chunk", watched)
+    monkeypatch.setattr(host_loop, "CHUNK_SECONDS", 0.0)
+    monkeypatch.setattr(MarchRun, "first_chunk", lambda run, clock: (clocks.append(clock), first(run, clock))[1])
+    monkeypatch.setattr(MarchRun, "advance", watched)
     times = [0.0, 0.5]
-    solution = hjb.march(question(discount=0.0), GRID, 0.6, times=times, throw=False)
+    solution = hjb.march(question(discount=0.0), GRID, 0.6, times=times, throw=False, scheme=hjb.Upwind(split=True))
     assert solution.status is status
     assert solution.times[-1] == 0.5
     assert 0 < solution.times[0] < 0.5
@@ -394,14 +398,15 @@ def test_a_march_between_two_kept_times(monkeypatch, act, status):
 
 
 def test_a_march_that_has_arrived_is_not_out_of_time(monkeypatch):
-    chunk = epochs._chunk
+    between, advance = MarchRun.between, MarchRun.advance
 
-    def watched(task, front, until, count, clock):
-        clock.seconds = 0.0
-        return chunk(task, front, until, 10**6, clock)
+    def late(run, status, clock):
+        clock.seconds = 0.0 if run.steps else np.inf
+        return between(run, status, clock)
 
-    monkeypatch.setattr(epochs, "_chunk", watched)
-    solution = hjb.march(question(discount=0.0), GRID, 0.6)
+    monkeypatch.setattr(MarchRun, "advance", lambda run, count: advance(run, 10**6))
+    monkeypatch.setattr(MarchRun, "between", late)
+    solution = hjb.march(question(discount=0.0), GRID, 0.6, scheme=hjb.Upwind(split=True))
     assert solution.status is hjb.Status.CONVERGED
     assert np.all(np.isfinite(solution.policy))
 
@@ -433,7 +438,7 @@ def rounds(monkeypatch):
     run = batch._run
 
     def rounds(act, at):
-        made, clocks, finish = [], [], batch._finish_lanes
+        made, clocks, first = [], [], LanesRun.first_chunk
 
         def watched(tasks, states, until):
             made.append(np.asarray(until))
@@ -442,11 +447,11 @@ def rounds(monkeypatch):
                 act(clocks[-1])
             return states
 
-        def begun(tasks, states, count, clock):
+        def begun(run, clock):
             clocks.append(clock)
-            return finish(tasks, states, count, clock)
+            return first(run, clock)
 
-        monkeypatch.setattr(batch, "_finish_lanes", begun)
+        monkeypatch.setattr(LanesRun, "first_chunk", begun)
         monkeypatch.setattr(batch, "_run", watched)
         return made
 
@@ -455,12 +460,14 @@ def rounds(monkeypatch):
 
 @pytest.mark.parametrize(("act", "status"), WAYS)
 def test_a_batch_keeps_its_finished_lanes(rounds, act, status):
-    whole = hjb.solve_batch(lanes(4), GRID, method=hjb.ValueIteration(), max_steps=200, throw=False)
+    whole = hjb.solve_batch(
+        lanes(4), GRID, method=hjb.ValueIteration(), max_steps=200, throw=False, scheme=hjb.Upwind()
+    )
     assert whole[0].status is hjb.Status.CONVERGED
     at = 2 + whole[0].steps // batch.CHUNK  # the first lane is done by then
     rounds(act, at)
-    with pytest.raises(hjb.SolveError, match=rf"lane \d: {status.name}: .*the steps of lanes 0 to 3") as caught:
-        hjb.solve_batch(lanes(4), GRID, method=hjb.ValueIteration(), max_steps=200)
+    with pytest.raises(hjb.SolveError, match=rf"lane \d: {status.name}: .*step \d+ on lanes 0 to 3") as caught:
+        hjb.solve_batch(lanes(4), GRID, method=hjb.ValueIteration(), max_steps=200, scheme=hjb.Upwind())
     solutions = caught.value.solutions
     assert solutions[0].status is hjb.Status.CONVERGED
     np.testing.assert_array_equal(solutions[0].value, whole[0].value)
@@ -469,7 +476,9 @@ def test_a_batch_keeps_its_finished_lanes(rounds, act, status):
         if found.status is status:
             assert 0 < found.steps < 200
             assert len(found.residuals) == found.steps + 1
-            part = hjb.solve(alone, GRID, method=hjb.ValueIteration(), max_steps=found.steps, throw=False)
+            part = hjb.solve(
+                alone, GRID, method=hjb.ValueIteration(), max_steps=found.steps, throw=False, scheme=hjb.Upwind()
+            )
             np.testing.assert_allclose(found.value, part.value, rtol=1e-12)
             np.testing.assert_allclose(found.bounds, part.bounds, rtol=1e-9)
 
@@ -480,7 +489,7 @@ def test_lanes_of_a_batch_that_did_not_begin(upon, monkeypatch, act, status):
     first, later = lanes(4), [question(target=disc, exit_cost=1.0)] * 2
     upon("jumps of the chain", act)
     mixed = [first[0], later[0], *first[1:], later[1]]
-    found = hjb.solve_batch(mixed, GRID, method=hjb.ValueIteration(), tol=1e3, throw=False)
+    found = hjb.solve_batch(mixed, GRID, method=hjb.ValueIteration(), tol=1e3, throw=False, scheme=hjb.Upwind())
     assert [k for k, solution in enumerate(found) if solution.status is status] == [1, 5]
     assert all(found[k].status is hjb.Status.CONVERGED for k in (0, 2, 3, 4))
     assert "jumps of the chain" in found[1].message
@@ -490,10 +499,10 @@ def test_lanes_of_a_batch_that_did_not_begin(upon, monkeypatch, act, status):
 
 def test_ctrl_c_after_the_last_look_of_a_batch_is_not_lost(rounds):
     made = rounds(press, NEVER)
-    whole = hjb.solve_batch(lanes(4), GRID, method=hjb.ValueIteration(), tol=1e3)
+    whole = hjb.solve_batch(lanes(4), GRID, method=hjb.ValueIteration(), tol=1e3, scheme=hjb.Upwind())
     rounds(press, len(made) - 1)
     with pytest.raises(hjb.SolveError, match=r"lane 3: INTERRUPTED: It was interrupted after") as caught:
-        hjb.solve_batch(lanes(4), GRID, method=hjb.ValueIteration(), tol=1e3)
+        hjb.solve_batch(lanes(4), GRID, method=hjb.ValueIteration(), tol=1e3, scheme=hjb.Upwind())
     for found, alone in zip(caught.value.solutions, whole, strict=True):
         np.testing.assert_array_equal(found.value, alone.value)
 
@@ -501,7 +510,7 @@ def test_ctrl_c_after_the_last_look_of_a_batch_is_not_lost(rounds):
 @pytest.mark.parametrize("limit", [0, -1.0, np.nan, "soon"])
 def test_a_time_limit_of_a_batch_that_is_none(limit):
     with pytest.raises((ValueError, TypeError), match="time_limit"):
-        hjb.solve_batch(lanes(1), GRID, time_limit=limit)
+        hjb.solve_batch(lanes(1), GRID, time_limit=limit, scheme=hjb.Upwind())
 
 
 # --- searches and studies of many solves ---
@@ -544,9 +553,10 @@ def test_an_interrupted_search_for_a_level_keeps_its_bracket_and_its_trials():
     assert "interrupted" in str(level)
 
 
-def test_ctrl_c_after_the_last_trial_is_not_lost(monkeypatch):
-    bisect = hinf._bisect
-    monkeypatch.setattr(hinf, "_bisect", lambda *a: (bisect(*a), signal.raise_signal(signal.SIGINT)))
+@pytest.mark.parametrize("last", ["_bisect", "comes_back"])
+def test_ctrl_c_after_the_last_trial_is_not_lost(monkeypatch, last):
+    usual = getattr(hinf, last)
+    monkeypatch.setattr(hinf, last, lambda *a: (usual(*a), signal.raise_signal(signal.SIGINT))[0])
     with pytest.raises(hjb.SolveError, match="hinf_level: interrupted after it had come to its end") as caught:
         level_of(attenuated)
     level = caught.value.solution
@@ -619,7 +629,7 @@ DOUBLE = hjb.Problem(lambda x, u: jnp.stack([x[1], u[0]]), lambda x, u: 1.0, U)
 @pytest.fixture
 def slopes(monkeypatch):
     """``slopes(number)``: Ctrl-C before the Jacobian of that number, one or two a Newton step; how many were made."""
-    inner = boundary_value._slopes
+    inner = collocation._slopes
 
     def slopes(number):
         made = []
@@ -630,7 +640,7 @@ def slopes(monkeypatch):
                 signal.raise_signal(signal.SIGINT)
             return inner(*arguments)
 
-        monkeypatch.setattr(boundary_value, "_slopes", counted)
+        monkeypatch.setattr(collocation, "_slopes", counted)
         return made
 
     return slopes
@@ -745,7 +755,90 @@ def test_ctrl_c_after_the_last_chunk_of_a_simulation_is_not_lost(monkeypatch):
 
 
 def test_an_extremal_whose_guess_is_being_simulated(monkeypatch):
-    solution = hjb.solve(to_rest(), GRID)
+    solution = hjb.solve(to_rest(), GRID, scheme=hjb.Upwind())
     pressing(monkeypatch, 1)
     with pytest.raises(hjb.SolveError, match="pontryagin: INTERRUPTED: on the way to a first guess"):
         hjb.pontryagin(to_rest(), [0.8], guess=solution)
+
+
+# --- interrupts at the worst of moments ---
+
+
+def keeping(monkeypatch, act, at):
+    """Act at the end of that call of ``Slices.keep``."""
+    keep, calls = march_run.Slices.keep, []
+
+    def kept(self, *rest, **options):
+        keep(self, *rest, **options)
+        calls.append(1)
+        if len(calls) == at:
+            act()
+
+    monkeypatch.setattr(march_run.Slices, "keep", kept)
+
+
+def by_hand():
+    raise KeyboardInterrupt  # what a handler of the user's own does
+
+
+@pytest.mark.parametrize("act", [lambda: signal.raise_signal(signal.SIGINT), by_hand], ids=["noted", "raised"])
+@pytest.mark.parametrize("at", [1, 2])
+def test_a_march_cut_just_after_a_kept_time_keeps_it_once(monkeypatch, act, at):
+    keeping(monkeypatch, act, at)
+    times = [0.0, 0.3, 0.6]
+    solution = hjb.march(question(discount=0.0), GRID, 0.6, times=times, throw=False)
+    assert solution.status is INTERRUPTED
+    np.testing.assert_array_equal(solution.times, times[-at:])
+    whole = hjb.march(question(discount=0.0), GRID, 0.6, times=times)
+    np.testing.assert_array_equal(solution.value, whole.value[-at:])
+    assert np.isfinite(solution.value_at(0.6, [0.5]))
+
+
+@pytest.mark.parametrize("where", ["cut", "device_get"])
+def test_an_interrupt_while_a_slice_is_filled_leaves_no_half_of_it(monkeypatch, where):
+    owner = march_run.edges if where == "cut" else march_run.jax
+    function, calls = getattr(owner, where), []
+
+    def interrupted(*rest, **options):
+        calls.append(1)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return function(*rest, **options)
+
+    monkeypatch.setattr(owner, where, interrupted)
+    solution = hjb.march(question(discount=0.0), GRID, 0.6, times=[0.0, 0.3, 0.6], throw=False)
+    monkeypatch.undo()
+    whole = hjb.march(question(discount=0.0), GRID, 0.6, times=[0.0, 0.3, 0.6])
+    assert solution.times[-1] == 0.6
+    assert np.all(np.diff(solution.times) > 0)
+    np.testing.assert_array_equal(solution.value[-1], whole.value[-1])
+    if solution.times.size > 1:
+        assert solution.times[0] == 0.3  # where it was, with its value
+        np.testing.assert_array_equal(solution.value[0], whole.value[1])
+
+
+def test_times_that_are_one_number_in_single_precision():
+    with pytest.raises(ValueError, match=r"march: two of the times .* are the same number in float32"):
+        hjb.march(question(discount=0.0), GRID, 1.0, times=[0.0, 0.5, 0.5 + 1e-9], dtype="float32")
+
+
+def test_an_interrupt_while_lanes_are_taken_out_keeps_them_all(monkeypatch):
+    problems = [question(discount=beta) for beta in (0.02, 3.0, 0.5, 20.0, 1.0)]
+    options = {"method": hjb.PolicyIteration(hjb.Sweeps(1)), "tol": 1e-9, "throw": False}
+    whole = hjb.solve_batch(problems, GRID, scheme=hjb.Upwind(), **options)
+    take, calls = batch._take, []
+
+    def interrupted(*rest):
+        calls.append(1)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return take(*rest)
+
+    monkeypatch.setattr(batch.LanesRun, "longest", 1)
+    monkeypatch.setattr(batch, "_take", interrupted)
+    found = hjb.solve_batch(problems, GRID, scheme=hjb.Upwind(), **options)
+    assert {solution.status for solution in found} == {hjb.Status.CONVERGED, INTERRUPTED}
+    for solution, known in zip(found, whole, strict=True):
+        assert len(solution.residuals) == solution.steps + 1
+        if solution.status is hjb.Status.CONVERGED:
+            np.testing.assert_array_equal(solution.value, known.value)

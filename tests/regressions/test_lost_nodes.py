@@ -32,7 +32,7 @@ def drifting(cost, rate):
 @pytest.mark.filterwarnings("ignore:.*cannot reach")
 @pytest.mark.parametrize(("cost", "rate"), [(1.0, 1.0), (1e7, 1.0), (1e9, 1.0), (1e9, 1e6), (1e-9, 1e-6)])
 def test_no_action_steps_into_what_is_lost(cost, rate):
-    solution = hjb.solve(drifting(cost, rate), GRID, tol=1e-6 * cost)
+    solution = hjb.solve(drifting(cost, rate), GRID, tol=1e-6 * cost, scheme=hjb.Upwind())
     x = GRID.axis(0)
     assert np.allclose(solution.value[x <= 3.0] / cost, 10 * x[x <= 3.0], atol=1e-5)
     assert np.all(np.isinf(solution.value[x > 3.05]))
@@ -42,11 +42,11 @@ def test_no_action_steps_into_what_is_lost(cost, rate):
 
 @pytest.mark.filterwarnings("ignore:.*cannot reach")
 def test_lanes_with_and_without_lost_nodes_and_traced_ones():
-    lanes = hjb.solve_batch([drifting(1.0, 1.0), drifting(1e9, 1.0)], GRID, tol=1e-6 * 1e9)
+    lanes = hjb.solve_batch([drifting(1.0, 1.0), drifting(1e9, 1.0)], GRID, tol=1e-6 * 1e9, scheme=hjb.Upwind())
     assert np.allclose(lanes[1].value[:30] / 1e9, GRID.axis(0)[:30] * 10, atol=1e-5)
     with jax.enable_x64(True):
-        solution = jax.jit(lambda problem: hjb.solve(problem, GRID, tol=1e3))(drifting(1e9, 1.0))
-        slope = jax.grad(lambda c: hjb.solve(drifting(c, 1.0), GRID, tol=1e-6).value[29])(1.0)
+        solution = jax.jit(lambda problem: hjb.solve(problem, GRID, tol=1e3, scheme=hjb.Upwind()))(drifting(1e9, 1.0))
+        slope = jax.grad(lambda c: hjb.solve(drifting(c, 1.0), GRID, tol=1e-6, scheme=hjb.Upwind()).value[29])(1.0)
     assert int(solution.code) == hjb.Status.CONVERGED
     value = np.asarray(solution.value)
     assert np.allclose(value[:30] / 1e9, GRID.axis(0)[:30] * 10, atol=1e-5)
@@ -79,12 +79,12 @@ def narrow_gate(x):
 def test_a_corridor_that_one_action_alone_keeps_to():
     """No sample of the controls is that action; the minimiser knows where the drift changes its sign."""
     grid = hjb.Grid([0.0, -1.0], [2.0, 1.0], (21, 21))
-    solution = hjb.solve(hjb.Problem(corridor, lambda x, u: 1.0, U, target=gate), grid)
+    solution = hjb.solve(hjb.Problem(corridor, lambda x, u: 1.0, U, target=gate), grid, scheme=hjb.Upwind())
     assert np.allclose(solution.value[:, 10], grid.axis(0), atol=1e-3)
     assert np.isinf(solution.value_at([1.0, 0.5]))
     grid = hjb.Grid([0.0, -1.0, -1.0], [2.0, 1.0, 1.0], (11, 5, 5))
     problem = hjb.Problem(narrow, lambda x, u: 1.0, hjb.Box([-1.0, -1.0], [1.0, 1.0]), target=narrow_gate)
-    solution = hjb.solve(problem, grid)
+    solution = hjb.solve(problem, grid, scheme=hjb.Upwind())
     assert np.allclose(solution.value[:, 2, 2], grid.axis(0), atol=1e-3)
 
 
@@ -96,7 +96,7 @@ def around(x, u):
 @pytest.mark.filterwarnings("ignore:.*cannot reach")
 def test_a_drift_that_cancels_reaches_nothing():
     grid = hjb.Grid([0.0], [1.0], (11,))
-    solution = hjb.solve(hjb.Problem(around, lambda x, u: 1.0, U, target=near_zero), grid)
+    solution = hjb.solve(hjb.Problem(around, lambda x, u: 1.0, U, target=near_zero), grid, scheme=hjb.Upwind())
     assert np.isinf(solution.value[-1])
     assert np.allclose(solution.value[:6], grid.axis(0)[:6], atol=1e-3)
 
@@ -113,7 +113,7 @@ def test_a_game_says_from_where_its_target_cannot_be_forced(isaacs):
     problem = hjb.Problem(
         partial(pursued, 1.5), lambda x, u, d: 1.0, U, disturbances=U, target=near_zero, isaacs=isaacs
     )
-    solution = hjb.solve(problem, grid, tol=1e-6)
+    solution = hjb.solve(problem, grid, tol=1e-6, scheme=hjb.Upwind())
     x = grid.axis(0)
     assert solution.status is hjb.Status.CONVERGED
     assert np.allclose(solution.value[x <= 2.05], 2 * x[x <= 2.05], atol=1e-5)
@@ -135,6 +135,6 @@ def test_a_slow_way_beside_a_fast_current(fast):
     problem = hjb.Problem(
         partial(crawling, fast), lambda x, u: 0.59, controls, target=lambda x: jnp.abs(x[0] - 2.0) - 0.1
     )
-    solution = hjb.solve(problem, grid, tol=0.03)
+    solution = hjb.solve(problem, grid, tol=0.03, scheme=hjb.Upwind())
     cells = np.arange(15, 0, -1)
     assert np.allclose(solution.value[:15], cells * 0.59 * 0.2 / (0.0284 * 0.152), atol=0.03)

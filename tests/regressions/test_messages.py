@@ -29,7 +29,7 @@ def between(x, u):
 
 @pytest.mark.parametrize("method", [None, hjb.ValueIteration()])
 def test_a_nan_on_the_way_is_placed(method):
-    solution = hjb.solve(problem(cost=between), GRID, method=method, throw=False)
+    solution = hjb.solve(problem(cost=between), GRID, method=method, throw=False, scheme=hjb.Upwind())
     assert solution.status is Status.NONFINITE
     assert "NaN or infinity appeared at the guess and the last finite value is kept" in solution.message
     assert "at 7 of 21 nodes, first at node (14,), x = [0.4]" in solution.message
@@ -38,7 +38,7 @@ def test_a_nan_on_the_way_is_placed(method):
 
 def test_a_nan_in_a_later_step_is_placed():
     """x² from a guess of 1e200 overflows when the policy is improved."""
-    solution = hjb.solve(problem(), GRID, guess=np.linspace(0, 1e200, 21), throw=False)
+    solution = hjb.solve(problem(), GRID, guess=np.linspace(0, 1e200, 21), throw=False, scheme=hjb.Upwind())
     assert solution.status is Status.NONFINITE
     assert "appeared at the guess" in solution.message or "appeared in step" in solution.message
     assert "first at node (" in solution.message
@@ -46,7 +46,7 @@ def test_a_nan_in_a_later_step_is_placed():
 
 @pytest.mark.parametrize("discount", [1e-300, 5e-324])
 def test_a_discount_that_is_next_to_nothing(discount):
-    solution = hjb.solve(problem(discount=discount), GRID, throw=False)
+    solution = hjb.solve(problem(discount=discount), GRID, throw=False, scheme=hjb.Upwind())
     if solution.status is Status.NONFINITE:
         assert f"discount = {discount:.3g} is so small" in solution.message
         assert "check drift" not in solution.message
@@ -59,7 +59,7 @@ def test_a_discount_that_is_next_to_nothing(discount):
 @pytest.mark.parametrize("given", [problem(), None, 3])
 def test_a_batch_is_a_list(given):
     with pytest.raises(TypeError, match=r"solve_batch: got .*; wanted a list of problems, as in \[problem\]"):
-        hjb.solve_batch(given, GRID)
+        hjb.solve_batch(given, GRID, scheme=hjb.Upwind())
 
 
 def test_no_node_in_the_middle():
@@ -67,7 +67,7 @@ def test_no_node_in_the_middle():
     move = lambda x, u: jnp.stack([x[1], jnp.sin(x[0]) + u[0]])  # noqa: E731
     small = hjb.Grid(far.lo, far.hi, (9, 8), far.periodic)
     with pytest.raises(ValueError, match=r"(?s)no finite solution.*middle of the box.*shape=\(8, 7\) puts one there"):
-        hjb.solve(problem(move, discount=0.0), small)
+        hjb.solve(problem(move, discount=0.0), small, scheme=hjb.Upwind())
 
 
 @pytest.mark.parametrize(
@@ -83,9 +83,9 @@ def test_nodes_that_coincide_when_stretched_or_in_single_precision():
         hjb.Grid([1e6], [1e6 + 1], (100_001,), stretch=[hjb.Sinh(30.0)])
     fine = hjb.Grid([1e6], [1e6 + 1], (101,))
     doors = (
-        lambda: hjb.solve(problem(), fine, dtype="float32"),
-        lambda: hjb.march(problem(), fine, 1.0, dtype="float32"),
-        lambda: hjb.solve_batch([problem()], fine, dtype="float32"),
+        lambda: hjb.solve(problem(), fine, dtype="float32", scheme=hjb.Upwind()),
+        lambda: hjb.march(problem(), fine, 1.0, dtype="float32", scheme=hjb.Upwind(split=True)),
+        lambda: hjb.solve_batch([problem()], fine, dtype="float32", scheme=hjb.Upwind()),
     )
     for door in doors:
         with pytest.raises(ValueError, match="rounding of its coordinates in float32"):

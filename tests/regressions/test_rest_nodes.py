@@ -44,8 +44,8 @@ def by_value_iteration(reward):
 def test_a_rest_node_is_left_where_that_pays(reward):
     """The way out costs 2.47: a reward of 2.5 is worth it and one of 2 is not."""
     exact = by_value_iteration(reward)
-    alone = hjb.solve(paying(reward), LINE, tol=1e-6)
-    together = hjb.solve_batch([paying(10.0), paying(reward)], LINE, tol=1e-6)[1]
+    alone = hjb.solve(paying(reward), LINE, tol=1e-6, scheme=hjb.Upwind())
+    together = hjb.solve_batch([paying(10.0), paying(reward)], LINE, tol=1e-6, scheme=hjb.Upwind())[1]
     for solution in (alone, together):
         assert solution.status is hjb.Status.CONVERGED
         assert np.allclose(solution.value, exact, atol=1e-5)
@@ -55,7 +55,7 @@ def test_a_rest_node_is_left_where_that_pays(reward):
 
 def test_a_traced_solve_that_had_better_leave_says_that_it_failed():
     with jax.enable_x64(True):
-        solve = jax.jit(lambda problem: hjb.solve(problem, LINE, tol=1e-6))
+        solve = jax.jit(lambda problem: hjb.solve(problem, LINE, tol=1e-6, scheme=hjb.Upwind()))
         wrong, right = solve(paying(10.0)), solve(paying(2.0))
     assert int(wrong.code) == hjb.Status.STALLED
     assert np.isinf(wrong.error)
@@ -73,7 +73,7 @@ def earning(x, u):
 
 def test_a_rest_node_is_left_for_a_place_that_earns():
     problem = hjb.Problem(carried, earning, U, target=lambda x: 1.55 - x[0])
-    solution = hjb.solve(problem, hjb.Grid([-1.0], [2.0], (31,)), tol=1e-6)
+    solution = hjb.solve(problem, hjb.Grid([-1.0], [2.0], (31,)), tol=1e-6, scheme=hjb.Upwind())
     gains = [0.1 * k for k in range(1, 11)]  # the squares on the way from 0 to 1, then 5 cells at -2 a cell
     assert np.isclose(solution.value_at([0.0]), sum(0.1 * x**2 for x in [0.0, *gains]) - 10.0, atol=1e-5)
 
@@ -103,9 +103,9 @@ def fast(rate, x, u):
 )
 def test_rest_is_told_by_like_beside_like(cost, rate, dtype):
     """Cost and time in other units scale V and change nothing else."""
-    standard = hjb.solve(hjb.Problem(pushed, partial(quadratic, 1.0), U), PLANE, tol=1e-4)
+    standard = hjb.solve(hjb.Problem(pushed, partial(quadratic, 1.0), U), PLANE, tol=1e-4, scheme=hjb.Upwind())
     problem = hjb.Problem(partial(fast, rate), partial(quadratic, cost * rate), U)
-    solution = hjb.solve(problem, PLANE, tol=(1e-4 if dtype is None else 1e-2) * cost, dtype=dtype)
+    solution = hjb.solve(problem, PLANE, tol=(1e-4 if dtype is None else 1e-2) * cost, dtype=dtype, scheme=hjb.Upwind())
     assert np.max(np.abs(solution.value / cost - standard.value)) <= solution.error / cost + standard.error + 1e-6
     assert np.count_nonzero(solution.value == 0) == 1
 
@@ -116,7 +116,7 @@ def test_correlated_noise_leaves_no_rest(noise):
     cost, push = (lambda x, u: x @ x + u @ u), hjb.Box([-1.0] * 2, [1.0] * 2)
     problem = hjb.Problem(straight, cost, push, noise=np.array(noise))
     with pytest.raises(ValueError, match="no finite solution"):
-        hjb.solve(problem, hjb.Grid([-1.0, -1.0], [1.0, 1.0], (11, 11)))
+        hjb.solve(problem, hjb.Grid([-1.0, -1.0], [1.0, 1.0], (11, 11)), scheme=hjb.Upwind())
 
 
 def damped(x, u):
@@ -125,7 +125,7 @@ def damped(x, u):
 
 def test_noise_that_the_control_switches_off_leaves_rest():
     problem = hjb.Problem(straight, square, U, noise=lambda x, u: jnp.stack([u[0]]) * jnp.ones((1, 1)))
-    solution = hjb.solve(problem, LINE, tol=1e-4)
+    solution = hjb.solve(problem, LINE, tol=1e-4, scheme=hjb.Upwind())
     assert solution.value[20] == 0
     assert np.all(np.delete(solution.value, 20) > 0)
 
@@ -142,7 +142,7 @@ def test_going_back_and_forth_at_no_cost_is_a_rest(exit_cost):
     problem = hjb.Problem(
         straight, valley, hjb.Finite([[-1.0], [1.0]]), target=lambda x: x[0] - 0.05, exit_cost=exit_cost
     )
-    solution = hjb.solve(problem, grid, tol=1e-6)
+    solution = hjb.solve(problem, grid, tol=1e-6, scheme=hjb.Upwind())
     x, value = grid.axis(0), np.full(21, 1e3)
     pay = step * np.maximum(np.abs(x - 1.5) - 0.3, 0)
     value[0], value[12:19] = exit_cost, 0.0
@@ -156,7 +156,7 @@ def test_going_back_and_forth_at_no_cost_is_a_rest(exit_cost):
 def test_nothing_paid_on_the_way_and_a_price_at_the_end():
     """Without a running cost who can stay away from a target that costs something pays nothing."""
     problem = hjb.Problem(straight, None, hjb.Finite([[-1.0], [1.0]]), target=lambda x: x[0] - 0.05, exit_cost=4.0)
-    solution = hjb.solve(problem, hjb.Grid([0.0], [2.0], (21,)), tol=1e-6)
+    solution = hjb.solve(problem, hjb.Grid([0.0], [2.0], (21,)), tol=1e-6, scheme=hjb.Upwind())
     assert solution.value[0] == 4.0
     assert np.allclose(solution.value[1:], 0.0, atol=1e-9)
 
@@ -164,7 +164,7 @@ def test_nothing_paid_on_the_way_and_a_price_at_the_end():
 def test_the_derivative_of_a_failed_solve_is_no_number():
     def value(reward):
         problem = hjb.Problem(straight, square, U, target=ends, exit_cost=-reward)
-        return hjb.solve(problem, LINE, tol=1e-6).value[20]
+        return hjb.solve(problem, LINE, tol=1e-6, scheme=hjb.Upwind()).value[20]
 
     with jax.enable_x64(True):
         assert np.isnan(jax.grad(value)(10.0))
@@ -176,7 +176,7 @@ def test_a_traced_solve_certifies_nothing_where_nothing_is_paid(cost):
 
     def solved(cost):
         drift, toll = (lambda x, u: -1.0 - 0.5 * u * u), partial(lambda c, x, u: c + 0 * x[0], cost)
-        return hjb.solve(hjb.Problem(drift, toll, U, target=lambda x: x[0] + 1.0), LINE)
+        return hjb.solve(hjb.Problem(drift, toll, U, target=lambda x: x[0] + 1.0), LINE, scheme=hjb.Upwind())
 
     with jax.enable_x64(True):
         solution = jax.jit(solved)(cost)
@@ -194,7 +194,7 @@ def test_a_game_that_may_go_on_at_no_cost(exit_cost):
     problem = hjb.Problem(
         lambda x, u, d: u + 0.3 * d, fuel, U, disturbances=U, target=lambda x: x[0] + 1.0, exit_cost=exit_cost
     )
-    solution = hjb.solve(problem, LINE, tol=1e-6)
+    solution = hjb.solve(problem, LINE, tol=1e-6, scheme=hjb.Upwind())
     h, value = 0.1, np.zeros(41)
     held = LINE.axis(0) <= -1.0 + 1e-9
     value[held] = exit_cost

@@ -59,13 +59,13 @@ def traced(make, which):
     """V for radius ½ by transformations: of a number in the problem, of the whole problem, of a batch of numbers."""
 
     def value(radius):
-        return hjb.solve(make(radius), GRID, tol=1e-9).value
+        return hjb.solve(make(radius), GRID, tol=1e-9, scheme=hjb.Upwind()).value
 
     with jax.enable_x64(True):
         if which == "jit":
             return np.asarray(jax.jit(value)(0.5))
         if which == "jit of the problem":
-            found = jax.jit(lambda problem: hjb.solve(problem, GRID, tol=1e-9))(make(0.5))
+            found = jax.jit(lambda problem: hjb.solve(problem, GRID, tol=1e-9, scheme=hjb.Upwind()))(make(0.5))
             assert int(found.code) == hjb.Status.CONVERGED
             return np.asarray(found.value)
         return np.asarray(jax.vmap(value)(jnp.array([0.4, 0.5]))[1])
@@ -74,11 +74,11 @@ def traced(make, which):
 @pytest.mark.parametrize("name", CASES)
 def test_every_path_to_a_tube_starts_from_its_constraint(name):
     make, exact = CASES[name]
-    alone = hjb.solve(make(0.5), GRID, tol=1e-9)
+    alone = hjb.solve(make(0.5), GRID, tol=1e-9, scheme=hjb.Upwind())
     assert alone.status is hjb.Status.CONVERGED
     if exact is not None:
         assert np.allclose(alone.value, exact(0.5), atol=1e-9)
-    together = hjb.solve_batch([make(0.4), make(0.5)], GRID, tol=1e-9)
+    together = hjb.solve_batch([make(0.4), make(0.5)], GRID, tol=1e-9, scheme=hjb.Upwind())
     assert np.allclose(together[1].value, alone.value, atol=1e-12)
     for which in ("jit", "jit of the problem", "vmap"):
         assert np.allclose(traced(make, which), alone.value, atol=1e-12), which
@@ -87,7 +87,7 @@ def test_every_path_to_a_tube_starts_from_its_constraint(name):
 def test_the_derivative_of_a_tube():
     """V = l outside where nothing moves, and l at the middle inside: both fall as the ball grows."""
     with jax.enable_x64(True):
-        slope = jax.jacrev(lambda radius: hjb.solve(reach(radius), GRID, tol=1e-9).value)(0.5)
+        slope = jax.jacrev(lambda radius: hjb.solve(reach(radius), GRID, tol=1e-9, scheme=hjb.Upwind()).value)(0.5)
     assert np.allclose(slope, -1)
 
 
@@ -105,7 +105,7 @@ def test_a_tube_goes_to_its_end_whatever_the_units_and_the_spacing(scale, nodes,
         return scale * (jnp.abs(x[0]) - half / 6)
 
     grid = hjb.Grid([-half], [half], (nodes,))
-    solution = hjb.solve(hjb.reach(free, U, level), grid)
+    solution = hjb.solve(hjb.reach(free, U, level), grid, scheme=hjb.Upwind())
     assert solution.status is hjb.Status.CONVERGED
     assert np.allclose(solution.value, scale * np.min(np.abs(grid.axis(0)) - half / 6), atol=1e-12 * scale)
 
@@ -113,10 +113,10 @@ def test_a_tube_goes_to_its_end_whatever_the_units_and_the_spacing(scale, nodes,
 def test_a_tube_with_noise_and_in_single_precision_is_the_limit_of_marching():
     """Relatives: noise makes V fall for long by little, and float32 knows fewer numbers."""
     problem = hjb.reach(lambda x, u: 0.3 * u + 0.5, U, lambda x: jnp.abs(x[0] - 1.0) - 0.4, disturbances=None)
-    solution = hjb.solve(problem, GRID)
-    far = hjb.march(problem, GRID, 60.0)
+    solution = hjb.solve(problem, GRID, scheme=hjb.Upwind())
+    far = hjb.march(problem, GRID, 60.0, scheme=hjb.Upwind(split=True))
     assert np.allclose(solution.value, far.value[0], atol=1e-6)
-    single = hjb.solve(problem, GRID, dtype="float32")
+    single = hjb.solve(problem, GRID, dtype="float32", scheme=hjb.Upwind())
     assert single.status is hjb.Status.CONVERGED
     assert np.allclose(single.value, solution.value, atol=1e-4)
 
@@ -131,8 +131,8 @@ def test_a_slow_spiral_is_followed_to_its_end():
     problem = hjb.reach(
         winding, hjb.Box([-1.0, -1.0], [1.0, 1.0]), lambda x: jnp.linalg.norm(x - jnp.array([0.5, 0.0])) - 0.2
     )
-    solution = hjb.solve(problem, grid)
-    further = hjb.march(problem, grid, 50.0, start=solution.value)
+    solution = hjb.solve(problem, grid, scheme=hjb.Upwind())
+    further = hjb.march(problem, grid, 50.0, start=solution.value, scheme=hjb.Upwind(split=True))
     assert np.max(np.abs(further.value[0] - solution.value)) <= 1e-9
 
 
@@ -140,4 +140,4 @@ def test_a_slow_spiral_is_followed_to_its_end():
 def test_a_guess_between_the_fixed_points_of_a_tube_is_refused(make):
     """Zero is itself a fixed point, and would stay."""
     with pytest.raises(ValueError, match="leave out guess"):
-        hjb.solve(make(0.5), GRID, guess=np.zeros(GRID.shape))
+        hjb.solve(make(0.5), GRID, guess=np.zeros(GRID.shape), scheme=hjb.Upwind())

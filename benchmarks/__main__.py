@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 NAMES = {
     "accuracy": ("accuracy", "errors, orders and seconds over the zoo's problems with known answers"),
+    "estimates": ("accuracy", "the estimated error of the grid beside the true one, over the same problems"),
     "sweep": ("speed", "node-controls per second of one sweep, against numba and the copy bandwidth"),
     "peers": ("speed", "a certified solve beside QuantEcon, mdpsolver and a hand-written numba solver"),
     "growth": ("speed", "seconds, steps and bytes a node of certified solves on finer and finer grids"),

@@ -62,10 +62,9 @@ axes[1].set_xlabel("position")
 plt.show()
 
 # %% [markdown]
-# The bound printed above is on the distance to the exact solution of the *discrete* problem. The distance to $S$ is
-# another matter: the upwind scheme carries numerical diffusion, which rounds the kink off, and since optimal paths run
-# along the kink, the error converges slowly. Refining the grid shows it, on the inner half of the box, where the edge
-# is not felt:
+# The screen above shows two errors. What the iteration left is bounded; the distance to $S$ is another matter, and is
+# estimated from a coarser grid: the scheme rounds the kink off, and since optimal paths run along the kink, the error
+# converges slowly. Refining the grid shows it, on the inner half of the box, where the edge is not felt:
 
 # %%
 for count in (nodes // 4 + 1, nodes // 2 + 1, nodes):

@@ -1,10 +1,10 @@
-"""Error against seconds: what a second-order scheme is worth, on the pendulum and on the double integrator.
+"""Error against seconds: what schemes of high order are worth, on the pendulum, the double integrator, a smooth value.
 
 The pendulum (gain 1/m) has no exact value; errors are relative ones at the states of ``STATES``, against Limited() on
 a grid twice as fine as the finest measured. What the plain chain would need for an error that it does not reach is
 read off its fitted order and off the fitted growth of its seconds. On the double integrator (minimum time in
 Kružkov's form on [−1, 1]², exact values on {T ≤ ½} and on the edge) hj_reachability's "very_high" marches beside us,
-and seconds are compared at equal mean error.
+and seconds are compared at equal mean error; so it does on the zoo's smooth problem, compared at equal largest error.
 
 Writes ``precision.json`` and ``precision.png``. Our seconds are medians of whole solves that take turns,
 hj_reachability's those of a second march; compiling stands apart.
@@ -27,12 +27,13 @@ from benchmarks.harness.timing import interleaved
 
 COLUMNS = ("problem", "scheme", "shape", "error", "seconds", "compile_seconds", "status")
 PLAIN, LIMITED = hjb.Upwind(central=False), hjb.Limited()
+FIFTH = hjb.Weno5()
 HELD = hjb.Limited(subcell=False)  # where a level set of time, no distance, says which nodes are held
 STATES = ((0.5, 0.0), (np.pi / 4, 0.0), (1.5, -1.0), (2.8, 1.5), (-2.0, -2.0))
-PENDULUM, DOUBLE_INTEGRATOR = (50, 100, 200, 400), (21, 41, 81, 161, 321)
+PENDULUM, DOUBLE_INTEGRATOR, SMOOTH = (50, 100, 200, 400), (21, 41, 81, 161, 321), (21, 41, 81, 161)
 LEVELS = 25  # errors at which seconds are compared
 REPEATS = 15
-TOL = 1e-4
+TOL, SMALL = 1e-4, 1e-12
 
 
 def pendulum(nodes: Sequence[int]) -> list[dict[str, Any]]:
@@ -45,7 +46,7 @@ def pendulum(nodes: Sequence[int]) -> list[dict[str, Any]]:
     fine = hjb.solve(problem, grid(2 * max(nodes)), scheme=LIMITED, tol=TOL)
     known = np.array([fine.value_at(state) for state in STATES])
     rows, asked = [], []
-    for scheme in (PLAIN, LIMITED):
+    for scheme in (PLAIN, LIMITED, FIFTH):
         study = hjb.convergence_study(problem, [grid(count) for count in nodes], fine, scheme=scheme, tol=TOL)
         for row, solution in zip(study.rows, study.solutions, strict=True):
             values = np.array([solution.value_at(state) for state in STATES])
@@ -68,18 +69,38 @@ def double_integrator(nodes: Sequence[int]) -> list[dict[str, Any]]:
         asked += [(grid, scheme) for grid in grids]
     rows = with_seconds(rows, problem, asked)
     affordable = [grid for grid in grids if grid.shape[0] <= 161]
-    theirs = accuracy.marched(problem, affordable, exact, tol=TOL)
-    rows += [{"code": "hj_reachability", "scheme": "hj_reachability very_high"} | row for row in theirs]
+    rows += _theirs(accuracy.marched(problem, affordable, exact, tol=TOL))
     return [row | {"problem": "double integrator", "error": row.get("mean_error")} for row in rows]
 
 
-def with_seconds(rows: list[dict[str, Any]], problem: Any, asked: Sequence[tuple[Any, Any]]) -> list[dict[str, Any]]:
+def smooth(nodes: Sequence[int]) -> list[dict[str, Any]]:
+    """One row a code, scheme and grid; the error is the largest one where the edge is not felt."""
+    problem, exact = hjb.zoo.smooth()[0], hjb.zoo.smooth_exact()
+    grids, rows, asked = [hjb.zoo.smooth(shape=(n, n))[1] for n in nodes], [], []
+    for scheme in (LIMITED, FIFTH):
+        label = {"code": "hjbjax", "scheme": _name(scheme), "tol": SMALL}
+        study = hjb.convergence_study(problem, grids, exact, scheme=scheme, tol=SMALL, region=cases.inner)
+        rows += [label | row for row in study.rows]
+        asked += [(grid, scheme) for grid in grids]
+    rows = with_seconds(rows, problem, asked, SMALL)
+    # settled to a hundredth of the error on the finest of its grids
+    rows += _theirs(accuracy.marched(problem, grids[:3], exact, tol=1e-9, region=cases.inner))
+    return [row | {"problem": "smooth"} for row in rows]
+
+
+def _theirs(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [{"code": "hj_reachability", "scheme": "hj_reachability very_high"} | row for row in rows]
+
+
+def with_seconds(
+    rows: list[dict[str, Any]], problem: Any, asked: Sequence[tuple[Any, Any]], tol: float = TOL
+) -> list[dict[str, Any]]:
     """The rows with the wall time of a whole solve that compiles nothing any more, a grid and a scheme a row.
 
     It is the median of ``REPEATS``, in which all rows take turns.
     """
     calls = {
-        number: functools.partial(hjb.solve, problem, grid, scheme=scheme, tol=TOL)
+        number: functools.partial(hjb.solve, problem, grid, scheme=scheme, tol=tol)
         for number, (grid, scheme) in enumerate(asked)
     }
     _, timings = interleaved(calls, REPEATS)
@@ -87,7 +108,7 @@ def with_seconds(rows: list[dict[str, Any]], problem: Any, asked: Sequence[tuple
 
 
 def _name(scheme: Any) -> str:
-    return "Limited()" if isinstance(scheme, hjb.Limited) else "plain upwind"
+    return "plain upwind" if scheme == PLAIN else f"{type(scheme).__name__}()"
 
 
 def would_need(rows: Sequence[dict[str, Any]], error: float) -> float:
@@ -131,12 +152,13 @@ def verdicts(rows: Sequence[dict[str, Any]]) -> list[str]:
             f"pendulum: Limited() on 100 x 101 is {here[0]['error']:.2%} off; by its fitted order and growth the plain "
             f"scheme would need {factor:.3g} times its time (threshold 50)"
         )
-    ours = of("double integrator", "Limited()")
-    for scheme in ("plain upwind", "hj_reachability very_high"):
-        found = advantage(ours, others) if ours and (others := of("double integrator", scheme)) else None
-        if found:
+    pairs = [("double integrator", "Limited()", other, 1) for other in ("plain upwind", "hj_reachability very_high")]
+    for problem, scheme, other, least in [*pairs, ("smooth", _name(FIFTH), "hj_reachability very_high", 10)]:
+        ours, theirs = of(problem, scheme), of(problem, other)
+        if ours and theirs and (found := advantage(ours, theirs)):
             said.append(
-                f"double integrator: {scheme} takes {found[0]:.3g} to {found[1]:.3g} times our time (threshold 1)"
+                f"{problem}: {other} takes {found[0]:.3g} to {found[1]:.3g} times the time of {scheme} at the same "
+                f"error (threshold {least})"
             )
     return said
 
@@ -149,7 +171,8 @@ def command(quick: bool, out: Path) -> None:
     about = {"benchmark": "precision", "dtype": "float64"}
     rows = attempt(lambda: pendulum(PENDULUM[:2] if quick else PENDULUM), about)
     rows += attempt(lambda: double_integrator(DOUBLE_INTEGRATOR[:2] if quick else DOUBLE_INTEGRATOR), about)
+    rows += attempt(lambda: smooth(SMOOTH[:2] if quick else SMOOTH), about)
     click.echo(table(rows, COLUMNS))
     for sentence in verdicts(rows):
         click.echo(sentence)
-    publish(out, "precision", rows, panel="problem", line="scheme", x=("seconds",), y="error", across=2)
+    publish(out, "precision", rows, panel="problem", line="scheme", x=("seconds",), y="error", across=3)

@@ -9,7 +9,7 @@ import hjbjax as hjb
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import fixed_point
 from hjbjax.problem.pytree import cast
-from hjbjax.solvers import host_loop
+from hjbjax.solvers import stationary_run
 from hjbjax.solvers.setup import assumptions_of, choose, prepare
 
 
@@ -22,7 +22,7 @@ def bytes_of(lowered: Any) -> int:
 
 def of_solve(problem: Any, grid: Any, tol: float, *, method: Any = None, dtype: Any = np.float64) -> dict[str, Any]:
     """Bytes a node of that loop at the finest level of a solve."""
-    method = method or choose(problem, grid, traced=False)
+    method = choose(problem, grid, traced=False, method=method)
     inner = method.inner if isinstance(method, hjb.Nested) else method
     kind = np.dtype(dtype)
     with jax.enable_x64(kind == np.float64):
@@ -34,4 +34,4 @@ def of_solve(problem: Any, grid: Any, tol: float, *, method: Any = None, dtype: 
             return task, fixed_point.begin(task, jax.numpy.zeros(grid.shape, kind))
 
         shapes = jax.eval_shape(begin, on)
-        return {"bytes_per_node": bytes_of(host_loop.run.lower(*shapes, 1)) / grid.size}
+        return {"bytes_per_node": bytes_of(stationary_run.run.lower(*shapes, 1)) / grid.size}

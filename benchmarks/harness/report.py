@@ -20,6 +20,11 @@ RESULTS = Path(__file__).parents[1] / "results"
 PACKAGES = ("jax", "numpy", "scipy", "hj-reachability", "quantecon", "numba", "mdpsolver", "scikit-fmm")
 
 
+def threads() -> int:
+    """The threads that XLA computes with on a processor: one for each core that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def environment() -> dict[str, Any]:
     """The machine, the versions and the date, to stand in every row."""
     import jax

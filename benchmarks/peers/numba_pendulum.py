@@ -1,11 +1,11 @@
-"""The hand-written competitor: what an expert would write in numba for one problem on two cores.
+"""The hand-written competitor: what an expert would write in numba for one problem.
 
 Pendulum θ̈ = g sin θ + u on [−π, π) × [−8, 8] (angle periodic), cost (θ² + ω² + u²)/2, discount beta, K equally
 spaced controls in [−30, 30], first-order Kushner–Dupuis upwinding, projection at |ω| = 8.
 
-    jacobi_sweep(V, W, controls, beta)      one parallel Bellman sweep, float32
-    solve(N, K, beta, tol)                  nested grids and Gauss–Seidel modified policy iteration, float64, one
-                                            thread; stops when max |residual| / beta < tol; V has shape (N, N + 1)
+    jacobi_sweep(V, W, controls, beta, pace)  one Bellman sweep on all threads, float32, given max_u |f|/h + beta
+    solve(N, K, beta, tol)                    nested grids and Gauss–Seidel modified policy iteration, float64, one
+                                              thread; stops when max |residual| / beta < tol; V has shape (N, N + 1)
 
 Needs numba (pip install '.[bench]'). Run: python -m benchmarks.peers.numba_pendulum 200 400 800
 """
@@ -21,7 +21,7 @@ GRAVITY, UMAX, WMAX = 9.81, 30.0, 8.0
 
 
 @nb.njit(parallel=True, fastmath=True)
-def jacobi_sweep(V, W, controls, beta):
+def jacobi_sweep(V, W, controls, beta, pace):
     n0, n1 = V.shape
     h0 = np.float32(2 * np.pi / n0)
     h1 = np.float32(2 * WMAX / (n1 - 1))
@@ -41,13 +41,11 @@ def jacobi_sweep(V, W, controls, beta):
             slope = (V[ip, j] - v) * r0 if x1 > 0 else (v - V[im, j]) * r0
             base = np.float32(0.5) * (x0 * x0 + x1 * x1) + x1 * slope
             best = np.float32(1e30)
-            rate = np.float32(0)
             for k in range(controls.size):
                 u = controls[k]
                 f = s + u
                 best = min(best, np.float32(0.5) * u * u + max(f, np.float32(0)) * dp + min(f, np.float32(0)) * dm)
-                rate = max(rate, abs(f))
-            W[i, j] = v + (best + base - rho * v) / (abs(x1) * r0 + rate * r1 + rho)
+            W[i, j] = v + (best + base - rho * v) / pace[i, j]
 
 
 @nb.njit(fastmath=True)

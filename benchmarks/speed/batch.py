@@ -31,10 +31,12 @@ def measure(nodes: int, lanes: int, repeats: int) -> list[dict[str, Any]]:
     solutions: dict[str, list[hjb.Solution]] = {}
 
     def together():
-        solutions["solve_batch"] = hjb.solve_batch(problems, grid, tol=TOL, throw=False)
+        solutions["solve_batch"] = hjb.solve_batch(problems, grid, tol=TOL, throw=False, scheme=hjb.Upwind())
 
     def apart():
-        solutions["solve"] = [hjb.solve(problem, grid, tol=TOL, throw=False) for problem in problems]
+        solutions["solve"] = [
+            hjb.solve(problem, grid, tol=TOL, throw=False, scheme=hjb.Upwind()) for problem in problems
+        ]
 
     _, timings = interleaved({"solve_batch": together, "solve": apart}, repeats)
     pairs = zip(solutions["solve_batch"], solutions["solve"], strict=True)

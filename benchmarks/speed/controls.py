@@ -36,7 +36,7 @@ def solved(problems: dict[str, tuple[Any, Any]], repeats: int) -> dict[str, tupl
     solutions: dict[str, hjb.Solution] = {}
 
     def call(name):
-        solutions[name] = hjb.solve(*problems[name], tol=TOL, throw=False)
+        solutions[name] = hjb.solve(*problems[name], tol=TOL, throw=False, scheme=hjb.Upwind())
 
     _, timings = interleaved({name: lambda name=name: call(name) for name in problems}, repeats)  # type: ignore[misc]
     return {name: (solutions[name], timings[name].row) for name in problems}

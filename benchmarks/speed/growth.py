@@ -72,7 +72,7 @@ def solve(case: Case, size: int, time_limit: float | None) -> hjb.Solution:
     problem, grid = case.build(size)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", hjb.SolveWarning)  # of nodes that cannot reach the target; see reached
-        return hjb.solve(problem, grid, tol=case.tol, time_limit=time_limit, throw=False)
+        return hjb.solve(problem, grid, tol=case.tol, time_limit=time_limit, throw=False, scheme=hjb.Upwind())
 
 
 def in_turns(case: Case, rows: list[dict[str, Any]], repeats: int, time_limit: float | None) -> list[dict[str, Any]]:

@@ -1,12 +1,13 @@
 """A certified solve beside other people's solvers, on one chain: the pendulum, K torques, discount .1.
 
 The hand-written numba solver (``peers.numba_pendulum``) knows this one problem; QuantEcon and mdpsolver
-(``peers.decision``) get the exported chain, which is built beforehand and whose making is not in their seconds.
-mdpsolver gets that of half as many nodes an axis, and one round, since it takes minutes on the whole one. All stop at
-the same tolerance, so that two values differ by at most twice that, which is checked before anything is called faster.
-Our first call, which compiles, is measured in this process before any other, and twice more after clearing JAX's
-caches. hj_reachability would march such a problem for thousands of steps; ``python -m benchmarks accuracy`` has it
-where it does better.
+(``peers.decision``) get the exported chain, which is built beforehand and whose making is not in their seconds. All
+three run on one thread and ours on all that XLA takes, so that each row has its threads, the processor's seconds, and
+the ratio by those. mdpsolver gets the chain of half as many nodes an axis, and one round, since it takes minutes on the
+whole one. All stop at the same tolerance, so that two values differ by at most twice that, which is checked before
+anything is called faster. Our first call, which compiles, is measured in this process before any other, and twice more
+after clearing JAX's caches; numba's compiling is not in its seconds either. hj_reachability would march such a problem
+for thousands of steps; ``python -m benchmarks accuracy`` has it where it does better.
 """
 
 import time
@@ -21,15 +22,15 @@ import numpy as np
 import hjbjax as hjb
 from benchmarks import cases
 from benchmarks.harness import thresholds
-from benchmarks.harness.report import RESULTS, attempt, publish, table, without
+from benchmarks.harness.report import RESULTS, attempt, publish, table, threads, without
 from benchmarks.harness.timing import interleaved, timed
 from benchmarks.peers import decision
 
 PAIRS = 2_000_000  # of state and action in a chain: beyond that it takes gigabytes
 OURS, NUMBA, MDP = "hjbjax", "numba", "mdpsolver"
 COLUMNS = (
-    "code", "shape", "controls", "seconds", "fastest", "compile_seconds", "first_seconds", "first_cpu_seconds",
-    "ours_is_faster", "difference", "build_seconds", "status",
+    "code", "threads", "shape", "controls", "seconds", "cpu_seconds", "fastest", "compile_seconds", "first_seconds",
+    "first_cpu_seconds", "ours_is_faster", "by_cpu_seconds", "difference", "build_seconds", "status",
 )  # fmt: skip
 ABOUT = {"benchmark": "peers", "problem": "pendulum", "dtype": "float64"}
 
@@ -41,7 +42,7 @@ def our_first(problem: Any, grid: Any, tol: float, times: int) -> dict[str, floa
         if count:
             jax.clear_caches()
         before = time.process_time()
-        seconds.append(timed(lambda: hjb.solve(problem, grid, tol=tol).value)[1])
+        seconds.append(timed(lambda: hjb.solve(problem, grid, tol=tol, scheme=hjb.Upwind()).value)[1])
         busy.append(time.process_time() - before)
     return {"first_seconds": median(seconds), "first_cpu_seconds": median(busy)}
 
@@ -61,7 +62,7 @@ def measure(nodes: int, actions: int, tol: float, repeats: int, *, chain: bool, 
     solutions: list[hjb.Solution] = []
 
     def ours():
-        solutions[:] = [hjb.solve(problem, grid, tol=tol)]
+        solutions[:] = [hjb.solve(problem, grid, tol=tol, scheme=hjb.Upwind())]
         return solutions[0].value
 
     calls, missing, build = {OURS: ours}, [], {}
@@ -89,7 +90,7 @@ def beside_mdpsolver(nodes: int, actions: int, tol: float) -> list[dict[str, Any
         return [_about(grid, actions, tol) | {"code": MDP, "status": "SKIPPED", "reason": reason}]
     make = lambda: decision.mdpsolver(hjb.chain.transition_arrays(problem, grid), tol)  # noqa: E731
     (afresh, solve), took = timed(make)
-    calls = {OURS: lambda: hjb.solve(problem, grid, tol=tol).value, MDP: solve}
+    calls = {OURS: lambda: hjb.solve(problem, grid, tol=tol, scheme=hjb.Upwind()).value, MDP: solve}
     rows = _rows(calls, interleaved(calls, 1, {MDP: afresh}), {MDP: took})
     return [_about(grid, actions, tol) | row for row in rows[1:]]
 
@@ -101,10 +102,11 @@ def _about(grid: hjb.Grid, actions: int, tol: float) -> dict[str, Any]:
 def _rows(calls: Any, measured: Any, build: dict[str, float]) -> list[dict[str, Any]]:
     results, timings = measured
     ours = np.asarray(results[OURS])
-    rows = [{"code": OURS, "status": "DONE"} | timings[OURS].row]
+    rows = [{"code": OURS, "status": "DONE", "threads": threads()} | timings[OURS].row]
     for code in list(calls)[1:]:
         off = float(np.max(np.abs(np.asarray(results[code]).reshape(ours.shape) - ours)))
         row = {"code": code, "status": "DONE", "difference": off, "ours_is_faster": timings[code].over(timings[OURS])}
+        row |= {"threads": 1, "by_cpu_seconds": timings[code].row["cpu_seconds"] / rows[0]["cpu_seconds"]}
         rows.append(row | {"build_seconds": build.get(code)} | timings[code].row)
     return rows
 

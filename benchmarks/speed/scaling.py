@@ -34,11 +34,11 @@ TOL = 1e-3
 def measure(dimension: int, nodes: int, repeats: int) -> list[dict[str, Any]]:
     """One row: a solve that compiles, ``repeats`` that do not, and the check of their value."""
     problem, grid = cases.apart(dimension, nodes)
-    line = hjb.solve(*cases.apart(1, nodes), tol=TOL / dimension).value
+    line = hjb.solve(*cases.apart(1, nodes), tol=TOL / dimension, scheme=hjb.Upwind()).value
     solutions: list[hjb.Solution] = []
 
     def call():
-        solutions[:] = [hjb.solve(problem, grid, tol=TOL, throw=False)]
+        solutions[:] = [hjb.solve(problem, grid, tol=TOL, throw=False, scheme=hjb.Upwind())]
 
     _, timings = interleaved({"hjbjax": call}, repeats)
     (solution,), timing = solutions, timings["hjbjax"]

@@ -30,7 +30,7 @@ if TYPE_CHECKING:  # for annotations alone: what is heavy is imported by the com
 FILES = ("solution.npz", "value.png", "policy.png", "trajectory.png")
 CODES = {"CONVERGED": 0, "DIVERGED": 4, "NONFINITE": 4, "INTERRUPTED": 130}  # any other status: 3, not converged
 METHODS = {"value-iteration": "ValueIteration", "policy-iteration": "PolicyIteration"}
-SCHEMES = {"upwind": "Upwind", "limited": "Limited"}
+SCHEMES = {"upwind": "Upwind", "limited": "Limited", "weno5": "Weno5"}
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "diffrax", "optax", "matplotlib", "tqdm", "click")
 
 
@@ -84,7 +84,9 @@ def list_problems(name: str | None) -> None:
 @click.option("--shape", type=Shape(), help="Nodes along each axis, as in 200x201.")
 @click.option("--set", "settings", multiple=True, metavar="NAME=VALUE", help="A parameter; may be given several times.")
 @click.option("--method", type=Name("method", _names_of(METHODS)), help=f"{' or '.join(METHODS)}; chosen if not given.")
-@click.option("--scheme", type=Name("scheme", _names_of(SCHEMES)), help="The discretisation; upwind if not given.")
+@click.option(
+    "--scheme", type=Name("scheme", _names_of(SCHEMES)), help="The discretisation; second order if not given."
+)
 @click.option("--tol", type=Number(), help="Certified bound on the algebraic error, in cost units.")
 @click.option("--max-steps", type=Number(int), help="Stop after so many steps.")
 @click.option("--time-limit", type=Number(), help="Stop after so many seconds.")

@@ -19,7 +19,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
-import jax
 import numpy as np
 
 from hjbjax import plotting
@@ -28,6 +27,7 @@ from hjbjax.feedback.feedback import greedy_feedback
 from hjbjax.feedback.path import Path as Trajectory
 from hjbjax.feedback.path import joined
 from hjbjax.feedback.simulation import simulate
+from hjbjax.plotting.slices import at_states
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import Ball
 from hjbjax.solution import placement
@@ -248,31 +248,34 @@ def difference(exact: Exact, solution: Solution) -> float | None:
     corner = np.ix_(*index)
     states = grid.nodes()[corner]  # (k₁, …, k_n, n)
     # in chunks, as series and Newton's steps at every node at once would need many times the memory of the value
-    with jax.enable_x64(True):
-        wanted = np.asarray(jax.lax.map(exact, states.reshape(-1, grid.ndim), batch_size=1 << 16))
+    wanted = at_states(exact, states)
     with np.errstate(invalid="ignore"):  # ∞ − ∞ where neither reaches the target
-        off = np.abs(np.asarray(solution.value)[corner] - wanted.reshape(states.shape[:-1]))
+        off = np.abs(np.asarray(solution.value)[corner] - wanted)
     off = off[np.isfinite(off)]  # ∞ − ∞ where both say out of reach
     return float(off.max()) if off.size else None
 
 
 def report(solution: Solution, path: Trajectory | None, files: Sequence[Path], **about: Any) -> dict[str, Any]:
     """The answer as JSON has it: without arrays of nodes, and null for infinity and NaN, which JSON lacks."""
-    names = ("start", "end", "duration", "cost", "status", "message")
+    numbers = ("steps", "residual", "error", "monotone_error", "isaacs_gap", "stats")
+    off = None if solution.grid_error is None else float(np.nanmax(solution.grid_error))
+    trajectory = path and {
+        "start": path.states[0],
+        "end": path.states[-1],
+        "duration": path.times[-1],
+        "cost": path.cost,
+        "promised": path.promised,
+        "status": path.status.name,
+        "message": path.message,
+    }
     answer = {
         **about,
         "shape": solution.grid.shape,
         "status": solution.status.name,
         "message": solution.message or solution.status.message,
-        **{name: getattr(solution, name) for name in ("steps", "residual", "error", "isaacs_gap", "stats")},
-        "trajectory": path
-        and dict(
-            zip(
-                names,
-                (path.states[0], path.states[-1], path.times[-1], path.cost, path.status.name, path.message),
-                strict=True,
-            )
-        ),
+        **{name: getattr(solution, name) for name in numbers},
+        "grid_error": off,
+        "trajectory": trajectory,
         "files": [str(file) for file in files],
         "version": __version__,
     }

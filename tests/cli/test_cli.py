@@ -465,11 +465,11 @@ def test_help_and_version():
 
 
 def test_the_schemes_on_offer_solve_and_others_are_refused():
-    for name in ("eno2", "weno5"):
-        result = run("solve", "bang-bang", "--scheme", name)
-        assert result.exit_code == 2
-        assert "upwind" in result.stderr
-    assert run("solve", "bang-bang", "--scheme", "limited").exit_code == 0
+    result = run("solve", "bang-bang", "--scheme", "eno2")
+    assert result.exit_code == 2
+    assert "upwind" in result.stderr
+    for name in ("limited", "weno5"):
+        assert run("solve", "bang-bang", "--scheme", name, "--out", name).exit_code == 0
 
 
 def test_help_loads_nothing_heavy():

@@ -1,18 +1,20 @@
-"""What annotations of the kernels say of an array, its type and its axes, holds while problems are solved."""
+"""What annotations say of an array, its type and its axes, holds while problems are solved and looked at."""
 
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
-LEAST = 60  # functions whose arrays were looked at: fewer would mean that the hook found nothing
+LEAST = 150  # functions whose arrays were looked at: fewer would mean that the hook found nothing
 
 SCRIPT = """
 import warnings
 warnings.simplefilter("ignore")
 from jaxtyping import install_import_hook
-with install_import_hook(["hjbjax.hamiltonian", "hjbjax.iteration", "hjbjax.discretisation"], "array_checks.check"):
+with install_import_hook("hjbjax", "array_checks.check"):
     import hjbjax as hjb
 import array_checks
 import jax.numpy as jnp
@@ -28,6 +30,7 @@ def near(x):
 
 grid, line, box = hjb.Grid([-2.0, -2.0], [2.0, 2.0], (11, 12)), hjb.Grid([-1.0], [1.0], (11,)), hjb.Box([-1.0], [1.0])
 problem = hjb.Problem(swing, square, box, discount=0.3)
+pendulum = hjb.Problem(swing, lambda x, u: x @ x + u @ u, hjb.Box([-4.0], [4.0]), discount=1.0)
 game = hjb.Problem(lambda x, u, d: u + d, square, box, disturbances=hjb.Box([-0.5], [0.5]), discount=1.0, noise=0.3)
 hjb.solve(problem, grid)
 hjb.solve(problem, grid, scheme=hjb.Limited(), method=hjb.PolicyIteration(hjb.Krylov()))
@@ -37,11 +40,20 @@ hjb.solve(game, line)
 hjb.solve_batch([problem, problem], grid)
 hjb.march(problem, grid, 0.3, scheme=hjb.Weno5())
 hjb.march(game, line, 0.3, method=hjb.Implicit())
+answer = hjb.solve(pendulum, grid)
+hjb.simulate(pendulum, answer, [0.5, 0.0], 1.0)
+hjb.simulate(pendulum, hjb.greedy_feedback(pendulum, answer), [0.5, 0.0], 1.0)
+hjb.pontryagin(pendulum, [0.5, 0.0], horizon=1.0)
+hjb.reach_probability(hjb.Problem(swing, None, box, noise=0.5), grid, near, horizon=0.2)
+hjb.geometry.reachability_distribution(*hjb.geometry.affine_fields(swing, 1), jnp.zeros(2), depth=3)
+hjb.geometry.relative_degree(*hjb.geometry.affine_fields(swing, 1), lambda x: x[0], jnp.zeros(2))
+hjb.stability.brockett_check(*hjb.geometry.affine_fields(swing, 1), jnp.zeros(2))
 print(len(array_checks.SEEN))
 """
 
 
-def test_arrays_are_what_the_annotations_of_the_kernels_say():
+@pytest.mark.slow
+def test_arrays_are_what_the_annotations_say():
     path = os.pathsep.join([str(ROOT), str(ROOT / "tests" / "support"), os.environ.get("PYTHONPATH", "")])
     run = subprocess.run(
         [sys.executable, "-c", SCRIPT], capture_output=True, text=True, env=os.environ | {"PYTHONPATH": path}

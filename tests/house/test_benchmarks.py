@@ -113,7 +113,7 @@ def test_sweep_kernels_compute_what_a_step_of_value_iteration_does():
     iterated = hjb.solve(
         problem, grid, method=hjb.ValueIteration(), guess=np.asarray(sweep.started(grid)),
         dtype="float32", max_steps=3, throw=False,
-    )  # fmt: skip
+    scheme=hjb.Upwind())  # fmt: skip
     for kernel in ("sweep", "loop"):
         np.testing.assert_allclose(calls[kernel](), iterated.value, rtol=0, atol=1e-5)
     np.testing.assert_allclose(sweep.whole_steps(problem, grid, 3)(), iterated.value, rtol=0, atol=1e-5)

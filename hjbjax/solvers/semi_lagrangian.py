@@ -161,8 +161,8 @@ def _check_arcs(on: Discretisation, plan: Plan, links: Arcs, fixed: jax.Array) -
         action = plan.actions[int(np.argmax(broken)) // len(plan.legs)]
         raise ValueError(
             f"solve: on the arcs of the action {np.asarray(action).tolist()} drift, cost, target or exit_cost is NaN "
-            "or infinite between the nodes, where SemiLagrangian() evaluates them; define them in the whole box, or use "
-            "hjb.Upwind()"
+            "or infinite between the nodes, where SemiLagrangian() evaluates them; define them in the whole box, or "
+            "use hjb.Upwind()"
         )
     if free.any():
         action = plan.actions[int(np.argmax(free)) // len(plan.legs)]

@@ -60,6 +60,8 @@ and where the gain of a drift component has kinks; its answers are certified. On
 The exact value is (√5 − 1)/8 = .155: so much diffusion is dear. Such a class must be hashable, for
 compiled programs are remembered by it, and its methods are traced: no branches on numbers.
 
+A scheme that follows paths over many cells, in place of slopes, is of another kind: see ``semi_lagrangian``.
+
 What happens at a wall is not the scheme's to say. The wall stands on the node, whose cell is half a cell. With noise a,
 drift n out of the box (f at an upper end, −f at a lower one) and ∂V/∂n = 0 on the wall, the balance over that cell is
 

@@ -48,11 +48,11 @@ class SemiLagrangian:
 
     From each node arcs of 1, about √``cells`` and ``cells`` cells are tried, each under one action that is held. V_h is
     the fixed point of the least of them, a Markov chain with long jumps, and the certificates are those of ``Upwind``
-    with jumps in place of rates, r the residual in cost units: V + min r/(1 − e^{−βτ}) ≤ V_h ≤ V + max r/(1 − e^{−βτ})
-    under a discount, and V/(1 + max(−r/c)) ≤ V_h ≤ V/(1 − max(r/c)) without, c the running cost of an arc. First order
-    in general, with a far smaller constant than the chain's where V has kinks: on the double integrator's minimum time
-    a seventh of its mean error. A target ends where its l is zero, between the nodes; one of a single node is met by
-    interpolation.
+    with jumps in place of rates: V + min r/(1 − e^{−βτ}) ≤ V_h ≤ V + max r/(1 − e^{−βτ}) under a discount, and
+    V/(1 + max(−r/c)) ≤ V_h ≤ V/(1 − max(r/c)) without, r what an arc is worth less V, on the left of all arcs and on
+    the right of the best one from each node, and c its running cost. First order in general, with a far smaller
+    constant than the chain's where V has kinks: on the double integrator's minimum time a seventh of its mean error. A
+    target ends where its l is zero, between the nodes; one of a single node is met by interpolation.
 
     What is minimised over are these arcs and nothing between them. The actions are those of a ``Finite`` set; of a box
     or a ball for which drift and cost are affine in the control the corners, or about ``actions`` directions on the

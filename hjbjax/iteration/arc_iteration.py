@@ -1,12 +1,12 @@
 """Value and policy iteration on arcs: V ← min(ψ, min over arcs of Q), and relaxations of the arcs that are best.
 
-With Q = pay + keep · I[V] of every arc (see ``arcs``), r = min Q − V is the residual, in cost units, and
+With Q = pay + keep · I[V] of every arc (see ``arcs``), r = min Q − V is the residual, in cost units, κ = ``keep`` and
 
-    residual = min(r, ψ − V);    V + min r/(1 − κ) ≤ V_h ≤ V + max r/(1 − κ),
+    residual = min(r, ψ − V);    V − max (V − Q)⁺/(1 − κ) ≤ V_h ≤ V + max r/(1 − κ),
 
-κ the ``keep`` of the best arc where r > 0 and the largest of all arcs where r < 0. Without a discount, with the running
-cost c > 0 of every arc, V/(1 + η) ≤ V_h ≤ V/(1 − ρ), ρ = max(r/c)⁺ at the best arc, η = max((V − Q)⁺/c) over all.
-Both as in ``certificates``, a jump taking the place of a rate.
+on the left over all arcs of all nodes, on the right of the best arc where r > 0: V + ε is a supersolution if one arc of
+every node has Q + κ ε ≤ V + ε, and V − ε a subsolution if all arcs have Q − κ ε ≥ V − ε. Without a discount, with the
+running cost c > 0 of an arc in place of 1 − κ, likewise V/(1 + η) ≤ V_h ≤ V/(1 − ρ), as in ``certificates``.
 
 A step follows each node's best arc again and again, and then looks at all arcs: modified policy iteration. Value
 iteration follows it once. Since an arc leads several cells on, V is told from the target to the ends of the box in as
@@ -146,8 +146,15 @@ def look(task: ArcTask, value: Field) -> Look:
 
 
 def _unit(arcs: Arcs) -> jax.Array:
-    """What r is divided by in the certificate: 1 − e^{−βτ}, or without a discount the running cost of an arc."""
-    return 1 - arcs.keep if arcs.running is None else arcs.running
+    """What r is divided by in the certificate: 1 − e^{−βτ}, or without a discount the running cost of an arc.
+
+    Of an arc that ends on the target all of Q is paid, with the exit cost, if that is not negative: next to a target
+    the running cost alone may be as small as the rounding of V.
+    """
+    if arcs.running is None:
+        return 1 - arcs.keep
+    ends = (arcs.keep == 0) & jnp.isfinite(arcs.pay)  # infinite: an arc that leads to a lost node
+    return jnp.where(ends, jnp.maximum(arcs.running, arcs.pay), arcs.running)
 
 
 def _advance(task: ArcTask, state: ArcState, start: Scalar) -> ArcState:
@@ -190,9 +197,13 @@ def _bound(task: ArcTask, value: Field, found: Look) -> ErrorBound:
         task.counted,
     )  # fmt: skip
     one = jnp.ones((), value.dtype)
-    return certificates.error_bound(
+    bound = certificates.error_bound(
         task.certificate, iterate, discount=one, least_cost=jnp.broadcast_to(one, value.shape)
     )
+    if task.certificate is not Certificate.ADDITIVE:
+        return bound
+    # that the best arcs all lead upwards says nothing of how far the others do
+    return dataclasses.replace(bound, below=jnp.minimum(bound.below, 0))
 
 
 def _judge(task: ArcTask, value: Field, bound: ErrorBound, since: Scalar) -> Scalar:

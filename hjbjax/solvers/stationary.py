@@ -207,6 +207,7 @@ def _solve_traced(
 
 
 def _at_host_level(scheme: object) -> str:
+    """The refusal of a scheme inside a transformation."""
     return f"solve: {type(scheme).__name__}() runs at host level only; inside jit, vmap and grad use Upwind()"
 
 

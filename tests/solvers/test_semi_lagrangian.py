@@ -179,6 +179,22 @@ def test_certificates_hold_wherever_a_run_is_stopped(discount):
     assert np.max(np.abs(guessed.value - exact)) <= guessed.error + 1e-9 <= 2e-6
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+def test_certificates_hold_where_nothing_is_held(sign):
+    """Without a target every node may have a residual of one sign, and V_h lie on one side of V everywhere."""
+    problem, grid = QUESTIONS["a plane, walls and a long stay"][0]()
+    options = {"scheme": hjb.SemiLagrangian(), "tol": 1e-10, "throw": False}
+    exact = hjb.solve(problem, grid, **options).value
+    rng = np.random.default_rng(5)
+    for size in (0.01, 0.1, 1.0):
+        guess = exact - sign * size * (1 + rng.uniform(size=grid.shape))
+        for steps in (1, 2):
+            method = hjb.PolicyIteration(hjb.Sweeps(1))
+            lower, upper = hjb.solve(problem, grid, guess=guess, max_steps=steps, method=method, **options).bounds
+            assert np.all(lower <= exact + 1e-9)
+            assert np.all(exact <= upper + 1e-9)
+
+
 def test_one_dimension_is_exact():
     """(|x| − r)/(1 − c sgn x): straight arcs, and the boundary between two nodes."""
     problem = hjb.Problem(slide, hold, ONE, target=lambda x: jnp.abs(x[0]) - 0.21)

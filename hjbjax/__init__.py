@@ -10,6 +10,7 @@ from hjbjax.applications.probabilities import expected_exit_time, reach_probabil
 from hjbjax.applications.reachability import avoid, reach, reach_avoid
 from hjbjax.discretisation import chain
 from hjbjax.discretisation.schemes import Eno2, Limited, Upwind, Weno5
+from hjbjax.discretisation.semi_lagrangian import SemiLagrangian
 from hjbjax.extremals.indirect_method import FreeTime, pontryagin
 from hjbjax.feedback.dissipation import dissipation
 from hjbjax.feedback.feedback import greedy_feedback
@@ -50,6 +51,7 @@ __all__ = [
     "Nested",
     "PolicyIteration",
     "Problem",
+    "SemiLagrangian",
     "Sinh",
     "Solution",
     "SolveError",

@@ -5,6 +5,7 @@ a grid twice as fine as the finest measured. What the plain chain would need for
 read off its fitted order and off the fitted growth of its seconds. On the double integrator (minimum time in
 Kružkov's form on [−1, 1]², exact values on {T ≤ ½} and on the edge) hj_reachability's "very_high" marches beside us,
 and seconds are compared at equal mean error; so it does on the zoo's smooth problem, compared at equal largest error.
+SemiLagrangian() is held against the plain chain on the same nodes of the double integrator.
 
 Writes ``precision.json`` and ``precision.png``. Our seconds are medians of whole solves that take turns,
 hj_reachability's those of a second march; compiling stands apart.
@@ -28,11 +29,13 @@ from benchmarks.harness.timing import interleaved
 COLUMNS = ("problem", "scheme", "shape", "error", "seconds", "compile_seconds", "status")
 PLAIN, LIMITED = hjb.Upwind(central=False), hjb.Limited()
 FIFTH = hjb.Weno5()
+PATHS = hjb.SemiLagrangian()
 HELD = hjb.Limited(subcell=False)  # where a level set of time, no distance, says which nodes are held
 STATES = ((0.5, 0.0), (np.pi / 4, 0.0), (1.5, -1.0), (2.8, 1.5), (-2.0, -2.0))
 PENDULUM, DOUBLE_INTEGRATOR, SMOOTH = (50, 100, 200, 400), (21, 41, 81, 161, 321), (21, 41, 81, 161)
 LEVELS = 25  # errors at which seconds are compared
 REPEATS = 15
+SIDE_BY_SIDE, LEAST_ERROR, MOST_SECONDS = 161, 0.3, 3.0  # nodes an axis of the double integrator, and the thresholds
 TOL, SMALL = 1e-4, 1e-12
 
 
@@ -62,7 +65,7 @@ def double_integrator(nodes: Sequence[int]) -> list[dict[str, Any]]:
     exact = hjb.zoo.double_integrator_exact()
     problem, grids = cases.double_integrator(nodes[0])[0], [cases.double_integrator(n)[1] for n in nodes]
     rows, asked = [], []
-    for scheme in (PLAIN, HELD):
+    for scheme in (PLAIN, HELD, PATHS):
         label = {"code": "hjbjax", "scheme": _name(scheme), "tol": TOL}
         study = hjb.convergence_study(problem, grids, exact, scheme=scheme, tol=TOL)
         rows += [label | row for row in study.rows]
@@ -160,6 +163,17 @@ def verdicts(rows: Sequence[dict[str, Any]]) -> list[str]:
                 f"{problem}: {other} takes {found[0]:.3g} to {found[1]:.3g} times the time of {scheme} at the same "
                 f"error (threshold {least})"
             )
+    ours, theirs = (
+        [row for row in of("double integrator", scheme) if row["shape"][0] == SIDE_BY_SIDE]
+        for scheme in (_name(PATHS), "plain upwind")
+    )
+    if ours and theirs:
+        errors, seconds = (ours[0][key] / theirs[0][key] for key in ("error", "seconds"))
+        said.append(
+            f"double integrator: {_name(PATHS)} on {SIDE_BY_SIDE} x {SIDE_BY_SIDE} has {errors:.3g} times the mean "
+            f"error of plain upwind (threshold {LEAST_ERROR}) in {seconds:.3g} times its seconds (threshold "
+            f"{MOST_SECONDS})"
+        )
     return said
 
 

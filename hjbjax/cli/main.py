@@ -30,7 +30,7 @@ if TYPE_CHECKING:  # for annotations alone: what is heavy is imported by the com
 FILES = ("solution.npz", "value.png", "policy.png", "trajectory.png")
 CODES = {"CONVERGED": 0, "DIVERGED": 4, "NONFINITE": 4, "INTERRUPTED": 130}  # any other status: 3, not converged
 METHODS = {"value-iteration": "ValueIteration", "policy-iteration": "PolicyIteration"}
-SCHEMES = {"upwind": "Upwind", "limited": "Limited", "weno5": "Weno5"}
+SCHEMES = {"upwind": "Upwind", "limited": "Limited", "weno5": "Weno5", "semi-lagrangian": "SemiLagrangian"}
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "diffrax", "optax", "matplotlib", "tqdm", "click")
 
 

@@ -60,6 +60,8 @@ and where the gain of a drift component has kinks; its answers are certified. On
 The exact value is (√5 − 1)/8 = .155: so much diffusion is dear. Such a class must be hashable, for
 compiled programs are remembered by it, and its methods are traced: no branches on numbers.
 
+A scheme that follows paths over many cells, in place of slopes, is of another kind: see ``semi_lagrangian``.
+
 What happens at a wall is not the scheme's to say. The wall stands on the node, whose cell is half a cell. With noise a,
 drift n out of the box (f at an upper end, −f at a lower one) and ∂V/∂n = 0 on the wall, the balance over that cell is
 
@@ -81,6 +83,7 @@ import jax.numpy as jnp
 
 from hjbjax.discretisation import correlated_noise, slopes, stencil
 from hjbjax.discretisation.discretisation import Chain, Differences, Discretisation, Scheme
+from hjbjax.discretisation.semi_lagrangian import PathScheme
 from hjbjax.discretisation.stencil import Links
 from hjbjax.problem import arguments, sets
 from hjbjax.problem.grid import Grid
@@ -123,16 +126,21 @@ def kinks(
     return found, [jnp.where(wall, new, d) for new, d in zip(doubled, derivatives, strict=True)]
 
 
-def check(scheme: Any, name: str, grid: Grid, *, stationary: bool = False) -> None:
+def check(scheme: Any, name: str, grid: Grid, *, stationary: bool = False, paths: bool = False) -> None:
     """Refuse what is no scheme, none for stationary problems, or none for the grid's spacings.
+
+    With ``paths`` a scheme that follows paths will do as well.
 
     Raises:
       TypeError: another kind of thing.
       ValueError: a stretched grid where the scheme wants equal spacings.
     """
-    own = isinstance(scheme, Scheme) and not isinstance(scheme, type) and type(scheme).__hash__ is not None
-    if not own or (stationary and not scheme.stationary):
-        offered = f"hjb.Upwind(), Limited(), {'Eno2() ' * (not stationary)}or Weno5()"
+    whole = not isinstance(scheme, type) and type(scheme).__hash__ is not None
+    if paths and whole and isinstance(scheme, PathScheme):
+        return
+    if not (whole and isinstance(scheme, Scheme)) or (stationary and not scheme.stationary):
+        others = "Eno2() " * (not stationary) + "SemiLagrangian() " * paths
+        offered = f"hjb.Upwind(), Limited(), {others}or Weno5()"
         raise TypeError(f"{name} is {arguments.shown(scheme)}; wanted {offered}")
     if scheme.even and any(each is not None for each in grid.stretch or ()):
         caller = name.partition(":")[0]

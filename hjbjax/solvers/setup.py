@@ -228,7 +228,7 @@ def prepare_on_host(
         return task, assumptions, None
     reached = attainability.reached(task.on, held, surely=undiscounted, least=_least_rate(task), clock=clock)
     if not reached.all():
-        _warn_unreached(reached, undiscounted)
+        warn_unreached(reached, undiscounted)
         if undiscounted:
             task = _finite_part(task, reached)
     return task, assumptions, reached
@@ -246,7 +246,7 @@ def forced_only(task: Task, clock: Clock) -> tuple[Task, Mask | None]:
     reached = attainability.forced(task.on, held, least=_least_rate(task), clock=clock)
     if reached.all():
         return task, reached
-    _warn_unreached(reached, True)
+    warn_unreached(reached, True)
     return _finite_part(task, reached), reached
 
 
@@ -297,7 +297,7 @@ def _finite_part(task: Task, reached: Mask) -> Task:
     return dataclasses.replace(task, obstacles=obstacles, counted=task.counted & jnp.asarray(reached), has_lost=True)
 
 
-def _warn_unreached(reached: Mask, undiscounted: bool) -> None:
+def warn_unreached(reached: Mask, undiscounted: bool) -> None:
     """Warn of nodes from which no policy is sure to reach the target, and say what their value is."""
     share = 100 * (1 - float(np.mean(reached)))
     what = "their value is inf" if undiscounted else "their value is the discounted cost of never arriving"

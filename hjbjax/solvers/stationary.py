@@ -15,6 +15,7 @@ import numpy as np
 from hjbjax.discretisation import schemes
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.schemes import Upwind
+from hjbjax.discretisation.semi_lagrangian import PathScheme
 from hjbjax.finiteness import admissibility, node_checks, resting
 from hjbjax.iteration import adjoint, fixed_point
 from hjbjax.iteration.fixed_point import State, Task
@@ -28,7 +29,7 @@ from hjbjax.solution import transfer
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
-from hjbjax.solvers import host_loop, memory, nested
+from hjbjax.solvers import host_loop, memory, nested, semi_lagrangian
 from hjbjax.solvers.result import assemble, finish, solution_at_start, with_grid_error, with_last_phase
 from hjbjax.solvers.setup import choose, choose_scheme, is_constrained, prepare_on_host, prepare_traced
 from hjbjax.tracing import checks
@@ -44,7 +45,7 @@ def solve(
     grid: Grid,
     *,
     method: Method | None = None,
-    scheme: Scheme | None = None,
+    scheme: Scheme | PathScheme | None = None,
     tol: float = 1e-3,
     guess: Nodes | None = None,
     dtype: DType | None = None,
@@ -63,7 +64,8 @@ def solve(
       grid: the nodes.
       method: ``PolicyIteration(...)`` or ``ValueIteration()``; ``None`` picks by the problem.
       scheme: ``Upwind()``, first order and monotone; ``Limited()``, second order where the value is smooth; or
-        ``Weno5()``, fifth order there, on equal spacings, for a ``tol`` as small as its error. ``None`` is
+        ``Weno5()``, fifth order there, on equal spacings, for a ``tol`` as small as its error; or ``SemiLagrangian()``,
+        monotone, for deterministic problems whose optimal paths run along kinks of the value. ``None`` is
         ``Limited()`` where its iteration converges, with an estimate of the grid's error. It is ``Upwind()`` for value
         iteration and tubes without discount, inside transformations, and wherever noise lets central differences be
         monotone.
@@ -96,15 +98,22 @@ def solve(
       ('CONVERGED', True, True)
     """
     check_limits(max_steps, time_limit)
-    check_arguments(problem, grid, method, scheme, tol, guess)
+    check_arguments(problem, grid, method, scheme, tol, guess, paths=True)
     if is_traced(problem, grid, guess, tol):
+        if isinstance(scheme, PathScheme):
+            raise ValueError(_at_host_level(scheme))
         traced = jnp.result_type(float) if dtype is None else jnp.dtype(dtype)
         return _solve_traced(Discretisation(problem, grid, scheme or Upwind(), traced), method, tol, guess, max_steps)
     kind = as_dtype(dtype)
     check_node_values(guess, grid, "solve: the guess")
     grid.check_spacings(kind)
-    method = choose(problem, grid, traced=False, method=method)
     clock = Clock(max_steps or 10**9, time_limit, progress)
+    if isinstance(scheme, PathScheme):
+        with noting_interrupts(clock), jax.enable_x64(kind == np.float64):
+            options: Any = {"method": method, "tol": tol, "guess": guess, "max_memory": max_memory}
+            solution = semi_lagrangian.solve_on_host(problem, grid, scheme, kind, clock=clock, **options)
+        return _ended(with_last_phase(solution, clock), clock, tol, throw=throw)
+    method = choose(problem, grid, traced=False, method=method)
     on, sharpen = Discretisation(problem, grid, scheme or Upwind(subcell=True), kind), scheme is None
     # float64 for this call alone: another thread, and the caller's own programs, keep theirs
     with noting_interrupts(clock), jax.enable_x64(kind == np.float64):
@@ -112,9 +121,15 @@ def solve(
         with host_loop.with_solution(clock, needed, lambda kept: _partial(on, kept)):
             solution = with_last_phase(_solve_on_host(on, method, tol, guess, clock, sharpen=sharpen), clock)
     solution.stats.setdefault("method", method.described(problem.is_game))
+    solution.stats["bytes"] = needed
+    return _ended(solution, clock, tol, throw=throw)
+
+
+def _ended(solution: Solution, clock: Clock, tol: float, *, throw: bool) -> Solution:
+    """The solution with its times; raises ``SolveError`` where it did not converge and that was asked for."""
     solution.stats.update(
         seconds=clock.stepping, compile_seconds=clock.elapsed() - clock.stepping,
-        bytes=needed, tol=tol,
+        tol=tol,
     )  # fmt: skip
     if throw and solution.status is not Status.CONVERGED:
         raise SolveError(f"{solution.status.name}: {solution.message}", solution)
@@ -173,8 +188,7 @@ def _solve_traced(
 ) -> Solution:
     """The solution inside a JAX transformation: no chunks, no files, no exceptions, no checks of values."""
     if not on.scheme.monotone:
-        name = type(on.scheme).__name__
-        raise ValueError(f"solve: {name}() runs at host level only; inside jit, vmap and grad use Upwind()")
+        raise ValueError(_at_host_level(on.scheme))
     method = choose(on.problem, on.grid, traced=True, method=method)
     if method.coarsest is not None:
         raise ValueError("solve: Nested(...) runs at host level only; inside jit, vmap and grad use its inner method")
@@ -190,6 +204,11 @@ def _solve_traced(
     wrong |= state.code == Status.NONFINITE
     value = value * jnp.where(wrong, jnp.nan, 1).astype(value.dtype)  # a derivative drops the code, and is NaN, too
     return altered(solution, value=jnp.where(task.counted, value, jnp.inf) if task.has_lost else value)
+
+
+def _at_host_level(scheme: object) -> str:
+    """The refusal of a scheme inside a transformation."""
+    return f"solve: {type(scheme).__name__}() runs at host level only; inside jit, vmap and grad use Upwind()"
 
 
 def _without_rests_to_leave(task: Task, state: State) -> tuple[State, Scalar]:
@@ -225,15 +244,19 @@ def check_limits(max_steps: object, time_limit: object) -> None:
 
 
 def check_arguments(
-    problem: object, grid: object, method: object, scheme: object, tol: object, guess: object = None
-) -> None:
-    """Refuse arguments with which no solve can start; needs no values of the problem's functions."""
+    problem: object, grid: object, method: object, scheme: object, tol: object, guess: object = None,
+    *, paths: bool = False,
+) -> None:  # fmt: skip
+    """Refuse arguments with which no solve can start; needs no values of the problem's functions.
+
+    ``paths``: whether a scheme that follows paths is offered.
+    """
     if not isinstance(problem, Problem) or not isinstance(grid, Grid):
         raise TypeError(f"solve: got {type(problem).__name__}, {type(grid).__name__}; wanted a Problem and a Grid")
     if method is not None:
         check_method(method, "solve: method")
     if scheme is not None:
-        schemes.check(scheme, "solve: scheme", grid, stationary=True)
+        schemes.check(scheme, "solve: scheme", grid, stationary=True, paths=paths)
     arguments.positive(tol, "solve: tol", "in the units of the cost")
     if guess is not None and is_constrained(problem) and is_discounted(problem) is False:
         raise ValueError(

@@ -1,0 +1,286 @@
+"""``solve`` by a scheme that follows paths: its refusals, its task, its run in chunks of steps, its solution."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.discretisation import arcs as paths
+from hjbjax.discretisation import edges
+from hjbjax.discretisation.arcs import Arcs, Plan
+from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.schemes import Upwind
+from hjbjax.discretisation.semi_lagrangian import PathScheme
+from hjbjax.finiteness import node_checks
+from hjbjax.iteration import arc_iteration, bellman, certificates
+from hjbjax.iteration.arc_iteration import HISTORY, ArcState, ArcTask
+from hjbjax.iteration.certificates import Certificate
+from hjbjax.iteration.evaluation import Sweeps
+from hjbjax.iteration.methods import Method
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import cast
+from hjbjax.problem.sets import Finite
+from hjbjax.problem.types import DType, Mask, Nodes
+from hjbjax.solution.clock import CUT, Clock, Stopped
+from hjbjax.solution.solution import Solution
+from hjbjax.solution.status import Status
+from hjbjax.solvers import host_loop, memory
+from hjbjax.solvers.host_loop import FIRST_NODES
+from hjbjax.solvers.result import solution_at_start, warn_of_cuts
+from hjbjax.solvers.setup import warn_unreached
+from hjbjax.tracing import checks
+
+WORDS = {
+    Certificate.ADDITIVE: "from the discount, V + min r/(1 − e^{−βτ}) ≤ V_h ≤ V + max r/(1 − e^{−βτ})",
+    Certificate.MULTIPLICATIVE: "from the running cost, V/(1 + η) ≤ V_h ≤ V/(1 − ρ)",
+}
+
+
+def relaxations(method: Method | None, n: int) -> int:
+    """How often a step follows the best arcs, in n dimensions.
+
+    Raises:
+      ValueError: a method that solves the equation of a policy by the matrix of a chain, or on coarser grids.
+    """
+    if method is None:
+        return Sweeps().count * 2**n
+    if method.coarsest is None and method.relaxes:
+        return 1
+    # as many as the sweeps of a chain are worth; see ``Sweeps``
+    evaluation = method.filled(Sweeps()).evaluation
+    if method.coarsest is None and isinstance(evaluation, Sweeps):
+        return evaluation.count * 2**n
+    raise ValueError(
+        f"solve: SemiLagrangian() follows its arcs again and again, and has no matrix for {method!r}; use "
+        "hjb.PolicyIteration(), PolicyIteration(Sweeps(...)) or ValueIteration(), on one grid"
+    )
+
+
+def estimate(grid: Grid, plan: Plan, dtype: DType) -> int:
+    """Bytes of the arcs and of what is made of them, from a count of the arrays that live at once."""
+    word = np.dtype(dtype).itemsize
+    each = (3 + grid.ndim) * word + 4  # pay, keep, fractions, running cost, cell
+    return (each * (plan.count + 2) + 12 * word) * grid.size
+
+
+def solve_on_host(
+    problem: Problem,
+    grid: Grid,
+    scheme: PathScheme,
+    kind: np.dtype,
+    *,
+    method: Method | None,
+    tol: float,
+    guess: Nodes | None,
+    max_memory: int | None,
+    clock: Clock,
+) -> Solution:
+    """The solution by checks, arcs and steps, in this order, as far as the clock allows; float64 is on if asked for."""
+    scheme.check(problem, grid)
+    times = relaxations(method, grid.ndim)
+    on = Discretisation(problem, grid, Upwind(), kind)  # what is asked of it has nothing to do with slopes
+    start = None if guess is None else np.asarray(guess, kind)
+    try:
+        checks.shapes(problem, grid, scheme)
+        node_checks.values(problem, grid, kind, clock)
+        plan = scheme.plan(problem, grid, kind)
+        needed = memory.fitting(estimate(grid, plan, kind), grid, max_memory)
+        with host_loop.with_solution(clock, needed, lambda kept: _partial(on, kept)):
+            task, reached = _prepare(on, plan, tol, times, clock)
+            start = np.asarray(_start(task)) if start is None else start
+            solution = _finish(on, scheme, plan, _Run(task, start, clock.max_steps), reached, clock)
+    except Stopped as stop:
+        return _said(solution_at_start(on, np.zeros(grid.shape) if start is None else start, stop.status), scheme)
+    described = "PolicyIteration()" if method is None else method.described(False)
+    solution.stats.update(bytes=needed, method=f"{described}, {plan.count} arcs a node")
+    return solution
+
+
+def _partial(on: Discretisation, kept: host_loop.Kept | None) -> Solution:
+    """The solution of a run that broke, from the value that outlived it; else zero."""
+    return solution_at_start(on, np.zeros(on.grid.shape) if kept is None else kept[0], Status.INTERRUPTED)
+
+
+def _prepare(on: Discretisation, plan: Plan, tol: float, times: int, clock: Clock) -> tuple[ArcTask, Mask | None]:
+    """The task, and the nodes from which the target is reached for sure, where that has to be known.
+
+    Raises:
+      ValueError: numbers that are not finite on the way of an arc; without a discount an arc that costs nothing.
+    """
+    problem, grid = on.problem, on.grid
+    additive = bool(np.asarray(problem.discount) > 0)
+    clock.enter(f"the arcs of {' x '.join(map(str, grid.shape))} nodes")
+    links, obstacles = _traced(on, plan, running=not additive)
+    _check_arcs(on, plan, links, obstacles.fixed)
+    reached, counted = None, jnp.ones(grid.shape, bool)
+    if not additive and problem.target is not None and problem.stopping_cost is None:
+        clock.enter("the search for nodes that reach the target")
+        reached = np.asarray(_surely_arriving(links, grid, obstacles.fixed))
+        if not reached.all():
+            warn_unreached(reached, True)
+            counted = jnp.asarray(reached)
+            links = _without(links, grid, counted)
+            obstacles = dataclasses.replace(obstacles, fixed=obstacles.fixed | ~counted)
+    kind = Certificate.ADDITIVE if additive else Certificate.MULTIPLICATIVE
+    return ArcTask(grid, links, obstacles, counted, jnp.asarray(tol, on.dtype), kind, times), reached
+
+
+@functools.partial(jax.jit, static_argnames="running")
+def _traced(on: Discretisation, plan: Plan, *, running: bool) -> tuple[Arcs, bellman.Obstacles]:
+    """The arcs of a plan and what is given at the nodes, in the type of the solve."""
+    on = cast(on, on.dtype)
+    obstacles = bellman.obstacles(on)
+    return paths.trace(on, plan, obstacles.fixed, running=running), obstacles
+
+
+_surely_arriving = jax.jit(arc_iteration.surely_arriving)
+_without = jax.jit(arc_iteration.without)
+_start = jax.jit(arc_iteration.start)
+_run = jax.jit(arc_iteration.run, donate_argnames="state")
+
+
+@jax.jit
+def _faults(links: Arcs, fixed: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Per arc whether from some free node it is worth no finite number, and whether from some it costs nothing."""
+    along = tuple(range(1, links.pay.ndim))
+    broken = jnp.any(~fixed & ~(jnp.isfinite(links.pay) & jnp.isfinite(links.keep)), axis=along)
+    free = jnp.zeros(broken.shape, bool)
+    if links.running is not None:
+        free = jnp.any(~fixed & ~(links.running > 0), axis=along)
+    return broken, free
+
+
+def _check_arcs(on: Discretisation, plan: Plan, links: Arcs, fixed: jax.Array) -> None:
+    """Refuse arcs that are worth no number, and without a discount such that cost nothing."""
+    broken, free = (np.asarray(found) for found in _faults(links, fixed))
+    if broken.any():
+        action = plan.actions[int(np.argmax(broken)) // len(plan.legs)]
+        raise ValueError(
+            f"solve: on the arcs of the action {np.asarray(action).tolist()} drift, cost, target or exit_cost is NaN "
+            "or infinite between the nodes, where SemiLagrangian() evaluates them; define them in the whole box, or "
+            "use hjb.Upwind()"
+        )
+    if free.any():
+        action = plan.actions[int(np.argmax(free)) // len(plan.legs)]
+        raise ValueError(
+            "solve: SemiLagrangian() without discount wants a running cost that is positive off the target, or nothing "
+            f"bounds its error; the action {np.asarray(action).tolist()} pays none somewhere. "
+            "Give a discount > 0, or use hjb.Upwind()"
+        )
+
+
+class _Run:
+    """The iteration of a task on arcs: its last state, and the one before the chunk that is running."""
+
+    longest = HISTORY
+
+    def __init__(self, task: ArcTask, guess: Nodes, limit: int):
+        self.task, self.guess, self.limit = task, guess, limit
+        self.state = self.before = arc_iteration.begin(task, guess)
+        self.residuals, self.steps = [np.zeros(0)], -1
+        self.nodes, self.name = task.grid.size, f"{' x '.join(map(str, task.grid.shape))} nodes"
+        self.bar = {"desc": "solve", "unit": " steps"}
+
+    def compile(self) -> None:
+        """Run no step: the state is at step −1, before the look at the guess."""
+        self.before, self.state = self.state, _run(self.task, self.state, -1)
+
+    def first_chunk(self, clock: Clock) -> int:
+        """Steps of the first chunk, beside the look at the guess: a step looks at every arc of a node."""
+        return int(np.clip(FIRST_NODES / (self.nodes * self.task.arcs.count), 1, HISTORY - 1))
+
+    def advance(self, count: int) -> Status:
+        """Take ``count`` steps at most; the look at the guess comes with the first of them."""
+        until = int(min(max(self.steps, 0) + count, self.limit))
+        # in one assignment: an interrupt may come from here on, and the state before may be donated
+        self.before, self.state = self.state, _run(self.task, self.state, until)
+        status = Status(int(self.state.code))
+        self._note()
+        return status
+
+    def _note(self) -> None:
+        """Write down the residuals of the last chunk, once."""
+        done = int(self.state.step)
+        self.residuals.append(np.asarray(self.state.history)[: done - self.steps])
+        self.steps = done
+
+    def between(self, status: Status, clock: Clock) -> Status:
+        """Write down what an interrupt left open."""
+        if status is Status.INTERRUPTED:
+            self._note()
+        return status
+
+    def show(self, bar: Any) -> None:
+        """Move the progress bar; the look is no step."""
+        bar.update(max(self.steps, 0) - bar.n)
+        bar.set_postfix_str(f"error {float(self.state.bound.error):.2e}, tol {float(self.task.tol):.0e}", refresh=False)
+
+    def keep(self, error: Exception) -> None:
+        """Attach the value to an exception: of the step that failed, the one before unless donated, the guess."""
+        host_loop.keep(error, self.task.grid, lambda: self.state.value, lambda: self.before.value, lambda: self.guess)
+
+
+def _finish(
+    on: Discretisation, scheme: PathScheme, plan: Plan, run: _Run, reached: Mask | None, clock: Clock
+) -> Solution:
+    """The solution at the end of a run: values, first actions of the best arcs, bounds, and the words for them."""
+    code = host_loop.drive(run, clock)
+    task, state, problem = run.task, jax.device_get(run.state), on.problem
+    looked, counted = int(state.step) >= 0, np.asarray(task.counted)
+    value = np.array(state.value if looked else task.obstacles.impose(jnp.asarray(state.value)))
+    value[~counted] = np.inf
+    policy = np.array(np.asarray(plan.actions)[state.number // len(plan.legs)])
+    if reached is None and looked and problem.target is not None and problem.stopping_cost is None and code not in CUT:
+        reached = _who_arrives(task, run.state)
+    leaving = None if code in CUT or not looked else _leaving(on, value, policy, task)
+    policy[~counted | np.asarray(task.obstacles.ended) | (not looked)] = np.nan
+    message = code.message
+    if code is Status.STALLED and np.isfinite(state.best[0]):
+        best = float(state.best[0])
+        message = f"{message} The smallest error was {best:.2g}: a tolerance of {2 * best:.2g} is within reach."
+    solution = solution_at_start(on, value, code)
+    solution = dataclasses.replace(
+        solution, policy=policy, message=message, reached=reached, cut=leaving, steps=max(int(state.step), 0),
+        residuals=np.concatenate(run.residuals)[: int(state.step) + 1],
+        enclosure=certificates.enclosure(task.certificate, state.bound) if looked else None,
+        discrete=isinstance(problem.controls, Finite),
+    )  # fmt: skip
+    solution.stats["certificate"] = WORDS[task.certificate] + "; for the arcs that are tried"
+    return _said(solution, scheme)
+
+
+def _said(solution: Solution, scheme: PathScheme) -> Solution:
+    """The solution with the name of the scheme that made it."""
+    solution.stats["scheme"] = repr(scheme)
+    return solution
+
+
+def _leaving(on: Discretisation, value: np.ndarray, policy: np.ndarray, task: ArcTask) -> np.ndarray:
+    """Numbers of nodes at which the optimal drift is cut off, (n, 2), with a warning where they are most of an end."""
+    acting = np.asarray(task.counted & task.obstacles.acting(jnp.asarray(value)))
+    u = [np.ascontiguousarray(policy[..., j]) for j in range(policy.shape[-1])]
+    cut, ends = edges.cut(on.problem, on.grid, np.where(acting, value, 0), u, [], acting)
+    warn_of_cuts(cut, ends, on.grid)
+    return cut
+
+
+def _who_arrives(task: ArcTask, state: ArcState) -> Mask:
+    """The nodes that can be brought to the target, under a discount, with a warning where some cannot."""
+    reached = np.asarray(_arriving(task, state.number))
+    if not reached.all():
+        warn_unreached(reached, False)
+    return reached
+
+
+@jax.jit
+def _arriving(task: ArcTask, number: jax.Array) -> jax.Array:
+    """Those that the best arcs bring there, and where that is not all of them those that any arcs do."""
+    chosen = jax.tree.map(lambda entry: entry[None], task.arcs.chosen(number))
+    found = arc_iteration.arriving(chosen, task.grid, task.obstacles.fixed)
+    return jax.lax.cond(
+        jnp.all(found), lambda: found, lambda: arc_iteration.arriving(task.arcs, task.grid, task.obstacles.fixed)
+    )

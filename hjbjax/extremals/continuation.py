@@ -23,7 +23,8 @@ from hjbjax.solution.status import Status
 SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)  # of the way, in a continuation
 SPANS = (1.0, 2.0, 0.5, 4.0)  # given final times over the guess of a free one
 HUGE = 1e6  # times the guess: what grows so much has no limit
-SETTLED = 1e-3  # how far from a rest its quadratic value is trusted, relative to |x₀| + |x̄|; what is left is its cube
+SETTLED = 1e-3  # how far from a rest its quadratic value is trusted, relative to x₀; what is left is its cube
+STILL = 1e-10  # the square of a distance from a rest, over that of x₀ and x̄ from 0, that is none
 LONGER, EXTENSIONS = 1.5, 6  # factor, and how often, an infinite horizon is lengthened
 GAP = 1e-6  # by how much the Hamiltonian may miss its minimum, relative to its terms
 ENDINGS = {1: Status.MAX_STEPS, 2: Status.DIVERGED, 3: Status.STALLED}
@@ -217,9 +218,12 @@ def _refuse_unsettled(found: Outcome) -> Outcome:
 
 def _is_near_rest(bvp: BoundaryValueProblem, last: State) -> bool:
     """Whether the last state is so near to the rest that its quadratic value may be trusted."""
-    assert bvp.rest is not None
-    size = np.linalg.norm(bvp.start) + np.linalg.norm(bvp.rest.state)
-    return bool(np.linalg.norm(last - bvp.rest.state) <= SETTLED * size)
+    rest = bvp.rest
+    assert rest is not None
+    # distances by the value itself: lengths and speeds have no common unit, and what does not cost does not matter
+    begun, left, far = bvp.start - rest.state, last - rest.state, np.abs(bvp.start) + np.abs(rest.state)
+    size = abs(begun @ rest.matrix @ begun) + STILL * (far @ np.abs(rest.matrix) @ far)
+    return bool(abs(left @ rest.matrix @ left) <= SETTLED**2 * size)
 
 
 def _lengthen(found: Outcome, limits: Limits) -> Outcome:

@@ -9,7 +9,7 @@ import sympy
 import hjbjax as hjb
 from hjbjax import geometry, zoo
 from hjbjax.geometry import stability
-from hjbjax.geometry.distributions import _reach
+from hjbjax.geometry.distributions import _reach, _span_of_generations
 from hjbjax.problem.pytree import pytree_dataclass
 
 
@@ -126,9 +126,11 @@ def test_ranks_in_float32_are_those_of_float64():
     for depth, rank in ((1, 2), (2, 3), (4, 3)):
         fields = (plant.drift, plant.push)
         with jax.enable_x64(False):
-            found = jax.jit(lambda x, fields=fields, depth=depth: _reach(fields, x, 3e-4, depth=depth).counted)(
-                jnp.zeros(3, jnp.float32)
-            )
+
+            def span(x, fields=fields, depth=depth):
+                return _span_of_generations(_reach(fields, x, 3e-4, depth=depth), x, 3e-4)
+
+            found = jax.jit(span)(jnp.zeros(3, jnp.float32)).counted
         assert int(found.sum()) == rank
 
 

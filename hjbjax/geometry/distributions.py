@@ -232,9 +232,16 @@ def _span_of_generations(generations: Generations, x: State, tolerance: Number) 
     ends = np.cumsum([len(generation) for generation in values])
     first = jnp.asarray(np.arange(ends[-1]) < ends[:, None])
     spans = jax.vmap(lambda kept: span(jnp.where(kept[:, None], vectors, 0), tolerance, sizes))(first)
-    best = jnp.argmax(jnp.sum(jax.vmap(lambda one: one.counted)(spans), axis=-1))
-    directions, singular_values = spans.directions[best], spans.singular_values[best]
-    return Distribution(vectors, directions, singular_values, jnp.asarray(tolerance, vectors.dtype))
+    counted = jax.vmap(lambda one: one.counted)(spans)
+    best = jnp.argmax(jnp.sum(counted, axis=-1))
+    # what any of them shows beside that rank, and does not count, is the residue of the verdict
+    shares = spans.singular_values / jnp.where(spans.singular_values[:, :1] > 0, spans.singular_values[:, :1], 1)
+    chosen = spans.singular_values[best]
+    beside = jnp.where(counted, 0, shares).max(axis=0) * chosen[0]
+    counts = jnp.arange(len(chosen)) < jnp.sum(counted[best])
+    return Distribution(
+        vectors, spans.directions[best], jnp.where(counts, chosen, beside), jnp.asarray(tolerance, vectors.dtype)
+    )
 
 
 def span(vectors: Array, tolerance: Number, terms: Array) -> Distribution:

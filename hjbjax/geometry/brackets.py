@@ -169,7 +169,7 @@ def decide(
     x: State | Sequence[float],
     tolerance: Number | None,
     default: Callable[[DType], float] = root_eps,
-    **static: float | tuple[float, ...],
+    **static: int | bool,
 ) -> S:
     """The verdict on derivatives: in float64 at the host, in the dtype of the state under a tracer.
 
@@ -212,7 +212,7 @@ def decide(
 
 
 @functools.lru_cache(maxsize=256)
-def _compiled(rule: Callable[..., T], static: tuple[tuple[str, float | tuple[float, ...]], ...]) -> Callable[..., T]:
+def _compiled(rule: Callable[..., T], static: tuple[tuple[str, int | bool], ...]) -> Callable[..., T]:
     # jit knows its programs by the identity of the function, and a new partial in every call would compile anew
     return jax.jit(functools.partial(rule, **dict(static)))
 
@@ -256,19 +256,20 @@ def output_derivatives(
     return ladder
 
 
-def as_half_widths(radius: float | Array, states: int, name: str) -> tuple[float, ...]:
-    """The half widths of the cube that is near, one a state."""
+def as_half_widths(radius: float | Array, states: int, name: str) -> np.ndarray:
+    """The half widths of the cube that is near, shape (n,)."""
     widths = np.asarray(radius, np.float64)
     if widths.shape not in ((), (states,)) or not np.all(np.isfinite(widths) & (widths >= 0)):
         raise ValueError(f"{name}: got radius = {radius!r}, wanted a finite number ≥ 0, or {states} of them")
-    return tuple(np.broadcast_to(widths, states).tolist())
+    return np.array(np.broadcast_to(widths, states))
 
 
-def near(x: State, radius: tuple[float, ...], samples: int) -> jax.Array:
+def near(x: State, radius: Array, samples: int) -> jax.Array:
     """The state and points around it, shape (samples + 1, n)."""
     # a fixed seed: a verdict must not change from call to call, nor between a trace and the host
-    spread = np.random.default_rng(0).uniform(-1.0, 1.0, (samples, x.shape[0])) * np.asarray(radius)
-    return jnp.asarray(x) + jnp.asarray(np.concatenate([np.zeros((1, x.shape[0])), spread]), x.dtype)
+    spread = np.random.default_rng(0).uniform(-1.0, 1.0, (samples, x.shape[0]))
+    spread = np.concatenate([np.zeros((1, x.shape[0])), spread])
+    return jnp.asarray(x) + jnp.asarray(spread, x.dtype) * jnp.asarray(radius, x.dtype)
 
 
 def as_bool(verdict: bool | Array) -> bool | jax.Array:

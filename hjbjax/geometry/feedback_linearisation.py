@@ -175,9 +175,8 @@ class Linearisation:
             # radius and samples as ``relative_degree`` has them by default
             def rule(depth: int) -> RelativeDegree:
                 tolerance = np.asarray(rounding_of_terms(origin.dtype))
-                radius = (0.1,) * states
-                functions = (self.fields, self.output)
-                found = _first_effects(functions, origin, tolerance, radius=radius, samples=16, depth=depth)
+                functions = (self.fields, self.output, np.full(states, 0.1))
+                found = _first_effects(functions, origin, tolerance, samples=16, depth=depth)
                 return _relative_degree(found, origin, tolerance)
 
             return _degrees_or_refuse(_deepen(rule, states), "the origin")
@@ -220,9 +219,8 @@ def relative_degree(
       relative degree 2 of 3 states: zero dynamics of dimension 1 on {h = L_f h = 0}
     """
     arguments.count(samples, "relative_degree: samples", least=0)
-    functions = (as_fields(f, g), as_pytree(h))
     states = np.shape(x)[0] if np.ndim(x) else 1
-    half_widths = as_half_widths(radius, states, "relative_degree")
+    functions = (as_fields(f, g), as_pytree(h), as_half_widths(radius, states, "relative_degree"))
 
     def rule(depth: int) -> RelativeDegree:
         return decide(
@@ -232,7 +230,6 @@ def relative_degree(
             x,
             tolerance,
             rounding_of_terms,
-            radius=half_widths,
             samples=int(samples),
             depth=depth,
         )
@@ -314,16 +311,10 @@ def _verdict(degrees: Sequence[int] | np.ndarray, states: int) -> str:
 
 
 def _first_effects(
-    functions: tuple[tuple[Field, ...], Callable],
-    x: State,
-    tolerance: Number,
-    *,
-    radius: tuple[float, ...],
-    samples: int,
-    depth: int,
+    functions: tuple[tuple[Field, ...], Callable, Array], x: State, tolerance: Number, *, samples: int, depth: int
 ) -> dict[str, jax.Array]:
     """The first L_g L_f^k h, k < depth, that is not zero, for every output: degrees, decoupling, its terms, residue."""
-    (f, *gs), h = functions
+    (f, *gs), h, radius = functions
     stacked = [stack_fields([f]), stack_fields(gs), stack_outputs(h)]
 
     def build(copies, y):

@@ -115,7 +115,7 @@ def is_feedback_linearisable(
 
     def rule(depth: int) -> Linearisability:
         return decide(
-            _ladders_near, _linearisability, fields, x, tolerance, radius=half_widths, samples=int(samples), depth=depth
+            _ladders_near, _linearisability, (fields, half_widths), x, tolerance, samples=int(samples), depth=depth
         )
 
     # Where G_k is everything the longer brackets add nothing, and with m inputs that can be from k = n/m − 1 on.
@@ -128,9 +128,10 @@ def is_feedback_linearisable(
 
 
 def _ladders_near(
-    fields: tuple[Field, ...], x: State, tolerance: Number, *, radius: tuple[float, ...], samples: int, depth: int
+    functions: tuple[tuple[Field, ...], Array], x: State, tolerance: Number, *, samples: int, depth: int
 ) -> Ladders:
     """The members of G_0, …, G_{depth − 1} at points near x, and their slopes, and the terms of both."""
+    fields, radius = functions
     stacked = [stack_fields(fields[:1]), stack_fields(fields[1:])]
 
     def at(y):

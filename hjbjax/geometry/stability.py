@@ -106,7 +106,7 @@ def _linearisation(
         return copies[0][0](y), jax.jacfwd(copies[0][0])(y)
 
     (values, slopes), (sizes, bends) = with_terms(build, [field], x, 1)
-    around = jax.vmap(lambda y: field(y)[0])(near(x, (0.1,) * x.shape[0], 16))
+    around = jax.vmap(lambda y: field(y)[0])(near(x, np.full(x.shape[0], 0.1), 16))
     return (values, sizes), (slopes, bends), jnp.all(around == 0)
 
 

@@ -211,6 +211,22 @@ def test_a_definite_function_is_not_violated_by_its_units(widths):
 
 
 @pytest.mark.parametrize(
+    ("level", "positive"),
+    [
+        (lambda x: 3 + jnp.sum(x**8), True),  # at 0.01 by 1e-16, below the digits of 3
+        (lambda x: 1 + 1e-20 * (x @ x), True),
+        (lambda x: 3 - jnp.sum(x**8), False),
+        (lambda x: 3 + x[0] ** 8, False),
+        (lambda x: 3 + jnp.maximum(x @ x - 0.09, 0) ** 2, False),
+        (lambda x: 3 + (x @ x) * (x @ x - 0.25) ** 2, False),
+    ],
+)
+def test_a_flat_function_is_told_from_one_that_is_zero(level, positive):
+    report = hjb.lyapunov_check(level, lambda x: -x, hjb.Box([-1.0, -1.0], [1.0, 1.0]), samples=256)
+    assert report.positive == positive
+
+
+@pytest.mark.parametrize(
     ("region", "equilibrium", "words"),
     [
         (hjb.Ball(1.0, 2), [3.0, 3.0], "wanted a state in"),

@@ -27,12 +27,14 @@ def way_out(bvp: BoundaryValueProblem) -> str:
         )
     if not bvp.rule.jumps and not bvp.rule.exact and (kinked := _kinked(arrays)):
         return kinked
+    # sought from 1 on without a guess, whatever the unit of time
+    sought = "; give horizon=FreeTime(guess) with the size of the final time" if bvp.free else ""
     if bvp.closing is Closing.TARGET:
-        return (
+        return sought + (
             "; where the end in the target is known give it as terminal=, without the target: "
             "dataclasses.replace(problem, target=None, exit_cost=None)"
         )
-    return ""
+    return sought
 
 
 def is_smooth_at_start(bvp: BoundaryValueProblem) -> bool:

@@ -138,9 +138,10 @@ def units_of(
     target, timed = bvp.closing is Closing.TARGET, bvp.free or bvp.count > 1
     # before l, and H or the time: what the guess lacks of the cost at the end
     cost = max(cost, abs(missed[len(missed) - 1 - target - timed]))
-    if np.min(lengths) < 1 / ORDINARY or not cost:
+    if min(np.min(lengths), cost) < 1 / ORDINARY:
         moved, spent = (horizon * np.asarray(part) for part in _reach(arrays))
-        lengths, cost = np.where(lengths > ROUNDING * moved, lengths, moved), cost or spent
+        lengths = np.where(lengths > ROUNDING * moved, lengths, moved)
+        cost = cost if cost > ROUNDING**2 * spent else spent  # costs are squares of what moves
     x, c, t = (_unit(part) for part in (lengths, cost, horizon))
     column = np.concatenate([x, c / x, c[None]])
     closing = np.where(bvp.held, x, c / x) if bvp.closing is Closing.STATE else c / x

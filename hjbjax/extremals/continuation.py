@@ -1,8 +1,9 @@
 """Solving the boundary-value problem of an extremal whose control is continuous: at once, or by continuation.
 
 The collocation starts from the guess; if that fails, from easier problems on the way: starts nearer to the rest of an
-infinite horizon, or shorter horizons. An infinite horizon is lengthened until the path has settled. What comes back is
-held against the necessary conditions before it counts as converged.
+infinite horizon, shorter horizons, or given final times where one is sought; and then from the path under a constant
+control. An infinite horizon is lengthened until the path has settled. What comes back is held against the necessary
+conditions before it counts as converged.
 """
 
 import dataclasses
@@ -11,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.extremals import initial_guess, periodic_arcs, second_order
+from hjbjax.extremals import diagnosis, initial_guess, periodic_arcs, reaching_guess, second_order
 from hjbjax.extremals.boundary_value import BoundaryValueProblem, Closing, Limits
 from hjbjax.extremals.collocation import collocate
 from hjbjax.extremals.necessary_conditions import Extremal, assemble, entry_time, last_iterate, only_touches
@@ -20,8 +21,10 @@ from hjbjax.solution.clock import CUT, Stopped
 from hjbjax.solution.status import Status
 
 SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)  # of the way, in a continuation
+SPANS = (1.0, 2.0, 0.5, 4.0)  # given final times over the guess of a free one
 HUGE = 1e6  # times the guess: what grows so much has no limit
-SETTLED = 1e-3  # how far from a rest its quadratic value is trusted, relative to |x₀| + |x̄|; what is left is its cube
+SETTLED = 1e-3  # how far from a rest its quadratic value is trusted, relative to x₀; what is left is its cube
+STILL = 1e-10  # the square of a distance from a rest, over that of x₀ and x̄ from 0, that is none
 LONGER, EXTENSIONS = 1.5, 6  # factor, and how often, an infinite horizon is lengthened
 GAP = 1e-6  # by how much the Hamiltonian may miss its minimum, relative to its terms
 ENDINGS = {1: Status.MAX_STEPS, 2: Status.DIVERGED, 3: Status.STALLED}
@@ -123,13 +126,42 @@ def smooth(
         # ν alone: in place of one final time, if it is sought, there are the durations of all arcs
         multiplier = unknowns(bvp, times, columns)[int(bvp.timed) :]
         return _refuse_unsettled(attempt(*apart[:3], np.append(apart[3], multiplier), limits))
-    found = attempt(bvp, times / times[-1], columns, unknowns(bvp, times, columns), limits)
+    found = _attempt_by_times(bvp, times, columns, limits, trusted=trusted)
     # the direct attempt first: a continuation costs up to five solves
     if not found.solved and not trusted:
         found = _by_continuation(found, limits)
+    reaching = bvp.closing in (Closing.STATE, Closing.TARGET) and not trusted
+    if not found.solved and reaching and diagnosis.is_smooth_at_start(bvp):
+        carry_on(found, limits)
+        other = reaching_guess.under_constant_control(bvp, times[-1])
+        again = _attempt_by_times(bvp, *other, limits, trusted=False)
+        found = again if again.solved else found
     if bvp.closing is Closing.REST:
         found = _lengthen(found, limits)
     return found
+
+
+def _attempt_by_times(
+    bvp: BoundaryValueProblem, times: np.ndarray, columns: np.ndarray, limits: Limits, *, trusted: bool
+) -> Outcome:
+    """One collocation from a guess; if it fails with an end to be met, from those with other, given final times.
+
+    With a given time the costate is determined even where it is far off, as in linear equations; the condition of a
+    free one has no slope under a costate of zero.
+    """
+    s, failed = times / times[-1], attempt(bvp, times / times[-1], columns, unknowns(bvp, times, columns), limits)
+    if failed.solved or trusted or not (bvp.free or bvp.closing is Closing.STATE):
+        return failed
+    for span in SPANS[not bvp.free :]:
+        carry_on(failed, limits)
+        given = dataclasses.replace(bvp, free=False, horizon=span * times[-1])
+        found = attempt(given, s, columns, unknowns(given, times, columns), limits.rough)
+        if found.solved:
+            theta = np.append([found.horizon] * bvp.free, found.theta)
+            found = attempt(bvp, found.s, found.y, theta, limits)
+            if found.solved:
+                return found
+    return failed
 
 
 def unknowns(bvp: BoundaryValueProblem, times: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -186,9 +218,12 @@ def _refuse_unsettled(found: Outcome) -> Outcome:
 
 def _is_near_rest(bvp: BoundaryValueProblem, last: State) -> bool:
     """Whether the last state is so near to the rest that its quadratic value may be trusted."""
-    assert bvp.rest is not None
-    size = np.linalg.norm(bvp.start) + np.linalg.norm(bvp.rest.state)
-    return bool(np.linalg.norm(last - bvp.rest.state) <= SETTLED * size)
+    rest = bvp.rest
+    assert rest is not None
+    # distances by the value itself: lengths and speeds have no common unit, and what does not cost does not matter
+    begun, left, far = bvp.start - rest.state, last - rest.state, np.abs(bvp.start) + np.abs(rest.state)
+    size = abs(begun @ rest.matrix @ begun) + STILL * (far @ np.abs(rest.matrix) @ far)
+    return bool(abs(left @ rest.matrix @ left) <= SETTLED**2 * size)
 
 
 def _lengthen(found: Outcome, limits: Limits) -> Outcome:
@@ -215,7 +250,7 @@ def report(found: Outcome) -> Extremal:
     extremal = assemble(found.bvp, found.s, found.y, found.theta, found.code, found.trouble)
     check = extremal.optimality_check
     if not found.solved:
-        return extremal
+        return dataclasses.replace(extremal, message=found.trouble + diagnosis.way_out(found.bvp))
     # durations are sought without a sign, and an arc run backwards meets all equations
     if np.min(found.lengths) < -GAP * found.horizon:
         missed = "an arc came out with a negative duration; give another guess"

@@ -8,7 +8,6 @@ w̄ + p̄·y + ½ y'Py with y = x − x̄ and, for A = f_x, B = f_u over the inp
 so the closed loop is ẏ = (A − B H_uu⁻¹(B'P + H_ux)) y, and a path that has come near may be cut off.
 """
 
-import functools
 from collections.abc import Callable
 
 import jax
@@ -20,7 +19,7 @@ from hjbjax.hamiltonian import pointwise
 from hjbjax.problem.sets import Ball, Box
 from hjbjax.problem.types import Array, Costate, State
 
-NEAR = 1e-8  # what counts as at rest, relative to 1 + |x̄| + |p̄|
+NEAR = 1e-8  # what counts as at rest, relative to the terms of ẋ and ṗ
 FREE_OF_CHARGE = 1e-10  # what counts as no cost at a rest, relative to L: rests are found to some 1e-13
 FREE = 1e-9  # an input this close to an end of its range, relative to its width, is at a bound
 
@@ -64,19 +63,21 @@ def find(bvp: BoundaryValueProblem, near: State, costate: Costate) -> tuple[Rest
     from scipy.optimize import root
 
     n = len(near)
-    # Powell's hybrid method with exact slopes; its tol is on the step, and what it reaches is checked below
+    first, states = np.append(near, costate), np.maximum(np.abs(near), np.abs(bvp.start))
+    units, terms = (np.where((part > 0) & np.isfinite(part), part, 1) for part in _sizes(bvp, first, states))
+    # Powell's hybrid method with exact slopes, in units of its own: a costate may be 1e12 times another
     with np.errstate(all="ignore"):
         found = root(
-            functools.partial(_on_host, _rest_rates, bvp), np.append(near, costate),
-            jac=functools.partial(_on_host, _rest_slopes, bvp), tol=1e-13,
-        )  # fmt: skip
-    left = np.max(np.abs(_on_host(_rest_rates, bvp, found.x)))
-    if not left < NEAR * (1 + np.linalg.norm(found.x)):
+            lambda z: _on_host(_rest_rates, bvp, z * units) / terms, first / units,
+            jac=lambda z: _on_host(_rest_slopes, bvp, z * units) * units / terms[:, None], tol=1e-13,
+        ).x * units  # fmt: skip
+    left = _share_left(bvp, found, states)
+    if not left < NEAR:
         raise ValueError(
-            f"pontryagin: no rest of the Hamiltonian flow near x = {near.tolist()} (what is left is {left:.2g}); an "
-            "infinite horizon ends at one: give rest=, or a horizon"
+            f"pontryagin: no rest of the Hamiltonian flow near x = {near.tolist()} (what is left is {left:.2g} of its "
+            "terms); an infinite horizon ends at one: give rest=, or a horizon"
         )
-    x, p = found.x[:n], found.x[n:]
+    x, p = found[:n], found[n:]
     at = {name: np.asarray(part) for name, part in _expansion(bvp, x, p).items()}
     beta = float(bvp.problem.discount)
     # any cost of the rest, however small, is paid for ever: only rounding, of the rest as well, is none
@@ -107,6 +108,34 @@ def find(bvp: BoundaryValueProblem, near: State, costate: Costate) -> tuple[Rest
         )
     value = at["cost"] / beta if beta else 0.0
     return Rest(x, p, np.asarray(value), matrix), slowest
+
+
+def _sizes(bvp: BoundaryValueProblem, y: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Sizes of x and p near (x, p), and of the terms of ẋ and ṗ, both of shape (2n,).
+
+    States that are zero here may be large on the way, and costates may vanish at a rest: within the shortest time
+    constant, 1/ρ of the slopes, states of the given sizes lend them theirs.
+
+    Args:
+      bvp: the boundary-value problem.
+      y: (x, p), shape (2n,).
+      states: sizes of the states elsewhere, shape (n,).
+    """
+    slopes = _on_host(_rest_slopes, bvp, y)
+    sizes = np.maximum(np.abs(y), np.append(states, np.zeros(len(states))))
+    if not np.all(np.isfinite(slopes)):
+        return sizes, sizes
+    fastest = np.max(np.abs(np.linalg.eigvals(slopes)), initial=0)
+    for _ in range(len(y) if fastest > 0 else 0):
+        sizes = np.maximum(sizes, np.abs(slopes) @ sizes / fastest)
+    return sizes, np.maximum(np.abs(slopes) @ sizes, fastest * sizes)
+
+
+def _share_left(bvp: BoundaryValueProblem, y: np.ndarray, states: np.ndarray) -> float:
+    """The largest |ẋ| or |ṗ| at (x, p) relative to its terms; infinite where it has none."""
+    rates, terms = np.abs(_on_host(_rest_rates, bvp, y)), _sizes(bvp, y, states)[1]
+    with np.errstate(all="ignore"):
+        return float(np.max(np.where(rates == 0, 0, rates / terms)))
 
 
 def _cost_size(bvp: BoundaryValueProblem, rest: State, at: dict[str, np.ndarray]) -> float:

@@ -9,19 +9,19 @@ have stopped there and is no answer: for the problem without its target give
 """
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.extremals import continuation, equilibria, initial_guess, switching
+from hjbjax.extremals import arguments, continuation, equilibria, initial_guess, reaching_guess, switching
 from hjbjax.extremals.boundary_value import BoundaryValueProblem, Closing, Law, Limits
 from hjbjax.extremals.necessary_conditions import Extremal
 from hjbjax.hamiltonian.pointwise import rule_of
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_partial, is_traced, pytree_dataclass
+from hjbjax.problem.pytree import is_traced, pytree_dataclass
 from hjbjax.problem.types import Array, Number, State
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
@@ -29,6 +29,8 @@ from hjbjax.solution.status import Status
 from hjbjax.tracing import checks
 
 SETTLED = 12.0  # time constants of the loop near a rest that an infinite horizon is followed: what is left is e⁻¹²
+WAYS = 4  # ends that are tried where angles can go to rest on either side
+AT_REST = 1e-6  # of a period: an angle no further from its rest has one way there
 LONGEST = 20.0  # units of time that the loop of a solution is followed to a target without a guess of the time
 
 
@@ -81,9 +83,10 @@ def pontryagin(
         the end in place of ``terminal_cost``. ``None``: without a horizon on the target, with ``exit_cost``. The
         problem's target ends the path all the same: end states within it need a problem without.
       guess: a Solution, whose closed loop and DV are the first guess, or another extremal. ``None``: a line to the end
-        states, or the loop under the Riccati costate.
+        states or to the target, the loop under the Riccati costate, or a path under a constant control.
       rest: a state near the rest of an infinite horizon; ``None``: the least node of a Solution, else the origin.
-      grid: its periodic axes are wrapped before the problem sees a state; a Solution brings its own.
+      grid: its periodic axes are wrapped before the problem sees a state; a Solution brings its own. Without a guess
+        and without ``rest`` an angle is brought to rest either way round, and the cheaper one is the answer.
       tol: on the relative residual of the differential equations, and on the conditions at the ends.
       max_nodes: of the mesh; each iteration of the solver costs as much as it has.
       throw: whether a failure raises.
@@ -107,28 +110,30 @@ def pontryagin(
     """
     if is_traced(problem, x0, guess, terminal):
         raise ValueError("pontryagin: got traced values; it runs at the host: call it outside of jit, vmap and grad")
-    _check_problem(problem, tol, max_nodes)
-    start = _state_of_numbers(x0, "x0")
+    arguments.check_problem(problem, tol, max_nodes)
+    start = arguments.state_of_numbers(x0, "x0")
     # checked with ψ in place of the terminal cost, so that a ψ of the wrong shape is refused before anything compiles
     paid = dataclasses.replace(problem, terminal_cost=terminal) if callable(terminal) else problem
     checks.of_one_state(paid, len(start), "the length of x0")
-    _check_guess(guess, len(start), horizon)
-    _check_grid(grid, len(start))
+    arguments.check_guess(guess, len(start), horizon)
+    arguments.check_grid(grid, len(start))
     clock = Clock()
     limits = Limits(tol, max_nodes, clock)
     # float64 whatever the session has: a residual of 1e-8 is below the rounding of float32
     with noting_interrupts(clock), jax.enable_x64(True):
         try:
             bvp = _pose(problem, start, horizon, terminal, guess.grid if isinstance(guess, Solution) else grid)
-            _check_start(bvp)
+            arguments.check_start(bvp)
             if bvp.closing is Closing.REST:
-                bvp, times, columns = _to_rest(bvp, guess, rest, clock)
+                begun = [_to_rest(bvp, guess, rest, clock)]
+                if guess is None and rest is None:  # a rest that is given is the one on its side of the circle
+                    begun = _ways_round(*begun[0], clock)
             else:
                 times, columns = _guess(bvp, guess, horizon)
                 if not bvp.free:  # a loop that reached its end sooner, or an extremal of another horizon
                     times = times * (float(bvp.horizon) / times[-1])
-            solve = switching.switching if bvp.rule.jumps else continuation.smooth
-            found = solve(bvp, times, columns, limits, trusted=guess is not None)
+                begun = [(bvp, times, columns)]
+            found = _cheapest(begun, limits, trusted=guess is not None)
             # Ctrl-C after the last evaluation, which is where the clock is looked at
             if clock.interrupted:
                 raise Stopped(Status.INTERRUPTED, dataclasses.replace(found, code=Status.INTERRUPTED))
@@ -145,54 +150,6 @@ def pontryagin(
     return extremal
 
 
-def _check_problem(problem: object, tol: float, max_nodes: int) -> None:
-    if not isinstance(problem, Problem):
-        raise TypeError(f"pontryagin: got problem = {problem!r}, wanted a Problem")
-    for name, why in (
-        ("noise", "the principle here is the deterministic one; solve it on a grid"),
-        ("disturbances", "a game has a saddle, not a minimum; solve it on a grid"),
-        ("stopping_cost", "stopping is no end condition of (8.7); solve it on a grid"),
-        ("running_max", "a running maximum is no integral; solve it on a grid"),
-    ):
-        if getattr(problem, name) is not None:
-            raise ValueError(f"pontryagin: got a problem with {name}, wanted one without: {why}")
-    if problem.controls is None:
-        raise ValueError("pontryagin: got a problem without controls, wanted a Box, a Ball or a Finite to choose from")
-    if not (np.ndim(tol) == 0 and 0 < tol < 1):
-        raise ValueError(f"pontryagin: got tol = {tol!r}, wanted a number between 0 and 1")
-    if isinstance(max_nodes, bool) or not isinstance(max_nodes, (int, np.integer)) or max_nodes < 1:
-        raise ValueError(f"pontryagin: got max_nodes = {max_nodes!r}, wanted a positive integer")
-
-
-def _check_guess(guess: object, n: int, horizon: object) -> None:
-    if guess is not None and not isinstance(guess, (Solution, Extremal)):
-        raise TypeError(f"pontryagin: got guess = {guess!r}, wanted a Solution, an Extremal or None")
-    if not isinstance(guess, Solution):
-        return
-    if guess.grid.ndim != n:
-        raise ValueError(
-            f"pontryagin: got a guess on a grid of {guess.grid.ndim} axes, wanted {n}, the length of x0; "
-            "give the Solution of this problem, or no guess"
-        )
-    # its closed loop is followed for as long as it takes, and past its last time it has no feedback
-    if guess.times is not None and horizon is None:
-        raise ValueError(
-            "pontryagin: got a marched Solution as the guess, and no horizon: its feedback is known up to "
-            f"t = {float(guess.times[-1]):g} only;\ngive horizon=, or FreeTime() to seek it, or a Solution of solve"
-        )
-
-
-def _check_grid(grid: object, n: int) -> None:
-    if grid is None:
-        return
-    if not isinstance(grid, Grid):
-        raise TypeError(f"pontryagin: got grid = {grid!r}, wanted a Grid or None")
-    if grid.ndim != n:
-        raise ValueError(
-            f"pontryagin: got a grid of {grid.ndim} axes, wanted {n}, the length of x0; give one axis a state"
-        )
-
-
 def _pose(
     problem: Problem,
     start: np.ndarray,
@@ -203,7 +160,7 @@ def _pose(
     """The boundary-value problem that the arguments of ``pontryagin`` pose, all but its rest."""
     n = len(start)
     rule = rule_of(problem, n)
-    held, ends, final = _ends(terminal, n)
+    held, ends, final = arguments.end_states(terminal, n)
     closing = Closing.STATE if any(held) else Closing.COST
     # where the call says neither when nor how the path ends, the problem does: on its target, or never
     if horizon is None and terminal is None:
@@ -228,7 +185,7 @@ def _pose(
         # wrapping is traced into every evaluation, and does nothing without a periodic axis
         grid=grid if grid is not None and any(grid.periodic or ()) else None,
         start=start,
-        horizon=0.0 if given is None else _fixed_horizon(given),
+        horizon=0.0 if given is None else arguments.fixed_horizon(given),
         final=final,
         ends=ends,
         rest=None,
@@ -242,52 +199,6 @@ def _pose(
     )
 
 
-def _check_start(bvp: BoundaryValueProblem) -> None:
-    """Refuse a start from which nothing runs."""
-    problem, start = bvp.problem, jnp.asarray(bvp.start)
-    if problem.target is None or float(bvp.level(0.0, start)) > 0:
-        return
-    paid = float(dataclasses.replace(bvp, final=problem.exit_cost).psi(0.0, start))
-    raise ValueError(
-        f"pontryagin: got x0 = {bvp.start.tolist()}, in the target, where a run ends at once and costs {paid:.6g}; "
-        "start outside, or leave the target out: dataclasses.replace(problem, target=None, exit_cost=None)"
-    )
-
-
-def _state_of_numbers(value: object, name: str) -> np.ndarray:
-    """One finite number a state in float64; NaN is admissible in ``terminal`` alone."""
-    try:
-        array = np.asarray(value, np.float64)
-    except (TypeError, ValueError):
-        raise TypeError(f"pontryagin: got {name} = {value!r}, wanted one number a state") from None
-    if array.ndim != 1 or array.size == 0 or (name != "terminal" and not np.all(np.isfinite(array))):
-        raise ValueError(f"pontryagin: got {name} = {value!r}, wanted shape (n,): one finite number a state")
-    return array
-
-
-def _ends(
-    terminal: Callable | Array | Sequence[float] | None, n: int
-) -> tuple[tuple[bool, ...], np.ndarray, Callable | None]:
-    """A mask of the end states that are given, their values, and the terminal cost."""
-    if terminal is None or callable(terminal):
-        return (False,) * n, np.zeros(n), None if terminal is None else as_partial(terminal)
-    ends = _state_of_numbers(terminal, "terminal")
-    if len(ends) != n or np.any(np.isinf(ends)) or np.all(np.isnan(ends)):
-        raise ValueError(
-            f"pontryagin: got terminal = {ends.tolist()}, wanted {n} numbers, NaN for a state that is free at the end, "
-            "and at least one that is not"
-        )
-    # the 0 of a free state is read nowhere
-    return tuple(bool(given) for given in ~np.isnan(ends)), np.nan_to_num(ends), None
-
-
-def _fixed_horizon(horizon: Number) -> float:
-    """A horizon that is given, checked."""
-    if isinstance(horizon, (bool, str)) or np.ndim(horizon) or not (np.isfinite(horizon) and horizon > 0):
-        raise ValueError(f"pontryagin: got horizon = {horizon!r}, wanted a finite number > 0, FreeTime() or None")
-    return float(horizon)
-
-
 def _guess(
     bvp: BoundaryValueProblem, guess: Solution | Extremal | None, horizon: Number | FreeTime | None
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -298,7 +209,51 @@ def _guess(
     # a free horizon is 0 in the problem, and without a guess of it the loop says how long it takes
     if guess is not None:
         return initial_guess.along_loop(bvp, guess, long or LONGEST)
+    # where the control jumps no costate is to prefer a value
+    if bvp.closing is Closing.TARGET and not bvp.rule.jumps:
+        found = reaching_guess.toward_target(bvp, long or 1.0)
+        if found is not None:
+            return found
     return initial_guess.straight_line(bvp, long or 1.0)
+
+
+def _ways_round(
+    bvp: BoundaryValueProblem, times: np.ndarray, columns: np.ndarray, clock: Clock
+) -> list[tuple[BoundaryValueProblem, np.ndarray, np.ndarray]]:
+    """The problem with its rest on either side of x₀ along periodic axes, and where the solver starts for each."""
+    rest = bvp.rest
+    if bvp.grid is None or rest is None:
+        return [(bvp, times, columns)]
+    period = np.where(np.array(bvp.grid.periodic), np.asarray(bvp.grid.hi) - np.asarray(bvp.grid.lo), 0)
+    turns = (bvp.start - rest.state) / np.where(period > 0, period, 1)
+    # the nearest rest, and the one on the other side; an x₀ at rest in an axis has no other
+    nearest = np.where(period > 0, np.round(turns), 0)
+    other = np.where(np.abs(turns - nearest) > AT_REST, nearest + np.sign(turns - nearest), nearest)
+    sides = np.stack([nearest, np.where(period > 0, other, nearest)], axis=1)
+    ends = itertools.product(*(dict.fromkeys(side) for side in sides.tolist()))
+    ways = []
+    for end in itertools.islice(ends, WAYS):
+        there = dataclasses.replace(rest, state=rest.state + np.array(end) * period)
+        way = dataclasses.replace(bvp, rest=there)
+        ways.append((way, *initial_guess.into_rest(way, bvp.start, float(bvp.horizon), clock)))
+    return ways
+
+
+def _cheapest(
+    begun: Sequence[tuple[BoundaryValueProblem, np.ndarray, np.ndarray]], limits: Limits, *, trusted: bool
+) -> continuation.Outcome:
+    """The solution that costs least of all that are solved; the first failure where none is."""
+    solve = switching.switching if begun[0][0].rule.jumps else continuation.smooth
+    answers: list[continuation.Outcome] = []
+    for bvp, times, columns in begun:
+        if answers:
+            continuation.carry_on(answers[-1], limits)
+        answers.append(solve(bvp, times, columns, limits, trusted=trusted))
+    if len(answers) == 1:
+        return answers[0]
+    solved = [answer for answer in answers if continuation.report(answer).status is Status.CONVERGED]
+    # the cost to go is the last row of an arc, and the first arc's comes first
+    return min(solved, key=lambda answer: answer.y[2 * answer.bvp.n, 0]) if solved else answers[0]
 
 
 def _to_rest(
@@ -309,7 +264,7 @@ def _to_rest(
 ) -> tuple[BoundaryValueProblem, np.ndarray, np.ndarray]:
     """The boundary-value problem with its rest, and where the solver starts."""
     n = bvp.n
-    near: State = np.zeros(n) if rest is None else _state_of_numbers(rest, "rest")
+    near: State = np.zeros(n) if rest is None else arguments.state_of_numbers(rest, "rest")
     if len(near) != n:
         raise ValueError(f"pontryagin: got rest = {near.tolist()}, wanted shape ({n},), like x0: a state near the rest")
     if isinstance(guess, Solution) and rest is None:  # from the least node no path has much left to pay

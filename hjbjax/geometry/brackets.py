@@ -21,6 +21,7 @@ from hjbjax.problem import arguments
 from hjbjax.problem.pytree import as_partial, cast, is_traced, pytree_dataclass
 from hjbjax.problem.types import Array, Control, DType, Number, State
 
+S = TypeVar("S")
 T = TypeVar("T")
 Field: TypeAlias = Callable[[State], State]
 
@@ -162,17 +163,30 @@ def rounding_of_terms(dtype: DType) -> float:
 
 
 def decide(
-    rule: Callable[..., T],
+    derive: Callable[..., T],
+    judge: Callable[[T, State, Number], S],
     functions: tuple,
     x: State | Sequence[float],
     tolerance: Number | None,
     default: Callable[[DType], float] = root_eps,
-    **static: float | tuple[float, ...],
-) -> T:
-    """``rule(functions, x, tolerance, **static)``: in float64 at the host, in its own dtype under a tracer."""
+    **static: int | bool,
+) -> S:
+    """The verdict on derivatives: in float64 at the host, in the dtype of the state under a tracer.
+
+    Args:
+      derive: ``derive(functions, x, tolerance, **static)``, compiled anew for every system.
+      judge: ``judge(derivatives, x, tolerance)``, a program that systems with as many states and inputs share: scales
+        and singular values take as long to compile as the derivatives of four states.
+      functions: a pytree of functions of one state.
+      x: the state, shape (n,).
+      tolerance: what counts as zero.
+      default: the tolerance unless one is given.
+      static: what the programs depend on.
+    """
     if is_traced(functions, x, tolerance):
         x = as_state(x)
-        return rule(functions, x, default(x.dtype) if tolerance is None else tolerance, **static)
+        allowed = default(x.dtype) if tolerance is None else tolerance
+        return judge(derive(functions, x, allowed, **static), x, allowed)
     # float64 whatever the session has: in float32 √eps is 3.5e-4, and that would decide ranks
     with jax.enable_x64(True):
         state = np.asarray(x, np.float64)
@@ -182,13 +196,14 @@ def decide(
         if not 0 < allowed < 1:
             raise ValueError(f"got tolerance = {tolerance!r}, wanted a number between 0 and 1")
         try:
-            answer = _compiled_rule(rule, tuple(static.items()))(cast(functions, np.float64), state, allowed)
+            found = _compiled(derive, tuple(static.items()))(cast(functions, np.float64), state, allowed)
         except jax.errors.JAXTypeError as error:
             # an ``if`` on a state, or a NumPy function of one
             raise ValueError("a field cannot be traced: use jnp.where instead of if, jnp instead of numpy") from error
+        answer = _compiled(judge, ())(found, state, allowed)
         # what a field closes over may be traced though neither field nor state is; such answers stay in their trace
         answer = jax.tree.map(lambda leaf: leaf if is_traced(leaf) else np.asarray(leaf), answer)
-    numbers = [leaf for leaf in jax.tree.leaves(answer) if not is_traced(leaf)]
+    numbers = [leaf for leaf in jax.tree.leaves((found, answer)) if not is_traced(leaf)]
     if not all(np.all(np.isfinite(leaf)) for leaf in numbers):
         raise ValueError(
             f"a derivative of the fields is not finite at or near x = {state.tolist()}: they must be smooth there"
@@ -197,9 +212,7 @@ def decide(
 
 
 @functools.lru_cache(maxsize=256)
-def _compiled_rule(
-    rule: Callable[..., T], static: tuple[tuple[str, float | tuple[float, ...]], ...]
-) -> Callable[..., T]:
+def _compiled(rule: Callable[..., T], static: tuple[tuple[str, int | bool], ...]) -> Callable[..., T]:
     # jit knows its programs by the identity of the function, and a new partial in every call would compile anew
     return jax.jit(functools.partial(rule, **dict(static)))
 
@@ -243,19 +256,20 @@ def output_derivatives(
     return ladder
 
 
-def as_half_widths(radius: float | Array, states: int, name: str) -> tuple[float, ...]:
-    """The half widths of the cube that is near, one a state."""
+def as_half_widths(radius: float | Array, states: int, name: str) -> np.ndarray:
+    """The half widths of the cube that is near, shape (n,)."""
     widths = np.asarray(radius, np.float64)
     if widths.shape not in ((), (states,)) or not np.all(np.isfinite(widths) & (widths >= 0)):
         raise ValueError(f"{name}: got radius = {radius!r}, wanted a finite number ≥ 0, or {states} of them")
-    return tuple(np.broadcast_to(widths, states).tolist())
+    return np.array(np.broadcast_to(widths, states))
 
 
-def near(x: State, radius: tuple[float, ...], samples: int) -> jax.Array:
+def near(x: State, radius: Array, samples: int) -> jax.Array:
     """The state and points around it, shape (samples + 1, n)."""
     # a fixed seed: a verdict must not change from call to call, nor between a trace and the host
-    spread = np.random.default_rng(0).uniform(-1.0, 1.0, (samples, x.shape[0])) * np.asarray(radius)
-    return jnp.asarray(x) + jnp.asarray(np.concatenate([np.zeros((1, x.shape[0])), spread]), x.dtype)
+    spread = np.random.default_rng(0).uniform(-1.0, 1.0, (samples, x.shape[0]))
+    spread = np.concatenate([np.zeros((1, x.shape[0])), spread])
+    return jnp.asarray(x) + jnp.asarray(spread, x.dtype) * jnp.asarray(radius, x.dtype)
 
 
 def as_bool(verdict: bool | Array) -> bool | jax.Array:

@@ -12,6 +12,7 @@ Cost: the program of depth k holds 2^k derivatives, and the number of brackets g
 """
 
 from collections.abc import Callable, Sequence
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +23,8 @@ from hjbjax.geometry.scaling import balance, with_terms, without_rounding
 from hjbjax.problem import arguments
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
 from hjbjax.problem.types import Array, Number, State
+
+Generations: TypeAlias = tuple[Sequence[Array], Sequence[Array]]  # vectors of each, (members, n), and their terms
 
 
 @pytree_dataclass()
@@ -116,7 +119,7 @@ def reachability_distribution(
     """
     arguments.count(depth, "reachability_distribution: depth", least=0)
     fields = as_fields(f, gs)
-    return decide(_reach, fields, x, tolerance, depth=int(depth))
+    return decide(_reach, _span_of_generations, fields, x, tolerance, depth=int(depth))
 
 
 def observability_codistribution(
@@ -156,11 +159,11 @@ def observability_codistribution(
     """
     arguments.count(depth, "observability_codistribution: depth", least=0)
     fields = as_fields(f, gs)
-    return decide(_observe, (fields, as_pytree(h)), x, tolerance, depth=int(depth))
+    return decide(_observe, _span_of_generations, (fields, as_pytree(h)), x, tolerance, depth=int(depth))
 
 
-def _reach(fields: tuple[Field, ...], x: State, tolerance: Number, *, depth: int) -> Distribution:
-    """The span of the fields and of ``depth`` generations of brackets."""
+def _reach(fields: tuple[Field, ...], x: State, tolerance: Number, *, depth: int) -> Generations:
+    """The fields and ``depth`` generations of brackets, and their terms."""
 
     def build(copies, y):
         (first, *others) = copies[0]
@@ -172,7 +175,7 @@ def _reach(fields: tuple[Field, ...], x: State, tolerance: Number, *, depth: int
             generations = _with_brackets(field, generations)
         return generations(y)
 
-    return _span_of_generations(*with_terms(build, [stack_fields(fields)], x, depth + 1), tolerance)
+    return with_terms(build, [stack_fields(fields)], x, depth + 1)
 
 
 def _with_brackets(
@@ -189,8 +192,8 @@ def _with_brackets(
     return longer
 
 
-def _observe(functions: tuple[tuple[Field, ...], Callable], x: State, tolerance: Number, *, depth: int) -> Distribution:
-    """The span of the differentials of the outputs and of ``depth`` generations of their Lie derivatives."""
+def _observe(functions: tuple[tuple[Field, ...], Callable], x: State, tolerance: Number, *, depth: int) -> Generations:
+    """The differentials of the outputs and of ``depth`` generations of their Lie derivatives, and their terms."""
     fields, h = functions
     depth = depth if fields else 0
 
@@ -206,7 +209,7 @@ def _observe(functions: tuple[tuple[Field, ...], Callable], x: State, tolerance:
         return jax.jacfwd(generations)(y)
 
     stacked = [stack_outputs(h), stack_fields(fields)] if fields else [stack_outputs(h)]
-    return _span_of_generations(*with_terms(build, stacked, x, max(depth, 1)), tolerance)
+    return with_terms(build, stacked, x, max(depth, 1))
 
 
 def _with_derivatives(
@@ -221,16 +224,24 @@ def _with_derivatives(
     return longer
 
 
-def _span_of_generations(values: Sequence[Array], terms: Sequence[Array], tolerance: Number) -> Distribution:
+def _span_of_generations(generations: Generations, x: State, tolerance: Number) -> Distribution:
     """The Distribution of all generations, with the directions of the first ones that have the highest rank."""
+    values, terms = generations
     vectors, sizes = jnp.concatenate(values), jnp.concatenate(terms)
     # Many long brackets near one direction make the others small beside it: what shorter ones span stays spanned.
     ends = np.cumsum([len(generation) for generation in values])
     first = jnp.asarray(np.arange(ends[-1]) < ends[:, None])
     spans = jax.vmap(lambda kept: span(jnp.where(kept[:, None], vectors, 0), tolerance, sizes))(first)
-    best = jnp.argmax(jnp.sum(jax.vmap(lambda one: one.counted)(spans), axis=-1))
-    directions, singular_values = spans.directions[best], spans.singular_values[best]
-    return Distribution(vectors, directions, singular_values, jnp.asarray(tolerance, vectors.dtype))
+    counted = jax.vmap(lambda one: one.counted)(spans)
+    best = jnp.argmax(jnp.sum(counted, axis=-1))
+    # what any of them shows beside that rank, and does not count, is the residue of the verdict
+    shares = spans.singular_values / jnp.where(spans.singular_values[:, :1] > 0, spans.singular_values[:, :1], 1)
+    chosen = spans.singular_values[best]
+    beside = jnp.where(counted, 0, shares).max(axis=0) * chosen[0]
+    counts = jnp.arange(len(chosen)) < jnp.sum(counted[best])
+    return Distribution(
+        vectors, spans.directions[best], jnp.where(counts, chosen, beside), jnp.asarray(tolerance, vectors.dtype)
+    )
 
 
 def span(vectors: Array, tolerance: Number, terms: Array) -> Distribution:

@@ -12,6 +12,7 @@ With one input the first condition implies the third, and the second is needed f
 """
 
 from collections.abc import Callable, Sequence
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +33,8 @@ from hjbjax.geometry.scaling import ROUNDING, balance, with_terms, without_round
 from hjbjax.problem import arguments
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
 from hjbjax.problem.types import Array, Number, State
+
+Ladders: TypeAlias = tuple[tuple[Array, Array], tuple[Array, Array]]  # members and slopes, and the terms of both
 
 
 @pytree_dataclass()
@@ -111,7 +114,9 @@ def is_feedback_linearisable(
     half_widths = as_half_widths(radius, states, "is_feedback_linearisable")
 
     def rule(depth: int) -> Linearisability:
-        return decide(_linearisability, fields, x, tolerance, radius=half_widths, samples=int(samples), depth=depth)
+        return decide(
+            _ladders_near, _linearisability, (fields, half_widths), x, tolerance, samples=int(samples), depth=depth
+        )
 
     # Where G_k is everything the longer brackets add nothing, and with m inputs that can be from k = n/m − 1 on.
     enough = states if is_traced(fields, x, tolerance) else -(-states // max(len(fields) - 1, 1))
@@ -122,32 +127,48 @@ def is_feedback_linearisable(
     return rule(states)
 
 
-def _linearisability(
-    fields: tuple[Field, ...], x: State, tolerance: Number, *, radius: tuple[float, ...], samples: int, depth: int
-) -> Linearisability:
-    """The conditions as far as G_0, …, G_{depth − 1} show them."""
-    n = x.shape[0]
+def _ladders_near(
+    functions: tuple[tuple[Field, ...], Array], x: State, tolerance: Number, *, samples: int, depth: int
+) -> Ladders:
+    """The members of G_0, …, G_{depth − 1} at points near x, and their slopes, and the terms of both."""
+    fields, radius = functions
     stacked = [stack_fields(fields[:1]), stack_fields(fields[1:])]
 
     def at(y):
-        # members (depth, m, n), slopes (depth − 1, m, n, n)
-        found, terms = with_terms(lambda copies, z: _ad_ladder(copies[0], copies[1], z), stacked, y, depth)
-        (members, slopes), (_, sizes) = _in_common_units(found, terms)
-        exact = jnp.zeros_like(members)
-        spans = [span(members[: k + 1].reshape(-1, n), tolerance, exact[: k + 1].reshape(-1, n)) for k in range(depth)]
-        outside = [
-            _bracket_residue(spans[k], members[: k + 1], slopes[: k + 1], sizes[: k + 1]) for k in range(depth - 1)
-        ]
-        ranks = jnp.stack([one.counted.sum() for one in spans])
-        residue = jnp.max(jnp.stack(outside)) if outside else jnp.zeros((), x.dtype)
-        return ranks, residue, spans[-1].singular_values
+        return with_terms(lambda copies, z: _ad_ladder(copies[0], copies[1], z), stacked, y, depth)
 
-    ranks, outside, values = jax.vmap(at)(near(x, radius, samples))
+    return jax.vmap(at)(near(x, radius, samples))
+
+
+def _linearisability(ladders: Ladders, x: State, tolerance: Number) -> Linearisability:
+    """The conditions as far as G_0, …, G_{depth − 1} show them."""
+    n, depth = x.shape[0], ladders[0][0].shape[1]
+    up_to = jnp.asarray(np.tril(np.ones((depth, depth), bool)))  # which generations are in G_k, k the row
+
+    def at(found, terms):
+        # members (depth, m, n), slopes (depth − 1, m, n, n)
+        (members, slopes), (_, sizes) = _in_common_units(found, terms)
+        # All G_k in one program, with zeros for the later generations: one singular value decomposition to compile.
+        spans = jax.vmap(lambda kept: _span_of_some(members, kept, tolerance))(up_to)
+        ranks = jnp.sum(jax.vmap(lambda one: one.counted)(spans), axis=-1)
+        if depth == 1:
+            return ranks, jnp.zeros((), x.dtype), spans.singular_values[-1]
+        shorter = jax.tree.map(lambda part: part[:-1], spans)
+        outside = jax.vmap(lambda one, kept: _bracket_residue(one, kept, members[:-1], slopes, sizes))
+        return ranks, jnp.max(outside(shorter, up_to[:-1, :-1])), spans.singular_values[-1]
+
+    ranks, outside, values = jax.vmap(at)(*ladders)
     # at the state itself, which ``near`` puts first; fewer than n rows have fewer than n singular values
     largest, smallest = values[0, 0], values[0, -1]
     full = values.shape[1] == n
     independence = jnp.where((largest > 0) & full, smallest / jnp.where(largest > 0, largest, 1), 0)
     return Linearisability(ranks[0], independence, jnp.max(outside), jnp.all(ranks == ranks[0]), tolerance)
+
+
+def _span_of_some(members: Array, kept: Array, tolerance: Number) -> Distribution:
+    """The span of the generations that are kept, a mask of shape (depth,)."""
+    vectors = jnp.where(kept[:, None, None], members, 0).reshape(-1, members.shape[-1])
+    return span(vectors, tolerance, jnp.zeros_like(vectors))
 
 
 def _in_common_units(
@@ -200,16 +221,26 @@ def _ad_ladder(
     return jnp.stack([*found, slopes[-1] @ last(x)[0] - bends[:, 0]]), slopes
 
 
-def _bracket_residue(spanned: Distribution, members: Array, slopes: Array, terms: Array) -> jax.Array:
-    """The largest part outside of the span of a bracket of two members, relative to the terms of the brackets."""
+def _bracket_residue(spanned: Distribution, kept: Array, members: Array, slopes: Array, terms: Array) -> jax.Array:
+    """The largest part outside of the span of a bracket of two members, relative to the terms of the brackets.
+
+    Args:
+      spanned: the span of the generations that are kept.
+      kept: a mask of generations, shape (k,).
+      members: shape (k, m, n), of length 1.
+      slopes: shape (k, m, n, n).
+      terms: of the slopes.
+    """
     n = members.shape[-1]
-    v, dv = members.reshape(-1, n), slopes.reshape(-1, n, n)  # of all members of G_k, one a row
+    v, dv, made_of = members.reshape(-1, n), slopes.reshape(-1, n, n), terms.reshape(-1, n, n)  # one member a row
+    counts = jnp.repeat(kept, members.shape[1], total_repeat_length=len(v))
     products = jnp.einsum("bij,aj->abi", dv, v)  # (∂w/∂x) v
     brackets = products - products.swapaxes(0, 1)
     # zeros past the rank instead of fewer columns: the rank differs from point to point, and this is vmapped over them
     basis = spanned.directions * spanned.counted
     rest = brackets - brackets @ basis @ basis.T
-    steepest, made_of = (jnp.sqrt(jnp.max(jnp.sum(a * a, axis=(-1, -2)))) for a in (dv, terms.reshape(-1, n, n)))
-    # members have length 1; slopes that are all rounding of larger terms count as none
-    scale = 2 * (steepest + ROUNDING * jnp.finfo(v.dtype).eps ** 0.5 * made_of)
-    return jnp.max(jnp.sqrt(jnp.sum(rest * rest, axis=-1))) / jnp.where(scale > 0, scale, 1)
+    # what this very bracket is made of: one steep pair must not hide another; slopes that are rounding count as none
+    steep = jnp.abs(dv) + ROUNDING * jnp.finfo(v.dtype).eps ** 0.5 * made_of
+    parts = jnp.einsum("bij,aj->abi", steep, jnp.abs(v))
+    scale, left = (jnp.sqrt(jnp.sum(part * part, axis=-1)) for part in (parts + parts.swapaxes(0, 1), rest))
+    return jnp.max(jnp.where(counts[:, None] & counts & (scale > 0), left / jnp.where(scale > 0, scale, 1), 0))

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hjbjax.geometry.unit_cube import half_widths, nearest_inside, state_of, time_of
 from hjbjax.problem.pytree import as_partial, cast, pytree_dataclass
 from hjbjax.problem.sets import Ball, Box
 from hjbjax.problem.types import Array, Number, State
@@ -27,6 +28,7 @@ Place: TypeAlias = tuple[Box | Ball, Array, Array | None]  # the region, the equ
 CLIMBS = 32  # starts of the local search, for each of the three measures
 STEPS = 80  # its steps; a step that does not climb is halved
 NEAR = 0.01  # closer to the equilibrium than this part of the region's half widths, V is not compared with zero
+FLAT = 1e-9  # of the rise of V elsewhere at this distance: a rise below it may be that of a V that is 0 nearby
 AT_REST = 1e-8  # of the drift in the region; an equilibrium comes from a root finder or a rounded formula
 
 
@@ -167,7 +169,7 @@ def lyapunov_check(
 
 def _check_inside(region: Box | Ball, rest: np.ndarray) -> None:
     """Refuse an equilibrium outside of the region: nothing near it would be looked at."""
-    if not np.all(np.abs(_inside(region, rest) - rest) <= AT_REST * _half_widths(region)):
+    if not np.all(np.abs(nearest_inside(region, rest) - rest) <= AT_REST * half_widths(region)):
         raise ValueError(f"lyapunov_check: got equilibrium = {rest.tolist()}, wanted a state in {region!r}")
 
 
@@ -203,10 +205,10 @@ def _starts(dim: int, samples: int) -> np.ndarray:
 def _search(functions: Functions, place: Place, starts: Array, tolerance: float) -> dict[str, jax.Array | None]:
     """The fields of a LyapunovReport, and ``finite``: whether V and dV/dt are so at all starts."""
     region, rest, times = place
-    half = _half_widths(region)
+    half = half_widths(region)
 
     def at(z):
-        return _state_of(region, times, z)
+        return state_of(region, times, z)
 
     def value(z):
         return _value(functions[0], times, z, at(z)[1])
@@ -233,7 +235,11 @@ def _search(functions: Functions, place: Place, starts: Array, tolerance: float)
     decreasing &= relative(nearest) <= tolerance
     # the point in the report is the largest rate where that is a violation, and else the clearest one
     worst = jnp.where((rate > tolerance * terms), highest, nearest)
-    above, rounding = _compare(functions[0], place, lowest, at(lowest)[1])
+    above, rounding, around = _compare(functions[0], place, lowest, at(lowest)[1])
+    risen, rises = _rise(functions[0], place, lowest, at(lowest)[1])
+    # flat beside a large V(x_e), below whose digits it rises; not so where others at this distance rise far more
+    hidden = (jnp.abs(above) <= rounding) & rises & (risen > FLAT * around)
+    above, rounding = jnp.where(hidden, risen, above), jnp.where(hidden, 0, rounding)
     # a sum of both, to have NaN and infinity of either
     everywhere = jax.vmap(lambda z: value(z) + rates(z)[0])(starts)
     moved = _share_of_drift(functions[1], place, jax.vmap(at)(starts))
@@ -244,14 +250,6 @@ def _search(functions: Functions, place: Place, starts: Array, tolerance: float)
         "worst_state": worst_state, "worst_time": worst_time, "rate": rates(worst)[0],
         "lowest_state": lowest_state, "lowest_time": lowest_time, "lowest": above,
     }  # fmt: skip
-
-
-def _half_widths(region: Box | Ball) -> jax.Array:
-    """Half the width of the region in every state: what distances are measured in."""
-    if isinstance(region, Ball):
-        return jnp.broadcast_to(jnp.asarray(region.radius), region.dim)
-    width = jnp.asarray(region.hi - region.lo) / 2
-    return jnp.where(width > 0, width, 1)
 
 
 def _share_of_drift(f: Callable, place: Place, points: tuple[Array | None, Array]) -> jax.Array:
@@ -265,28 +263,9 @@ def _share_of_drift(f: Callable, place: Place, points: tuple[Array | None, Array
     return jnp.max(left / jnp.where(largest > 0, largest, 1))
 
 
-def _state_of(region: Box | Ball, times: Array | None, z: Array) -> tuple[jax.Array | None, jax.Array]:
-    """The time, or None, and the state that a point of the unit cube stands for."""
-    t = None if times is None else _time_of(times, z)
-    z = z if times is None else z[:-1]
-    if isinstance(region, Box):
-        return t, region.lo + z * (region.hi - region.lo)
-    # the cube around the ball; points outside go to the sphere along their ray, so that its edge is searched as well
-    x = region.radius * (2 * z - 1)
-    square = jnp.sum(x * x)
-    outside = square > region.radius**2
-    # the root of 1 inside: at the centre the slope of √0 is infinite, and NaN through a ``where`` that discards it
-    return t, jnp.where(outside, x * region.radius / jnp.sqrt(jnp.where(outside, square, 1)), x)
-
-
-def _time_of(times: Array, z: Array) -> jax.Array:
-    """The time that a point of the unit cube stands for: its last coordinate."""
-    return times[0] + z[-1] * (times[1] - times[0])
-
-
 def _value(V: Callable, times: Array | None, z: Array, x: State) -> jax.Array:
     """V at a state, and at the time that ``z`` stands for if V depends on it."""
-    return jnp.asarray(V(x) if times is None else V(_time_of(times, z), x), x.dtype)
+    return jnp.asarray(V(x) if times is None else V(time_of(times, z), x), x.dtype)
 
 
 def _terms(functions: Functions, times: Array | None, z: Array, x: State) -> tuple[jax.Array, jax.Array]:
@@ -296,7 +275,7 @@ def _terms(functions: Functions, times: Array | None, z: Array, x: State) -> tup
     if times is None:
         parts = jax.grad(lambda x: jnp.asarray(V(x), x.dtype))(x) * jnp.asarray(f(x), x.dtype)
         return jnp.sum(parts), jnp.sum(jnp.abs(parts))
-    t = _time_of(times, z)
+    t = time_of(times, z)
     slope, slopes = jax.grad(lambda t, x: jnp.asarray(V(t, x), x.dtype), argnums=(0, 1))(t, x)
     parts = slopes * jnp.asarray(f(t, x), x.dtype)
     return slope + jnp.sum(parts), jnp.abs(slope) + jnp.sum(jnp.abs(parts))
@@ -328,23 +307,26 @@ def _best(measure: Callable[[Array], jax.Array], starts: Array) -> jax.Array:
     return points[jnp.argmax(heights)]
 
 
-def _compare(V: Callable, place: Place, z: Array, x: State) -> tuple[jax.Array, jax.Array]:
-    """V − V(x_e) at a point, and the rounding of V along the axes as many half widths from x_e."""
+def _compare(V: Callable, place: Place, z: Array, x: State) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """V − V(x_e) at a point, the rounding of V, and |V − V(x_e)| along the axes as many half widths from x_e."""
     region, rest, times = place
     axes = np.concatenate([np.eye(region.dim), -np.eye(region.dim)])
     here, base = _value(V, times, z, x), _value(V, times, z, rest)
-    half = _half_widths(region)
+    half = half_widths(region)
     # The terms of V are as large as V is elsewhere at this distance: 2n points, those inside of the region.
     distance = jnp.sqrt(jnp.sum(((x - rest) / half) ** 2))
-    ring = jax.vmap(lambda y: _inside(region, y))(rest + distance * half * axes)
+    ring = jax.vmap(lambda y: nearest_inside(region, y))(rest + distance * half * axes)
     around = jax.vmap(lambda y: jnp.abs(_value(V, times, z, y) - base))(ring)
-    size = jnp.max(jnp.where(jnp.isfinite(around), around, 0)) + jnp.abs(here) + jnp.abs(base)
-    return here - base, 4 * jnp.finfo(size.dtype).eps * size
+    beside = jnp.max(jnp.where(jnp.isfinite(around), around, 0))
+    return here - base, 4 * jnp.finfo(beside.dtype).eps * (beside + jnp.abs(here) + jnp.abs(base)), beside
 
 
-def _inside(region: Box | Ball, x: State) -> jax.Array:
-    """The state, or the nearest one of the region."""
-    if isinstance(region, Box):
-        return jnp.clip(x, region.lo, region.hi)
-    length = jnp.sqrt(jnp.sum(x * x))
-    return jnp.where(length > region.radius, x * region.radius / jnp.where(length > 0, length, 1), x)
+def _rise(V: Callable, place: Place, z: Array, x: State) -> tuple[jax.Array, jax.Array]:
+    """V − V(x_e) as the integral of its slope along the line from x_e, and whether V rises all the way."""
+    _, rest, times = place
+    # no difference of two values of V: what is constant in it takes no digits away
+    at, weights = np.polynomial.legendre.leggauss(8)
+    slopes = jax.vmap(lambda part: jax.jvp(lambda s: _value(V, times, z, rest + s * (x - rest)), (part,), (1.0,))[1])(
+        jnp.asarray((at + 1) / 2)
+    )
+    return jnp.asarray(weights / 2) @ slopes, jnp.all(slopes >= 0) & jnp.any(slopes > 0)

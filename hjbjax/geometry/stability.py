@@ -9,7 +9,7 @@ Kvalheim and D. E. Koditschek, Necessary conditions for feedback stabilization a
 states Brockett's theorem of 1983.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ from hjbjax.geometry.distributions import Distribution, span
 from hjbjax.geometry.lyapunov import LyapunovReport, lyapunov_check, lyapunov_derivative
 from hjbjax.geometry.scaling import balance, with_terms, without_rounding
 from hjbjax.problem.pytree import pytree_dataclass
-from hjbjax.problem.types import Number, State
+from hjbjax.problem.types import Array, Number, State
 
 __all__ = ["BrockettVerdict", "LyapunovReport", "brockett_check", "lyapunov_check", "lyapunov_derivative"]
 
@@ -72,7 +72,7 @@ def brockett_check(
       violated: 2 independent fields move 3 states without drift; no continuous u(x) makes this state stable
     """
     fields = as_fields(f, gs)
-    linear, unbalanced, driftless = decide(_linearisation, fields, x, tolerance, drift=f is not None)
+    linear, unbalanced, driftless = decide(_linearisation, _rank_and_rest, fields, x, tolerance, drift=f is not None)
     n, m, rank = linear.vectors.shape[1], len(fields) - (f is not None), int(linear.rank)
     # about √eps of float64: a rest point is known to rounding of the root finder or the formula it comes from
     if unbalanced > 1e-8:
@@ -95,28 +95,39 @@ def brockett_check(
 
 def _linearisation(
     fields: tuple[Field, ...], x: State, tolerance: Number, *, drift: bool
-) -> tuple[Distribution, jax.Array, jax.Array]:
-    """(∂f/∂x, ∂f/∂u) at x and the input that balances the drift best, the share of the drift left, whether it is 0."""
+) -> tuple[tuple[Array, Array], tuple[Array, Array] | None, jax.Array]:
+    """The fields and the ∂f_k/∂x at x, each with its terms, the latter for a drift alone, and whether that is zero."""
     field = stack_fields(fields)
     # without drift u = 0 keeps every state at rest, where ∂f/∂x = Σ u_j ∂g_j/∂x is zero: the fields are all there is
     if not drift:
-        vectors, terms = with_terms(lambda copies, y: copies[0][0](y), [field], x, 1)
-        return span(vectors, tolerance, terms), jnp.zeros((), x.dtype), jnp.asarray(True)
-    u, left = _balancing_input(field, x)
+        return with_terms(lambda copies, y: copies[0][0](y), [field], x, 1), None, jnp.asarray(True)
 
     def build(copies, y):
-        # ∂f/∂x + Σ u_j ∂g_j/∂x; its columns and the fields are the rows of which the span is taken
-        slopes = jnp.einsum("k,kij->ij", jnp.append(1.0, u).astype(x.dtype), jax.jacfwd(copies[0][0])(y))
-        return jnp.concatenate([slopes.T, copies[0][0](y)[1:]])
+        return copies[0][0](y), jax.jacfwd(copies[0][0])(y)
 
-    vectors, terms = with_terms(build, [field], x, 1)
-    around = jax.vmap(lambda y: field(y)[0])(near(x, (0.1,) * x.shape[0], 16))
-    return span(vectors, tolerance, terms), left, jnp.all(around == 0)
+    (values, slopes), (sizes, bends) = with_terms(build, [field], x, 1)
+    around = jax.vmap(lambda y: field(y)[0])(near(x, np.full(x.shape[0], 0.1), 16))
+    return (values, sizes), (slopes, bends), jnp.all(around == 0)
 
 
-def _balancing_input(field: Callable[[State], jax.Array], x: State) -> tuple[jax.Array, jax.Array]:
-    """The input that balances the drift best, shape (m,), and the share of the drift that it leaves."""
-    vectors = without_rounding(*with_terms(lambda copies, y: copies[0][0](y), [field], x, 1))
+def _rank_and_rest(
+    found: tuple[tuple[Array, Array], tuple[Array, Array] | None, Array], x: State, tolerance: Number
+) -> tuple[Distribution, Array, Array]:
+    """(∂f/∂x, ∂f/∂u) at x and the input that balances the drift best, the share of the drift left, whether it is 0."""
+    (values, sizes), derivatives, driftless = found
+    if derivatives is None:
+        return span(values, tolerance, sizes), jnp.zeros((), x.dtype), driftless
+    u, left = _balancing_input(without_rounding(values, sizes))
+    # ∂f/∂x + Σ u_j ∂g_j/∂x; its columns and the fields are the rows of which the span is taken
+    inputs = jnp.append(1.0, u).astype(x.dtype)
+    slopes = jnp.einsum("k,kij->ji", inputs, derivatives[0])
+    bends = jnp.einsum("k,kij->ji", jnp.abs(inputs), derivatives[1])
+    vectors, terms = jnp.concatenate([slopes, values[1:]]), jnp.concatenate([bends, sizes[1:]])
+    return span(vectors, tolerance, terms), left, driftless
+
+
+def _balancing_input(vectors: Array) -> tuple[jax.Array, jax.Array]:
+    """The input that balances the drift, the first vector, best, shape (m,), and the share of it that is left."""
     rows, columns = balance(vectors)
     scaled = rows[:, None] * vectors * columns  # of length 1: neither states nor fields are small by their units
     f, gs = scaled[0], scaled[1:].T

@@ -7,7 +7,7 @@ Unlike on a grid there is no upwinding, so H has no kinks in u. How it depends o
 
     Finite                            enumerated
     Box, separable quadratic in u     the stationary point clipped, input by input; an end where H is affine or concave
-    Ball, separable convex quadratic  −(2C + μ)⁻¹b with the multiplier μ ≥ 0 of the radius, by Newton's method
+    Ball, separable quadratic         −(2C + μ)⁻¹b with the multiplier μ ≥ 0 of the radius, by Newton's method
     anything else                     samples, a pattern search, and Newton steps in the inputs that are not at a bound
 
 Where H is affine in an input of a box, u* jumps between the ends: that input is ``jumping``. Between enumerated
@@ -134,19 +134,25 @@ def _in_box(lo: Control, hi: Control, slope: Control, square: Control) -> jax.Ar
 
 
 def _in_ball(radius: Scalar, slope: Control, square: Control) -> jax.Array:
-    """The minimum of b·u + Σ c_j u_j², c ≥ 0, over |u| ≤ r: u = −b/(2c + μ); the centre where b = 0.
+    """The minimum of b·u + Σ c_j u_j² over |u| ≤ r: u = −b/(2c + μ); the centre where b = 0 and c ≥ 0.
 
     1/|u| − 1/r is concave and increasing in μ, so Newton's method from the left rises to the root. Where c is one
-    number it is linear, and the first μ is the root.
+    number it is linear, and the first μ is the root. Some c < 0 leave the sphere alone, where |u|² is a constant:
+    with the least c taken off all of them it is the same minimum, and nothing is concave.
     """
-    curvature = jnp.maximum(2 * square, 0)
-    # tiny: √0 has an infinite derivative, and b = 0 is no rare case
-    size = jnp.sqrt(jnp.maximum(slope @ slope, jnp.finfo(slope.dtype).tiny))
+    concave = jnp.min(square) < 0
+    curvature = 2 * (square - jnp.minimum(jnp.min(square), 0))
     inner = -slope / jnp.where(curvature > 0, curvature, 1)
     # the free minimum counts only where it exists: an input without curvature but with a slope runs to the sphere
-    inside = jnp.all((curvature > 0) | (slope == 0)) & (inner @ inner <= radius * radius)
-    # |u| ≥ |b|/(max 2c + μ): at this μ the norm is at least r, so that Newton's method starts left of the root
-    mu = jnp.maximum(size / radius - jnp.max(curvature), 0)
+    inside = jnp.all((curvature > 0) | (slope == 0)) & (inner @ inner <= radius * radius) & ~concave
+    # b = 0 is no rare case, and on the sphere nothing has a derivative there
+    nothing = slope @ slope <= jnp.finfo(slope.dtype).tiny
+    slope = jnp.where(nothing, 1, slope)
+    size = jnp.sqrt(slope @ slope)
+    # |u| ≥ |b|/(max 2c + μ) and |u| ≥ |b_j|/(2c_j + μ): at this μ the norm is at least r, so that Newton's method
+    # starts left of the root; without the second a tiny b_j where c_j is least would take more steps than there are
+    mu = jnp.maximum(size / radius - jnp.max(curvature), jnp.max(jnp.abs(slope) / radius - curvature))
+    mu = jnp.maximum(mu, 0)
 
     def newton(_, mu):
         parts = jnp.where(curvature + mu > 0, curvature + mu, 1)
@@ -156,7 +162,12 @@ def _in_ball(radius: Scalar, slope: Control, square: Control) -> jax.Array:
         return jnp.maximum(mu + (norm / radius - 1) * norm * norm / rise, 0)
 
     mu = jax.lax.fori_loop(0, NEWTON, newton, mu)
-    bound = -slope / jnp.where(curvature + mu > 0, curvature + mu, 1)
+    bound = jnp.where(nothing, 0, -slope / jnp.where(curvature + mu > 0, curvature + mu, 1))
+    # without a slope along the most concave input both ways to the sphere are as good: up
+    room = jnp.maximum(radius * radius - bound @ bound, 0)
+    aside = concave & (room > 1e-6 * radius * radius)
+    rest = jnp.sqrt(jnp.where(aside, room, 1))
+    bound += jnp.where(aside, rest, 0) * (jnp.arange(len(square)) == jnp.argmin(square))
     return jnp.where(inside, inner, bound)
 
 

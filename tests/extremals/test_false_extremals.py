@@ -148,3 +148,28 @@ def test_lengths_in_any_unit(unit):
 def test_an_infinite_horizon_in_a_small_unit():
     problem, _ = zoo.double_integrator_lq(bound=1e-8)
     assert hjb.pontryagin(problem, [1e-9, 0.0]).cost == pytest.approx(np.sqrt(3) * 1e-18, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "units", [(1.0, 1.0, 1.0, 1.0), (1e6, 1e-6, 1.0, 1.0), (1e-6, 1e6, 1e3, 1e6), (1.0, 1.0, 1e-6, 1e-9)], ids=str
+)
+def test_a_rest_in_any_units(units):
+    """A damped pendulum held at 0.2: states, time and cost in other units have the same rest, cost, and refusals."""
+    sizes, time, cost = np.array(units[:2]), units[2], units[3]
+
+    def drift(x, u, gravity=0.0):
+        z = x / sizes
+        return sizes * jnp.stack([z[1], gravity + jnp.sin(z[0]) - 0.3 * z[1] + u[0]]) / time
+
+    def running(x, u):
+        z = x / sizes
+        return cost / time * (3 * (z[0] - 0.2) ** 2 + 0.5 * z[1] ** 2 + (u[0] + jnp.sin(0.2)) ** 2)
+
+    problem = hjb.Problem(drift, running, hjb.Box([-5.0], [5.0]))
+    near = sizes * np.array([0.1, 0.3])
+    assert hjb.pontryagin(problem, sizes * np.array([1.5, 0.0]), rest=near).cost == pytest.approx(7.80215844 * cost)
+    held = hjb.pontryagin(problem, sizes * np.array([0.2, 0.0]), rest=near)
+    assert abs(held.cost) < 1e-20 * cost
+    falling = dataclasses.replace(problem, drift=lambda x, u: drift(x, u, 9.0))
+    with pytest.raises(ValueError, match="no rest of the Hamiltonian flow"):
+        hjb.pontryagin(falling, sizes * np.array([1.5, 0.0]))

@@ -358,11 +358,14 @@ def tilted(x, u):
 QUADRATIC = (tilted, lambda x, u: 0.5 * u[0] ** 2 + 2 * u[1] ** 2 + x[0] * u[0])
 COUPLED = (tilted, lambda x, u: u[0] ** 2 + u[1] ** 2 + u[0] * u[1] + jnp.cosh(u[1]))
 AFFINE = (tilted, lambda x, u: 1 + x[0] * u[0])
+CONCAVE = (tilted, lambda x, u: 0.5 * u[0] ** 2 - 2 * u[1] ** 2 + x[0] * u[0])
 SETS = {"box": hjb.Box([-1.0, -0.5], [0.7, 1.0]), "ball": hjb.Ball(0.9, 2)}
 
 
 @pytest.mark.parametrize("admissible", SETS)
-@pytest.mark.parametrize(("functions", "exactly"), [(QUADRATIC, True), (AFFINE, True), (COUPLED, False)])
+@pytest.mark.parametrize(
+    ("functions", "exactly"), [(QUADRATIC, True), (AFFINE, True), (CONCAVE, True), (COUPLED, False)]
+)
 def test_no_sample_beats_the_minimiser(admissible, functions, exactly):
     problem = hjb.Problem(*functions, SETS[admissible])
     rule = pointwise.rule_of(problem, 2)

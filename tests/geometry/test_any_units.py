@@ -9,7 +9,7 @@ import sympy
 import hjbjax as hjb
 from hjbjax import geometry, zoo
 from hjbjax.geometry import stability
-from hjbjax.geometry.distributions import _reach
+from hjbjax.geometry.distributions import _reach, _span_of_generations
 from hjbjax.problem.pytree import pytree_dataclass
 
 
@@ -126,9 +126,11 @@ def test_ranks_in_float32_are_those_of_float64():
     for depth, rank in ((1, 2), (2, 3), (4, 3)):
         fields = (plant.drift, plant.push)
         with jax.enable_x64(False):
-            found = jax.jit(lambda x, fields=fields, depth=depth: _reach(fields, x, 3e-4, depth=depth).counted)(
-                jnp.zeros(3, jnp.float32)
-            )
+
+            def span(x, fields=fields, depth=depth):
+                return _span_of_generations(_reach(fields, x, 3e-4, depth=depth), x, 3e-4)
+
+            found = jax.jit(span)(jnp.zeros(3, jnp.float32)).counted
         assert int(found.sum()) == rank
 
 
@@ -206,6 +208,22 @@ def test_a_definite_function_is_not_violated_by_its_units(widths):
     )
     assert saddle.lowest < 0
     assert not saddle.positive
+
+
+@pytest.mark.parametrize(
+    ("level", "positive"),
+    [
+        (lambda x: 3 + jnp.sum(x**8), True),  # at 0.01 by 1e-16, below the digits of 3
+        (lambda x: 1 + 1e-20 * (x @ x), True),
+        (lambda x: 3 - jnp.sum(x**8), False),
+        (lambda x: 3 + x[0] ** 8, False),
+        (lambda x: 3 + jnp.maximum(x @ x - 0.09, 0) ** 2, False),
+        (lambda x: 3 + (x @ x) * (x @ x - 0.25) ** 2, False),
+    ],
+)
+def test_a_flat_function_is_told_from_one_that_is_zero(level, positive):
+    report = hjb.lyapunov_check(level, lambda x: -x, hjb.Box([-1.0, -1.0], [1.0, 1.0]), samples=256)
+    assert report.positive == positive
 
 
 @pytest.mark.parametrize(

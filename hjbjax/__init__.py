@@ -8,7 +8,6 @@ from hjbjax.applications.l2_gain import attenuation, saturation
 from hjbjax.applications.perturbations import perturbation_study
 from hjbjax.applications.probabilities import expected_exit_time, reach_probability, stay_probability
 from hjbjax.applications.reachability import avoid, reach, reach_avoid
-from hjbjax.discretisation import chain
 from hjbjax.discretisation.schemes import Eno2, Limited, Upwind, Weno5
 from hjbjax.discretisation.semi_lagrangian import SemiLagrangian
 from hjbjax.extremals.indirect_method import FreeTime, pontryagin
@@ -21,6 +20,7 @@ from hjbjax.geometry.lyapunov import lyapunov_check
 from hjbjax.iteration.evaluation import Direct, Krylov, Sweeps
 from hjbjax.iteration.methods import Nested, PolicyIteration, ValueIteration
 from hjbjax.iteration.time_methods import Explicit, Implicit, Tableau
+from hjbjax.markov_chain import chain
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import Ball, Box, Finite

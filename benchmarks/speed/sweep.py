@@ -26,11 +26,12 @@ from benchmarks.harness import thresholds
 from benchmarks.harness.footprint import bytes_of
 from benchmarks.harness.report import RESULTS, attempt, publish, table, threads, without
 from benchmarks.harness.timing import interleaved
-from hjbjax.discretisation import chain
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.finiteness import memory
 from hjbjax.iteration import bellman, fixed_point
+from hjbjax.markov_chain import chain
 from hjbjax.problem.pytree import cast
-from hjbjax.solvers import memory, stationary_run
+from hjbjax.solvers import stationary_run
 from hjbjax.solvers.setup import prepare_on_host
 
 COLUMNS = (

@@ -20,13 +20,12 @@ from hjbjax.applications import exit_problems
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.feedback.feedback import GridFeedback, Place, is_grid_feedback
-from hjbjax.finiteness import attainability, node_checks
+from hjbjax.finiteness import attainability, memory, node_checks
 from hjbjax.iteration.methods import ValueIteration
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, is_traced
 from hjbjax.solution.solution import Solution, SolveError
-from hjbjax.solvers import memory
 from hjbjax.solvers.finite_horizon import march
 from hjbjax.solvers.stationary import as_dtype, check_arguments, solve
 from hjbjax.tracing import checks

@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.extremals import diagnosis, initial_guess, periodic_arcs, reaching_guess, second_order
+from hjbjax.extremals import initial_guess, necessary_conditions, second_order
 from hjbjax.extremals.boundary_value import BoundaryValueProblem, Closing, Limits
-from hjbjax.extremals.collocation import collocate
+from hjbjax.extremals.collocation import collocate, split_at_seams
 from hjbjax.extremals.necessary_conditions import Extremal, assemble, entry_time, last_iterate, only_touches
 from hjbjax.problem.types import Array, Number, State
 from hjbjax.solution.clock import CUT, Stopped
@@ -121,7 +121,7 @@ def smooth(
       limits: how far to go.
       trusted: whether the guess is of the very problem, so that easier ones would lead away from it.
     """
-    apart = periodic_arcs.split(bvp, times, columns)
+    apart = split_at_seams(bvp, times, columns)
     if apart is not None:
         # ν alone: in place of one final time, if it is sought, there are the durations of all arcs
         multiplier = unknowns(bvp, times, columns)[int(bvp.timed) :]
@@ -131,9 +131,9 @@ def smooth(
     if not found.solved and not trusted:
         found = _by_continuation(found, limits)
     reaching = bvp.closing in (Closing.STATE, Closing.TARGET) and not trusted
-    if not found.solved and reaching and diagnosis.is_smooth_at_start(bvp):
+    if not found.solved and reaching and necessary_conditions.is_smooth_at_start(bvp):
         carry_on(found, limits)
-        other = reaching_guess.under_constant_control(bvp, times[-1])
+        other = initial_guess.under_constant_control(bvp, times[-1])
         again = _attempt_by_times(bvp, *other, limits, trusted=False)
         found = again if again.solved else found
     if bvp.closing is Closing.REST:
@@ -250,7 +250,7 @@ def report(found: Outcome) -> Extremal:
     extremal = assemble(found.bvp, found.s, found.y, found.theta, found.code, found.trouble)
     check = extremal.optimality_check
     if not found.solved:
-        return dataclasses.replace(extremal, message=found.trouble + diagnosis.way_out(found.bvp))
+        return dataclasses.replace(extremal, message=found.trouble + necessary_conditions.way_out(found.bvp))
     # durations are sought without a sign, and an arc run backwards meets all equations
     if np.min(found.lengths) < -GAP * found.horizon:
         missed = "an arc came out with a negative duration; give another guess"

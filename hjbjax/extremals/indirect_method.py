@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 import jax
 import numpy as np
 
-from hjbjax.extremals import arguments, continuation, equilibria, initial_guess, reaching_guess, switching
+from hjbjax.extremals import arguments, continuation, equilibria, initial_guess, switching
 from hjbjax.extremals.boundary_value import BoundaryValueProblem, Closing, Law, Limits
 from hjbjax.extremals.necessary_conditions import Extremal
 from hjbjax.hamiltonian.pointwise import rule_of
@@ -211,7 +211,7 @@ def _guess(
         return initial_guess.along_loop(bvp, guess, long or LONGEST)
     # where the control jumps no costate is to prefer a value
     if bvp.closing is Closing.TARGET and not bvp.rule.jumps:
-        found = reaching_guess.toward_target(bvp, long or 1.0)
+        found = initial_guess.toward_target(bvp, long or 1.0)
         if found is not None:
             return found
     return initial_guess.straight_line(bvp, long or 1.0)

@@ -2,5 +2,5 @@
 
 ``node_checks`` looks at what the functions return, ``admissibility`` at constrained ends, ``attainability`` at which
 nodes can be brought to the target (``tried_actions``: by which actions), ``resting`` at where the system can rest at no
-cost, ``earnings`` at costs earned for ever.
+cost, ``earnings`` at costs earned for ever, and ``memory`` at whether there is room for it.
 """

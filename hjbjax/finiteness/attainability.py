@@ -12,11 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import chain, cut_cells, edges, stencil
-from hjbjax.discretisation.chain import Rates
+from hjbjax.discretisation import cut_cells, stencil
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.finiteness import tried_actions
 from hjbjax.hamiltonian.players import players_of
+from hjbjax.markov_chain import chain, edges
+from hjbjax.markov_chain.chain import Rates
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.types import Array, Mask, Number, Scalar

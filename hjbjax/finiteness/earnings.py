@@ -11,10 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import chain, stationary_law, stencil
-from hjbjax.discretisation.chain import Rates
+from hjbjax.discretisation import stencil
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.fixed_point import State, Task
+from hjbjax.markov_chain import chain, stationary_law
+from hjbjax.markov_chain.chain import Rates
 from hjbjax.problem.types import Field
 
 if TYPE_CHECKING:

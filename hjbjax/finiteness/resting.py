@@ -13,11 +13,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from hjbjax.discretisation import chain
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.hamiltonian import discrete
 from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import Obstacles
+from hjbjax.markov_chain import chain
 from hjbjax.problem import sets
 from hjbjax.problem.sets import AdmissibleSet
 from hjbjax.problem.types import Field, Mask, Numbers, Scalar

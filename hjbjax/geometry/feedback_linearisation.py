@@ -105,8 +105,7 @@ class Linearisation:
     def alpha(self, x: State) -> Control:
         """α(x) = −β (L_f^{r_i} h_i), shape (m,)."""
         last, matrix, _ = self._ladder(as_state(x))
-        # a solve, more accurate than β times L_f^r h
-        return -jnp.linalg.solve(matrix, last)
+        return -jnp.linalg.solve(matrix, last)  # more accurate than β times L_f^r h
 
     def beta(self, x: State) -> jax.Array:
         """β(x), the inverse of the matrix of L_{g_j} L_f^{r_i − 1} h_i, shape (m, m)."""
@@ -301,8 +300,7 @@ def _in_words(degrees: Sequence[int] | np.ndarray) -> str:
 
 def _verdict(degrees: Sequence[int] | np.ndarray, states: int) -> str:
     """The relative degree and the dimension of its zero dynamics, in words."""
-    total = int(np.sum(degrees))
-    text = f"relative degree {_in_words(degrees)} of {states} states: "
+    text, total = f"relative degree {_in_words(degrees)} of {states} states: ", int(np.sum(degrees))
     if total == states:
         return text + "no zero dynamics"
     names = ["h", "L_f h", *(f"L_f^{k} h" for k in range(2, max(degrees)))][: max(degrees)]
@@ -324,13 +322,11 @@ def _first_effects(
 
     # both (points, depth, outputs, m)
     effects, terms = jax.vmap(lambda y: with_terms(build, stacked, y, depth))(near(x, radius, samples))
-    ratios = jnp.abs(effects) / jnp.where(terms > 0, terms, 1)
     # at any point near x: on the ball and beam L_g L_f² h = 2B r θ̇ is 0 at rest alone, which makes no degree of 4
-    ratio = jnp.max(ratios, axis=(0, -1))  # (depth, outputs)
+    ratio = jnp.max(jnp.abs(effects) / jnp.where(terms > 0, terms, 1), axis=(0, -1))  # (depth, outputs)
     appears = ratio > tolerance
     # argmax of truth values is the first True, and 0 without one, which ``reached`` tells apart
-    first, reached = jnp.argmax(appears, axis=0), jnp.any(appears, axis=0)
-    outputs = jnp.arange(first.shape[0])
+    first, reached, outputs = jnp.argmax(appears, axis=0), jnp.any(appears, axis=0), jnp.arange(appears.shape[1])
     zeros = ~reached | (jnp.arange(depth)[:, None] < first)
     return {
         "degrees": jnp.where(reached, first + 1, 0),
@@ -344,15 +340,11 @@ def _relative_degree(found: Mapping[str, Array], x: State, tolerance: Number) ->
     """The relative degree from the first effects of the inputs on the outputs."""
     decoupling, terms = found["decoupling"], found["terms"]
     if terms.size == 1:  # what ``balance`` makes of one number, whose program takes as long as two derivatives
-        scaled = decoupling / jnp.where(terms > 0, terms, 1)
+        margin = (jnp.abs(decoupling) / jnp.where(terms > 0, terms, 1))[0, 0]
+    elif terms.shape[0] > terms.shape[1]:  # with more outputs than inputs the rows are dependent, without any SVD
+        margin = jnp.zeros((), x.dtype)
     else:
         rows, columns = balance(terms)
-        scaled = rows[:, None] * decoupling * columns
-    # with more outputs than inputs the rows are dependent, and the margin is 0 without any SVD
-    dependent = scaled.shape[0] > scaled.shape[1]
-    if terms.size == 1:
-        margin = jnp.abs(scaled[0, 0])
-    else:
-        margin = jnp.zeros((), x.dtype) if dependent else jnp.linalg.svd(scaled, compute_uv=False)[-1]
+        margin = jnp.linalg.svd(rows[:, None] * decoupling * columns, compute_uv=False)[-1]
     allowed = jnp.asarray(tolerance, x.dtype)
     return RelativeDegree(found["degrees"], decoupling, margin, found["residue"], allowed, x.shape[0])

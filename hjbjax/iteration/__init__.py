@@ -1,6 +1,7 @@
 """Steps, pure and jittable: from a value to a better one, and what bounds its error.
 
 Read ``bellman`` for one step and its linear equation, ``evaluation`` with ``gauss_seidel`` for how that is solved,
-``fixed_point`` for value and policy iteration, ``hoffman_karp`` for the inner player of a game, ``certificates`` for
-bounds, ``time_methods`` and ``time_stepping`` for steps in time, and ``adjoint`` for derivatives of a fixed point.
+``methods`` for what there is to choose, ``fixed_point`` for value and policy iteration (``arc_iteration``: on arcs of
+many cells), ``certificates`` for bounds, ``time_methods`` and ``time_stepping`` for steps in time, and ``adjoint`` for
+derivatives of a fixed point.
 """

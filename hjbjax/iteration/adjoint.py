@@ -17,11 +17,11 @@ from typing import TypeAlias
 import jax
 import jax.numpy as jnp
 
-from hjbjax.discretisation import chain
 from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import PolicyEquation
 from hjbjax.iteration.evaluation import Evaluation, Krylov, direct, evaluate, left_over
 from hjbjax.iteration.fixed_point import State, Task
+from hjbjax.markov_chain import chain
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.types import Field, Number, Scalar
 

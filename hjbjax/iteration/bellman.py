@@ -16,12 +16,13 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from hjbjax.discretisation import chain, cut_cells, edges, stencil
-from hjbjax.discretisation.chain import Rates
+from hjbjax.discretisation import cut_cells, stencil
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.hamiltonian import discrete
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.hamiltonian.search import Action
+from hjbjax.markov_chain import chain, edges
+from hjbjax.markov_chain.chain import Rates
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import Field, Nodes, Number, Scalar
 

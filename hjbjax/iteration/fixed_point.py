@@ -3,7 +3,7 @@
 Every method repeats the same step. At V the greedy policy leaves a residual; the linear equation of that
 policy gives a correction δ; V + δ is the next value. What differs is how well the equation is solved: value
 iteration takes its diagonal with the largest rate (monotone, a contraction), modified policy iteration a few
-Gauss–Seidel sweeps, policy iteration (Howard; semismooth Newton) solves it. In a game see ``hoffman_karp``.
+Gauss–Seidel sweeps, policy iteration (Howard; semismooth Newton) solves it. In a game see ``methods``.
 
 The loop stops by the certificate of the value it returns, not by the size of a step, and tests finiteness: a
 NaN residual is never taken for convergence.
@@ -17,14 +17,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import chain
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.hamiltonian.players import players_of
-from hjbjax.iteration import bellman, certificates, hoffman_karp
+from hjbjax.iteration import bellman, certificates, methods
 from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
 from hjbjax.iteration.certificates import Certificate, ErrorBound, Iterate
 from hjbjax.iteration.evaluation import Evaluation, evaluate
 from hjbjax.iteration.methods import Method
+from hjbjax.markov_chain import chain
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, is_traced, pytree_dataclass
@@ -318,7 +318,7 @@ class Look:
             return evaluate(evaluation, task.asking(later).equation(state.value, state.policy), task.grid)
         if task.problem.is_game:
             left, outer = state.bound.residual, (state.value, state.policy)
-            return hoffman_karp.evaluated(task, *outer, evaluation, residual=left, replies=replies) - state.value
+            return methods.evaluated(task, *outer, evaluation, residual=left, replies=replies) - state.value
         return evaluate(evaluation, self.equation(), task.grid)
 
 

@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.iteration import bellman, certificates, hoffman_karp
+from hjbjax.iteration import bellman, certificates, methods
 from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
 from hjbjax.iteration.certificates import Certificate, Iterate
 from hjbjax.iteration.evaluation import Evaluation, check_evaluation, evaluate
@@ -333,5 +333,5 @@ class ImplicitStep:
     def _evaluated(self, value: Field, policy: Greedy, residual: Number, evaluation: Evaluation) -> Field:
         """The value of the policy, roughly; in a game of the outer player's."""
         if self.on.problem.is_game:
-            return hoffman_karp.evaluated(self, value, policy, evaluation, residual=residual, replies=REPLIES)
+            return methods.evaluated(self, value, policy, evaluation, residual=residual, replies=REPLIES)
         return self.impose(value + evaluate(evaluation, self.equation(value, policy), self.grid))

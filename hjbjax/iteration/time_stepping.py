@@ -11,13 +11,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax.discretisation import chain, correlated_noise
+from hjbjax.discretisation import correlated_noise
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.hamiltonian import discrete
 from hjbjax.hamiltonian.search import Action
 from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import Obstacles
 from hjbjax.iteration.time_methods import TimeMethod
+from hjbjax.markov_chain import chain
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import pytree_dataclass

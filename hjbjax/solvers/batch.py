@@ -15,7 +15,7 @@ import numpy as np
 
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.finiteness import admissibility, node_checks
+from hjbjax.finiteness import admissibility, memory, node_checks
 from hjbjax.iteration import fixed_point
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import Method
@@ -26,7 +26,7 @@ from hjbjax.problem.types import Array, DType, Mask, Nodes
 from hjbjax.solution.clock import CUT, Clock, Stopped, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
-from hjbjax.solvers import host_loop, memory, nested
+from hjbjax.solvers import host_loop, nested
 from hjbjax.solvers.host_loop import FIRST_NODES
 from hjbjax.solvers.nested import Settled
 from hjbjax.solvers.result import finish, solution_at_start, with_last_phase

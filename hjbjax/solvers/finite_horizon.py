@@ -15,7 +15,7 @@ import numpy as np
 from hjbjax.discretisation import schemes
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.schemes import Limited, Upwind
-from hjbjax.finiteness import admissibility, node_checks
+from hjbjax.finiteness import admissibility, memory, node_checks
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import bellman, time_stepping
 from hjbjax.iteration.evaluation import Evaluation, Krylov, Sweeps, check_pytree
@@ -31,7 +31,7 @@ from hjbjax.problem.types import Array, DType, Mask, Nodes, Scalar
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
-from hjbjax.solvers import host_loop, march_run, memory
+from hjbjax.solvers import host_loop, march_run
 from hjbjax.solvers.result import solution_at_start, with_last_phase
 from hjbjax.solvers.setup import choose_evaluation
 from hjbjax.solvers.stationary import as_dtype, check_node_values

@@ -17,12 +17,12 @@ from typing import Any, Protocol, TypeAlias
 import jax
 import numpy as np
 
+from hjbjax.finiteness import memory
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.types import Nodes
 from hjbjax.solution.clock import CHUNK_SECONDS, Clock
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
-from hjbjax.solvers import memory
 
 FIRST_NODES = 20_000  # a first chunk steps over about so many nodes
 CALLBACK = "CpuCallback error"  # how JAX heads the exception of a callback, whatever its type

@@ -9,17 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation import arcs as paths
-from hjbjax.discretisation import edges
 from hjbjax.discretisation.arcs import Arcs, Plan
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.discretisation.semi_lagrangian import PathScheme
-from hjbjax.finiteness import node_checks
+from hjbjax.finiteness import memory, node_checks
 from hjbjax.iteration import arc_iteration, bellman, certificates
 from hjbjax.iteration.arc_iteration import HISTORY, ArcState, ArcTask
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.evaluation import Sweeps
 from hjbjax.iteration.methods import Method
+from hjbjax.markov_chain import edges
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import cast
@@ -28,7 +28,7 @@ from hjbjax.problem.types import DType, Mask, Nodes
 from hjbjax.solution.clock import CUT, Clock, Stopped
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
-from hjbjax.solvers import host_loop, memory
+from hjbjax.solvers import host_loop
 from hjbjax.solvers.host_loop import FIRST_NODES
 from hjbjax.solvers.result import solution_at_start, warn_of_cuts
 from hjbjax.solvers.setup import warn_unreached

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import chain, cut_cells, schemes
+from hjbjax.discretisation import cut_cells, schemes
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.schemes import Limited, Upwind
 from hjbjax.finiteness import attainability, resting
@@ -19,6 +19,7 @@ from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.evaluation import Direct, Evaluation, Krylov, Sweeps
 from hjbjax.iteration.fixed_point import Task
 from hjbjax.iteration.methods import Method, Nested, PolicyIteration, ValueIteration
+from hjbjax.markov_chain import chain
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_discounted
 from hjbjax.problem.pytree import cast, known

@@ -16,7 +16,7 @@ from hjbjax.discretisation import schemes
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.discretisation.semi_lagrangian import PathScheme
-from hjbjax.finiteness import admissibility, node_checks, resting
+from hjbjax.finiteness import admissibility, memory, node_checks, resting
 from hjbjax.iteration import adjoint, fixed_point
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import Method, check_method
@@ -29,7 +29,7 @@ from hjbjax.solution import transfer
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
-from hjbjax.solvers import host_loop, memory, nested, semi_lagrangian
+from hjbjax.solvers import host_loop, nested, semi_lagrangian
 from hjbjax.solvers.result import assemble, finish, solution_at_start, with_grid_error, with_last_phase
 from hjbjax.solvers.setup import choose, choose_scheme, is_constrained, prepare_on_host, prepare_traced
 from hjbjax.tracing import checks

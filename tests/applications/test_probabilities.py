@@ -11,9 +11,9 @@ from systems import SEEDS, random_grid, random_problem
 
 import hjbjax as hjb
 from hjbjax.applications import exit_problems, probabilities
-from hjbjax.discretisation import chain
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import time_stepping
+from hjbjax.markov_chain import chain
 from hjbjax.problem.pytree import pytree_dataclass
 
 UNIT = hjb.Box([-1.0], [1.0])

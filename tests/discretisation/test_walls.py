@@ -9,9 +9,9 @@ from scipy.sparse.linalg import spsolve
 from systems import SEEDS
 
 import hjbjax as hjb
-from hjbjax.discretisation import chain
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.hamiltonian import discrete
+from hjbjax.markov_chain import chain
 from hjbjax.problem.stretching import Sinh
 
 SIGMA = 0.5

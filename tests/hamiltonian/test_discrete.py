@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from systems import SEEDS, random_game, random_grid, random_problem, random_sigma
 
-from hjbjax.discretisation import chain
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.hamiltonian import discrete
 from hjbjax.hamiltonian.players import SAMPLES, find_players
+from hjbjax.markov_chain import chain
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import pytree_dataclass

@@ -15,8 +15,8 @@ from benchmarks import cases
 from benchmarks.__main__ import NAMES
 from benchmarks.harness import footprint, thresholds, timing
 from benchmarks.speed import batch, controls, growth, peers, scaling, startup, sweep
-from hjbjax.discretisation import chain
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.markov_chain import chain
 from hjbjax.problem.pytree import cast
 
 COMPLETE = {"benchmark", "device", "dtype", "versions", "date", "cores", "status"}

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from systems import SEEDS, random_game, random_grid, random_problem
 
-from hjbjax.discretisation import chain
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.hamiltonian import discrete
 from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import Obstacles
+from hjbjax.markov_chain import chain
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import pytree_dataclass

@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given, settings
 from systems import SEEDS, random_grid, random_problem
 
-from hjbjax.discretisation import chain
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.iteration import bellman, certificates
 from hjbjax.iteration.bellman import Obstacles
 from hjbjax.iteration.certificates import Certificate
+from hjbjax.markov_chain import chain
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import cast

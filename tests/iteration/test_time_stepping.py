@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
-from hjbjax.discretisation import chain
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import time_stepping
+from hjbjax.markov_chain import chain
 
 UNIT = hjb.Box([-1.0], [1.0])
 LINE = hjb.Grid([-1.0], [1.0], (41,))

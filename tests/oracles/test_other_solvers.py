@@ -6,7 +6,7 @@ import pytest
 
 import hjbjax as hjb
 from hjbjax import zoo
-from hjbjax.discretisation import chain
+from hjbjax.markov_chain import chain
 
 TOL = 1e-5
 METHODS = [

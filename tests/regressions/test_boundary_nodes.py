@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
-from hjbjax.discretisation import chain
+from hjbjax.markov_chain import chain
 
 TWO = hjb.Finite([[-1.0], [1.0]])
 partial = jax.tree_util.Partial

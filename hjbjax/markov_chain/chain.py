@@ -24,10 +24,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import correlated_noise, decision_process, edges, schemes, stationary_law, stencil
+from hjbjax.discretisation import correlated_noise, schemes, stencil
 from hjbjax.discretisation.cut_cells import links
 from hjbjax.discretisation.discretisation import Chain, Discretisation
 from hjbjax.discretisation.schemes import Upwind
+from hjbjax.markov_chain import decision_process, edges, stationary_law
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from systems import SEEDS, SHAPES, random_grid, random_problem
 
-from hjbjax.discretisation import chain
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
+from hjbjax.markov_chain import chain
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import Ball, Box, Finite

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from systems import SEEDS, random_grid, random_problem
 
-from hjbjax.discretisation import chain, stationary_law
 from hjbjax.discretisation.schemes import Upwind
+from hjbjax.markov_chain import chain, stationary_law
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import Box

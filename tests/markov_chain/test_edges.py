@@ -13,8 +13,8 @@ from jax.tree_util import Partial
 from plain_chain import hamiltonians, solved, tables
 
 import hjbjax as hjb
-from hjbjax.discretisation import chain
 from hjbjax.discretisation.stencil import continued, inward, sparse
+from hjbjax.markov_chain import chain
 
 PLAIN = hjb.Upwind(central=False)
 SEEDS = st.integers(0, 2**32 - 1)

@@ -11,9 +11,10 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hjbjax.discretisation import cut_cells, stationary_law, stencil
+from hjbjax.discretisation import cut_cells, stencil
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
+from hjbjax.markov_chain import stationary_law
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import AdmissibleSet, Finite

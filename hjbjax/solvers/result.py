@@ -29,8 +29,7 @@ from hjbjax.solvers.nested import Settled
 from hjbjax.solvers.setup import Assumptions, warn
 
 GAP = 0.05  # of what the actions matter; where Isaacs' condition holds, upwinding left up to .019 on 21 nodes
-# orders: of upwinding, of central differences, and of limited slopes, which is 2 where V is smooth and 1 at kinks
-FIRST, CENTRAL, LIMITED = 1.0, 2.0, 1.3
+FIRST, CENTRAL = 1.0, 2.0  # orders of upwinding and of central differences
 COARSE = 0.1  # of the range of V: a larger error of the grid is worth a warning
 MOST = 2 / 3  # of an end's nodes: whatever has a velocity leaves by half of those where its position ends
 
@@ -106,7 +105,10 @@ def with_grid_error(solution: Solution, settled: Settled, coarser: tuple[Grid, n
     """
     value, origin = np.asarray(solution.value), settled.origin
     if coarser is not None:
-        order = LIMITED if origin is not None else FIRST if settled.note else CENTRAL
+        order: float | np.ndarray = FIRST if settled.note else CENTRAL
+        if origin is not None:
+            chain, policy = np.asarray(origin.state.value), np.asarray(solution.policy)
+            order = grid_error.order_of_slopes(solution.grid, value, *coarser, chain=chain, policy=policy)
         found = grid_error.estimate(solution.grid, value, *coarser, order=order)
     elif origin is not None and settled.task.problem.noise is None:
         with np.errstate(invalid="ignore"):

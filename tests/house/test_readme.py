@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import json
 import re
 from pathlib import Path
 
@@ -49,3 +50,13 @@ def test_the_files_it_names_exist():
     assert named
     for path in linked + named:
         assert (ROOT / path).exists(), path
+
+
+def test_the_table_of_estimated_errors_is_what_the_benchmark_wrote():
+    rows = json.loads((ROOT / "benchmarks/results/estimates.json").read_text(encoding="utf-8"))
+    ratios = [row["ratio"] for row in rows if row["counts"]]
+    table = README.split("over the largest true error, on three grids each")[1].split("\n\n")[1]
+    quoted = [float(cell) for cell in re.findall(r"\| (\d*\.\d+)(?= \|)", table)]
+    assert quoted == pytest.approx(ratios, abs=0.006, rel=0.002)
+    within = sum(1 / 3 <= ratio <= 5 for ratio in ratios)
+    assert f"Between a third and five in {within} of {len(ratios)}" in README

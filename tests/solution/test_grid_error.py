@@ -1,0 +1,56 @@
+"""The order by which two grids estimate the error, on node values in closed form."""
+
+import numpy as np
+import pytest
+
+from hjbjax import Grid
+from hjbjax.solution import grid_error
+
+FINE, COARSE = Grid([-1.0] * 2, [1.0] * 2, (41, 41)), Grid([-1.0] * 2, [1.0] * 2, (21, 21))
+X = np.stack(np.meshgrid(np.linspace(-1, 1, 41), np.linspace(-1, 1, 41), indexing="ij"), -1)
+H = 0.05
+SMOOTH = np.cos(X[..., 0]) * np.sin(X[..., 1] + 1)
+STEADY, SIDES = np.ones((41, 41, 1)), np.where(X[..., :1] + X[..., 1:] > 0.01, 1.0, -1.0)
+
+
+def answers(error, of_chain):
+    """V_h, V_2h with four times the error, and the chain's answer, on the values of ``SMOOTH``."""
+    return (SMOOTH + error, (SMOOTH + 4 * error)[::2, ::2]), SMOOTH + of_chain
+
+
+@pytest.mark.parametrize("policy", [STEADY, SIDES])
+def test_smooth_errors_of_order_two_are_estimated_exactly(policy):
+    error = H**2 * (1 + X[..., 0] ** 2) / 10
+    (value, before), chain = answers(error, H * (1 + X[..., 1] ** 2))
+    order = grid_error.order_of_slopes(FINE, value, COARSE, before, chain=chain, policy=policy)
+    found = grid_error.estimate(FINE, value, COARSE, before, order=order)
+    np.testing.assert_allclose(found[::2, ::2], error[::2, ::2], rtol=1e-9)
+
+
+def test_a_kink_is_told_at_its_nodes_alone():
+    error = H**2 / 10 + np.where(np.abs(X[..., 0]) < 1e-9, H / 10, 0)
+    (value, before), chain = answers(error, H * np.ones((41, 41)))
+    order = grid_error.order_of_slopes(FINE, value, COARSE, before, chain=chain, policy=STEADY)
+    assert np.all((order == grid_error.KINKED) == (np.abs(X[::2, ::2, 0]) < 1e-9))
+
+
+@pytest.mark.parametrize(
+    ("policy", "gain", "broken"), [(SIDES, 1.0, True), (STEADY, 1.0, False), (SIDES, 10.0, False), (SIDES, 0.0, False)]
+)
+def test_where_slopes_gain_nothing_and_the_policy_jumps_the_order_is_that_of_a_root(policy, gain, broken):
+    error = 0.1 * np.abs(X[..., 0])
+    (value, before), chain = answers(error, error + gain * 3 * error)
+    order = grid_error.order_of_slopes(FINE, value, COARSE, before, chain=chain, policy=policy)
+    assert (np.ndim(order) == 0 and order == grid_error.BROKEN) == broken
+
+
+def test_nodes_without_a_value_or_a_policy_count_for_nothing():
+    error = 0.1 * np.abs(X[..., 0])
+    (value, before), chain = answers(error, 4 * error)
+    lost, policy = X[..., 1] > 0.5, SIDES.copy()
+    value[lost], before[lost[::2, ::2]], chain[lost], policy[lost] = np.inf, np.inf, np.inf, np.nan
+    order = grid_error.order_of_slopes(FINE, value, COARSE, before, chain=chain, policy=policy)
+    assert order == grid_error.BROKEN
+    found = grid_error.estimate(FINE, value, COARSE, before, order=order)
+    assert np.all(np.isfinite(found))
+    assert np.all(found[lost & (X[..., 1] > 0.6)] == 0)

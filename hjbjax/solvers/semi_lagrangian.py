@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +31,7 @@ from hjbjax.solvers import host_loop
 from hjbjax.solvers.host_loop import FIRST_NODES
 from hjbjax.solvers.result import solution_at_start, warn_of_cuts
 from hjbjax.solvers.setup import warn_unreached
+from hjbjax.solvers.stationary_run import StatesInChunks
 from hjbjax.tracing import checks
 
 WORDS = {
@@ -173,55 +173,15 @@ def _check_arcs(on: Discretisation, plan: Plan, links: Arcs, fixed: jax.Array) -
         )
 
 
-class _Run:
-    """The iteration of a task on arcs: its last state, and the one before the chunk that is running."""
-
-    longest = HISTORY
+class _Run(StatesInChunks):
+    """The iteration of a task on arcs."""
 
     def __init__(self, task: ArcTask, guess: Nodes, limit: int):
-        self.task, self.guess, self.limit = task, guess, limit
-        self.state = self.before = arc_iteration.begin(task, guess)
-        self.residuals, self.steps = [np.zeros(0)], -1
-        self.nodes, self.name = task.grid.size, f"{' x '.join(map(str, task.grid.shape))} nodes"
-        self.bar = {"desc": "solve", "unit": " steps"}
-
-    def compile(self) -> None:
-        """Run no step: the state is at step −1, before the look at the guess."""
-        self.before, self.state = self.state, _run(self.task, self.state, -1)
+        super().__init__(task, arc_iteration.begin(task, guess), _run, guess, limit)
 
     def first_chunk(self, clock: Clock) -> int:
         """Steps of the first chunk, beside the look at the guess: a step looks at every arc of a node."""
         return int(np.clip(FIRST_NODES / (self.nodes * self.task.arcs.count), 1, HISTORY - 1))
-
-    def advance(self, count: int) -> Status:
-        """Take ``count`` steps at most; the look at the guess comes with the first of them."""
-        until = int(min(max(self.steps, 0) + count, self.limit))
-        # in one assignment: an interrupt may come from here on, and the state before may be donated
-        self.before, self.state = self.state, _run(self.task, self.state, until)
-        status = Status(int(self.state.code))
-        self._note()
-        return status
-
-    def _note(self) -> None:
-        """Write down the residuals of the last chunk, once."""
-        done = int(self.state.step)
-        self.residuals.append(np.asarray(self.state.history)[: done - self.steps])
-        self.steps = done
-
-    def between(self, status: Status, clock: Clock) -> Status:
-        """Write down what an interrupt left open."""
-        if status is Status.INTERRUPTED:
-            self._note()
-        return status
-
-    def show(self, bar: Any) -> None:
-        """Move the progress bar; the look is no step."""
-        bar.update(max(self.steps, 0) - bar.n)
-        bar.set_postfix_str(f"error {float(self.state.bound.error):.2e}, tol {float(self.task.tol):.0e}", refresh=False)
-
-    def keep(self, error: Exception) -> None:
-        """Attach the value to an exception: of the step that failed, the one before unless donated, the guess."""
-        host_loop.keep(error, self.task.grid, lambda: self.state.value, lambda: self.before.value, lambda: self.guess)
 
 
 def _finish(

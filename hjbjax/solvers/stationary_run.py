@@ -1,6 +1,7 @@
 """A solve in chunks of steps: the jitted iteration from a guess to its end, with the residuals of all steps."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -51,42 +52,30 @@ def with_obstacles(task: Task, state: State) -> State:
     return dataclasses.replace(state, value=task.obstacles.impose(jnp.asarray(state.value)))
 
 
-class StationaryRun:
-    """The iteration of a task: its last state, and the one before the chunk that is running."""
+class StatesInChunks:
+    """An iteration whose state holds all there is: the last one, and the one before the chunk that is running.
+
+    Args:
+      task: what is iterated, with ``grid`` and ``tol``.
+      state: where it begins, at step −1, with ``step``, ``code``, ``history``, ``bound`` and ``value``.
+      run: from a task, a state and a number of steps to the state then; it may donate the state.
+      guess: the value to fall back on.
+      limit: of the steps.
+    """
 
     longest = HISTORY  # a chunk records the residuals of so many steps
 
-    def __init__(self, task: Task, guess: Nodes, limit: int):
+    def __init__(self, task: Any, state: Any, run: Callable[..., Any], guess: Nodes, limit: int):
         self.task, self.guess, self.limit = task, guess, limit
-        self.state = self.before = fixed_point.begin(task, guess)
+        self.state = self.before = state
         self.residuals, self.steps = [np.zeros(0)], -1
         self.nodes, self.name = task.grid.size, f"{' x '.join(map(str, task.grid.shape))} nodes"
         self.bar = {"desc": "solve", "unit": " steps"}
-        self._run = _run_kept if _calls_back(task) else run
+        self._run = run
 
     def compile(self) -> None:
         """Run no step: the state is at step −1, before the look at the guess."""
         self.before, self.state = self.state, self._run(self.task, self.state, -1)
-
-    def first_chunk(self, clock: Clock) -> int:
-        """Steps of the first chunk on this grid, before any is timed there, beside the look at the guess.
-
-        A coarser grid tells what they take; a finer one may fall out of the cache, hence half a chunk's time. One alone
-        where a step may take many passes over the nodes, and more of them on a finer grid.
-        """
-        evaluation = self.task.method.evaluation
-        # the look is one pass over the nodes, a step with a linear solve hundreds: it is timed before one is begun
-        if clock.per_node is None and self.nodes > MANY_NODES:
-            return 0
-        # a Krylov or direct solve takes more passes on finer grids, and so do the replies of a game: what a step took
-        # on a coarser grid says nothing
-        if self.task.problem.is_game or (evaluation is not None and not evaluation.rough):
-            return 1
-        if clock.per_node is None:
-            steps = FIRST_NODES / self.nodes
-        else:
-            steps = clock.steps_in(min(CHUNK_SECONDS / 2, clock.seconds - clock.elapsed()), self.nodes)
-        return int(np.clip(steps, 1, HISTORY - 1))  # one place of the history is the look's
 
     def advance(self, count: int) -> Status:
         """Take ``count`` steps at most; the look at the guess comes with the first of them."""
@@ -118,6 +107,33 @@ class StationaryRun:
     def keep(self, error: Exception) -> None:
         """Attach the value to an exception: of the step that failed, the one before unless donated, the guess."""
         host_loop.keep(error, self.task.grid, lambda: self.state.value, lambda: self.before.value, lambda: self.guess)
+
+
+class StationaryRun(StatesInChunks):
+    """The iteration of a task of the chain, or of one with slopes of high order behind it."""
+
+    def __init__(self, task: Task, guess: Nodes, limit: int):
+        super().__init__(task, fixed_point.begin(task, guess), _run_kept if _calls_back(task) else run, guess, limit)
+
+    def first_chunk(self, clock: Clock) -> int:
+        """Steps of the first chunk on this grid, before any is timed there, beside the look at the guess.
+
+        A coarser grid tells what they take; a finer one may fall out of the cache, hence half a chunk's time. One alone
+        where a step may take many passes over the nodes, and more of them on a finer grid.
+        """
+        evaluation = self.task.method.evaluation
+        # the look is one pass over the nodes, a step with a linear solve hundreds: it is timed before one is begun
+        if clock.per_node is None and self.nodes > MANY_NODES:
+            return 0
+        # a Krylov or direct solve takes more passes on finer grids, and so do the replies of a game: what a step took
+        # on a coarser grid says nothing
+        if self.task.problem.is_game or (evaluation is not None and not evaluation.rough):
+            return 1
+        if clock.per_node is None:
+            steps = FIRST_NODES / self.nodes
+        else:
+            steps = clock.steps_in(min(CHUNK_SECONDS / 2, clock.seconds - clock.elapsed()), self.nodes)
+        return int(np.clip(steps, 1, HISTORY - 1))  # one place of the history is the look's
 
 
 def _calls_back(task: Task) -> bool:

@@ -5,36 +5,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import sympy
+from linear_plants import Linear
 
 import hjbjax as hjb
 from hjbjax import geometry, zoo
 from hjbjax.geometry import stability
 from hjbjax.geometry.distributions import _reach, _span_of_generations
-from hjbjax.problem.pytree import pytree_dataclass
 
 
 @pytest.fixture(autouse=True)
 def float64():
     with jax.enable_x64(True):
         yield
-
-
-@pytree_dataclass()
-class Linear:
-    """ẋ = A x + b u with the output c x, shifted to a rest point."""
-
-    a: object
-    b: object
-    c: object
-
-    def drift(self, x):
-        return self.a @ x
-
-    def push(self, x):
-        return jnp.asarray(self.b, x.dtype) + 0 * x
-
-    def output(self, x):
-        return self.c @ x
 
 
 def motor(inductance):

@@ -11,10 +11,10 @@ import jax
 import numpy as np
 import pytest
 import sympy
+from linear_plants import Linear
 
 from hjbjax import geometry
 from hjbjax.geometry import stability
-from hjbjax.problem.pytree import pytree_dataclass
 
 S = sympy.Symbol("s")
 N = 3
@@ -24,24 +24,6 @@ N = 3
 def float64():
     with jax.enable_x64(True):
         yield
-
-
-@pytree_dataclass()
-class Plant:
-    """ẋ = A x + b u, y = c x."""
-
-    a: object
-    b: object
-    c: object
-
-    def drift(self, x):
-        return self.a @ x
-
-    def push(self, x):
-        return self.b + 0 * x
-
-    def output(self, x):
-        return self.c @ x
 
 
 def dense(random):
@@ -123,7 +105,7 @@ def test_verdicts_on_linear_plants_are_those_of_the_theory_in_any_units(kind, sp
         a, b, c = kind(random)
         reached, seen, degree, onto = theory(a, b, c)
         units, time, size = 10 ** random.uniform(-spread, spread, N), *10 ** random.uniform(-spread, spread, 2)
-        found = verdicts(Plant(time * units[:, None] * a / units, size * units * b, c / units))
+        found = verdicts(Linear(time * units[:, None] * a / units, size * units * b, c / units))
         # past the tolerance a rank may be missed; none is invented, and verdicts by other ways stay as they are
         clear = is_clear(a, b), is_clear(a.T, c)
         unclear += not all(clear)

@@ -1,9 +1,11 @@
 """Other people's solvers of Markov decision problems, on the chain that hjbjax exports.
 
 QuantEcon's ``DiscreteDP`` takes the pairs of state and action as they are; mdpsolver takes lists. Both maximise.
-QuantEcon's modified policy iteration stops at half of ``epsilon``, so that twice the tolerance certifies it. The
-chain moves by very short steps, with a factor near one, which is hard on value iteration and on plain sweeps:
-mdpsolver's value iteration takes minutes where its Gauss–Seidel modified policy iteration takes seconds.
+QuantEcon's modified policy iteration stops at half of ``epsilon``, so that twice the tolerance certifies it; its policy
+iteration knows no tolerance and solves to rounding, ours stops at the one that is asked for. The chain moves by very
+short steps, with a factor near one: it is uniform in time, as such solvers want it, and hard on value iteration and on
+plain sweeps of theirs, while ours take each node's own step. mdpsolver's value iteration takes minutes where its
+Gauss–Seidel modified policy iteration takes seconds.
 """
 
 from collections.abc import Callable

@@ -105,9 +105,9 @@ def with_grid_error(solution: Solution, settled: Settled, coarser: tuple[Grid, n
     """
     value, origin = np.asarray(solution.value), settled.origin
     if coarser is not None:
-        order: float | np.ndarray = FIRST if settled.note else CENTRAL
+        order = FIRST if settled.note else CENTRAL
         if origin is not None:
-            chain, policy = np.asarray(origin.state.value), np.asarray(solution.policy)
+            chain, policy = np.asarray(origin.state.value), solution.policy
             order = grid_error.order_of_slopes(solution.grid, value, *coarser, chain=chain, policy=policy)
         found = grid_error.estimate(solution.grid, value, *coarser, order=order)
     elif origin is not None and settled.task.problem.noise is None:

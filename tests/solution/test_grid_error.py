@@ -18,20 +18,12 @@ def answers(error, of_chain):
     return (SMOOTH + error, (SMOOTH + 4 * error)[::2, ::2]), SMOOTH + of_chain
 
 
-@pytest.mark.parametrize("policy", [STEADY, SIDES])
-def test_smooth_errors_of_order_two_are_estimated_exactly(policy):
-    error = H**2 * (1 + X[..., 0] ** 2) / 10
-    (value, before), chain = answers(error, H * (1 + X[..., 1] ** 2))
-    order = grid_error.order_of_slopes(FINE, value, COARSE, before, chain=chain, policy=policy)
-    found = grid_error.estimate(FINE, value, COARSE, before, order=order)
-    np.testing.assert_allclose(found[::2, ::2], error[::2, ::2], rtol=1e-9)
-
-
-def test_a_kink_is_told_at_its_nodes_alone():
-    error = H**2 / 10 + np.where(np.abs(X[..., 0]) < 1e-9, H / 10, 0)
-    (value, before), chain = answers(error, H * np.ones((41, 41)))
-    order = grid_error.order_of_slopes(FINE, value, COARSE, before, chain=chain, policy=STEADY)
-    assert np.all((order == grid_error.KINKED) == (np.abs(X[::2, ::2, 0]) < 1e-9))
+@pytest.mark.parametrize(("order", "share"), [(1, 0.47), (2, 1.41)])
+def test_the_usual_order_is_between_those_of_kinks_and_of_smooth_values(order, share):
+    error = H**order * (1 + X[..., 0] ** 2) / 10
+    value, before = SMOOTH + error, (SMOOTH + 2**order * error)[::2, ::2]
+    found = grid_error.estimate(FINE, value, COARSE, before, order=grid_error.USUAL)
+    np.testing.assert_allclose(found[::2, ::2], share * error[::2, ::2], rtol=0.01)
 
 
 @pytest.mark.parametrize(
@@ -41,7 +33,16 @@ def test_where_slopes_gain_nothing_and_the_policy_jumps_the_order_is_that_of_a_r
     error = 0.1 * np.abs(X[..., 0])
     (value, before), chain = answers(error, error + gain * 3 * error)
     order = grid_error.order_of_slopes(FINE, value, COARSE, before, chain=chain, policy=policy)
-    assert (np.ndim(order) == 0 and order == grid_error.BROKEN) == broken
+    assert order == (grid_error.BROKEN if broken else grid_error.USUAL)
+
+
+@pytest.mark.parametrize("policy", [None, np.full((41, 41, 1), np.nan), np.zeros((41, 41, 0))])
+def test_no_policy_jumps_nowhere(policy):
+    error = 0.1 * np.abs(X[..., 0])
+    (value, before), chain = answers(error, 4 * error)
+    order = grid_error.order_of_slopes(FINE, value, COARSE, before, chain=chain, policy=policy)
+    assert order == grid_error.USUAL
+    assert grid_error.order_of_slopes(FINE, SMOOTH, COARSE, SMOOTH[::2, ::2], chain=SMOOTH, policy=SIDES) == order
 
 
 def test_nodes_without_a_value_or_a_policy_count_for_nothing():

@@ -15,6 +15,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.solution import transfer
 
 USUAL, BROKEN = 1.65, 0.5  # orders of limited slopes
+OTHERS = 1.3  # where the coarser grid has other nodes, as at odd intervals, and one of them may meet a kink
 # of the mean change between grids over that between schemes: slopes gain nothing, and where both schemes are one
 LARGE, ALIKE = 0.5, 10.0
 JUMP = 0.9  # of the range of a control, between neighbours
@@ -49,7 +50,10 @@ def order_of_slopes(
     """
     change = np.mean(_apart(transfer.restrict(value, grid, coarse), before))
     gain = np.mean(_apart(value, chain))
-    return BROKEN if LARGE * gain <= change <= ALIKE * gain and change > 0 and _jumps(policy) else USUAL
+    if LARGE * gain <= change <= ALIKE * gain and change > 0 and _jumps(policy):
+        return BROKEN
+    nested = all(grid.intervals(axis) % coarse.intervals(axis) == 0 for axis in range(grid.ndim))
+    return USUAL if nested else OTHERS
 
 
 def _apart(value: np.ndarray, other: np.ndarray) -> np.ndarray:

@@ -22,7 +22,7 @@ import numpy as np
 
 from hjbjax.discretisation import cut_cells
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.problem.grid import Grid
+from hjbjax.problem.grid import Grid, into_period
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import Array, AtNodes, Mask, Number, Scalar
 from hjbjax.tracing import components
@@ -208,9 +208,7 @@ def _moved(grid: Grid, x: Sequence[jax.Array], f: Sequence[jax.Array], time: jax
         lo, hi = jnp.asarray(grid.lo[axis], place.dtype), jnp.asarray(grid.hi[axis], place.dtype)
         place = place + time * velocity
         if grid.periodic[axis]:  # type: ignore[index]
-            # by comparison first, since the remainder rounds every place anew
-            turned = lo + jnp.mod(place - lo, hi - lo)
-            found.append(jnp.where((place >= lo) & (place < hi), place, jnp.where(turned >= hi, lo, turned)))
+            found.append(into_period(place, lo, hi))
         else:
             found.append(jnp.clip(place, lo, hi))
     return found

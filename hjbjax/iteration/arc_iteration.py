@@ -25,15 +25,12 @@ from hjbjax.discretisation.arcs import Arcs, widened
 from hjbjax.iteration import certificates
 from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
 from hjbjax.iteration.certificates import Certificate, ErrorBound, Iterate
+from hjbjax.iteration.fixed_point import HISTORY, PATIENCE, ROUNDING
 from hjbjax.markov_chain.chain import Rates
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import AtNodes, Field, Mask, Nodes, Number, Scalar
 from hjbjax.solution.status import Status
-
-HISTORY = 256  # steps whose residuals one chunk can record
-PATIENCE = 10  # steps without progress of a residual that is rounding
-ROUNDING = 64  # residuals below this many units in the last place of max|V| are rounding
 
 
 @pytree_dataclass(static=("certificate", "relaxations"))
@@ -162,15 +159,9 @@ def _advance(task: ArcTask, state: ArcState, start: Scalar) -> ArcState:
     value = _relaxed(task, state)
     found = look(task, value)
     bound = _bound(task, value, found)
-    measures = jnp.stack([bound.error, bound.residual])
-    since = jnp.where(jnp.any(measures < state.best), 0, state.since_best + 1)
+    since = certificates.steps_since_best(state, bound)
     code = _judge(task, value, bound, since)
-    history = state.history.at[state.step - start].set(bound.residual)
-    new = ArcState(
-        value, found.number, bound, state.step + 1, jnp.fmin(state.best, measures), since, code, history
-    )  # fmt: skip
-    old = dataclasses.replace(state, step=new.step, since_best=since, code=code, history=history)
-    return jax.tree.map(lambda after, before: jnp.where(code == Status.NONFINITE, before, after), new, old)
+    return certificates.booked(state, start, bound, code, since, value=value, number=found.number)
 
 
 def _relaxed(task: ArcTask, state: ArcState) -> Field:

@@ -15,11 +15,13 @@ count for η alone.
 A factor 1/(1 − ρ) beyond ε^{-1/2}, ε the unit of rounding, is no bound: its 1 − ρ may be rounding of r and L alone,
 and it says nothing anyway. Both follow from the comparison principle of a monotone scheme; they bound the algebraic
 error and not the error of the grid, hold where the minimum over the actions is exact, and want float64.
+
+An iteration books its progress by them: the least error and residual so far, and the steps since either fell.
 """
 
 import dataclasses
 import enum
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +30,9 @@ import numpy as np
 from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
 from hjbjax.problem.types import Array, Field, Mask, Number, Scalar
+from hjbjax.solution.status import Status
+
+S = TypeVar("S", bound=Any)
 
 LOST = 4  # roundings of numbers of the size lift · max(factor, 1) in factor · V + shift
 
@@ -186,3 +191,32 @@ def enclosure(kind: Certificate, bound: ErrorBound, discount: Number | None = No
         return xp.stack([factor, xp.where(endless, outwards * xp.inf, lifted * (factor - 1) + outwards * lost)])
 
     return xp.stack([line(below, -1), line(above, 1)])
+
+
+def steps_since_best(state: Any, bound: ErrorBound) -> Scalar:
+    """The steps without progress, this one among them: neither error nor residual is less than ever before."""
+    return jnp.where(jnp.any(_measures(bound) < state.best), 0, state.since_best + 1)
+
+
+def booked(state: S, start: Scalar, bound: ErrorBound, code: Scalar, since: Scalar, **found: Any) -> S:
+    """The state after a step, with what it found; where that is not finite the state before, with the step booked.
+
+    Args:
+      state: before the step, with the books of ``State``.
+      start: the step with which this chunk began.
+      bound: on the error after it.
+      code: the status after it.
+      since: of ``steps_since_best``.
+      found: what else the state holds.
+    """
+    # counted and recorded even where it is taken back: ``broken`` makes that step again
+    history = state.history.at[state.step - start].set(bound.residual)
+    old = dataclasses.replace(state, step=state.step + 1, since_best=since, code=code, history=history)
+    best = jnp.fmin(state.best, _measures(bound))  # fmin, which a NaN does not win
+    new = dataclasses.replace(old, bound=bound, best=best, **found)
+    return jax.tree.map(lambda after, before: jnp.where(code == Status.NONFINITE, before, after), new, old)
+
+
+def _measures(bound: ErrorBound) -> jax.Array:
+    """Error and residual, (2,): less of either is progress."""
+    return jnp.stack([bound.error, bound.residual])

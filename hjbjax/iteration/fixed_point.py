@@ -197,15 +197,9 @@ def advance(task: Task, state: State, start: Scalar) -> State:
         moved = moved * _shift_factor(task, state)
     policy, fastest, bound = _look(task, value, state.policy, moved=moved, first=state.step < 0)
     bound = dataclasses.replace(bound, error=jnp.where(_lacks_measure(task, state), jnp.inf, bound.error))
-    measures = jnp.stack([bound.error, bound.residual])
-    since = jnp.where(jnp.any(measures < state.best), 0, state.since_best + 1)
+    since = certificates.steps_since_best(state, bound)
     code = _judge(task, value, bound, state.best, since)
-    # counted and recorded even where it is taken back: ``broken`` makes that step again
-    history = state.history.at[state.step - start].set(bound.residual)
-    best = jnp.fmin(state.best, measures)  # fmin, which a NaN does not win
-    new = State(value, policy, fastest, bound, state.step + 1, best, since, code, history)
-    old = dataclasses.replace(state, step=new.step, since_best=since, code=code, history=history)
-    return jax.tree.map(lambda after, before: jnp.where(code == Status.NONFINITE, before, after), new, old)
+    return certificates.booked(state, start, bound, code, since, value=value, policy=policy, fastest=fastest)
 
 
 def broken(task: Task, state: State) -> jax.Array:

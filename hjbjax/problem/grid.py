@@ -202,10 +202,7 @@ class Grid:
         """States with their periodic entries brought into [lo, hi); the others as they are."""
         x = _states(x)
         lo, hi = jnp.asarray(self.lo, x.dtype), jnp.asarray(self.hi, x.dtype)
-        moved = lo + jnp.mod(x - lo, hi - lo)
-        moved = jnp.where(moved >= hi, lo, moved)  # just below lo, the remainder rounds up to a whole period
-        # a state in [lo, hi) keeps its bits: the remainder of a small difference would be rounded
-        return jnp.where(np.array(self.periodic) & ~((x >= lo) & (x < hi)), moved, x)
+        return jnp.where(np.array(self.periodic), into_period(x, lo, hi), x)
 
     def interpolate(self, values: Array, x: States, *, clamp: bool = False) -> jax.Array:
         """Multilinear interpolation of node values, second order; jit- and vmap-able.
@@ -281,6 +278,14 @@ def _from_table(computed: jax.Array, table: jax.Array) -> jax.Array:
 def _derivative_of_the_formula(primals: tuple, tangents: tuple) -> tuple:
     """Value and tangent: nodes move with the corners as the formula says; the table is constant."""
     return _from_table(*primals), tangents[0]
+
+
+def into_period(x: Array, lo: Array, hi: Array) -> jax.Array:
+    """Places along periodic axes, brought into [lo, hi)."""
+    moved = lo + jnp.mod(x - lo, hi - lo)
+    moved = jnp.where(moved >= hi, lo, moved)  # just below lo, the remainder rounds up to a whole period
+    # a place in [lo, hi) keeps its bits: the remainder of a small difference would be rounded
+    return jnp.where((x >= lo) & (x < hi), x, moved)
 
 
 def _states(x: Numbers) -> jax.Array:

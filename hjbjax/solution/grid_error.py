@@ -21,46 +21,40 @@ LARGE, ALIKE = 0.5, 10.0
 JUMP = 0.9  # of the range of a control, between neighbours
 
 
-def estimate(grid: Grid, value: np.ndarray, coarse: Grid, before: np.ndarray, *, order: float) -> np.ndarray:
-    """|V − V_h| at the nodes, about, shape (*grid), in cost units; zero beside values that are not finite.
-
-    Args:
-      grid: the grid.
-      value: V_h at its nodes.
-      coarse: the grid with half of the intervals.
-      before: V_2h at its nodes.
-      order: q.
-    """
-    known = _apart(transfer.restrict(value, grid, coarse), before) / (2**order - 1)
-    return np.asarray(transfer.prolong(known, coarse, grid))
-
-
-def order_of_slopes(
-    grid: Grid, value: np.ndarray, coarse: Grid, before: np.ndarray, *, chain: np.ndarray, policy: np.ndarray | None
-) -> float:
-    """q of limited slopes, by what they changed of the chain's answer.
-
-    Args:
-      grid: the grid.
-      value: V_h at its nodes, by limited slopes.
-      coarse: the grid with half of the intervals.
-      before: V_2h at its nodes, likewise.
-      chain: the answer of the chain on ``grid``.
-      policy: the controls on it, shape (*grid, m), NaN where there are none; None without controls.
-    """
-    change = np.mean(_apart(transfer.restrict(value, grid, coarse), before))
-    gain = np.mean(_apart(value, chain))
-    if LARGE * gain <= change <= ALIKE * gain and change > 0 and _jumps(policy):
-        return BROKEN
-    nested = all(grid.intervals(axis) % coarse.intervals(axis) == 0 for axis in range(grid.ndim))
-    return USUAL if nested else OTHERS
-
-
-def _apart(value: np.ndarray, other: np.ndarray) -> np.ndarray:
+def apart(value: np.ndarray, other: np.ndarray) -> np.ndarray:
     """|value − other|, zero where that is not finite."""
     with np.errstate(invalid="ignore"):
         change = np.abs(value - other)
     return np.where(np.isfinite(change), change, 0)
+
+
+def estimate(grid: Grid, coarse: Grid, change: np.ndarray, order: float) -> np.ndarray:
+    """|V − V_h| at the nodes, about, shape (*grid), in cost units.
+
+    Args:
+      grid: the grid.
+      coarse: the grid with half of the intervals.
+      change: |V_h − V_2h| at the nodes of ``coarse``.
+      order: q.
+    """
+    return np.asarray(transfer.prolong(change / (2**order - 1), coarse, grid))
+
+
+def order_of_slopes(grid: Grid, coarse: Grid, change: np.ndarray, gain: np.ndarray, policy: np.ndarray | None) -> float:
+    """q of limited slopes, by what they changed of the chain's answer.
+
+    Args:
+      grid: the grid.
+      coarse: the grid with half of the intervals.
+      change: |V_h − V_2h| at the nodes of ``coarse``, V by limited slopes.
+      gain: |V_h − the answer of the chain| on ``grid``.
+      policy: the controls on it, shape (*grid, m), NaN where there are none; None without controls.
+    """
+    moved, gained = np.mean(change), np.mean(gain)
+    if LARGE * gained <= moved <= ALIKE * gained and moved > 0 and _jumps(policy):
+        return BROKEN
+    nested = all(grid.intervals(axis) % coarse.intervals(axis) == 0 for axis in range(grid.ndim))
+    return USUAL if nested else OTHERS
 
 
 def _jumps(policy: np.ndarray | None) -> bool:

@@ -21,7 +21,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import is_traced
 from hjbjax.problem.sets import AdmissibleSet, Finite
 from hjbjax.problem.types import Array, Field, Mask, Nodes, Scalar
-from hjbjax.solution import grid_error
+from hjbjax.solution import grid_error, transfer
 from hjbjax.solution.clock import CUT, Clock
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
@@ -105,11 +105,13 @@ def with_grid_error(solution: Solution, settled: Settled, coarser: tuple[Grid, n
     """
     value, origin = np.asarray(solution.value), settled.origin
     if coarser is not None:
+        coarse, before = coarser
+        change = grid_error.apart(transfer.restrict(value, solution.grid, coarse), before)
         order = FIRST if settled.note else CENTRAL
         if origin is not None:
-            chain, policy = np.asarray(origin.state.value), solution.policy
-            order = grid_error.order_of_slopes(solution.grid, value, *coarser, chain=chain, policy=policy)
-        found = grid_error.estimate(solution.grid, value, *coarser, order=order)
+            gain = grid_error.apart(value, np.asarray(origin.state.value))
+            order = grid_error.order_of_slopes(solution.grid, coarse, change, gain, solution.policy)
+        found = grid_error.estimate(solution.grid, coarse, change, order)
     elif origin is not None and settled.task.problem.noise is None:
         with np.errstate(invalid="ignore"):
             found = np.abs(value - np.asarray(origin.state.value))
@@ -319,6 +321,11 @@ def _not_finite_message(task: Task, state: State, grid: Grid) -> str:
     )
 
 
+def within_reach(best: float) -> str:
+    """The sentence on a certified solve that stalled, by its smallest error."""
+    return f"{Status.STALLED.message} The smallest error was {best:.2g}: a tolerance of {2 * best:.2g} is within reach."
+
+
 def _message(code: Status, task: Task, state: State, grid: Grid) -> str:
     """The sentence that says how a solve ended, and what to do about it."""
     if code is Status.NONFINITE:
@@ -327,7 +334,7 @@ def _message(code: Status, task: Task, state: State, grid: Grid) -> str:
     best, tol = float(state.best[0]), float(task.tol)
     certified = task.certificate not in (Certificate.NONE, Certificate.RESIDUAL, Certificate.OPEN)
     if code is Status.STALLED and np.isfinite(best) and certified:
-        return f"{code.message} The smallest error was {best:.2g}: a tolerance of {2 * best:.2g} is within reach."
+        return within_reach(best)
     if code is Status.STALLED and np.isfinite(best):
         return (
             f"Residual and last step stopped falling at {best:.2g}, above the tolerance, and no certificate says how "

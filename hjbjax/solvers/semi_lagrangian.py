@@ -14,9 +14,10 @@ from hjbjax.discretisation.schemes import Upwind
 from hjbjax.discretisation.semi_lagrangian import PathScheme
 from hjbjax.finiteness import memory, node_checks
 from hjbjax.iteration import arc_iteration, bellman, certificates
-from hjbjax.iteration.arc_iteration import HISTORY, ArcState, ArcTask
+from hjbjax.iteration.arc_iteration import ArcState, ArcTask
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.evaluation import Sweeps
+from hjbjax.iteration.fixed_point import HISTORY
 from hjbjax.iteration.methods import Method
 from hjbjax.markov_chain import edges
 from hjbjax.problem.grid import Grid
@@ -29,7 +30,7 @@ from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop
 from hjbjax.solvers.host_loop import FIRST_NODES
-from hjbjax.solvers.result import solution_at_start, warn_of_cuts
+from hjbjax.solvers.result import solution_at_start, warn_of_cuts, within_reach
 from hjbjax.solvers.setup import warn_unreached
 from hjbjax.solvers.stationary_run import StatesInChunks
 from hjbjax.tracing import checks
@@ -198,10 +199,8 @@ def _finish(
         reached = _who_arrives(task, run.state)
     leaving = None if code in CUT or not looked else _leaving(on, value, policy, task)
     policy[~counted | np.asarray(task.obstacles.ended) | (not looked)] = np.nan
-    message = code.message
-    if code is Status.STALLED and np.isfinite(state.best[0]):
-        best = float(state.best[0])
-        message = f"{message} The smallest error was {best:.2g}: a tolerance of {2 * best:.2g} is within reach."
+    best = float(state.best[0])
+    message = within_reach(best) if code is Status.STALLED and np.isfinite(best) else code.message
     solution = solution_at_start(on, value, code)
     solution = dataclasses.replace(
         solution, policy=policy, message=message, reached=reached, cut=leaving, steps=max(int(state.step), 0),

@@ -13,6 +13,14 @@ SMOOTH = np.cos(X[..., 0]) * np.sin(X[..., 1] + 1)
 STEADY, SIDES = np.ones((41, 41, 1)), np.where(X[..., :1] + X[..., 1:] > 0.01, 1.0, -1.0)
 
 
+def change(value, before):
+    return grid_error.apart(value[::2, ::2], before)
+
+
+def order_of(value, before, chain, policy):
+    return grid_error.order_of_slopes(FINE, COARSE, change(value, before), grid_error.apart(value, chain), policy)
+
+
 def answers(error, of_chain):
     """V_h, V_2h with four times the error, and the chain's answer, on the values of ``SMOOTH``."""
     return (SMOOTH + error, (SMOOTH + 4 * error)[::2, ::2]), SMOOTH + of_chain
@@ -22,7 +30,7 @@ def answers(error, of_chain):
 def test_the_usual_order_is_between_those_of_kinks_and_of_smooth_values(order, share):
     error = H**order * (1 + X[..., 0] ** 2) / 10
     value, before = SMOOTH + error, (SMOOTH + 2**order * error)[::2, ::2]
-    found = grid_error.estimate(FINE, value, COARSE, before, order=grid_error.USUAL)
+    found = grid_error.estimate(FINE, COARSE, change(value, before), grid_error.USUAL)
     np.testing.assert_allclose(found[::2, ::2], share * error[::2, ::2], rtol=0.01)
 
 
@@ -32,7 +40,7 @@ def test_the_usual_order_is_between_those_of_kinks_and_of_smooth_values(order, s
 def test_where_slopes_gain_nothing_and_the_policy_jumps_the_order_is_that_of_a_root(policy, gain, broken):
     error = 0.1 * np.abs(X[..., 0])
     (value, before), chain = answers(error, error + gain * 3 * error)
-    order = grid_error.order_of_slopes(FINE, value, COARSE, before, chain=chain, policy=policy)
+    order = order_of(value, before, chain, policy)
     assert order == (grid_error.BROKEN if broken else grid_error.USUAL)
 
 
@@ -40,9 +48,9 @@ def test_where_slopes_gain_nothing_and_the_policy_jumps_the_order_is_that_of_a_r
 def test_no_policy_jumps_nowhere(policy):
     error = 0.1 * np.abs(X[..., 0])
     (value, before), chain = answers(error, 4 * error)
-    order = grid_error.order_of_slopes(FINE, value, COARSE, before, chain=chain, policy=policy)
+    order = order_of(value, before, chain, policy)
     assert order == grid_error.USUAL
-    assert grid_error.order_of_slopes(FINE, SMOOTH, COARSE, SMOOTH[::2, ::2], chain=SMOOTH, policy=SIDES) == order
+    assert order_of(SMOOTH, SMOOTH[::2, ::2], SMOOTH, SIDES) == order
 
 
 def test_nodes_without_a_value_or_a_policy_count_for_nothing():
@@ -50,8 +58,8 @@ def test_nodes_without_a_value_or_a_policy_count_for_nothing():
     (value, before), chain = answers(error, 4 * error)
     lost, policy = X[..., 1] > 0.5, SIDES.copy()
     value[lost], before[lost[::2, ::2]], chain[lost], policy[lost] = np.inf, np.inf, np.inf, np.nan
-    order = grid_error.order_of_slopes(FINE, value, COARSE, before, chain=chain, policy=policy)
+    order = order_of(value, before, chain, policy)
     assert order == grid_error.BROKEN
-    found = grid_error.estimate(FINE, value, COARSE, before, order=order)
+    found = grid_error.estimate(FINE, COARSE, change(value, before), order)
     assert np.all(np.isfinite(found))
     assert np.all(found[lost & (X[..., 1] > 0.6)] == 0)

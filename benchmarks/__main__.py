@@ -20,6 +20,7 @@ NAMES = {
     "startup": ("speed", "from process start to pictures, cold and with the compile cache"),
     "precision": ("accuracy", "error against seconds: what second order is worth"),
     "march": ("speed", "marching beside hj_reachability: seconds and bytes at equal scheme"),
+    "quoted": ("harness", "the README's table of what was seen, from the recorded rows"),
     "bounds": (
         "accuracy",
         "random problems beside a dense solver: which certified bounds hold, and how tight they are",

@@ -43,6 +43,7 @@ THRESHOLDS = {
     "sweep 6-D": Threshold("one value-iteration sweep on 20^6, beside two values", 16, unit=" bytes a node", most=True),
     "quantecon": Threshold(f"{CHAIN}, compiled", 20, 50),
     "quantecon cold": Threshold(f"{CHAIN}, our compile time counted", 2, 3.5),
+    "numba 200 nested": Threshold(HAND.format("200 x 201, both by nested grids,"), 1.2, 1.5),
     "numba 800": Threshold(HAND.format("800 x 801"), 1.5, 3.5),
     "numba 1600": Threshold(HAND.format("1600 x 1601"), 1.5, 3.5),
     "growth": Threshold("pendulum, seconds at 1600 x 1601 over those at 400 x 401", 24, most=True),

@@ -227,7 +227,7 @@ class Nested:
 
     def described(self, game: bool) -> str:
         """As it is written, with the method of each level."""
-        return f"Nested({self.inner.described(game)})"
+        return f"Nested({self.inner.described(game)}, coarsest={self.coarsest})"
 
 
 def check_method(method: object, name: str) -> None:

@@ -37,7 +37,7 @@ def estimate(grid: Grid, coarse: Grid, change: np.ndarray, order: float) -> np.n
       change: |V_h − V_2h| at the nodes of ``coarse``.
       order: q.
     """
-    return np.asarray(transfer.prolong(change / (2**order - 1), coarse, grid))
+    return transfer.prolong(change / (2**order - 1), coarse, grid)
 
 
 def order_of_slopes(grid: Grid, coarse: Grid, change: np.ndarray, gain: np.ndarray, policy: np.ndarray | None) -> float:

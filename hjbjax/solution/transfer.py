@@ -3,11 +3,9 @@
 import dataclasses
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.types import Array, Nodes
 
 FEWEST = 12  # intervals that an axis keeps
 
@@ -29,12 +27,11 @@ def coarser(grid: Grid, fewest: int = FEWEST) -> Grid | None:
     return dataclasses.replace(grid, shape=tuple(shape))
 
 
-def prolong(values: Nodes, coarse: Grid, fine: Grid) -> Array:
+def prolong(values: np.ndarray, coarse: Grid, fine: Grid) -> np.ndarray:
     """Multilinear interpolation of node values on one grid of a box to the nodes of another grid of that box, (*fine).
 
-    A JAX array for one of JAX, else NumPy's.
+    In NumPy, which is as fast and compiles nothing.
     """
-    xp: Any = np if isinstance(values, np.ndarray) else jnp
     # axis by axis: 2n gathers in place of 2^n
     for axis, count in enumerate(fine.shape):
         if coarse.shape[axis] == count:
@@ -42,9 +39,9 @@ def prolong(values: Nodes, coarse: Grid, fine: Grid) -> Array:
         # in parts of a coarse interval; on a stretched axis, too, as both grids are images of one uniform axis
         place = np.arange(count) * (coarse.intervals(axis) / fine.intervals(axis))
         cell = np.minimum(place.astype(int), coarse.intervals(axis) - 1)
-        weight = xp.asarray((place - cell).reshape([-1 if i == axis else 1 for i in range(fine.ndim)]), values.dtype)
-        below = xp.take(values, cell, axis=axis)
-        above = xp.take(values, (cell + 1) % coarse.shape[axis], axis=axis)
+        weight = np.asarray((place - cell).reshape([-1 if i == axis else 1 for i in range(fine.ndim)]), values.dtype)
+        below = np.take(values, cell, axis=axis)
+        above = np.take(values, (cell + 1) % coarse.shape[axis], axis=axis)
         values = (1 - weight) * below + weight * above
     return values
 

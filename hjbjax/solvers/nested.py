@@ -5,7 +5,6 @@ error of the grid.
 """
 
 import dataclasses
-import itertools
 from typing import Any, NamedTuple
 
 import jax
@@ -13,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation import cut_cells
-from hjbjax.discretisation.discretisation import Discretisation, Scheme
+from hjbjax.discretisation.discretisation import Scheme
 from hjbjax.finiteness import resting
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.fixed_point import State, Task
@@ -24,7 +23,7 @@ from hjbjax.problem.types import Mask, Nodes
 from hjbjax.solution import transfer
 from hjbjax.solution.clock import Clock, Stopped
 from hjbjax.solution.status import Status
-from hjbjax.solvers.setup import Assumptions, assumptions_of, forced_only, held_jit, linear_solve, prepare_jit
+from hjbjax.solvers.setup import Assumptions, assumptions_of, forced_only, linear_solve, prepare_jit
 from hjbjax.solvers.stationary_run import iterate
 
 VANISHING = (2.0, 0.2, 0.02)  # discounts on the way to none, over one by the time that crossing the box takes
@@ -36,31 +35,36 @@ FEWEST = 6  # intervals that an axis keeps on the coarser grid that tells the er
 
 
 def start(
-    on: Discretisation, method: Method, tol: float, guess: Nodes | None, clock: Clock
+    task: Task, scheme: Scheme, method: Method, guess: Nodes | None, clock: Clock, *, asked_again: bool
 ) -> tuple[Nodes | None, list[tuple[int, ...]]]:
     """The guess for the finest grid: the user's, or the answer of the coarser grids, and the shapes of those.
 
-    Where the clock says stop on the way, the answer so far on the finest grid, interpolated by NumPy, which compiles
-    nothing; None if there is none.
+    Where the clock says stop on the way, the answer so far on the finest grid; None if there is none.
+
+    Args:
+      task: that of the chain on the finest grid.
+      scheme: of the answer that is wanted there.
+      method: as chosen, maybe of nested grids.
+      guess: the user's, or None.
+      clock: the limits.
+      asked_again: whether the next coarser grid will tell the error of the grid: its program is compiled in any case.
     """
-    if guess is not None or method.coarsest is None:
+    if guess is not None:
         return guess, []
-    grids = levels(on.chain, method, clock)
     value: Nodes | None = None
-    if clock.over() is not None:
-        return None, []
-    for coarse, fine in itertools.pairwise(grids):
-        clock.phase = f"the preparation of {' x '.join(map(str, coarse.shape))} nodes"
-        level = on.chain.on_grid(coarse)
-        # without the checks of the host: a coarser grid gives a guess, and is no reason to refuse or to warn
-        task = prepare_jit(level, method=method.inner, tol=tol, assumptions=assumptions_of(level))
-        if fine is on.grid:  # the one that is asked again how far the answer is from the exact one
-            task = staged(task, on.scheme)
-        state, _, _ = iterate(task, warm(task, value, clock), clock)
+    # with noise, or without a certificate, the schemes have programs of their own
+    asked_again &= scheme.monotone or staged(task, scheme) is not task
+    coarser = levels(task, method, clock, asked_again=asked_again)
+    for place, level in enumerate(coarser):
+        last = place + 1 == len(coarser)
+        if last:  # the one that is asked again
+            level = staged(level, scheme)
+        state, _, _ = iterate(level, warm(level, value, clock), clock)
         if clock.over() is not None:
-            return transfer.prolong(np.asarray(state.value), coarse, on.grid), []
-        value = transfer.prolong(state.value, coarse, fine)
-    return value, [coarse.shape for coarse in grids[:-1]]
+            return transfer.prolong(np.asarray(state.value), level.grid, task.grid), []
+        finer = task.grid if last else coarser[place + 1].grid
+        value = transfer.prolong(np.asarray(state.value), level.grid, finer)
+    return value, [level.grid.shape for level in coarser]
 
 
 def staged(task: Task, scheme: Scheme) -> Task:
@@ -72,20 +76,25 @@ def staged(task: Task, scheme: Scheme) -> Task:
     return dataclasses.replace(task, on=dataclasses.replace(task.on, scheme=scheme, plain=np.asarray(True)))
 
 
-def levels(on: Discretisation, method: Method, clock: Clock) -> list[Grid]:
-    """The grids of a nested solve, coarsest first; a coarser grid that loses the target or rest point is left out."""
-    assert method.coarsest is not None
-    grids, assumptions = [on.grid], assumptions_of(on)
-    needs_held = on.problem.target is not None or assumptions.may_rest
-    while (smaller := transfer.coarser(grids[0])) is not None and smaller.size >= method.coarsest:
-        if clock.over() is not None:
+def levels(task: Task, method: Method, clock: Clock, *, asked_again: bool) -> list[Task]:
+    """The tasks on coarser grids, coarsest first, down to the nodes that the method names.
+
+    ``asked_again``: the next coarser grid in any case, if it can tell the error of the grid.
+    """
+    found: list[Task] = []
+    smaller = _telling(task.grid) if asked_again else None
+    while clock.over() is None:
+        if smaller is None:
+            smaller = transfer.coarser(found[0].grid if found else task.grid)
+            if smaller is None or method.coarsest is None or smaller.size < method.coarsest:
+                break
+        clock.phase = f"the preparation of {' x '.join(map(str, smaller.shape))} nodes"
+        level = _on_coarser(task, smaller)
+        if level is None:
             break
-        clock.phase = f"the choice of coarser grids, {' x '.join(map(str, smaller.shape))} nodes"
-        # without a held node an undiscounted problem has no finite value to start from
-        if needs_held and not held_jit(on.on_grid(smaller), assumptions=assumptions).any():
-            break
-        grids.insert(0, smaller)
-    return grids
+        found.insert(0, level)
+        smaller = None
+    return found
 
 
 def warm(task: Task, guess: Nodes | None, clock: Clock) -> Nodes:
@@ -232,10 +241,8 @@ def coarser_answer(settled: Settled, clock: Clock) -> tuple[Grid, np.ndarray] | 
     None where an axis cannot do with so few, the coarser grid loses what is held, or the iteration does not converge.
     """
     task, fine = running(settled), settled.task.grid
-    coarse = transfer.coarser(fine, FEWEST)
-    if coarse is None or any(many == few for many, few in zip(fine.shape, coarse.shape, strict=True)):
-        return None
-    if clock.over() is not None or (level := _on_coarser(task, coarse)) is None:
+    coarse = _telling(fine)
+    if coarse is None or clock.over() is not None or (level := _on_coarser(task, coarse)) is None:
         return None
     # infinite values are imposed anew by what is lost
     value = np.where(np.asarray(task.counted), np.asarray(settled.state.value), 0)
@@ -245,24 +252,34 @@ def coarser_answer(settled: Settled, clock: Clock) -> tuple[Grid, np.ndarray] | 
     return coarse, np.where(np.asarray(level.counted), np.asarray(state.value), np.inf)
 
 
+def _telling(fine: Grid) -> Grid | None:
+    """The grid with half of the intervals on every axis, which tells the error of ``fine``; None where one has few."""
+    coarse = transfer.coarser(fine, FEWEST)
+    halved = coarse is not None and all(few < many for many, few in zip(fine.shape, coarse.shape, strict=True))
+    return coarse if halved else None
+
+
 def _on_coarser(task: Task, coarse: Grid) -> Task | None:
     """The task on a coarser grid; None where that is another question."""
     fine = task.grid
-    if all(2 * coarse.intervals(axis) == fine.intervals(axis) for axis in range(fine.ndim)):
+    strides = [divmod(fine.intervals(axis), coarse.intervals(axis)) for axis in range(fine.ndim)]
+    # the rate of the fastest action is not that of the coarser grid
+    if task.outflow is None and not any(rest for _, rest in strides):
         # what is known of the nodes is known of every second one
-        every = tuple(slice(None, None, 2) for _ in fine.shape)
+        every = tuple(slice(None, None, stride) for stride, _ in strides)
         # without those of the problem and the grid, which may have the shape of the nodes by chance
         bare: Any = dataclasses.replace(task, on=None)  # type: ignore[arg-type]
-        known = jax.tree.map(lambda leaf: leaf[every] if np.shape(leaf) == fine.shape else leaf, bare)
-        return dataclasses.replace(known, on=_kept(task.on.on_grid(coarse)))
-    level = task.on.chain.on_grid(coarse)
-    made = prepare_jit(level, method=task.method, tol=task.tol, assumptions=assumptions_of(level))
-    held, kept = (bool(np.any(np.asarray(each.obstacles.fixed))) for each in (task, made))
-    # which nodes cannot reach the target is not known of other ones
-    if task.has_lost or (held and not kept):
+        known = jax.tree.map(lambda leaf: np.asarray(leaf)[every] if np.shape(leaf) == fine.shape else leaf, bare)
+        made = dataclasses.replace(known, on=_kept(task.on.on_grid(coarse)))
+    elif task.has_lost:  # which nodes cannot reach the target is not known of other ones
         return None
-    on = dataclasses.replace(task.on.on_grid(coarse), cut=made.on.cut)
-    return dataclasses.replace(made, on=on, certificate=task.certificate)
+    else:
+        level = task.on.chain.on_grid(coarse)
+        made = prepare_jit(level, method=task.method, tol=task.tol, assumptions=assumptions_of(level))
+        on = dataclasses.replace(task.on.on_grid(coarse), cut=made.on.cut)
+        made = dataclasses.replace(made, on=on, certificate=task.certificate)
+    held, kept = (bool(np.any(np.asarray(each.obstacles.fixed))) for each in (task, made))
+    return None if held and not kept else made
 
 
 _kept = jax.jit(cut_cells.kept)

@@ -1,7 +1,6 @@
 """From a problem on a grid to a task: what is held, what counts, which certificate applies, which method runs."""
 
 import dataclasses
-import functools
 import sys
 import warnings
 
@@ -43,6 +42,7 @@ def warn(message: str) -> None:
 
 DIRECT = 50_000  # nodes up to which a plane with open ends is solved by sparse LU: about a second a step
 NEST = 100_000  # nodes beyond which compiling coarser grids pays
+COARSEST = 20_000  # nodes up to which none is worth it: a step takes under a millisecond, and its program a second
 
 
 def is_constrained(problem: Problem) -> bool:
@@ -64,7 +64,7 @@ def choose(problem: Problem, grid: Grid, *, traced: bool, method: Method | None 
     method = PolicyIteration(choose_evaluation(problem, grid, traced=traced))
     # from a cold start a good policy spreads by one cell an improvement: N of them on one grid, a few on nested ones;
     # on the zoo's pendulum with 400 x 401 nodes the steps of all levels took .2 s in place of .9
-    return Nested(method) if grid.size > NEST and not (traced or grid.sides("open")) else method
+    return Nested(method, COARSEST) if grid.size > NEST and not (traced or grid.sides("open")) else method
 
 
 def choose_evaluation(problem: Problem, grid: Grid, *, traced: bool) -> Evaluation:
@@ -183,12 +183,6 @@ def assumptions_of(on: Discretisation) -> Assumptions:
 
 
 prepare_jit = jax.jit(prepare, static_argnames="assumptions")
-
-
-@functools.partial(jax.jit, static_argnames="assumptions")
-def held_jit(on: Discretisation, *, assumptions: Assumptions) -> jax.Array:
-    """The nodes at which the value is given, bool (*grid)."""
-    return _obstacles(cast(on, on.dtype), assumptions)[0].fixed
 
 
 def prepare_on_host(

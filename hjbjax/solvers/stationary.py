@@ -31,7 +31,7 @@ from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop, nested, semi_lagrangian
 from hjbjax.solvers.result import assemble, finish, solution_at_start, with_grid_error, with_last_phase
-from hjbjax.solvers.setup import choose, choose_scheme, is_constrained, prepare_on_host, prepare_traced
+from hjbjax.solvers.setup import COARSEST, choose, choose_scheme, is_constrained, prepare_on_host, prepare_traced
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
 
@@ -113,13 +113,13 @@ def solve(
             options: Any = {"method": method, "tol": tol, "guess": guess, "max_memory": max_memory}
             solution = semi_lagrangian.solve_on_host(problem, grid, scheme, kind, clock=clock, **options)
         return _ended(with_last_phase(solution, clock), clock, tol, throw=throw)
-    method = choose(problem, grid, traced=False, method=method)
+    free, method = method is None, choose(problem, grid, traced=False, method=method)
     on, sharpen = Discretisation(problem, grid, scheme or Upwind(subcell=True), kind), scheme is None
     # float64 for this call alone: another thread, and the caller's own programs, keep theirs
     with noting_interrupts(clock), jax.enable_x64(kind == np.float64):
         needed = memory.require(problem, grid, method, kind, max_memory)
         with host_loop.with_solution(clock, needed, lambda kept: _partial(on, kept)):
-            solution = with_last_phase(_solve_on_host(on, method, tol, guess, clock, sharpen=sharpen), clock)
+            solution = with_last_phase(_solve_on_host(on, method, tol, guess, clock, sharpen=sharpen, free=free), clock)
     solution.stats.setdefault("method", method.described(problem.is_game))
     solution.stats["bytes"] = needed
     return _ended(solution, clock, tol, throw=throw)
@@ -142,33 +142,33 @@ def _partial(on: Discretisation, kept: host_loop.Kept | None) -> Solution:
         value = np.broadcast_to(np.zeros((), on.dtype), on.grid.shape)  # one zero seen everywhere takes no memory
     else:
         value, grid = kept
-        value = value if grid.shape == on.grid.shape else np.asarray(transfer.prolong(value, grid, on.grid))
+        value = value if grid.shape == on.grid.shape else transfer.prolong(value, grid, on.grid)
     return solution_at_start(on, value, Status.INTERRUPTED)
 
 
 def _solve_on_host(
-    on: Discretisation, method: Method, tol: float, guess: Nodes | None, clock: Clock, *, sharpen: bool = False
+    on: Discretisation, method: Method, tol: float, guess: Nodes | None, clock: Clock, *, sharpen: bool, free: bool
 ) -> Solution:
-    """The solution by checks, coarser grids, preparation and steps, in this order, as far as the clock allows.
+    """The solution by checks, preparation, coarser grids and steps, in this order, as far as the clock allows.
 
-    ``sharpen``: by the scheme that suits the problem, with an estimate of the grid's error.
+    ``sharpen``: by the scheme that suits the problem, with an estimate of the grid's error. ``free``: nobody asked for
+    the method.
     """
     problem, grid = on.problem, on.grid
     start: Nodes | None = None if guess is None else np.asarray(guess, on.dtype)
     try:
-        # from cheap to dear: one state, all nodes, the ends of the box, the coarser grids, and only then what is
-        # compiled for the finest one
+        # from cheap to dear: one state, all nodes, the ends of the box, and only then what is compiled for the grid
         checks.shapes(problem, grid, on.scheme)
         node_checks.values(problem, grid, on.dtype, clock)
         admissibility.values(problem, grid, on.dtype)
         if sharpen:
             on = dataclasses.replace(on, scheme=choose_scheme(on, method))
             sharpen = on.scheme.subcell  # value iteration and tubes start from nowhere else, on a coarser grid neither
-        known = None if start is None else jnp.asarray(start)
-        start, shapes = nested.start(on, method, tol, known, clock)
         task, assumptions, reached = prepare_on_host(on.chain, method=method.inner, tol=tol, clock=clock)
     except Stopped as stop:
         return solution_at_start(on, np.zeros(grid.shape) if start is None else np.array(start), stop.status)
+    asked_again = sharpen and free and grid.size > COARSEST and not grid.sides("open")
+    start, shapes = nested.start(task, on.scheme, method, start, clock, asked_again=asked_again)
     settled = nested.settle(nested.staged(task, on.scheme), assumptions, reached, start, clock)
     about: dict[str, Any] = {"levels": [*shapes, grid.shape]}
     if not on.scheme.monotone and (settled.code is Status.CONVERGED or not sharpen):

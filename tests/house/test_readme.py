@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.harness import quoted
+
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
@@ -60,3 +62,8 @@ def test_the_table_of_estimated_errors_is_what_the_benchmark_wrote():
     assert quoted == pytest.approx(ratios, abs=0.006, rel=0.002)
     within = sum(1 / 3 <= ratio <= 5 for ratio in ratios)
     assert f"Between a third and five in {within} of {len(ratios)}" in README
+
+
+def test_the_table_of_measurements_is_what_the_benchmarks_wrote():
+    table = README.split("holds it to them:\n\n")[1].split("\n\n")[0]
+    assert table.splitlines()[2:] == quoted.lines()

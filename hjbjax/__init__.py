@@ -8,6 +8,7 @@ from hjbjax.applications.l2_gain import attenuation, saturation
 from hjbjax.applications.perturbations import perturbation_study
 from hjbjax.applications.probabilities import expected_exit_time, reach_probability, stay_probability
 from hjbjax.applications.reachability import avoid, reach, reach_avoid
+from hjbjax.cli.compile_cache import keep_compiled
 from hjbjax.discretisation.schemes import Eno2, Limited, Upwind, Weno5
 from hjbjax.discretisation.semi_lagrangian import SemiLagrangian
 from hjbjax.extremals.indirect_method import FreeTime, pontryagin
@@ -72,6 +73,7 @@ __all__ = [
     "geometry",
     "greedy_feedback",
     "hinf_level",
+    "keep_compiled",
     "least_restrictive",
     "load",
     "lyapunov_check",

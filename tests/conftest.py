@@ -9,6 +9,7 @@ import pytest
 from hypothesis import settings
 
 os.environ["MPLBACKEND"] = "Agg"  # for this process and for the commands and notebooks that tests start
+os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"  # or the command finds in a user's folder what others compiled
 
 # Traced programs are millions of objects that stay: looking through them again and again finds nothing.
 gc.set_threshold(100_000, 20, 20)

@@ -93,6 +93,7 @@ def list_problems(name: str | None) -> None:
 @click.option("--out", type=click.Path(path_type=Path), help="Folder of the results; the problem's name if not given.")
 @click.option("--force", is_flag=True, help="Replace results that are there already.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of the screen.")
+@click.option("--no-cache", is_flag=True, help="Keep no compiled programs in the user's folder for caches.")
 def solve(
     name: str,
     shape: tuple[int, ...] | None,
@@ -100,11 +101,12 @@ def solve(
     out: Path | None,
     force: bool,
     as_json: bool,
+    no_cache: bool,
     **options: Any,
 ) -> None:
     """Solve the ready problem NAME; write solution.npz, value.png, policy.png and trajectory.png."""
     from hjbjax import zoo
-    from hjbjax.cli import run_folder
+    from hjbjax.cli import compile_cache, run_folder
 
     entry = zoo.catalogue[name]
     parameters = _parameters(entry, settings)
@@ -112,6 +114,8 @@ def solve(
     # refusals in the order of what they cost: words, folder, problem; the solve comes after all of them
     with _one_line_error(OSError, 2, "--out: "):
         run_folder.check_folder(out, force)
+    if not no_cache:
+        compile_cache.keep_for_the_command()
     problem, grid = _build(entry, parameters, shape)
     path, made = None, []
     with contextlib.ExitStack() as stack:  # the hidden folder goes last: after an interrupt, too

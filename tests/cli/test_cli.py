@@ -613,3 +613,56 @@ def test_sigterm_in_a_real_process(folder, way):
         assert "INTERRUPTED" in out
         assert load("bang-bang/solution.npz").status == Status.INTERRUPTED
     assert os.listdir(".") == (["bang-bang"] if way == "keeps" else [])
+
+
+# ------------------------------------------------------------------------------------------- compiled programs
+
+
+def cached(folder, *options):
+    """The command in a process whose user has his caches in ``folder``: the process, and the entries it left."""
+    kept = {key: value for key, value in environment().items() if "COMPILATION_CACHE" not in key}
+    kept |= dict.fromkeys(("XDG_CACHE_HOME", "HOME", "LOCALAPPDATA"), str(folder)) | {"PYTHONWARNINGS": "default"}
+    words = ["solve", "bang-bang", "--shape", "41", "--force", "--json", *options]
+    done = subprocess.run(
+        [sys.executable, "-m", "hjbjax", *words], capture_output=True, text=True, env=kept, timeout=300
+    )
+    return done, {path for path in folder.rglob("*-cache")} if folder.is_dir() else set()
+
+
+@pytest.mark.slow
+def test_the_second_process_finds_what_the_first_one_compiled(tmp_path):
+    first, left = cached(tmp_path)
+    assert first.returncode == 0, first.stderr
+    assert any(path.name.startswith("jit_run-") for path in left)
+    again, entries = cached(tmp_path)
+    assert entries == left
+    assert json.loads(again.stdout)["residual"] == json.loads(first.stdout)["residual"]
+    for path in left:
+        path.write_bytes(b"no program")
+    damaged, _ = cached(tmp_path)
+    assert damaged.returncode == 0
+    assert all(line.startswith("hjbjax: warning: ") for line in damaged.stderr.splitlines())
+
+
+@pytest.mark.slow
+def test_nothing_is_kept_where_nobody_wants_it_or_nothing_can_be(tmp_path):
+    assert cached(tmp_path, "--no-cache")[1] == set()
+    (tmp_path / "file").write_text("no folder")
+    done, left = cached(tmp_path / "file")
+    assert (done.returncode, left) == (0, set())
+
+
+def test_one_line_keeps_what_is_compiled(tmp_path):
+    script = "import hjbjax as hjb, jax, sys; print(hjb.keep_compiled(sys.argv[1])); jax.jit(lambda x: x + 1)(1.0)"
+    place = tmp_path / "mine"
+    kept = {key: value for key, value in environment().items() if "COMPILATION_CACHE" not in key}
+    words = [sys.executable, "-c", script, str(place)]
+    done = subprocess.run(words, capture_output=True, text=True, env=kept, timeout=120)
+    assert done.stdout == f"{place}\n", done.stderr
+    assert list(place.glob("*-cache"))
+
+
+def test_a_folder_that_cannot_be_made_is_said(tmp_path):
+    (tmp_path / "file").write_text("no folder")
+    with pytest.raises(OSError, match="file"):
+        hjbjax.keep_compiled(tmp_path / "file")

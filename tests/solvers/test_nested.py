@@ -1,0 +1,121 @@
+"""Coarser grids: which ones a solve begins on, and what it knows of them."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+import hjbjax as hjb
+from hjbjax import zoo
+from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.solution.clock import Clock
+from hjbjax.solvers import nested
+from hjbjax.solvers.setup import prepare_on_host
+
+METHOD = hjb.PolicyIteration(hjb.Sweeps())
+SCHEME = hjb.Upwind(subcell=True)
+KIND = np.dtype(float)
+
+
+def task_of(problem, grid):
+    """The task of a solve by the chain, with the checks of the host."""
+    return prepare_on_host(Discretisation(problem, grid, SCHEME, KIND), method=METHOD, tol=1e-3)[0]
+
+
+def wall(x, u):
+    """Drift that only the control makes."""
+    return u
+
+
+PROBLEMS = {
+    "discounted": lambda: zoo.pendulum(shape=(40, 41)),
+    "target": lambda: zoo.double_integrator(shape=(41, 41)),
+    "undiscounted, at rest": lambda: zoo.smooth(shape=(41, 41), discount=0.0),
+    "obstacles": lambda: (
+        hjb.Problem(wall, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), discount=1.0, stopping_cost=lambda x: 0.3 + x[0]),
+        hjb.Grid([-1.0], [1.0], (41,)),
+    ),
+    "constrained": lambda: (
+        hjb.Problem(wall, lambda x, u: x @ x + u @ u, hjb.Box([-1.0], [1.0]), discount=1.0),
+        hjb.Grid([-1.0], [1.0], (41,), edges="constrained"),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_what_is_known_of_every_second_node_is_what_a_preparation_finds_there(name):
+    problem, grid = PROBLEMS[name]()
+    task = task_of(problem, grid)
+    coarse = nested.transfer.coarser(grid)
+    with jax.enable_x64(True):
+        found, made = nested._on_coarser(task, coarse), task_of(problem, coarse)
+    assert found.grid.shape == made.grid.shape == tuple((n + 1) // 2 for n in grid.shape)
+    for part in ("obstacles", "counted", "least_cost", "on"):
+        mine, theirs = (jax.tree.leaves(getattr(each, part)) for each in (found, made))
+        for one, other in zip(mine, theirs, strict=True):
+            np.testing.assert_allclose(np.broadcast_to(one, np.shape(other)), other, rtol=1e-12, atol=1e-12)
+
+
+def test_the_fastest_rate_is_asked_for_on_every_grid():
+    problem, grid = zoo.pendulum(shape=(40, 41))
+    on = Discretisation(problem, grid, SCHEME, KIND)
+    task = prepare_on_host(on, method=hjb.ValueIteration(), tol=1e-3)[0]
+    with jax.enable_x64(True):
+        found = nested._on_coarser(task, nested.transfer.coarser(grid))
+    assert found.outflow.shape == (20, 21)
+    assert float(np.max(found.outflow)) < 0.6 * float(np.max(task.outflow))  # half as many jumps per unit time
+
+
+def test_a_coarser_grid_that_loses_the_target_is_none():
+    problem = hjb.Problem(wall, lambda x, u: 1.0, hjb.Box([-1.0], [1.0]), target=lambda x: abs(x[0] - 0.05) - 0.01)
+    task = task_of(problem, hjb.Grid([-1.0], [1.0], (41,)))  # the node at .05 is an odd one
+    with jax.enable_x64(True):
+        assert nested._on_coarser(task, hjb.Grid([-1.0], [1.0], (21,))) is None
+
+
+def test_odd_intervals_are_prepared_anew_unless_nodes_are_lost():
+    problem, grid = zoo.double_integrator(shape=(42, 42))
+    task, coarse = task_of(problem, grid), nested.transfer.coarser(grid)
+    with jax.enable_x64(True):
+        found = nested._on_coarser(task, coarse)
+        assert found.counted.shape == coarse.shape == (22, 22)
+        lost = dataclasses.replace(task, has_lost=True)
+        assert nested._on_coarser(lost, coarse) is None
+
+
+@pytest.fixture
+def grids(monkeypatch):
+    """The shapes and schemes of all iterations on the host, a name and a shape each."""
+    seen, iterate = [], nested.iterate
+
+    def noted(task, *rest, **options):
+        seen.append(("chain" if task.plain else "second order", task.grid.shape))
+        return iterate(task, *rest, **options)
+
+    monkeypatch.setattr(nested, "iterate", noted)
+    return seen
+
+
+def test_the_grid_that_tells_the_error_is_where_a_large_solve_begins(grids):
+    problem, grid = zoo.pendulum(shape=(150, 151))
+    solution = hjb.solve(problem, grid)
+    fine, half = (150, 151), (75, 76)
+    assert grids == [("chain", half), ("chain", fine), ("second order", fine), ("second order", half)]
+    assert solution.stats["levels"] == [half, fine]
+    alone = hjb.solve(problem, grid, method=METHOD)  # asked for, on one grid
+    assert grids[4] == ("chain", fine)
+    assert alone.stats["levels"] == [fine]
+    np.testing.assert_allclose(solution.value, alone.value, rtol=0, atol=2e-3)  # each to a residual of 1e-3
+    assert np.max(solution.grid_error) == pytest.approx(np.max(alone.grid_error), rel=0.05)
+
+
+def test_levels_end_at_the_nodes_that_the_method_names():
+    problem, grid = zoo.pendulum(shape=(100, 101))
+    task = task_of(problem, grid)
+    with jax.enable_x64(True):
+        for coarsest, wanted in ((300, [(25, 26), (50, 51)]), (2000, [(50, 51)]), (9000, [])):
+            found = nested.levels(task, hjb.Nested(METHOD, coarsest), Clock(10**9, None, False), asked_again=False)
+            assert [level.grid.shape for level in found] == wanted
+        told = nested.levels(task, METHOD, Clock(10**9, None, False), asked_again=True)
+    assert [level.grid.shape for level in told] == [(50, 51)]

@@ -25,8 +25,8 @@ def keep_compiled(folder: str | os.PathLike | None = None) -> Path:
 
     One line at the start of a script or notebook, for problems that are solved again tomorrow. The options are JAX's
     own and hold for the whole process, which is why no solve sets them by itself. A program is found again where
-    problem, shapes, options, versions and processor are the same; numbers may differ. Entries are never removed: delete
-    the folder when it has grown. One that is damaged is compiled anew, with a warning.
+    problem, shapes, options, versions and processor are the same; numbers may differ. Entries are never removed or
+    mended: one that is damaged warns, and what it held is compiled anew; delete the folder then, or when it has grown.
 
     Args:
       folder: where; ``None`` is the user's folder for caches, ``~/.cache/hjbjax`` on Linux.

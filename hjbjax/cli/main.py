@@ -114,8 +114,6 @@ def solve(
     # refusals in the order of what they cost: words, folder, problem; the solve comes after all of them
     with _one_line_error(OSError, 2, "--out: "):
         run_folder.check_folder(out, force)
-    if not no_cache:
-        compile_cache.keep_for_the_command()
     problem, grid = _build(entry, parameters, shape)
     path, made = None, []
     with contextlib.ExitStack() as stack:  # the hidden folder goes last: after an interrupt, too
@@ -123,6 +121,8 @@ def solve(
             staging = stack.enter_context(run_folder.staging(out))
         stack.enter_context(_one_line_warnings())
         stack.enter_context(_interruptible())
+        if not no_cache:
+            compile_cache.keep_for_the_command()
         solution = _solve(problem, grid, options)
         with _one_line_error(OSError, 5, "the results could not be written: "):
             try:
@@ -138,7 +138,7 @@ def solve(
                 run_folder.publish(staging, out, made, force)
     files = [out / file for file in made]
     off = None
-    with contextlib.suppress(ValueError):  # no answer is known for these parameters
+    with contextlib.suppress(ValueError), _one_line_warnings():  # no answer is known for these parameters
         off = None if entry.exact is None else run_folder.difference(entry.exact(**parameters), solution)
     if as_json:
         about = {"problem": name, "parameters": parameters, "exact_difference": off}

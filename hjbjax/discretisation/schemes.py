@@ -57,8 +57,10 @@ and where the gain of a drift component has kinks; its answers are certified. On
     >>> solution.status.name, round(float(solution.value_at([0.5])), 2)
     ('CONVERGED', 0.17)
 
-The exact value is (√5 − 1)/8 = .155: so much diffusion is dear. Such a class must be hashable, for
-compiled programs are remembered by it, and its methods are traced: no branches on numbers.
+The exact value is (√5 − 1)/8 = .155: so much diffusion is dear. It must be enough, e ≥ max(a, h⁺f, −h⁻f), here a
+``speed`` of at least |f|: a chain cannot jump with a negative probability, and carries only as much of the drift as e
+allows; the bound is on the value of that. Such a class must be hashable, for compiled programs are remembered by it,
+and its methods are traced: no branches on numbers. Under ``jit``, ``vmap`` and ``grad`` a solve wants a monotone one.
 
 A scheme that follows paths over many cells, in place of slopes, is of another kind: see ``semi_lagrangian``.
 
@@ -141,7 +143,13 @@ def check(scheme: Any, name: str, grid: Grid, *, stationary: bool = False, paths
     if not (whole and isinstance(scheme, Scheme)) or (stationary and not scheme.stationary):
         others = "Eno2() " * (not stationary) + "SemiLagrangian() " * paths
         offered = f"hjb.Upwind(), Limited(), {others}or Weno5()"
-        raise TypeError(f"{name} is {arguments.shown(scheme)}; wanted {offered}")
+        own = "one of your own: hjbjax.discretisation.schemes tells how"
+        raise TypeError(f"{name} is {arguments.shown(scheme)}; wanted {offered}, or {own}")
+    if missing := [each for each in ("one_way", "excess", "kinks", "subcell") if not hasattr(scheme.chain, each)]:
+        raise TypeError(
+            f"{name} is {arguments.shown(scheme)}, whose chain {arguments.shown(scheme.chain)} has no "
+            f"{', '.join(missing)}; hjbjax.discretisation.schemes tells how to write one"
+        )
     if scheme.even and any(each is not None for each in grid.stretch or ()):
         caller = name.partition(":")[0]
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Methods in time, as values, and how to write one of your own: V at t − Δt from V at t.
+"""Methods in time, as values: V at t − Δt from V at t. ``Tableau`` says how to write a Runge–Kutta method of your own.
 
 Explicit: strong-stability-preserving Runge–Kutta methods of Shu and Osher, with F = min max H − β V,
 

@@ -65,7 +65,7 @@ def solve_batch(
     Args:
       problems: problems; those with the same functions and shapes run together, whatever their numbers.
       grid: the nodes.
-      method: as in ``solve``, without nesting; ``None`` picks by the problem.
+      method: as in ``solve``, without nesting: of ``Nested`` its inner method; ``None`` picks by the problem.
       scheme: as in ``solve``; no error of the grid is estimated.
       tol: as in ``solve``.
       dtype: as in ``solve``.

@@ -49,7 +49,8 @@ def start(
       clock: the limits.
       asked_again: whether the next coarser grid will tell the error of the grid: its program is compiled in any case.
     """
-    if guess is not None:
+    # a tube without discount has many fixed points: from its constraint the iteration comes to the one that is sought
+    if guess is not None or (task.constrained and not np.asarray(task.problem.discount) > 0):
         return guess, []
     value: Nodes | None = None
     # with noise, or without a certificate, the schemes have programs of their own

@@ -74,7 +74,7 @@ def solve(
         the high-order equation; a tube without discount goes on until V no longer changes.
       guess: node values to start from, shape (*grid); not for a tube without discount, which has many fixed points.
       dtype: ``None`` is float64; ``"float32"`` for memory, with a tolerance that float32 can reach.
-      max_steps: at most so many steps.
+      max_steps: at most so many steps, by each scheme and on each grid.
       time_limit: at most so many seconds, checks and compilation included; what cannot be cut, as one compilation or
         one step, is let come to its end.
       throw: raise when the solve does not converge; otherwise the status says it.

@@ -187,3 +187,29 @@ def test_its_generator_is_exported():
     np.testing.assert_allclose(np.diag(found, 1), ((e + H * f) / cell)[:-1], atol=1e-10)
     np.testing.assert_allclose(np.diag(found, -1), ((e - H * f) / cell)[1:], atol=1e-10)
     np.testing.assert_allclose(found.sum(axis=1), 0, atol=1e-10)
+
+
+def test_a_chain_that_is_none_is_refused_by_what_it_lacks():
+    @dataclasses.dataclass(frozen=True)
+    class Slopes:
+        monotone, stationary, even, subcell, split = True, True, True, False, False
+        stages, points = 1, 2
+
+        @property
+        def chain(self):
+            return self
+
+        def slopes(self, around):
+            return around.one_sided
+
+    @dataclasses.dataclass(frozen=True)
+    class Chainless(Slopes):
+        chain = None
+
+    problem, grid = hjb.zoo.bang_bang(shape=(21,))
+    with pytest.raises(TypeError, match=r"whose chain .* has no one_way, excess, kinks"):
+        hjb.solve(problem, grid, scheme=Slopes())
+    with pytest.raises(TypeError, match="whose chain None has no"):
+        hjb.march(problem, grid, 0.1, scheme=Chainless())
+    with pytest.raises(TypeError, match="or one of your own: hjbjax.discretisation.schemes tells how"):
+        hjb.solve(problem, grid, scheme=Slopes)

@@ -141,3 +141,18 @@ def test_a_guess_between_the_fixed_points_of_a_tube_is_refused(make):
     """Zero is itself a fixed point, and would stay."""
     with pytest.raises(ValueError, match="leave out guess"):
         hjb.solve(make(0.5), GRID, guess=np.zeros(GRID.shape), scheme=hjb.Upwind())
+
+
+@pytest.mark.parametrize("inner", [hjb.ValueIteration(), hjb.PolicyIteration()], ids=repr)
+def test_coarser_grids_lead_to_no_other_fixed_point(inner):
+    """From the interpolated answer of a coarser grid it came to another one, .0025 off, and said CONVERGED."""
+    grid, actions = hjb.Grid([-1.0], [1.0], (41,)), hjb.Finite(np.array([[-1.0], [0.0], [1.0]]))
+    still = hjb.Problem(lambda x, u: 0 * u, None, actions, stopping_cost=lambda x: -(x[0] ** 2))
+    nested = hjb.solve(still, grid, method=hjb.Nested(inner, coarsest=5))
+    np.testing.assert_allclose(nested.value, -(np.asarray(grid.axis(0)) ** 2), rtol=0, atol=1e-12)
+    assert nested.stats["levels"] == [(41,)]
+    # of an even number of nodes none is at zero: the coarser grid has one
+    reach = hjb.Problem(lambda x, u: u, None, hjb.Box([-1.0], [1.0]), stopping_cost=lambda x: abs(x[0]))
+    grid = hjb.Grid([-1.0], [1.0], (40,))
+    nested, alone = (hjb.solve(reach, grid, method=each) for each in (hjb.Nested(inner, coarsest=5), None))
+    np.testing.assert_allclose(nested.value, alone.value, rtol=0, atol=1e-6)

@@ -58,9 +58,9 @@ and where the gain of a drift component has kinks; its answers are certified. On
     ('CONVERGED', 0.17)
 
 The exact value is (√5 − 1)/8 = .155: so much diffusion is dear. It must be enough, e ≥ max(a, h⁺f, −h⁻f), here a
-``speed`` of at least |f|: a chain cannot jump with a negative probability, and carries only as much of the drift as e
-allows; the bound is on the value of that. Such a class must be hashable, for compiled programs are remembered by it,
-and its methods are traced: no branches on numbers. Under ``jit``, ``vmap`` and ``grad`` a solve wants a monotone one.
+``speed`` of at least |f|: a chain cannot jump with a negative probability, and with less carries a part of the drift
+alone, which is refused. Such a class must be hashable, for compiled programs are remembered by it, and its methods are
+traced: no branches on numbers. Under ``jit``, ``vmap`` and ``grad`` a solve wants a monotone one, and checks no values.
 
 A scheme that follows paths over many cells, in place of slopes, is of another kind: see ``semi_lagrangian``.
 
@@ -92,6 +92,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import pytree_dataclass
 
 Slopes = Sequence[tuple[jax.Array, jax.Array]]
+ROUNDING = 64  # units of eps of what is wanted, by which the diffusion of a chain may fall short
 
 
 def weights(scheme: Chain, f: Any, a: Any, link: Links, grid: Grid, axis: int) -> tuple[Any, Any]:
@@ -111,6 +112,13 @@ def weights(scheme: Chain, f: Any, a: Any, link: Links, grid: Grid, axis: int) -
     e = scheme.excess(leaving, a, link)
     # e = h⁺ f in exact arithmetic may be a rounding below it: a rate of −1e-17 is a negative probability
     return jnp.maximum(e + link.down * f, 0) / span, jnp.maximum(e - link.up * f, 0) / span
+
+
+def falls_short(scheme: Chain, f: Any, a: Any, link: Links) -> Any:
+    """Where e is less than max(a, h⁺ f, −h⁻ f) by more than rounding, bool: there ``weights`` cuts the drift down."""
+    a = jnp.zeros(()) if a is None else jnp.maximum(a, 0)
+    e, wanted = scheme.excess(f, a, link), jnp.maximum(a, jnp.maximum(link.up * f, -link.down * f))
+    return wanted - e > ROUNDING * jnp.finfo(jnp.result_type(wanted)).eps * wanted
 
 
 def kinks(

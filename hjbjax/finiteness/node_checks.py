@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import correlated_noise, cut_cells
-from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation import correlated_noise, cut_cells, schemes, stencil
+from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
@@ -28,20 +28,25 @@ ACTIONS = 33  # at most so many actions of one player are tried, 9 where both pl
 LOOK = 10**7  # nodes times actions between two looks at the clock: about a second of a drift with some sines
 
 
-def values(problem: Problem, grid: Grid, dtype: DType, clock: Clock | None = None) -> None:
-    """Refuse a problem by its numbers at the nodes: NaN, an empty target, noise that the chain cannot represent.
+def values(
+    problem: Problem, grid: Grid, dtype: DType, clock: Clock | None = None, scheme: Scheme | None = None
+) -> None:
+    """Refuse a problem by its numbers at the nodes: NaN, an empty target, noise or drift that no chain can represent.
 
     Args:
       problem: the problem; one that passed ``checks.shapes``.
       grid: the grid.
       dtype: the floating-point type in which the functions are evaluated.
       clock: where a limit is looked at on the way, between some actions and others; ``Stopped`` leaves then.
+      scheme: whose chain is looked at, where it is one of the user's own.
 
     Raises:
       ValueError: with the number of nodes, the first of them and its state, and what to do.
     """
     clock, actions = clock or Clock(), _actions(problem)
-    on = Discretisation(problem, grid, Upwind(), np.dtype(dtype))
+    # one program for all schemes whose chain is right by construction
+    ours = scheme is None or isinstance(scheme.chain, Upwind)
+    on = Discretisation(problem, grid, Upwind() if scheme is None or ours else scheme.chain, np.dtype(dtype))
     # for counts of 64 bits; the functions are evaluated in ``dtype`` all the same
     with jax.enable_x64(True):
         # nearly every problem passes, and is spared counts and first nodes, which are slow on a CPU
@@ -61,6 +66,12 @@ def values(problem: Problem, grid: Grid, dtype: DType, clock: Clock | None = Non
         )
     if "correlation" in found and found["correlation"].nodes:
         _refuse_noise(problem, grid, found["correlation"], actions)
+    if "diffusion" in found and found["diffusion"].nodes:
+        raise ValueError(
+            f"scheme: the chain of {scheme!r} has too little diffusion at "
+            f"{_where(problem, grid, found['diffusion'], actions)}.\nWanted e ≥ max(a, h⁺ f, −h⁻ f) along every axis: "
+            "with less it carries a part of the drift alone, and its value is that of another problem"
+        )
     if problem.target is not None:
         _check_target(problem, grid, int(found["inside"]), found["nearest"])
 
@@ -194,6 +205,14 @@ def _faults(on: Discretisation, x: list, u: list, d: list | None) -> dict[str, M
     lacking = correlated_noise.lacking(on, a)
     if lacking is not None:
         bad["correlation"] = lacking
+    if on.scheme != Upwind():  # a chain of the user's own
+        links = [stencil.links(on.grid, axis) for axis in range(on.grid.ndim)]
+        short = [
+            schemes.falls_short(on.scheme.chain, part[axis], correlated_noise.along_axis(a, on.grid, axis), link)
+            for part in on.drifts(u, d, x)
+            for axis, link in enumerate(links)
+        ]
+        bad["diffusion"] = functools.reduce(jnp.logical_or, short)
     return bad
 
 

@@ -5,6 +5,7 @@ which compiles fast; a second one, where it is needed, reduces on the fly to cou
 refused can be named.
 """
 
+import dataclasses
 import functools
 import itertools
 from typing import Any, NamedTuple, NoReturn
@@ -14,12 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation import correlated_noise, cut_cells, schemes, stencil
-from hjbjax.discretisation.discretisation import Discretisation, Scheme
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.types import Array, DType, Mask, Numbers, Scalar, Verdict
+from hjbjax.problem.types import Array, Mask, Numbers, Scalar, Verdict
 from hjbjax.solution.clock import Clock
 from hjbjax.tracing import components
 from hjbjax.tracing.checks import OF_ACTION, STATE_COSTS, call
@@ -28,25 +29,21 @@ ACTIONS = 33  # at most so many actions of one player are tried, 9 where both pl
 LOOK = 10**7  # nodes times actions between two looks at the clock: about a second of a drift with some sines
 
 
-def values(
-    problem: Problem, grid: Grid, dtype: DType, clock: Clock | None = None, scheme: Scheme | None = None
-) -> None:
+def values(on: Discretisation, clock: Clock | None = None) -> None:
     """Refuse a problem by its numbers at the nodes: NaN, an empty target, noise or drift that no chain can represent.
 
     Args:
-      problem: the problem; one that passed ``checks.shapes``.
-      grid: the grid.
-      dtype: the floating-point type in which the functions are evaluated.
+      on: the problem, one that passed ``checks.shapes``, on its grid; the functions are evaluated in its type, and its
+        chain is looked at where that is the user's own.
       clock: where a limit is looked at on the way, between some actions and others; ``Stopped`` leaves then.
-      scheme: whose chain is looked at, where it is one of the user's own.
 
     Raises:
       ValueError: with the number of nodes, the first of them and its state, and what to do.
     """
-    clock, actions = clock or Clock(), _actions(problem)
+    clock, problem, grid, scheme = clock or Clock(), on.problem, on.grid, on.scheme
+    actions = _actions(problem)
     # one program for all schemes whose chain is right by construction
-    ours = scheme is None or isinstance(scheme.chain, Upwind)
-    on = Discretisation(problem, grid, Upwind() if scheme is None or ours else scheme.chain, np.dtype(dtype))
+    on = dataclasses.replace(on, scheme=Upwind() if isinstance(scheme.chain, Upwind) else scheme.chain)
     # for counts of 64 bits; the functions are evaluated in ``dtype`` all the same
     with jax.enable_x64(True):
         # nearly every problem passes, and is spared counts and first nodes, which are slow on a CPU

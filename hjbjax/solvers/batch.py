@@ -146,7 +146,7 @@ def _solve_together(
     prepared: list[tuple[Task, Assumptions, Mask | None]] = []
     for i, on in enumerate(asked):
         try:
-            node_checks.values(on.problem, on.grid, on.dtype, clock, on.scheme)
+            node_checks.values(on, clock)
             admissibility.values(on.problem, on.grid, on.dtype)
             if sharpen:
                 on = asked[i] = dataclasses.replace(on, scheme=choose_scheme(on, method))

@@ -134,7 +134,7 @@ def march(
         ):
             try:
                 checks.shapes(problem, grid, scheme)
-                node_checks.values(_without_moving_target(problem), grid, kind, clock, scheme)
+                node_checks.values(on.asking(_without_moving_target(problem)), clock)
                 # a drift that changes in time may keep inside a constrained end now and not later
                 for t in np.linspace(horizon, 0.0, PROBES) if problem.time_dependent else (0.0,):
                     admissibility.values(problem, grid, kind, t)

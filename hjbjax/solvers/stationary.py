@@ -159,7 +159,7 @@ def _solve_on_host(
     try:
         # from cheap to dear: one state, all nodes, the ends of the box, and only then what is compiled for the grid
         checks.shapes(problem, grid, on.scheme)
-        node_checks.values(problem, grid, on.dtype, clock, on.scheme)
+        node_checks.values(on, clock)
         admissibility.values(problem, grid, on.dtype)
         if sharpen:
             on = dataclasses.replace(on, scheme=choose_scheme(on, method))

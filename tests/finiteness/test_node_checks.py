@@ -9,6 +9,8 @@ from questions import GRID, U, accepted, in_disc, refused
 
 from hjbjax import Box, Finite, Grid, Problem
 from hjbjax.discretisation import correlated_noise
+from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.schemes import Upwind
 from hjbjax.finiteness import node_checks
 from hjbjax.problem.pytree import pytree_dataclass
 
@@ -78,7 +80,7 @@ def test_another_parameter_value_does_not_trace_again():
 
     counts = []
     for rate in (1.0, 2.0, 3.0):
-        node_checks.values(Problem(Counted(rate).drift, controls=U), GRID, "float64")
+        node_checks.values(Discretisation(Problem(Counted(rate).drift, controls=U), GRID, Upwind(), "float64"))
         counts.append(count)
     assert counts[0] > 0
     assert len(set(counts)) == 1

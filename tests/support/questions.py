@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import pytest
 
 from hjbjax import Box, Grid, Problem
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.finiteness import node_checks
 from hjbjax.tracing import checks
@@ -27,7 +28,7 @@ def refused(ask, match, grid=GRID, cause=None, **ingredients):
         checks.shapes(problem, grid, Upwind())
     asked = {
         "shapes": lambda: checks.shapes(problem, grid, Upwind()),
-        "values": lambda: node_checks.values(problem, grid, "float64"),
+        "values": lambda: node_checks.values(Discretisation(problem, grid, Upwind(), "float64")),
     }
     with pytest.raises(ValueError, match=match) as caught:
         asked[ask]()
@@ -40,4 +41,4 @@ def refused(ask, match, grid=GRID, cause=None, **ingredients):
 def accepted(grid=GRID, dtype="float64", **ingredients):
     problem = Problem(**({"drift": drift, "controls": U} | ingredients))
     checks.shapes(problem, grid, Upwind())
-    node_checks.values(problem, grid, dtype)
+    node_checks.values(Discretisation(problem, grid, Upwind(), dtype))

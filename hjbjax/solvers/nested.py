@@ -62,10 +62,16 @@ def start(
             level = staged(level, scheme)
         state, _, _ = iterate(level, warm(level, value, clock), clock)
         if clock.over() is not None:
-            return transfer.prolong(np.asarray(state.value), level.grid, task.grid), []
+            return transfer.prolong(_finite(level, state), level.grid, task.grid), []
         finer = task.grid if last else coarser[place + 1].grid
-        value = transfer.prolong(np.asarray(state.value), level.grid, finer)
+        value = transfer.prolong(_finite(level, state), level.grid, finer)
     return value, [level.grid.shape for level in coarser]
+
+
+def _finite(task: Task, state: State) -> np.ndarray:
+    """The value, at lost nodes the largest of the others: what is far above all of them would spoil its neighbours."""
+    value, counted = np.asarray(state.value), np.asarray(task.counted)
+    return np.where(counted, value, np.max(value[counted])) if task.has_lost else value
 
 
 def staged(task: Task, scheme: Scheme) -> Task:

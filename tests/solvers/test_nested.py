@@ -3,6 +3,7 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -120,3 +121,20 @@ def test_levels_end_at_the_nodes_that_the_method_names():
         assert [level.grid.shape for level in found] == wanted
     told = nested.levels(task, METHOD, Clock(), asked_again=True)
     assert [level.grid.shape for level in told] == [(50, 51)]
+
+
+def test_nodes_that_are_lost_do_not_spoil_the_guess_of_their_neighbours():
+    problem = hjb.Problem(
+        lambda x, u: jnp.where(x[0] > 0.5, 1.0, u[0])[None],
+        lambda x, u: 1.0,
+        hjb.Box([-1.0], [1.0]),
+        target=lambda x: jnp.abs(x[0]) - 0.1,
+    )
+    grid = hjb.Grid([-1.0], [1.0], (161,))
+    with pytest.warns(hjb.SolveWarning, match="cannot reach the target"):
+        found = hjb.solve(problem, grid, method=hjb.Nested(METHOD, 20), scheme=SCHEME, tol=1e-9)
+    assert found.stats["levels"] == [(21,), (41,), (81,), (161,)]
+    x = np.asarray(grid.axis(0))
+    # upwinding is exact on a straight line: the time to the target, or for ever
+    np.testing.assert_allclose(found.value, np.where(x > 0.5 + 1e-9, np.inf, np.maximum(np.abs(x) - 0.1, 0)), atol=1e-9)
+    assert found.steps <= 2

@@ -42,9 +42,8 @@ ABOUT = {"benchmark": "peers", "problem": "pendulum", "dtype": "float64"}
 def our_first(solve: Any, times: int) -> dict[str, float]:
     """First calls of ``solve``, compiling each time: the median of their seconds, and of the processor's."""
     seconds, busy = [], []
-    for count in range(times):
-        if count:
-            jax.clear_caches()
+    for _ in range(times):
+        jax.clear_caches()
         before = time.process_time()
         seconds.append(timed(lambda: solve().value)[1])
         busy.append(time.process_time() - before)
@@ -65,10 +64,7 @@ def measure(nodes: int, actions: int, tol: float, repeats: int, *, chain: bool, 
     ours = {OURS: functools.partial(hjb.solve, problem, grid, tol=tol, scheme=hjb.Upwind())}
     if chain:  # the smallest size, at which coarser grids are left to the user
         ours[NESTED] = functools.partial(ours[OURS], method=hjb.Nested())
-    cold = {}
-    for name, solve in ours.items():
-        jax.clear_caches()
-        cold[name] = our_first(solve, first)
+    cold = {name: our_first(solve, first) for name, solve in ours.items()}
     solutions: dict[str, hjb.Solution] = {}
 
     def call(name):

@@ -277,9 +277,10 @@ def _count_staying(question: Problem, grid: Grid, options: dict) -> int:
     with jax.enable_x64(kind == np.float64):
         memory.require(question, grid, method, kind, options.get("max_memory"))
         checks.shapes(question, grid, scheme)
-        node_checks.values(Discretisation(question, grid, scheme, kind))
+        on = Discretisation(question, grid, scheme, kind)
+        node_checks.values(on)
         # of the chain beneath the scheme: slopes of higher order make no transition probabilities
-        kept = attainability.refuge(Discretisation(question, grid, scheme.chain, kind))
+        kept = attainability.refuge(on.chain)
         return int(np.sum(np.asarray(kept)))
 
 

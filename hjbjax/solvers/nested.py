@@ -56,16 +56,15 @@ def start(
     # with noise, or without a certificate, the schemes have programs of their own
     asked_again &= scheme.monotone or staged(task, scheme) is not task
     coarser = levels(task, method, clock, asked_again=asked_again)
-    for place, level in enumerate(coarser):
-        last = place + 1 == len(coarser)
-        if last:  # the one that is asked again
-            level = staged(level, scheme)
+    if coarser:
+        coarser[-1] = staged(coarser[-1], scheme)  # the one that is asked again
+    grids = [*(level.grid for level in coarser), task.grid]
+    for level, finer in zip(coarser, grids[1:], strict=True):
         state, _, _ = iterate(level, warm(level, value, clock), clock)
         if clock.over() is not None:
             return transfer.prolong(_finite(level, state), level.grid, task.grid), []
-        finer = task.grid if last else coarser[place + 1].grid
         value = transfer.prolong(_finite(level, state), level.grid, finer)
-    return value, [level.grid.shape for level in coarser]
+    return value, [grid.shape for grid in grids[:-1]]
 
 
 def _finite(task: Task, state: State) -> np.ndarray:
@@ -89,19 +88,21 @@ def levels(task: Task, method: Method, clock: Clock, *, asked_again: bool) -> li
     ``asked_again``: the next coarser grid in any case, if it can tell the error of the grid.
     """
     found: list[Task] = []
-    smaller = _telling(task.grid) if asked_again else None
-    while clock.over() is None:
-        if smaller is None:
-            smaller = transfer.coarser(found[0].grid if found else task.grid)
-            if smaller is None or method.coarsest is None or smaller.size < method.coarsest:
-                break
+    smaller = (_telling(task.grid) if asked_again else None) or _below(task.grid, method)
+    while smaller is not None and clock.over() is None:
         clock.phase = f"the preparation of {' x '.join(map(str, smaller.shape))} nodes"
         level = _on_coarser(task, smaller)
         if level is None:
             break
         found.insert(0, level)
-        smaller = None
+        smaller = _below(smaller, method)
     return found
+
+
+def _below(grid: Grid, method: Method) -> Grid | None:
+    """The next coarser grid, if it has as many nodes as the method wants of the coarsest."""
+    smaller = transfer.coarser(grid)
+    return None if smaller is None or method.coarsest is None or smaller.size < method.coarsest else smaller
 
 
 def warm(task: Task, guess: Nodes | None, clock: Clock) -> Nodes:
@@ -251,8 +252,7 @@ def coarser_answer(settled: Settled, clock: Clock) -> tuple[Grid, np.ndarray] | 
     coarse = _telling(fine)
     if coarse is None or clock.over() is not None or (level := _on_coarser(task, coarse)) is None:
         return None
-    # infinite values are imposed anew by what is lost
-    value = np.where(np.asarray(task.counted), np.asarray(settled.state.value), 0)
+    value = _finite(task, settled.state)  # infinite values are imposed anew by what is lost
     state, code, _ = iterate(level, transfer.restrict(value, fine, coarse).astype(value.dtype), clock)
     if code is not Status.CONVERGED:
         return None

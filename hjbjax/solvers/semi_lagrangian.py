@@ -87,7 +87,7 @@ def solve_on_host(
     start = None if guess is None else np.asarray(guess, kind)
     try:
         checks.shapes(problem, grid, scheme)
-        node_checks.values(Discretisation(problem, grid, Upwind(), kind), clock)
+        node_checks.values(on, clock)
         plan = scheme.plan(problem, grid, kind)
         needed = memory.fitting(estimate(grid, plan, kind), grid, max_memory)
         with host_loop.with_solution(clock, needed, lambda kept: _partial(on, kept)):

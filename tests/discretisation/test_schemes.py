@@ -109,9 +109,10 @@ def test_what_a_scheme_of_ones_own_cannot_do_is_said():
 
 @dataclasses.dataclass(frozen=True)
 class LaxFriedrichs:
-    """Central differences, and a diffusion that no drift of at most ``speed`` turns negative."""
+    """Central differences, and a diffusion that no drift of at most ``speed`` turns negative, with a share of noise."""
 
     speed: float
+    share: float = 1.0
     monotone, stationary, even, subcell, split, one_way = True, True, True, False, False, False
     stages, points = 1, 2
 
@@ -123,7 +124,7 @@ class LaxFriedrichs:
         return around.one_sided
 
     def excess(self, f, a, link):
-        return a + self.speed * link.up + 0 * f
+        return self.share * a + self.speed * link.up + 0 * f
 
     def kinks(self, a, slopes, link):
         return (), (sum(slopes) / 2,)
@@ -215,29 +216,6 @@ def test_a_chain_that_is_none_is_refused_by_what_it_lacks():
         hjb.solve(problem, grid, scheme=Slopes)
 
 
-@dataclasses.dataclass(frozen=True)
-class Spread:
-    """Lax–Friedrichs: central differences and a diffusion of ``speed`` times h, whatever the drift."""
-
-    speed: float
-    share: float = 1.0  # of the noise
-    monotone, stationary, even, subcell, split, one_way = True, True, True, False, False, False
-    stages, points = 1, 2
-
-    @property
-    def chain(self):
-        return self
-
-    def slopes(self, around):
-        return around.one_sided
-
-    def excess(self, f, a, link):
-        return self.share * a + self.speed * link.up + 0 * f
-
-    def kinks(self, a, slopes, link):
-        return (), (sum(slopes) / 2,)
-
-
 FAST = hjb.Problem(lambda x, u: u, lambda x, u: x @ x, hjb.Box([-2.0], [2.0]), discount=1.0)
 LINE = hjb.Grid([-1.0], [1.0], (41,))
 
@@ -253,15 +231,15 @@ LINE = hjb.Grid([-1.0], [1.0], (41,))
 )
 def test_a_chain_with_too_little_diffusion_is_refused(ask):
     """It carried half of the drift, converged to .16 for .12, and its bound said 1e-6."""
-    with pytest.raises(ValueError, match=r"Spread\(speed=1.0.*too little diffusion at 41 of 41 nodes, first at"):
-        ask(Spread(1.0))
-    ask(Spread(2.0))
+    with pytest.raises(ValueError, match=r"LaxFriedrichs\(speed=1.0.*too little diffusion at 41 of 41 nodes, first at"):
+        ask(LaxFriedrichs(1.0))
+    ask(LaxFriedrichs(2.0))
 
 
 def test_a_chain_that_leaves_out_noise_is_refused():
     noisy = dataclasses.replace(FAST, noise=0.5)
     with pytest.raises(ValueError, match="too little diffusion"):
-        hjb.solve(noisy, LINE, scheme=Spread(2.0, share=0.5))
+        hjb.solve(noisy, LINE, scheme=LaxFriedrichs(2.0, share=0.5))
     # e may be made of noise and of artificial diffusion: 2 h = .1 stands for a fifth of a = .25 and for no drift
     still = dataclasses.replace(noisy, drift=lambda x, u: 0 * u)
-    assert hjb.solve(still, LINE, scheme=Spread(2.0, share=0.8)).status is hjb.Status.CONVERGED
+    assert hjb.solve(still, LINE, scheme=LaxFriedrichs(2.0, share=0.8)).status is hjb.Status.CONVERGED

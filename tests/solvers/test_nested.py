@@ -31,7 +31,7 @@ def task_of(problem, grid):
     return prepare_on_host(Discretisation(problem, grid, SCHEME, KIND), method=METHOD, tol=1e-3)[0]
 
 
-def wall(x, u):
+def drift(x, u):
     """Drift that only the control makes."""
     return u
 
@@ -41,11 +41,13 @@ PROBLEMS = {
     "target": lambda: zoo.double_integrator(shape=(41, 41)),
     "undiscounted, at rest": lambda: zoo.smooth(shape=(41, 41), discount=0.0),
     "obstacles": lambda: (
-        hjb.Problem(wall, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), discount=1.0, stopping_cost=lambda x: 0.3 + x[0]),
+        hjb.Problem(
+            drift, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), discount=1.0, stopping_cost=lambda x: 0.3 + x[0]
+        ),
         hjb.Grid([-1.0], [1.0], (41,)),
     ),
     "constrained": lambda: (
-        hjb.Problem(wall, lambda x, u: x @ x + u @ u, hjb.Box([-1.0], [1.0]), discount=1.0),
+        hjb.Problem(drift, lambda x, u: x @ x + u @ u, hjb.Box([-1.0], [1.0]), discount=1.0),
         hjb.Grid([-1.0], [1.0], (41,), edges="constrained"),
     ),
 }
@@ -74,7 +76,7 @@ def test_the_fastest_rate_is_asked_for_on_every_grid():
 
 
 def test_a_coarser_grid_that_loses_the_target_is_none():
-    problem = hjb.Problem(wall, lambda x, u: 1.0, hjb.Box([-1.0], [1.0]), target=lambda x: abs(x[0] - 0.05) - 0.01)
+    problem = hjb.Problem(drift, lambda x, u: 1.0, hjb.Box([-1.0], [1.0]), target=lambda x: abs(x[0] - 0.05) - 0.01)
     task = task_of(problem, hjb.Grid([-1.0], [1.0], (41,)))  # the node at .05 is an odd one
     assert nested._on_coarser(task, hjb.Grid([-1.0], [1.0], (21,))) is None
 
@@ -87,27 +89,14 @@ def test_odd_intervals_are_prepared_anew_unless_nodes_are_lost():
     assert nested._on_coarser(dataclasses.replace(task, has_lost=True), coarse) is None
 
 
-@pytest.fixture
-def grids(monkeypatch):
-    """The shapes and schemes of all iterations on the host, a name and a shape each."""
-    seen, iterate = [], nested.iterate
-
-    def noted(task, *rest, **options):
-        seen.append(("chain" if task.plain else "second order", task.grid.shape))
-        return iterate(task, *rest, **options)
-
-    monkeypatch.setattr(nested, "iterate", noted)
-    return seen
-
-
-def test_the_grid_that_tells_the_error_is_where_a_large_solve_begins(grids):
+def test_the_grid_that_tells_the_error_is_where_a_large_solve_begins(iterations):
     problem, grid = zoo.smooth(shape=(145, 145))
     solution = hjb.solve(problem, grid)
     fine, half = (145, 145), (73, 73)
-    assert grids == [("chain", half), ("chain", fine), ("second order", fine), ("second order", half)]
+    assert iterations == [("Upwind", half), ("Upwind", fine), ("Limited", fine), ("Limited", half)]
     assert solution.stats["levels"] == [half, fine]
     alone = hjb.solve(problem, grid, method=METHOD)  # asked for, on one grid
-    assert grids[4] == ("chain", fine)
+    assert iterations[4] == ("Upwind", fine)
     assert alone.stats["levels"] == [fine]
     np.testing.assert_allclose(solution.value, alone.value, rtol=0, atol=2e-3)  # each to a residual of 1e-3
     assert np.max(solution.grid_error) == pytest.approx(np.max(alone.grid_error), rel=0.05)

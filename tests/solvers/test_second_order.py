@@ -10,7 +10,7 @@ import pytest
 import hjbjax as hjb
 from hjbjax import zoo
 from hjbjax.applications.reference import at_nodes_of, mask_of
-from hjbjax.solvers import nested, stationary_run
+from hjbjax.solvers import nested
 
 U = hjb.Box([-1.0], [1.0])
 
@@ -66,20 +66,6 @@ def test_the_estimate_is_of_the_size_of_the_error(name, count, share, parameters
     true = np.max(np.abs(solution.value - at_nodes_of(entry.exact(**parameters), grid, mask))[mask])
     assert solution.grid_error.shape == grid.shape
     assert true / 3 <= np.max(solution.grid_error[mask]) <= 5 * true
-
-
-@pytest.fixture
-def iterations(monkeypatch):
-    """The schemes and shapes of all iterations on the host."""
-    seen, run = [], stationary_run.StationaryRun.__init__
-
-    def noted(self, task, *rest):
-        scheme = task.scheme.chain if task.plain else task.scheme
-        seen.append((type(scheme).__name__, task.grid.shape))
-        run(self, task, *rest)
-
-    monkeypatch.setattr(stationary_run.StationaryRun, "__init__", noted)
-    return seen
 
 
 def test_each_grid_is_solved_once_by_each_scheme(iterations):

@@ -27,9 +27,9 @@ from benchmarks.harness.footprint import bytes_of
 from benchmarks.harness.report import RESULTS, attempt, publish, table, threads, without
 from benchmarks.harness.timing import interleaved
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.finiteness import memory
+from hjbjax.discretisation.rates import fastest_rate
 from hjbjax.iteration import bellman, fixed_point
-from hjbjax.markov_chain import chain
+from hjbjax.markov_chain import memory
 from hjbjax.problem.pytree import cast
 from hjbjax.solvers import stationary_run
 from hjbjax.solvers.setup import prepare_on_host
@@ -84,7 +84,7 @@ def copy(old: jax.Array, value: jax.Array) -> jax.Array:
 @jax.jit
 def paces(problem: Any, grid: Any) -> jax.Array:
     """max_u Q + β at the nodes."""
-    return chain.fastest_rate(Discretisation(problem, grid, SCHEME, KIND)) + problem.discount
+    return fastest_rate(Discretisation(problem, grid, SCHEME, KIND)) + problem.discount
 
 
 def started(grid: hjb.Grid) -> jax.Array:

@@ -20,8 +20,8 @@ from hjbjax.applications import exit_problems
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.feedback.feedback import GridFeedback, Place, is_grid_feedback
-from hjbjax.finiteness import attainability, memory, node_checks
 from hjbjax.iteration.methods import ValueIteration
+from hjbjax.markov_chain import attainability, memory, node_checks
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, is_traced

@@ -22,12 +22,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax.discretisation import correlated_noise, cut_cells, schemes, stencil
+from hjbjax.discretisation import correlated_noise, cut_cells, edges, schemes, stencil
 from hjbjax.discretisation.discretisation import Differences, Discretisation
 from hjbjax.hamiltonian.piecewise import Kinked, inverse_root, kinked_ball, piecewise_input, piecewise_pair
 from hjbjax.hamiltonian.players import SAMPLES, Player, players_of, shared
 from hjbjax.hamiltonian.search import UNROLL, Action, best_of, enumerate_actions, refine
-from hjbjax.markov_chain import edges
 from hjbjax.problem import sets
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered

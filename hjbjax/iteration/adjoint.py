@@ -17,11 +17,11 @@ from typing import TypeAlias
 import jax
 import jax.numpy as jnp
 
+from hjbjax.discretisation.rates import jump_rates
 from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import PolicyEquation
 from hjbjax.iteration.evaluation import Evaluation, Krylov, direct, evaluate, left_over
 from hjbjax.iteration.fixed_point import State, Task
-from hjbjax.markov_chain import chain
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.types import Field, Number, Scalar
 
@@ -106,7 +106,7 @@ def _residual(task: Task, state: State, equation: PolicyEquation) -> Field:
     held = jax.lax.stop_gradient(task.obstacles.fixed)
     lost = jax.lax.stop_gradient(task.lost)
     rate = bellman.greedy(task.on, value, held, incumbent=policy, lost=lost).defect
-    outflow = jax.lax.stop_gradient(chain.rates(task.on, u, d).total() + task.problem.discount)
+    outflow = jax.lax.stop_gradient(jump_rates(task.on, u, d).total() + task.problem.discount)
     # divided as the equation is, so that ∂Φ/∂V = −(I − W); a derivative of the divisor would be multiplied by r = 0
     phi = rate / jnp.where(outflow > 0, outflow, 1)
     bound = equation.weights.total() == 0  # rows of the constraints hold no weights

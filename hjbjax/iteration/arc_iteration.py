@@ -22,11 +22,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation.arcs import Arcs, widened
+from hjbjax.discretisation.rates import Rates
 from hjbjax.iteration import certificates
 from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
 from hjbjax.iteration.certificates import Certificate, ErrorBound, Iterate
 from hjbjax.iteration.fixed_point import HISTORY, PATIENCE, ROUNDING
-from hjbjax.markov_chain.chain import Rates
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import AtNodes, Field, Mask, Nodes, Number, Scalar

@@ -16,13 +16,12 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from hjbjax.discretisation import cut_cells, stencil
+from hjbjax.discretisation import cut_cells, edges, stencil
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.rates import Rates, jump_rates
 from hjbjax.hamiltonian import discrete
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.hamiltonian.search import Action
-from hjbjax.markov_chain import chain, edges
-from hjbjax.markov_chain.chain import Rates
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import Field, Nodes, Number, Scalar
 
@@ -129,7 +128,7 @@ def improvement(on: Discretisation, value: Field, fixed: jax.Array, new: Greedy,
     the first one found leads to where its value came from, and another one may go round. There is no disturbance.
     """
     hamiltonian, u, discount = _around(on, value, None), list(old.controls), on.problem.discount
-    rates = chain.rates(on, u, [])
+    rates = jump_rates(on, u, [])
     # H − β V is a sum of c V(x + o) − c V(x): terms of the size of (Q + β)|V|, each rounded
     rounding = ROUNDING * jnp.finfo(on.dtype).eps * (rates.total() + discount) * jnp.abs(value)
     rate = hamiltonian.at(u, []) - discount * value
@@ -180,7 +179,7 @@ def policy_equation(
     every rate counts, however small it is beside the others.
     """
     u, d = list(policy.controls), list(policy.disturbances)
-    rates = chain.rates(on, u, d)
+    rates = jump_rates(on, u, d)
     leaving = rates.total() + on.problem.discount
     fastest = jnp.max(leaving) if fastest is None else fastest
     moves = leaving > 8 * jnp.finfo(value.dtype).eps * fastest  # a drift that cancels leaves rounding
@@ -205,7 +204,7 @@ def policy_equation(
 def leaks(on: Discretisation, policy: Greedy, held: jax.Array, lost: jax.Array) -> jax.Array:
     """True if the policy leads from a node that counts to one that is ``lost``, by more than rounding."""
     grid, u, d = on.grid, list(policy.controls), list(policy.disturbances)
-    rates, ends = chain.rates(on, u, d), list(zip(edges.beside(lost, grid), edges.slack(on), strict=True))
+    rates, ends = jump_rates(on, u, d), list(zip(edges.beside(lost, grid), edges.slack(on), strict=True))
     # each part of the drift by itself: of players upwinded apart one may lead where their sum does not
     leads = [
         functools.reduce(jnp.logical_or, (edges.leads(part[axis], *end) for part in on.drifts(u, d)))

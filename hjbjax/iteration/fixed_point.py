@@ -18,13 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
+from hjbjax.discretisation.rates import jump_rates
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import bellman, certificates, methods
 from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
 from hjbjax.iteration.certificates import Certificate, ErrorBound, Iterate
 from hjbjax.iteration.evaluation import Evaluation, evaluate
 from hjbjax.iteration.methods import Method
-from hjbjax.markov_chain import chain
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, is_traced, pytree_dataclass
@@ -341,5 +341,5 @@ def _outflow(task: Task, state: State) -> Field:
     if players.control.fastest_at_ends and players.disturbance.fastest_at_ends:
         return task.outflow
     u, d = list(state.policy.controls), list(state.policy.disturbances)
-    chosen = chain.rates(task.on, u, d).total()  # a fast action between the samples
+    chosen = jump_rates(task.on, u, d).total()  # a fast action between the samples
     return jnp.maximum(task.outflow, chosen + task.problem.discount)

@@ -13,12 +13,12 @@ import jax.numpy as jnp
 
 from hjbjax.discretisation import correlated_noise
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.rates import fastest_rate, jump_rates
 from hjbjax.hamiltonian import discrete
 from hjbjax.hamiltonian.search import Action
 from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import Obstacles
 from hjbjax.iteration.time_methods import TimeMethod
-from hjbjax.markov_chain import chain
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import pytree_dataclass
@@ -87,7 +87,7 @@ class March:
         on, dtype = self.on.at(t), self.on.dtype
         seen = self.nothing_seen()
         if self.checks_rates:  # a pass over all rates, which is spared where the limit of the step is known
-            fastest = jnp.max(chain.rates(on, u, d).total()) + jnp.asarray(on.problem.discount, dtype)
+            fastest = jnp.max(jump_rates(on, u, d).total()) + jnp.asarray(on.problem.discount, dtype)
             seen = dataclasses.replace(seen, fastest=fastest)
         if self.checks_noise:
             lacking = correlated_noise.lacking(on, on.diffusion(u, d))
@@ -142,7 +142,7 @@ class Seen:
 
 def stable(on: Discretisation) -> Scalar:
     """The longest step for which explicit Euler is monotone, 1/(max Q + β); inf where nothing moves."""
-    rate = jnp.max(chain.fastest_rate(on)) + on.problem.discount
+    rate = jnp.max(fastest_rate(on)) + on.problem.discount
     # the inner where keeps 1/0 out of the branch not taken, whose NaN a derivative would bring back
     return jnp.where(rate > 0, 1 / jnp.where(rate > 0, rate, 1), jnp.inf)
 

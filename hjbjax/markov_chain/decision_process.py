@@ -27,7 +27,7 @@ Table = tuple[Offsets, Sequence[np.ndarray], np.ndarray, np.ndarray]
 
 
 class Jumps(Protocol):
-    """The jumps of a chain and the rate of each at every node, as ``chain.Rates`` holds them."""
+    """The jumps of a chain and the rate of each at every node, as ``rates.Rates`` holds them."""
 
     @property
     def offsets(self) -> Offsets:

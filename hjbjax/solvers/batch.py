@@ -15,10 +15,10 @@ import numpy as np
 
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.finiteness import admissibility, memory, node_checks
 from hjbjax.iteration import fixed_point
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import Method
+from hjbjax.markov_chain import admissibility, memory, node_checks
 from hjbjax.problem.arguments import shown
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem

@@ -15,13 +15,13 @@ import numpy as np
 from hjbjax.discretisation import schemes
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.schemes import Limited, Upwind
-from hjbjax.finiteness import admissibility, memory, node_checks
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import bellman, time_stepping
 from hjbjax.iteration.evaluation import Evaluation, Krylov, Sweeps, check_pytree
 from hjbjax.iteration.methods import PolicyIteration
 from hjbjax.iteration.time_methods import Explicit, TimeMethod
 from hjbjax.iteration.time_stepping import March
+from hjbjax.markov_chain import admissibility, memory, node_checks
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem

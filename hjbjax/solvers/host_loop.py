@@ -17,7 +17,7 @@ from typing import Any, Protocol, TypeAlias
 import jax
 import numpy as np
 
-from hjbjax.finiteness import memory
+from hjbjax.markov_chain import memory
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.types import Nodes
 from hjbjax.solution.clock import CHUNK_SECONDS, Clock

@@ -6,12 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import correlated_noise
+from hjbjax.discretisation import correlated_noise, edges
 from hjbjax.hamiltonian import discrete
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import time_stepping
 from hjbjax.iteration.time_stepping import Front, March
-from hjbjax.markov_chain import edges
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.sets import Finite
 from hjbjax.problem.types import Field, Nodes, Number, Scalar

@@ -13,10 +13,10 @@ import numpy as np
 
 from hjbjax.discretisation import cut_cells
 from hjbjax.discretisation.discretisation import Scheme
-from hjbjax.finiteness import resting
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import Method, PolicyIteration
+from hjbjax.markov_chain import resting
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import altered, known
 from hjbjax.problem.types import Mask, Nodes

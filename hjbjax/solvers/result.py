@@ -7,15 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import correlated_noise
+from hjbjax.discretisation import correlated_noise, edges
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.finiteness import earnings
 from hjbjax.hamiltonian import discrete
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import certificates, fixed_point
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.fixed_point import State, Task
-from hjbjax.markov_chain import edges
+from hjbjax.markov_chain import earnings
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import is_traced

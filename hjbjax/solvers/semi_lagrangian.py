@@ -8,18 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation import arcs as paths
+from hjbjax.discretisation import edges
 from hjbjax.discretisation.arcs import Arcs, Plan
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.discretisation.semi_lagrangian import PathScheme
-from hjbjax.finiteness import memory, node_checks
 from hjbjax.iteration import arc_iteration, bellman, certificates
 from hjbjax.iteration.arc_iteration import ArcState, ArcTask
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.evaluation import Sweeps
 from hjbjax.iteration.fixed_point import HISTORY
 from hjbjax.iteration.methods import Method
-from hjbjax.markov_chain import edges
+from hjbjax.markov_chain import memory, node_checks
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import cast

@@ -10,15 +10,15 @@ import numpy as np
 
 from hjbjax.discretisation import cut_cells, schemes
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
+from hjbjax.discretisation.rates import fastest_rate
 from hjbjax.discretisation.schemes import Limited, Upwind
-from hjbjax.finiteness import attainability, resting
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import bellman
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.evaluation import Direct, Evaluation, Krylov, Sweeps
 from hjbjax.iteration.fixed_point import Task
 from hjbjax.iteration.methods import Method, Nested, PolicyIteration, ValueIteration
-from hjbjax.markov_chain import chain
+from hjbjax.markov_chain import attainability, resting
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_discounted
 from hjbjax.problem.pytree import cast, known
@@ -117,7 +117,7 @@ def prepare(on: Discretisation, *, method: Method, tol: Number, assumptions: "As
     undecided = assumptions.certificate is Certificate.BY_DISCOUNT and is_constrained(on.problem)
     outflow = None
     if method.relaxes or undecided or assumptions.certificate is Certificate.OPEN:
-        rate = chain.fastest_rate(on) + on.problem.discount
+        rate = fastest_rate(on) + on.problem.discount
         outflow = jnp.where(rate > 0, rate, 1)  # it is divided by, also where nothing moves
     priced = assumptions.costs_certify and still is not None
     return Task(

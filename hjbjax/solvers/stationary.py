@@ -16,10 +16,10 @@ from hjbjax.discretisation import schemes
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.discretisation.semi_lagrangian import PathScheme
-from hjbjax.finiteness import admissibility, memory, node_checks, resting
 from hjbjax.iteration import adjoint, fixed_point
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import Method, check_method
+from hjbjax.markov_chain import admissibility, memory, node_checks, resting
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_discounted

@@ -10,6 +10,7 @@ from systems import SEEDS
 
 import hjbjax as hjb
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.rates import jump_rates
 from hjbjax.hamiltonian import discrete
 from hjbjax.markov_chain import chain
 from hjbjax.problem.stretching import Sinh
@@ -198,7 +199,7 @@ def test_the_hamiltonian_at_walls_is_that_of_the_chain(central, subcell, seed):
         on = Discretisation(problem, grid, hjb.Upwind(central=central, subcell=subcell), np.float64)
         value, u = jnp.asarray(rng.normal(size=grid.shape)), list(jnp.asarray(rng.normal(size=(2, *grid.shape)) * 3))
         found = discrete.around(on, value).at(u, [])
-        np.testing.assert_allclose(found, chain.rates(on, u).apply(grid, value), atol=1e-9)
+        np.testing.assert_allclose(found, jump_rates(on, u).apply(grid, value), atol=1e-9)
 
 
 @pytest.mark.parametrize("noise", [0.05, 0.5])

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from systems import SEEDS, random_game, random_grid, random_problem, random_sigma
 
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.rates import jump_rates
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.hamiltonian import discrete
 from hjbjax.hamiltonian.players import SAMPLES, find_players
-from hjbjax.markov_chain import chain
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import pytree_dataclass
@@ -33,7 +33,7 @@ def _float64():
 @functools.partial(jax.jit, static_argnames="scheme")
 def both_forms(problem, grid, value, u, d, scheme):
     on, other = Discretisation(problem, grid, scheme, value.dtype), d if problem.is_game else None
-    rates, cost = chain.rates(on, u, other), on.running_cost(u, other)
+    rates, cost = jump_rates(on, u, other), on.running_cost(u, other)
     return discrete.around(on, value).at(u, d), cost + rates.apply(grid, value)
 
 

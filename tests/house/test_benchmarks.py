@@ -16,7 +16,7 @@ from benchmarks.__main__ import NAMES
 from benchmarks.harness import footprint, thresholds, timing
 from benchmarks.speed import batch, controls, growth, peers, scaling, startup, sweep
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.markov_chain import chain
+from hjbjax.discretisation.rates import fastest_rate
 from hjbjax.problem.pytree import cast
 
 COMPLETE = {"benchmark", "device", "dtype", "versions", "date", "cores", "status"}
@@ -90,7 +90,7 @@ def test_the_timed_sweep_is_that_of_the_exported_chain(shape):
     rate = pairs.reshape(*shape, 3).min(axis=-1) - problem.discount * value
     with jax.enable_x64(True):
         on = cast(Discretisation(problem, grid, sweep.SCHEME, np.float64), np.float64)
-        outflow = np.asarray(jax.jit(chain.fastest_rate)(on))
+        outflow = np.asarray(jax.jit(fastest_rate)(on))
         found = sweep.sweep(on.problem, on.grid, jnp.asarray(value), jnp.asarray(outflow + problem.discount))
     np.testing.assert_allclose(found, value + rate / (outflow + problem.discount), rtol=0, atol=1e-12)
 

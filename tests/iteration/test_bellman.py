@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from systems import SEEDS, random_game, random_grid, random_problem
 
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.rates import fastest_rate
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.hamiltonian import discrete
 from hjbjax.iteration import bellman
@@ -39,7 +40,7 @@ def upwind(problem, grid):
 def operator(problem, grid, value, obstacles, scheme=Upwind()):
     """One step of value iteration; and βΔt, by which it contracts."""
     on = Discretisation(problem, grid, scheme, value.dtype)
-    outflow = chain.fastest_rate(on) + problem.discount
+    outflow = fastest_rate(on) + problem.discount
     greedy = bellman.greedy(on, value, obstacles.fixed)
     return obstacles.impose(value + greedy.defect / outflow), problem.discount / jnp.max(outflow)
 
@@ -304,7 +305,7 @@ def test_no_action_is_faster_than_the_fastest_rate(controls, seed):
 
 @jax.jit
 def _fastest(problem, grid):
-    return chain.fastest_rate(upwind(problem, grid))
+    return fastest_rate(upwind(problem, grid))
 
 
 @pytest.mark.parametrize("isaacs", ["upper", "lower"])

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from systems import SEEDS
 
 import hjbjax as hjb
+from hjbjax.discretisation.rates import Rates
 from hjbjax.iteration.bellman import PolicyEquation
 from hjbjax.iteration.evaluation import Direct, Krylov, Sweeps, evaluate, jacobi, left_over, relaxed
-from hjbjax.markov_chain.chain import Rates
 
 
 @pytest.fixture(autouse=True, scope="module")

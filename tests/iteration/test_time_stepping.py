@@ -9,8 +9,8 @@ import pytest
 
 import hjbjax as hjb
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.rates import jump_rates
 from hjbjax.iteration import time_stepping
-from hjbjax.markov_chain import chain
 
 UNIT = hjb.Box([-1.0], [1.0])
 LINE = hjb.Grid([-1.0], [1.0], (41,))
@@ -144,7 +144,7 @@ def test_noise_between_the_sampled_controls_is_looked_at_under_the_policy(ask):
 
 @functools.partial(jax.jit, static_argnames="dtype")
 def rates(problem, u, d, dtype):
-    return chain.rates(Discretisation(problem, LINE, hjb.Upwind(split=True), dtype), u, d).total()
+    return jump_rates(Discretisation(problem, LINE, hjb.Upwind(split=True), dtype), u, d).total()
 
 
 @pytest.mark.parametrize("name", QUESTIONS)

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from systems import SEEDS, SHAPES, random_grid, random_problem
 
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.rates import jump_rates
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.markov_chain import chain
 from hjbjax.problem.grid import Grid
@@ -197,7 +198,7 @@ def test_generator_and_adjoint_are_dual(n, seed):
 def _apply_both(problem, grid, u, value, density):
     from hjbjax.discretisation import stencil
 
-    rates = chain.rates(Discretisation(problem, grid, Upwind(), value.dtype), u)
+    rates = jump_rates(Discretisation(problem, grid, Upwind(), value.dtype), u)
     arriving = rates.inflow(grid)
     jumps = zip(arriving.offsets, arriving.values, strict=True)
     came = sum(c * stencil.neighbour(density, grid, offset, ghost=False) for offset, c in jumps)
@@ -207,7 +208,7 @@ def _apply_both(problem, grid, u, value, density):
 def test_scaled_multiplies_every_rate():
     problem = Problem(lambda x, u: u, None, Box([-1.0], [1.0]), noise=1.0)
     grid = Grid([0.0], [1.0], (3,))
-    rates = chain.rates(Discretisation(problem, grid, PLAIN, np.float64), [jnp.ones(3)])
+    rates = jump_rates(Discretisation(problem, grid, PLAIN, np.float64), [jnp.ones(3)])
     factor = jnp.array([0.0, 1.0, 3.0])
     assert rates.scaled(factor).total().tolist() == (factor * rates.total()).tolist()
 

@@ -17,7 +17,7 @@ import hjbjax as hjb
 from hjbjax.applications import convergence, hinf, perturbations
 from hjbjax.extremals import collocation, continuation, equilibria
 from hjbjax.feedback import simulation
-from hjbjax.finiteness import node_checks
+from hjbjax.markov_chain import node_checks
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solvers import batch, host_loop, march_run, stationary_run

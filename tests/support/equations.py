@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation import stencil
+from hjbjax.discretisation.rates import Rates
 from hjbjax.iteration.bellman import PolicyEquation
-from hjbjax.markov_chain.chain import Rates
 from hjbjax.problem.grid import Grid
 
 SHAPES = {1: (9,), 2: (6, 5), 3: (4, 3, 5), 4: (3, 4, 2, 3)}

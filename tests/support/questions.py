@@ -6,7 +6,7 @@ import pytest
 from hjbjax import Box, Grid, Problem
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.finiteness import node_checks
+from hjbjax.markov_chain import node_checks
 from hjbjax.tracing import checks
 
 GRID = Grid([-1.0, -2.0], [1.0, 2.0], (5, 9))

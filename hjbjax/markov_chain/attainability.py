@@ -12,12 +12,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import cut_cells, stencil
+from hjbjax.discretisation import cut_cells, edges, stencil
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.finiteness import tried_actions
+from hjbjax.discretisation.rates import Rates, jump_rates
 from hjbjax.hamiltonian.players import players_of
-from hjbjax.markov_chain import chain, edges
-from hjbjax.markov_chain.chain import Rates
+from hjbjax.markov_chain import tried_actions
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.types import Array, Mask, Number, Scalar
@@ -68,12 +67,12 @@ def _more_open_jumps(
     outmost = tried_actions.of_a_ball(on, mine) if kinks and known is None else []
     if known is None:
         # the offsets are those of every action, since they follow from the noise and not from what is done
-        start = chain.rates(on, list(points[0]))
+        start = jump_rates(on, list(points[0]))
         known = Rates(start.offsets, tuple(jnp.zeros(grid.shape, bool) for _ in start.offsets))
 
     def tried(actions, opened):
         for each in actions:
-            rates = chain.rates(on, each)
+            rates = jump_rates(on, each)
             # an action that a constrained end rules out makes no jump at all, not one to the node itself
             stays = ~edges.inadmissible(on, each)
             if inside is not None:
@@ -190,7 +189,7 @@ def _controllable_predecessors(
     def answered(first):
         def also(ok, second):
             u, d = (first, second) if upper else (second, first)
-            rates = chain.rates(on, list(u), list(d))
+            rates = jump_rates(on, list(u), list(d))
             jumps = zip(rates.offsets, rates.values, strict=True)
             leads = functools.reduce(
                 jnp.logical_or, ((c > least) & stencil.neighbour(found, grid, offset) for offset, c in jumps)
@@ -236,7 +235,7 @@ def refuge(on: Discretisation, inside: jax.Array | None = None, dearest: Scalar 
             allowed = ~edges.inadmissible(on, action, answer)
             if dearest is not None:
                 allowed &= on.running_cost(action, answer) <= dearest
-            return allowed & _stays(chain.rates(on, action, answer), grid, inside, 0.0)
+            return allowed & _stays(jump_rates(on, action, answer), grid, inside, 0.0)
 
         def also(found, pair):
             for action in tried_actions.with_kinks(on, mine, list(u[pair[0]])):

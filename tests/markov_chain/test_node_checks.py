@@ -11,7 +11,7 @@ from hjbjax import Box, Finite, Grid, Problem
 from hjbjax.discretisation import correlated_noise
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.finiteness import node_checks
+from hjbjax.markov_chain import node_checks
 from hjbjax.problem.pytree import pytree_dataclass
 
 

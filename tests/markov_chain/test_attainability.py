@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 import hjbjax as hjb
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.finiteness import attainability
-from hjbjax.markov_chain import chain
+from hjbjax.markov_chain import attainability, chain
 from hjbjax.solution.clock import Clock
 
 MOVES = np.array([[-1.0], [0.0], [1.0]])

@@ -13,8 +13,8 @@ import pytest
 
 import hjbjax as hjb
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.finiteness import memory
 from hjbjax.iteration import fixed_point
+from hjbjax.markov_chain import memory
 from hjbjax.problem.pytree import cast
 from hjbjax.solvers import stationary_run
 from hjbjax.solvers.setup import assumptions_of, prepare
@@ -164,7 +164,7 @@ def test_a_limit_on_the_address_space_refuses_a_grid():
     program = """
 import resource
 import hjbjax as hjb
-from hjbjax.finiteness import memory
+from hjbjax.markov_chain import memory
 used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
 memory.available()  # starts JAX
 resource.setrlimit(resource.RLIMIT_AS, (used + 4 * 10**9,) * 2)

@@ -14,10 +14,10 @@ import jax
 import jax.numpy as jnp
 
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.rates import jump_rates
 from hjbjax.hamiltonian import discrete
 from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import Obstacles
-from hjbjax.markov_chain import chain
 from hjbjax.problem import sets
 from hjbjax.problem.sets import AdmissibleSet
 from hjbjax.problem.types import Field, Mask, Numbers, Scalar
@@ -109,7 +109,7 @@ def leaving_pays(on: Discretisation, obstacles: Obstacles, counted: Mask, value:
     # not held for this look: the defect at a rest node is the gain of its best action
     policy = bellman.greedy(on, value, obstacles.fixed & ~rests)
     u, d = list(policy.controls), list(policy.disturbances)
-    leaving = chain.rates(on, u, d).total()
+    leaving = jump_rates(on, u, d).total()
     cost = jnp.max(jnp.abs(on.running_cost(u, d)))
     size = jnp.max(jnp.where(counted, jnp.abs(value), 0))
     return rests & (policy.defect < -GAIN * jnp.finfo(value.dtype).eps * (leaving * size + cost))

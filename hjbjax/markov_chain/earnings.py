@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation import stencil
+from hjbjax.discretisation.rates import Rates, jump_rates
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.fixed_point import State, Task
-from hjbjax.markov_chain import chain, stationary_law
-from hjbjax.markov_chain.chain import Rates
+from hjbjax.markov_chain import stationary_law
 from hjbjax.problem.types import Field
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def earned(task: Task, state: State) -> Earning | None:
 def _rates_and_cost(task: Task, controls: tuple[Field, ...]) -> tuple[Rates, Field]:
     """The rates of the chain and the running cost at the nodes under a policy."""
     cost = task.on.running_cost(list(controls))
-    return chain.rates(task.on, list(controls)), jnp.broadcast_to(cost, task.grid.shape)
+    return jump_rates(task.on, list(controls)), jnp.broadcast_to(cost, task.grid.shape)
 
 
 def _mean_cost(generator: "csr_array", states: np.ndarray, cost: np.ndarray) -> float:

@@ -1,0 +1,139 @@
+"""The rates at which the Kushner–Dupuis Markov chain of a controlled diffusion jumps.
+
+On axis i with spacing h (h⁺ up, h⁻ down), drift f_i and diffusion a = σσᵀ the chain leaves a node at the rates
+
+    c_i^+ = (e_i + h⁻ f_i) / (h⁺ (h⁺ + h⁻)),     c_i^- = (e_i − h⁺ f_i) / (h⁻ (h⁺ + h⁻))
+
+with e_i = a_ii + h⁺ f_i⁺ + h⁻ f_i⁻ for the plain upwind chain, so that on a uniform grid
+c_i^± = f_i^±/h + a_ii/(2h²), and with e_i = max(a_ii, h⁺ f_i, −h⁻ f_i) where central differences are allowed as
+far as they stay monotone. Correlated noise moves along diagonals: a pair i, j gives
+c^{±(e_i + e_j)} = a_ij⁺/(2 h_i h_j), c^{±(e_i − e_j)} = a_ij⁻/(2 h_i h_j), and takes |a_ij| h_i/h_j from a_ii.
+
+Q = Σ c, Δt = 1/max_u Q, the transition probabilities are c Δt, and the self-transition is 1 − Q Δt (the chapter
+prints (13.3) without the "1 −"). At a wall drift that points out of the box is cut off and noise reflects on the node:
+inwards at (e(n⁺) − h n)/h², n the drift outwards, see ``schemes``; a diagonal jump across goes to its mirror image.
+Source: H. J. Kushner and P. Dupuis, Numerical Methods for Stochastic Control Problems in Continuous Time.
+"""
+
+import dataclasses
+import functools
+import itertools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from hjbjax.discretisation import correlated_noise, schemes, stencil
+from hjbjax.discretisation.cut_cells import links
+from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.problem import sets
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.pytree import pytree_dataclass
+
+Offset = tuple[int, ...]
+
+
+@pytree_dataclass(static=("offsets", "one_way"))
+class Rates:
+    """The generator of the chain under one policy, matrix-free: (𝓛V)(x) = Σ_o c_o(x) (V(x + o) − V(x)).
+
+    Args:
+      offsets: the jumps o, each a tuple of −1, 0, 1, one entry an axis.
+      values: for each offset the rates c_o ≥ 0 per unit time, shape (*grid); none leads out of the box.
+      one_way: whether of two opposite jumps at most one has a positive rate, as without noise.
+    """
+
+    offsets: tuple[Offset, ...]
+    values: tuple[Any, ...]
+    one_way: bool = False
+
+    def total(self) -> Any:
+        """Q = Σ_o c_o, the rate at which the chain leaves each node, shape (*grid)."""
+        return sum(self.values[1:], start=self.values[0])  # no 0 to start from, which would be one more array
+
+    def apply(self, grid: Grid, values: jax.Array) -> jax.Array:
+        """𝓛V for node values V, shape (*grid); cost per unit time."""
+        jumps = zip(self.offsets, self.values, strict=True)
+        # differences first: c V(x + o) and c V(x) are both large where h is small, and their difference is not
+        terms = [c * (stencil.continued(values, grid, offset) - values) for offset, c in jumps]
+        return sum(terms[1:], start=terms[0])
+
+    def scaled(self, factor: Any) -> "Rates":
+        """Every rate times ``factor``, shape (*grid) or a number."""
+        return dataclasses.replace(self, values=tuple(factor * c for c in self.values))
+
+    def inflow(self, grid: Grid) -> "Rates":
+        """The off-diagonal part of the transposed generator: what flows into x from x + o, as rates."""
+        opposite = [tuple(-step for step in offset) for offset in self.offsets]
+        arriving = [
+            stencil.neighbour(c, grid, offset, ghost=False) for offset, c in zip(opposite, self.values, strict=True)
+        ]
+        return Rates(tuple(opposite), tuple(arriving))
+
+
+def jump_rates(on: Discretisation, u: list, d: list | None = None) -> Rates:
+    """The jump rates under a policy of the monotone chain that goes with the scheme.
+
+    Args:
+      on: the chain; of its problem only drift and noise matter.
+      u: the m components of the control, each of a shape that broadcasts to (*grid).
+      d: likewise of the disturbance, in a game.
+    """
+    grid = on.grid
+    x, u, d = jax.lax.optimization_barrier((on.coordinates(), u, d))  # or loops keep drift that u does not move
+    first, *others = on.drifts(u, d, x)
+    table = _table(on, first, on.diffusion(u, d, x))
+    for other in others:  # jumps of one chain or of the other
+        for offset, rate in _table(on, other, {}).items():
+            table[offset] = table[offset] + rate
+    values = tuple(jnp.broadcast_to(jnp.asarray(rate, on.dtype), grid.shape) for rate in table.values())
+    return Rates(tuple(table), values, one_way=on.problem.noise is None and on.scheme.chain.one_way and not others)
+
+
+def _table(on: Discretisation, f: list, a: dict[tuple[int, int], Any]) -> dict[Offset, Any]:
+    """The rate of every jump for a drift f and a diffusion a."""
+    grid = on.grid
+    table: dict[Offset, Any] = {}
+    for axis, link in enumerate(links(on.chain)):
+        left = correlated_noise.along_axis(a, grid, axis)
+        upward, downward = schemes.weights(on.scheme.chain, f[axis], left, link, grid, axis)
+        for step, weight, length in ((1, upward, link.up), (-1, downward, link.down)):
+            beyond = stencil.wall(grid, axis, step)
+            table[stencil.unit(grid, axis, step)] = jnp.where(beyond, 0, weight / length)
+    for (i, j), entry in a.items():
+        if i != j:
+            _add_diagonal_jumps(table, entry, grid, i, j)
+    return table
+
+
+def fastest_rate(on: Discretisation) -> jax.Array:
+    """max over the actions of Q at every node, (*grid): with Δt = 1/(Q + β) value iteration is monotone.
+
+    Q is convex in u for a drift affine in u, so that corners of the sets suffice; samples are added for others.
+    """
+    result = jnp.zeros(on.grid.shape, on.dtype)
+    us, ds = (list(sets.probes(each, on.dtype)) for each in (on.problem.controls, on.problem.disturbances))
+    if on.apart:  # Q is a sum of what each player adds: pairs of probes would take twice the time to compile
+        mine = (_table(on, on.drifts(u, ds[0])[0], on.diffusion(u, ds[0])) for u in us)
+        theirs = (_table(on, on.drifts(us[0], d)[1], {}) for d in ds)
+        tables = ([sum(table.values()) for table in each] for each in (mine, theirs))
+        return result + sum(functools.reduce(jnp.maximum, totals) for totals in tables)
+    for u, d in itertools.product(us, ds):
+        result = jnp.maximum(result, jump_rates(on, u, d).total())
+    return result
+
+
+def _add_diagonal_jumps(table: dict[Offset, Any], entry: Any, grid: Grid, i: int, j: int) -> None:
+    """A diagonal jump that would leave the box goes to the mirror image of its end: noise reflects."""
+    scale = 2 * grid.spacing(i) * grid.spacing(j)
+    pairs = list(itertools.product((1, -1), repeat=2))
+    # a_ij⁺ along the diagonal, a_ij⁻ across it
+    rate = {(p, q): jnp.maximum(entry * (p * q), 0) / scale for p, q in pairs}
+    for p, q in pairs:  # first across the walls of axis i, then, at a corner once more, across those of axis j
+        off = stencil.wall(grid, i, p)
+        rate[-p, q], rate[p, q] = rate[-p, q] + jnp.where(off, rate[p, q], 0), jnp.where(off, 0, rate[p, q])
+    for p, q in pairs:
+        off = stencil.wall(grid, j, q)
+        rate[p, -q], rate[p, q] = rate[p, -q] + jnp.where(off, rate[p, q], 0), jnp.where(off, 0, rate[p, q])
+    for p, q in pairs:
+        table[tuple(p * (k == i) + q * (k == j) for k in range(grid.ndim))] = rate[p, q]

@@ -10,6 +10,8 @@ A function that closes over a number under differentiation, as in ``grad(lambda 
 hides it from those who look at the leaves of a problem. Here such numbers become leaves.
 """
 
+from __future__ import annotations
+
 import dataclasses
 import functools
 import hashlib
@@ -17,18 +19,21 @@ import inspect
 import re
 import types
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend import core as jex
 from jax.tree_util import Partial
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, is_traced
 from hjbjax.problem.types import DType, Numbers
+from hjbjax.tracing import jaxprs
+
+if TYPE_CHECKING:
+    from jax.extend import core as jex
 
 ADDRESS = re.compile(r" at 0x[0-9a-f]+|id=\d+")  # of rules of derivatives, made anew with every trace
 # whose functions compute tomorrow what they compute today: problems made of these alone need no trace at all
@@ -274,7 +279,7 @@ def fingerprint(closed: jex.ClosedJaxpr) -> bytes:
 
 def _feed(digest: hashlib.blake2b, jaxpr: jex.Jaxpr, consts: Iterable[Numbers]) -> None:
     """Put a jaxpr into a digest, equation by equation."""
-    numbers: dict[jex.Var, int] = {}  # variables by their first appearance; their own names differ from trace to trace
+    numbers: dict[Any, int] = {}  # variables by their first appearance; their own names differ from trace to trace
 
     def tell(*words: Any) -> None:
         digest.update(repr(words).encode())
@@ -285,9 +290,9 @@ def _feed(digest: hashlib.blake2b, jaxpr: jex.Jaxpr, consts: Iterable[Numbers]) 
         digest.update(array.tobytes())
 
     def tell_parameter(value: object) -> None:
-        if isinstance(value, jex.ClosedJaxpr):
+        if jaxprs.is_closed(value):
             _feed(digest, value.jaxpr, value.consts)
-        elif isinstance(value, jex.Jaxpr):
+        elif jaxprs.is_open(value):
             _feed(digest, value, ())
         elif isinstance(value, (tuple, list)):
             tell(len(value))
@@ -306,7 +311,7 @@ def _feed(digest: hashlib.blake2b, jaxpr: jex.Jaxpr, consts: Iterable[Numbers]) 
         operands, results = (jaxpr.outvars, ()) if eqn is None else (eqn.invars, eqn.outvars)
         tell("" if eqn is None else eqn.primitive.name)
         for operand in operands:
-            if isinstance(operand, jex.Literal):  # a number in the code, of which no variable tells
+            if jaxprs.is_literal(operand):  # a number in the code, of which no variable tells
                 number(operand.val)
             else:
                 tell(numbers.get(operand, -1))

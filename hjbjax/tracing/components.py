@@ -8,20 +8,24 @@ computed N times and not N^n times, stacking and slicing cost nothing, and XLA f
 What ``interpreter`` has no rule for falls back to ``vmap``, with one warning.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend import core as jex
 
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.types import DType, Numbers
 from hjbjax.tracing import indices
 from hjbjax.tracing.interpreter import bind, evaluate, is_components, lift, object_array, pack
 from hjbjax.tracing.primitives import array_type
+
+if TYPE_CHECKING:
+    from jax.extend import core as jex
 
 
 def components(function: Callable, *arguments: Any, dtype: DType) -> np.ndarray:

@@ -9,18 +9,23 @@ The slopes of an affine function are taken by JAX's derivative rules, so that a 
 (``stop_gradient``, ``custom_jvp``, ``custom_vjp``) of the control counts as any other that is no polynomial.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
-from jax.extend import core as jex
 
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import remembered
 from hjbjax.problem.types import DType, Numbers
 from hjbjax.tracing.interpreter import evaluate, is_components
 from hjbjax.tracing.primitives import array_type
+
+if TYPE_CHECKING:
+    from jax.extend import core as jex
 
 Term = tuple[int, ...] | frozenset[int]  # a product of at most two inputs, or some function of these inputs
 Terms = frozenset

@@ -5,15 +5,20 @@ its jaxpr, behind a few operations on integers ("if negative, add the length"). 
 NumPy; whatever depends on the state is unknown, and unknown indices are let pass.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
-from jax.extend import core as jex
 
 from hjbjax.problem.types import Numbers
+from hjbjax.tracing import jaxprs
 from hjbjax.tracing.primitives import array_type
+
+if TYPE_CHECKING:
+    from jax.extend import core as jex
 
 # A look costs time before every solve, and slips of the pen are small: x[2] of two states, a row beyond a small table.
 MOST = 10_000  # entries of an array of indices that is looked at
@@ -76,17 +81,17 @@ def _walk(
     called: dict[Any, str | None] = dict(zip(jaxpr.invars, labels, strict=True))
 
     def look(var: jex.Var | jex.Literal) -> np.ndarray | None:
-        return _index_array(var.val) if isinstance(var, jex.Literal) else values.get(var)
+        return _index_array(var.val) if jaxprs.is_literal(var) else values.get(var)
 
     for eqn in jaxpr.eqns:
         known = [look(var) for var in eqn.invars]
         first = eqn.invars[0] if eqn.invars else None
         # an array is called by its name as long as it is the argument itself, also inside an inner ``jit``
-        name = None if first is None or isinstance(first, jex.Literal) else called.get(first)
+        name = None if first is None or jaxprs.is_literal(first) else called.get(first)
         if (found := _outside(eqn, known, name)) is not None:
             return [], found
         results: Sequence[Any] = [None] * len(eqn.outvars)
-        passed = [None if isinstance(var, jex.Literal) else called.get(var) for var in eqn.invars]
+        passed = [None if jaxprs.is_literal(var) else called.get(var) for var in eqn.invars]
         inner = _inner(eqn)
         if eqn.primitive.name == "scan":  # its counters are known turn by turn, and unknown in the body as such
             inner, (results, found) = [], _walk_turns(eqn, known, passed)
@@ -132,10 +137,10 @@ def _inner(eqn: jex.JaxprEqn) -> list[jex.ClosedJaxpr]:
     found = []
     for name, value in eqn.params.items():
         for each in value if isinstance(value, (tuple, list)) else (value,):
-            if isinstance(each, jex.ClosedJaxpr):
+            if jaxprs.is_closed(each):
                 found.append(each)
-            elif isinstance(each, jex.Jaxpr) and name != "update_jaxpr":
-                found.append(jex.ClosedJaxpr(each, ()))
+            elif jaxprs.is_open(each) and name != "update_jaxpr":
+                found.append(jaxprs.closed(each))
     return found
 
 

@@ -4,19 +4,21 @@ Three kinds of primitives have a rule: those that move entries about (one rule: 
 entry by entry, and sums and products. Anything else is left to the algebra's ``nodewise``, with one warning.
 """
 
+from __future__ import annotations
+
 import functools
 import itertools
 import math
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Protocol, TypeAlias, TypeGuard
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeGuard
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend import core as jex
 
 from hjbjax.problem.types import Numbers
+from hjbjax.tracing import jaxprs
 from hjbjax.tracing.primitives import (
     CALLS,
     CUMULATIVE,
@@ -28,6 +30,9 @@ from hjbjax.tracing.primitives import (
     array_type,
     in_numpy,
 )
+
+if TYPE_CHECKING:
+    from jax.extend import core as jex
 
 Operand: TypeAlias = Numbers  # of an equation: an object array of scalars, or numbers that hold at all nodes
 
@@ -97,10 +102,10 @@ def evaluate(closed: jex.ClosedJaxpr, arguments: Sequence[Operand], algebra: Alg
     env: dict[jex.Var, Any] = dict(zip(closed.jaxpr.constvars, closed.consts, strict=True))
     env |= dict(zip(closed.jaxpr.invars, arguments, strict=True))
     for eqn in closed.jaxpr.eqns:
-        operands = [var.val if isinstance(var, jex.Literal) else env[var] for var in eqn.invars]
+        operands = [var.val if jaxprs.is_literal(var) else env[var] for var in eqn.invars]
         results = _apply(eqn, operands, algebra)
         env.update(zip(eqn.outvars, results, strict=True))
-    return [var.val if isinstance(var, jex.Literal) else env[var] for var in closed.jaxpr.outvars]
+    return [var.val if jaxprs.is_literal(var) else env[var] for var in closed.jaxpr.outvars]
 
 
 def _apply(eqn: jex.JaxprEqn, operands: list, algebra: Algebra) -> list:
@@ -110,7 +115,7 @@ def _apply(eqn: jex.JaxprEqn, operands: list, algebra: Algebra) -> list:
         return _bind_uniform(eqn, operands)
     if name in CALLS and CALLS[name] in eqn.params:
         inner = eqn.params[CALLS[name]]  # some calls keep a jaxpr without constants
-        inner = inner if isinstance(inner, jex.ClosedJaxpr) else jex.ClosedJaxpr(inner, ())
+        inner = inner if jaxprs.is_closed(inner) else jaxprs.closed(inner)
         return (
             algebra.custom_jvp(eqn, inner, operands)
             if name == "custom_jvp_call"

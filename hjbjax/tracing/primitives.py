@@ -1,13 +1,17 @@
 """JAX's primitives by the rule that evaluates them component by component; see ``components``."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import jax
 import numpy as np
-from jax.extend import core as jex
 
 from hjbjax.problem.types import Numbers
+
+if TYPE_CHECKING:
+    from jax.extend import core as jex
 
 # Which of its n operands a data-moving primitive moves; the others are indices, and an index that varies from node to
 # node moves other entries at every node, for which only ``vmap`` has an answer.

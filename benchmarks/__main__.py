@@ -17,7 +17,7 @@ NAMES = {
     "scaling": ("speed", "the N^n law: seconds, steps and bytes a node in one to six dimensions"),
     "controls": ("speed", "seconds against the number of controls and against the error: O(1/ε^{2n+m}) and less"),
     "batch": ("speed", "solve_batch of pendulums of different mass, against one after the other"),
-    "startup": ("speed", "from process start to pictures, cold and with the compile cache"),
+    "startup": ("speed", "the first answer of a process: importing, compiling, pictures; cold and with the cache"),
     "precision": ("accuracy", "error against seconds: what second order is worth"),
     "march": ("speed", "marching beside hj_reachability: seconds and bytes at equal scheme"),
     "quoted": ("harness", "the README's table of what was seen, from the recorded rows"),

@@ -108,7 +108,9 @@ def of_marches(folder: Path) -> dict[str, Sequence[float]]:
 
 def of_the_rest(folder: Path) -> dict[str, Sequence[float]]:
     """Batches and starts."""
-    starts = [one(folder, "startup", start=start)["seconds"] for start in ("cold", "cached")]
+    starts = [
+        one(folder, "startup", problem="double-integrator", start=start)["seconds"] for start in ("cold", "cached")
+    ]
     batch = one(folder, "batch", code="solve_batch")
     return {
         "`solve_batch` of 64 pendulums on 100 x 101, against one solve after the other": [batch["throughput"]],

@@ -36,6 +36,7 @@ class Threshold:
 
 
 CHAIN = "pendulum 200 x 201, 21 controls, to 1e-3, against the faster of QuantEcon's two methods"
+FIRST = "first answer of the pendulum at its default on {} over one compilation of its loop"
 HAND = "pendulum {} to 1e-3, 21 controls, against the numba solver"
 THRESHOLDS = {
     "sweep 1024": Threshold("sweep on 1024 x 1024, 21 controls, float32, against the numba loop", 1.5, 2.5),
@@ -51,6 +52,14 @@ THRESHOLDS = {
     "dubins exponent": Threshold("Dubins car, exponent of seconds in nodes", 1.2, unit="", most=True),
     "manipulator bytes": Threshold("two-link arm 40 x 40 x 41 x 41, peak", 100, unit=" bytes a node", most=True),
     "manipulator exponent": Threshold("two-link arm, exponent of seconds in nodes", 1.2, unit="", most=True),
+    "import": Threshold("import hjbjax over import jax", 1.3, most=True),
+    "first pendulum 101": Threshold(FIRST.format("100 x 101"), 2.2, 1.4, most=True),
+    "first pendulum 401": Threshold(FIRST.format("400 x 401"), 3, 1.8, most=True),
+    "first pendulum 801": Threshold(FIRST.format("800 x 801"), 4.2, 2.2, most=True),
+    "programs": Threshold("pendulum by default, the most programs compiled", 14, unit="", most=True),
+    "quantecon cold 160": Threshold("pendulum 160 x 161, 31 controls, our first answer against QuantEcon's", 1.8, 2.5),
+    "quantecon cold 200": Threshold("pendulum 200 x 201, 21 controls, our first answer against QuantEcon's", 3, 4),
+    "one grid": Threshold("first answers of the zoo, one grid over the default, the least", 1 / 1.2),
     "cold start": Threshold("process start to pictures, no cache", 12, unit=" s", most=True),
     "cached start": Threshold("process start to pictures, with the compile cache", 7, unit=" s", most=True),
     "batch": Threshold("solve_batch of 64 pendulums at 100 x 101, against one by one", 1, 10),

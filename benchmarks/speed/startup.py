@@ -1,7 +1,12 @@
-"""From process start to pictures: ``hjbjax solve double-integrator`` in a process of its own.
+"""How long one waits for the first answer, everything in processes of its own that take turns.
 
-``cold`` compiles everything, by ``--no-cache``; ``cached`` finds what an earlier process left in the user's folder for
-caches, here one of the benchmark's own.
+* import: ``import hjbjax`` beside ``import jax``.
+* pictures: ``hjbjax solve`` from the start of the process to its pictures. ``cold`` compiles everything, by
+  ``--no-cache``; ``cached`` finds what an earlier process left in the user's folder for caches, here one of the
+  benchmark's own.
+* pendulum: its default answer and the monotone one alone, by the programs that they compile.
+* chain: the monotone answer, compiling counted, against QuantEcon's warm solve of the exported chain.
+* zoo: twelve problems by default and by policy iteration on the one grid.
 """
 
 import os
@@ -15,11 +20,27 @@ from typing import Any
 
 import click
 
+import hjbjax as hjb
 from benchmarks.harness import thresholds
-from benchmarks.harness.report import RESULTS, attempt, publish, table
+from benchmarks.harness.report import RESULTS, attempt, publish, table, without
+from benchmarks.harness.timing import timed
+from benchmarks.peers import decision
+from benchmarks.speed import first_answer
 
 ROOT = Path(__file__).parents[2]
-COLUMNS = ("start", "seconds", "fastest", "cpu_seconds", "repeats", "pictures", "status")
+PARTS = ("import", "pictures", "pendulum", "chain", "zoo")
+COLUMNS = {
+    "import": ("start", "seconds", "fastest", "cpu_seconds", "repeats", "over_jax", "status"),
+    "pictures": ("problem", "start", "seconds", "fastest", "cpu_seconds", "repeats", "pictures", "status"),
+    "pendulum": (
+        "shape", "way", "first_seconds", "first_cpu_seconds", "seconds", "programs", "compile_seconds", "loops",
+        "over_one_loop", "operations", "status",
+    ),
+    "chain": ("shape", "problem", "first_seconds", "theirs", "their_seconds", "ours_is_faster", "difference", "status"),
+    "zoo": (
+        "problem", "shape", "way", "first_seconds", "seconds", "programs", "over_default", "warm_over_default", "status"
+    ),
+}  # fmt: skip
 HOMES = ("XDG_CACHE_HOME", "HOME", "LOCALAPPDATA")  # where a user's caches are, on one platform or another
 
 
@@ -54,23 +75,100 @@ def measure(problem: str, shape: str | None, repeats: int) -> list[dict[str, Any
         seconds, busy, pictures = zip(*runs, strict=True)
         row = {"start": start, "seconds": median(seconds), "fastest": min(seconds), "repeats": repeats}
         row["cpu_seconds"] = median(busy)
-        rows.append(row | {"pictures": min(pictures), "filling_seconds": filling, "status": "DONE"})
+        row |= {"problem": problem, "shape": shape or "default", "pictures": min(pictures)}
+        rows.append(row | {"filling_seconds": filling, "status": "DONE"})
     return rows
 
 
+def importing(repeats: int) -> list[dict[str, Any]]:
+    """Two rows; bytecode is written by a round that does not count, as an installation does."""
+    kept = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
+    runs: dict[str, list[tuple[float, float]]] = {"jax": [], "hjbjax": []}
+    for _ in range(repeats + 1):
+        for name, found in runs.items():
+            began, before = time.perf_counter(), os.times()
+            subprocess.run([sys.executable, "-c", f"import {name}"], env=kept, cwd=ROOT, check=True)
+            seconds, after = time.perf_counter() - began, os.times()
+            busy = after.children_user + after.children_system - before.children_user - before.children_system
+            found.append((seconds, busy))
+    rows = []
+    for name, (_, *found) in runs.items():
+        seconds, busy = zip(*found, strict=True)
+        ratios = [mine / theirs for (mine, _), (theirs, _) in zip(found, runs["jax"][1:], strict=True)]
+        row = {"start": f"import {name}", "seconds": median(seconds), "fastest": min(seconds), "repeats": repeats}
+        rows.append(row | {"cpu_seconds": median(busy), "over_jax": median(ratios), "status": "DONE"})
+    return rows
+
+
+def pendulum(nodes: int, repeats: int) -> list[dict[str, Any]]:
+    """The default answer and the monotone one; the operations of each loop are those of one more process."""
+    rows = first_answer.middle("pendulum", nodes, ("monotone", "default"), repeats)
+    for row in rows:
+        row["operations"] = first_answer.sizes("pendulum", nodes, row["way"])
+    return rows
+
+
+def chain(nodes: int, actions: int, repeats: int) -> list[dict[str, Any]]:
+    """Our first answer beside the faster of QuantEcon's methods, whose own compiling is not counted."""
+    if reason := without("quantecon"):
+        return [{"status": "SKIPPED", "reason": reason}]
+    name, tol = f"pendulum, {actions} torques", 1e-3
+    problem, grid = first_answer.SAMPLED[name](nodes)
+    ours = first_answer.middle(name, nodes, ("to 1e-3",), repeats)[0]
+    value = hjb.solve(problem, grid, tol=tol, scheme=hjb.Upwind()).value
+    best: dict[str, Any] = {"their_seconds": float("inf")}
+    for method, solve in decision.quantecon(hjb.chain.transition_arrays(problem, grid), tol).items():
+        solve()  # compiles
+        answer, took = min((timed(solve) for _ in range(repeats)), key=lambda run: run[1])
+        if took < best["their_seconds"]:
+            off = float(abs(answer.reshape(grid.shape) - value).max())
+            best = {"theirs": method, "their_seconds": took, "difference": off}
+    status = ours["status"] if best["difference"] <= 2 * tol else "DISAGREES"
+    ratio = best["their_seconds"] / ours["first_seconds"]
+    return [ours | best | {"ours_is_faster": ratio, "status": status}]
+
+
 @click.command()
-@click.option("--quick", is_flag=True, help="A small grid, one round.")
-@click.option("--problem", default="double-integrator", show_default=True, help="A ready problem of the zoo.")
+@click.option("--quick", is_flag=True, help="Small grids, one round, one problem of the zoo.")
+@click.option("--part", multiple=True, type=click.Choice(PARTS), help="What to measure; repeatable, all if not given.")
 @click.option("--repeats", type=click.IntRange(1), default=None, help="Rounds; 3 if not given, quick 1.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Folder of the files.")
-def command(quick: bool, problem: str, repeats: int | None, out: Path) -> None:
-    """From process start to pictures, cold and with the compile cache."""
-    about = {"benchmark": "startup", "problem": problem, "dtype": "float64", "shape": "15x15" if quick else "default"}
-    shape = about["shape"] if quick else None
-    rows = attempt(lambda: measure(problem, shape, repeats or (1 if quick else 3)), about)
-    click.echo(table(rows, COLUMNS))
-    figures = {}
-    if not quick and problem == "double-integrator" and rows[0]["status"] == "DONE":
-        figures = {f"{row['start']} start": row["seconds"] for row in rows}
-    rows += thresholds.announced(figures, "startup")
+def command(quick: bool, part: tuple[str, ...], repeats: int | None, out: Path) -> None:
+    """The first answer: importing, compiling, and from process start to pictures."""
+    rounds, shape = repeats or (1 if quick else 3), "15x15" if quick else None
+    sizes, chains = ((21,), ((27, 21),)) if quick else ((101, 401, 801), ((161, 31), (201, 21)))
+    problems = list(first_answer.ZOO)[:1] if quick else list(first_answer.ZOO)
+    ways = ("default", "one grid")
+    measures: dict[str, list[Any]] = {
+        "import": [lambda: importing(rounds + 2)],
+        "pictures": [lambda p=p: measure(p, shape, rounds) for p in ("double-integrator", "pendulum")[: 2 - quick]],
+        "pendulum": [lambda n=n: pendulum(n, rounds) for n in sizes],
+        "chain": [lambda n=n, k=k: chain(n, k, rounds) for n, k in chains],
+        "zoo": [lambda p=p, n=n: first_answer.middle(p, n, ways, 1) for p in problems for n in sizes],
+    }
+    rows: list[dict[str, Any]] = []
+    for name in part or PARTS:
+        about = {"benchmark": "startup", "part": name, "dtype": "float64"}
+        found = [row for each in measures[name] for row in attempt(each, about)]
+        click.echo(f"{name}\n{table(found, COLUMNS[name])}\n")
+        click.echo("\n".join(f"{row['status'].lower()}: {row['reason']}" for row in found if "reason" in row))
+        rows += found
+    rows += thresholds.announced({} if quick else judged(rows), "startup")
     publish(out, "startup", rows)
+
+
+def judged(rows: list[dict[str, Any]]) -> dict[str, float]:
+    """The figures of the thresholds that these rows hold."""
+    figures: dict[str, float] = {}
+    for row in rows:
+        if row["part"] == "import" and row.get("start") == "import hjbjax":
+            figures["import"] = row["over_jax"]
+        elif row["part"] == "pictures" and row.get("problem") == "double-integrator":
+            figures[f"{row['start']} start"] = row["seconds"]
+        elif row["part"] == "pendulum" and row.get("way") == "default" and row["over_one_loop"]:
+            figures[f"first pendulum {row['shape'][1]}"] = row["over_one_loop"]
+            figures["programs"] = max(figures.get("programs", 0), row["programs"])
+        elif row["part"] == "chain" and "ours_is_faster" in row:
+            figures[f"quantecon cold {row['shape'][0]}"] = row["ours_is_faster"]
+    slower = [row["over_default"] for row in rows if row["part"] == "zoo" and row.get("way") == "one grid"]
+    return figures | ({"one grid": min(slower)} if slower else {})

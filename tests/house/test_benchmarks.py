@@ -241,10 +241,20 @@ def test_a_batch_gives_the_values_of_its_members(tmp_path):
 
 
 @pytest.mark.slow
-def test_startup_leaves_pictures_and_fills_the_cache(tmp_path):
-    cold, cached = rows_of(startup, tmp_path)
+def test_first_answers_in_processes_of_their_own(tmp_path):
+    parts = {name: [] for name in startup.PARTS}
+    for row in rows_of(startup, tmp_path):
+        parts[row["part"]].append(row)
+    theirs, ours = parts["import"]
+    assert ours["over_jax"] > theirs["over_jax"] == 1
+    cold, cached = parts["pictures"]
     assert (cold["start"], cached["start"]) == ("cold", "cached")
     assert cold["pictures"] == cached["pictures"] == 3
+    monotone, default = parts["pendulum"]
+    assert [row["loops"] for row in (monotone, default)] == [1, 2]  # on a grid this small: one a scheme
+    assert all(len(row["operations"]) == row["loops"] and min(row["operations"]) > 100 for row in parts["pendulum"])
+    assert all(row["programs"] > row["loops"] and row["over_one_loop"] > 1 for row in parts["pendulum"])
+    assert all(row["status"] == "CONVERGED" for row in (*parts["chain"], *parts["zoo"]))
 
 
 @pytest.mark.slow

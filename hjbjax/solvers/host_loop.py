@@ -86,7 +86,11 @@ def drive(run: Run, clock: Clock) -> Status:
         try:
             chunk = run.first_chunk(clock)
             clock.phase = f"compiling for {run.name}"
+            if bar is not None:
+                bar.set_description_str(clock.phase)  # at once: it takes a second or more, and no step shows it
             run.compile()
+            if bar is not None:
+                bar.set_description_str(run.bar["desc"], refresh=False)
             while (status := run.between(status, clock)) is Status.RUNNING:
                 began, before = time.perf_counter(), run.steps
                 status = _stop_status(run, clock)

@@ -8,18 +8,22 @@ The value V of a converged solve satisfies Φ(V, θ) = 0, node by node the activ
 ∂Φ/∂θ is taken through the formulas that give the optimal action: where that is stationary they contribute nothing,
 and where it sits at a bound or at a kink of the upwinding, both of which may move with θ, they do. Forward mode
 takes one linear solve and reverse mode one transposed solve, whatever the number of steps that led to V. A linear solve
-that does not come to its end makes the derivative NaN; the value stays as it is.
+that does not come to its end makes the derivative NaN; the value stays as it is. The policy moves with V and θ as the
+optimum of the Hamiltonian does, see ``sensitivity``.
 """
 
+import dataclasses
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.rates import jump_rates
+from hjbjax.hamiltonian import discrete, sensitivity
 from hjbjax.iteration import bellman
-from hjbjax.iteration.bellman import PolicyEquation
+from hjbjax.iteration.bellman import Greedy, PolicyEquation
 from hjbjax.iteration.evaluation import Evaluation, Krylov, direct, evaluate, left_over
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.problem.grid import Grid
@@ -59,6 +63,41 @@ def attach(task: Task, state: State) -> Field:
         solvers = solver(weights), solver(weights.inflow(task_kept.grid))
     delta = jax.lax.custom_linear_solve(matvec, _residual(task, state, equation), *solvers)
     return _with_derivative(value, delta)
+
+
+def attach_policy(task: Task, state: State, value: Field) -> State:
+    """The state, its numbers unchanged, with a policy that is a differentiable function of ``value`` and of ``task``.
+
+    Args:
+      task: the task as the user gave it, with its tracers.
+      state: a converged state of the same task, found without derivatives.
+      value: its value with derivatives, of ``attach``.
+    """
+    frozen, policy = jax.lax.stop_gradient((task, state.policy))
+    return dataclasses.replace(state, policy=_moving(policy, task.on, value, frozen))
+
+
+@jax.custom_jvp
+def _moving(policy: Greedy, on: Discretisation, value: Field, task: Task) -> Greedy:
+    """``policy``, with the derivative of the optimum of the Hamiltonian; formed only where it is asked for."""
+    return policy
+
+
+@_moving.defjvp
+def _moving_tangent(primals: Any, tangents: Any) -> tuple[Greedy, Greedy]:
+    """The policy, and its tangent at the nodes where an action is taken."""
+    policy, on, value, task = primals
+
+    def actions(on: Discretisation, value: Field) -> Greedy:
+        moved = sensitivity.actions(on, value, task.lost, list(policy.controls), list(policy.disturbances))
+        acting = task.counted & ~task.obstacles.ended
+        controls, disturbances = (
+            tuple(jnp.where(acting, jnp.asarray(new, kept.dtype), kept) for kept, new in zip(*pair, strict=True))
+            for pair in zip((policy.controls, policy.disturbances), moved, strict=True)
+        )
+        return Greedy(policy.defect, controls, disturbances)
+
+    return policy, jax.jvp(actions, (on, value), tangents[1:3])[1]
 
 
 @jax.custom_jvp
@@ -105,7 +144,8 @@ def _residual(task: Task, state: State, equation: PolicyEquation) -> Field:
     # which node is on which branch does not change with θ, to first order: the masks carry no derivative
     held = jax.lax.stop_gradient(task.obstacles.fixed)
     lost = jax.lax.stop_gradient(task.lost)
-    rate = bellman.greedy(task.on, value, held, incumbent=policy, lost=lost).defect
+    moved = sensitivity.actions(task.on, value, lost, u, d)  # as at an end or at a kink that moves
+    rate = jnp.where(held, 0, discrete.around(task.on, value, lost).at(*moved) - task.problem.discount * value)
     outflow = jax.lax.stop_gradient(jump_rates(task.on, u, d).total() + task.problem.discount)
     # divided as the equation is, so that ∂Φ/∂V = −(I − W); a derivative of the divisor would be multiplied by r = 0
     phi = rate / jnp.where(outflow > 0, outflow, 1)

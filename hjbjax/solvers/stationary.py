@@ -200,7 +200,8 @@ def _solve_traced(
     wrong = jnp.zeros((), bool)
     if assumptions.may_rest:
         state, wrong = _without_rests_to_leave(frozen, state)
-    solution, value = assemble(task, state, assumptions), adjoint.attach(task, state)
+    value = adjoint.attach(task, state)
+    solution = assemble(task, adjoint.attach_policy(task, state, value), assumptions)
     wrong |= state.code == Status.NONFINITE
     value = value * jnp.where(wrong, jnp.nan, 1).astype(value.dtype)  # a derivative drops the code, and is NaN, too
     return altered(solution, value=jnp.where(task.counted, value, jnp.inf) if task.has_lost else value)

@@ -130,37 +130,43 @@ def _implicit(at: Optimum, inputs: Sequence[Input]) -> tuple[Action, Action]:
 
 def _rows(at: Optimum, inputs: Sequence[Input], slopes: Sequence[Field], bends: Sequence[Sequence[Field]]) -> list[Row]:
     """The linear system of small steps: a row an input, and one more a ball for its multiplier."""
-    rows, free = [], []
     rims = {mine: _rim(at, inputs, slopes, mine) for mine in (True, False) if _in_ball(inputs, mine)}
-    kinks = _kinks(at, inputs)
+    columns, ends, kinked = [], [], []
     for a, each in enumerate(inputs):
-        entry, close = each.entry(at.u, at.d), each.close()
-        columns, slope = dict(enumerate(bends[a])), jax.lax.stop_gradient(slopes[a])
-        ended, end = _end(each, entry, close)
+        entry, row, slope = each.entry(at.u, at.d), dict(enumerate(bends[a])), jax.lax.stop_gradient(slopes[a])
         if each.mine in rims:
             rim = rims[each.mine]
-            slope, columns[a] = slope + rim.multiplier * entry, columns[a] + rim.multiplier
-            columns[len(inputs) + list(rims).index(each.mine)] = jnp.where(rim.on, entry, 0)
-        stationary = jnp.abs(slope) < close * jnp.abs(columns[a])  # a flat H is not
-        held = ended | ~stationary
-        columns = {b: jnp.where(held, float(a == b), value) for b, value in columns.items()}
-        row = columns, jnp.where(held, end, -slopes[a])
-        rows.append(kinks.claimed(row, a, held & ~ended, close))
-        free.append(~held)
+            slope, row[a] = slope + rim.multiplier * entry, row[a] + rim.multiplier
+            row[len(inputs) + list(rims).index(each.mine)] = jnp.where(rim.on, entry, 0)
+        columns.append(row)
+        ends.append(_end(each, entry))
+        kinked.append(~ends[a][0] & ~(jnp.abs(slope) < each.close() * jnp.abs(row[a])))  # also where H is flat
+    kinks = _kinks(at, inputs, kinked)
+    held = [ended | unsettled for (ended, _), unsettled in zip(ends, kinked, strict=True)]
+    for rim in rims.values():  # beside an input that a kink holds the rim holds the others
+        beside = rim.on & functools.reduce(jnp.logical_or, (kinks.hold(k) for k in rim.entries))
+        held = [each & ~beside if k in rim.entries else each for k, each in enumerate(held)]
+    rows = [
+        kinks.followed(
+            a, ({b: jnp.where(held[a], float(a == b), x) for b, x in row.items()}, jnp.where(held[a], end, -g))
+        )
+        for a, (row, (_, end), g) in enumerate(zip(columns, ends, slopes, strict=True))
+    ]
     for place, rim in enumerate(rims.values(), len(inputs)):
-        # the rim says nothing of inputs that are all held by kinks
-        on = rim.on & functools.reduce(jnp.logical_or, (free[k] & (abs(rim.entries[k]) > 0) for k in rim.entries))
-        columns = {k: jnp.where(on, entry, 0) for k, entry in rim.entries.items()} | {place: jnp.where(on, 0.0, 1.0)}
-        rows.append((columns, jnp.where(on, rim.radius**2 / 2, 0)))
+        # the rim says nothing of inputs that are all held
+        free = (~held[k] & ~kinks.hold(k) & (abs(entry) > 0) for k, entry in rim.entries.items())
+        on = rim.on & functools.reduce(jnp.logical_or, free)
+        around = {k: jnp.where(on, entry, 0) for k, entry in rim.entries.items()} | {place: jnp.where(on, 0.0, 1.0)}
+        rows.append((around, jnp.where(on, rim.radius**2 / 2, 0)))
     return rows
 
 
-def _end(each: Input, entry: Any, close: Any) -> tuple[Any, Any]:
+def _end(each: Input, entry: Any) -> tuple[Any, Any]:
     """The nodes where an end of its box holds an input, and the end there."""
     admissible = each.player.admissible
     if not isinstance(admissible, Box):
         return jnp.zeros(jnp.shape(entry), bool), jnp.zeros_like(entry)
-    lo, hi = admissible.lo[each.index], admissible.hi[each.index]
+    lo, hi, close = admissible.lo[each.index], admissible.hi[each.index], each.close()
     low, high = entry <= jax.lax.stop_gradient(lo) + close, entry >= jax.lax.stop_gradient(hi) - close
     return low | high, jnp.where(low, lo, jnp.where(high, hi, 0))
 
@@ -191,26 +197,28 @@ def _rim(at: Optimum, inputs: Sequence[Input], slopes: Sequence[Field], mine: bo
     return Rim(on, jnp.where(on, -pull / jnp.where(on, size, 1), 0), entries, radius)
 
 
-@dataclasses.dataclass
+@dataclasses.dataclass(frozen=True)
 class Kinks:
-    """Kinks of the upwinding: drift components by how they depend on every input, and which are taken at a node."""
+    """Kinks of the upwinding: drift components, their slopes in every input, and the nodes where one holds an input."""
 
     drift: Sequence[Any]  # with derivatives
     slopes: Sequence[Sequence[Any]]  # ∂f/∂z, a row a component
-    taken: list[Any]
+    holds: Sequence[Sequence[Any]]  # a row an input; a component holds one input of a node at most
 
-    def claimed(self, row: Row, a: int, kinked: Any, close: Any) -> Row:
-        """The row of an input that a kink holds: it moves so that f stays zero; one component holds one input."""
+    def hold(self, a: int) -> Any:
+        """The nodes where some kink holds an input, bool."""
+        return functools.reduce(jnp.logical_or, self.holds[a], jnp.zeros((), bool))
+
+    def followed(self, a: int, row: Row) -> Row:
+        """The row of an input, which moves so that f stays zero where a kink holds it."""
         columns, side = row
-        for i, (f, slopes) in enumerate(zip(self.drift, self.slopes, strict=True)):
-            here = kinked & ~self.taken[i] & (jnp.abs(jax.lax.stop_gradient(f)) < close * jnp.abs(slopes[a]))
-            columns = columns | {b: jnp.where(here, slope, columns[b]) for b, slope in enumerate(slopes)}
-            side, kinked = jnp.where(here, -f, side), kinked & ~here
-            self.taken[i] = self.taken[i] | here
+        for f, slopes, here in zip(self.drift, self.slopes, self.holds[a], strict=True):
+            columns = {b: jnp.where(here, slopes[b] if b < len(slopes) else 0, value) for b, value in columns.items()}
+            side = jnp.where(here, -f, side)
         return columns, side
 
 
-def _kinks(at: Optimum, inputs: Sequence[Input]) -> Kinks:
+def _kinks(at: Optimum, inputs: Sequence[Input], kinked: Sequence[Any]) -> Kinks:
     """The drift components that an input drives, of each player by itself where they are upwinded apart."""
     on, frozen = at.moving.on, at.frozen.on
     count = on.grid.ndim
@@ -226,7 +234,15 @@ def _kinks(at: Optimum, inputs: Sequence[Input]) -> Kinks:
         return jnp.broadcast_to(drift(frozen, u, d)[i], on.grid.shape)
 
     slopes = [[each.slope(functools.partial(component, i), at.u, at.d) for each in inputs] for i in sorted(driven)]
-    return Kinks(kept, slopes, [jnp.zeros(on.grid.shape, bool)] * len(kept))
+    taken = [jnp.zeros(on.grid.shape, bool)] * len(kept)
+    holds: list[list[Any]] = []
+    for a, (each, here) in enumerate(zip(inputs, kinked, strict=True)):
+        holds.append([])
+        for i, (f, slope) in enumerate(zip(kept, slopes, strict=True)):
+            near = here & ~taken[i] & (jnp.abs(jax.lax.stop_gradient(f)) < each.close() * jnp.abs(slope[a]))
+            holds[a].append(near)
+            taken[i], here = taken[i] | near, here & ~near
+    return Kinks(kept, slopes, holds)
 
 
 def _solved(rows: Sequence[Row]) -> list[Any]:

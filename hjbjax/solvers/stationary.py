@@ -1,7 +1,7 @@
 """The front door: ``solve``.
 
 At host level it validates, picks a method, drives the iteration from grid to grid and reports. Under a tracer the
-same iteration runs with a fixed method and none of that, and its value is differentiable.
+same iteration runs with a fixed method and none of that, and its value and its policy are differentiable.
 """
 
 import contextlib
@@ -82,8 +82,8 @@ def solve(
       max_memory: bytes that the solve may take, instead of what is free.
 
     Returns:
-      The solution; NumPy arrays at host level. Inside ``jit``, ``vmap`` or ``grad`` its value is traced, and
-      differentiable with respect to every number in the problem and the grid.
+      The solution; NumPy arrays at host level. Inside ``jit``, ``vmap`` or ``grad`` its value and its policy are
+      traced, and differentiable with respect to every number in the problem and the grid.
 
     Raises:
       ValueError: a question without an answer, or a bad argument.

@@ -5,6 +5,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 import hjbjax as hjb
@@ -125,3 +126,37 @@ def test_a_value_follows_the_kinks_that_hold_searched_actions():
         forward = np.asarray(jax.jit(jax.jacfwd(functools.partial(value, searched)))(numbers))
         found = np.stack([(solve(numbers + e) - solve(numbers - e)) / (2 * step) for e in step * np.eye(4)], axis=-1)
         np.testing.assert_allclose(forward, found, rtol=0, atol=1e-7)
+
+
+@pytest.mark.slow
+def test_a_weight_of_the_cost_is_recovered_from_what_an_expert_does():
+    """Twenty paths of the closed loop; Adam on the squared distance of the actions, from three times the weight."""
+    grid, weight = hjb.Grid([-1.5, -1.5], [1.5, 1.5], (31, 31)), 0.7
+
+    def question(weight):
+        return hjb.Problem(
+            lambda x, u: jnp.stack([x[1], u[0]]), lambda x, u: x[0] ** 2 + weight * x[1] ** 2 + 0.5 * u @ u,
+            hjb.Box([-2.0], [2.0]), discount=0.3,
+        )  # fmt: skip
+
+    expert = hjb.solve(question(weight), grid, scheme=hjb.Upwind(), tol=1e-8)
+    states = [np.random.default_rng(3).uniform(-0.8, 0.8, (20, 2))]
+    for _ in range(40):
+        x = states[-1]
+        states.append(x + 0.05 * np.stack([x[:, 1], expert.control_at(x)[:, 0]], axis=-1))
+    seen = np.concatenate(states)
+    actions = expert.control_at(seen)
+
+    with jax.enable_x64(True):
+
+        def loss(weight):
+            imitator = hjb.solve(question(weight), grid, scheme=hjb.Upwind(), tol=1e-8)
+            return jnp.mean((imitator.control_at(seen) - actions) ** 2)
+
+        slope = jax.jit(jax.grad(loss))
+        found, rule = jnp.array(3 * weight), optax.adam(optax.cosine_decay_schedule(0.2, 120))
+        state = rule.init(found)
+        for _ in range(120):
+            step, state = rule.update(slope(found), state)
+            found = optax.apply_updates(found, step)
+    assert abs(float(found) - weight) < 0.02 * weight

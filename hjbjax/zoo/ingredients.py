@@ -98,7 +98,7 @@ class OutsideBall:
     def level(self, x: State) -> Number:
         """r − |x|: ≤ 0 outside."""
         # as of the cube: nodes of the box's faces lie on the sphere up to their last bit
-        return self.radius * (1 - 1e-6) - jnp.sqrt(jnp.sum(x * x))
+        return self.radius * (1 - 1e-6) - root(jnp.sum(x * x))
 
 
 class Traveller(Protocol):
@@ -127,6 +127,13 @@ def discounted_time(time: Number, discount: Number) -> Scalar:
     rate = jnp.where(discount == 0, 1.0, discount)
     # expm1 keeps the digits that 1 − e^{−βT} would lose for small β, down to β = 1e-9
     return jnp.where(discount == 0, time, -jnp.expm1(-rate * time) / rate)
+
+
+def root(square: Number) -> Scalar:
+    """√max(s, 0), with the derivative 0 where the root is 0: at a corner of a distance no number moves it."""
+    inside = square > 0
+    # the derivative of √s at 0 is infinite, and times what is not asked for it would be NaN
+    return jnp.where(inside, jnp.sqrt(jnp.where(inside, square, 1.0)), 0 * square)
 
 
 def answer(method: Callable[..., T]) -> Callable[..., T]:

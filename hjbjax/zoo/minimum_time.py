@@ -19,7 +19,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Ball, Box
 from hjbjax.problem.types import Array, Control, Number, State
-from hjbjax.zoo.ingredients import Arrival, Disc, Exact, Scalar, answer, positive, unit_cost
+from hjbjax.zoo.ingredients import Arrival, Disc, Exact, Scalar, answer, positive, root, unit_cost
 
 
 @pytree_dataclass()
@@ -48,7 +48,7 @@ class DoubleIntegrator:
         sign = jnp.where(side >= 0, 1.0, -1.0)  # left of the curve the plane is mirrored; no jnp.sign, which is 0 on it
         # On the switching curve the root is |velocity|; rounding must not make its argument negative.
         # x₂ + 2√(x₁ + ½x₂²), the two arcs together, with the 2 under the root
-        return sign * velocity + jnp.sqrt(jnp.maximum(4 * sign * position + 2 * velocity * velocity, 0.0))
+        return sign * velocity + root(4 * sign * position + 2 * velocity * velocity)
 
     def switching_position(self, velocity: Number) -> Number:
         """x₁ on the switching curve x₁ = −½m x₂|x₂|; to its right the best force is −1, to its left +1."""
@@ -83,7 +83,7 @@ class Boat:
         square = x[0] * x[0] + x[1] * x[1]
         current = self.current[0] * self.current[0] + self.current[1] * self.current[1]
         inside = along * along + (self.speed * self.speed - current) * square
-        below = jnp.sqrt(jnp.maximum(inside, 0.0)) - along
+        below = root(inside) - along
         # inside < 0: the disc of radius sT around the drifting boat never holds the origin; below ≤ 0: only in the past
         reachable = (inside >= 0) & (below > 0)
         # a divisor of 1 where out of reach: the branch not taken is differentiated too

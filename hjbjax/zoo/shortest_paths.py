@@ -16,7 +16,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Ball, Box, Finite
 from hjbjax.problem.types import Control, Number, State
-from hjbjax.zoo.ingredients import Arrival, Disc, Exact, Scalar, answer, positive, unit_cost
+from hjbjax.zoo.ingredients import Arrival, Disc, Exact, Scalar, answer, positive, root, unit_cost
 
 
 # static: it chooses a formula, not a number in one
@@ -44,7 +44,7 @@ class SingleIntegrator:
         if self.norm == 1:
             return jnp.sum(jnp.abs(x)) / self.speed
         # at full speed straight to the origin: the time is the norm whose unit ball the velocities fill
-        return (jnp.sqrt(jnp.sum(x * x)) if self.norm == 2 else jnp.max(jnp.abs(x))) / self.speed
+        return (root(jnp.sum(x * x)) if self.norm == 2 else jnp.max(jnp.abs(x))) / self.speed
 
 
 @pytree_dataclass()

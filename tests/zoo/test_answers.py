@@ -249,3 +249,19 @@ def test_nobody_stays_in_a_cube_that_he_has_left(dim):
         assert float(value(x)) == 0.0
         assert not np.any(np.asarray(jax.grad(value)(jnp.array(x))))
     assert float(value([1.0] * dim)) == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        lambda number: zoo.double_integrator_exact(mass=number),
+        lambda number: zoo.zermelo_exact(speed=number),
+        lambda number: zoo.eikonal_exact(speed=number),
+    ],
+)
+def test_derivatives_at_the_corner_of_a_distance(answer):
+    """They were NaN at the origin, and so was every derivative of a solve that holds the answer there."""
+    for state in (jnp.zeros(2), jnp.array([0.3, -0.2])):
+        slope = jax.grad(lambda number, x=state: answer(number)(x))(1.1)
+        assert jnp.isfinite(slope)
+        assert (slope == 0) == (not jnp.any(state))

@@ -1,0 +1,12 @@
+"""State estimates and control from them: output feedback.
+
+    dx = f(x, u) dt + σ dw,    dy = h(x) dt + r dv,    u = control(information state)
+
+Read ``observers`` first: the protocol, the extended Kalman filter, the Luenberger observer; then ``information_state``,
+the law of the state on a grid, and ``output_feedback``, the loop through plant, sensor, observer and control.
+"""
+
+from hjbjax.filtering.information_state import GridFilter, InformationState, zakai
+from hjbjax.filtering.observers import ExtendedKalman, Luenberger, Observer
+
+__all__ = ["ExtendedKalman", "GridFilter", "InformationState", "Luenberger", "Observer", "zakai"]

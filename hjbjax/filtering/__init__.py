@@ -8,5 +8,16 @@ the law of the state on a grid, and ``output_feedback``, the loop through plant,
 
 from hjbjax.filtering.information_state import GridFilter, InformationState, zakai
 from hjbjax.filtering.observers import ExtendedKalman, Luenberger, Observer
+from hjbjax.filtering.output_feedback import simulate_output
+from hjbjax.filtering.output_loop import OutputPath
 
-__all__ = ["ExtendedKalman", "GridFilter", "InformationState", "Luenberger", "Observer", "zakai"]
+__all__ = [
+    "ExtendedKalman",
+    "GridFilter",
+    "InformationState",
+    "Luenberger",
+    "Observer",
+    "OutputPath",
+    "simulate_output",
+    "zakai",
+]

@@ -4,9 +4,9 @@
 
     p ← p + τ 𝓛*p
 
-is a step of a Markov chain, and Heun's mean ½ p + ½ (1 + τ𝓛*)² p of two of them, which is taken, is of second order in
-τ. The number of sub-steps is the least, ⌈dt max Q⌉, so that a step of any length is admissible; it costs two passes over
-the nodes each.
+is a step of a Markov chain, and the mean of p and of two of them, ½ p + ½ (1 + τ𝓛*)² p, K. Heun's, is of second
+order in τ. The number of sub-steps is the least, ⌈dt max Q⌉, so that a step of any length is admissible; each costs two
+passes over the nodes.
 
 The chain's law is a probability at each node. Its density is that over the node's cell: half a cell at a wall on which
 noise reflects, a whole one at an end of an axis without noise, see ``chain.stationary_density``.
@@ -19,7 +19,8 @@ import numpy as np
 from hjbjax.discretisation import stencil
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.rates import Rates, jump_rates
-from hjbjax.problem.types import Control, Field, Number
+from hjbjax.problem.pytree import known
+from hjbjax.problem.types import Array, Control, Field, Number
 
 
 def advanced(on: Discretisation, probability: Field, u: Control, dt: Number) -> Field:
@@ -42,21 +43,21 @@ def advanced(on: Discretisation, probability: Field, u: Control, dt: Number) -> 
 
 def _moved(on: Discretisation, stays: Field, moves: Rates, p: Field) -> Field:
     """The probabilities after one jump of the chain at most."""
+    found = stays * p
     for offset, share in zip(moves.offsets, moves.values, strict=True):
-        arrived = share * stencil.neighbour(p, on.grid, offset, ghost=False)
-        moved = arrived if offset is moves.offsets[0] else moved + arrived
-    return stays * p + moved
+        found = found + share * stencil.neighbour(p, on.grid, offset, ghost=False)
+    return found
 
 
-def cells(on: Discretisation) -> np.ndarray:
-    """The cell of every node for the law of the chain, shape (*grid), in the units of the states; host level.
+def cells(on: Discretisation) -> Array:
+    """The cell of every node for the law of the chain, shape (*grid), in the units of the states.
 
     Noise that depends on the control counts with its value at zero control.
     """
-    grid, volumes = on.grid, on.grid.volumes()
+    grid, sizes = on.grid, on.grid.volumes()
     m = 0 if on.problem.controls is None else on.problem.controls.dim
     noise = on.diffusion([jnp.zeros((), on.dtype)] * m)
     for axis in range(grid.ndim):
-        still = np.asarray(stencil.walls(grid, axis) & ~(jnp.asarray(noise.get((axis, axis), 0.0)) > 0))
-        volumes = np.where(still, 2 * volumes, volumes)
-    return volumes
+        still = stencil.walls(grid, axis) & ~(known(noise.get((axis, axis), 0.0)) > 0)
+        sizes = sizes * (1 + still)  # whole cells
+    return sizes

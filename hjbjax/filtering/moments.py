@@ -26,9 +26,7 @@ def covariance(grid: Grid, probability: Field) -> jax.Array:
     center = mean(grid, probability)
     off = [_difference(grid, axis, center[axis], probability.dtype) for axis in range(grid.ndim)]
     entries = {(i, j): jnp.sum(probability * off[i] * off[j]) for i in range(grid.ndim) for j in range(i, grid.ndim)}
-    return jnp.stack(
-        [jnp.stack([entries[min(i, j), max(i, j)] for j in range(grid.ndim)]) for i in range(grid.ndim)]
-    )
+    return jnp.stack([jnp.stack([entries[min(i, j), max(i, j)] for j in range(grid.ndim)]) for i in range(grid.ndim)])
 
 
 def mode(grid: Grid, density: Field) -> State:

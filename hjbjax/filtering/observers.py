@@ -240,14 +240,16 @@ def _covariance(given: Numbers | Sequence, n: int, name: str) -> Any:
         correlation = matrix / np.outer(scale, scale)
         ok = bool(np.all(np.abs(correlation - correlation.T) <= slack) and np.linalg.eigvalsh(correlation)[0] >= -slack)
     if not ok:
-        raise ValueError(f"{name} is {given!r}, wanted a symmetric matrix of finite numbers without negative eigenvalues")
+        raise ValueError(
+            f"{name} is {given!r}, wanted a symmetric matrix of finite numbers without negative eigenvalues"
+        )
     return (matrix + matrix.T) / 2
 
 
 def _gain(given: Callable | Numbers | Sequence, wanted: tuple[int, int], name: str) -> Any:
     """G as a matrix or as a function of the estimate that returns one."""
     if callable(given):
-        function = as_partial(given, f"{name}: gain")
+        function: Any = as_partial(given, f"{name}: gain")
         with jax.enable_x64(True):
             shape = jax.eval_shape(lambda x: jnp.asarray(function(x)), np.zeros(wanted[0])).shape
     else:

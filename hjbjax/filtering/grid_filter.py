@@ -129,11 +129,11 @@ class GridFilter:
         """The law after holding the control u (m,) for dt and seeing the increment dy (p,)."""
         dtype = state.density.dtype
         dt, u = jnp.asarray(dt, dtype), jnp.asarray(u, dtype)
-        signal, cell = jnp.asarray(self.signal, dtype), jnp.asarray(self.cells, dtype)
+        signal = jnp.asarray(self.signal, dtype)
         seen = self.measurement.whitened(jnp.asarray(dy, dtype))
         # half of ℓ, before the state moves and after it
         half = (jnp.tensordot(seen, signal, 1) - jnp.sum(signal**2, axis=0) * (dt / 2)) / 2
-        probability, before = _weighed(state.density * cell, half)
+        probability, before = _weighed(self._probability(state), half)
         probability = advanced(self._on(dtype), probability, u, dt)
         probability, after = _weighed(probability, half)
         return Density(self._density(probability), state.log_likelihood + before + after)

@@ -196,7 +196,7 @@ def _advanced(
         # up to a target that is met on the way; a record ends there, and so does its noise
         later = t + share * tau
         further = dy + share * tau / 2 * (seen + seen_then) + jnp.sqrt(share) * error
-        new = (later, z + share * (moved - z), further, hit)
+        new = (later, _on_target(plant, sigma, later, z + share * (moved - z), hit), further, hit)
         return jax.tree.map(lambda new, old: jnp.where(met, old, new), new, carry), None
 
     start = (t, z, jnp.zeros(p, dtype), jnp.zeros((), bool))
@@ -217,3 +217,11 @@ def _meeting(plant: Loop, draw: first_passage.Draw, sigma: Array, begins: tuple,
         bridged = flag < 1
         hit, share = hit | bridged, jnp.where(bridged, 1 / jnp.where(bridged, 1 - flag, 1), share)
     return hit, share
+
+
+def _on_target(plant: Loop, sigma: Array, t: Array, z: Array, hit: Array) -> Array:
+    """The state with cost, moved by the noise onto the edge of a target that is met; a bridge is no straight line."""
+    if plant.problem.target is None or plant.problem.noise is None:
+        return z
+    edge = first_passage.onto_edge(functools.partial(plant.target, t), z[:-1], sigma[:-1])
+    return jnp.where(hit, jnp.append(edge, z[-1]), z)

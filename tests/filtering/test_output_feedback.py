@@ -318,7 +318,7 @@ def test_a_solution_is_asked_at_the_estimate():
 
 
 def pendulum(x, u):
-    return jnp.stack([x[1], 9.81 * jnp.sin(x[0]) - 0.1 * x[1] + u[0]])
+    return jnp.stack([x[1], jnp.sin(x[0]) - 0.05 * x[1] + u[0]])
 
 
 def angle(x):
@@ -326,11 +326,15 @@ def angle(x):
 
 
 def swing_cost(x, u):
-    return 2 * (1 - jnp.cos(x[0])) + 0.1 * x[1] ** 2 + 0.02 * u[0] ** 2
+    return 2 * (1 - jnp.cos(x[0])) + 0.5 * x[1] ** 2 + 0.1 * u[0] ** 2
 
 
-SWING = Problem(pendulum, swing_cost, Box([-6.0], [6.0]), discount=0.2, noise=[0.0, 0.2])
-ROUND = Grid([-np.pi, -9.0], [np.pi, 9.0], (64, 61), (True, False))
+def hanging(x):
+    return jnp.exp(-(1 - jnp.cos(x[0] - np.pi)) / 0.1 - x[1] ** 2 / 0.1)
+
+
+SWING = Problem(pendulum, swing_cost, Box([-0.7], [0.7]), discount=0.05, noise=[0.0, 0.05])
+ROUND = Grid([-np.pi, -3.5], [np.pi, 3.5], (80, 81), (True, False))
 
 
 @pytest.fixture(scope="module")
@@ -341,22 +345,21 @@ def swing_up():
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["extended Kalman", "grid"])
 def test_a_pendulum_swings_up_on_its_angle_alone(swing_up, kind):
-    """From hanging at 170°, with less torque than gravity (6 < 9.81) and an observer that takes it for at rest."""
-    start = [np.deg2rad(170), 0.5]
+    """From 170°, with less torque than gravity and an observer that takes it for hanging at rest."""
     if kind == "grid":
-        prior = lambda x: jnp.exp(-(1 - jnp.cos(x[0] - np.pi)) / 0.1 - x[1] ** 2 / 0.5)  # noqa: E731
-        observer = GridFilter(SWING, angle, ROUND, prior, measurement_noise=0.05)
+        observer = GridFilter(SWING, angle, ROUND, hanging, measurement_noise=0.03)
     else:
-        observer = ExtendedKalman(SWING, angle, [np.pi, 0.0], [0.1, 0.25], measurement_noise=0.05)
+        observer = ExtendedKalman(SWING, angle, [np.pi, 0.0], [0.1, 0.05], measurement_noise=0.03)
     path = simulate_output(
         SWING, observer, swing_up,
-        h=angle, x0=start, duration=10.0, dt=0.02, key=1, paths=3, measurement_noise=0.05, substeps=2,
+        h=angle, x0=[np.deg2rad(170), 0.2], duration=20.0, dt=0.05, key=1, paths=4, measurement_noise=0.03, substeps=2,
     )  # fmt: skip
-    late = path.times[0] > 8
+    late = path.times[0] > 17
     assert np.all(path.code == PathStatus.DURATION)
-    assert np.all(np.cos(path.states[:, late, 0]) > 0.95)
     assert np.all(np.cos(path.states[:, 0, 0]) < -0.98)
-    assert np.all(np.cos(path.estimates[:, late, 0] - path.states[:, late, 0]) > 0.99)
+    assert np.all(np.cos(path.states[:, late, 0]) > 0.95)
+    off = path.estimates[:, 50:, 0] - path.states[:, 50:, 0]
+    assert np.all(np.cos(off) > 0.95)  # angles are compared round the circle: 18°
 
 
 # --- refusals ---

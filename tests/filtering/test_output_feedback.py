@@ -151,6 +151,7 @@ def test_errors_of_a_kalman_filter_have_the_covariance_that_it_says():
     assert np.max(np.abs(error.mean(axis=0))) < 0.03
 
 
+@pytest.mark.slow
 def test_separation_of_linear_quadratic_and_gaussian():
     """Mean cost a unit time of u = −K x̂: tr(P σσᵀ) + tr(S Kᵀ K), P and S of both Riccati equations."""
     a, b, c = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]]), np.array([[1.0, 0.0]])
@@ -251,19 +252,24 @@ def law(state):
     return -state.mean[:1] - 1.5 * state.mean[1:]
 
 
+def of_estimate(state):
+    return -state[:1] - 1.5 * state[1:]
+
+
 def test_a_batch_of_keys_is_each_of_them_and_seeds_are_keys():
-    observer = ExtendedKalman(LQ, position, [0.5, 0.0], [0.3, 0.3], measurement_noise=R)
+    observer = Luenberger(LQ, position, [[3.0], [2.0]], [0.5, 0.0])
+
+    def ask(key, **more):
+        return simulate_output(LQ, observer, of_estimate, **options(key=key, measurement_noise=R, **more))
+
     keys = jax.random.split(jax.random.key(7), 3)
-    batch = simulate_output(LQ, observer, law, **options(key=keys, measurement_noise=R))
-    many = simulate_output(LQ, observer, law, **options(key=jax.random.key(7), paths=3, measurement_noise=R))
+    batch, many = ask(keys), ask(jax.random.key(7), paths=3)
     for k in range(3):
-        alone = simulate_output(LQ, observer, law, **options(key=keys[k], measurement_noise=R))
-        for one, each, same in zip(*(jax.tree.leaves(p) for p in (alone, batch, many)), strict=True):
+        for one, each, same in zip(*(jax.tree.leaves(p) for p in (ask(keys[k]), batch, many)), strict=True):
             np.testing.assert_allclose(one, each[k], rtol=1e-9, atol=1e-12)
             np.testing.assert_array_equal(each, same)
-    seeded = simulate_output(LQ, observer, law, **options(key=5, measurement_noise=R))
-    keyed = simulate_output(LQ, observer, law, **options(key=jax.random.key(5), measurement_noise=R))
-    old = simulate_output(LQ, observer, law, **options(key=jax.random.PRNGKey(5), measurement_noise=R))
+    assert np.ptp(batch.states[:, -1, 0]) > 0.01
+    seeded, keyed, old = ask(5), ask(jax.random.key(5)), ask(jax.random.PRNGKey(5))
     np.testing.assert_array_equal(seeded.states, keyed.states)
     np.testing.assert_allclose(old.states, keyed.states)
 
@@ -278,10 +284,10 @@ def test_inside_jit_and_vmap_in_the_type_of_the_start():
     keys = jax.random.split(jax.random.key(1), 2)
     states, costs = jax.jit(jax.vmap(end))(jnp.ones((2, 2), jnp.float32), keys)
     assert (states.shape, states.dtype) == ((2, 2), np.float32)
-    for k in range(2):
-        path = simulate_output(LQ, observer, law, **options(x0=[1.0, 1.0], key=keys[k], measurement_noise=R))
-        assert np.all(np.isfinite(path.states))
+    outside = simulate_output(LQ, observer, law, **options(x0=np.ones((2, 2)), key=keys, measurement_noise=R))
+    assert outside.states.dtype == np.float64
     assert np.all(np.isfinite(costs))
+    assert np.all(np.isfinite(outside.states))
 
 
 def test_the_observer_sees_the_record_and_nothing_else():

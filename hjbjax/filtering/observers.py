@@ -28,7 +28,21 @@ ROUNDINGS = 64  # units of eps: what rounding may leave of symmetry and of a zer
 
 @runtime_checkable
 class Observer(Protocol):
-    """A state estimator in discrete steps: pure functions, for ``jit``, ``vmap`` and ``lax.scan``."""
+    """A state estimator in discrete steps: pure functions, for ``jit``, ``vmap`` and ``lax.scan``.
+
+    Example:
+      >>> @pytree_dataclass()
+      ... class LowPass:  # takes the measurement for the state, smoothed over a time
+      ...     time: float
+      ...     def initial(self):
+      ...         return jnp.zeros(1)
+      ...     def update(self, state, u, dy, dt):
+      ...         return state + (1 - jnp.exp(-dt / self.time)) * (dy / dt - state)
+      ...     def estimate(self, state):
+      ...         return state
+      >>> isinstance(LowPass(0.5), Observer)
+      True
+    """
 
     def initial(self) -> Any:
         """The information state at t = 0, any pytree of arrays."""

@@ -284,10 +284,8 @@ def test_inside_jit_and_vmap_in_the_type_of_the_start():
     keys = jax.random.split(jax.random.key(1), 2)
     states, costs = jax.jit(jax.vmap(end))(jnp.ones((2, 2), jnp.float32), keys)
     assert (states.shape, states.dtype) == ((2, 2), np.float32)
-    outside = simulate_output(LQ, observer, law, **options(x0=np.ones((2, 2)), key=keys, measurement_noise=R))
-    assert outside.states.dtype == np.float64
-    assert np.all(np.isfinite(costs))
-    assert np.all(np.isfinite(outside.states))
+    assert np.all(np.isfinite(states))
+    assert np.all(costs > 0)
 
 
 def test_the_observer_sees_the_record_and_nothing_else():
@@ -318,6 +316,22 @@ def test_a_solution_is_asked_at_the_estimate():
     assert by_solution.reached == pytest.approx(0.8, abs=1e-6)
     np.testing.assert_allclose(by_solution.controls[:8], -1.0)
     assert np.min(np.abs(by_solution.estimates)) < 0.2  # for the estimate starts ahead of the plant
+
+
+@pytest.mark.slow
+def test_a_marched_feedback_and_a_greedy_one_act_at_the_estimate_and_at_the_time():
+    """An observer that knows the state: the path is that of ``simulate`` under a hold, but for what it integrates."""
+    problem = Problem(integrator, lambda x, u: 0.5 * u @ u, Box([-4.0], [4.0]), terminal_cost=lambda x: 5 * (x @ x))
+    grid = Grid([-2.0, -3.0], [2.0, 3.0], (41, 41))
+    marched = hjb.march(problem, grid, 2.0, times=np.linspace(0, 2, 41))
+    observer = ExtendedKalman(problem, lambda x: x, [1.0, 0.0], [0.0, 0.0], measurement_noise=1e-3)
+    for feedback in (marched, hjb.greedy_feedback(problem, marched)):
+        path = simulate_output(
+            problem, observer, feedback, **options(h=lambda x: x, dt=0.05, measurement_noise=0.0, substeps=8)
+        )
+        known = hjb.simulate(problem, feedback, [1.0, 0.0], 2.0, hold=0.05)
+        np.testing.assert_allclose(path.states, known.states, atol=2e-3)
+        assert path.cost == pytest.approx(known.cost, abs=5e-3)
 
 
 # --- a pendulum ---

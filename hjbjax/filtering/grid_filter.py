@@ -207,7 +207,7 @@ def _check_rates(on: Discretisation, name: str) -> None:
     """Refuse drift or noise that is not finite at a node, and correlated noise that the chain cannot represent."""
     for u in sets.probes(on.problem.controls, on.dtype)[:3]:
         leaving, lacking = _look(on, u)
-        _refuse(f"{name}: a jump rate, made of drift and noise, is not finite", ~np.isfinite(leaving), on.grid)
+        _refuse(f"{name}: a jump rate, made of drift and noise, is not finite", ~jnp.isfinite(leaving), on.grid)
         _refuse(f"{name}: the noise is correlated more than the spacings allow", lacking, on.grid)
 
 

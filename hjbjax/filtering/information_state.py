@@ -58,8 +58,8 @@ def zakai(
 
     for dx = f(x, u) dt + σ dw and dy = h(x) dt + r dv, R = r rᵀ. Positive, and of mass one up to rounding, whatever dt
     and the record; of second order in dt, in the spacing of second order where the noise of an axis makes central
-    differences monotone, a_ii ≥ h|f_i|, and first elsewhere. All k densities are
-    kept; a ``GridFilter`` keeps the last. In float64; under a tracer in the type of the record.
+    differences monotone, a_ii ≥ h|f_i|, and first elsewhere. All k densities are kept; a ``GridFilter`` keeps the last.
+    In float64; under a tracer in the type of the record, with forward derivatives (``jacfwd``).
 
     Along a periodic axis the mean is the circular one, the angle of the mean of e^{iθ}, brought into the box, and the
     covariance that of the differences from it the short way round.
@@ -101,7 +101,8 @@ def zakai(
     run = _run if record.ndim == 2 else _run_batch
     if is_traced(observer, record, acts, dt):
         return run(observer, record, acts, dt, bool(normalised))
-    with jax.enable_x64(True):
+    # inside somebody's ``jit`` as well, what is known is computed here and now
+    with jax.core.eval_context(), jax.enable_x64(True):
         answer = run(*cast((observer, record, acts, dt), np.float64), bool(normalised))
         return jax.tree.map(np.asarray, answer)
 

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_partial, is_traced, numbers, pytree_dataclass
+from hjbjax.problem.pytree import is_traced, numbers, pytree_dataclass
 from hjbjax.problem.types import Array, Numbers, State
-from hjbjax.tracing import checks, indices
+from hjbjax.tracing import checks, closures, indices
 
 ROUNDINGS = 16  # units of eps: a matrix r whose rows are so near to dependent has no inverse worth the name
 
@@ -59,9 +59,10 @@ def measurement(h: Callable, n: int, noise: Numbers | Sequence, name: str, *, pe
       ValueError: a result of another shape, noise that is not positive, or code that JAX cannot trace.
       TypeError: an h that cannot be called, noise that is no number.
     """
-    function = as_partial(h, f"{name}: h")
-    if function is None:
-        raise TypeError(f"{name}: h is None, wanted the measured function of one state, (x) -> (p,)")
+    if not callable(h):
+        raise TypeError(f"{name}: h is {h!r}, wanted a function, the measured one of one state, (x) -> (p,)")
+    # as a problem's function of the state: other numbers in its closure are seen, and traced ones become leaves
+    function = closures.settled(Problem(_rest, target=h), n).target
     try:
         with jax.enable_x64(True):
             closed, found = jax.make_jaxpr(function, return_shape=True)(jax.ShapeDtypeStruct((n,), np.float64))
@@ -134,5 +135,11 @@ def plant(problem: Problem, n: int, name: str) -> Problem:
             f"{name}: got a problem with disturbances, whose actions nobody tells a filter; leave them out, or "
             "put noise in their place"
         )
-    checks.of_one_state(problem, n, "the number of states")
-    return Problem(problem.drift, controls=problem.controls, noise=problem.noise)
+    system = closures.settled(Problem(problem.drift, controls=problem.controls, noise=problem.noise), n)
+    checks.of_one_state(system, n, "the number of states")
+    return system
+
+
+def _rest(x: State, u: Array) -> State:
+    """No drift."""
+    return 0 * x

@@ -26,7 +26,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, as_partial, cast, is_traced, numbers
 from hjbjax.problem.types import Array, Key, Numbers
-from hjbjax.tracing import checks
+from hjbjax.tracing import checks, closures
 
 ROUNDING = 1e-9  # relative: a duration of 0.3 is three steps of 0.1
 MOST = 10**7  # intervals of a path: 80 MB a state
@@ -55,7 +55,7 @@ def simulate_output(
     moves in sub-steps of weak order 1, of order 2 without noise. A path ends in the target, which ``observer`` and
     ``control`` need not know of. Periodic states are wrapped into the grid, where one is known, before any function
     sees them, so that h should be periodic as well. In float64; under a tracer (``jit``, ``vmap``) in the type of x0,
-    without checks.
+    without checks, with forward derivatives (``jacfwd``).
 
     Args:
       problem: the plant and its costs; no game.
@@ -92,7 +92,6 @@ def simulate_output(
       >>> path.times.shape, path.estimates.shape, bool(abs(path.estimates - path.states)[-1] < 0.5)
       ((11,), (11, 1), True)
     """
-    traced = is_traced(problem, observer, control, x0, key, measurement_noise)
     if isinstance(key, (int, np.integer)) and not isinstance(key, bool):
         key = jax.random.key(int(key))
     times = _times(duration, dt)
@@ -102,10 +101,14 @@ def simulate_output(
     keys = _keys(key, paths, np.shape(start)[:-1])
     arguments.count(substeps, "simulate_output: substeps")
     loop = _closed(problem, observer, control, measured, grid, n, float(times[-1]))
-    if traced:
+    if is_traced(loop, start, keys) or _sees_tracers(loop):
         start = jnp.asarray(start)
         return _paths(loop, start, jnp.asarray(times, start.dtype), keys, substeps)
-    with jax.enable_x64(True), jax.debug_nans(False):  # after the end of a path its controls are NaN
+    with (
+        jax.core.eval_context(),
+        jax.enable_x64(True),
+        jax.debug_nans(False),
+    ):  # after the end of a path its controls are NaN
         loop = cast(loop, np.float64)
         _check_shapes(loop, np.zeros(n))
         path = _jit_paths(loop, start, times, keys, substeps)
@@ -125,6 +128,16 @@ def _paths(loop: OutputLoop, x0: Array, times: Array, keys: Key, substeps: int) 
 
 
 _jit_paths = jax.jit(_paths, static_argnums=4)
+
+
+def _sees_tracers(loop: OutputLoop) -> bool:
+    """True if the control closes over numbers that somebody traces, as of a gain whose derivative is wanted."""
+    m = 0 if loop.plant.problem.controls is None else loop.plant.problem.controls.dim
+    try:
+        closed = jax.make_jaxpr(lambda u: loop.control(jnp.zeros(()), loop.initial(), u))(jnp.zeros(m))
+    except (TypeError, ValueError):  # whose reason the checks will tell
+        return False
+    return is_traced(closed.consts)
 
 
 def _times(duration: float, dt: float) -> np.ndarray:
@@ -197,6 +210,7 @@ def _closed(
             f"simulate_output: the observer is a {type(observer).__name__} without {' and '.join(missing)}, wanted an "
             "Observer, with initial(), update(state, u, dy, dt) and estimate(state)"
         )
+    problem = closures.settled(problem, n)
     checks.of_one_state(problem, n, "the number of states in x0")
     # bound methods of a pytree bring its numbers along as leaves; those of another object belong to the program
     initial, update, estimate = (_method(observer, name) for name in ("initial", "update", "estimate"))

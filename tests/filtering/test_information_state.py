@@ -334,7 +334,15 @@ def test_inside_jit_vmap_and_grad():
     record = np.random.default_rng(5).normal(size=(4, 1)) * 0.2
 
     def likelihood(sigma):
-        law = zakai(Problem(decay, noise=sigma), identity, SMALL, record, 0.05, gauss(0.0, 1.0), measurement_noise=R)
+        law = zakai(
+            Problem(lambda x, u: -sigma * x, noise=sigma),
+            identity,
+            SMALL,
+            record,
+            0.05,
+            gauss(0.0, 1.0),
+            measurement_noise=R,
+        )
         return law.log_likelihood[-1]
 
     with jax.enable_x64(True):

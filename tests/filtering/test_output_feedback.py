@@ -288,6 +288,47 @@ def test_inside_jit_and_vmap_in_the_type_of_the_start():
     assert np.all(costs > 0)
 
 
+@pytest.mark.slow
+def test_the_derivative_in_a_gain_that_the_control_closes_over():
+    problem = Problem(lambda x, u: u, lambda x, u: x @ x + u @ u, REACH)
+    observer = Luenberger(problem, identity, [[2.0]], [0.5])
+
+    def cost(gain):
+        return simulate_output(
+            problem, observer, lambda s: -gain * s, **options(h=identity, x0=[1.0], measurement_noise=0.0)
+        ).cost
+
+    with jax.enable_x64(True):
+        slope = float(jax.jacfwd(cost)(0.7))
+        assert slope == pytest.approx((cost(0.7 + 1e-4) - cost(0.7 - 1e-4)) / 2e-4, rel=1e-5)
+        # inside a jit in which nothing is traced it is a number
+        assert float(jax.jit(lambda: jnp.asarray(cost(0.7)))()) == pytest.approx(float(cost(0.7)), rel=1e-12)
+
+
+def test_a_number_that_h_reads_may_change():
+    """A function that computes otherwise is another program."""
+    problem = Problem(lambda x, u: 0 * x)
+    seen = []
+    for c in (1.0, 2.0):
+        SCALE["c"] = c
+        path = simulate_output(
+            problem, Memory0(), None, **options(h=scaled, x0=[1.0], duration=1.0, measurement_noise=0.0)
+        )
+        seen.append(float(path.information["seen"][0]))
+    assert seen == pytest.approx([1.0, 2.0])
+
+
+def identity(x):
+    return x
+
+
+SCALE = {"c": 1.0}
+
+
+def scaled(x):
+    return SCALE["c"] * x
+
+
 def test_the_observer_sees_the_record_and_nothing_else():
     """What the filter of a path says is what ``zakai`` says of its record and its controls."""
     grid = Grid([-3.0], [3.0], (61,))

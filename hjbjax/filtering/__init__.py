@@ -6,13 +6,16 @@ Read ``observers`` first: the protocol, the extended Kalman filter, the Luenberg
 the law of the state on a grid, and ``output_feedback``, the loop through plant, sensor, observer and control.
 """
 
-from hjbjax.filtering.information_state import GridFilter, InformationState, zakai
-from hjbjax.filtering.observers import ExtendedKalman, Luenberger, Observer
+from hjbjax.filtering.grid_filter import Density, GridFilter
+from hjbjax.filtering.information_state import InformationState, zakai
+from hjbjax.filtering.observers import ExtendedKalman, Gaussian, Luenberger, Observer
 from hjbjax.filtering.output_feedback import simulate_output
 from hjbjax.filtering.output_loop import OutputPath
 
 __all__ = [
+    "Density",
     "ExtendedKalman",
+    "Gaussian",
     "GridFilter",
     "InformationState",
     "Luenberger",

@@ -224,6 +224,19 @@ def test_a_noisy_path_meets_its_target_between_two_steps():
     np.testing.assert_allclose(path.states[met, -1], 0, atol=1e-9)
 
 
+def test_a_record_ends_where_the_path_does():
+    """dx = −dt meets x = 0.35 after .65 of the one step: what is seen has the mean ∫x dt and the variance r² .65."""
+    problem = Problem(lambda x, u: -jnp.ones(1), target=lambda x: x[0] - 0.35)
+    path = simulate_output(
+        problem, Memory0(), None,
+        **options(x0=[1.0], duration=1.0, dt=1.0, substeps=1, paths=20_000, h=lambda x: jnp.ones(1), measurement_noise=R),
+    )  # fmt: skip
+    seen = path.measurements[:, 0, 0]
+    np.testing.assert_allclose(path.reached, 0.65, atol=1e-12)
+    assert seen.mean() == pytest.approx(0.65, abs=0.01)
+    assert seen.var() == pytest.approx(0.65 * R**2, rel=0.05)
+
+
 def test_the_terminal_cost_is_paid_at_the_end_alone():
     problem = Problem(lambda x, u: -jnp.ones(1), terminal_cost=lambda x: 10 * x[0], discount=0.5)
     path = simulate_output(problem, Memory0(), None, **options(x0=[3.0], h=lambda x: x))

@@ -229,7 +229,7 @@ def test_a_record_ends_where_the_path_does():
     problem = Problem(lambda x, u: -jnp.ones(1), target=lambda x: x[0] - 0.35)
     path = simulate_output(
         problem, Memory0(), None,
-        **options(x0=[1.0], duration=1.0, dt=1.0, substeps=1, paths=20_000, h=lambda x: jnp.ones(1), measurement_noise=R),
+        **options(x0=[1.0], duration=1.0, dt=1.0, substeps=1, paths=20_000, h=unity, measurement_noise=R),
     )  # fmt: skip
     seen = path.measurements[:, 0, 0]
     np.testing.assert_allclose(path.reached, 0.65, atol=1e-12)
@@ -329,6 +329,10 @@ def test_a_number_that_h_reads_may_change():
         )
         seen.append(float(path.information["seen"][0]))
     assert seen == pytest.approx([1.0, 2.0])
+
+
+def unity(x):
+    return jnp.ones(1)
 
 
 def identity(x):

@@ -9,16 +9,16 @@ and the cost of a control is Σ_i π_i c_i(u): a problem for ``hjb.solve`` whose
 control also chooses how well it sees: dual control.
 
 Two states: x = π₁ in [0, 1], dx = (Aᵀπ)₁ dt + x(1 − x) |h₁ − h₂|/r dν; noise vanishes at both ends, and drift there
-points inwards or is zero. Three or more: one channel of noise moves all of π at once, degenerate and correlated, which no
-grid in π carries. In logarithms it is constant: with H = h/r and an orthonormal basis B of the vectors with sum zero
-that makes B H Hᵀ Bᵀ = diag(a₁, …) the state is
+points inwards or is zero. Three or more: one channel of noise moves all of π at once, degenerate and correlated in
+directions that turn with π, which no chain on the spacings of a grid in π represents. In logarithms it is constant:
+with H = h/r and an orthonormal basis B of the vectors with sum zero that makes B H Hᵀ Bᵀ = diag(a₁, …) the state is
 
     ζ = B log π,     dζ = B μ dt + √a dw,     μ_i = (Aᵀπ)_i/π_i − ½ Σ_l (H_il − Ĥ_l)²,     π = softmax(Bᵀ ζ),
 
-the second term being Ito's. Noise acts along each axis alone, so that the chain is monotone on any spacings. The faces of
-the simplex lie at infinity: the box ends where the smallest π is ``floor`` of the largest, which moves the value by
-about as much as a belief of that size does. Nodes gather around equal beliefs, and at the faces drift is fast, of the
-order of a rate over ``floor``.
+the second term being Ito's. Noise acts along each axis alone, so that the chain is monotone on any spacings. The faces
+of the simplex lie at infinity: the box ends where the smallest π is ``floor`` of the largest, which moves the value by
+about as much as a belief of that size does. There drift is fast, a rate over ``floor`` or more: the default scheme may
+stall at it and say so, and ``hjb.solve(..., scheme=hjb.Upwind())`` is the one to take.
 """
 
 import dataclasses
@@ -151,13 +151,13 @@ def belief_problem(
 ) -> BeliefProblem:
     """The control problem of the belief of a hidden chain, its grid, and the map between beliefs and states.
 
-    β V = min_u { Σ_i π_i c_i(u) + (generator of dπ under u) V }: the state is all that is known, and it is measured. V as
-    a function of π is concave, at least the mean Σ_i π_i V_i of the values of a controller that sees the state, and at
-    most the value without measurements.
+    β V = min_u { Σ_i π_i c_i(u) + (generator of dπ under u) V }: the state is all that is known, and it is measured. V
+    as a function of π is concave, at least the mean Σ_i π_i V_i of the values of a controller that sees the state, and
+    at most the value without measurements.
 
     Args:
-      generator: A(u), a function of one control that returns shape (S, S), or the matrix itself: rates per unit time from
-        row to column, rows sum to zero.
+      generator: A(u), a function of one control that returns shape (S, S), or the matrix itself: rates per unit time
+        from row to column, rows sum to zero.
       h: what is seen of each state, shape (S,) or (S, p), or a function of u that returns one of these.
       cost: c, a function of one control that returns the cost per unit time in every state, shape (S,).
 
@@ -165,16 +165,17 @@ def belief_problem(
       controls: the admissible set of u; ``None``: there is no control.
       discount: β > 0, per unit time.
       measurement_noise: r in dy = h dt + r dv, a number or one a measurement (p,), in the units of h √time.
-      nodes: the number of nodes, or one an axis; ``None``: 201 for two states, 61 an axis for more.
+      nodes: the number of nodes, or one an axis; ``None``: 201 for two states, 81 an axis for more.
       floor: for three or more states the smallest belief in the box over the largest.
 
     Returns:
       ``BeliefProblem(problem, grid, coordinates)``.
 
     Raises:
-      ValueError: rates that are negative or rows that do not sum to zero, at some admissible control; shapes that do not
-        fit; numbers that are not finite or not positive; for three or more states an h(u) whose noises have no common
-        axes, as two sensors that the control switches between.
+      ValueError: rates that are negative or rows that do not sum to zero, at some admissible control; shapes that do
+        not fit; numbers that are not finite or not positive; for three or more states an h(u) whose noises have no
+        common axes, as two sensors that the control switches between.
+      TypeError: a cost that is no function.
 
     Example:
       >>> import hjbjax as hjb
@@ -193,30 +194,32 @@ def belief_problem(
     arguments.positive(discount, "belief_problem: discount", "per unit time")
     if not 0 < floor < 1:
         raise ValueError(f"belief_problem: floor = {arguments.shown(floor)}; wanted a number between 0 and 1")
-    fields = _functions(generator, h, cost, measurement_noise)
+    if not callable(cost):
+        raise TypeError(
+            f"belief_problem: cost is {arguments.shown(cost)}, wanted a function of u that returns shape (S,)"
+        )
+    rates, sensor = chain_functions(generator, h, measurement_noise, "belief_problem")
+    chain = BeliefDynamics(BeliefCoordinates(), rates, sensor, as_partial(cost))
     with jax.enable_x64(True):
         looks = _looks(controls)
-        states = _check_chain(fields, looks)
-        basis = None if states == 2 else _common_axes(fields.h, looks, states)
-    dynamics = dataclasses.replace(fields, coordinates=BeliefCoordinates(basis))
+        states = _check_chain(chain, looks)
+        basis = None if states == 2 else _common_axes(sensor, looks, states)
+    dynamics = dataclasses.replace(chain, coordinates=BeliefCoordinates(basis))
     problem = Problem(dynamics.drift, dynamics.cost, controls, noise=dynamics.noise, discount=discount)
     return BeliefProblem(problem, _box(basis, states, nodes, floor), dynamics.coordinates)
 
 
-def _functions(generator: Any, h: Any, cost: Any, noise: Any) -> BeliefDynamics:
-    """The chain with numbers and functions as pytrees; the coordinates are still open."""
-    if not callable(cost):
-        raise TypeError(f"belief_problem: cost is {arguments.shown(cost)}, wanted a function of u that returns shape (S,)")
-    spread: Any = numbers(noise, "belief_problem: measurement_noise")
+def chain_functions(generator: Any, h: Any, noise: Any, name: str) -> tuple[Any, Sensor]:
+    """The generator as a function of u, and h over r, with their numbers as leaves; ``name`` is for refusals."""
+    spread: Any = numbers(noise, f"{name}: measurement_noise")
     if not is_traced(spread) and not (spread.ndim <= 1 and np.all(np.isfinite(spread) & (spread > 0))):
         raise ValueError(
-            f"belief_problem: measurement_noise = {arguments.shown(noise)}; wanted finite numbers > 0, one or one a "
+            f"{name}: measurement_noise = {arguments.shown(noise)}; wanted finite numbers > 0, one or one a "
             "measurement: without noise the state is seen, which is the problem of the chain itself"
         )
-    fixed = generator if callable(generator) else Constant(numbers(generator, "belief_problem: generator"))
-    values = as_partial(h) if callable(h) else numbers(h, "belief_problem: h")
-    sensor = Sensor(values, spread, callable(h))
-    return BeliefDynamics(BeliefCoordinates(), as_partial(fixed), sensor, as_partial(cost))
+    rates = generator if callable(generator) else Constant(numbers(generator, f"{name}: generator"))
+    values = as_partial(h) if callable(h) else numbers(h, f"{name}: h")
+    return as_partial(rates), Sensor(values, spread, callable(h))
 
 
 @pytree_dataclass()
@@ -269,19 +272,23 @@ def check_generator(rates: np.ndarray, name: str) -> None:
     off = rates - np.diag(np.diag(rates))
     if np.any(off < 0):
         i, j = np.argwhere(off < 0)[0]
-        raise ValueError(f"{name} has the rate {rates[i, j]:g} from state {i} to {j}; wanted rates ≥ 0 off the diagonal")
+        raise ValueError(
+            f"{name} has the rate {rates[i, j]:g} from state {i} to {j}; wanted rates ≥ 0 off the diagonal"
+        )
     if np.any(np.abs(rates.sum(axis=1)) > len(rates) * slack):
         row = int(np.argmax(np.abs(rates.sum(axis=1))))
         raise ValueError(
-            f"{name} has a row {row} that sums to {rates[row].sum():g}, wanted zero: the diagonal is minus the sum of the "
-            "rates out of a state"
+            f"{name} has a row {row} that sums to {rates[row].sum():g}, wanted zero: the diagonal is minus the sum of "
+            "the rates out of a state"
         )
 
 
 def _common_axes(sensor: Sensor, looks: np.ndarray, states: int) -> np.ndarray:
-    """B, shape (S − 1, S): an orthonormal basis of the vectors with sum zero along which no two noises are correlated."""
+    """B, shape (S − 1, S): an orthonormal basis of the vectors with sum zero, along which noises are not correlated."""
     centring = np.eye(states) - 1 / states
-    covariances = [centring @ gains @ gains.T @ centring for gains in (np.asarray(sensor(u)) for u in jnp.asarray(looks))]
+    covariances = [
+        centring @ gains @ gains.T @ centring for gains in (np.asarray(sensor(u)) for u in jnp.asarray(looks))
+    ]
     # unequal weights: eigenvectors of a sum are common to all parts only if no two parts make up for each other
     weights = [1 / np.sqrt(2 + k) for k in range(len(covariances))]
     size = max(max(np.abs(each).max() for each in covariances), np.finfo(float).tiny)
@@ -294,9 +301,9 @@ def _common_axes(sensor: Sensor, looks: np.ndarray, states: int) -> np.ndarray:
         turned = basis @ covariance @ basis.T
         if np.any(np.abs(turned - np.diag(np.diag(turned))) > 1e3 * ROUNDING * size):
             raise ValueError(
-                f"belief_problem: the noises of h at u = {u.tolist()} and at other controls have no common axes, wanted "
-                f"h(u) h(u)ᵀ/r² that commute: with {states} states let the control change the gain of a sensor, h(u) = "
-                "k(u) h₀, or use two states"
+                f"belief_problem: the noises of h at u = {u.tolist()} and at other controls have no common axes, "
+                f"wanted h(u) h(u)ᵀ/r² that commute: with {states} states let the control change the gain of a sensor, "
+                "h(u) = k(u) h₀, or use two states"
             )
     return basis
 
@@ -304,7 +311,7 @@ def _common_axes(sensor: Sensor, looks: np.ndarray, states: int) -> np.ndarray:
 def _box(basis: np.ndarray | None, states: int, nodes: Any, floor: float) -> Grid:
     """The grid of a belief problem."""
     axes = states - 1
-    given = (201 if states == 2 else 61) if nodes is None else nodes
+    given = (201 if states == 2 else 81) if nodes is None else nodes
     shape = (given,) * axes if not isinstance(given, (Sequence, np.ndarray)) else tuple(given)
     if len(shape) != axes:
         raise ValueError(f"belief_problem: nodes = {arguments.shown(nodes)}; wanted a count or {axes} of them")

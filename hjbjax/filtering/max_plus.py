@@ -111,8 +111,8 @@ def sup_pairing(p: Nodes, psi: Nodes | float, grid: Grid) -> tuple[Array, Array]
 
     Args:
       p: the information state at the nodes, shape (*grid); −∞ for states that are impossible.
-      psi: a cost at the nodes, shape (*grid), or a number: with the value function of the control problem, the chapter's
-        certainty-equivalence principle asks for this maximum.
+      psi: a cost at the nodes, shape (*grid), or a number; with the value function of the control problem the state is
+        the one that certainty equivalence for games acts on.
       grid: the nodes.
 
     Returns:
@@ -184,7 +184,7 @@ _refined_maximum = jax.jit(refined_maximum)
 
 
 def _neighbours(grid: Grid, best: Sequence[jax.Array], dtype: Any) -> list[tuple[list, list, Any]]:
-    """Along every axis the numbers of a node's neighbours and its own, the distances to them, and whether it has both."""
+    """For every axis: numbers of the node below, the node and the one above; two distances; whether both are there."""
     found = []
     for axis, count in enumerate(grid.shape):
         here, x = best[axis], jnp.asarray(grid.axis(axis), dtype)

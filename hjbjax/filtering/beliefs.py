@@ -258,6 +258,10 @@ def _check_chain(chain: BeliefDynamics, looks: np.ndarray) -> int:
                 raise ValueError(f"belief_problem: {name} has shape {array.shape}, wanted {shape}: one row a state")
             if not np.all(np.isfinite(array)):
                 raise ValueError(f"belief_problem: {name} is not finite at u = {np.asarray(u).tolist()}")
+        if np.shape(chain.h.measurement_noise) not in ((), (sensors := np.shape(chain.h(u))[1:])):
+            raise ValueError(
+                f"belief_problem: measurement_noise has shape {np.shape(chain.h.measurement_noise)}, wanted () or {sensors}"
+            )
         check_generator(rates, f"belief_problem: the generator at u = {np.asarray(u).tolist()}")
     return states
 

@@ -45,8 +45,9 @@ def check_question(problem: object, grid: object, scheme: Any) -> None:
 
 def measurements(h: Callable, n: int) -> int:
     """The number of measurements p, by a trace of h on one state."""
+    function: Any = as_partial(h, "robust_filter: h")
     with jax.enable_x64(True):
-        shape = jax.eval_shape(h, jax.ShapeDtypeStruct((n,), np.float64)).shape
+        shape = jax.eval_shape(function, jax.ShapeDtypeStruct((n,), np.float64)).shape
     if len(shape) != 1 or shape[0] == 0:
         raise ValueError(f"robust_filter: h returns shape {shape}, wanted (p,): one number a measurement, as in x[:1]")
     return shape[0]
@@ -54,10 +55,11 @@ def measurements(h: Callable, n: int) -> int:
 
 def initial_values(initial: Any, grid: Grid) -> Any:
     """p₀ at the nodes, refused where it is not finite."""
+    values: Any
     if callable(initial):
         with jax.enable_x64(True):
             x = cast(grid, np.float64).components(np.float64)
-            values = components.scalar(as_partial(initial), x, dtype=np.dtype(np.float64))
+            values = components.scalar(initial, x, dtype=np.dtype(np.float64))
             values = jnp.broadcast_to(values, grid.shape)
             values = values if is_traced(values) else np.asarray(values)
     else:

@@ -38,6 +38,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, cast, is_traced, pytree_dataclass
 from hjbjax.problem.types import Array, Control, Field, Nodes, Number, Numbers, State
 from hjbjax.tracing import components
+from hjbjax.tracing.closures import settled
 
 
 @pytree_dataclass()
@@ -115,12 +116,12 @@ class RobustGridFilter:
         scheme: Scheme = Weno5(),
     ):
         robust_arguments.check_question(problem, grid, scheme)
-        h = as_partial(h, "robust_filter: h")
+        measured = as_partial(h, "robust_filter: h")
         arguments.positive(gamma, "robust_filter: gamma")
         count = robust_arguments.measurements(h, grid.ndim)
         fields = {
             "problem": problem,
-            "h": h,
+            "h": measured,
             "grid": grid,
             "p0": robust_arguments.initial_values(initial, grid),
             "gamma": gamma,
@@ -138,7 +139,8 @@ class RobustGridFilter:
     def update(self, state: Field, u: Control, dy: Array, dt: Number) -> Field:
         """p after holding the control u, shape (m,), for a time dt, over which y = dy/dt was seen, dy (p,)."""
         dtype = state.dtype
-        return self._after(state, jnp.asarray(u, dtype), jnp.asarray(dy, dtype) / dt, dt)
+        # compiled even where the caller does not: a loop whose body is new would be compiled at every call
+        return _after(self, state, jnp.asarray(u, dtype), jnp.asarray(dy, dtype) / dt, dt)
 
     def estimate(self, state: Field) -> State:
         """The worst case: the state where p is largest, shape (n,), refined between the nodes."""
@@ -161,6 +163,9 @@ class RobustGridFilter:
             [gain**2 / mine.gamma**2 for gain in mine.sigma],
             on.running_cost(entries) - mine.gamma**2 / 2 * misfit,
         ).after(p, dt)
+
+
+_after = jax.jit(RobustGridFilter._after)
 
 
 def robust_filter(
@@ -220,20 +225,25 @@ def robust_filter(
     Source: M. R. James, Nonlinear Control Systems, (12.10) and (12.11).
     """
     options: Any = {"sigma": sigma, "measurement_noise": measurement_noise, "scheme": scheme}
-    observer = RobustGridFilter(problem, h, grid, initial, gamma, **options)
+    robust_arguments.check_question(problem, grid, scheme)
+    robust_arguments.measurements(h, grid.ndim)
+    # h in the place of a target, which is a function of the state as well: both are looked at again in every call
+    asked = settled(Problem(problem.drift, problem.cost, problem.controls, noise=problem.noise, target=h), grid.ndim)
+    observer = RobustGridFilter(asked, asked.target, grid, initial, gamma, **options)
     if not is_traced(dt):
         arguments.positive(dt, "robust_filter: dt", "in units of time")
     y, controls = (
-        robust_arguments.record_of(y, len(np.atleast_1d(observer.measurement_noise))),
+        robust_arguments.record_of(y, np.shape(observer.measurement_noise)[0]),
         robust_arguments.controls_of(problem, controls, np.shape(y)),
     )
-    if is_traced(problem, h, grid, y, dt, observer.p0, gamma, controls, sigma, measurement_noise):
+    if is_traced(asked, grid, y, dt, observer.p0, gamma, controls, sigma, measurement_noise):
         return _scan(observer, jnp.asarray(y), jnp.asarray(controls), dt)
-    with jax.enable_x64(True):
+    # inside somebody's ``jit`` a record of known numbers is filtered at once
+    with jax.core.eval_context(), jax.enable_x64(True):
         found = _scan_compiled(*cast((observer, y, controls, float(dt)), np.float64))
         found = jax.tree.map(np.asarray, found)
     if not np.all(np.isfinite(found.p)):
-        first = int(np.argmin(np.all(np.isfinite(found.p.reshape(len(y), -1)), axis=1)))
+        first = int(np.argmin(np.all(np.isfinite(found.p.reshape(len(found.p), -1)), axis=1)))
         raise ValueError(
             f"robust_filter: p is not finite from interval {first} on, t = {first * dt:g} to {(first + 1) * dt:g}: the "
             "cost grows faster than the disturbances pay for it; take a larger gamma, a smaller box or a shorter record"

@@ -123,11 +123,20 @@ class Sensor:
     measurement_noise: Any
     varies: bool
 
+    def values(self, u: Control) -> jax.Array:
+        """h(u), shape (S, p)."""
+        found = jnp.asarray(self.h(u) if self.varies else self.h)
+        return found[:, None] if found.ndim == 1 else found
+
     def __call__(self, u: Control) -> jax.Array:
-        """h(u)/r."""
-        values = jnp.asarray(self.h(u) if self.varies else self.h)
-        values = values[:, None] if values.ndim == 1 else values
-        return values / self.measurement_noise
+        """h(u)/r, shape (S, p)."""
+        return self.values(u) / self.measurement_noise
+
+    def check(self, name: str, u: Control) -> None:
+        """Refuse a measurement noise that is not one of each measurement; ``name`` is for the refusal."""
+        wanted = jax.eval_shape(self.values, u).shape[1:]
+        if (got := np.shape(self.measurement_noise)) not in ((), wanted):
+            raise ValueError(f"{name}: measurement_noise has shape {got}, wanted () or {wanted}: one a column of h")
 
 
 class BeliefProblem(NamedTuple):
@@ -258,10 +267,7 @@ def _check_chain(chain: BeliefDynamics, looks: np.ndarray) -> int:
                 raise ValueError(f"belief_problem: {name} has shape {array.shape}, wanted {shape}: one row a state")
             if not np.all(np.isfinite(array)):
                 raise ValueError(f"belief_problem: {name} is not finite at u = {np.asarray(u).tolist()}")
-        if np.shape(chain.h.measurement_noise) not in ((), (sensors := np.shape(chain.h(u))[1:])):
-            raise ValueError(
-                f"belief_problem: measurement_noise has shape {np.shape(chain.h.measurement_noise)}, wanted () or {sensors}"
-            )
+        chain.h.check("belief_problem", u)
         check_generator(rates, f"belief_problem: the generator at u = {np.asarray(u).tolist()}")
     return states
 

@@ -104,6 +104,7 @@ class WonhamFilter:
                     "how likely each state is at time 0"
                 )
             law = law / law.sum()
+        _check_shapes(generator, h, sensor, len(law))
         for name, value in {"generator": fixed, "sensor": sensor, "prior": law}.items():
             object.__setattr__(self, name, value)
 
@@ -114,7 +115,10 @@ class WonhamFilter:
 
     def update(self, state: Array, u: Control, dy: Array, dt: Number) -> jax.Array:
         """π after holding the control u, shape (m,), for a time dt and seeing the increment dy, shape (p,)."""
-        belief = jnp.asarray(state)
+        return _updated(self, jnp.asarray(state), jnp.asarray(u), jnp.asarray(dy), dt)
+
+    def _after(self, belief: jax.Array, u: jax.Array, dy: jax.Array, dt: Number) -> jax.Array:
+        """π after a step."""
         mine, u = cast(self, belief.dtype), jnp.asarray(u, belief.dtype)
         half = transition_matrix(jnp.asarray(mine.generator(u), belief.dtype), dt / 2)
         gains = mine.sensor(u)
@@ -131,6 +135,9 @@ class WonhamFilter:
     def estimate(self, state: Array) -> jax.Array:
         """The conditional mean of the indicator of the hidden state: π, shape (S,)."""
         return jnp.asarray(state)
+
+
+_updated = jax.jit(WonhamFilter._after)
 
 
 @pytree_dataclass()
@@ -152,6 +159,22 @@ class HiddenPath:
     controls: Any
     measurements: Any
     cost: Any
+
+
+def _check_shapes(generator: Any, h: Any, sensor: Sensor, states: int) -> None:
+    """Refuse arrays of another number of states than the prior has; of functions nothing is known without a control."""
+    if not callable(generator) and np.shape(generator) != (states, states):
+        raise ValueError(
+            f"WonhamFilter: generator has shape {np.shape(generator)}, wanted {(states, states)}: the prior has "
+            f"{states} states"
+        )
+    if callable(h):
+        return
+    if np.ndim(h) not in (1, 2) or len(np.asarray(h)) != states:
+        raise ValueError(
+            f"WonhamFilter: h has shape {np.shape(h)}, wanted ({states},) or ({states}, p): one row a state"
+        )
+    sensor.check("WonhamFilter", np.zeros(0))
 
 
 def simulate_hidden(

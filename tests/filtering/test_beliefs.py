@@ -19,7 +19,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 @pytree_dataclass()
 class Chain:
-    """Two rate matrices and two costs, between which the control goes: numbers as leaves, so that nothing recompiles."""
+    """Rates and costs affine in the control; their numbers are leaves, so that nothing compiles again."""
 
     idle: object
     busy: object
@@ -56,7 +56,7 @@ def posed(chain, h, controls=SWITCH, discount=0.5, **options):
     return belief_problem(chain.generator, h, chain.cost, controls=controls, discount=discount, **options)
 
 
-def solved(question, tol=1e-8):
+def solved(question, tol=1e-7):
     return hjb.solve(question.problem, question.grid, tol=tol, scheme=hjb.Upwind())
 
 
@@ -75,9 +75,29 @@ def fully_observed(chain, actions, discount):
 # --- the diffusion ---
 
 
-@pytest.mark.parametrize(("states", "sensors"), [(2, 1), (2, 2), (3, 1), (3, 2), (4, 2)])
+@jax.jit
+def both_generators(question, h, noise, belief, u, weights):
+    """Those of a smooth function of π: by the problem of the belief, and by Wonham's equation; and two costs."""
+    problem, coordinates = question.problem, question.coordinates
+
+    def smooth(pi):
+        return jnp.sin(weights @ pi) + pi[0] * pi[1] ** 2
+
+    def here(x):
+        return smooth(coordinates.to_belief(x))
+
+    x, chain = coordinates.from_belief(belief), problem.drift.args[0]
+    sigma = problem.diffusion(x, u)
+    ours = problem.drift(x, u) @ jax.grad(here)(x) + jnp.trace(sigma @ sigma.T @ jax.hessian(here)(x)) / 2
+    gains = belief[:, None] * (h - belief @ h) / noise
+    theirs = chain.generator(u).T @ belief @ jax.grad(smooth)(belief)
+    theirs += jnp.trace(gains @ gains.T @ jax.hessian(smooth)(belief)) / 2
+    return ours, theirs, problem.cost(x, u), belief @ chain.running(u), coordinates.to_belief(x)
+
+
+@pytest.mark.parametrize(("states", "sensors"), [(2, 2), (3, 1), (4, 2)])
 @given(seed=SEEDS)
-@settings(max_examples=10)
+@settings(max_examples=15)
 def test_itos_formula_on_the_simplex(states, sensors, seed):
     """The generator of any smooth function of π, in the coordinates of the grid and by Wonham's equation."""
     rng = np.random.default_rng(seed)
@@ -85,26 +105,12 @@ def test_itos_formula_on_the_simplex(states, sensors, seed):
     noise = rng.uniform(0.3, 2, sensors)
     question = posed(chain, h, measurement_noise=noise)
     with jax.enable_x64(True):
-        belief, u = jnp.asarray(rng.dirichlet(np.ones(states)) * 0.9 + 0.1 / states), jnp.array([2.0])
-        weights = jnp.asarray(rng.normal(size=states))
-
-        def smooth(pi):
-            return jnp.sin(weights @ pi) + pi[0] * pi[1] ** 2
-
-        problem, coordinates = question.problem, question.coordinates
-        x = coordinates.from_belief(belief)
-        np.testing.assert_allclose(coordinates.to_belief(x), belief, atol=1e-12)
-
-        def here(x):
-            return smooth(coordinates.to_belief(x))
-
-        sigma = problem.diffusion(x, u)
-        ours = problem.drift(x, u) @ jax.grad(here)(x) + jnp.trace(sigma @ sigma.T @ jax.hessian(here)(x)) / 2
-        drift = chain.generator(u).T @ belief
-        gains = belief[:, None] * (h - belief @ h) / noise
-        theirs = drift @ jax.grad(smooth)(belief) + jnp.trace(gains @ gains.T @ jax.hessian(smooth)(belief)) / 2
-        assert float(ours) == pytest.approx(float(theirs), rel=1e-9, abs=1e-9)
-        assert float(problem.cost(x, u)) == pytest.approx(float(belief @ chain.cost(u)), rel=1e-12)
+        belief = rng.dirichlet(np.ones(states)) * 0.9 + 0.1 / states
+        asked = (belief, np.array([2.0]), rng.normal(size=states))
+        ours, theirs, cost, expected, back = map(np.asarray, both_generators(question, h, noise, *asked))
+    assert ours == pytest.approx(theirs, rel=1e-9, abs=1e-9)
+    assert cost == pytest.approx(expected, rel=1e-12)
+    np.testing.assert_allclose(back, belief, atol=1e-12)
 
 
 @given(seed=SEEDS)
@@ -148,12 +154,12 @@ def test_a_perfect_sensor_is_full_observation():
     gaps = np.array(gaps)
     assert np.all(gaps > 0)
     assert np.all(np.diff(gaps, axis=0) < 0)
-    assert np.all(gaps[-1] < 0.02 * exact)
+    assert np.all(gaps[-1] < 0.03 * exact)
 
 
 def test_the_value_is_concave_and_of_second_order_in_the_nodes():
     for value in machine_values().values():
-        assert np.max(np.diff(value, 2)) < 1e-7
+        assert np.max(np.diff(value, 2)) < 1e-6
     coarse = {n: solved(posed(machine(), [1.0, 0.0], nodes=n)).value for n in (26, 51, 101, 801)}
     errors = [np.max(np.abs(coarse[n] - coarse[801][:: 800 // (n - 1)])) for n in (26, 51, 101)]
     assert -np.polyfit(range(3), np.log2(errors), 1)[0] >= 1.5
@@ -220,7 +226,7 @@ def discrete_value(chain, h, r, actions, discount, dt, count):
         after = [p + np.exp(-discount * dt) * sum(w * np.interp(to, pi, value) for w, to in b) for p, b in tables]
         new = np.min(after, axis=0)
         if np.max(np.abs(new - value)) < 1e-6:
-            return pi, new
+            return new
         value = new
     raise AssertionError("value iteration did not end")
 
@@ -228,14 +234,13 @@ def discrete_value(chain, h, r, actions, discount, dt, count):
 def test_a_discretised_decision_problem_has_the_same_value():
     chain, h = machine(), np.array([1.0, 0.0])
     values = {}
-    for dt in (0.1, 0.05):
-        pi, values[dt] = discrete_value(chain, h, 0.5, (0.0, 2.0), 0.5, dt, 401)
-    ours = solved(posed(chain, h, measurement_noise=0.5, nodes=401)).value
+    for dt in (0.0125, 0.00625):
+        values[dt] = discrete_value(chain, h, 0.5, (0.0, 2.0), 0.5, dt, 801)
+    ours = solved(posed(chain, h, measurement_noise=0.5, nodes=801)).value
     # held longer, controls and looks cost more, in proportion to dt
-    limit = 2 * values[0.05] - values[0.1]
-    np.testing.assert_allclose(ours, limit, atol=6e-3)
-    assert np.max(np.abs(ours - limit)) < 0.5 * np.max(np.abs(ours - values[0.1]))
-    assert len(pi) == 401
+    limit = 2 * values[0.00625] - values[0.0125]
+    np.testing.assert_allclose(ours, limit, atol=1.5e-3)
+    assert np.max(np.abs(ours - limit)) < 0.25 * np.max(np.abs(ours - values[0.0125]))
 
 
 # --- three states ---

@@ -68,7 +68,12 @@ def lag_errors(count, y, u, dt, exact, scheme):
 
 
 @pytest.mark.parametrize(
-    ("scheme", "order", "finest"), [(hjb.Upwind(), 1, 0.15), (hjb.Limited(), 2, 1e-5), (hjb.Weno5(), 2.75, 4e-7)]
+    ("scheme", "order", "finest"),
+    [
+        pytest.param(hjb.Upwind(), 1, 0.15, marks=pytest.mark.slow),
+        pytest.param(hjb.Limited(), 2, 1e-5, marks=pytest.mark.slow),
+        (hjb.Weno5(), 2.75, 4e-7),
+    ],
 )
 def test_a_parabola_stays_one_for_a_lag(scheme, order, finest):
     """High slopes are exact for it: what is left falls with the inner steps, which are in proportion to h."""
@@ -102,7 +107,9 @@ def test_records_sampled_in_the_middle_are_of_second_order_in_dt():
 OSCILLATOR = np.array([[0.0, 1.0], [-1.0, -0.4]])
 
 
-@pytest.mark.parametrize(("sigma", "spread"), [(None, (1.0, 1.0)), ([[0.0], [0.8]], (0.0, 0.8))])
+@pytest.mark.parametrize(
+    ("sigma", "spread"), [pytest.param(None, (1.0, 1.0), marks=pytest.mark.slow), ([[0.0], [0.8]], (0.0, 0.8))]
+)
 def test_a_quadratic_stays_one_for_an_oscillator(sigma, spread):
     """Cross terms and all; with noise on the velocity alone, too."""
     plant = hjb.Problem(

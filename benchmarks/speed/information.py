@@ -31,12 +31,12 @@ from hjbjax.applications.convergence import fitted_order
 from hjbjax.filtering import BeliefProblem, belief_problem
 
 COLUMNS = (
-    "part", "hidden", "inverse_h", "shape", "state_feedback", "information", "nodes", "table_bytes", "bytes_per_node",
-    "steps", "seconds", "compile_seconds", "error", "exponent", "status",
+    "part", "states", "inverse_h", "hidden", "shape", "state_feedback", "information", "nodes", "table_bytes",
+    "bytes_per_node", "steps", "seconds", "compile_seconds", "error", "exponent", "status",
 )  # fmt: skip
-SIZES = {2: (11, 21, 41, 81, 161, 321, 641), 3: (11, 21, 41, 81, 161), 4: (9, 13, 19, 27)}
+SIZES = {2: (11, 21, 41, 81, 161, 321), 3: (11, 21, 41, 81, 161), 4: (9, 13, 19, 27)}
 QUICK = {2: (11, 21), 3: (7, 9)}
-TOL = 1e-5  # well below the errors of the grids
+TOL = 1e-6  # well below the errors of the grids
 LEAST = 0.05  # belief in every state, where errors are looked at: away from the faces, which the grid cuts off
 WORD = 8  # bytes of a float64
 
@@ -114,8 +114,10 @@ def _values(question: BeliefProblem, solution: hjb.Solution, beliefs: np.ndarray
 
 
 def _with_exponents(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The rows with the fitted exponent of the nodes in the error: how many it takes for half of it."""
-    known = [row for row in rows if row["error"] and row["status"] == "CONVERGED"]
+    """The rows with the fitted exponent of the nodes in the error, by grids of at most half the finest's intervals."""
+    # of a finer one the difference from the finest is much less than its error
+    finest = rows[-1]["inverse_h"] - 1
+    known = [row for row in rows if row["status"] == "CONVERGED" and 2 * (row["inverse_h"] - 1) <= finest]
     exponent = fitted_order([row["error"] for row in known], [row["nodes"] for row in known])
     return [row | {"exponent": exponent if math.isfinite(exponent) else None} for row in rows]
 

@@ -175,22 +175,15 @@ def test_the_control_of_the_belief_beats_certainty_equivalence_and_costs_its_val
     def equivalent(belief):  # as if the likelier state were the state
         return jnp.asarray(seen)[jnp.argmax(belief)][None]
 
-    keys = jax.random.split(jax.random.key(2), 2000)
-    options = {"duration": 20.0, "dt": 0.05, "key": keys, "discount": DISCOUNT}
+    keys = jax.random.split(jax.random.key(2), 600)
+    options = {"duration": 15.0, "dt": 0.1, "key": keys, "discount": DISCOUNT}
     optimal = simulate_hidden(OBSERVER, of_belief, price, **options).cost
     naive = simulate_hidden(OBSERVER, equivalent, price, **options).cost
     gain = naive - optimal  # of the same draws
-    print(
-        gain.mean(),
-        gain.std() / np.sqrt(len(keys)),
-        optimal.mean(),
-        optimal.std() / np.sqrt(len(keys)),
-        float(solution.value_at([0.5])),
-    )
     assert gain.mean() > 3 * gain.std() / np.sqrt(len(keys))
     promised = float(solution.value_at([0.5]))
-    # held for dt the control loses a little: of the order of dt
-    assert abs(optimal.mean() - promised) < 4 * optimal.std() / np.sqrt(len(keys)) + 0.03
+    # held for dt the control loses a little, and e^{−4.5} of the cost comes after the duration
+    assert abs(optimal.mean() - promised) < 4 * optimal.std() / np.sqrt(len(keys)) + 0.06
 
 
 # --- refusals ---

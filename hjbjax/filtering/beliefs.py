@@ -242,34 +242,36 @@ class Constant:
         return jnp.asarray(self.value)
 
 
-def _looks(controls: AdmissibleSet | None) -> np.ndarray:
+def _looks(controls: AdmissibleSet | None) -> jax.Array:
     """Controls at which the functions are looked at, shape (K, m): all of a finite set, samples of a continuum."""
-    if controls is None:
-        return np.zeros((1, 0))
-    return np.asarray(sets.samples(controls, LOOKS))
+    return jnp.asarray(np.zeros((1, 0)) if controls is None else sets.samples(controls, LOOKS))
 
 
-def _check_chain(chain: BeliefDynamics, looks: np.ndarray) -> int:
-    """The number of states S; refuses what is no chain at one of the controls."""
-    for u in jnp.asarray(looks):
-        rates = np.asarray(chain.generator(u))
-        states = len(rates) if rates.ndim else 0
-        if rates.shape != (states, states) or states < 2:
-            raise ValueError(f"belief_problem: generator returns shape {rates.shape}, wanted (S, S) with S ≥ 2")
-        for name, array, wanted in (
-            ("generator", rates, rates.shape),
-            ("cost", np.asarray(chain.running(u)), (states,)),
-            ("h", np.asarray(chain.h.h(u) if chain.h.varies else chain.h.h), None),
-        ):
-            fits = array.shape[:1] == (states,) and array.ndim <= 2 if wanted is None else array.shape == wanted
-            if not fits:
-                shape = wanted or f"({states},) or ({states}, p)"
-                raise ValueError(f"belief_problem: {name} has shape {array.shape}, wanted {shape}: one row a state")
-            if not np.all(np.isfinite(array)):
-                raise ValueError(f"belief_problem: {name} is not finite at u = {np.asarray(u).tolist()}")
+def _check_chain(chain: BeliefDynamics, looks: jax.Array) -> int:
+    """The number of states S; refuses what is no chain at one of the controls. Of traced arrays shapes are known alone."""
+    states = 0
+    for u in looks:
+        rates = chain.generator(u)
+        states = rates.shape[0] if np.ndim(rates) else 0
+        if np.shape(rates) != (states, states) or states < 2:
+            raise ValueError(f"belief_problem: generator returns shape {np.shape(rates)}, wanted (S, S) with S ≥ 2")
+        _check_rows("generator", rates, ((states, states),), u)
+        _check_rows("cost", chain.running(u), ((states,),), u)
+        h = chain.h.h(u) if chain.h.varies else chain.h.h
+        _check_rows("h", h, ((states,), (states, np.shape(h)[-1] if np.ndim(h) else 1)), u)
         chain.h.check("belief_problem", u)
-        check_generator(rates, f"belief_problem: the generator at u = {np.asarray(u).tolist()}")
+        if not is_traced(rates):
+            check_generator(np.asarray(rates), f"belief_problem: the generator at u = {np.asarray(u).tolist()}")
     return states
+
+
+def _check_rows(name: str, array: Any, wanted: tuple, u: jax.Array) -> None:
+    """Refuse an array of another shape than those that are wanted, or with numbers that are not finite."""
+    if np.shape(array) not in wanted:
+        shapes = " or ".join(str(each) for each in wanted)
+        raise ValueError(f"belief_problem: {name} has shape {np.shape(array)}, wanted {shapes}: one row a state")
+    if not is_traced(array) and not np.all(np.isfinite(np.asarray(array))):
+        raise ValueError(f"belief_problem: {name} is not finite at u = {np.asarray(u).tolist()}")
 
 
 def check_generator(rates: np.ndarray, name: str) -> None:
@@ -293,12 +295,16 @@ def check_generator(rates: np.ndarray, name: str) -> None:
         )
 
 
-def _common_axes(sensor: Sensor, looks: np.ndarray, states: int) -> np.ndarray:
+def _common_axes(sensor: Sensor, looks: jax.Array, states: int) -> np.ndarray:
     """B, shape (S − 1, S): an orthonormal basis of the vectors with sum zero, along which noises are not correlated."""
+    seen = [sensor(u) for u in looks]
+    if is_traced(seen):
+        raise ValueError(
+            f"belief_problem: h or measurement_noise is traced; with {states} states they set the axes of the grid and must "
+            "be known numbers"
+        )
     centring = np.eye(states) - 1 / states
-    covariances = [
-        centring @ gains @ gains.T @ centring for gains in (np.asarray(sensor(u)) for u in jnp.asarray(looks))
-    ]
+    covariances = [centring @ gains @ gains.T @ centring for gains in map(np.asarray, seen)]
     # unequal weights: eigenvectors of a sum are common to all parts only if no two parts make up for each other
     weights = [1 / np.sqrt(2 + k) for k in range(len(covariances))]
     size = max(max(np.abs(each).max() for each in covariances), np.finfo(float).tiny)

@@ -144,7 +144,7 @@ class RobustGridFilter:
 
     def estimate(self, state: Field) -> State:
         """The worst case: the state where p is largest, shape (n,), refined between the nodes."""
-        return refined_maximum(state, cast(self.grid, state.dtype))[1]
+        return _largest(state, cast(self.grid, state.dtype))[1]
 
     def _after(self, p: Field, u: Control, y: Array, dt: Number) -> Field:
         """p a time dt later, with control and measurement held."""
@@ -165,7 +165,7 @@ class RobustGridFilter:
         ).after(p, dt)
 
 
-_after = jax.jit(RobustGridFilter._after)
+_after, _largest = jax.jit(RobustGridFilter._after), jax.jit(refined_maximum)
 
 
 def robust_filter(

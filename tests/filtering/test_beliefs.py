@@ -201,6 +201,24 @@ def test_a_sensor_that_costs_is_switched_on_only_where_it_pays():
     assert np.max(blind - solution.value) > 0.05
 
 
+def test_the_value_has_derivatives_in_the_numbers_of_the_chain():
+    """In the failure rate and in the noise of the sensor, against differences."""
+
+    def worth(rate, noise):
+        base = machine()
+        idle = jnp.stack([jnp.stack([-rate, rate]), jnp.zeros(2)])
+        question = posed(Chain(idle, base.busy, base.costs), [1.0, 0.0], measurement_noise=noise, nodes=51)
+        return hjb.solve(question.problem, question.grid, tol=1e-9, throw=False, scheme=hjb.Upwind()).value[25]
+
+    with jax.enable_x64(True):
+        slopes = jax.grad(worth, argnums=(0, 1))(0.2, 1.0)
+        step = 1e-4
+        rate = (worth(0.2 + step, 1.0) - worth(0.2 - step, 1.0)) / (2 * step)
+        noise = (worth(0.2, 1.0 + step) - worth(0.2, 1.0 - step)) / (2 * step)
+    assert float(slopes[0]) == pytest.approx(float(rate), rel=1e-3)
+    assert float(slopes[1]) == pytest.approx(float(noise), rel=1e-3)
+
+
 # --- another way to the answer ---
 
 
@@ -299,7 +317,7 @@ def test_a_third_state_that_is_as_the_second_changes_nothing():
         ({"generator": [[-1.0, 2.0], [0.0, 0.0]]}, r"has a row 0 that sums to 1, wanted zero"),
         ({"generator": [-1.0, 2.0]}, r"generator returns shape \(2,\), wanted \(S, S\)"),
         ({"generator": [[np.nan, 1.0], [0.0, 0.0]]}, r"generator is not finite"),
-        ({"h": [1.0, 2.0, 3.0]}, r"h has shape \(3,\), wanted \(2,\) or \(2, p\)"),
+        ({"h": [1.0, 2.0, 3.0]}, r"h has shape \(3,\), wanted \(2,\) or \(2, 3\)"),
         ({"cost": lambda u: u[0]}, r"cost has shape \(\), wanted \(2,\)"),
         ({"discount": 0.0}, r"discount = 0.0; wanted a finite number > 0, per unit time"),
         ({"measurement_noise": 0.0}, r"measurement_noise = 0.0; wanted finite numbers > 0"),

@@ -186,6 +186,37 @@ def test_the_control_of_the_belief_beats_certainty_equivalence_and_costs_its_val
     assert abs(optimal.mean() - promised) < 4 * optimal.std() / np.sqrt(len(keys)) + 0.06
 
 
+def worn(u):
+    """Good, worn, failed: the second wears faster, and a repair makes all of them new."""
+    wear = np.array([[-0.3, 0.2, 0.1], [0.0, -0.4, 0.4], [0.0, 0.0, 0.0]])
+    return jnp.asarray(wear) + u[0] * jnp.array([[0.0, 0.0, 0.0], [0.5, -0.5, 0.0], [1.0, 0.0, -1.0]])
+
+
+def worn_price(u):
+    return jnp.array([0.0, 0.4, 1.5]) + u[0] * jnp.array([1.0, 1.0, 0.2])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("prior", [[0.8, 0.1, 0.1], [0.2, 0.3, 0.5]])
+def test_three_states_cost_in_simulation_what_the_value_in_logarithms_promises(prior):
+    """Ito's terms and all: paths of the chain and of its filter know nothing of the coordinates."""
+    question = belief_problem(
+        worn, [1.0, 0.4, 0.0], worn_price, controls=hjb.Finite([[0.0], [2.0]]), discount=0.5, measurement_noise=0.7,
+        nodes=161,
+    )  # fmt: skip
+    solution = hjb.solve(question.problem, question.grid, tol=1e-5, scheme=hjb.Upwind())
+
+    def of_belief(belief):
+        return solution.control_at(question.coordinates.from_belief(belief), clamp=True)
+
+    observer = WonhamFilter(worn, [1.0, 0.4, 0.0], prior, measurement_noise=0.7)
+    keys = jax.random.split(jax.random.key(5), 4000)
+    cost = simulate_hidden(observer, of_belief, worn_price, duration=16.0, dt=0.02, key=keys, discount=0.5).cost
+    promised = float(solution.value_at(question.coordinates.from_belief(np.array(prior))))
+    print(cost.mean(), cost.std() / np.sqrt(4000), promised)
+    assert abs(cost.mean() - promised) < 4 * cost.std() / np.sqrt(4000) + 0.01
+
+
 # --- refusals ---
 
 

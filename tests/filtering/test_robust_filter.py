@@ -160,7 +160,7 @@ def test_brute_force_over_all_paths_agrees(reach, name):
     fine = np.linspace(-reach, reach, int(500 * reach) + 1)
     theirs = brute_force(
         lambda x: np.sin(2 * x) - 0.5 * x, lambda x: 0.2 * np.cos(x), lambda x: x + 0.2 * x**3, fine,
-        -2.0 * (fine - 0.2) ** 2, record, 0.2, 3, gamma, sigma,
+        -2.0 * (fine - 0.2) ** 2, record, 0.2, 4, gamma, sigma,
     )  # fmt: skip
     grid = hjb.Grid([-reach], [reach], (int(40 * reach) + 1,))
     state = robust_filter(
@@ -171,7 +171,7 @@ def test_brute_force_over_all_paths_agrees(reach, name):
     # the oracle is of second order in its steps: with half of them it is off by a quarter
     assert np.max((np.abs(state.p[-1] - there) / (1 + np.abs(there)))[grid.inner(0.9)]) < 1.5e-3
     assert abs(state.value[-1] - theirs.max()) < 3e-3
-    assert abs(state.worst_case[-1, 0] - fine[np.argmax(theirs)]) < 1e-2
+    assert abs(state.worst_case[-1, 0] - fine[np.argmax(theirs)]) < 2e-2
 
 
 # --- laws ---
@@ -234,10 +234,10 @@ def test_the_observer_is_the_filter_and_records_come_in_batches():
     rng = np.random.default_rng(3)
     y, u = rng.normal(size=(4, 5, 2)), rng.uniform(-1, 1, (4, 5, 1))
     p0 = -rng.uniform(size=RING.shape)
-    one = [filtered(p0, *each, scheme=hjb.Weno5()) for each in zip(y, u, strict=True)]
+    one = [filtered(p0, *each) for each in zip(y, u, strict=True)]
     with jax.enable_x64(True):
-        many = jax.vmap(lambda y, u: filtered(p0, y, u, scheme=hjb.Weno5()))(y, u)
-        observer = RobustGridFilter(PLANT, angle, RING, p0, 1.2)
+        many = jax.vmap(lambda y, u: filtered(p0, y, u))(y, u)
+        observer = RobustGridFilter(PLANT, angle, RING, p0, 1.2, scheme=hjb.Upwind())
         assert isinstance(observer, Observer)
         state, update = observer.initial(), jax.jit(observer.update)
         for number in range(5):
@@ -263,10 +263,14 @@ def test_a_function_that_reads_a_number_from_elsewhere_is_looked_at_again():
 
     record = np.full((5, 1), 0.5)
     plant = hjb.Problem(lambda x, u: Gain.value * -x)
-    ask = lambda: robust_filter(plant, lambda x: x, hjb.Grid([-3.0], [3.0], (31,)), record, 0.2, prior, gamma=2.0)  # noqa: E731
-    first = ask().value[-1]
+    grid = hjb.Grid([-3.0], [3.0], (31,))
+
+    def largest():
+        return robust_filter(plant, lambda x: x, grid, record, 0.2, prior, gamma=2.0, scheme=hjb.Upwind()).value[-1]
+
+    first = largest()
     Gain.value = -1.0
-    assert ask().value[-1] != first
+    assert largest() != first
 
 
 # --- maxima between the nodes ---

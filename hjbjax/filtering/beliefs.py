@@ -248,7 +248,7 @@ def _looks(controls: AdmissibleSet | None) -> jax.Array:
 
 
 def _check_chain(chain: BeliefDynamics, looks: jax.Array) -> int:
-    """The number of states S; refuses what is no chain at one of the controls. Of traced arrays shapes are known alone."""
+    """The number of states S; refuses what is no chain at one of the controls. Of traced arrays it sees the shapes."""
     states = 0
     for u in looks:
         rates = chain.generator(u)
@@ -300,8 +300,8 @@ def _common_axes(sensor: Sensor, looks: jax.Array, states: int) -> np.ndarray:
     seen = [sensor(u) for u in looks]
     if is_traced(seen):
         raise ValueError(
-            f"belief_problem: h or measurement_noise is traced; with {states} states they set the axes of the grid and must "
-            "be known numbers"
+            f"belief_problem: h or measurement_noise is traced; with {states} states they set the axes of the grid and "
+            "must be known numbers"
         )
     centring = np.eye(states) - 1 / states
     covariances = [centring @ gains @ gains.T @ centring for gains in map(np.asarray, seen)]

@@ -180,6 +180,7 @@ def test_random_chains_lie_between_full_and_no_observation(seed):
     assert np.max(np.diff(value, 2)) <= 1e-6
 
 
+@pytest.mark.slow
 def test_a_sensor_that_costs_is_switched_on_only_where_it_pays():
     """Dual control: h(u) = u₂ (1, 0) at a price; worth nothing where the state is known."""
     base = machine()
@@ -201,6 +202,7 @@ def test_a_sensor_that_costs_is_switched_on_only_where_it_pays():
     assert np.max(blind - solution.value) > 0.05
 
 
+@pytest.mark.slow
 def test_the_value_has_derivatives_in_the_numbers_of_the_chain():
     """In the failure rate and in the noise of the sensor, against differences."""
 
@@ -285,6 +287,7 @@ def test_three_states_between_full_and_no_observation_and_on_edges_those_of_two(
     assert np.mean(unseen - values) > 0.02
 
 
+@pytest.mark.slow
 def test_a_third_state_that_is_as_the_second_changes_nothing():
     """Two equal states are one: V(π₁, π₂ + π₃) of the chain of two."""
     two = machine()

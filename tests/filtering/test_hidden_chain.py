@@ -213,7 +213,6 @@ def test_three_states_cost_in_simulation_what_the_value_in_logarithms_promises(p
     keys = jax.random.split(jax.random.key(5), 4000)
     cost = simulate_hidden(observer, of_belief, worn_price, duration=16.0, dt=0.02, key=keys, discount=0.5).cost
     promised = float(solution.value_at(question.coordinates.from_belief(np.array(prior))))
-    print(cost.mean(), cost.std() / np.sqrt(4000), promised)
     assert abs(cost.mean() - promised) < 4 * cost.std() / np.sqrt(4000) + 0.01
 
 

@@ -87,6 +87,7 @@ def test_a_parabola_stays_one_for_a_lag(scheme, order, finest):
     assert errors[-1, 2] < finest
 
 
+@pytest.mark.slow
 def test_records_sampled_in_the_middle_are_of_second_order_in_dt():
     def y(t):
         return np.array([np.sin(2 * t)])
@@ -107,9 +108,7 @@ def test_records_sampled_in_the_middle_are_of_second_order_in_dt():
 OSCILLATOR = np.array([[0.0, 1.0], [-1.0, -0.4]])
 
 
-@pytest.mark.parametrize(
-    ("sigma", "spread"), [pytest.param(None, (1.0, 1.0), marks=pytest.mark.slow), ([[0.0], [0.8]], (0.0, 0.8))]
-)
+@pytest.mark.parametrize(("sigma", "spread"), [(None, (1.0, 1.0)), ([[0.0], [0.8]], (0.0, 0.8))])
 def test_a_quadratic_stays_one_for_an_oscillator(sigma, spread):
     """Cross terms and all; with noise on the velocity alone, too."""
     plant = hjb.Problem(
@@ -213,6 +212,7 @@ def test_an_interval_of_any_length_is_stable():
     np.testing.assert_allclose(whole.p[0], parts.p[-1], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_stretched_axes_and_other_schemes():
     exact = riccati(
         np.array([[A]]), np.eye(1), np.ones(1), np.array([[Q]]), np.array([[C]]), GAMMA,

@@ -8,14 +8,14 @@ Read ``observers`` first: the extended Kalman filter, the Luenberger observer, a
 observer and control stands with the other closed loops, in ``hjbjax.feedback.output_feedback``.
 """
 
+from hjbjax.feedback.output_feedback import simulate_output
+from hjbjax.feedback.output_loop import OutputPath
 from hjbjax.filtering.beliefs import BeliefCoordinates, BeliefProblem, belief_problem
 from hjbjax.filtering.grid_filter import Density, GridFilter
 from hjbjax.filtering.hidden_chain import HiddenPath, WonhamFilter, simulate_hidden
 from hjbjax.filtering.information_state import InformationState, zakai
 from hjbjax.filtering.max_plus import sup_pairing
 from hjbjax.filtering.observers import ExtendedKalman, Gaussian, Luenberger, Observer
-from hjbjax.filtering.output_feedback import simulate_output
-from hjbjax.filtering.output_loop import OutputPath
 from hjbjax.filtering.robust_filter import RobustGridFilter, RobustState, robust_filter
 
 __all__ = [

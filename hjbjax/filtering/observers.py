@@ -4,54 +4,40 @@
 
 An observer holds an information state, any pytree of arrays. It sees the control that was held over a step and the
 increment dy of the record, and nothing else. Steps on which the drift is affine are made exactly, whatever their
-length: see ``affine_flow``.
+length: with dξ = (F ξ + g) dt + dw, W dt the covariance of dw, so are
 
-An observer of your own is an object with three methods, see ``Observer``; make it a pytree (``pytree_dataclass``), and
-other numbers in it compile nothing anew.
+    Φ = e^{F t},    s = ∫₀ᵗ e^{F σ} g dσ,    Q = ∫₀ᵗ e^{F σ} W e^{Fᵀ σ} dσ
+
+by Taylor series on a short piece and doublings,
+
+    s(2t) = s + Φ s,    Q(2t) = Q + Φ Q Φᵀ,    Φ(2t) = Φ²,
+
+which add covariances and subtract nothing, so that no step is too long, unlike with C. F. Van Loan's exponential of
+[−F, W; 0, Fᵀ], whose e^{−F t} overflows for a stiff system.
+
+An observer of your own is an object with three methods, see ``output_loop.Observer``; make it a pytree
+(``pytree_dataclass``), and other numbers in it compile nothing anew.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.filtering.affine_flow import affine_flow
-from hjbjax.filtering.measurement import Measurement, measurement, plant
+from hjbjax.feedback.measurement import Measurement, measurement, plant
+from hjbjax.feedback.output_loop import Observer
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, is_traced, numbers, pytree_dataclass
 from hjbjax.problem.types import Array, Control, Number, Numbers, State
 
+__all__ = ["ExtendedKalman", "Gaussian", "Luenberger", "Observer", "affine_flow"]
+
+SHORT = 0.25  # of the piece, |F| t: the series of Q then falls like ½^j/j!
+TERMS = 14  # of the series: what is left is ½^15/15!, 2e-17
+DOUBLINGS = 64  # at most: a piece 2^64 times shorter than the step is no longer told from none
 ROUNDINGS = 64  # units of eps: what rounding may leave of symmetry and of a zero eigenvalue in a covariance
-
-
-@runtime_checkable
-class Observer(Protocol):
-    """A state estimator in discrete steps: pure functions, for ``jit``, ``vmap`` and ``lax.scan``.
-
-    Example:
-      >>> @pytree_dataclass()
-      ... class LowPass:  # takes the measurement for the state, smoothed over a time
-      ...     time: float
-      ...     def initial(self):
-      ...         return jnp.zeros(1)
-      ...     def update(self, state, u, dy, dt):
-      ...         return state + (1 - jnp.exp(-dt / self.time)) * (dy / dt - state)
-      ...     def estimate(self, state):
-      ...         return state
-      >>> isinstance(LowPass(0.5), Observer)
-      True
-    """
-
-    def initial(self) -> Any:
-        """The information state at t = 0, any pytree of arrays."""
-
-    def update(self, state: Any, u: Control, dy: Array, dt: Number) -> Any:
-        """The information state after holding the control u (m,) for dt and seeing the increment dy (p,)."""
-
-    def estimate(self, state: Any) -> State:
-        """The point estimate of x, shape (n,)."""
 
 
 @pytree_dataclass()
@@ -228,6 +214,47 @@ class Luenberger:
     def estimate(self, state: State) -> State:
         """x̂ itself."""
         return state
+
+
+def affine_flow(matrix: Array, source: Array, noise: Array, dt: Number, *, states: int) -> tuple[Array, Array, Array]:
+    """Φ, s and Q after the time dt, shapes (k, k), (k,) and (k, k).
+
+    Args:
+      matrix: F, shape (k, k); of its columns only the first ``states`` need not be zero.
+      source: g, shape (k,).
+      noise: W, shape (k, k), symmetric and not negative.
+      dt: the length of the step, in units of time.
+      states: the number of entries that feed back. The others are integrals of them, whose units do not count for
+        the number of doublings, and cost no rounding.
+    """
+    inner = jnp.abs(matrix[:states, :states])
+    # both bound the spectral radius; the lesser one, as states may have units far apart
+    rate = jnp.minimum(jnp.max(jnp.sum(inner, axis=0)), jnp.max(jnp.sum(inner, axis=1)))
+    halvings = jnp.ceil(jnp.log2(jnp.maximum(rate * dt / SHORT, 1)))
+    halvings = jnp.where(jnp.isfinite(halvings), jnp.clip(halvings, 0, DOUBLINGS), 0)
+    piece = dt * jnp.exp2(-halvings)
+
+    def add(j: int, carry: tuple) -> tuple:
+        # t^j F^j/j!, t^{j+1} F^j g/(j+1)! and the same of Q: T_{j+1} = F T_j + T_j Fᵀ
+        sums, (power, push, spread) = carry[:3], carry[3]
+        half = matrix @ spread
+        power, push, spread = (
+            matrix @ power * (piece / j), matrix @ push * (piece / (j + 1)), (half + half.T) * (piece / (j + 1))
+        )  # fmt: skip
+        return sums[0] + power, sums[1] + push, sums[2] + spread, (power, push, spread)
+
+    first = jnp.eye(len(source), dtype=matrix.dtype), piece * source, piece * noise
+    transition, shift, covariance, _ = jax.lax.fori_loop(1, TERMS, add, (*first, first))
+
+    def double(_: int, carry: tuple) -> tuple:
+        transition, shift, covariance = carry
+        return (
+            transition @ transition,
+            shift + transition @ shift,
+            covariance + transition @ covariance @ transition.T,
+        )
+
+    return jax.lax.fori_loop(0, halvings.astype(jnp.int32), double, (transition, shift, covariance))
 
 
 def _start(given: Numbers | Sequence[float], name: str) -> Any:

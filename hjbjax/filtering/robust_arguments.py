@@ -1,6 +1,5 @@
 """What the robust filter is given, checked before anything is compiled."""
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -11,7 +10,7 @@ from hjbjax.discretisation import schemes
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_partial, cast, is_traced, numbers
+from hjbjax.problem.pytree import cast, is_traced, numbers
 from hjbjax.tracing import checks, components
 
 
@@ -41,16 +40,6 @@ def check_question(problem: object, grid: object, scheme: Any) -> None:
             raise ValueError(
                 f"robust_filter: axis {axis} has {count} points; {type(scheme).__name__} needs at least {scheme.points}"
             )
-
-
-def measurements(h: Callable, n: int) -> int:
-    """The number of measurements p, by a trace of h on one state."""
-    function: Any = as_partial(h, "robust_filter: h")
-    with jax.enable_x64(True):
-        shape = jax.eval_shape(function, jax.ShapeDtypeStruct((n,), np.float64)).shape
-    if len(shape) != 1 or shape[0] == 0:
-        raise ValueError(f"robust_filter: h returns shape {shape}, wanted (p,): one number a measurement, as in x[:1]")
-    return shape[0]
 
 
 def initial_values(initial: Any, grid: Grid) -> Any:
@@ -102,20 +91,6 @@ def gains(problem: Problem, sigma: Any, n: int) -> Any:
             "a diagonal one: each column of σ acts on one axis; turn the state's axes so that it does"
         )
     return np.sqrt(np.diag(a))
-
-
-def spread(noise: Any, count: int) -> Any:
-    """r for each of the measurements, shape (p,)."""
-    array: Any = numbers(noise, "robust_filter: measurement_noise")
-    if array.ndim > 1 or (array.ndim == 1 and array.shape != (count,)):
-        raise ValueError(f"robust_filter: measurement_noise has shape {array.shape}, wanted () or ({count},)")
-    if is_traced(array):
-        return jnp.broadcast_to(array, (count,))
-    if not np.all(np.isfinite(array) & (array > 0)):
-        raise ValueError(
-            f"robust_filter: measurement_noise = {array.tolist()}; wanted finite numbers > 0, as h is measured"
-        )
-    return np.broadcast_to(array, (count,)).copy()
 
 
 def record_of(y: Any, count: int) -> Any:

@@ -30,12 +30,13 @@ import numpy as np
 
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.schemes import Weno5
+from hjbjax.feedback.measurement import Measurement, measurement
 from hjbjax.filtering import robust_arguments
 from hjbjax.filtering.max_plus import MaxPlusMarch, refined_maximum
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_partial, cast, is_traced, pytree_dataclass
+from hjbjax.problem.pytree import cast, is_traced, pytree_dataclass
 from hjbjax.problem.types import Array, Control, Field, Nodes, Number, Numbers, State
 from hjbjax.tracing import components
 from hjbjax.tracing.closures import settled
@@ -77,7 +78,7 @@ class RobustGridFilter:
     Keyword Args:
       sigma: the gain of w: a number, one an axis (n,), or a matrix (n, k) with σσᵀ diagonal. ``None``: the noise of the
         problem, and without noise the identity.
-      measurement_noise: r, a number or one a measurement (p,), in the units of h.
+      measurement_noise: r: a number, one a measurement (p,), or a matrix (p, p), in the units of h.
       scheme: slopes: ``Weno5()``, fifth order where p is smooth; ``Limited()``, second; ``Upwind()``, first, monotone.
 
     Raises:
@@ -95,12 +96,11 @@ class RobustGridFilter:
     """
 
     problem: Problem
-    h: Any
+    measurement: Measurement
     grid: Grid
     p0: Any
     gamma: Any
     sigma: Any
-    measurement_noise: Any
     scheme: Scheme
 
     def __init__(
@@ -116,17 +116,14 @@ class RobustGridFilter:
         scheme: Scheme = Weno5(),
     ):
         robust_arguments.check_question(problem, grid, scheme)
-        measured = as_partial(h, "robust_filter: h")
         arguments.positive(gamma, "robust_filter: gamma")
-        count = robust_arguments.measurements(h, grid.ndim)
         fields = {
             "problem": problem,
-            "h": measured,
+            "measurement": measurement(h, grid.ndim, measurement_noise, "robust_filter"),
             "grid": grid,
             "p0": robust_arguments.initial_values(initial, grid),
             "gamma": gamma,
             "sigma": robust_arguments.gains(problem, sigma, grid.ndim),
-            "measurement_noise": robust_arguments.spread(measurement_noise, count),
             "scheme": scheme,
         }
         for name, value in fields.items():
@@ -151,10 +148,10 @@ class RobustGridFilter:
         mine = cast(self, p.dtype)
         on = Discretisation(mine.problem, mine.grid, self.scheme, p.dtype)
         entries = [u[k] for k in range(u.shape[0])]
-        seen = components.components(mine.h, on.coordinates(), dtype=p.dtype)
-        misfit: Any = 0.0
-        for k, at_node in enumerate(seen):
-            misfit = misfit + ((y[k] - at_node) / mine.measurement_noise[k]) ** 2
+        seen = components.components(mine.measurement.h, on.coordinates(), dtype=p.dtype)
+        errors = [y[k] - at_node for k, at_node in enumerate(seen)]
+        whitening = mine.measurement.whitened(jnp.eye(len(errors), dtype=p.dtype))  # r⁻¹
+        misfit = sum(sum(row[k] * error for k, error in enumerate(errors)) ** 2 for row in whitening)
         # slopes alone are asked of the scheme: noise would make some of them central, wrong without second derivatives
         bare = dataclasses.replace(on, problem=Problem(mine.problem.drift))
         return MaxPlusMarch(
@@ -201,7 +198,7 @@ def robust_filter(
       gamma: γ > 0: a smaller one gives the disturbances more room.
       controls: the controls that were held, shape (k, m); wanted exactly when the problem has controls.
       sigma: the gain of w, as in ``RobustGridFilter``; ``None``: the noise of the problem, else the identity.
-      measurement_noise: r, a number or one a measurement (p,), in the units of h.
+      measurement_noise: r: a number, one a measurement (p,), or a matrix (p, p), in the units of h.
       scheme: how slopes are made.
 
     Returns:
@@ -226,17 +223,16 @@ def robust_filter(
     """
     options: Any = {"sigma": sigma, "measurement_noise": measurement_noise, "scheme": scheme}
     robust_arguments.check_question(problem, grid, scheme)
-    robust_arguments.measurements(h, grid.ndim)
-    # h in the place of a target, which is a function of the state as well: both are looked at again in every call
-    asked = settled(Problem(problem.drift, problem.cost, problem.controls, noise=problem.noise, target=h), grid.ndim)
-    observer = RobustGridFilter(asked, asked.target, grid, initial, gamma, **options)
+    # its functions are looked at again in every call, as h is
+    asked = settled(Problem(problem.drift, problem.cost, problem.controls, noise=problem.noise), grid.ndim)
+    observer = RobustGridFilter(asked, h, grid, initial, gamma, **options)
     if not is_traced(dt):
         arguments.positive(dt, "robust_filter: dt", "in units of time")
     y, controls = (
-        robust_arguments.record_of(y, np.shape(observer.measurement_noise)[0]),
+        robust_arguments.record_of(y, observer.measurement.dim),
         robust_arguments.controls_of(problem, controls, np.shape(y)),
     )
-    if is_traced(asked, grid, y, dt, observer.p0, gamma, controls, sigma, measurement_noise):
+    if is_traced(asked, observer.measurement, grid, y, dt, observer.p0, gamma, controls, sigma):
         return _scan(observer, jnp.asarray(y), jnp.asarray(controls), dt)
     # inside somebody's ``jit`` a record of known numbers is filtered at once
     with jax.core.eval_context(), jax.enable_x64(True):

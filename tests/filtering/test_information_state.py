@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from systems import SEEDS, random_grid, random_problem
 
-from hjbjax.filtering import moments
+from hjbjax.filtering import forward_equation
 from hjbjax.filtering.information_state import GridFilter, zakai
 from hjbjax.filtering.observers import Observer
 from hjbjax.markov_chain import chain
@@ -266,11 +266,11 @@ def test_means_on_a_ring_are_circular():
     p = along[:, None] * np.array([0.0, 1.0, 2.0, 1.0, 0.0])
     with jax.enable_x64(True):
         p = jnp.asarray(p / p.sum())
-        np.testing.assert_allclose(moments.mean(grid, p), [3.0, 0.0], atol=1e-9)
-        np.testing.assert_allclose(moments.covariance(grid, p), np.diag([0.04, 0.125]), atol=1e-9)
+        np.testing.assert_allclose(forward_equation.mean(grid, p), [3.0, 0.0], atol=1e-9)
+        np.testing.assert_allclose(forward_equation.covariance(grid, p), np.diag([0.04, 0.125]), atol=1e-9)
         turned = jnp.roll(p, 57, axis=0)
-        np.testing.assert_allclose(moments.covariance(grid, turned), np.diag([0.04, 0.125]), atol=1e-9)
-        np.testing.assert_allclose(moments.mode(grid, turned), [x[(np.argmax(along) + 57) % 400], 0.0])
+        np.testing.assert_allclose(forward_equation.covariance(grid, turned), np.diag([0.04, 0.125]), atol=1e-9)
+        np.testing.assert_allclose(forward_equation.mode(grid, turned), [x[(np.argmax(along) + 57) % 400], 0.0])
 
 
 def test_a_phase_that_runs_round_is_followed():

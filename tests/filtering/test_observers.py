@@ -9,8 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import block_diag, expm
 from systems import SEEDS
 
-from hjbjax.filtering.affine_flow import affine_flow
-from hjbjax.filtering.observers import ExtendedKalman, Gaussian, Luenberger, Observer
+from hjbjax.filtering.observers import ExtendedKalman, Gaussian, Luenberger, Observer, affine_flow
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Box

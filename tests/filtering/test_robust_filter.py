@@ -295,7 +295,7 @@ GAME = hjb.Problem(lambda x, u, d: u + d, None, hjb.Box([-1.0], [1.0]), disturba
         ({"y": np.zeros(5)}, r"y has shape \(5,\), wanted \(k, 1\)"),
         ({"controls": None}, r"got controls none, wanted \(5, 1\)"),
         ({"controls": np.full((5, 1), np.inf)}, r"controls hold numbers that are not finite"),
-        ({"h": lambda x: x[0]}, r"h returns shape \(\), wanted \(p,\)"),
+        ({"h": lambda x: x[0]}, r"h\(x\) returned float64 numbers of shape \(\), wanted .* of shape \(p,\)"),
         ({"initial": lambda x: jnp.where(x[0] > 0, -jnp.inf, 0.0)}, r"initial is -inf at some node"),
         ({"initial": np.full(41, np.inf)}, r"initial is inf at some node"),
         ({"initial": np.zeros(40)}, r"initial has shape \(40,\), wanted \(41,\)"),
@@ -306,7 +306,7 @@ GAME = hjb.Problem(lambda x, u, d: u + d, None, hjb.Box([-1.0], [1.0]), disturba
         ({"grid": hjb.Grid([-4.0], [4.0], (5,))}, r"axis 0 has 5 points; Weno5 needs at least 7"),
         ({"sigma": -1.0}, r"sigma = -1.0; wanted finite numbers ≥ 0"),
         ({"sigma": [1.0, 1.0]}, r"sigma has shape \(2,\), wanted \(\), \(1,\) or \(1, k\)"),
-        ({"measurement_noise": 0.0}, r"measurement_noise = 0.0; wanted finite numbers > 0"),
+        ({"measurement_noise": 0.0}, r"got measurement_noise = 0.0, wanted finite numbers > 0"),
         ({"problem": GAME}, r"got a problem with an opponent, wanted drift \(x, u\)"),
         (
             {"problem": hjb.Problem(lambda t, x, u: u, None, LAG.controls, time_dependent=True)},

@@ -7,23 +7,50 @@ The plant moves in sub-steps τ by the predictor and corrector of E. Platen with
     x̃ = x + f(x) τ + σ(x) Δw,    x ← x + ½ (f(x) + f(x̃)) τ + σ(x) Δw,
 
 of weak order 1 and of order 2 where there is no noise; dy and the running cost are integrated by the trapezoidal rule
-at the same points. With noise a target is also met between two points, by a draw of its own, see ``first_passage``.
+at the same points. With noise a target is also met between two points, by a draw of its own, see ``loop``.
 """
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 
-from hjbjax.feedback import first_passage
-from hjbjax.feedback.loop import Loop
+from hjbjax.feedback.loop import BridgeDraw, Loop, meeting_flag, onto_edge
+from hjbjax.feedback.measurement import Measurement
 from hjbjax.feedback.path import PathStatus
-from hjbjax.filtering.measurement import Measurement
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import Array, Control, Key, Number, State
+
+
+@runtime_checkable
+class Observer(Protocol):
+    """A state estimator in discrete steps: pure functions, for ``jit``, ``vmap`` and ``lax.scan``.
+
+    Example:
+      >>> @pytree_dataclass()
+      ... class LowPass:  # takes the measurement for the state, smoothed over a time
+      ...     time: float
+      ...     def initial(self):
+      ...         return jnp.zeros(1)
+      ...     def update(self, state, u, dy, dt):
+      ...         return state + (1 - jnp.exp(-dt / self.time)) * (dy / dt - state)
+      ...     def estimate(self, state):
+      ...         return state
+      >>> isinstance(LowPass(0.5), Observer)
+      True
+    """
+
+    def initial(self) -> Any:
+        """The information state at t = 0, any pytree of arrays."""
+
+    def update(self, state: Any, u: Control, dy: Array, dt: Number) -> Any:
+        """The information state after holding the control u (m,) for dt and seeing the increment dy (p,)."""
+
+    def estimate(self, state: Any) -> State:
+        """The point estimate of x, shape (n,)."""
 
 
 @pytree_dataclass()
@@ -119,7 +146,7 @@ def output_path(loop: OutputLoop, x0: State, times: Array, key: Key, *, substeps
     plant, dtype, count = loop.plant, x0.dtype, len(times) - 1
     brownian, bridge = jax.random.split(key)
     m = 0 if plant.problem.controls is None else plant.problem.controls.dim
-    advance = functools.partial(_advanced, loop, first_passage.Draw(bridge), substeps)
+    advance = functools.partial(_advanced, loop, BridgeDraw(bridge), substeps)
 
     def interval(carry: tuple, row: tuple) -> tuple[tuple, tuple]:
         t, z, information, before, code = carry
@@ -172,7 +199,7 @@ def _folded(key: Key, k: Array) -> Key:
 
 
 def _advanced(
-    loop: OutputLoop, draw: first_passage.Draw, substeps: int, t: Array, z: Array, u: Control, end: Array, key: Key
+    loop: OutputLoop, draw: BridgeDraw, substeps: int, t: Array, z: Array, u: Control, end: Array, key: Key
 ) -> tuple[Array, Array, Array, Array]:
     """Time, state with cost, the increment dy and True if the target was met, at the end of an interval or there."""
     plant, measured, dtype = loop.plant, loop.measurement, z.dtype
@@ -204,7 +231,7 @@ def _advanced(
     return jnp.where(met, later, end), moved, dy, met
 
 
-def _meeting(plant: Loop, draw: first_passage.Draw, sigma: Array, begins: tuple, ends: tuple) -> tuple[Array, Array]:
+def _meeting(plant: Loop, draw: BridgeDraw, sigma: Array, begins: tuple, ends: tuple) -> tuple[Array, Array]:
     """True if a sub-step meets the target, and the share of it after which it does; 1 where it does not."""
     if plant.problem.target is None:
         return jnp.zeros((), bool), jnp.ones((), ends[1].dtype)
@@ -213,7 +240,7 @@ def _meeting(plant: Loop, draw: first_passage.Draw, sigma: Array, begins: tuple,
     # where the target's function is zero on the straight line, if it is linear
     share = jnp.where(hit, before / jnp.where(hit, before - after, 1), 1).astype(ends[1].dtype)
     if plant.problem.noise is not None:
-        flag = first_passage.flag(plant, draw, sigma, begins, ends)  # 1 − 1/share where the bridge meets it
+        flag = meeting_flag(plant, draw, sigma, begins, ends)  # 1 − 1/share where the bridge meets it
         bridged = flag < 1
         hit, share = hit | bridged, jnp.where(bridged, 1 / jnp.where(bridged, 1 - flag, 1), share)
     return hit, share
@@ -223,5 +250,5 @@ def _on_target(plant: Loop, sigma: Array, t: Array, z: Array, hit: Array) -> Arr
     """The state with cost, moved by the noise onto the edge of a target that is met; a bridge is no straight line."""
     if plant.problem.target is None or plant.problem.noise is None:
         return z
-    edge = first_passage.onto_edge(functools.partial(plant.target, t), z[:-1], sigma[:-1])
+    edge = onto_edge(functools.partial(plant.target, t), z[:-1], sigma[:-1])
     return jnp.where(hit, jnp.append(edge, z[-1]), z)

@@ -10,17 +10,17 @@ import numpy as np
 
 from hjbjax.feedback.feedback import GridFeedback, check_kept, is_grid_feedback, lookups
 from hjbjax.feedback.loop import Loop
-from hjbjax.feedback.path import PathStatus
-from hjbjax.filtering.measurement import Measurement, measurement
-from hjbjax.filtering.observers import Observer
-from hjbjax.filtering.output_loop import (
+from hjbjax.feedback.measurement import Measurement, measurement
+from hjbjax.feedback.output_loop import (
     CertaintyEquivalence,
+    Observer,
     OutputLoop,
     OutputPath,
     no_control,
     of_information,
     output_path,
 )
+from hjbjax.feedback.path import PathStatus
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem

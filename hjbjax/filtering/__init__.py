@@ -4,13 +4,15 @@
 
 Read ``observers`` first: the extended Kalman filter, the Luenberger observer, and how to write one; then
 ``information_state``, the law of the state on a grid; ``robust_filter`` for the worst case, with its equation in
-``max_plus``; ``beliefs`` with ``hidden_chain`` for hidden chains of a few states. The loop through plant, sensor,
-observer and control stands with the other closed loops, in ``hjbjax.feedback.output_feedback``.
+``max_plus``; ``beliefs`` with ``hidden_chain`` for hidden chains of a few states; and ``controllers`` for controls from
+the states of all these. The loop through plant, sensor, observer and control stands with the other closed loops, in
+``hjbjax.feedback.output_feedback``.
 """
 
 from hjbjax.feedback.output_feedback import simulate_output
 from hjbjax.feedback.output_loop import OutputPath
 from hjbjax.filtering.beliefs import BeliefCoordinates, BeliefProblem, belief_problem
+from hjbjax.filtering.controllers import averaged_hamiltonian, certainty_equivalence, minimum_stress
 from hjbjax.filtering.grid_filter import Density, GridFilter
 from hjbjax.filtering.hidden_chain import HiddenPath, WonhamFilter, simulate_hidden
 from hjbjax.filtering.information_state import InformationState, zakai
@@ -33,7 +35,10 @@ __all__ = [
     "RobustGridFilter",
     "RobustState",
     "WonhamFilter",
+    "averaged_hamiltonian",
     "belief_problem",
+    "certainty_equivalence",
+    "minimum_stress",
     "robust_filter",
     "simulate_hidden",
     "simulate_output",

@@ -21,9 +21,9 @@ from hjbjax.discretisation import correlated_noise
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.rates import jump_rates
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.filtering import moments
+from hjbjax.feedback.measurement import Measurement, measurement, plant
+from hjbjax.filtering import forward_equation
 from hjbjax.filtering.forward_equation import advanced, cells
-from hjbjax.filtering.measurement import Measurement, measurement, plant
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
@@ -133,29 +133,30 @@ class GridFilter:
         seen = self.measurement.whitened(jnp.asarray(dy, dtype))
         # half of ℓ, before the state moves and after it
         half = (jnp.tensordot(seen, signal, 1) - jnp.sum(signal**2, axis=0) * (dt / 2)) / 2
-        probability, before = _weighed(self._probability(state), half)
+        probability, before = _weighed(self.probability(state), half)
         probability = advanced(self._on(dtype), probability, u, dt)
         probability, after = _weighed(probability, half)
         return Density(self._density(probability), state.log_likelihood + before + after)
 
     def estimate(self, state: Density) -> State:
         """The mean, shape (n,); along periodic axes the circular mean, in the box. See ``zakai``."""
-        return moments.mean(self.grid, self._probability(state))
+        return forward_equation.mean(self.grid, self.probability(state))
 
     def covariance(self, state: Density) -> jax.Array:
         """The covariance about the estimate, shape (n, n)."""
-        return moments.covariance(self.grid, self._probability(state))
+        return forward_equation.covariance(self.grid, self.probability(state))
+
+    def probability(self, state: Density) -> Field:
+        """The probability of each node of the chain, shape (*grid), of sum 1: the density times the node's cell."""
+        mass = state.density * jnp.asarray(self.cells, state.density.dtype)
+        return mass / jnp.sum(mass)
 
     def mode(self, state: Density) -> State:
         """The node at which the density is largest, shape (n,)."""
-        return moments.mode(self.grid, state.density)
+        return forward_equation.mode(self.grid, state.density)
 
     def _on(self, dtype: DType) -> Discretisation:
         return Discretisation(*cast((self.plant, self.grid), dtype), Upwind(), dtype)
-
-    def _probability(self, state: Density) -> Field:
-        mass = state.density * jnp.asarray(self.cells, state.density.dtype)
-        return mass / jnp.sum(mass)
 
     def _density(self, probability: Field) -> Field:
         density = probability / jnp.asarray(self.cells, probability.dtype)

@@ -93,7 +93,7 @@ class AveragedHamiltonian:
         return jnp.sum(weights * total)
 
 
-_least = jax.jit(AveragedHamiltonian._least)
+_least, _largest = jax.jit(AveragedHamiltonian._least), jax.jit(refined_maximum)
 
 
 @pytree_dataclass()
@@ -124,7 +124,7 @@ class MinimumStress:
 
     def _maximum(self, information: Field) -> tuple[Scalar, State]:
         dtype = information.dtype
-        return refined_maximum(information + jnp.asarray(self.value, dtype), cast(self.grid, dtype))
+        return _largest(information + jnp.asarray(self.value, dtype), cast(self.grid, dtype))
 
 
 def certainty_equivalence(observer: Observer, feedback: GridFeedback | Callable) -> jax.tree_util.Partial:

@@ -157,6 +157,7 @@ def test_a_perfect_sensor_is_full_observation():
     assert np.all(gaps[-1] < 0.03 * exact)
 
 
+@pytest.mark.slow
 def test_the_value_is_concave_and_of_second_order_in_the_nodes():
     for value in machine_values().values():
         assert np.max(np.diff(value, 2)) < 1e-6
@@ -273,6 +274,7 @@ def worn():
     return Chain(idle, busy, np.array([[0.0, 0.4, 1.5], [1.0, 1.0, 0.2]]))
 
 
+@pytest.mark.slow
 def test_three_states_between_full_and_no_observation_and_on_edges_those_of_two():
     chain = worn()
     question = posed(chain, [1.0, 0.4, 0.0], measurement_noise=0.7, nodes=41)

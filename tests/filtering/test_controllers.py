@@ -67,15 +67,15 @@ def test_certainty_equivalence_is_the_feedback_at_the_estimate_in_and_out_of_a_p
     for feedback in (solution, lambda x: -0.35 * x):
         control = certainty_equivalence(observer, feedback)
         assert_allclose(jax.jit(control)(observer.initial()), [-0.14], rtol=1e-6)
-        path = simulate_output(plant, observer, control, **options)
-        assert_allclose(path.states, given_itself.states, rtol=1e-12)
-        assert_allclose(path.controls, -0.35 * path.estimates[:-1], rtol=1e-12)
+    path = simulate_output(plant, observer, certainty_equivalence(observer, solution), **options)
+    assert_allclose(path.states, given_itself.states, rtol=1e-12)
+    assert_allclose(path.controls, -0.35 * path.estimates[:-1], rtol=1e-12)
 
 
 # --- the averaged Hamiltonian ---
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(st.floats(-2, 2), st.floats(0.3, 0.8), st.floats(0.2, 3.0), st.floats(0.1, 4.0))
 def test_of_a_quadratic_the_average_is_certainty_equivalence(mean, deviation, slope, push):
     control, observer = _of_quadratic(slope, push)
@@ -121,7 +121,7 @@ COSTS = {  # of one state in NumPy's functions or JAX's, and the set
 }
 
 
-@pytest.mark.parametrize("kind", COSTS)
+@pytest.mark.parametrize("kind", [*list(COSTS)[:-1], pytest.param("ball", marks=pytest.mark.slow)])
 def test_the_minimum_is_that_of_an_average_in_numpy_with_a_target_left_out(kind):
     cost, admissible = COSTS[kind]
     plant = hjb.Problem(
@@ -157,6 +157,7 @@ def _ends(admissible):
     return admissible.lo[0], admissible.hi[0]
 
 
+@pytest.mark.slow
 def test_a_law_all_inside_the_target_has_a_control_too_and_grids_may_differ():
     plant = hjb.Problem(lag, quadratic, WIDE, noise=0.3, target=lambda x: 1.0 - x[0], exit_cost=0.0)
     inner = hjb.Grid([0.0], [3.0], (61,))
@@ -169,7 +170,7 @@ def test_a_law_all_inside_the_target_has_a_control_too_and_grids_may_differ():
 # --- minimum stress ---
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(st.floats(-1, 1), st.floats(0.2, 1.0), st.floats(0.1, 1.5), st.floats(1.5, 4.0))
 def test_of_parabolas_the_worst_case_is_the_coupled_state(estimate, spread, slope, gamma):
     coupling = spread * slope / gamma**2
@@ -191,7 +192,8 @@ def _stressed(slope):
 
 def test_where_both_together_do_not_hold_the_level_the_worst_case_runs_to_an_end():
     control = _stressed(1.5)
-    assert abs(control.worst_case(jnp.asarray(-0.5 * (X - 0.1) ** 2))[0]) == 6.0
+    with jax.enable_x64(True):
+        assert abs(control.worst_case(jnp.asarray(-0.5 * (X - 0.1) ** 2))[0]) == 6.0
 
 
 # A plant that is not stable: ẋ = x + u + w, y = 2x + v, ∫ x² + u². No filter feedback holds a gain below 2; Kalman's
@@ -333,6 +335,7 @@ def separated_cost(duration):
     return solve_ivp(rates, (0, duration), [0.0, NOISE**2 * START, 0.0], rtol=1e-9, atol=1e-12).y[2, -1]
 
 
+@pytest.mark.slow
 def test_the_averaged_hamiltonian_attains_the_cost_of_separation():
     plant = dataclasses.replace(PLANT, noise=NOISE)
     grid = hjb.Grid([-2.5], [2.5], (81,))
@@ -350,6 +353,7 @@ def test_the_averaged_hamiltonian_attains_the_cost_of_separation():
     assert abs(np.mean(costs - beside)) < 0.005 * np.mean(beside)
 
 
+@pytest.mark.slow
 def test_each_controller_is_best_at_what_it_is_made_for():
     plant = dataclasses.replace(PLANT, noise=NOISE)
     kalman = ExtendedKalman(plant, sensed, [0.0], [NOISE**2 * START], measurement_noise=NOISE)
@@ -399,6 +403,7 @@ def stress_on(grid, scheme, value):
     return observer, minimum_stress(observer, value)
 
 
+@pytest.mark.slow
 def test_along_a_record_the_worst_case_is_the_coupled_state_to_second_order():
     errors = []
     for count in (61, 121, 241):
@@ -409,6 +414,7 @@ def test_along_a_record_the_worst_case_is_the_coupled_state_to_second_order():
     assert_allclose(-np.polyfit(np.log([1, 2, 4]), np.log(errors), 1)[0], 2, atol=0.15)
 
 
+@pytest.mark.slow
 def test_with_a_marched_value_of_the_game_it_is_the_coupled_state_too():
     grid = hjb.Grid([-3.0], [3.0], (31,))
     game = hjb.attenuation(dataclasses.replace(PLANT, controls=hjb.Box([-30.0], [30.0])), GAIN, hjb.Box([-6.0], [6.0]))

@@ -122,6 +122,7 @@ def test_simulated_chains_have_the_law_of_the_chain_and_beliefs_are_calibrated()
     np.testing.assert_allclose(path.beliefs.sum(axis=-1), 1, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_one_key_is_one_lane_and_an_integer_is_a_key():
     options = {"duration": 1.0, "dt": 0.1, "discount": DISCOUNT}
     many = simulate_hidden(OBSERVER, never, price, key=jax.random.split(jax.random.key(3), 2), **options)
@@ -140,6 +141,7 @@ def test_one_key_is_one_lane_and_an_integer_is_a_key():
     np.testing.assert_array_equal(known.beliefs, again.beliefs)
 
 
+@pytest.mark.slow
 def test_costs_of_a_fixed_control_are_those_of_the_chain():
     """(β − A)⁻¹ c from the prior, less what is left after the duration."""
     keys = jax.random.split(jax.random.key(1), 4000)
@@ -154,6 +156,7 @@ def test_costs_of_a_fixed_control_are_those_of_the_chain():
     assert float(free.cost) == pytest.approx(4, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_the_control_of_the_belief_beats_certainty_equivalence_and_costs_its_value():
     """Repairs pay where the machine is likely to stand; who trusts the likelier state starts too late or too soon."""
     machine = belief_problem(

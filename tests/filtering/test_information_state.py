@@ -127,6 +127,7 @@ def test_a_control_on_record_moves_the_law():
 # --- Beneš ---
 
 
+@pytest.mark.slow
 def test_the_filter_of_benes():
     """dx = tanh x dt + dw, dy = x dt + r dv: q ∝ cosh x · N(m, P) with m and P those of dx = dw."""
     mean, variance, _ = bucy(*(np.array([[k]]) for k in (0.0, 1.0, 1.0)), [0.3], [[0.5]], 1.5)
@@ -175,7 +176,7 @@ def test_a_state_that_rests_is_bayes_to_rounding():
         assert tuple(law.mode[k]) == tuple(nodes[np.unravel_index(np.argmax(density), grid.shape)])
 
 
-@pytest.mark.parametrize("size", [1e3, 1e8])
+@pytest.mark.parametrize("size", [pytest.param(1e3, marks=pytest.mark.slow), 1e8])
 def test_records_of_any_size_leave_no_mass_behind(size):
     """Factors of e^{±size} neither overflow nor vanish; at first the law sits where the record points."""
     grid = Grid([-1.0], [1.0], (21,))
@@ -195,7 +196,9 @@ def test_records_of_any_size_leave_no_mass_behind(size):
 # --- the chain ---
 
 
-@pytest.mark.parametrize(("n", "kind"), [(2, "matrix"), (3, "diagonal"), (2, "none")])
+@pytest.mark.parametrize(
+    ("n", "kind"), [(2, "matrix"), pytest.param(3, "diagonal", marks=pytest.mark.slow), (2, "none")]
+)
 @given(seed=SEEDS)
 @settings(max_examples=6)
 def test_laws_of_random_systems_are_laws_and_those_of_the_exponential_of_the_chain(n, kind, seed):
@@ -239,7 +242,7 @@ def SENSOR(x):
     return jnp.cos(x[:1])
 
 
-@pytest.mark.parametrize("stretch", [None, (Sinh(2.5, 0.0),)])
+@pytest.mark.parametrize("stretch", [pytest.param(None, marks=pytest.mark.slow), (Sinh(2.5, 0.0),)])
 def test_walls_keep_a_flat_density_flat(stretch):
     grid = Grid([0.0], [2.0], (31,), stretch=stretch)
     law = zakai(Problem(lambda x, u: 0 * x, noise=1.0), lambda x: 0 * x, grid, np.zeros((2, 1)), 0.5, np.ones(31))
@@ -247,6 +250,7 @@ def test_walls_keep_a_flat_density_flat(stretch):
     assert law.log_likelihood[-1] == pytest.approx(0, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_after_a_long_time_without_news_the_law_is_the_stationary_one():
     grid = Grid([-3.0], [3.0], (41,))
     problem = Problem(decay, noise=1.0)
@@ -273,6 +277,7 @@ def test_means_on_a_ring_are_circular():
         np.testing.assert_allclose(forward_equation.mode(grid, turned), [x[(np.argmax(along) + 57) % 400], 0.0])
 
 
+@pytest.mark.slow
 def test_a_phase_that_runs_round_is_followed():
     """dθ = 2 dt + noise, measured by its sine and cosine, over several turns."""
     problem = Problem(lambda x, u: 2 + 0 * x, noise=0.2)
@@ -315,6 +320,7 @@ def test_zakai_is_a_scan_of_the_filter():
             np.testing.assert_allclose(filtering.mode(state), law.mode[k])
 
 
+@pytest.mark.slow
 def test_a_batch_of_records_is_each_of_them():
     rng = np.random.default_rng(2)
     problem = Problem(lambda x, u: u - x, controls=Box([-1.0], [1.0]), noise=0.8)

@@ -152,7 +152,7 @@ def brute_force(drift, cost, measured, nodes, p, record, dt, pieces, gamma, sigm
     return p
 
 
-@pytest.mark.parametrize(("reach", "name"), [(3.0, "wide"), (1.0, "narrow")])
+@pytest.mark.parametrize(("reach", "name"), [pytest.param(3.0, "wide", marks=pytest.mark.slow), (1.0, "narrow")])
 def test_brute_force_over_all_paths_agrees(reach, name):
     """A nonlinear drift and sensor; in the narrow box paths from outside would do better, and are not there."""
     gamma, sigma, record = 1.5, 0.7, np.array([0.8, 0.5, -0.2])
@@ -250,6 +250,7 @@ def test_the_observer_is_the_filter_and_records_come_in_batches():
     np.testing.assert_allclose(estimate, one[0].worst_case[-1], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_single_precision_follows():
     observer = RobustGridFilter(LAG, seen, hjb.Grid([-4.0], [4.0], (41,)), prior, GAMMA)
     state = observer.update(observer.initial(), jnp.zeros(1), jnp.array([0.05]), 0.1)
@@ -335,3 +336,20 @@ def test_a_cost_without_bound_is_reported_with_its_time():
     plant = hjb.Problem(lambda x, u: 0 * x, lambda x, u: jnp.exp(jnp.exp(8 * x[0] ** 2)))
     with pytest.raises(ValueError, match=r"p is not finite from interval 0 on, t = 0 to 0.1: .* larger gamma"):
         robust_filter(plant, lambda x: x, hjb.Grid([-2.0], [2.0], (31,)), [[0.0]], 0.1, prior, gamma=1.0)
+
+
+def test_correlated_measurements_count_as_their_whitened_ones():
+    root = np.array([[0.5, 0.0], [0.8, 1.5]])
+
+    def twice(x):
+        return jnp.stack([x[0], jnp.sin(x[0])])
+
+    def white(x):
+        return jnp.linalg.inv(root) @ twice(x)
+
+    grid, dy = hjb.Grid([-4.0], [4.0], (41,)), np.array([0.03, -0.02])
+    observer = RobustGridFilter(LAG, twice, grid, prior, GAMMA, measurement_noise=root)
+    beside = RobustGridFilter(LAG, white, grid, prior, GAMMA)
+    p = observer.update(observer.initial(), jnp.zeros(1), jnp.asarray(dy), 0.1)
+    wanted = beside.update(beside.initial(), jnp.zeros(1), jnp.asarray(np.linalg.solve(root, dy)), 0.1)
+    assert np.max(np.abs(p - wanted)) < 1e-5 * np.max(np.abs(wanted))

@@ -16,6 +16,7 @@ NAMES = {
     "growth": ("speed", "seconds, steps and bytes a node of certified solves on finer and finer grids"),
     "scaling": ("speed", "the N^n law: seconds, steps and bytes a node in one to six dimensions"),
     "controls": ("speed", "seconds against the number of controls and against the error: O(1/ε^{2n+m}) and less"),
+    "information": ("speed", "nodes, bytes and seconds of beliefs on grids, beside the counts of section 13.2"),
     "batch": ("speed", "solve_batch of pendulums of different mass, against one after the other"),
     "startup": ("speed", "the first answer of a process: importing, compiling, pictures; cold and with the cache"),
     "precision": ("accuracy", "error against seconds: what second order is worth"),

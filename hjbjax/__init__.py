@@ -1,6 +1,6 @@
 """hjbjax: Hamilton–Jacobi–Bellman and Isaacs equations on grids, with JAX."""
 
-from hjbjax import geometry, plotting, zoo
+from hjbjax import filtering, geometry, plotting, zoo
 from hjbjax._version import __version__
 from hjbjax.applications.convergence import convergence_study
 from hjbjax.applications.hinf import hinf_level
@@ -70,6 +70,7 @@ __all__ = [
     "convergence_study",
     "dissipation",
     "expected_exit_time",
+    "filtering",
     "geometry",
     "greedy_feedback",
     "hinf_level",

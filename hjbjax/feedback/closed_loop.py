@@ -17,7 +17,7 @@ The target, the edge of the box and the end of what the players know are looked 
 step, and located by bisection of that step's interpolant; the path ends on their far side, by rounding. Inside the
 target a Solution has no control, and a step that ends there still wants one at its stages: it is that of the last
 place on the straight way there where the players had an answer.
-With noise a target is also met between the ends of a step, by a draw of its own: see ``first_passage``. A mean time
+With noise a target is also met between the ends of a step, by a draw of its own: see ``loop``. A mean time
 to a target then has the order 1 in the step. The edge of the box is looked at at the ends of steps alone.
 """
 
@@ -29,8 +29,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.feedback import first_passage
-from hjbjax.feedback.loop import Actions, Loop, are_finite
+from hjbjax.feedback.loop import Actions, BridgeDraw, Loop, are_finite, bridging, meeting_flag, onto_edge
 from hjbjax.feedback.path import Path, PathStatus
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import Array, Control, Key, Number, State
@@ -252,7 +251,7 @@ def _solver(ivp: InitialValueProblem, stepping: Stepping) -> Callable:
         terms = diffrax.MultiTerm(terms, diffrax.ControlTerm(noise, brownian))
         # SRA1 has its order for additive noise alone; a function may depend on the state, and is not asked
         kind, controller = diffrax.SRA1 if additive else diffrax.Euler, diffrax.ConstantStepSize()
-        solver = first_passage.bridging(kind)(flag=_flag_of_steps(ivp, stepping)) if bridged else kind()
+        solver = bridging(kind)(flag=_flag_of_steps(ivp, stepping)) if bridged else kind()
     event = None
     if (
         loop.guarded or loop.problem.target is not None or (loop.grid is not None and not loop.clamp)
@@ -280,16 +279,16 @@ def _acting(loop: Loop, stepping: Stepping, t: Number, x: State, beginning: Begi
 def _on_target(loop: Loop, stepping: Stepping, t: Number, x: State, beginning: Beginning) -> State:
     """The state in which a path meets the target, from the one on the straight way between the ends of the step."""
     sigma = loop.noise(t, x, *_acting(loop, stepping, t, x, beginning))[:-1]
-    return first_passage.onto_edge(functools.partial(loop.target, t), x, sigma)
+    return onto_edge(functools.partial(loop.target, t), x, sigma)
 
 
 def _flag_of_steps(ivp: InitialValueProblem, stepping: Stepping) -> Callable:
-    """The flag that ``first_passage.bridging`` writes at the end of a step."""
-    loop, n, draw = ivp.loop, len(ivp.x0), first_passage.Draw(ivp.key)
+    """The flag that ``loop.bridging`` writes at the end of a step."""
+    loop, n, draw = ivp.loop, len(ivp.x0), BridgeDraw(ivp.key)
 
     def flag(t: Array, later: Array, y: Array, moved: Array, beginning: Beginning) -> jax.Array:
         sigma = loop.noise(t, y[:n], *_acting(loop, stepping, t, y[:n], beginning))[:-1]
-        return first_passage.flag(loop, draw, sigma, (t, y[:n]), (later, moved[:n]))
+        return meeting_flag(loop, draw, sigma, (t, y[:n]), (later, moved[:n]))
 
     return flag
 

@@ -27,7 +27,7 @@ from hjbjax.hamiltonian.search import enumerate_actions, refine
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite, samples, spacing
 from hjbjax.problem.types import Control, Costate, DType, Number, Scalar, State
-from hjbjax.tracing.dependence import dependence
+from hjbjax.tracing import dependence
 
 BUDGET = 64  # samples that start a search
 NEWTON = 24  # steps for the multiplier of a ball, monotone and at last quadratic; an affine H needs none
@@ -61,13 +61,33 @@ def rule_of(problem: Problem, n: int) -> Rule:
     inputs = tuple(range(problem.controls.dim))
     lengths = [(None, False)] * problem.time_dependent + [(n, False), (len(inputs), True)]
     functions = [problem.drift] if problem.cost is None else [problem.drift, problem.cost]
-    found = [dependence(function, *lengths, dtype=jnp.result_type(float)) for function in functions]
+    found = [dependence.dependence(function, *lengths, dtype=jnp.result_type(float)) for function in functions]
     if not all(each.separable_quadratic_in(inputs) for each in found):
         return Rule(exact=False)
     # without a square in either function H is affine in that input: bang-bang
     straight = tuple(j for j in inputs if not any(each.has_square((j,)) for each in found))
     # over a ball the minimum of an affine H, −r b/|b|, turns with b and does not jump
     return Rule(exact=True, jumping=straight if isinstance(problem.controls, Box) else ())
+
+
+def quadratic_with_noise(problem: Problem, n: int) -> tuple[bool, bool]:
+    """True if L + f·p + ½ tr(σσᵀ M) is a separable quadratic in u for all p and M; and true if the noise depends on u.
+
+    Of a problem without opponent and without time.
+    """
+    dtype = np.dtype(np.float64)
+    found = dependence.influence(problem, n, dtype)
+    functions, noisy = [found.drift, found.cost], not found.noise.is_constant
+    if noisy:
+        covariance = jax.tree_util.Partial(_covariance, problem)
+        functions.append(dependence.dependence(covariance, (n, False), (len(found.control), True), dtype=dtype))
+    return all(each.separable_quadratic_in(found.control) for each in functions), noisy
+
+
+def _covariance(problem: Problem, x: State, u: Control) -> jax.Array:
+    """σσᵀ at one state."""
+    sigma = problem.diffusion(x, u)
+    return sigma @ sigma.T
 
 
 def hamiltonian(problem: Problem, t: Number, x: State, p: Costate, u: Control | None) -> Scalar:
@@ -105,23 +125,32 @@ def at_corner(problem: Problem, rule: Rule, t: Number, x: State, p: Costate, cor
 
 def minimiser(problem: Problem, rule: Rule, t: Number, x: State, p: Costate) -> jax.Array:
     """The control u* that minimises H, shape (m,)."""
-    admissible = problem.controls
+    assert problem.controls is not None
+    return least(problem.controls, lambda u: hamiltonian(problem, t, x, p, u), rule.exact, p.dtype)
 
-    def energy(u):
-        return hamiltonian(problem, t, x, p, u)
 
+def least(
+    admissible: AdmissibleSet, energy: Callable[[jax.Array], jax.Array], quadratic: bool, dtype: DType
+) -> jax.Array:
+    """The admissible u, shape (m,), at which a function of u is least.
+
+    Args:
+      admissible: the set.
+      energy: the function, of u (m,).
+      quadratic: true if it is a sum of quadratic polynomials of one input each, so that the formulas hold.
+      dtype: of u.
+    """
     if isinstance(admissible, Finite):
-        points = jnp.asarray(admissible.points, p.dtype)
+        points = jnp.asarray(admissible.points, dtype)
         return points[jnp.argmin(jax.vmap(energy)(points))]
-    if not rule.exact:
-        return _searched(admissible, energy, p.dtype)
-    assert admissible is not None
-    # exactly quadratic by the rule: gradient and second derivatives at zero are its coefficients
-    zero = jnp.zeros(admissible.dim, p.dtype)
+    if not quadratic:
+        return _searched(admissible, energy, dtype)
+    # gradient and second derivatives at zero are its coefficients
+    zero = jnp.zeros(admissible.dim, dtype)
     slope, square = jax.grad(energy)(zero), jnp.diagonal(jax.hessian(energy)(zero)) / 2
     if isinstance(admissible, Box):
-        return _in_box(jnp.asarray(admissible.lo, p.dtype), jnp.asarray(admissible.hi, p.dtype), slope, square)
-    return _in_ball(jnp.asarray(admissible.radius, p.dtype), slope, square)
+        return _in_box(jnp.asarray(admissible.lo, dtype), jnp.asarray(admissible.hi, dtype), slope, square)
+    return _in_ball(jnp.asarray(admissible.radius, dtype), slope, square)
 
 
 def _in_box(lo: Control, hi: Control, slope: Control, square: Control) -> jax.Array:

@@ -10,6 +10,7 @@ numbers: they get a grey of their own and a line in the legend. A periodic axis 
 """
 
 from hjbjax.plotting.costates import costates
+from hjbjax.plotting.estimates import density, estimates
 from hjbjax.plotting.level_sets import animation, zero_level_set
 from hjbjax.plotting.maps import closed_loop, controls, policy, residuals, switching_curve, trajectory, value
 from hjbjax.plotting.studies import convergence, perturbation
@@ -23,6 +24,8 @@ __all__ = [
     "controls",
     "convergence",
     "costates",
+    "density",
+    "estimates",
     "perturbation",
     "policy",
     "residuals",

@@ -14,7 +14,7 @@ import hjbjax as hjb
 from benchmarks import cases
 from benchmarks.__main__ import NAMES
 from benchmarks.harness import footprint, thresholds, timing
-from benchmarks.speed import batch, controls, growth, peers, scaling, startup, sweep
+from benchmarks.speed import batch, controls, growth, information, peers, scaling, startup, sweep
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.rates import fastest_rate
 from hjbjax.problem.pytree import cast
@@ -35,7 +35,7 @@ def rows_of(benchmark, folder, *options):
 
 
 def test_every_name_leads_to_a_command():
-    for module in (sweep, peers, growth, scaling, controls, batch, startup):
+    for module in (sweep, peers, growth, scaling, controls, information, batch, startup):
         _, folder, name = module.__name__.split(".")
         assert NAMES[name][0] == folder
         assert CliRunner().invoke(module.command, ["--help"]).exit_code == 0
@@ -229,6 +229,17 @@ def test_more_controls_never_cost_more_to_the_controlled(tmp_path):
         coarse, fine = (row["error"] for row in rows if (row["part"], row["minimum"]) == ("error", minimum))
         assert fine < 0.7 * coarse
         assert {row["bound"] for row in rows if row["part"] == "error"} == {-5.0}
+
+
+@pytest.mark.slow
+def test_an_information_state_takes_a_table_of_one_axis_less_than_it_has_states(tmp_path):
+    rows = rows_of(information, tmp_path)
+    counted, measured = ([row for row in rows if row["part"] == part] for part in ("formula", "measured"))
+    assert {(row["states"], row["inverse_h"]): row["information"] for row in counted}[2, 3] == 3**9
+    for row in measured:
+        assert row["nodes"] == row["inverse_h"] ** (row["hidden"] - 1)
+        assert row["table_bytes"] == 16 * row["nodes"]
+    assert [row["error"] is None for row in measured] == [False, True, False, True]
 
 
 @pytest.mark.slow

@@ -1,0 +1,145 @@
+"""What is measured of a state that is not: dy = h(x) dt + r dv, and how a plant must be for it to be filtered.
+
+Records come as increments dy over steps of length dt. A sensor that is sampled, y_k = h(x_k) + s v_k, is the case
+dy = y_k dt with r² = s² dt.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import is_traced, numbers, pytree_dataclass
+from hjbjax.problem.types import Array, Numbers, State
+from hjbjax.tracing import checks, closures, indices
+
+ROUNDINGS = 16  # units of eps: a matrix r whose rows are so near to dependent has no inverse worth the name
+
+
+@pytree_dataclass()
+class Measurement:
+    """The measured function and the strength of its noise, dy = h(x) dt + r dv.
+
+    Args:
+      h: of one state, returns shape (p,).
+      root: r, shape (p, p), in units of y times time^½.
+    """
+
+    h: jax.tree_util.Partial
+    root: Any
+
+    @property
+    def dim(self) -> int:
+        """The number p of measured quantities."""
+        return np.shape(self.root)[-1]
+
+    def at(self, x: State) -> jax.Array:
+        """h(x) in the type of the state, shape (p,)."""
+        return jnp.asarray(self.h(x), x.dtype)
+
+    def whitened(self, y: Array) -> jax.Array:
+        """r⁻¹ y for y of shape (p, ...): what is measured in units in which its noise is 1."""
+        return jnp.linalg.solve(jnp.asarray(self.root, jnp.result_type(y)), y)
+
+
+def measurement(h: Callable, n: int, noise: Numbers | Sequence, name: str, *, perfect: bool = False) -> Measurement:
+    """The measurement of h with noise r, once both are known to be what they should be.
+
+    Args:
+      h: of one state of n numbers, returns shape (p,).
+      n: the number of states.
+      noise: r, a number, one an entry of y, or a matrix (p, p).
+      name: who asks, for refusals.
+      perfect: whether r = 0 is admissible: a measurement without noise.
+
+    Raises:
+      ValueError: a result of another shape, noise that is not positive, or code that JAX cannot trace.
+      TypeError: an h that cannot be called, noise that is no number.
+    """
+    if not callable(h):
+        raise TypeError(f"{name}: h is {h!r}, wanted a function, the measured one of one state, (x) -> (p,)")
+    # as a problem's function of the state: other numbers in its closure are seen, and traced ones become leaves
+    function = closures.settled(Problem(_rest, target=h), n).target
+    try:
+        with jax.enable_x64(True):
+            closed, found = jax.make_jaxpr(function, return_shape=True)(jax.ShapeDtypeStruct((n,), np.float64))
+    except jax.errors.JAXTypeError as error:
+        raise ValueError(
+            f"{name}: h(x) cannot be traced: use jnp.where instead of if, and jnp instead of numpy"
+        ) from error
+    except (TypeError, ValueError, IndexError) as error:
+        said = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise ValueError(f"{name}: h(x) failed on one state, with x of shape ({n},):\n{said[:400]}") from error
+    shape = getattr(found, "shape", None)
+    if shape is None or len(shape) != 1 or shape[0] == 0 or not jnp.issubdtype(found.dtype, jnp.floating):
+        got = f"a {type(found).__name__}" if shape is None else f"{found.dtype} numbers of shape {shape}"
+        raise ValueError(
+            f"{name}: h(x) returned {got}, wanted floating-point numbers of shape (p,), one entry a measured "
+            "quantity: x[:1] for the first state, jnp.stack([...]) for several"
+        )
+    outside = indices.beyond(closed, ("x",))
+    if outside is not None:
+        raise ValueError(f"{name}: h(x) asks for {outside}.\nJAX would take the nearest one, or none, without a word")
+    return Measurement(function, _root(noise, shape[0], name, perfect))
+
+
+def _root(noise: Numbers | Sequence, p: int, name: str, perfect: bool) -> Any:
+    """r as a matrix, shape (p, p)."""
+    given = numbers(noise, f"{name}: measurement_noise")
+    if np.shape(given) not in ((), (p,), (p, p)):
+        raise ValueError(
+            f"{name}: measurement_noise has shape {np.shape(given)}, wanted a number, ({p},) or ({p}, {p}): h(x) has "
+            f"shape ({p},)"
+        )
+    xp: Any = jnp if is_traced(given) else np
+    root = given if np.ndim(given) == 2 else xp.diag(xp.broadcast_to(given, (p,)))
+    if is_traced(root) or (perfect and not np.any(root)):
+        return root
+    size = np.linalg.norm(root, axis=1, keepdims=True)  # rows may have units as different as what they measure
+    sound = bool(np.all(np.isfinite(root)) and np.all(size > 0) and (np.ndim(given) == 2 or np.all(np.diag(root) > 0)))
+    if not sound or np.linalg.svd(root / size, compute_uv=False)[-1] <= ROUNDINGS * p * np.finfo(np.float64).eps:
+        wanted = "finite numbers > 0" if np.ndim(given) < 2 else "a finite matrix with an inverse"
+        raise ValueError(
+            f"{name}: got measurement_noise = {noise!r}, wanted {wanted}: it is r in dy = h(x) dt + r dv, and a "
+            "likelihood divides by it; a small r stands for a sensor that is nearly exact"
+        )
+    return root
+
+
+def plant(problem: Problem, n: int, name: str) -> Problem:
+    """Drift, controls and noise of a problem: what a filter needs of it.
+
+    Args:
+      problem: the problem.
+      n: the number of states.
+      name: who asks, for refusals.
+
+    Raises:
+      TypeError: no Problem.
+      ValueError: a game, a problem that depends on time, or functions that do not fit n states.
+    """
+    if not isinstance(problem, Problem):
+        raise TypeError(
+            f"{name}: got {type(problem).__name__} for the plant, wanted a Problem: Problem(drift, noise=...)"
+        )
+    if problem.time_dependent:
+        raise ValueError(
+            f"{name}: got time_dependent=True, wanted a plant whose functions take (x, u): an observer is not told the "
+            "time. Make the time a state with drift 1"
+        )
+    if problem.is_game:
+        raise ValueError(
+            f"{name}: got a problem with disturbances, whose actions nobody tells a filter; leave them out, or "
+            "put noise in their place"
+        )
+    system = closures.settled(Problem(problem.drift, controls=problem.controls, noise=problem.noise), n)
+    checks.of_one_state(system, n, "the number of states")
+    return system
+
+
+def _rest(x: State, u: Array) -> State:
+    """No drift."""
+    return 0 * x

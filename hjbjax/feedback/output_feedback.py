@@ -1,0 +1,297 @@
+"""Output feedback: the plant is steered by what an observer makes of the measurements."""
+
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.feedback.feedback import GridFeedback, check_kept, is_grid_feedback, lookups
+from hjbjax.feedback.loop import Loop
+from hjbjax.feedback.measurement import Measurement, measurement
+from hjbjax.feedback.output_loop import (
+    CertaintyEquivalence,
+    Observer,
+    OutputLoop,
+    OutputPath,
+    no_control,
+    of_information,
+    output_path,
+)
+from hjbjax.feedback.path import PathStatus
+from hjbjax.problem import arguments
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import altered, as_partial, cast, is_traced, numbers
+from hjbjax.problem.types import Array, Key, Numbers
+from hjbjax.tracing import checks, closures
+
+ROUNDING = 1e-9  # relative: a duration of 0.3 is three steps of 0.1
+MOST = 10**7  # intervals of a path: 80 MB a state
+
+
+def simulate_output(
+    problem: Problem,
+    observer: Observer,
+    control: GridFeedback | Callable | None,
+    *,
+    h: Callable,
+    x0: Numbers | Sequence,
+    duration: float,
+    dt: float,
+    key: Key | int,
+    measurement_noise: Numbers | Sequence = 1.0,
+    paths: int | None = None,
+    substeps: int = 4,
+    grid: Grid | None = None,
+) -> OutputPath:
+    """Paths of the plant under a control that sees the observer's information state alone.
+
+        dx = f(x, u) dt + σ dw,    dy = h(x) dt + r dv,    u = control(information state)
+
+    The control is held over dt; then the observer is told u, the increment dy and dt, and nothing else. The plant
+    moves in sub-steps of weak order 1, of order 2 without noise. A path ends in the target, which ``observer`` and
+    ``control`` need not know of. Periodic states are wrapped into the grid, where one is known, before any function
+    sees them, so that h should be periodic as well. In float64; under a tracer (``jit``, ``vmap``) in the type of x0,
+    without checks, with forward derivatives (``jacfwd``).
+
+    Args:
+      problem: the plant and its costs; no game.
+      observer: an ``Observer``, as ``ExtendedKalman``, ``Luenberger`` or ``GridFilter``.
+      control: a function of the observer's state that returns the control, shape (m,), or a Solution or
+        ``greedy_feedback``, which is asked at the observer's estimate: certainty equivalence. Where a Solution has no
+        control, as in its target, the one before is held. ``None`` without controls.
+
+    Keyword Args:
+      h: the measured function of one state, returns shape (p,): the plant's, which need not be the observer's.
+      x0: the state of the plant at t = 0, shape (n,), or (batch, n), one a path.
+      duration: in units of time.
+      dt: the time between two updates; the last interval may be shorter.
+      key: a JAX random key or an integer, or an array of keys, shape (batch,), one a path.
+      measurement_noise: r: a number, (p,) or (p, p); 0 for a measurement without noise.
+      paths: how many to make from one key; ``None`` for one, without an axis for a batch.
+      substeps: steps of the plant between two updates.
+      grid: whose periodic axes are wrapped; ``None``: that of a Solution, or of the observer, if it has one.
+
+    Returns:
+      An ``OutputPath``. Paths that end early, except in the target, are warned of and have it in their ``code``.
+
+    Raises:
+      ValueError: an argument that is not admissible, or a function that returns the wrong shape.
+      TypeError: an observer without one of its three methods, a control that cannot be called.
+
+    Example:
+      >>> from hjbjax.filtering.observers import ExtendedKalman
+      >>> problem = Problem(lambda x, u: x, lambda x, u: x @ x, noise=0.1)
+      >>> observer = ExtendedKalman(problem, lambda x: x, [0.0], [1.0], measurement_noise=0.1)
+      >>> path = simulate_output(
+      ...     problem, observer, None, h=lambda x: x, x0=[1.0], duration=1.0, dt=0.1, key=0, measurement_noise=0.1
+      ... )
+      >>> path.times.shape, path.estimates.shape, bool(abs(path.estimates - path.states)[-1] < 0.5)
+      ((11,), (11, 1), True)
+    """
+    if isinstance(key, (int, np.integer)) and not isinstance(key, bool):
+        key = jax.random.key(int(key))
+    times = _times(duration, dt)
+    start = _initial_states(x0)
+    n = np.shape(start)[-1]
+    measured = measurement(h, n, measurement_noise, "simulate_output", perfect=True)
+    keys = _keys(key, paths, np.shape(start)[:-1])
+    arguments.count(substeps, "simulate_output: substeps")
+    loop = _closed(problem, observer, control, measured, grid, n, float(times[-1]))
+    if is_traced(loop, start, keys) or _sees_tracers(loop):
+        start = jnp.asarray(start)
+        return _paths(loop, start, jnp.asarray(times, start.dtype), keys, substeps)
+    with (
+        jax.core.eval_context(),
+        jax.enable_x64(True),
+        jax.debug_nans(False),
+    ):  # after the end of a path its controls are NaN
+        loop = cast(loop, np.float64)
+        _check_shapes(loop, np.zeros(n))
+        path = _jit_paths(loop, start, times, keys, substeps)
+        path = jax.tree.map(np.asarray, path)
+    _report(path)
+    return path
+
+
+def _paths(loop: OutputLoop, x0: Array, times: Array, keys: Key, substeps: int) -> OutputPath:
+    """One path, or one for each of a batch of starts or keys."""
+
+    def one(x0: Array, key: Key) -> OutputPath:
+        return output_path(loop, x0, times, key, substeps=substeps)
+
+    axes = (0 if jnp.ndim(x0) == 2 else None, 0 if _count(keys) else None)
+    return one(x0, keys) if axes == (None, None) else jax.vmap(one, axes)(x0, keys)
+
+
+_jit_paths = jax.jit(_paths, static_argnums=4)
+
+
+def _sees_tracers(loop: OutputLoop) -> bool:
+    """True if the control closes over numbers that somebody traces, as of a gain whose derivative is wanted."""
+    m = 0 if loop.plant.problem.controls is None else loop.plant.problem.controls.dim
+    try:
+        closed = jax.make_jaxpr(lambda u: loop.control(jnp.zeros(()), loop.initial(), u))(jnp.zeros(m))
+    except (TypeError, ValueError):  # whose reason the checks will tell
+        return False
+    return is_traced(closed.consts)
+
+
+def _times(duration: float, dt: float) -> np.ndarray:
+    """The times of the updates, shape (k+1,)."""
+    end = float(arguments.positive(duration, "simulate_output: duration", "in units of time"))
+    step = float(arguments.positive(dt, "simulate_output: dt", "the time between two updates"))
+    wanted = max(1.0, end / step * (1 - ROUNDING))
+    if wanted > MOST:
+        raise ValueError(f"simulate_output: dt = {dt} makes {wanted:.3g} intervals of {duration:g}, wanted at most 1e7")
+    return np.append(np.arange(int(np.ceil(wanted))) * step, end)
+
+
+def _initial_states(x0: object) -> Any:
+    """x0 as an array (n,) or (batch, n)."""
+    state = jnp.asarray(x0) if is_traced(x0) else numbers(x0, "simulate_output: x0")
+    if np.ndim(state) not in (1, 2) or 0 in np.shape(state):
+        raise ValueError(f"simulate_output: x0 has shape {np.shape(state)}, wanted (n,), or (batch, n), one a path")
+    if not is_traced(state) and not np.all(np.isfinite(state)):
+        raise ValueError(f"simulate_output: x0 is {arguments.shown(x0)}, wanted finite numbers")
+    return state
+
+
+def _count(keys: Any) -> int:
+    """The length of an array of keys; 0 for one key."""
+    shape = np.shape(keys)
+    # two kinds of keys: typed ones, and rows of uint32 as jax.random.PRNGKey makes them
+    shape = shape if jnp.issubdtype(keys.dtype, jax.dtypes.prng_key) else shape[:-1]
+    return shape[0] if shape else 0
+
+
+def _keys(key: Any, paths: int | None, batch: tuple[int, ...]) -> Key:
+    """One key, or one a path."""
+    dtype = getattr(key, "dtype", None)
+    typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
+    if not typed and not (dtype == np.uint32 and np.ndim(key) in (1, 2)):
+        raise ValueError(
+            f"simulate_output: key is {arguments.shown(key)}, wanted a JAX random key, an array of them, or a seed: "
+            "key=0"
+        )
+    count = _count(key)
+    if paths is not None:
+        if count:
+            raise ValueError(f"simulate_output: got {count} keys and paths = {paths}; leave out one of them")
+        count = arguments.count(paths, "simulate_output: paths")
+    if batch and count not in (0, batch[0]):
+        raise ValueError(f"simulate_output: got {batch[0]} states and {count} paths, wanted as many of both")
+    wanted = count or (batch[0] if batch else 0)  # each start gets a key of its own
+    return key if _count(key) or not wanted else jax.random.split(key, wanted)
+
+
+def _closed(
+    problem: Problem,
+    observer: Observer,
+    control: Any,
+    measured: Measurement,
+    grid: Grid | None,
+    n: int,
+    duration: float,
+) -> OutputLoop:
+    """The loop through an observer and a function, or a feedback at its estimate."""
+    if not isinstance(problem, Problem):
+        raise TypeError(f"simulate_output: got {type(problem).__name__}, wanted a Problem")
+    if problem.is_game or problem.running_max is not None:
+        what = "disturbances" if problem.is_game else "a running_max"
+        fix = "put noise in their place" if problem.is_game else "leave it out, and take the maximum along path.states"
+        raise ValueError(f"simulate_output: got a problem with {what}, wanted one player and a running cost; {fix}")
+    missing = [name for name in ("initial", "update", "estimate") if not callable(getattr(observer, name, None))]
+    if missing:
+        raise TypeError(
+            f"simulate_output: the observer is a {type(observer).__name__} without {' and '.join(missing)}, wanted an "
+            "Observer, with initial(), update(state, u, dy, dt) and estimate(state)"
+        )
+    problem = closures.settled(problem, n)
+    checks.of_one_state(problem, n, "the number of states in x0")
+    # bound methods of a pytree bring its numbers along as leaves; those of another object belong to the program
+    initial, update, estimate = (_method(observer, name) for name in ("initial", "update", "estimate"))
+    acts: Any
+    if problem.controls is None:
+        if control is not None:
+            raise ValueError("simulate_output: got a control, but problem.controls is None; give an admissible set")
+        acts = jax.tree_util.Partial(no_control)
+    elif is_grid_feedback(control):
+        if control.times is not None:
+            problem = _within_horizon(problem, control, duration)
+        grid = control.grid if grid is None else grid
+        acts = CertaintyEquivalence(estimate, lookups(control)[0], control.grid)
+    elif callable(control):
+        acts = jax.tree_util.Partial(of_information, as_partial(control))
+    else:
+        raise TypeError(
+            f"simulate_output: control is {arguments.shown(control)}, wanted a function of the observer's state, or a "
+            "Solution, which is asked at its estimate"
+        )
+    grid = getattr(observer, "grid", None) if grid is None else grid
+    if grid is not None and not (isinstance(grid, Grid) and grid.ndim == n):
+        raise ValueError(f"simulate_output: grid is {arguments.shown(grid)}, wanted a Grid of {n} axes, as x0 has")
+    plant = Loop(problem, None, None, grid, clamp=True)
+    return OutputLoop(plant, measured, initial, update, estimate, acts)
+
+
+def _method(observer: Observer, name: str) -> jax.tree_util.Partial:
+    """One of the observer's functions as a pytree."""
+    function = as_partial(getattr(observer, name))
+    assert function is not None
+    return function
+
+
+def _within_horizon(problem: Problem, solution: GridFeedback, duration: float) -> Problem:
+    """The problem under a marched feedback, without its terminal cost if the path ends before the horizon."""
+    horizon = check_kept(solution, duration, "simulate_output: duration")
+    return altered(problem, terminal_cost=None) if duration < horizon * (1 - ROUNDING) else problem
+
+
+def _check_shapes(loop: OutputLoop, x0: np.ndarray) -> None:
+    """Trace observer and control once, abstractly, and compare what they return with what is wanted."""
+    m = 0 if loop.plant.problem.controls is None else loop.plant.problem.controls.dim
+    u, dy, dt = np.zeros(m), np.zeros(loop.measurement.dim), np.zeros(())
+    information = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, loop.initial()))
+    try:
+        told = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, loop.update(loop.initial(), u, dy, dt)))
+    except (TypeError, ValueError) as error:
+        said = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise ValueError(
+            f"simulate_output: the observer does not take a control of shape {u.shape} and an increment of shape "
+            f"{dy.shape}, which problem and h have: {said[:400]}"
+        ) from error
+    forms: list[Any] = [jax.tree.structure(each) for each in (information, told)]
+    before, after = ([leaf.shape for leaf in jax.tree.leaves(each)] for each in (information, told))
+    if forms[0] != forms[1] or before != after:
+        raise ValueError(
+            f"simulate_output: update(state, u, dy, dt) returned a pytree of arrays of shapes {after}, wanted that of "
+            f"initial(), {before}: {arguments.shown(forms[0])}"
+        )
+    for name, found, wanted in (
+        ("the observer's estimate", jax.eval_shape(lambda: jnp.asarray(loop.estimate(loop.initial()))), x0.shape),
+        ("control", jax.eval_shape(lambda: loop.control(0.0, loop.initial(), u)), (m,)),
+    ):
+        if found.shape != wanted:
+            raise ValueError(f"simulate_output: {name} has shape {found.shape}, wanted {wanted}")
+
+
+def _report(path: OutputPath) -> None:
+    """Warn of paths that end early, except in the target."""
+    codes = np.atleast_1d(path.code)
+    for code in np.unique(codes):
+        status = PathStatus(int(code))
+        if status not in (PathStatus.DURATION, PathStatus.TARGET):
+            ends = np.atleast_2d(path.times)[codes == code, -1]
+            many = f"{ends.size} of {codes.size} paths" if codes.size > 1 else "the path"
+            message = ADVICE[status]
+            warnings.warn(f"simulate_output: {many} {message}; the first at t = {ends.min():.6g}", stacklevel=3)
+
+
+ADVICE = {
+    PathStatus.NONFINITE: "stopped before a step to no finite state or estimate; a shorter dt or more substeps may do",
+    PathStatus.UNDEFINED: "stopped where the control is not finite",
+}

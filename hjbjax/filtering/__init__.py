@@ -1,0 +1,47 @@
+"""State estimates and control from them: output feedback.
+
+    dx = f(x, u) dt + σ dw,    dy = h(x) dt + r dv,    u = control(information state)
+
+Read ``observers`` first: the extended Kalman filter, the Luenberger observer, and how to write one; then
+``information_state``, the law of the state on a grid; ``robust_filter`` for the worst case, with its equation in
+``max_plus``; ``beliefs`` with ``hidden_chain`` for hidden chains of a few states; and ``controllers`` for controls from
+the states of all these. The loop through plant, sensor, observer and control stands with the other closed loops, in
+``hjbjax.feedback.output_feedback``.
+"""
+
+from hjbjax.feedback.output_feedback import simulate_output
+from hjbjax.feedback.output_loop import OutputPath
+from hjbjax.filtering.beliefs import BeliefCoordinates, BeliefProblem, belief_problem
+from hjbjax.filtering.controllers import averaged_hamiltonian, certainty_equivalence, minimum_stress
+from hjbjax.filtering.grid_filter import Density, GridFilter
+from hjbjax.filtering.hidden_chain import HiddenPath, WonhamFilter, simulate_hidden
+from hjbjax.filtering.information_state import InformationState, zakai
+from hjbjax.filtering.max_plus import sup_pairing
+from hjbjax.filtering.observers import ExtendedKalman, Gaussian, Luenberger, Observer
+from hjbjax.filtering.robust_filter import RobustGridFilter, RobustState, robust_filter
+
+__all__ = [
+    "BeliefCoordinates",
+    "BeliefProblem",
+    "Density",
+    "ExtendedKalman",
+    "Gaussian",
+    "GridFilter",
+    "HiddenPath",
+    "InformationState",
+    "Luenberger",
+    "Observer",
+    "OutputPath",
+    "RobustGridFilter",
+    "RobustState",
+    "WonhamFilter",
+    "averaged_hamiltonian",
+    "belief_problem",
+    "certainty_equivalence",
+    "minimum_stress",
+    "robust_filter",
+    "simulate_hidden",
+    "simulate_output",
+    "sup_pairing",
+    "zakai",
+]

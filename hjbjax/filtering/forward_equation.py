@@ -1,0 +1,121 @@
+"""The forward equation ∂p/∂t = 𝓛*p on a grid: where the chain under one control is after some time.
+
+𝓛* is the transposed generator, so that Σ p is kept and p ≥ 0 stays so: with sub-steps τ ≤ 1/max Q every
+
+    p ← p + τ 𝓛*p
+
+is a step of a Markov chain, and the mean of p and of two of them, ½ p + ½ (1 + τ𝓛*)² p, K. Heun's, is of second
+order in τ. The number of sub-steps is the least, ⌈dt max Q⌉, so that a step of any length is admissible; each costs two
+passes over the nodes.
+
+The chain's law is a probability at each node. Its density is that over the node's cell: half a cell at a wall on which
+noise reflects, a whole one at an end of an axis without noise, see ``chain.stationary_density``.
+
+Mean, covariance and mode of probabilities at the nodes of a grid.
+
+Along a periodic axis of length L the mean is the circular one,
+
+    lo + L/2π arg Σ p e^{2πi (x − lo)/L},
+
+brought into the box, and differences from it are taken the short way round, in [−L/2, L/2). Where the sum vanishes, as
+of a uniform law, there is no direction and the mean is ``lo``.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.discretisation import stencil
+from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.rates import Rates, jump_rates
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.pytree import known
+from hjbjax.problem.types import Array, Control, Field, Number, State
+
+
+def advanced(on: Discretisation, probability: Field, u: Control, dt: Number) -> Field:
+    """The probabilities at the nodes after the time dt under the control u (m,): their sum is kept, none negative."""
+    dtype = probability.dtype
+    jumps = jump_rates(on, [jnp.asarray(u[j], dtype) for j in range(len(u))])
+    leaving, arriving = jumps.total(), jumps.inflow(on.grid)
+    wanted = jnp.ceil(jnp.max(leaving) * dt)
+    # rates that are not finite make no count; the probabilities that they make say so
+    count = jnp.where(jnp.isfinite(wanted), jnp.clip(wanted, 1, np.iinfo(np.int32).max // 2), 1)
+    tau = (dt / count).astype(dtype)
+    stays = jnp.maximum(1 - tau * leaving, 0)  # of the fastest node 1 − 1, which may round below zero
+    moves = arriving.scaled(tau)
+
+    def substep(_: int, p: Field) -> Field:
+        return (p + _moved(on, stays, moves, _moved(on, stays, moves, p))) / 2
+
+    return jax.lax.fori_loop(0, count.astype(jnp.int32), substep, probability)
+
+
+def _moved(on: Discretisation, stays: Field, moves: Rates, p: Field) -> Field:
+    """The probabilities after one jump of the chain at most."""
+    found = stays * p
+    for offset, share in zip(moves.offsets, moves.values, strict=True):
+        found = found + share * stencil.neighbour(p, on.grid, offset, ghost=False)
+    return found
+
+
+def cells(on: Discretisation) -> Array:
+    """The cell of every node for the law of the chain, shape (*grid), in the units of the states.
+
+    Noise that depends on the control counts with its value at zero control.
+    """
+    grid, sizes = on.grid, on.grid.volumes()
+    m = 0 if on.problem.controls is None else on.problem.controls.dim
+    noise = on.diffusion([jnp.zeros((), on.dtype)] * m)
+    for axis in range(grid.ndim):
+        still = stencil.walls(grid, axis) & ~(known(noise.get((axis, axis), 0.0)) > 0)
+        sizes = sizes * (1 + still)  # whole cells
+    return sizes
+
+
+# --- moments ---
+
+
+def mean(grid: Grid, probability: Field) -> State:
+    """The mean, shape (n,), of probabilities of sum one."""
+    return jnp.stack([_mean_along(grid, axis, _marginal(probability, axis)) for axis in range(grid.ndim)])
+
+
+def covariance(grid: Grid, probability: Field) -> jax.Array:
+    """The covariance about the mean, shape (n, n), of probabilities of sum one."""
+    center = mean(grid, probability)
+    off = [_difference(grid, axis, center[axis], probability.dtype) for axis in range(grid.ndim)]
+    entries = {(i, j): jnp.sum(probability * off[i] * off[j]) for i in range(grid.ndim) for j in range(i, grid.ndim)}
+    return jnp.stack([jnp.stack([entries[min(i, j), max(i, j)] for j in range(grid.ndim)]) for i in range(grid.ndim)])
+
+
+def mode(grid: Grid, density: Field) -> State:
+    """The node at which a density is largest, shape (n,); the first of equals."""
+    index = jnp.unravel_index(jnp.argmax(density), grid.shape)
+    return jnp.stack([jnp.asarray(grid.axis(axis, density.dtype), density.dtype)[i] for axis, i in enumerate(index)])
+
+
+def _marginal(probability: Field, axis: int) -> jax.Array:
+    """The probabilities of the nodes along one axis, shape (N,)."""
+    return jnp.sum(probability, axis=tuple(i for i in range(probability.ndim) if i != axis))
+
+
+def _mean_along(grid: Grid, axis: int, probability: jax.Array) -> jax.Array:
+    dtype = probability.dtype
+    x = jnp.asarray(grid.axis(axis, dtype), dtype)
+    if not grid.periodic[axis]:  # type: ignore[index]
+        return probability @ x
+    lo, hi = jnp.asarray(grid.lo[axis], dtype), jnp.asarray(grid.hi[axis], dtype)
+    angle = 2 * np.pi * (x - lo) / (hi - lo)
+    turn = jnp.arctan2(probability @ jnp.sin(angle), probability @ jnp.cos(angle)) / (2 * np.pi)
+    place = lo + (hi - lo) * jnp.mod(turn, 1)
+    return jnp.where(place >= hi, lo, place)  # just below zero, the remainder rounds up to a whole turn
+
+
+def _difference(grid: Grid, axis: int, center: jax.Array, dtype: np.dtype) -> jax.Array:
+    """x − mean along one axis, the short way round a periodic one; broadcasts over the nodes."""
+    off = grid.components(dtype)[axis] - center
+    if not grid.periodic[axis]:  # type: ignore[index]
+        return off
+    length = jnp.asarray(grid.hi[axis], dtype) - jnp.asarray(grid.lo[axis], dtype)
+    return jnp.mod(off + length / 2, length) - length / 2

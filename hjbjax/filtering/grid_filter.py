@@ -1,0 +1,229 @@
+"""The law of the state given what was measured, on a grid, step by step: an ``Observer`` for any drift, noise and h.
+
+A step of length dt of the Duncan–Mortensen–Zakai equation is split as G. Strang did,
+
+    q ← e^{ℓ/2} q,    q ← e^{𝓛* dt} q,    q ← e^{ℓ/2} q,    ℓ = hᵀR⁻¹dy − ½ hᵀR⁻¹h dt,
+
+where the factors are exact for a state that rests, and the middle step keeps sums and signs, see ``forward_equation``:
+q ≥ 0 for any dt and any record. Of second order in dt; in the spacing of the order of the chain, two where its
+differences are central and one elsewhere. The factors are multiplied as logarithms, with the largest product taken out,
+so that nothing overflows or vanishes; what is taken out is kept in the logarithm of the mass.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.discretisation import correlated_noise
+from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.rates import jump_rates
+from hjbjax.discretisation.schemes import Upwind
+from hjbjax.feedback.measurement import Measurement, measurement, plant
+from hjbjax.filtering import forward_equation
+from hjbjax.filtering.forward_equation import advanced, cells
+from hjbjax.problem import sets
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import cast, is_traced, numbers, pytree_dataclass
+from hjbjax.problem.types import Array, Control, DType, Field, Number, Numbers, State
+from hjbjax.tracing import components
+
+
+@pytree_dataclass()
+class Density:
+    """The law of the state on a grid, and the likelihood of the record so far.
+
+    Args:
+      density: at the nodes, (*grid), in 1/(units of the states); ``sum(density * grid.volumes())`` is 1.
+      log_likelihood: log ∫q, of the record against that of noise alone.
+    """
+
+    density: Any
+    log_likelihood: Any
+
+
+@pytree_dataclass()
+class GridFilter:
+    """The law of the state given what was measured, on a grid: an ``Observer`` for any drift, noise and h.
+
+    One update is a step of the Duncan–Mortensen–Zakai equation (12.6), see ``zakai``. Its state is a ``Density``. The
+    state of the plant stays on the grid: the box must hold it, with room to spare. Costs 2⌈dt max Q⌉ passes over the
+    nodes a step, Q the rate at which the chain leaves a node, Σ |f_i|/h_i + a_ii/h_i².
+
+    Args:
+      problem: the plant: its drift, controls and noise matter.
+      h: the measured function of one state, returns shape (p,).
+      grid: the nodes.
+      initial_density: of the state at t = 0: a function of one state that returns a number ≥ 0, or (*grid). It need
+        not be normalised.
+
+    Keyword Args:
+      measurement_noise: r in dy = h(x) dt + r dv: a number, (p,) or (p, p).
+
+    Raises:
+      ValueError: a game, a problem that depends on time, open ends, functions of the wrong shape or that are not finite
+        at a node, noise that the chain cannot represent, an initial density that is none.
+      TypeError: no Problem, no Grid, an h that cannot be called.
+
+    Example:
+      >>> grid = Grid([-3.0], [3.0], (61,))
+      >>> filter = GridFilter(Problem(lambda x, u: -x, noise=1.0), lambda x: x, grid, lambda x: jnp.exp(-x @ x))
+      >>> state = filter.update(filter.initial(), jnp.zeros(0), 0.1 * jnp.ones(1), 0.1)  # y = 1
+      >>> bool(0 < filter.estimate(state)[0] < 0.1), round(float(jnp.sum(state.density * grid.volumes())), 5)
+      (True, 1.0)
+    """
+
+    plant: Problem
+    grid: Grid
+    measurement: Measurement
+    signal: Any  # r⁻¹ h at the nodes, (p, *grid)
+    prior: Any  # the density at t = 0, (*grid)
+    volumes: Any  # of the nodes, (*grid)
+    cells: Any  # of the chain's law, (*grid)
+
+    def __init__(
+        self,
+        problem: Problem,
+        h: Callable,
+        grid: Grid,
+        initial_density: Callable | Numbers,
+        *,
+        measurement_noise: Numbers | Sequence = 1.0,
+    ):
+        name = "GridFilter"
+        if not isinstance(grid, Grid):
+            raise TypeError(f"{name}: got {type(grid).__name__} for the grid, wanted a Grid")
+        if grid.sides("open"):
+            raise ValueError(
+                f"{name}: got a grid with open ends, where mass would leave; choose edges='projected', and a box with "
+                "room for the state"
+            )
+        system = plant(problem, grid.ndim, name)
+        measured = measurement(h, grid.ndim, measurement_noise, name)
+        # inside ``jit`` as well, what is known is computed here and now
+        with jax.enable_x64(True), jax.ensure_compile_time_eval():
+            on = Discretisation(*cast((system, grid), np.float64), Upwind(), np.dtype(np.float64))
+            if not is_traced(system, grid):
+                _check_rates(on, name)
+            fields = {
+                "plant": system,
+                "grid": grid,
+                "measurement": measured,
+                "signal": _signal(on, cast(measured, np.float64), name),
+                "prior": _prior(on, initial_density, name),
+                "volumes": grid.volumes(),
+                "cells": cells(on),
+            }
+        for field, value in fields.items():
+            object.__setattr__(self, field, value)
+
+    def initial(self) -> Density:
+        """The law at t = 0, of likelihood one."""
+        density = jnp.asarray(self.prior, jnp.result_type(float))
+        return Density(density, jnp.zeros((), density.dtype))
+
+    def update(self, state: Density, u: Control, dy: Array, dt: Number) -> Density:
+        """The law after holding the control u (m,) for dt and seeing the increment dy (p,)."""
+        dtype = state.density.dtype
+        dt, u = jnp.asarray(dt, dtype), jnp.asarray(u, dtype)
+        signal = jnp.asarray(self.signal, dtype)
+        seen = self.measurement.whitened(jnp.asarray(dy, dtype))
+        # half of ℓ, before the state moves and after it
+        half = (jnp.tensordot(seen, signal, 1) - jnp.sum(signal**2, axis=0) * (dt / 2)) / 2
+        probability, before = _weighed(self.probability(state), half)
+        probability = advanced(self._on(dtype), probability, u, dt)
+        probability, after = _weighed(probability, half)
+        return Density(self._density(probability), state.log_likelihood + before + after)
+
+    def estimate(self, state: Density) -> State:
+        """The mean, shape (n,); along periodic axes the circular mean, in the box. See ``zakai``."""
+        return forward_equation.mean(self.grid, self.probability(state))
+
+    def covariance(self, state: Density) -> jax.Array:
+        """The covariance about the estimate, shape (n, n)."""
+        return forward_equation.covariance(self.grid, self.probability(state))
+
+    def probability(self, state: Density) -> Field:
+        """The probability of each node of the chain, shape (*grid), of sum 1: the density times the node's cell."""
+        mass = state.density * jnp.asarray(self.cells, state.density.dtype)
+        return mass / jnp.sum(mass)
+
+    def mode(self, state: Density) -> State:
+        """The node at which the density is largest, shape (n,)."""
+        return forward_equation.mode(self.grid, state.density)
+
+    def _on(self, dtype: DType) -> Discretisation:
+        return Discretisation(*cast((self.plant, self.grid), dtype), Upwind(), dtype)
+
+    def _density(self, probability: Field) -> Field:
+        density = probability / jnp.asarray(self.cells, probability.dtype)
+        return density / jnp.sum(density * jnp.asarray(self.volumes, probability.dtype))
+
+
+def _weighed(probability: Field, exponent: Field) -> tuple[Field, jax.Array]:
+    """Probabilities times e^exponent, normalised, and the logarithm of what their sum was."""
+    positive = probability > 0
+    # the largest product is taken out, not the largest factor: where the factor is large, there may be no mass
+    logarithm = jnp.where(positive, jnp.log(jnp.where(positive, probability, 1)) + exponent, -jnp.inf)
+    largest = jax.lax.stop_gradient(jnp.max(logarithm))
+    weight = jnp.exp(logarithm - largest)
+    total = jnp.sum(weight)
+    return weight / total, largest + jnp.log(total)
+
+
+def _signal(on: Discretisation, measured: Measurement, name: str) -> Any:
+    """r⁻¹ h at the nodes, shape (p, *grid)."""
+    entries = components.components(measured.h, on.coordinates(), dtype=on.dtype)
+    h = jnp.stack([jnp.broadcast_to(entry, on.grid.shape) for entry in entries])
+    _refuse(f"{name}: h(x) is not finite", ~jnp.all(jnp.isfinite(h), axis=0), on.grid)
+    white = measured.whitened(h.reshape(len(h), -1)).reshape(h.shape)
+    return white if is_traced(white) else np.asarray(white)
+
+
+def _prior(on: Discretisation, given: Callable | Numbers, name: str) -> Any:
+    """The initial density, shape (*grid), of integral one."""
+    density = on.at_nodes(given) if callable(given) else numbers(given, f"{name}: initial_density")
+    if np.shape(density) != on.grid.shape:
+        raise ValueError(
+            f"{name}: initial_density has shape {np.shape(density)}, wanted that of the grid, {on.grid.shape}, or a "
+            "function of one state"
+        )
+    if is_traced(density):
+        return density / jnp.sum(density * on.grid.volumes())
+    density = np.asarray(density)
+    _refuse(f"{name}: initial_density is not a finite number ≥ 0", ~(np.isfinite(density) & (density >= 0)), on.grid)
+    if not np.any(density):
+        raise ValueError(
+            f"{name}: initial_density is zero at every node, so that no record tells anything; put mass on a node: a "
+            "peak narrower than the spacing may fall between two"
+        )
+    density = density / np.max(density)  # before the sum, which might overflow
+    return density / np.sum(density * on.grid.volumes())
+
+
+def _check_rates(on: Discretisation, name: str) -> None:
+    """Refuse drift or noise that is not finite at a node, and correlated noise that the chain cannot represent."""
+    for u in sets.probes(on.problem.controls, on.dtype)[:3]:
+        leaving, lacking = _look(on, u)
+        _refuse(f"{name}: a jump rate, made of drift and noise, is not finite", ~jnp.isfinite(leaving), on.grid)
+        _refuse(f"{name}: the noise is correlated more than the spacings allow", lacking, on.grid)
+
+
+@jax.jit
+def _look(on: Discretisation, u: list) -> tuple[jax.Array, jax.Array]:
+    """Q at every node, and the nodes at which correlated noise leaves a negative rate."""
+    short = correlated_noise.lacking(on, on.diffusion(u))
+    lacking = jnp.broadcast_to(jnp.zeros((), bool) if short is None else short, on.grid.shape)
+    return jump_rates(on, u).total(), lacking
+
+
+def _refuse(what: str, where: Any, grid: Grid) -> None:
+    """Raise a ValueError that names the fault ``what``, its count of nodes and the first, if it is at any."""
+    if is_traced(where) or not np.any(where):
+        return
+    first = tuple(int(i) for i in np.argwhere(where)[0])
+    state = np.array2string(grid.state(first), separator=", ")
+    raise ValueError(f"{what} at {int(np.sum(where))} nodes, the first {first} with state {state}")

@@ -1,0 +1,310 @@
+"""Hidden Markov chains of a few states: their exact filter as an observer, and simulation in closed loop.
+
+The chain jumps with the generator A(u), and dy = h(x, u) dt + r dv is seen. W. M. Wonham's filter over a step dt, in
+which control is held and dy is the increment:
+
+    π ← P½ᵀ π,     π_i ← π_i exp(h_i·R⁻¹dy − ½ h_i·R⁻¹h_i dt) / (sum over i),     π ← P½ᵀ π,
+
+with P½ = exp(A dt/2) and R = r²: Bayes' rule for a chain that jumps at both ends of the step and not within. No entry
+is ever negative and the sum is one for steps of any length; without measurements π is exact. The transition
+matrix is a Taylor series of A + qI ≥ 0, q the fastest rate, over 2^−s of the step, squared s times: sums and products
+of what is not negative.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.filtering.beliefs import Sensor, chain_functions, check_generator
+from hjbjax.problem import arguments
+from hjbjax.problem.pytree import as_partial, cast, is_traced, numbers, pytree_dataclass
+from hjbjax.problem.types import Array, Control, Key, Number, Numbers
+
+TERMS = 19  # of the Taylor series: 1/19! is below the rounding of float64 where q dt ≤ 1
+
+
+def transition_matrix(rates: Array, dt: Number) -> jax.Array:
+    """exp(A dt) of a generator A, shape (S, S), with entries ≥ 0 and rows that sum to one; pure, for any dt ≥ 0.
+
+    Example:
+      >>> matrix = transition_matrix(np.array([[-1.0, 1.0], [0.0, 0.0]]), 1.0)
+      >>> [round(float(entry), 4) for entry in matrix.ravel()]
+      [0.3679, 0.6321, 0.0, 1.0]
+    """
+    rates = jnp.asarray(rates)
+    fastest = jnp.max(-jnp.diag(rates))
+    squarings = jnp.ceil(jnp.log2(jnp.maximum(fastest * dt, 1)))
+    short = dt / 2**squarings
+    one = jnp.eye(rates.shape[0], dtype=rates.dtype)
+    raised = jnp.maximum(rates + fastest * one, 0) * short  # of a diagonal entry zero is left, up to rounding
+
+    def add(k, carry):
+        total, term = carry
+        term = term @ raised / k
+        return total + term, term
+
+    total, _ = jax.lax.fori_loop(1, TERMS, add, (one, one))
+
+    def normal(matrix):  # in place of the factor e^{−q dt}, and so that rounding does not grow with the squarings
+        return matrix / jnp.sum(matrix, axis=1, keepdims=True)
+
+    return jax.lax.fori_loop(0, squarings.astype(int), lambda _, matrix: normal(matrix @ matrix), normal(total))
+
+
+@pytree_dataclass()
+class WonhamFilter:
+    """The belief of a hidden chain as an observer: its state is π, shape (S,).
+
+    The estimate is the conditional mean of the chain's indicator, π itself. A controller is a function of π; with a
+    ``belief_problem`` it is ``lambda belief: solution.control_at(coordinates.from_belief(belief), clamp=True)``.
+
+    Args:
+      generator: A(u), a function of one control that returns shape (S, S), or the matrix itself, per unit time.
+      h: what is seen of each state, shape (S,) or (S, p), or a function of u that returns one of these.
+      prior: π at time 0, shape (S,), ≥ 0, in any multiple.
+
+    Keyword Args:
+      measurement_noise: r in dy = h dt + r dv, a number or one a measurement (p,).
+
+    Raises:
+      ValueError: a prior that is no law, or rates that make no generator.
+
+    Example:
+      >>> observer = WonhamFilter(np.array([[-1.0, 1.0], [1.0, -1.0]]), [1.0, -1.0], [0.5, 0.5])
+      >>> belief = observer.update(observer.initial(), jnp.zeros(0), jnp.array([0.3]), 0.1)
+      >>> bool(belief[0] > belief[1]), round(float(belief.sum()), 6)
+      (True, 1.0)
+
+    Source: W. M. Wonham, Some applications of stochastic differential equations to optimal nonlinear filtering, 1965.
+    """
+
+    generator: Any
+    sensor: Sensor
+    prior: Any
+
+    def __init__(
+        self,
+        generator: Callable | Numbers,
+        h: Callable | Numbers | Sequence,
+        prior: Numbers | Sequence,
+        *,
+        measurement_noise: Numbers | Sequence = 1.0,
+    ):
+        fixed, sensor = chain_functions(generator, h, measurement_noise, "WonhamFilter")
+        if not callable(generator) and not is_traced(generator):
+            check_generator(np.asarray(generator, float), "WonhamFilter: the generator")
+        law: Any = numbers(prior, "WonhamFilter: prior")
+        if not is_traced(law):
+            if law.ndim != 1 or not np.all(np.isfinite(law)) or np.any(law < 0) or not law.sum() > 0:
+                raise ValueError(
+                    f"WonhamFilter: prior = {arguments.shown(law.tolist())}; wanted (S,) numbers ≥ 0, not all zero: "
+                    "how likely each state is at time 0"
+                )
+            law = law / law.sum()
+        _check_shapes(generator, h, sensor, len(law))
+        for name, value in {"generator": fixed, "sensor": sensor, "prior": law}.items():
+            object.__setattr__(self, name, value)
+
+    def initial(self) -> jax.Array:
+        """The prior, shape (S,), sum one."""
+        law = jnp.asarray(self.prior, jnp.result_type(float))
+        return law / jnp.sum(law)
+
+    def update(self, state: Array, u: Control, dy: Array, dt: Number) -> jax.Array:
+        """π after holding the control u, shape (m,), for a time dt and seeing the increment dy, shape (p,)."""
+        return _updated(self, jnp.asarray(state), jnp.asarray(u), jnp.asarray(dy), dt)
+
+    def _after(self, belief: jax.Array, u: jax.Array, dy: jax.Array, dt: Number) -> jax.Array:
+        """π after a step."""
+        mine, u = cast(self, belief.dtype), jnp.asarray(u, belief.dtype)
+        half = transition_matrix(jnp.asarray(mine.generator(u), belief.dtype), dt / 2)
+        gains = mine.sensor(u)
+        # dy/r and h/r: unit noise in every measurement
+        seen = jnp.asarray(dy, belief.dtype) / mine.sensor.measurement_noise
+        evidence = gains @ jnp.broadcast_to(seen, gains.shape[1:]) - jnp.sum(gains**2, axis=1) * dt / 2
+        belief = belief @ half
+        # the largest exponent among the states that are possible is 0, so that nothing overflows and not all underflow
+        top = jnp.max(jnp.where(belief > 0, evidence, -jnp.inf))
+        belief = belief * jnp.exp(jnp.minimum(evidence - top, 0))
+        belief = belief @ half
+        return belief / jnp.sum(belief)
+
+    def estimate(self, state: Array) -> jax.Array:
+        """The conditional mean of the indicator of the hidden state: π, shape (S,)."""
+        return jnp.asarray(state)
+
+
+_updated = jax.jit(WonhamFilter._after)
+
+
+@pytree_dataclass()
+class HiddenPath:
+    """A simulated hidden chain with its measurements and beliefs; with several keys one more axis, first, in each.
+
+    Attributes:
+      times: shape (k + 1,).
+      hidden: the number of the state at each time, shape (k + 1,), integers.
+      beliefs: π at each time, shape (k + 1, S).
+      controls: what was held over each step, shape (k, m).
+      measurements: the increments dy, shape (k, p).
+      cost: ∫ e^{−βt} c dt over the path, shape ().
+    """
+
+    times: Any
+    hidden: Any
+    beliefs: Any
+    controls: Any
+    measurements: Any
+    cost: Any
+
+
+def _check_shapes(generator: Any, h: Any, sensor: Sensor, states: int) -> None:
+    """Refuse arrays of another number of states than the prior has; of functions nothing is known without a control."""
+    if not callable(generator) and np.shape(generator) != (states, states):
+        raise ValueError(
+            f"WonhamFilter: generator has shape {np.shape(generator)}, wanted {(states, states)}: the prior has "
+            f"{states} states"
+        )
+    if callable(h):
+        return
+    if np.ndim(h) not in (1, 2) or len(np.asarray(h)) != states:
+        raise ValueError(
+            f"WonhamFilter: h has shape {np.shape(h)}, wanted ({states},) or ({states}, p): one row a state"
+        )
+    sensor.check("WonhamFilter", np.zeros(0))
+
+
+def simulate_hidden(
+    observer: WonhamFilter,
+    control: Callable | None,
+    cost: Callable,
+    *,
+    duration: float,
+    dt: float,
+    key: Key | int,
+    discount: Number = 0.0,
+    start: int | None = None,
+) -> HiddenPath:
+    """Paths of a hidden chain whose control sees the belief alone, in float64; batched over keys.
+
+    The chain at the ends of the steps has its exact law under the control that is held over each; within a step in
+    which it jumps, measurements and costs are those of the mean of its two states, an error of order dt² in the mean.
+
+    Args:
+      observer: the filter, with the generator and the sensor of the chain.
+      control: a function of the belief (S,) that returns u, shape (m,); ``None`` where there is no control, m = 0.
+      cost: c, a function of u that returns the cost per unit time in every state, shape (S,).
+
+    Keyword Args:
+      duration: how long to run, in units of time; of an endless discounted cost e^{−β duration} is left out.
+      dt: the length of a step, over which the control is held; made a little shorter so that steps fill the duration.
+      key: a JAX random key, an integer, or an array of K keys: then K paths.
+      discount: β ≥ 0, per unit time.
+      start: the hidden state at time 0; ``None``: drawn from the prior.
+
+    Returns:
+      A ``HiddenPath``.
+
+    Raises:
+      ValueError: a duration or step that is not positive, a start that is no state, a control or a cost of the wrong
+        shape.
+
+    Example:
+      >>> observer = WonhamFilter(np.array([[-1.0, 1.0], [1.0, -1.0]]), [1.0, -1.0], [0.5, 0.5])
+      >>> keys = jax.random.split(jax.random.key(0), 100)
+      >>> path = simulate_hidden(observer, None, lambda u: jnp.array([1.0, 0.0]), duration=2.0, dt=0.1, key=keys)
+      >>> path.hidden.shape, path.beliefs.shape, bool(abs(path.cost.mean() - 1) < 0.2)
+      ((100, 21), (100, 21, 2), True)
+    """
+    if not isinstance(observer, WonhamFilter):
+        raise TypeError(f"simulate_hidden: got {type(observer).__name__}, wanted a WonhamFilter")
+    arguments.positive(duration, "simulate_hidden: duration", "in units of time")
+    arguments.positive(dt, "simulate_hidden: dt", "in units of time", most=float(duration))
+    if not (arguments.is_number(discount) and 0 <= discount < np.inf):
+        raise ValueError(f"simulate_hidden: discount = {arguments.shown(discount)}; wanted a finite number ≥ 0")
+    states = len(observer.prior)
+    if start is not None and not (isinstance(start, (int, np.integer)) and 0 <= start < states):
+        raise ValueError(
+            f"simulate_hidden: start = {arguments.shown(start)}; wanted a state, 0 to {states - 1}, or None"
+        )
+    steps = int(np.ceil(duration / dt * (1 - 1e-9)))
+    keys = jax.random.key(key) if isinstance(key, (int, np.integer)) else jnp.asarray(key)
+    with jax.enable_x64(True):
+        law = np.asarray(observer.prior) if start is None else np.eye(states)[start]
+        loop = cast(_Loop(observer, as_partial(control or _nothing), as_partial(cost), float(discount)), np.float64)
+        _check_loop(loop, states)
+        run = _paths if keys.ndim == (0 if jnp.issubdtype(keys.dtype, jax.dtypes.prng_key) else 1) else _many_paths
+        return jax.tree.map(np.asarray, run(loop, jnp.asarray(law), keys, duration / steps, steps))
+
+
+@pytree_dataclass()
+class _Loop:
+    """What a simulation is made of."""
+
+    observer: WonhamFilter
+    control: Any
+    cost: Any
+    discount: Any
+
+
+def _nothing(belief: Array) -> jax.Array:
+    """No control."""
+    return jnp.zeros(0)
+
+
+def _check_loop(loop: _Loop, states: int) -> None:
+    """Refuse a control or a cost of the wrong shape before anything is compiled."""
+    belief = jax.ShapeDtypeStruct((states,), np.float64)
+    u = jax.eval_shape(loop.control, belief)
+    if len(u.shape) != 1:
+        raise ValueError(f"simulate_hidden: control returns shape {u.shape}, wanted (m,)")
+    for name, function, wanted in (
+        ("cost", loop.cost, (states,)),
+        ("the generator", loop.observer.generator, (states, states)),
+    ):
+        if (shape := jax.eval_shape(function, u).shape) != wanted:
+            raise ValueError(
+                f"simulate_hidden: {name} returns shape {shape}, wanted {wanted}: the prior has {states} states"
+            )
+
+
+def _simulated(loop: _Loop, law: jax.Array, key: Key, dt: Any, steps: int) -> HiddenPath:
+    """One path."""
+    observer = loop.observer
+    key, first = jax.random.split(key)
+    hidden, belief = jax.random.choice(first, len(law), p=law), observer.initial()
+    # ∫ e^{−βs} ds over a step; dt without discount
+    beta = loop.discount
+    length = jnp.where(beta * dt > 0, -jnp.expm1(-beta * dt) / jnp.where(beta > 0, beta, 1), dt)
+
+    def step(carry, inputs):
+        hidden, belief = carry
+        number, key = inputs
+        u = jnp.asarray(loop.control(belief), belief.dtype)
+        jump, shake = jax.random.split(key)
+        row = transition_matrix(jnp.asarray(observer.generator(u), belief.dtype), dt)[hidden]
+        after = jax.random.choice(jump, len(row), p=row)
+        gains = observer.sensor(u)
+        noise = jax.random.normal(shake, gains.shape[1:], belief.dtype)
+        dy = ((gains[hidden] + gains[after]) / 2 * dt + jnp.sqrt(dt) * noise) * observer.sensor.measurement_noise
+        rates = loop.cost(u)
+        paid = jnp.exp(-beta * number * dt) * length * (rates[hidden] + rates[after]) / 2
+        belief = observer.update(belief, u, dy, dt)
+        return (after, belief), (after, belief, u, dy, paid)
+
+    inputs = (jnp.arange(steps), jax.random.split(key, steps))
+    _, (states, beliefs, controls, measurements, paid) = jax.lax.scan(step, (hidden, belief), inputs)
+    return HiddenPath(
+        dt * jnp.arange(steps + 1), jnp.append(hidden, states), jnp.concatenate([belief[None], beliefs]),
+        controls, measurements, jnp.sum(paid),
+    )  # fmt: skip
+
+
+_paths = jax.jit(_simulated, static_argnames="steps")
+_many_paths = jax.jit(
+    lambda loop, law, keys, dt, steps: jax.vmap(lambda key: _simulated(loop, law, key, dt, steps))(keys),
+    static_argnames="steps",
+)

@@ -1,0 +1,222 @@
+"""The max-plus equation of the robust information state on a grid, and maxima between the nodes.
+
+Between two measurements the worst-case cost p of paths that end in x, for dx/dt = f + σw with a = σσᵀ diagonal, obeys
+
+    p_t = max_w { −Dp·(f + σw) − ½γ²|w|² } + L = Σ_i max_v { −v D_i p − (γ²/2a_ii) (v − f_i)² } + L,    v = f + σw,
+
+a Hamilton–Jacobi equation without an opponent, convex in Dp. A path arrives at x with velocity v from x − v dt, so that
+v > 0 sees the slope D⁻ from below and v < 0 the slope D⁺ from above: the Godunov flux
+
+    max{ −v⁺ D⁻ − (γ²/2a) (v⁺ − f)²,  −v⁻ D⁺ − (γ²/2a) (v⁻ − f)² },    v⁺ = (f − aD⁻/γ²)⁺,  v⁻ = (f − aD⁺/γ²)⁻,
+
+which is monotone in all neighbours for steps up to 1/max Σ_i |v_i|/h_i. The velocities are found, never bounded
+beforehand. Without noise on an axis v = f. At an end of an axis nothing flows in: the velocities that come from
+outside are left out; where the drift comes from there and no noise can oppose it, it is cut off.
+
+Slopes are those of a scheme, and so is the order in space; in time a strong-stability-preserving Runge–Kutta method
+takes as many steps as the velocities want. All slopes of order 2 and more are exact for a quadratic p, which then stays
+one up to the error in time.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.discretisation import stencil
+from hjbjax.discretisation.discretisation import Differences, Discretisation
+from hjbjax.iteration.time_methods import TABLEAUX
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.pytree import cast, is_traced, pytree_dataclass
+from hjbjax.problem.types import Array, Field, Nodes, Number, Scalar
+
+FRACTION = 0.8  # of the limit of a monotone step: velocities of a later stage may be larger than those of the first
+
+
+@pytree_dataclass()
+class MaxPlusMarch:
+    """The equation of p with everything but p known.
+
+    Args:
+      on: the grid with the slopes of a scheme; of the problem nothing is read.
+      drift: f, n components, each of a shape that broadcasts to (*grid).
+      spread: a_ii/γ² along every axis, ≥ 0.
+      source: L and what a measurement costs, (*grid), per unit time.
+    """
+
+    on: Discretisation
+    drift: Sequence[Any]
+    spread: Sequence[Any]
+    source: Any
+
+    def rate(self, p: Field) -> tuple[Field, Scalar]:
+        """p_t at every node, and the fastest Σ_i |v_i|/h_i."""
+        on, grid = self.on, self.on.grid
+        links = tuple(stencil.links(grid, axis) for axis in range(grid.ndim))
+        one_sided = tuple(stencil.one_sided(p, grid, axis, link) for axis, link in enumerate(links))
+        slopes = on.scheme.slopes(Differences(on, on.coordinates(), p, links, one_sided))
+        total, speed = jnp.broadcast_to(self.source, p.shape), jnp.zeros_like(p)
+        for axis, (link, (up, down)) in enumerate(zip(links, slopes, strict=True)):
+            gain, fastest = self._along(axis, up, down, link)
+            total, speed = total + gain, speed + fastest
+        return total, jnp.max(speed)
+
+    def _along(self, axis: int, up: Field, down: Field, link: stencil.Links) -> tuple[Any, Any]:
+        """The Godunov flux along an axis, and |v|/h."""
+        f, spread = jnp.asarray(self.drift[axis]), jnp.asarray(self.spread[axis])
+        noisy = spread > 0
+        room = jnp.where(noisy, spread, 1)  # a division by zero would make NaN of the branch that is not taken
+        lower, upper = (stencil.wall(self.on.grid, axis, step) for step in (-1, 1))
+        rising = jnp.where(lower, 0, jnp.maximum(f - spread * down, 0))
+        falling = jnp.where(upper, 0, jnp.minimum(f - spread * up, 0))
+        from_below = -rising * down - jnp.where(noisy, (rising - f) ** 2 / (2 * room), 0)
+        from_above = -falling * up - jnp.where(noisy, (falling - f) ** 2 / (2 * room), 0)
+        # without noise the velocity is the drift, and one of the two is zero: their sum is the upwind difference
+        gain = jnp.where(noisy, jnp.maximum(from_below, from_above), from_below + from_above)
+        return gain, jnp.maximum(rising / link.down, -falling / link.up)
+
+    def after(self, p: Field, dt: Number) -> Field:
+        """p a time dt later, by as many steps as the velocities want; NaN where it is no longer finite."""
+        tableau = TABLEAUX[self.on.scheme.stages]
+        means = jnp.asarray(tableau.means, p.dtype)
+
+        def step(carry):
+            p, left = carry
+            first, speed = self.rate(p)
+            whole = jnp.ceil(left * speed / FRACTION)
+            dt = left / jnp.maximum(whole, 1)  # equal steps, were the velocities to stay as they are
+            moved = p + dt * first  # the first mean is zero in every tableau
+
+            def stage(k, w):
+                return means[k] * p + (1 - means[k]) * (w + dt * self.rate(w)[0])
+
+            # a loop, so that the slopes are compiled once and not once a stage
+            moved = jax.lax.fori_loop(1, len(tableau.means), stage, moved)
+            # an infinite velocity would take steps of no length for ever
+            fine = jnp.isfinite(speed) & jnp.all(jnp.isfinite(moved))
+            left = jnp.where(whole <= 1, 0, left - dt)
+            return jnp.where(fine, moved, jnp.nan), jnp.where(fine, left, 0)
+
+        return jax.lax.while_loop(lambda carry: carry[1] > 0, step, (p, jnp.asarray(dt, p.dtype)))[0]
+
+
+def sup_pairing(p: Nodes, psi: Nodes | float, grid: Grid) -> tuple[Array, Array]:
+    """The maximum of p + ψ over the box and the state where it is attained: the max-plus inner product (p, ψ).
+
+    Between the nodes p + ψ is taken as the quadratic through the largest node and its neighbours, cross terms
+    included: third order where p + ψ is smooth, exact for a concave quadratic whose maximum lies within the box.
+    The state is never more than a spacing from the largest node, and a maximum at an end stays there.
+
+    Args:
+      p: the information state at the nodes, shape (*grid); −∞ for states that are impossible.
+      psi: a cost at the nodes, shape (*grid), or a number; with the value function of the control problem the state is
+        the one that certainty equivalence for games acts on.
+      grid: the nodes.
+
+    Returns:
+      The maximum, shape (), in the units of cost, and the state, shape (n,). Jit- and vmap-able.
+
+    Raises:
+      ValueError: node values of another shape than the grid.
+
+    Example:
+      >>> grid = Grid([-1.0], [1.0], (11,))
+      >>> x = grid.axis(0)
+      >>> value, state = sup_pairing(-2.0 * (x - 0.33) ** 2, 1.0, grid)
+      >>> round(float(value), 6), round(float(state[0]), 6)
+      (1.0, 0.33)
+
+    Source: M. R. James, Nonlinear Control Systems, section 12.3.
+    """
+    for name, values in (("p", p), ("psi", psi)):
+        shape = np.shape(values)
+        if shape != grid.shape and not (name == "psi" and shape == ()):
+            raise ValueError(f"sup_pairing: {name} has shape {shape}, wanted {grid.shape}: one number a node")
+    if is_traced(p, psi, grid):
+        return refined_maximum(jnp.asarray(p) + psi, grid)
+    with jax.enable_x64(True):
+        value, state = _refined_maximum(jnp.asarray(np.asarray(p, np.float64) + psi), cast(grid, np.float64))
+        return np.asarray(value), np.asarray(state)
+
+
+def refined_maximum(values: Field, grid: Grid) -> tuple[Scalar, jax.Array]:
+    """The maximum of node values and its place, between the nodes by the quadratic around the largest one; traceable.
+
+    Returns:
+      The maximum, shape (), and the state, shape (n,), inside the box and wrapped on periodic axes.
+    """
+    n, dtype = grid.ndim, values.dtype
+    best = jnp.unravel_index(jnp.argmax(values), grid.shape)
+    top, around = values[best], _neighbours(grid, best, dtype)
+
+    def at(steps):
+        return values[tuple(around[axis][0][step + 1] for axis, step in enumerate(steps))]
+
+    def unit(*moves):
+        steps = [0] * n
+        for axis, step in moves:
+            steps[axis] = step
+        return at(steps)
+
+    gradient, hessian = [], [[jnp.zeros((), dtype)] * n for _ in range(n)]
+    for i in range(n):
+        down, up = around[i][1]
+        below, above = (top - unit((i, -1))) / down, (unit((i, 1)) - top) / up
+        gradient.append((down * above + up * below) / (down + up))
+        hessian[i][i] = 2 * (above - below) / (down + up)
+        for j in range(i):
+            cross = sum(p * q * unit((i, p), (j, q)) for p in (-1, 1) for q in (-1, 1))
+            hessian[i][j] = hessian[j][i] = cross / (sum(around[i][1]) * sum(around[j][1]))
+    widths = jnp.stack([jnp.stack(each[1]) for each in around])  # (n, 2): to the node below and to the one above
+    free = jnp.stack([each[2] for each in around]) & jnp.isfinite(jnp.stack(gradient))
+    shift = _climb(jnp.stack(gradient), jnp.stack([jnp.stack(row) for row in hessian]), free, widths)
+    slope, bend = jnp.where(free, jnp.stack(gradient), 0), jnp.stack([jnp.stack(row) for row in hessian])
+    bend = jnp.where(free[:, None] & free[None, :] & jnp.isfinite(bend), bend, 0)
+    gain = slope @ shift + shift @ bend @ shift / 2
+    place = jnp.stack([jnp.asarray(grid.axis(axis), dtype)[best[axis]] for axis in range(n)])
+    better = gain > 0
+    return top + jnp.where(better, gain, 0), grid.wrap(place + jnp.where(better, shift, 0))
+
+
+_refined_maximum = jax.jit(refined_maximum)
+
+
+def _neighbours(grid: Grid, best: Sequence[jax.Array], dtype: Any) -> list[tuple[list, list, Any]]:
+    """For every axis: numbers of the node below, the node and the one above; two distances; whether both are there."""
+    found = []
+    for axis, count in enumerate(grid.shape):
+        here, x = best[axis], jnp.asarray(grid.axis(axis), dtype)
+        if grid.periodic[axis]:  # type: ignore[index]
+            numbers = [(here + step) % count for step in (-1, 0, 1)]
+            spacing = jnp.asarray(grid.spacing(axis), dtype)
+            found.append((numbers, [spacing, spacing], jnp.ones((), bool)))
+            continue
+        inside = (here > 0) & (here < count - 1)
+        numbers = [jnp.clip(here + step, 0, count - 1) for step in (-1, 0, 1)]
+        # a node at an end is its own neighbour: any width but zero will do, as that axis is left out
+        down, up = (jnp.where(inside, x[numbers[k + 1]] - x[numbers[k]], 1) for k in (0, 1))
+        found.append((numbers, [down, up], inside))
+    return found
+
+
+def _climb(gradient: jax.Array, hessian: jax.Array, free: jax.Array, widths: jax.Array) -> jax.Array:
+    """The step to the maximum of the quadratic, at most to the neighbours; axis by axis where the whole has none."""
+    n = gradient.shape[0]
+    # in units of the spacings, so that a determinant compares like with like
+    scale = jnp.mean(widths, axis=1)
+    slope = jnp.where(free, gradient * scale, 0)
+    bend = hessian * scale[:, None] * scale[None, :]
+    curved = free & (jnp.diag(bend) < 0)
+    kept = curved[:, None] & curved[None, :] & jnp.isfinite(bend)
+    bend = jnp.where(kept, bend, -jnp.eye(n, dtype=bend.dtype))  # axes without a bend go nowhere
+    slope = jnp.where(curved, slope, 0)
+    # a degenerate quadratic is one whose determinant, over that of its diagonal, is rounding
+    unit = bend / jnp.sqrt(jnp.outer(jnp.diag(bend), jnp.diag(bend)))
+    whole = -jnp.linalg.solve(jnp.where(jnp.all(jnp.isfinite(unit)), bend, -jnp.eye(n, dtype=bend.dtype)), slope)
+    definite = jnp.all(jnp.linalg.eigvalsh(unit) < -jnp.sqrt(jnp.finfo(bend.dtype).eps))
+    near = jnp.all((whole * scale <= widths[:, 1]) & (-whole * scale <= widths[:, 0]))
+    alone = -slope / jnp.diag(bend)
+    step = jnp.where(definite & near & jnp.all(jnp.isfinite(whole)), whole, alone) * scale
+    return jnp.clip(step, -widths[:, 0], widths[:, 1])

@@ -1,0 +1,303 @@
+"""Observers: from what is measured to an estimate of the state, in steps of one length.
+
+    dx = f(x, u) dt + σ dw,    dy = h(x) dt + r dv
+
+An observer holds an information state, any pytree of arrays. It sees the control that was held over a step and the
+increment dy of the record, and nothing else. Steps on which the drift is affine are made exactly, whatever their
+length: with dξ = (F ξ + g) dt + dw, W dt the covariance of dw, so are
+
+    Φ = e^{F t},    s = ∫₀ᵗ e^{F σ} g dσ,    Q = ∫₀ᵗ e^{F σ} W e^{Fᵀ σ} dσ
+
+by Taylor series on a short piece and doublings,
+
+    s(2t) = s + Φ s,    Q(2t) = Q + Φ Q Φᵀ,    Φ(2t) = Φ²,
+
+which add covariances and subtract nothing, so that no step is too long, unlike with C. F. Van Loan's exponential of
+[−F, W; 0, Fᵀ], whose e^{−F t} overflows for a stiff system.
+
+An observer of your own is an object with three methods, see ``output_loop.Observer``; make it a pytree
+(``pytree_dataclass``), and other numbers in it compile nothing anew.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.feedback.measurement import Measurement, measurement, plant
+from hjbjax.feedback.output_loop import Observer
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import as_partial, is_traced, numbers, pytree_dataclass
+from hjbjax.problem.types import Array, Control, Number, Numbers, State
+
+__all__ = ["ExtendedKalman", "Gaussian", "Luenberger", "Observer", "affine_flow"]
+
+SHORT = 0.25  # of the piece, |F| t: the series of Q then falls like ½^j/j!
+TERMS = 14  # of the series: what is left is ½^15/15!, 2e-17
+DOUBLINGS = 64  # at most: a piece 2^64 times shorter than the step is no longer told from none
+ROUNDINGS = 64  # units of eps: what rounding may leave of symmetry and of a zero eigenvalue in a covariance
+
+
+@pytree_dataclass()
+class Gaussian:
+    """A normal law of the state.
+
+    Args:
+      mean: shape (n,).
+      covariance: shape (n, n).
+    """
+
+    mean: Any
+    covariance: Any
+
+
+@pytree_dataclass()
+class ExtendedKalman:
+    """The extended Kalman–Bucy filter: the law of the state, taken for normal.
+
+        dx̂ = f(x̂, u) dt + K (dy − h(x̂) dt),    Ṗ = A P + P Aᵀ + σσᵀ − K R Kᵀ,    K = P Cᵀ R⁻¹,  R = r rᵀ
+
+    with A = ∂f/∂x and C = ∂h/∂x at the estimate. In each step f and h are linear about the estimate at its start; the
+    law of the state and of dy at its end is then normal with moments that are known exactly, and P is conditioned on
+    dy by a congruence, P⁺ = [I, −K] S [I, −K]ᵀ: symmetric, without a negative eigenvalue, whatever dt. For a linear
+    plant the result is the exact law given the increments, which is Kalman and Bucy's up to O(dt²).
+
+    Noise that depends on the state counts with its value at the estimate. Angles are not wrapped: measure their sine
+    and cosine.
+
+    Args:
+      problem: the plant: its drift, controls and noise matter.
+      h: the measured function of one state, returns shape (p,).
+      mean: of the state at t = 0, shape (n,).
+      covariance: at t = 0, shape (n, n), or (n,) of independent entries.
+
+    Keyword Args:
+      measurement_noise: r in dy = h(x) dt + r dv: a number, (p,) or (p, p).
+
+    Raises:
+      ValueError: a game, a problem that depends on time, a covariance that is none, an h or a noise of the wrong shape.
+      TypeError: no Problem, an h that cannot be called, entries that are no numbers.
+
+    Example:
+      >>> filter = ExtendedKalman(Problem(lambda x, u: -x, noise=1.0), lambda x: x, [0.0], [0.5], measurement_noise=0.1)
+      >>> state = filter.update(filter.initial(), jnp.zeros(0), jnp.ones(1), 1.0)
+      >>> filter.estimate(state).shape, bool(state.covariance[0, 0] < 0.5)
+      ((1,), True)
+
+    Source: R. E. Kalman and R. S. Bucy, New results in linear filtering and prediction theory (1961).
+    """
+
+    plant: Problem
+    measurement: Measurement
+    mean: Any
+    covariance: Any
+
+    def __init__(
+        self,
+        problem: Problem,
+        h: Callable,
+        mean: Numbers | Sequence[float],
+        covariance: Numbers | Sequence,
+        *,
+        measurement_noise: Numbers | Sequence = 1.0,
+    ):
+        name = "ExtendedKalman"
+        start = _start(mean, f"{name}: mean")
+        n = start.shape[0]
+        fields = {
+            "plant": plant(problem, n, name),
+            "measurement": measurement(h, n, measurement_noise, name),
+            "mean": start,
+            "covariance": _covariance(covariance, n, f"{name}: covariance"),
+        }
+        for field, value in fields.items():
+            object.__setattr__(self, field, value)
+
+    def initial(self) -> Gaussian:
+        """The law at t = 0."""
+        mean = jnp.asarray(self.mean, jnp.result_type(float))
+        return Gaussian(mean, jnp.asarray(self.covariance, mean.dtype))
+
+    def update(self, state: Gaussian, u: Control, dy: Array, dt: Number) -> Gaussian:
+        """The law after holding the control u (m,) for dt and seeing the increment dy (p,)."""
+        mean, p = state.mean, self.measurement.dim
+        n, dtype = mean.shape[0], mean.dtype
+        u, dt = jnp.asarray(u, dtype), jnp.asarray(dt, dtype)
+
+        def rates(x: State) -> jax.Array:  # of the state, and of y in units of its noise
+            drift = jnp.asarray(self.plant.drift(x, u), dtype)
+            return jnp.concatenate([drift, self.measurement.whitened(self.measurement.at(x))])
+
+        sigma = self.plant.diffusion(mean, u).astype(dtype)
+        noise = jnp.eye(n + p, dtype=dtype).at[:n, :n].set(sigma @ sigma.T)
+        slopes = jnp.pad(jax.jacfwd(rates)(mean), ((0, 0), (0, p)))
+        transition, shift, spread = affine_flow(slopes, rates(mean), noise, dt, states=n)
+        # the joint law of the deviation of x at the end and of dy, given dy's before
+        joint = transition[:, :n] @ state.covariance @ transition[:, :n].T + spread
+        gain = jnp.linalg.solve(joint[n:, n:], joint[n:, :n]).T
+        innovation = self.measurement.whitened(jnp.asarray(dy, dtype)) - shift[n:]
+        keep = jnp.concatenate([jnp.eye(n, dtype=dtype), -gain], axis=1)
+        covariance = keep @ joint @ keep.T
+        return Gaussian(mean + shift[:n] + gain @ innovation, (covariance + covariance.T) / 2)
+
+    def estimate(self, state: Gaussian) -> State:
+        """The mean, shape (n,)."""
+        return state.mean
+
+
+@pytree_dataclass()
+class Luenberger:
+    """The Luenberger observer, a copy of the plant that what is measured pulls along.
+
+        dx̂/dt = f(x̂, u) + G(x̂) (y − h(x̂))                                                     (12.3)
+
+    with y = dy/dt constant over a step. One exponential step of Euler's (Rosenbrock's form): exact where the right-hand
+    side is affine, of the second order elsewhere, stable whatever the gain and dt where the error equation is.
+
+    Args:
+      problem: the plant: its drift matters.
+      h: the measured function of one state, returns shape (p,).
+      gain: G, shape (n, p), per unit time and in units of x over those of y, or a function of the estimate that
+        returns it.
+      start: x̂ at t = 0, shape (n,).
+
+    Raises:
+      ValueError: a game, a problem that depends on time, an h or a gain of the wrong shape.
+      TypeError: no Problem, an h that cannot be called, entries that are no numbers.
+
+    Example:
+      >>> observer = Luenberger(Problem(lambda x, u: -x), lambda x: x, [[3.0]], [0.0])
+      >>> estimate = observer.update(observer.initial(), jnp.zeros(0), 1.0 * jnp.ones(1), 1.0)  # y = 1
+      >>> round(float(estimate[0]), 4)  # ¾ (1 − e⁻⁴)
+      0.7363
+    """
+
+    plant: Problem
+    measurement: Measurement
+    gain: Any
+    start: Any
+
+    def __init__(
+        self, problem: Problem, h: Callable, gain: Callable | Numbers | Sequence, start: Numbers | Sequence[float]
+    ):
+        name = "Luenberger"
+        first = _start(start, f"{name}: start")
+        n = first.shape[0]
+        fields = {
+            "plant": plant(problem, n, name),
+            "measurement": measurement(h, n, 0.0, name, perfect=True),
+            "start": first,
+        }
+        fields["gain"] = _gain(gain, (n, fields["measurement"].dim), name)
+        for field, value in fields.items():
+            object.__setattr__(self, field, value)
+
+    def initial(self) -> State:
+        """x̂ at t = 0, shape (n,)."""
+        return jnp.asarray(self.start, jnp.result_type(float))
+
+    def update(self, state: State, u: Control, dy: Array, dt: Number) -> State:
+        """x̂ after holding the control u (m,) for dt and seeing the increment dy (p,)."""
+        n, dtype = state.shape[0], state.dtype
+        dt = jnp.asarray(dt, dtype)
+        u, y = jnp.asarray(u, dtype), jnp.asarray(dy, dtype) / dt
+
+        def rate(x: State) -> jax.Array:
+            gain = jnp.asarray(self.gain(x) if callable(self.gain) else self.gain, dtype)
+            return jnp.asarray(self.plant.drift(x, u), dtype) + gain @ (y - self.measurement.at(x))
+
+        _, shift, _ = affine_flow(jax.jacfwd(rate)(state), rate(state), jnp.zeros((n, n), dtype), dt, states=n)
+        return state + shift
+
+    def estimate(self, state: State) -> State:
+        """x̂ itself."""
+        return state
+
+
+def affine_flow(matrix: Array, source: Array, noise: Array, dt: Number, *, states: int) -> tuple[Array, Array, Array]:
+    """Φ, s and Q after the time dt, shapes (k, k), (k,) and (k, k).
+
+    Args:
+      matrix: F, shape (k, k); of its columns only the first ``states`` need not be zero.
+      source: g, shape (k,).
+      noise: W, shape (k, k), symmetric and not negative.
+      dt: the length of the step, in units of time.
+      states: the number of entries that feed back. The others are integrals of them, whose units do not count for
+        the number of doublings, and cost no rounding.
+    """
+    inner = jnp.abs(matrix[:states, :states])
+    # both bound the spectral radius; the lesser one, as states may have units far apart
+    rate = jnp.minimum(jnp.max(jnp.sum(inner, axis=0)), jnp.max(jnp.sum(inner, axis=1)))
+    halvings = jnp.ceil(jnp.log2(jnp.maximum(rate * dt / SHORT, 1)))
+    halvings = jnp.where(jnp.isfinite(halvings), jnp.clip(halvings, 0, DOUBLINGS), 0)
+    piece = dt * jnp.exp2(-halvings)
+
+    def add(j: int, carry: tuple) -> tuple:
+        # t^j F^j/j!, t^{j+1} F^j g/(j+1)! and the same of Q: T_{j+1} = F T_j + T_j Fᵀ
+        sums, (power, push, spread) = carry[:3], carry[3]
+        half = matrix @ spread
+        power, push, spread = (
+            matrix @ power * (piece / j), matrix @ push * (piece / (j + 1)), (half + half.T) * (piece / (j + 1))
+        )  # fmt: skip
+        return sums[0] + power, sums[1] + push, sums[2] + spread, (power, push, spread)
+
+    first = jnp.eye(len(source), dtype=matrix.dtype), piece * source, piece * noise
+    transition, shift, covariance, _ = jax.lax.fori_loop(1, TERMS, add, (*first, first))
+
+    def double(_: int, carry: tuple) -> tuple:
+        transition, shift, covariance = carry
+        return (
+            transition @ transition,
+            shift + transition @ shift,
+            covariance + transition @ covariance @ transition.T,
+        )
+
+    return jax.lax.fori_loop(0, halvings.astype(jnp.int32), double, (transition, shift, covariance))
+
+
+def _start(given: Numbers | Sequence[float], name: str) -> Any:
+    """A state, shape (n,), of finite numbers."""
+    state = numbers(given, name)
+    if np.ndim(state) != 1 or np.size(state) == 0 or (not is_traced(state) and not np.all(np.isfinite(state))):
+        raise ValueError(f"{name} is {given!r}, wanted finite numbers of shape (n,), one a state")
+    return state
+
+
+def _covariance(given: Numbers | Sequence, n: int, name: str) -> Any:
+    """A covariance, shape (n, n), symmetric and without negative eigenvalues."""
+    matrix = numbers(given, name)
+    if np.shape(matrix) not in ((n,), (n, n)):
+        raise ValueError(f"{name} has shape {np.shape(matrix)}, wanted ({n}, {n}), or ({n},) of independent entries")
+    if is_traced(matrix):
+        return jnp.diag(matrix) if matrix.ndim == 1 else matrix
+    matrix = np.diag(matrix) if matrix.ndim == 1 else matrix
+    variances = np.diag(matrix)
+    slack = ROUNDINGS * n * np.finfo(np.float64).eps
+    ok = bool(np.all(np.isfinite(matrix)) and np.all(variances >= 0))
+    if ok:  # as correlations, which have no units; an entry that is known exactly is correlated with none
+        scale = np.sqrt(np.where(variances > 0, variances, 1))
+        correlation = matrix / np.outer(scale, scale)
+        ok = bool(np.all(np.abs(correlation - correlation.T) <= slack) and np.linalg.eigvalsh(correlation)[0] >= -slack)
+    if not ok:
+        raise ValueError(
+            f"{name} is {given!r}, wanted a symmetric matrix of finite numbers without negative eigenvalues"
+        )
+    return (matrix + matrix.T) / 2
+
+
+def _gain(given: Callable | Numbers | Sequence, wanted: tuple[int, int], name: str) -> Any:
+    """G as a matrix or as a function of the estimate that returns one."""
+    if callable(given):
+        function: Any = as_partial(given, f"{name}: gain")
+        with jax.enable_x64(True):
+            shape = jax.eval_shape(lambda x: jnp.asarray(function(x)), np.zeros(wanted[0])).shape
+    else:
+        function = numbers(given, f"{name}: gain")
+        shape = np.shape(function)
+        if not is_traced(function) and not np.all(np.isfinite(function)):
+            raise ValueError(f"{name}: gain is {given!r}, wanted finite numbers")
+    if shape != wanted:
+        raise ValueError(f"{name}: gain has shape {shape}, wanted (n, p) = {wanted}: one column a measured quantity")
+    return function

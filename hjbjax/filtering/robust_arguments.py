@@ -1,0 +1,124 @@
+"""What the robust filter is given, checked before anything is compiled."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.discretisation import schemes
+from hjbjax.problem import arguments
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import cast, is_traced, numbers
+from hjbjax.tracing import checks, components
+
+
+def check_question(problem: object, grid: object, scheme: Any) -> None:
+    """Refuse what has no robust information state on a grid."""
+    if not isinstance(problem, Problem) or not isinstance(grid, Grid):
+        raise TypeError(
+            f"robust_filter: got {type(problem).__name__}, {type(grid).__name__}; wanted a Problem and a Grid"
+        )
+    if problem.is_game or problem.time_dependent:
+        what = "an opponent" if problem.is_game else "functions that depend on time"
+        raise ValueError(
+            f"robust_filter: got a problem with {what}, wanted drift (x, u) and cost (x, u): the disturbance of the "
+            "filter is w, which pays ½γ²|w|²; leave the other out"
+        )
+    if grid.sides("open"):
+        raise ValueError(
+            "robust_filter: got a grid with open ends, through which p would flow in from where nothing is known; "
+            "choose edges='projected' or 'constrained'"
+        )
+    schemes.check(scheme, "robust_filter: scheme", grid)
+    checks.of_one_state(
+        Problem(problem.drift, problem.cost, problem.controls), grid.ndim, "the number of axes of the grid"
+    )
+    for axis, count in enumerate(grid.shape):
+        if count < scheme.points:
+            raise ValueError(
+                f"robust_filter: axis {axis} has {count} points; {type(scheme).__name__} needs at least {scheme.points}"
+            )
+
+
+def initial_values(initial: Any, grid: Grid) -> Any:
+    """p₀ at the nodes, refused where it is not finite."""
+    values: Any
+    if callable(initial):
+        with jax.enable_x64(True):
+            x = cast(grid, np.float64).components(np.float64)
+            values = components.scalar(initial, x, dtype=np.dtype(np.float64))
+            values = jnp.broadcast_to(values, grid.shape)
+            values = values if is_traced(values) else np.asarray(values)
+    else:
+        values = numbers(initial, "robust_filter: initial")
+    if np.shape(values) != grid.shape:
+        raise ValueError(f"robust_filter: initial has shape {np.shape(values)}, wanted {grid.shape}: one number a node")
+    if not is_traced(values) and not np.all(np.isfinite(values)):
+        bad = np.asarray(values)[~np.isfinite(values)][0]
+        raise ValueError(
+            f"robust_filter: initial is {bad} at some node, wanted finite numbers: slopes are made of differences; for "
+            "a state known to lie in a set take a steep −γ² dist²/(2Y) outside, with √Y a few spacings"
+        )
+    return values
+
+
+def gains(problem: Problem, sigma: Any, n: int) -> Any:
+    """The square roots of diag σσᵀ, shape (n,)."""
+    given = problem.noise if sigma is None else sigma
+    if callable(given):
+        raise ValueError(
+            "robust_filter: got a noise that is a function of the state, wanted numbers; give sigma=, a number, (n,) "
+            "or (n, k)"
+        )
+    array: Any = numbers(1.0 if given is None else given, "robust_filter: sigma")
+    if array.ndim > 2 or (array.ndim and array.shape[0] != n):
+        raise ValueError(f"robust_filter: sigma has shape {array.shape}, wanted (), ({n},) or ({n}, k)")
+    if is_traced(array):
+        if array.ndim == 2:
+            raise ValueError("robust_filter: inside a transformation sigma must be a number or one an axis, (n,)")
+        return jnp.broadcast_to(array, (n,))
+    if not np.all(np.isfinite(array)) or (array.ndim < 2 and np.any(array < 0)):
+        raise ValueError(f"robust_filter: sigma = {arguments.shown(array.tolist())}; wanted finite numbers ≥ 0")
+    if array.ndim < 2:
+        return np.broadcast_to(array, (n,)).copy()
+    a = array @ array.T
+    size = np.sqrt(np.outer(np.diag(a), np.diag(a)))
+    if np.any(np.abs(a - np.diag(np.diag(a))) > 16 * np.finfo(float).eps * size):
+        raise ValueError(
+            f"robust_filter: sigma = {arguments.shown(array.tolist())} has σσᵀ = {arguments.shown(a.tolist())}, wanted "
+            "a diagonal one: each column of σ acts on one axis; turn the state's axes so that it does"
+        )
+    return np.sqrt(np.diag(a))
+
+
+def record_of(y: Any, count: int) -> Any:
+    """The record, shape (k, p), of finite numbers."""
+    array = numbers(y, "robust_filter: y")
+    if array.ndim != 2 or array.shape[0] == 0 or array.shape[1] != count:
+        raise ValueError(
+            f"robust_filter: y has shape {array.shape}, wanted (k, {count}): one row an interval, one column a "
+            "component of h"
+        )
+    if not is_traced(array) and not np.all(np.isfinite(array)):
+        row = int(np.argmin(np.all(np.isfinite(array), axis=1)))
+        raise ValueError(
+            f"robust_filter: y[{row}] = {array[row].tolist()}, wanted finite numbers; part the record where a "
+            "measurement is missing, and go on from the last p with a large measurement_noise"
+        )
+    return array
+
+
+def controls_of(problem: Problem, controls: Any, record: tuple) -> Any:
+    """The controls of every interval, shape (k, m), m = 0 where the problem has none."""
+    dim = 0 if problem.controls is None else problem.controls.dim
+    if controls is None and dim == 0:
+        return np.zeros((record[0], 0))
+    array = np.zeros(()) if controls is None else numbers(controls, "robust_filter: controls")
+    if array.shape != (record[0], dim):
+        got = "none" if controls is None else f"shape {array.shape}"
+        raise ValueError(f"robust_filter: got controls {got}, wanted ({record[0]}, {dim}): one row an interval")
+    if not is_traced(array) and not np.all(np.isfinite(array)):
+        raise ValueError("robust_filter: controls hold numbers that are not finite")
+    return array

@@ -1,0 +1,264 @@
+"""The robust information state on a grid: which states a deterministic disturbance can explain, and at what cost.
+
+For dx/dt = f(x, u) + σw, y = h(x) + rv with unknown w and v in L₂ the information state at time t is
+
+    p(x, t) = sup over x₀ and w leading to x(t) = x of { p₀(x₀) + ∫₀ᵗ [ L(x, u) − ½γ² (|w|² + |r⁻¹(y − h(x))|²) ] ds },
+
+the largest cost of a path that ends in x and explains what was seen, less what the disturbances pay. It solves
+
+    p_t = max_w { −Dp·(f + σw) − ½γ²|w|² } + L − ½γ² |r⁻¹(y − h)|²,     p(·, 0) = p₀,
+
+the max-plus twin of the Zakai equation: sums are maxima, products are sums. With y and u held over a step no splitting
+is needed, since what a measurement costs is a source like L: see ``max_plus`` for the scheme. As γ grows, or with
+L = 0, the largest p belongs to Mortensen's minimum-energy estimate.
+
+For a linear system with cost ½ qᵀx² and p₀ = −½γ²(x − x̂)²/Y, p stays such a parabola plus a constant, and
+
+    dY/dt = 2aY + σ² + (q/γ² − c²/r²) Y²,     dx̂/dt = a x̂ + bu + (qY/γ²) x̂ + (c/r²) Y (y − c x̂),
+
+so that a small γ lets Y escape to infinity in finite time: then no controller attenuates that well.
+Source: M. R. James, Nonlinear Control Systems, (12.10) and (12.11).
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.discretisation.discretisation import Discretisation, Scheme
+from hjbjax.discretisation.schemes import Weno5
+from hjbjax.feedback.measurement import Measurement, measurement
+from hjbjax.filtering import robust_arguments
+from hjbjax.filtering.max_plus import MaxPlusMarch, refined_maximum
+from hjbjax.problem import arguments
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import cast, is_traced, pytree_dataclass
+from hjbjax.problem.types import Array, Control, Field, Nodes, Number, Numbers, State
+from hjbjax.tracing import components
+from hjbjax.tracing.closures import settled
+
+
+@pytree_dataclass()
+class RobustState:
+    """The robust information state along a record, with its largest value.
+
+    Attributes:
+      p: the information state at the nodes after every measurement, shape (k, *grid), in the units of cost.
+      worst_case: the state where p is largest, refined between the nodes, shape (k, n).
+      value: the largest p, shape (k,): the worst cost so far that the record admits, in the units of cost.
+      times: the times at which these hold, shape (k,); p₀ at time 0 is not among them.
+    """
+
+    p: Any
+    worst_case: Any
+    value: Any
+    times: Any
+
+
+@pytree_dataclass(static=("scheme",))
+class RobustGridFilter:
+    """The robust information state as an observer: its state is p at the nodes, shape (*grid).
+
+    The estimate is the worst case, the state where p is largest. Periodic axes are wrapped; at the ends of the others
+    nothing flows in, be they projected or constrained. Steps of any length are stable: ``update`` makes as many inner
+    ones as the velocities want.
+
+    Args:
+      problem: f, L and the admissible controls, as in ``hjb.solve``; discount, target and costs at the end are not
+        read.
+      h: the measured quantity, a function of one state that returns shape (p,).
+      grid: the nodes.
+      initial: p₀, a function of one state or node values (*grid), in the units of cost; defined up to a constant.
+      gamma: γ > 0, in √(cost) over the size of the disturbances.
+
+    Keyword Args:
+      sigma: the gain of w: a number, one an axis (n,), or a matrix (n, k) with σσᵀ diagonal. ``None``: the noise of the
+        problem, and without noise the identity.
+      measurement_noise: r: a number, one a measurement (p,), or a matrix (p, p), in the units of h.
+      scheme: slopes: ``Weno5()``, fifth order where p is smooth; ``Limited()``, second; ``Upwind()``, first, monotone.
+
+    Raises:
+      ValueError: a number that is not admissible, functions or node values of the wrong shape, p₀ that is not finite,
+        a matrix σ whose columns act on several axes, open ends, an opponent or a problem that depends on time.
+      TypeError: something else than a Problem, a Grid or a function.
+
+    Example:
+      >>> import hjbjax as hjb
+      >>> plant = hjb.Problem(lambda x, u: u - x, None, hjb.Box([-1.0], [1.0]))
+      >>> observer = RobustGridFilter(plant, lambda x: x, hjb.Grid([-3.0], [3.0], (61,)), lambda x: -x @ x, 2.0)
+      >>> seen = jax.jit(observer.update)(observer.initial(), jnp.zeros(1), jnp.array([0.05]), 0.05)
+      >>> 0 < float(observer.estimate(seen)[0]) < 1
+      True
+    """
+
+    problem: Problem
+    measurement: Measurement
+    grid: Grid
+    p0: Any
+    gamma: Any
+    sigma: Any
+    scheme: Scheme
+
+    def __init__(
+        self,
+        problem: Problem,
+        h: Callable,
+        grid: Grid,
+        initial: Callable | Nodes,
+        gamma: Number,
+        *,
+        sigma: Numbers | Sequence | None = None,
+        measurement_noise: Numbers | Sequence = 1.0,
+        scheme: Scheme = Weno5(),
+    ):
+        robust_arguments.check_question(problem, grid, scheme)
+        arguments.positive(gamma, "robust_filter: gamma")
+        fields = {
+            "problem": problem,
+            "measurement": measurement(h, grid.ndim, measurement_noise, "robust_filter"),
+            "grid": grid,
+            "p0": robust_arguments.initial_values(initial, grid),
+            "gamma": gamma,
+            "sigma": robust_arguments.gains(problem, sigma, grid.ndim),
+            "scheme": scheme,
+        }
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
+
+    def initial(self) -> Field:
+        """p₀ at the nodes, shape (*grid)."""
+        return jnp.asarray(self.p0, jnp.result_type(float))
+
+    def update(self, state: Field, u: Control, dy: Array, dt: Number) -> Field:
+        """p after holding the control u, shape (m,), for a time dt, over which y = dy/dt was seen, dy (p,)."""
+        dtype = state.dtype
+        # compiled even where the caller does not: a loop whose body is new would be compiled at every call
+        return _after(self, state, jnp.asarray(u, dtype), jnp.asarray(dy, dtype) / dt, dt)
+
+    def estimate(self, state: Field) -> State:
+        """The worst case: the state where p is largest, shape (n,), refined between the nodes."""
+        return _largest(state, cast(self.grid, state.dtype))[1]
+
+    def _after(self, p: Field, u: Control, y: Array, dt: Number) -> Field:
+        """p a time dt later, with control and measurement held."""
+        mine = cast(self, p.dtype)
+        on = Discretisation(mine.problem, mine.grid, self.scheme, p.dtype)
+        entries = [u[k] for k in range(u.shape[0])]
+        seen = components.components(mine.measurement.h, on.coordinates(), dtype=p.dtype)
+        errors = [y[k] - at_node for k, at_node in enumerate(seen)]
+        whitening = mine.measurement.whitened(jnp.eye(len(errors), dtype=p.dtype))  # r⁻¹
+        misfit = sum(sum(row[k] * error for k, error in enumerate(errors)) ** 2 for row in whitening)
+        # slopes alone are asked of the scheme: noise would make some of them central, wrong without second derivatives
+        bare = dataclasses.replace(on, problem=Problem(mine.problem.drift))
+        return MaxPlusMarch(
+            bare,
+            on.drift(entries),
+            [gain**2 / mine.gamma**2 for gain in mine.sigma],
+            on.running_cost(entries) - mine.gamma**2 / 2 * misfit,
+        ).after(p, dt)
+
+
+_after, _largest = jax.jit(RobustGridFilter._after), jax.jit(refined_maximum)
+
+
+def robust_filter(
+    problem: Problem,
+    h: Callable,
+    grid: Grid,
+    y: Numbers | Sequence,
+    dt: float,
+    initial: Callable | Nodes,
+    *,
+    gamma: Number,
+    controls: Numbers | Sequence | None = None,
+    sigma: Numbers | Sequence | None = None,
+    measurement_noise: Numbers | Sequence = 1.0,
+    scheme: Scheme = Weno5(),
+) -> RobustState:
+    """The robust information state along a record of measurements, (12.10) and (12.11) of the chapter, in float64.
+
+    p_t = max_w { −Dp·(f + σw) − ½γ²|w|² } + L − ½γ² |r⁻¹(y − h)|², control and measurement held over each interval.
+    In space of the order of the scheme where p is smooth, at its kinks of first order; in time of order 3 inside an
+    interval; stable for intervals of any length. Under ``jit`` and ``vmap``, as over a batch of records, no values are
+    checked, and the answer has the type of the arrays that JAX is set to.
+
+    Args:
+      problem: f, L and the admissible controls; discount, target and costs at the end are not read.
+      h: the measured quantity, a function of one state that returns shape (p,).
+      grid: the nodes. At an end that is not periodic nothing flows in; open ends are refused.
+      y: the record, shape (k, p), in the units of h: y over each interval, as its mean or dy/dt.
+      dt: the length of an interval, in units of time.
+      initial: p₀, a function of one state or node values (*grid), in the units of cost; finite, see below.
+
+    Keyword Args:
+      gamma: γ > 0: a smaller one gives the disturbances more room.
+      controls: the controls that were held, shape (k, m); wanted exactly when the problem has controls.
+      sigma: the gain of w, as in ``RobustGridFilter``; ``None``: the noise of the problem, else the identity.
+      measurement_noise: r: a number, one a measurement (p,), or a matrix (p, p), in the units of h.
+      scheme: how slopes are made.
+
+    Returns:
+      A ``RobustState``: p after each interval, where it is largest, and how large.
+
+    Raises:
+      ValueError: a record, controls or functions of the wrong shape, numbers that are not finite or not positive; p₀
+        that is −∞ somewhere, since slopes need numbers: a known state x₀ is a steep −γ²|x − x₀|²/(2Y) with Y from a few
+        spacings squared on; and p that becomes infinite, where γ is too small for the horizon.
+      TypeError: something else than a Problem, a Grid or a function.
+
+    Example:
+      >>> import hjbjax as hjb
+      >>> plant = hjb.Problem(lambda x, u: -x, lambda x, u: 0.5 * x @ x)
+      >>> record = np.full((20, 1), 0.5)
+      >>> grid = hjb.Grid([-4.0], [4.0], (81,))
+      >>> state = robust_filter(plant, lambda x: x, grid, record, 0.1, lambda x: -2 * x @ x, gamma=2.0)
+      >>> state.p.shape, state.worst_case.shape, 0 < float(state.worst_case[-1, 0]) < 0.5
+      ((20, 81), (20, 1), True)
+
+    Source: M. R. James, Nonlinear Control Systems, (12.10) and (12.11).
+    """
+    options: Any = {"sigma": sigma, "measurement_noise": measurement_noise, "scheme": scheme}
+    robust_arguments.check_question(problem, grid, scheme)
+    # its functions are looked at again in every call, as h is
+    asked = settled(Problem(problem.drift, problem.cost, problem.controls, noise=problem.noise), grid.ndim)
+    observer = RobustGridFilter(asked, h, grid, initial, gamma, **options)
+    if not is_traced(dt):
+        arguments.positive(dt, "robust_filter: dt", "in units of time")
+    y, controls = (
+        robust_arguments.record_of(y, observer.measurement.dim),
+        robust_arguments.controls_of(problem, controls, np.shape(y)),
+    )
+    if is_traced(asked, observer.measurement, grid, y, dt, observer.p0, gamma, controls, sigma):
+        return _scan(observer, jnp.asarray(y), jnp.asarray(controls), dt)
+    # inside somebody's ``jit`` a record of known numbers is filtered at once
+    with jax.core.eval_context(), jax.enable_x64(True):
+        found = _scan_compiled(*cast((observer, y, controls, float(dt)), np.float64))
+        found = jax.tree.map(np.asarray, found)
+    if not np.all(np.isfinite(found.p)):
+        first = int(np.argmin(np.all(np.isfinite(found.p.reshape(len(found.p), -1)), axis=1)))
+        raise ValueError(
+            f"robust_filter: p is not finite from interval {first} on, t = {first * dt:g} to {(first + 1) * dt:g}: the "
+            "cost grows faster than the disturbances pay for it; take a larger gamma, a smaller box or a shorter record"
+        )
+    return found
+
+
+def _scan(observer: RobustGridFilter, y: jax.Array, controls: jax.Array, dt: Any) -> RobustState:
+    """The information state after every interval, with its maximum."""
+    grid = observer.grid
+    dtype = jnp.result_type(float)
+
+    def step(p, seen):
+        p = observer._after(p, seen[0].astype(dtype), seen[1].astype(dtype), dt)
+        value, place = refined_maximum(p, cast(grid, dtype))
+        return p, (p, place, value)
+
+    _, (p, place, value) = jax.lax.scan(step, observer.initial(), (controls, y))
+    return RobustState(p, place, value, dt * jnp.arange(1, len(y) + 1))
+
+
+_scan_compiled = jax.jit(_scan)

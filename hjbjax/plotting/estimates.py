@@ -1,0 +1,155 @@
+"""Pictures of output feedback: states beside their estimates over time, and the law of the state on a grid."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hjbjax.plotting.slices import section_of
+from hjbjax.plotting.style import COLOURS, axes_of, draw, label_axes, legend
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.types import Array
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+
+    from hjbjax.feedback.output_loop import OutputPath
+
+
+def estimates(
+    path: OutputPath,
+    *,
+    components: Sequence[int] | None = None,
+    measurements: bool = False,
+    grid: Grid | None = None,
+    ax: Axes | None = None,
+    names: Sequence[str] | None = None,
+) -> list[Artist]:
+    """The states of a path over time, drawn, and their estimates, broken, each pair in one colour.
+
+    Args:
+      path: one path of ``simulate_output``; of a batch choose one, ``jax.tree.map(lambda a: a[0], paths)``.
+
+    Keyword Args:
+      components: which states, from 0; ``None`` for all.
+      measurements: whether the mean rates of the record, dy/dt over each interval, are drawn as dots.
+      grid: whose periodic axes the estimates are turned about until they are next to the state; names the states.
+      ax: matplotlib axes to draw on; ``None`` makes a figure.
+      names: of the states, in place of the grid's.
+
+    Returns:
+      The artists: for each state its line and that of its estimate, then the dots, then the legend.
+
+    Raises:
+      ValueError: a batch of paths, or states that the path does not have.
+
+    Example:
+      >>> from types import SimpleNamespace
+      >>> path = SimpleNamespace(times=np.array([0.0, 1.0]), states=np.ones((2, 1)), estimates=np.zeros((2, 1)))
+      >>> [line.get_ydata().tolist() for line in estimates(path)[:2]]
+      [[1.0, 1.0], [0.0, 0.0]]
+    """
+    times, states, guessed = (np.asarray(array) for array in (path.times, path.states, path.estimates))
+    if states.ndim != 2:
+        raise ValueError(
+            f"estimates: got states of shape {states.shape}, wanted one path, (k+1, n): of a batch choose one, "
+            "jax.tree.map(lambda a: a[0], paths)"
+        )
+    count = states.shape[1]
+    shown = list(range(count)) if components is None else [int(i) for i in components]
+    if not shown or not all(0 <= i < count for i in shown):
+        raise ValueError(f"estimates: got components = {components!r}; the path has states 0 to {count - 1}")
+    names = tuple(names or (grid.names if grid is not None else (f"x{i + 1}" for i in range(count))))
+    ax = axes_of(ax, wide=True)
+    artists: list[Artist] = []
+    for k, i in enumerate(shown):
+        colour, estimate = COLOURS[k % len(COLOURS)], guessed[:, i]
+        if grid is not None and grid.periodic[i]:  # type: ignore[index]
+            # the states run on round the circle, while a law on a grid has its mean in the box
+            period = float(grid.hi[i] - grid.lo[i])
+            estimate = estimate + period * np.round((states[:, i] - estimate) / period)
+        artists += ax.plot(times, states[:, i], color=colour, linewidth=1.4, label=names[i])
+        artists += ax.plot(times, estimate, "--", color=colour, linewidth=1.4, label=f"{names[i]}, estimated")
+    if measurements:
+        lengths = np.diff(times)[:, None]
+        # intervals of no length follow the end of a path
+        rates = np.ma.masked_invalid(
+            np.where(lengths > 0, path.measurements / np.where(lengths > 0, lengths, 1), np.nan)
+        )
+        for j in range(rates.shape[1]):
+            label = "dy/dt" if rates.shape[1] == 1 else f"dy{j + 1}/dt"
+            style: dict[str, Any] = {"color": COLOURS[(len(shown) + j) % len(COLOURS)], "markersize": 2, "alpha": 0.5}
+            artists += ax.plot((times[:-1] + times[1:]) / 2, rates[:, j], ".", zorder=0, label=label, **style)
+    label_axes(ax, "t", names[shown[0]] if len(shown) == 1 else "state")
+    return [*artists, legend(ax)]
+
+
+def density(
+    values: Array,
+    grid: Grid,
+    *,
+    axes: Sequence[int] | None = None,
+    state: Array | Sequence[float] | None = None,
+    estimate: Array | Sequence[float] | None = None,
+    ax: Axes | None = None,
+    colorbar: bool = True,
+) -> list[Artist]:
+    """A density on a grid over one or two of its axes, integrated over the others, with the true state in it.
+
+    Args:
+      values: at the nodes, (*grid), as of an ``InformationState`` at one time.
+      grid: the nodes.
+
+    Keyword Args:
+      axes: one or two axes, by number; ``None`` for the first two, or the only one.
+      state: the true state, shape (n,), a ring over two axes and a line over one.
+      estimate: of it, likewise, a cross and a broken line.
+      ax: matplotlib axes to draw on; ``None`` makes a figure.
+      colorbar: whether a colour scale is drawn beside two-dimensional pictures.
+
+    Returns:
+      The artists: the line or the mesh first, then the marks.
+
+    Raises:
+      ValueError: a density of another shape than the grid, or axes that it does not have.
+
+    Example:
+      >>> grid = Grid([-1.0, 0.0], [1.0, 2.0], (3, 5), names=("x", "parameter"))
+      >>> line, mark = density(np.full((3, 5), 0.25), grid, axes=[0], state=[0.5, 1.0])
+      >>> line.get_ydata().tolist(), mark.get_xdata()
+      ([0.5, 0.5, 0.5], [0.5, 0.5])
+    """
+    field = np.asarray(values, float)
+    if field.shape != grid.shape:
+        raise ValueError(f"density: got values of shape {field.shape} on a grid of shape {grid.shape}")
+    kept = list(range(min(grid.ndim, 2))) if axes is None else [int(i) for i in axes]
+    if len(kept) not in (1, 2) or len(set(kept)) < len(kept) or not all(0 <= i < grid.ndim for i in kept):
+        raise ValueError(f"density: got axes = {axes!r}, wanted one or two of 0 to {grid.ndim - 1}")
+    kept = sorted(kept)
+    plane = Grid(
+        [grid.lo[i] for i in kept],
+        [grid.hi[i] for i in kept],
+        tuple(grid.shape[i] for i in kept),
+        tuple(grid.periodic[i] for i in kept),  # type: ignore[index]
+        tuple(grid.names[i] for i in kept),
+        stretch=tuple(grid.stretch[i] for i in kept),  # type: ignore[index]
+    )
+    others = tuple(i for i in range(grid.ndim) if i not in kept)
+    marginal = np.sum(field * grid.volumes(), axis=others) / plane.volumes()
+    ax = axes_of(ax)
+    artists = draw(ax, section_of("density", marginal, plane, None, ""), "density", "not finite", colorbar=colorbar)
+    for point, style, marker, label in ((state, "-", "o", "state"), (estimate, "--", "x", "estimate")):
+        if point is None:
+            continue
+        place = np.asarray(grid.wrap(np.asarray(point, float)))[kept]
+        if len(kept) == 1:
+            artists.append(ax.axvline(float(place[0]), color=COLOURS[1], linestyle=style, label=label))
+        else:
+            mark: dict[str, Any] = {"markerfacecolor": "none", "markeredgecolor": COLOURS[1], "markeredgewidth": 1.6}
+            artists += ax.plot(*place, marker, linestyle="none", label=label, zorder=5, **mark)
+    if len(artists) > 1 and (state is not None or estimate is not None):
+        legend(ax)
+    return artists

@@ -1,6 +1,9 @@
 """hjbjax: Hamilton–Jacobi–Bellman and Isaacs equations on grids, with JAX."""
 
-from hjbjax import filtering, geometry, plotting, zoo
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from hjbjax import geometry
 from hjbjax._version import __version__
 from hjbjax.applications.convergence import convergence_study
 from hjbjax.applications.hinf import hinf_level
@@ -34,6 +37,9 @@ from hjbjax.solvers.finite_horizon import march
 from hjbjax.solvers.setup import SolveWarning
 from hjbjax.solvers.stationary import solve
 from hjbjax.tracing.interpreter import FallbackWarning
+
+if TYPE_CHECKING:
+    from hjbjax import filtering, plotting, zoo
 
 __all__ = [
     "Ball",
@@ -93,3 +99,15 @@ __all__ = [
     "stay_probability",
     "zoo",
 ]
+
+LATER = ("filtering", "plotting", "zoo")  # imported when first asked for: a third of the seconds that the package takes
+
+
+def __getattr__(name: str) -> Any:
+    if name in LATER:
+        return importlib.import_module(f"hjbjax.{name}")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *LATER})

@@ -8,8 +8,7 @@ with u* and V those of a feedback that sees the state, σ the law of the state g
 information state (12.10). The first is optimal for a linear plant with quadratic cost and normal noise (W. M. Wonham's
 separation), where the second agrees with it. The second acts as if the state became known in the next instant, so that
 it never acts in order to learn. The third is optimal in the worst case for linear plants with quadratic cost, where
-x̄ = (1 − Y P/γ²)⁻¹ x̂ as long as the spectral radius of Y P is less than γ² (K. Glover and J. C. Doyle; T. Başar and
-P. Bernhard); for others it is where certainty equivalence of the worst case holds, which is not known beforehand.
+x̄ = (1 − Y P/γ²)⁻¹ x̂ while the spectral radius of Y P is less than γ² (K. Glover and J. C. Doyle, 1988).
 
 Source: M. R. James, Nonlinear Control Systems, section 12.
 """
@@ -60,8 +59,7 @@ class AveragedHamiltonian:
 
     def __call__(self, information: Density) -> Array:
         """The control, shape (m,)."""
-        # compiled even where the caller does not, as a pass over the nodes would else be a hundred programs
-        return _least(self, information)
+        return _least(self, information)  # compiled even where the caller does not
 
     def _least(self, information: Density) -> Array:
         dtype, weights = information.density.dtype, self._weights(information)
@@ -76,8 +74,7 @@ class AveragedHamiltonian:
     def _weights(self, information: Density) -> Field:
         """The probabilities outside the target; where all is inside, all."""
         probability = self.observer.probability(information)
-        outside = probability * jnp.asarray(self.counts, probability.dtype)
-        total = jnp.sum(outside)
+        total = jnp.sum(outside := probability * jnp.asarray(self.counts, probability.dtype))
         return jnp.where(total > 0, outside / jnp.where(total > 0, total, 1), probability)
 
     def _average(self, weights: Field, u: Array) -> Scalar:
@@ -136,8 +133,7 @@ def certainty_equivalence(observer: Observer, feedback: GridFeedback | Callable)
         shape (m,). A state beyond the grid gets the control of the nearest point in it.
 
     Returns:
-      A function of the observer's state that ``jit`` and ``vmap`` accept, a pytree. NaN where a Solution has no
-      control, as in its target; ``simulate_output`` holds the control before there if it is given the Solution itself.
+      A pytree, called with the observer's state. NaN where a Solution has no control, as in its target.
 
     Raises:
       TypeError: an observer without an estimate, a feedback that cannot be called.
@@ -177,7 +173,7 @@ def averaged_hamiltonian(problem: Problem, solution: Solution, observer: GridFil
       observer: the filter; its grid need not be that of the solution, in whose box it must lie.
 
     Returns:
-      A function of the filter's state that ``jit`` and ``vmap`` accept, a pytree; ``.average(state, u)`` is minimised.
+      A pytree, called with the filter's state; ``.average(state, u)`` is what is minimised.
 
     Raises:
       TypeError: no Problem, no Solution, no GridFilter.
@@ -208,15 +204,16 @@ def averaged_hamiltonian(problem: Problem, solution: Solution, observer: GridFil
     grid, n = observer.grid, observer.grid.ndim
     problem = closures.settled(problem, n)
     checks.of_one_state(problem, n, "the number of axes of the filter's grid")
-    with jax.enable_x64(True), jax.ensure_compile_time_eval():
-        on = Discretisation(*cast((problem, grid), np.float64), Upwind(), np.dtype(np.float64))
+    with _double(problem, solution, observer), jax.ensure_compile_time_eval():
+        dtype = np.dtype(jnp.result_type(float))
+        on = Discretisation(*cast((problem, grid), dtype), Upwind(), dtype)
         outside = jnp.ones(grid.shape) if problem.target is None else on.at_nodes(problem.target) > 0
         slopes = _slopes(solution, grid)
         exact, noisy = pointwise.quadratic_with_noise(problem, n)
         found = {
             "costate": tuple(slopes[..., i] for i in range(n)),
             "bends": _bends(solution, grid) if noisy else {},
-            "counts": outside.astype(np.float64),
+            "counts": outside.astype(dtype),
         }
     found = found if is_traced(found) else jax.tree.map(np.asarray, found)
     return AveragedHamiltonian(problem, observer, exact=exact, **found)
@@ -229,10 +226,9 @@ def minimum_stress(
 
         u = u*(x̄),    x̄ = argmax_x { p(x) + V(x) }
 
-    V is the value of the H∞ game with the filter's γ and σ: ``attenuation(problem, gamma, disturbances,
-    enters=sigma)``, solved or marched to where it settles. A γ that neither Riccati equation alone forbids may yet be
-    too small for both: then p + V has no maximum inside, x̄ runs to an end of the box, and no controller that sees y
-    alone holds that γ.
+    V is the value of the H∞ game with the filter's γ and σ, ``attenuation(problem, gamma, disturbances,
+    enters=sigma)``. A γ that is too small for both Riccati equations together leaves p + V no maximum inside: x̄ runs
+    to an end of the box.
 
     Args:
       observer: the robust filter; its grid need not be that of the solution, in whose box it must lie.
@@ -242,7 +238,7 @@ def minimum_stress(
       feedback: u*, a function of the state or a ``greedy_feedback``; ``None``: the solution's control.
 
     Returns:
-      A pytree, called with the filter's state; ``.worst_case(state)`` is x̄ and ``.stress(state)`` the largest p + V.
+      A pytree, called with the filter's state; ``.worst_case(state)`` is x̄, ``.stress(state)`` the largest p + V.
 
     Raises:
       TypeError: no RobustGridFilter, no Solution, a feedback that cannot be called.
@@ -267,10 +263,9 @@ def minimum_stress(
         kept = {each: getattr(solution, each) for each in ("value", "policy", "disturbance")}
         first = {each: array[0] for each, array in kept.items() if array is not None}
         solution = dataclasses.replace(solution, times=None, **first)
-    grid = observer.grid
-    _check_box(solution.grid, grid, name)
+    _check_box(solution.grid, grid := observer.grid, name)
     acts = _stationary(solution if feedback is None else feedback, name)
-    with jax.enable_x64(True), jax.ensure_compile_time_eval():
+    with _double(solution, grid), jax.ensure_compile_time_eval():
         value = solution.value_at(_states(grid), clamp=True)
     if not is_traced(value):
         value = np.asarray(value)
@@ -282,6 +277,11 @@ def minimum_stress(
                 "maximum; take a smaller box for the filter"
             )
     return MinimumStress(grid, value, acts)
+
+
+def _double(*trees: Any) -> Any:
+    """float64, but not in the middle of somebody's trace."""
+    return jax.enable_x64(jnp.result_type(float) == np.float64 or not is_traced(*trees))
 
 
 def _stationary(feedback: Any, name: str) -> Callable:
@@ -331,8 +331,8 @@ def _check_box(known: Grid, asked: Grid, name: str) -> None:
 
 def _states(grid: Grid) -> Array:
     """The states of all nodes, shape (*grid, n)."""
-    parts = [jnp.broadcast_to(part, grid.shape) for part in cast(grid, np.float64).components(np.dtype(np.float64))]
-    return jnp.stack(parts, axis=-1)
+    dtype = np.dtype(jnp.result_type(float))
+    return jnp.stack([jnp.broadcast_to(part, grid.shape) for part in cast(grid, dtype).components(dtype)], axis=-1)
 
 
 def _slopes(solution: Solution, grid: Grid) -> Array:

@@ -190,6 +190,18 @@ def _stressed(slope):
     return minimum_stress(observer, known(LINE, slope / 2 * X**2, -slope * X[:, None]))
 
 
+def test_a_controller_that_is_made_inside_a_program_has_a_derivative():
+    p, coupling = jnp.asarray(-2 * (X - 0.3) ** 2), 0.7 / 4  # γ = 2, Y = 1
+
+    def control(slope):
+        plant, x = hjb.Problem(lag, quadratic, WIDE), jnp.asarray(X)
+        observer = RobustGridFilter(plant, seen, LINE, lambda x: -x @ x, 2.0)
+        return minimum_stress(observer, known(LINE, slope / 2 * x**2, -slope * x[:, None]))(p)[0]
+
+    value, slope = jax.jit(jax.value_and_grad(control))(0.7)
+    assert_allclose([value, slope], [-0.21 / (1 - coupling), -0.3 / (1 - coupling) ** 2], rtol=1e-3)
+
+
 def test_where_both_together_do_not_hold_the_level_the_worst_case_runs_to_an_end():
     control = _stressed(1.5)
     with jax.enable_x64(True):

@@ -340,12 +340,13 @@ def test_a_cost_without_bound_is_reported_with_its_time():
 
 def test_correlated_measurements_count_as_their_whitened_ones():
     root = np.array([[0.5, 0.0], [0.8, 1.5]])
+    inverse = np.linalg.inv(root)
 
     def twice(x):
         return jnp.stack([x[0], jnp.sin(x[0])])
 
     def white(x):
-        return jnp.linalg.inv(root) @ twice(x)
+        return inverse @ twice(x)
 
     grid, dy = hjb.Grid([-4.0], [4.0], (41,)), np.array([0.03, -0.02])
     observer = RobustGridFilter(LAG, twice, grid, prior, GAMMA, measurement_noise=root)

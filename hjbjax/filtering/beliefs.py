@@ -54,7 +54,7 @@ class BeliefCoordinates:
         """π at a state, shape (S,), entries ≥ 0 that sum to one; of states (..., S − 1) shape (..., S)."""
         x = jnp.asarray(x)
         if self.basis is None:
-            return jnp.concatenate([x, 1 - x], axis=-1)
+            return jnp.concatenate([x, 1 - x], axis=-1)  # no clip: on the grid x is in [0, 1]
         return jax.nn.softmax(x @ jnp.asarray(self.basis, x.dtype), axis=-1)
 
     def from_belief(self, belief: Array) -> jax.Array:
@@ -303,6 +303,7 @@ def _common_axes(sensor: Sensor, looks: jax.Array, states: int) -> np.ndarray:
             f"belief_problem: h or measurement_noise is traced; with {states} states they set the axes of the grid and "
             "must be known numbers"
         )
+    # h and h + const tell the same: only differences between states are seen
     centring = np.eye(states) - 1 / states
     covariances = [centring @ gains @ gains.T @ centring for gains in map(np.asarray, seen)]
     # unequal weights: eigenvectors of a sum are common to all parts only if no two parts make up for each other
@@ -312,6 +313,7 @@ def _common_axes(sensor: Sensor, looks: jax.Array, states: int) -> np.ndarray:
     # the vector of ones is put far below all others, and left out
     _, vectors = np.linalg.eigh(mixed - np.ones((states, states)))
     basis = vectors[:, 1:].T[::-1].copy()
+    # eigenvectors have either sign: the largest entry positive, or the axes would turn from machine to machine
     basis *= np.sign(basis[np.arange(states - 1), np.argmax(np.abs(basis), axis=1)])[:, None]
     for covariance, u in zip(covariances, looks, strict=True):
         turned = basis @ covariance @ basis.T

@@ -36,6 +36,7 @@ def transition_matrix(rates: Array, dt: Number) -> jax.Array:
     """
     rates = jnp.asarray(rates)
     fastest = jnp.max(-jnp.diag(rates))
+    # q dt ≤ 1 in each part, where nineteen terms are enough; all of them are ≥ 0, so that nothing cancels
     squarings = jnp.ceil(jnp.log2(jnp.maximum(fastest * dt, 1)))
     short = dt / 2**squarings
     one = jnp.eye(rates.shape[0], dtype=rates.dtype)
@@ -103,7 +104,7 @@ class WonhamFilter:
                     f"WonhamFilter: prior = {arguments.shown(law.tolist())}; wanted (S,) numbers ≥ 0, not all zero: "
                     "how likely each state is at time 0"
                 )
-            law = law / law.sum()
+            law = law / law.sum()  # frequencies serve as well
         _check_shapes(generator, h, sensor, len(law))
         for name, value in {"generator": fixed, "sensor": sensor, "prior": law}.items():
             object.__setattr__(self, name, value)
@@ -120,6 +121,7 @@ class WonhamFilter:
     def _after(self, belief: jax.Array, u: jax.Array, dy: jax.Array, dt: Number) -> jax.Array:
         """π after a step."""
         mine, u = cast(self, belief.dtype), jnp.asarray(u, belief.dtype)
+        # half a step of jumps on either side of the evidence: Strang's splitting, of second order
         half = transition_matrix(jnp.asarray(mine.generator(u), belief.dtype), dt / 2)
         gains = mine.sensor(u)
         # dy/r and h/r: unit noise in every measurement
@@ -130,7 +132,7 @@ class WonhamFilter:
         top = jnp.max(jnp.where(belief > 0, evidence, -jnp.inf))
         belief = belief * jnp.exp(jnp.minimum(evidence - top, 0))
         belief = belief @ half
-        return belief / jnp.sum(belief)
+        return belief / jnp.sum(belief)  # the factor e^{top} goes with the norm
 
     def estimate(self, state: Array) -> jax.Array:
         """The conditional mean of the indicator of the hidden state: π, shape (S,)."""
@@ -230,8 +232,10 @@ def simulate_hidden(
         raise ValueError(
             f"simulate_hidden: start = {arguments.shown(start)}; wanted a state, 0 to {states - 1}, or None"
         )
+    # 1e-9: a duration that is a whole number of steps up to rounding takes no step more
     steps = int(np.ceil(duration / dt * (1 - 1e-9)))
     keys = jax.random.key(key) if isinstance(key, (int, np.integer)) else jnp.asarray(key)
+    # float64: over thousands of steps beliefs near a corner would be rounding
     with jax.enable_x64(True):
         law = np.asarray(observer.prior) if start is None else np.eye(states)[start]
         loop = cast(_Loop(observer, as_partial(control or _nothing), as_partial(cost), float(discount)), np.float64)
@@ -283,8 +287,9 @@ def _simulated(loop: _Loop, law: jax.Array, key: Key, dt: Any, steps: int) -> Hi
     def step(carry, inputs):
         hidden, belief = carry
         number, key = inputs
-        u = jnp.asarray(loop.control(belief), belief.dtype)
+        u = jnp.asarray(loop.control(belief), belief.dtype)  # of the belief alone: the state is hidden from it
         jump, shake = jax.random.split(key)
+        # the law of the state at the end of the step, with however many jumps there are between
         row = transition_matrix(jnp.asarray(observer.generator(u), belief.dtype), dt)[hidden]
         after = jax.random.choice(jump, len(row), p=row)
         gains = observer.sensor(u)

@@ -98,7 +98,7 @@ def zakai(
     acts = _record_of_controls(record, controls, problem, observer.measurement.dim, name)
     if not is_traced(dt) and not (np.ndim(dt) == 0 and np.isfinite(dt) and dt > 0):
         raise ValueError(f"{name}: dt = {dt!r}; wanted a finite number > 0, the time between two increments")
-    run = _run if record.ndim == 2 else _run_batch
+    run = _run if record.ndim == 2 else _run_batch  # one record needs no batch axis, which takes time to compile
     if is_traced(observer, record, acts, dt):
         return run(observer, record, acts, dt, bool(normalised))
     # inside somebody's ``jit`` as well, what is known is computed here and now
@@ -113,6 +113,7 @@ def _law(observer: GridFilter, record: Array, acts: Array, dt: Number, normalise
 
     def step(state: Density, row: tuple[Array, Array]) -> tuple[Density, InformationState]:
         state = observer.update(state, row[1], row[0], dt)
+        # the filter keeps the norm apart, in its logarithm, or a long record would overflow
         factor = 1.0 if normalised else jnp.exp(state.log_likelihood)
         shown = InformationState(
             density=state.density * factor,

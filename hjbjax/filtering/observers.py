@@ -113,7 +113,7 @@ class ExtendedKalman:
             "covariance": _covariance(covariance, n, f"{name}: covariance"),
         }
         for field, value in fields.items():
-            object.__setattr__(self, field, value)
+            object.__setattr__(self, field, value)  # frozen, as what is compiled for it knows it
 
     def initial(self) -> Gaussian:
         """The law at t = 0."""
@@ -132,10 +132,12 @@ class ExtendedKalman:
 
         sigma = self.plant.diffusion(mean, u).astype(dtype)
         noise = jnp.eye(n + p, dtype=dtype).at[:n, :n].set(sigma @ sigma.T)
+        # the slopes in y are zero: what was measured does not come back into the plant
         slopes = jnp.pad(jax.jacfwd(rates)(mean), ((0, 0), (0, p)))
         transition, shift, spread = affine_flow(slopes, rates(mean), noise, dt, states=n)
         # the joint law of the deviation of x at the end and of dy, given dy's before
         joint = transition[:, :n] @ state.covariance @ transition[:, :n].T + spread
+        # in units of its noise dy has a covariance of dt and more, so that the solve is sound
         gain = jnp.linalg.solve(joint[n:, n:], joint[n:, :n]).T
         innovation = self.measurement.whitened(jnp.asarray(dy, dtype)) - shift[n:]
         keep = jnp.concatenate([jnp.eye(n, dtype=dtype), -gain], axis=1)
@@ -202,7 +204,7 @@ class Luenberger:
         """x̂ after holding the control u (m,) for dt and seeing the increment dy (p,)."""
         n, dtype = state.shape[0], state.dtype
         dt = jnp.asarray(dt, dtype)
-        u, y = jnp.asarray(u, dtype), jnp.asarray(dy, dtype) / dt
+        u, y = jnp.asarray(u, dtype), jnp.asarray(dy, dtype) / dt  # the mean of y over the step
 
         def rate(x: State) -> jax.Array:
             gain = jnp.asarray(self.gain(x) if callable(self.gain) else self.gain, dtype)

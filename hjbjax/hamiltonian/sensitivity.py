@@ -93,9 +93,11 @@ def actions(on: Discretisation, value: Field, lost: jax.Array | None, u: Action,
       u, d: the actions that were found, each input (*grid).
     """
     players = players_of(on)
+    # what says which branch holds is frozen: to first order no node goes over to another one
     kept, u, d = jax.lax.stop_gradient(((on, value), list(u), list(d)))
     at = Optimum(discrete.around(on, value, lost), discrete.around(*kept, lost), u, d)
     control, disturbance = players.control, players.disturbance
+    # min max of a function that is no sum: where one moves the other's optimum moves, so both are solved for at once
     if disturbance.admissible is not None and not players.decoupled:
         return _implicit(at, [*_inputs(control), *_inputs(disturbance)])
     return _alone(at, control, lambda mine: (mine, d))[0], _alone(at, disturbance, lambda mine: (u, mine))[1]
@@ -249,6 +251,7 @@ def _solved(rows: Sequence[Row]) -> list[Any]:
     """The unknowns of a small linear system at every node."""
     right = jnp.stack([side for _, side in rows], axis=-1)
     entries = [[columns.get(b, 0.0) for b in range(len(rows))] for columns, _ in rows]
+    # a few unknowns at each of many nodes: batched elimination, and a division where there is one
     matrix = jnp.stack(
         [jnp.stack([jnp.broadcast_to(entry, right.shape[:-1]) for entry in row], axis=-1) for row in entries], axis=-2
     )

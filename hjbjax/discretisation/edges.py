@@ -117,7 +117,7 @@ def inadmissible(on: Discretisation, u: list, d: list | None = None, *, eps: Num
 
 
 def cut(
-    problem: Problem, grid: Grid, value: np.ndarray, u: list, d: list, acting: np.ndarray, t: Number = 0.0
+    problem: Problem, grid: Grid, value: np.ndarray, actions: tuple[list, list], acting: np.ndarray, t: Number = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Counts of nodes on each projected end: those where the drift under these actions is cut off, and all.
 
@@ -128,7 +128,7 @@ def cut(
     Args:
       problem, grid: the question.
       value: V, shape (*grid).
-      u, d: the actions, each component (*grid).
+      actions: u and d, each component (*grid).
       acting: bool (*grid), the nodes that are looked at.
       t: the time.
 
@@ -144,8 +144,8 @@ def cut(
     faces = [np.take(number, grid.shape[axis] - 1 if step > 0 else 0, axis).ravel() for axis, step in sides]
     places = np.unravel_index(np.concatenate([coarse.ravel(), *faces]), grid.shape)
     x = [np.asarray(grid.axis(axis), value.dtype)[index] for axis, index in enumerate(places)]
-    actions = ([np.broadcast_to(entry, grid.shape)[places] for entry in each] for each in (u, d))
-    f = np.asarray(_drift(problem, x, *actions, t))
+    taken = ([np.broadcast_to(entry, grid.shape)[places] for entry in each] for each in actions)
+    f = np.asarray(_drift(problem, x, *taken, t))
     # the sample tells the size of the drift over the box, next to which a remainder at an end may be rounding
     least = ROUNDINGS * np.finfo(value.dtype).eps * np.max(np.abs(f[:, : coarse.size]), axis=1)
     extent = np.ptp(value[acting]) if acting.any() else 0.0

@@ -100,7 +100,8 @@ def simulate_output(
     measured = measurement(h, n, measurement_noise, "simulate_output", perfect=True)
     keys = _keys(key, paths, np.shape(start)[:-1])
     arguments.count(substeps, "simulate_output: substeps")
-    loop = _closed(problem, observer, control, measured, grid, n, float(times[-1]))
+    plant = _plant(problem, observer, n)
+    loop = _closed(plant, observer, control, measured, _box(grid, control, observer, n), float(times[-1]))
     if is_traced(loop, start, keys) or _sees_tracers(loop):
         start = jnp.asarray(start)
         return _paths(loop, start, jnp.asarray(times, start.dtype), keys, substeps)
@@ -188,16 +189,8 @@ def _keys(key: Any, paths: int | None, batch: tuple[int, ...]) -> Key:
     return key if _count(key) or not wanted else jax.random.split(key, wanted)
 
 
-def _closed(
-    problem: Problem,
-    observer: Observer,
-    control: Any,
-    measured: Measurement,
-    grid: Grid | None,
-    n: int,
-    duration: float,
-) -> OutputLoop:
-    """The loop through an observer and a function, or a feedback at its estimate."""
+def _plant(problem: Problem, observer: Observer, n: int) -> Problem:
+    """The problem with its functions as they are now; refuses what is no plant of n states, and no observer."""
     if not isinstance(problem, Problem):
         raise TypeError(f"simulate_output: got {type(problem).__name__}, wanted a Problem")
     if problem.is_game or problem.running_max is not None:
@@ -212,6 +205,23 @@ def _closed(
         )
     problem = closures.settled(problem, n)
     checks.of_one_state(problem, n, "the number of states in x0")
+    return problem
+
+
+def _box(grid: Grid | None, control: Any, observer: Observer, n: int) -> Grid | None:
+    """The grid that says which states are periodic: the one that was given, the feedback's, or the observer's."""
+    if grid is None and is_grid_feedback(control):
+        grid = control.grid
+    grid = getattr(observer, "grid", None) if grid is None else grid
+    if grid is not None and not (isinstance(grid, Grid) and grid.ndim == n):
+        raise ValueError(f"simulate_output: grid is {arguments.shown(grid)}, wanted a Grid of {n} axes, as x0 has")
+    return grid
+
+
+def _closed(
+    problem: Problem, observer: Observer, control: Any, measured: Measurement, grid: Grid | None, duration: float
+) -> OutputLoop:
+    """The loop through an observer and a function, or a feedback at its estimate."""
     # bound methods of a pytree bring its numbers along as leaves; those of another object belong to the program
     initial, update, estimate = (_method(observer, name) for name in ("initial", "update", "estimate"))
     acts: Any
@@ -222,7 +232,6 @@ def _closed(
     elif is_grid_feedback(control):
         if control.times is not None:
             problem = _within_horizon(problem, control, duration)
-        grid = control.grid if grid is None else grid
         acts = CertaintyEquivalence(estimate, lookups(control)[0], control.grid)
     elif callable(control):
         acts = jax.tree_util.Partial(of_information, as_partial(control))
@@ -231,11 +240,7 @@ def _closed(
             f"simulate_output: control is {arguments.shown(control)}, wanted a function of the observer's state, or a "
             "Solution, which is asked at its estimate"
         )
-    grid = getattr(observer, "grid", None) if grid is None else grid
-    if grid is not None and not (isinstance(grid, Grid) and grid.ndim == n):
-        raise ValueError(f"simulate_output: grid is {arguments.shown(grid)}, wanted a Grid of {n} axes, as x0 has")
-    plant = Loop(problem, None, None, grid, clamp=True)
-    return OutputLoop(plant, measured, initial, update, estimate, acts)
+    return OutputLoop(Loop(problem, None, None, grid, clamp=True), measured, initial, update, estimate, acts)
 
 
 def _method(observer: Observer, name: str) -> jax.tree_util.Partial:

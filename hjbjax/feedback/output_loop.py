@@ -146,7 +146,7 @@ def output_path(loop: OutputLoop, x0: State, times: Array, key: Key, *, substeps
     plant, dtype, count = loop.plant, x0.dtype, len(times) - 1
     brownian, bridge = jax.random.split(key)
     m = 0 if plant.problem.controls is None else plant.problem.controls.dim
-    advance = functools.partial(_advanced, loop, BridgeDraw(bridge), substeps)
+    draw, shakes = BridgeDraw(bridge), (substeps, _sources(plant, x0, m) + loop.measurement.dim)
 
     def interval(carry: tuple, row: tuple) -> tuple[tuple, tuple]:
         t, z, information, before, code = carry
@@ -154,7 +154,9 @@ def output_path(loop: OutputLoop, x0: State, times: Array, key: Key, *, substeps
         u = loop.control(t, information, before)
         code = jnp.where((code == PathStatus.DURATION) & ~jnp.all(jnp.isfinite(u)), PathStatus.UNDEFINED, code)
         active = code == PathStatus.DURATION
-        later, moved, dy, met = advance(t, z, u, jnp.where(active, end, t + (end - times[k])), _folded(brownian, k))
+        end = jnp.where(active, end, t + (end - times[k]))
+        shake = jax.random.normal(jax.random.fold_in(brownian, k), shakes, dtype)
+        later, moved, dy, met = _advanced(loop, draw, (t, z), u, end, shake)
         told = jax.tree.map(
             lambda new, old: jnp.asarray(new, jnp.result_type(old)),
             loop.update(information, u, dy, later - t),
@@ -193,19 +195,22 @@ def output_path(loop: OutputLoop, x0: State, times: Array, key: Key, *, substeps
     )
 
 
-def _folded(key: Key, k: Array) -> Key:
-    """The key of one interval."""
-    return jax.random.fold_in(key, k)
+def _sources(plant: Loop, x0: State, m: int) -> int:
+    """The number of Wiener processes that drive a plant with m inputs."""
+    u = jax.ShapeDtypeStruct((m,), x0.dtype)
+    return jax.eval_shape(lambda x, u: plant.noise(0.0, x, u, None), x0, u).shape[1]
 
 
 def _advanced(
-    loop: OutputLoop, draw: BridgeDraw, substeps: int, t: Array, z: Array, u: Control, end: Array, key: Key
+    loop: OutputLoop, draw: BridgeDraw, begins: tuple[Array, Array], u: Control, end: Array, shake: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Time, state with cost, the increment dy and True if the target was met, at the end of an interval or there."""
-    plant, measured, dtype = loop.plant, loop.measurement, z.dtype
-    tau = (end - t) / substeps
-    sources, p = jax.eval_shape(lambda x: plant.noise(t, x, u, None), z[:-1]).shape[1], measured.dim
-    normal = jnp.sqrt(tau) * jax.random.normal(key, (substeps, sources + p), dtype)
+    """Time, state with cost, the increment dy and True if the target was met, at the end of an interval or there.
+
+    ``shake`` is a draw of unit normal numbers, a row a sub-step: what drives the plant, then what spoils y.
+    """
+    plant, measured, (t, z), p = loop.plant, loop.measurement, begins, loop.measurement.dim
+    dtype, tau, sources = z.dtype, (end - t) / len(shake), shake.shape[1] - p
+    normal = jnp.sqrt(tau) * shake
     root = jnp.asarray(measured.root, dtype)
 
     def rate(t: Array, z: Array) -> tuple[Array, Array]:

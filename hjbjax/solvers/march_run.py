@@ -91,7 +91,7 @@ class Slices:
             self.policy[place] = self.disturbance[place] = np.nan
         else:
             (u, d), ended, acting = answer
-            found = edges.cut(task.problem, task.grid, self.value[place], list(u), list(d), acting, t)
+            found = edges.cut(task.problem, task.grid, self.value[place], (list(u), list(d)), acting, t)
             self.cut[place], self.ends[place] = found
             for array, action in ((self.policy, u), (self.disturbance, d)):
                 for j, entry in enumerate(action):

@@ -178,7 +178,7 @@ def _leaving(task: Task, state: State, grid: Grid) -> np.ndarray:
     """Numbers of nodes at which the optimal drift is cut off, (n, 2), with a warning where they are most of an end."""
     value, policy, obstacles, counted = jax.device_get((state.value, state.policy, task.obstacles, task.counted))
     u, d = (list(players) for players in (policy.controls, policy.disturbances))
-    cut, ends = edges.cut(task.problem, task.grid, value, u, d, counted & obstacles.acting(value))
+    cut, ends = edges.cut(task.problem, task.grid, value, (u, d), counted & obstacles.acting(value))
     warn_of_cuts(cut, ends, grid)
     return cut
 

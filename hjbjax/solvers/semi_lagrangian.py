@@ -222,7 +222,7 @@ def _leaving(on: Discretisation, value: np.ndarray, policy: np.ndarray, task: Ar
     """Numbers of nodes at which the optimal drift is cut off, (n, 2), with a warning where they are most of an end."""
     acting = np.asarray(task.counted & task.obstacles.acting(jnp.asarray(value)))
     u = [np.ascontiguousarray(policy[..., j]) for j in range(policy.shape[-1])]
-    cut, ends = edges.cut(on.problem, on.grid, np.where(acting, value, 0), u, [], acting)
+    cut, ends = edges.cut(on.problem, on.grid, np.where(acting, value, 0), (u, []), acting)
     warn_of_cuts(cut, ends, on.grid)
     return cut
 

@@ -29,8 +29,8 @@ def check(cells):
     assert len(pictures) >= sum("plt.show()" in cell.source for cell in cells) > 0
 
 
-def test_both_are_there():
-    assert {path.stem for path in NOTEBOOKS} >= {"minimum_time", "pendulum"}
+def test_they_are_there():
+    assert {path.stem for path in NOTEBOOKS} >= {"minimum_time", "pendulum", "output_feedback"}
 
 
 @pytest.mark.slow

@@ -44,6 +44,14 @@ COLUMNS = {
 HOMES = ("XDG_CACHE_HOME", "HOME", "LOCALAPPDATA")  # where a user's caches are, on one platform or another
 
 
+def process(command: list[str], environment: dict[str, str]) -> tuple[float, float]:
+    """Seconds of a process, and the processor's seconds on all cores."""
+    began, before = time.perf_counter(), os.times()
+    subprocess.run(command, env=environment, check=True, capture_output=True)
+    seconds, after = time.perf_counter() - began, os.times()
+    return seconds, after.children_user + after.children_system - before.children_user - before.children_system
+
+
 def one(problem: str, shape: str | None, cache: str | None) -> tuple[float, float, int]:
     """Seconds of the process, the processor's seconds on all cores, and the pictures it left."""
     kept = {key: value for key, value in os.environ.items() if "COMPILATION_CACHE" not in key}
@@ -55,11 +63,7 @@ def one(problem: str, shape: str | None, cache: str | None) -> tuple[float, floa
         command = [sys.executable, "-m", "hjbjax", "solve", problem, "--out", str(out)]
         command += [] if shape is None else ["--shape", shape]
         command += ["--no-cache"] if cache is None else []
-        began, before = time.perf_counter(), os.times()
-        subprocess.run(command, env=environment, check=True, capture_output=True)
-        seconds, after = time.perf_counter() - began, os.times()
-        busy = after.children_user + after.children_system - before.children_user - before.children_system
-        return seconds, busy, len(list(out.glob("*.png")))
+        return *process(command, environment), len(list(out.glob("*.png")))
 
 
 def measure(problem: str, shape: str | None, repeats: int) -> list[dict[str, Any]]:
@@ -86,11 +90,7 @@ def importing(repeats: int) -> list[dict[str, Any]]:
     runs: dict[str, list[tuple[float, float]]] = {"jax": [], "hjbjax": []}
     for _ in range(repeats + 1):
         for name, found in runs.items():
-            began, before = time.perf_counter(), os.times()
-            subprocess.run([sys.executable, "-c", f"import {name}"], env=kept, cwd=ROOT, check=True)
-            seconds, after = time.perf_counter() - began, os.times()
-            busy = after.children_user + after.children_system - before.children_user - before.children_system
-            found.append((seconds, busy))
+            found.append(process([sys.executable, "-c", f"import {name}"], kept | {"PYTHONPATH": str(ROOT)}))
     rows = []
     for name, (_, *found) in runs.items():
         seconds, busy = zip(*found, strict=True)

@@ -24,6 +24,7 @@ from hjbjax.discretisation.schemes import Upwind
 from hjbjax.feedback.measurement import Measurement, measurement, plant
 from hjbjax.filtering import forward_equation
 from hjbjax.filtering.forward_equation import advanced, cells
+from hjbjax.markov_chain.decision_process import refuse
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
@@ -178,7 +179,7 @@ def _signal(on: Discretisation, measured: Measurement, name: str) -> Any:
     """r⁻¹ h at the nodes, shape (p, *grid)."""
     entries = components.components(measured.h, on.coordinates(), dtype=on.dtype)
     h = jnp.stack([jnp.broadcast_to(entry, on.grid.shape) for entry in entries])
-    _refuse(f"{name}: h(x) is not finite", ~jnp.all(jnp.isfinite(h), axis=0), on.grid)
+    refuse("h(x) is not finite", ~jnp.all(jnp.isfinite(h), axis=0), on.grid, name)
     white = measured.whitened(h.reshape(len(h), -1)).reshape(h.shape)
     return white if is_traced(white) else np.asarray(white)
 
@@ -194,7 +195,7 @@ def _prior(on: Discretisation, given: Callable | Numbers, name: str) -> Any:
     if is_traced(density):
         return density / jnp.sum(density * on.grid.volumes())
     density = np.asarray(density)
-    _refuse(f"{name}: initial_density is not a finite number ≥ 0", ~(np.isfinite(density) & (density >= 0)), on.grid)
+    refuse("initial_density is not a finite number ≥ 0", ~(np.isfinite(density) & (density >= 0)), on.grid, name)
     if not np.any(density):
         raise ValueError(
             f"{name}: initial_density is zero at every node, so that no record tells anything; put mass on a node: a "
@@ -208,8 +209,8 @@ def _check_rates(on: Discretisation, name: str) -> None:
     """Refuse drift or noise that is not finite at a node, and correlated noise that the chain cannot represent."""
     for u in sets.probes(on.problem.controls, on.dtype)[:3]:
         leaving, lacking = _look(on, u)
-        _refuse(f"{name}: a jump rate, made of drift and noise, is not finite", ~jnp.isfinite(leaving), on.grid)
-        _refuse(f"{name}: the noise is correlated more than the spacings allow", lacking, on.grid)
+        refuse("a jump rate, made of drift and noise, is not finite", ~jnp.isfinite(leaving), on.grid, name)
+        refuse("the noise is correlated more than the spacings allow", lacking, on.grid, name)
 
 
 @jax.jit
@@ -218,12 +219,3 @@ def _look(on: Discretisation, u: list) -> tuple[jax.Array, jax.Array]:
     short = correlated_noise.lacking(on, on.diffusion(u))
     lacking = jnp.broadcast_to(jnp.zeros((), bool) if short is None else short, on.grid.shape)
     return jump_rates(on, u).total(), lacking
-
-
-def _refuse(what: str, where: Any, grid: Grid) -> None:
-    """Raise a ValueError that names the fault ``what``, its count of nodes and the first, if it is at any."""
-    if is_traced(where) or not np.any(where):
-        return
-    first = tuple(int(i) for i in np.argwhere(where)[0])
-    state = np.array2string(grid.state(first), separator=", ")
-    raise ValueError(f"{what} at {int(np.sum(where))} nodes, the first {first} with state {state}")

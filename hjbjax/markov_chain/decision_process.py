@@ -17,7 +17,9 @@ from hjbjax.discretisation.schemes import Upwind
 from hjbjax.markov_chain import stationary_law
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import is_traced
 from hjbjax.problem.sets import AdmissibleSet, Finite
+from hjbjax.problem.types import Mask
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -44,12 +46,15 @@ def time_step(leaving: np.ndarray) -> float:
     return 1 / fastest if fastest > 0 else 1.0
 
 
-def refuse(what: str, where: np.ndarray, grid: Grid) -> None:
-    """Raise a ValueError that names the fault ``what``, its count of nodes and the first, if it is at any."""
-    if np.any(where):
+def refuse(what: str, where: Mask, grid: Grid, name: str = "chain") -> None:
+    """Raise a ValueError that names the fault ``what``, its count of nodes and the first, if it is at any.
+
+    ``name``: who refuses. Traced nodes pass.
+    """
+    if not is_traced(where) and np.any(where):
         first = tuple(int(i) for i in np.argwhere(where)[0])
         state = np.array2string(grid.state(first), separator=", ")
-        raise ValueError(f"chain: {what} at {int(np.sum(where))} nodes, the first {first} with state {state}")
+        raise ValueError(f"{name}: {what} at {int(np.sum(where))} nodes, the first {first} with state {state}")
 
 
 def single_law(classes: list[np.ndarray], generator: "csr_array", grid: Grid) -> np.ndarray:

@@ -21,6 +21,14 @@ def problem(**changes):
     return hjb.Problem(**({"drift": drift, "cost": cost, "controls": BOX, "discount": 1.0} | changes))
 
 
+def refused(call, reason, kind=ValueError):
+    """The call is refused in a few lines that hold the reason."""
+    with pytest.raises(kind) as caught:
+        call()
+    assert reason in str(caught.value)
+    assert len(str(caught.value).splitlines()) <= 6
+
+
 def refusal(kind, *words, question=None, grid=GRID, **options):
     """The message of the refusal, which holds all ``words``."""
     with pytest.raises(kind) as caught:

@@ -26,7 +26,7 @@ from hjbjax.problem.types import Array, Number, State
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
-from hjbjax.tracing import checks
+from hjbjax.tracing import checks, closures
 
 SETTLED = 12.0  # time constants of the loop near a rest that an infinite horizon is followed: what is left is e⁻¹²
 WAYS = 4  # ends that are tried where angles can go to rest on either side
@@ -117,6 +117,9 @@ def pontryagin(
     checks.of_one_state(paid, len(start), "the length of x0")
     arguments.check_guess(guess, len(start), horizon)
     arguments.check_grid(grid, len(start))
+    problem = closures.settled(problem, len(start))
+    if callable(terminal):
+        terminal = closures.settled_function(terminal, (len(start),))
     clock = Clock()
     limits = Limits(tol, max_nodes, clock)
     # float64 whatever the session has: a residual of 1e-8 is below the rounding of float32

@@ -30,6 +30,7 @@ from hjbjax.problem.pytree import as_partial, cast, is_traced, pytree_dataclass
 from hjbjax.problem.sets import Ball, Box, Finite
 from hjbjax.problem.types import Array, Key, Number, Numbers, State
 from hjbjax.solution.solution import Solution
+from hjbjax.tracing import closures
 
 POINTS = 33  # of a random disturbance
 STEPS = 64  # output intervals of a path: two between neighbouring points, so that no step runs over a kink
@@ -140,12 +141,14 @@ def dissipation(
     import diffrax  # noqa: F401  # before anything is compiled, see simulate
 
     with jax.enable_x64(True):  # the margin is a difference of energies, near zero in the worst case
-        problem, solution = cast(problem, np.float64), cast(solution, np.float64)
+        n = starts.shape[1]
+        problem, solution = cast(closures.settled(problem, n), np.float64), cast(solution, np.float64)
         times = np.linspace(0.0, float(duration), STEPS + 1)
         lanes, kinds = _lanes(problem, starts, random, typing.cast("Key", key))
         found = [_energies(problem, solution, lanes, times, rtol)]
         for signal in disturbances:
-            found.append(_energies_under(problem, solution, as_partial(signal), starts, times, rtol))
+            given = closures.settled_function(signal, (), (n,))
+            found.append(_energies_under(problem, solution, given, starts, times, rtol))
         output, total, ends, codes = (np.concatenate(each) for each in zip(*jax.device_get(found), strict=True))
         stored = np.asarray(solution.value_at(starts))
     count = len(output) // len(starts)  # paths of each start; all starts come in turn under each disturbance

@@ -26,6 +26,7 @@ from hjbjax.problem.pytree import as_partial, cast, is_traced, pytree_dataclass
 from hjbjax.problem.types import Array, Costate, DType, Number, Numbers, State
 from hjbjax.solution.interpolation import extended
 from hjbjax.solution.solution import Solution
+from hjbjax.tracing.closures import settled
 
 if TYPE_CHECKING:
     from typing_extensions import TypeIs
@@ -239,7 +240,7 @@ def greedy_feedback(problem: Problem, solution: Solution) -> Greedy:
     m = np.shape(solution.policy)[-1:] if solution.policy is not None else (problem.controls.dim,)
     if m != (problem.controls.dim,) or (problem.is_game and solution.disturbance is None):
         raise ValueError("greedy_feedback: the solution is not one of this problem; its players are others")
-    return Greedy(problem, solution)
+    return Greedy(settled(problem, solution.grid.ndim), solution)
 
 
 def _minimax(greedy: Greedy, where: tuple, costate: Array) -> tuple[Array, Array]:

@@ -15,17 +15,20 @@ the path has a slope, and the interpolant of the step says when it meets the tar
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 
+from hjbjax.feedback.feedback import is_grid_feedback
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import pytree_dataclass
+from hjbjax.problem.pytree import altered, pytree_dataclass
 from hjbjax.problem.types import Array, Control, Disturbance, Key, Number, State
+from hjbjax.tracing import closures
 
 Event: TypeAlias = tuple[Number, State]  # a point of the path: when, and where
 Actions: TypeAlias = tuple[Control, Disturbance | None]  # of both players; no disturbance where there is no opponent
@@ -297,3 +300,22 @@ def bridging(kind: type) -> type:
             return y1, error, {**dense, "y1": y1}, state, result
 
     return Bridging
+
+
+def timeless(function: Callable, t: Number, x: State) -> Array:
+    """A user's function of the state alone, as one of time and state."""
+    return function(x)
+
+
+def settled_loop(loop: Loop, n: int, own: Mapping[str, object]) -> Loop:
+    """The loop with the problem's functions, and the user's ``own`` players, looked at now.
+
+    A changed object is seen, and a function that computes as before compiles nothing again.
+    """
+    players = {name: getattr(loop, name) for name, given in own.items() if given is not None}
+    for name, player in players.items():
+        if player is not None and player.func is timeless:
+            players[name] = Partial(timeless, closures.settled_function(player.args[0], (n,)))
+        elif player is not None and not is_grid_feedback(own[name]):
+            players[name] = closures.settled_function(player, (), (n,))
+    return altered(loop, problem=closures.settled(loop.problem, n), **players)

@@ -12,13 +12,13 @@ import numpy as np
 
 from hjbjax.feedback.closed_loop import InitialValueProblem, Stepping, blank_record, integrate, integrate_part
 from hjbjax.feedback.feedback import GridFeedback, check_kept, is_grid_feedback, lookups
-from hjbjax.feedback.loop import Loop, check_shapes
+from hjbjax.feedback.loop import Loop, check_shapes, settled_loop, timeless
 from hjbjax.feedback.path import Interrupted, Path, PathStatus, promise, truncate
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, cast, is_traced
-from hjbjax.problem.types import Array, Key, Number, Numbers, State
+from hjbjax.problem.types import Key, Number, Numbers
 from hjbjax.solution.clock import CHUNK_SECONDS, Clock, noting_interrupts
 
 Feedback: TypeAlias = GridFeedback | Callable | None  # None where there is no control
@@ -100,6 +100,7 @@ def simulate(
         problem = _within_horizon(problem, feedback, duration)
     loop = _close(problem, feedback, disturbance, grid, clamp, time_varying)
     start = _initial_state(x0, loop.grid)
+    loop = settled_loop(loop, start.size, {"control": feedback, "opponent": disturbance})
     hold = None if hold is False else hold
     times = _times(duration, steps, hold)
     stepping = Stepping(
@@ -254,16 +255,11 @@ def _close(
             raise TypeError(f"simulate: {name} is {function!r}, wanted a Solution or a function {signature}")
     if not (problem.time_dependent or time_varying):  # from here on every player is one of (t, x); lookups are already
         control, opponent = (
-            jax.tree_util.Partial(_timeless, as_partial(player)) if player is not None and player is given else player
+            jax.tree_util.Partial(timeless, as_partial(player)) if player is not None and player is given else player
             for player, given in ((control, feedback), (opponent, disturbance))
         )
     control = None if problem.controls is None else as_partial(control)
     return Loop(problem, control, as_partial(opponent), grid, bool(clamp))
-
-
-def _timeless(function: Callable, t: Number, x: State) -> Array:
-    """A user's function of the state alone, as one of time and state."""
-    return function(x)
 
 
 def _is_marched(feedback: object) -> TypeGuard[GridFeedback]:

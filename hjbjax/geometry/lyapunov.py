@@ -17,10 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.geometry.unit_cube import half_widths, nearest_inside, state_of, time_of
-from hjbjax.problem.pytree import as_partial, cast, pytree_dataclass
+from hjbjax.problem.pytree import cast, pytree_dataclass
 from hjbjax.problem.sets import Ball, Box
 from hjbjax.problem.types import Array, Number, State
 from hjbjax.solution.screen import encodable
+from hjbjax.tracing.closures import settled_function
 
 Functions: TypeAlias = tuple[Callable, Callable]  # V and f, of (x) or of (t, x)
 Place: TypeAlias = tuple[Box | Ball, Array, Array | None]  # the region, the equilibrium, and two times if any
@@ -149,7 +150,9 @@ def lyapunov_check(
         place = cast((region, rest, span_of_times), np.float64)
         _check_inside(place[0], rest)
         starts = _starts(region.dim + (times is not None), int(samples))
-        functions = cast((as_partial(V), as_partial(f)), np.float64)
+        shapes = [()] * (times is not None) + [(region.dim,)]
+        asked = [settled_function(each, *shapes) for each in (V, f)]
+        functions = cast(tuple(asked), np.float64)
         found = jax.tree.map(np.asarray, _search(functions, place, starts, tolerance))
     if not found.pop("finite"):
         raise ValueError(

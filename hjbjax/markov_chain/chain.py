@@ -20,8 +20,10 @@ from hjbjax.markov_chain import decision_process, stationary_law
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import cast
+from hjbjax.tracing.closures import with_settled_functions
 
 
+@with_settled_functions
 def generator(
     problem: Problem,
     grid: Grid,
@@ -55,6 +57,7 @@ def generator(
     return stencil.sparse(jumps.offsets, jumps.values, -jumps.total(), grid)
 
 
+@with_settled_functions
 def matrix(
     problem: Problem,
     grid: Grid,
@@ -85,6 +88,7 @@ def matrix(
     return stencil.sparse(steps.offsets, steps.values, np.maximum(1 - steps.total(), 0), grid)
 
 
+@with_settled_functions
 def stationary_density(
     problem: Problem,
     grid: Grid,
@@ -135,6 +139,7 @@ def stationary_density(
     return density / np.sum(density * grid.volumes())
 
 
+@with_settled_functions
 def transition_arrays(
     problem: Problem, grid: Grid, *, scheme: Chain = Upwind()
 ) -> tuple[np.ndarray, Any, np.ndarray, np.ndarray, float]:

@@ -12,12 +12,8 @@ hides it from those who look at the leaves of a problem. Here such numbers becom
 
 from __future__ import annotations
 
-import dataclasses
 import functools
-import hashlib
 import inspect
-import re
-import types
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
@@ -28,16 +24,14 @@ from jax.tree_util import Partial
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import altered, is_traced
+from hjbjax.problem.pytree import altered, as_partial, is_traced
 from hjbjax.problem.types import DType, Numbers
-from hjbjax.tracing import jaxprs
+from hjbjax.tracing.captured import FLOATS, NUMBERS, OfNumbers, decisive, numbers_read
+from hjbjax.tracing.identity import code, fingerprint, identity
 
 if TYPE_CHECKING:
     from jax.extend import core as jex
 
-ADDRESS = re.compile(r" at 0x[0-9a-f]+|id=\d+")  # of rules of derivatives, made anew with every trace
-# whose functions compute tomorrow what they compute today: problems made of these alone need no trace at all
-LIBRARIES = frozenset({"builtins", "functools", "hjbjax", "itertools", "jax", "jaxlib", "math", "numpy", "operator"})
 OF_ACTION = ("drift", "cost", "noise")
 OF_STATE = ("target", "exit_cost", "terminal_cost", "stopping_cost", "running_max")
 
@@ -50,20 +44,23 @@ def settled(problem: Problem, n: int, dtype: DType | None = None) -> Problem:
       n: the number of states.
       dtype: the floating-point type inside a JAX transformation; ``None`` is that of ``float`` there.
     """
-    names = [name for name in (*OF_ACTION, *OF_STATE) if callable(getattr(problem, name))]
-    # library code computes tomorrow what it computes today and needs no mark; a trace takes about a millisecond
-    fixed = {name: _with_memory(getattr(problem, name)) for name in names if _is_fixed(getattr(problem, name))}
-    asked = [name for name in names if name not in fixed]
+    functions = {name: getattr(problem, name) for name in (*OF_ACTION, *OF_STATE) if callable(getattr(problem, name))}
     if not is_traced(problem):
-        # outside of the caller's ``jit`` and always in float64: every front door finds one mark for one function
-        with jax.core.eval_context(), jax.enable_x64(True):
-            found = {name: _trace(problem, name, n, np.dtype(np.float64)) for name in asked}
-        if not any(is_traced(closed.consts) for _, closed in found.values() if closed is not None):
-            return altered(problem, **fixed, **{name: _with_mark(*pair) for name, pair in found.items()})
+        known = {name: _settled_outside(each, _shapes(problem, name, n)) for name, each in functions.items()}
+        if None not in known.values():
+            return altered(problem, **known)
     # tracers belong to the caller's transformation, so that these functions are traced inside it, in its type
     kind = jnp.result_type(float) if dtype is None else jnp.dtype(dtype)
-    found = {name: _trace(problem, name, n, kind) for name in asked}
-    return altered(problem, **fixed, **{name: _with_closure_as_leaves(*pair) for name, pair in found.items()})
+    return altered(
+        problem, **{name: _settled_inside(each, _shapes(problem, name, n), kind) for name, each in functions.items()}
+    )
+
+
+def settled_function(function: Callable, *shapes: tuple[int, ...]) -> Partial:
+    """One function of arrays of these shapes, settled; only made a pytree if it closes over a traced number."""
+    held = as_partial(function)
+    assert held is not None
+    return _settled_outside(held, shapes) or held
 
 
 def with_settled_functions(front_door: Callable) -> Callable:
@@ -104,7 +101,10 @@ def _settle_all(asked: object, n: int, dtype: DType | None) -> object:
 
 
 class Marked:
-    """A function with a mark of what it computes, which it equals another by, and with the jaxprs of its traces.
+    """A function with a mark of what it computes, and with the jaxprs of its traces.
+
+    It equals another of one code and one mark: a lambda written in a loop, or a notebook's cell run again, compiles
+    nothing anew.
 
     Python runs the function once for every kind of arguments: a solve looks at it in half a dozen places (checks,
     dependence on the control, the chain, slopes of the drift in u), and each would trace it anew.
@@ -153,10 +153,12 @@ class Marked:
         return found
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Marked) and self.mark == other.mark and self.__wrapped__ == other.__wrapped__
+        return (
+            isinstance(other, Marked) and self.mark == other.mark and code(self.__wrapped__) == code(other.__wrapped__)
+        )
 
     def __hash__(self) -> int:
-        return hash((self.__wrapped__, self.mark))
+        return hash((code(self.__wrapped__), self.mark))
 
 
 class Opened:
@@ -189,78 +191,70 @@ def _kind(leaf: jax.typing.ArrayLike | jax.ShapeDtypeStruct) -> tuple[tuple[int,
     return aval.shape, aval.dtype, bool(aval.weak_type)
 
 
-def _with_closure_as_leaves(function: Partial, closed: jex.ClosedJaxpr | None) -> Partial:
+def _shapes(problem: Problem, name: str, n: int) -> list[tuple[int, ...]]:
+    """The shapes of the arguments of a problem's function."""
+    sizes = [0 if admissible is None else admissible.dim for admissible in (problem.controls, problem.disturbances)]
+    shapes = {"x": (n,), "u": (sizes[0],), "d": (sizes[1],), "t": ()}
+    letters = problem.arguments("x", "u", "d", "t") if name in OF_ACTION else problem.state_arguments("x", "t")
+    return [shapes[letter] for letter in letters]
+
+
+def _settled_outside(function: Partial, shapes: Sequence[tuple[int, ...]]) -> Partial | None:
+    """A function with its mark, and with the numbers that it reads as leaves; None if one of these is traced."""
+    function = _bare(function)
+    mark = identity(function)
+    if mark is not None:  # library code computes tomorrow what it computes today; a trace takes about a millisecond
+        return Partial(Marked(function.func, mark), *function.args, **function.keywords)
+    # outside of the caller's ``jit`` and always in float64: every front door finds one mark for one function
+    arguments = [jax.ShapeDtypeStruct(shape, np.float64) for shape in shapes]
+    with jax.core.eval_context(), jax.enable_x64(True):
+        found, closed = _trace_with_numbers_as_leaves(function, arguments)
+    return None if closed is not None and is_traced(closed.consts) else _with_mark(found, closed)
+
+
+def _settled_inside(function: Partial, shapes: Sequence[tuple[int, ...]], dtype: DType) -> Partial:
     """A function inside a JAX transformation: with a mark, or with what it closed over as leaves."""
+    function = _bare(function)
+    mark = identity(function)
+    if mark is not None:
+        return Partial(Marked(function.func, mark), *function.args, **function.keywords)
+    found, closed = _trace(function, [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes])
     if closed is None or not is_traced(closed.consts):
-        return _with_mark(function, closed)
-    leaves = jax.tree.leaves((function.keywords, function.args))
+        return _with_mark(found, closed)
+    leaves = jax.tree.leaves((found.keywords, found.args))
     return Partial(Opened(closed.jaxpr), (tuple(closed.consts), leaves))
 
 
-def _is_fixed(thing: object, depth: int = 8) -> bool:
-    """True if a part of a problem reads nothing from outside but library code, so that it never computes otherwise."""
-    if depth == 0:  # functions that call each other have no end; False costs a trace and is never wrong
-        return False
-    # numbers beside the leaves cannot change: a Partial keeps its own, and a dataclass of JAX's is frozen or copied
-    if thing is None or isinstance(thing, (bool, int, float, str, np.generic, np.ndarray, jax.Array)):
-        return True  # the arrays are leaves
-    if isinstance(thing, Partial):
-        return all(_is_fixed(each, depth - 1) for each in (thing.func, *thing.args, *thing.keywords.values()))
-    if isinstance(thing, (tuple, list)):
-        return all(_is_fixed(each, depth - 1) for each in thing)
-    if isinstance(thing, types.FunctionType):
-        return _reads_no_variables(thing, depth - 1)
-    if dataclasses.is_dataclass(thing) and not jax.tree_util.all_leaves([thing]):
-        return all(_is_fixed(getattr(thing, field.name), depth - 1) for field in dataclasses.fields(thing))
-    return False
+def _bare(function: Partial) -> Partial:
+    """The function as the user gave it, if an earlier front door has put a memory around it."""
+    inner = function.func
+    return Partial(inner.__wrapped__, *function.args, **function.keywords) if isinstance(inner, Marked) else function
 
 
-def _reads_no_variables(function: types.FunctionType, depth: int) -> bool:
-    """True if a function's globals are library code, or functions of which that is true."""
-    if function.__closure__ or function.__kwdefaults__:  # cells can be rebound, and dictionaries written to
-        return False
-    if not all(isinstance(each, (int, float, str, type(None))) for each in function.__defaults__ or ()):
-        return False
-    # CPython keeps names of globals and of attributes in one table; an attribute that is also a global costs a trace
-    known = function.__globals__
-    outside = [known[name] for name in _names(function.__code__) if name in known]
-    return all(
-        _is_library(each) or (isinstance(each, types.FunctionType) and _is_fixed(each, depth)) for each in outside
-    )
+def _trace_with_numbers_as_leaves(
+    function: Partial, arguments: Sequence[jax.ShapeDtypeStruct]
+) -> tuple[Partial, jex.ClosedJaxpr | None]:
+    """``_trace`` of the function with the numbers that it reads from outside as leaves, as far as it lets them be."""
+    for kinds in (NUMBERS, FLOATS):  # an integer may be a shape or an index, and then there is no trace
+        read = numbers_read(function.func, kinds)
+        while read:
+            asking = OfNumbers(function.func, tuple(read))
+            found = _trace(Partial(asking, tuple(read.values()), *function.args, **function.keywords), arguments)
+            if found[1] is None:
+                break
+            first = len(jax.tree.leaves(function.keywords))
+            stuck = decisive(found[1].jaxpr, found[1].jaxpr.invars[first : first + len(read)])
+            if not stuck:
+                return found
+            read = {name: number for at, (name, number) in enumerate(read.items()) if at not in stuck}
+    return _trace(function, arguments)
 
 
-def _names(code: types.CodeType) -> set[str]:
-    """The names of globals, and of attributes, in a piece of code and in the functions defined inside it."""
-    inner = (_names(each) for each in code.co_consts if isinstance(each, types.CodeType))
-    return set(code.co_names).union(*inner)
-
-
-def _is_library(thing: object) -> bool:
-    """True if a global is a module, a function or a class of a library that nobody changes between two solves."""
-    home = thing.__name__ if isinstance(thing, types.ModuleType) else getattr(thing, "__module__", None)
-    fixed = isinstance(thing, types.ModuleType) or callable(thing)
-    return fixed and isinstance(home, str) and home.split(".")[0] in LIBRARIES
-
-
-def _with_memory(function: Partial) -> Partial:
-    """The function with a memory for its jaxprs, and no mark yet."""
-    inner = function.func.__wrapped__ if isinstance(function.func, Marked) else function.func
-    return Partial(Marked(inner), *function.args, **function.keywords)
-
-
-def _trace(problem: Problem, name: str, n: int, dtype: DType) -> tuple[Partial, jex.ClosedJaxpr | None]:
+def _trace(function: Partial, arguments: Sequence[jax.ShapeDtypeStruct]) -> tuple[Partial, jex.ClosedJaxpr | None]:
     """A function and its jaxpr in leaves and arguments; None where it cannot be traced: the checks will say why."""
-    function = _with_memory(getattr(problem, name))
-    sizes = {
-        letter: 0 if admissible is None else admissible.dim
-        for letter, admissible in (("u", problem.controls), ("d", problem.disturbances))
-    }
-    shapes = {"x": (n,), "u": (sizes["u"],), "d": (sizes["d"],), "t": ()}
-    letters = problem.arguments("x", "u", "d", "t") if name in OF_ACTION else problem.state_arguments("x", "t")
-    arguments = [jax.ShapeDtypeStruct(shapes[letter], dtype) for letter in letters]
-    assert isinstance(function.func, Marked)
-    found = function.func.jaxpr(function.keywords, (*function.args, *arguments))
-    return function, None if found is None else found[0]
+    memory = Marked(function.func)
+    found = memory.jaxpr(function.keywords, (*function.args, *arguments))
+    return Partial(memory, *function.args, **function.keywords), None if found is None else found[0]
 
 
 def _with_mark(function: Partial, closed: jex.ClosedJaxpr | None) -> Partial:
@@ -268,56 +262,3 @@ def _with_mark(function: Partial, closed: jex.ClosedJaxpr | None) -> Partial:
     assert isinstance(function.func, Marked)
     function.func.mark = object() if closed is None else fingerprint(closed)
     return function
-
-
-def fingerprint(closed: jex.ClosedJaxpr) -> bytes:
-    """A digest of what a jaxpr computes, with every number that it holds."""
-    digest = hashlib.blake2b(digest_size=16)  # by chance two of 10^10 functions share 128 bits once in 10^18 cases
-    _feed(digest, closed.jaxpr, closed.consts)
-    return digest.digest()
-
-
-def _feed(digest: hashlib.blake2b, jaxpr: jex.Jaxpr, consts: Iterable[Numbers]) -> None:
-    """Put a jaxpr into a digest, equation by equation."""
-    numbers: dict[Any, int] = {}  # variables by their first appearance; their own names differ from trace to trace
-
-    def tell(*words: Any) -> None:
-        digest.update(repr(words).encode())
-
-    def number(value: Numbers) -> None:
-        array = np.asarray(value)  # its bits, since a printed one is rounded and a long one abridged
-        tell(array.dtype, array.shape)
-        digest.update(array.tobytes())
-
-    def tell_parameter(value: object) -> None:
-        if jaxprs.is_closed(value):
-            _feed(digest, value.jaxpr, value.consts)
-        elif jaxprs.is_open(value):
-            _feed(digest, value, ())
-        elif isinstance(value, (tuple, list)):
-            tell(len(value))
-            for each in value:
-                tell_parameter(each)
-        elif isinstance(value, (np.ndarray, jax.Array)):
-            number(value)
-        else:
-            tell(ADDRESS.sub("", repr(value)))
-
-    for var in (*jaxpr.constvars, *jaxpr.invars):
-        tell(numbers.setdefault(var, len(numbers)), str(var.aval))
-    for value in consts:
-        number(value)
-    for eqn in (*jaxpr.eqns, None):  # None: the outputs of the whole, as if an equation took them
-        operands, results = (jaxpr.outvars, ()) if eqn is None else (eqn.invars, eqn.outvars)
-        tell("" if eqn is None else eqn.primitive.name)
-        for operand in operands:
-            if jaxprs.is_literal(operand):  # a number in the code, of which no variable tells
-                number(operand.val)
-            else:
-                tell(numbers.get(operand, -1))
-        for result in results:
-            tell(numbers.setdefault(result, len(numbers)), str(result.aval))
-        parameters = {} if eqn is None else eqn.params
-        for name in sorted(parameters):
-            tell(name)
-            tell_parameter(parameters[name])

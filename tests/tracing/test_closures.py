@@ -1,5 +1,7 @@
 """What functions read from outside: changed objects and globals, traced numbers, solves inside of transformations."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -68,6 +70,130 @@ def test_a_changed_global_is_seen(function, monkeypatch):
     assert value(function) == moving
 
 
+def of_helpers(x, u):
+    return helper(x, u) + partly(x, u)
+
+
+def helper(x, u):
+    return u
+
+
+def still(x, u):
+    return 0 * u
+
+
+def scaled(factor, x, u):
+    return factor * u
+
+
+partly = functools.partial(scaled, 0.0)
+
+
+def test_a_helper_written_anew_is_seen(monkeypatch):
+    """Functions of nothing but library code and each other: these are not traced again, and were once believed."""
+    moving = value(of_helpers)
+    monkeypatch.setitem(globals(), "helper", still)
+    assert value(of_helpers) == pytest.approx(0.36, abs=1e-6)
+    monkeypatch.setitem(globals(), "partly", functools.partial(scaled, 1.0))
+    assert value(of_helpers) == pytest.approx(moving, rel=1e-12)
+
+
+def test_an_object_of_a_library_may_hold_anything(monkeypatch):
+    monkeypatch.setitem(globals(), "helper", functools.partial(scaled, 1.0))
+    moving = value(of_helpers)
+    monkeypatch.setitem(globals(), "helper", functools.partial(scaled, 0.0))
+    assert value(of_helpers) == pytest.approx(0.36, abs=1e-6)
+    assert moving < 0.2
+
+
+def compiled(ask):
+    """The programs that a call compiles, and its result."""
+    programs = []
+
+    def note(event, seconds, **_):
+        if event == "/jax/core/compile/backend_compile_duration":
+            programs.append(seconds)
+
+    jax.monitoring.register_event_duration_secs_listener(note)
+    try:
+        result = ask()
+    finally:
+        jax.monitoring.unregister_event_duration_listener(note)
+    return len(programs), result
+
+
+def asked(gain, weight, offset):
+    """A problem in closures: a Python number, an integer, and an array that is read by index."""
+    return hjb.Problem(lambda x, u: gain * u - offset[0] * x, lambda x, u: weight * (x @ x + u @ u), UNIT, discount=1.0)
+
+
+def test_a_lambda_of_other_numbers_compiles_nothing_again():
+    def ask(gain, weight, offset):
+        problem = asked(gain, weight, np.array([offset, 9.0]))
+        solution = hjb.solve(problem, LINE, tol=1e-9, scheme=hjb.Upwind())
+        path = hjb.simulate(problem, lambda x: -gain * x, [0.5], 1.0)
+        return solution.value[2], path.cost
+
+    ask(1.0, 2, 0.5)
+    for numbers in ((1.5, 3, 0.25), (0.5, 1, 1.0)):
+        programs, (found, cost) = compiled(lambda numbers=numbers: ask(*numbers))
+        assert programs == 0
+        gain, weight, offset = numbers
+        plain = hjb.Problem(
+            jax.tree_util.Partial(lambda g, o, x, u: g * u - o * x, gain, offset),
+            jax.tree_util.Partial(lambda w, x, u: w * (x @ x + u @ u), float(weight)),
+            UNIT,
+            discount=1.0,
+        )
+        assert found == pytest.approx(hjb.solve(plain, LINE, tol=1e-9, scheme=hjb.Upwind()).value[2], rel=1e-8)
+        rate = offset + gain**2  # dx = −rate·x dt, cost w(1 + gain²)x²
+        wanted = weight * (1 + gain**2) * 0.25 * (1 - np.exp(-2 * (rate + 0.5))) / (2 * rate + 1)
+        assert cost == pytest.approx(wanted, rel=1e-5)
+
+
+def test_numbers_that_decide_stay_in_the_code():
+    """Exponents, shapes, indices, branches and comparisons: seen anew each time, and as good as written down."""
+
+    def ask(power, entry, bound, flag):
+        def cost(x, u):
+            held = jnp.where(x[entry] > bound, 1.0, 0.0) + jnp.zeros(entry + 1)[entry]
+            return (u @ u) ** power + held if flag else x @ x
+
+        return closures.settled(hjb.Problem(steer, cost, UNIT), 1).cost
+
+    x, u = np.array([0.5]), np.array([0.3])
+    marks = set()
+    for power, entry, bound, flag in (
+        (1.0, 0, 0.25, True),
+        (2.0, 0, 0.25, True),
+        (2.0, 0, 0.75, True),
+        (2.0, 0, 0.75, 0),
+    ):
+        found = ask(power, entry, bound, flag)
+        marks.add(found.func.mark)
+        assert jax.jit(found)(x, u) == pytest.approx((u @ u) ** power + (bound < 0.5) if flag else 0.25)
+    assert len(marks) == 4
+
+
+def test_a_function_that_counts_its_calls_still_does():
+    def counting(x, u):
+        global GAIN
+        GAIN += 1
+        return u
+
+    before = GAIN
+    closures.settled(hjb.Problem(counting, square, UNIT), 1)
+    assert before + 1 <= GAIN
+    globals()["GAIN"] = before
+
+
+def test_closures_of_other_numbers_are_one_batch():
+    problems = [asked(gain, 1, np.array([0.5])) for gain in (0.5, 1.0)]
+    values = [each.value[2] for each in hjb.solve_batch(problems, LINE, tol=1e-9, scheme=hjb.Upwind())]
+    for problem, found in zip(problems, values, strict=True):
+        assert found == pytest.approx(hjb.solve(problem, LINE, tol=1e-9, scheme=hjb.Upwind()).value[2], rel=1e-8)
+
+
 def test_a_change_of_one_ulp_is_seen():
     car = Car()
     first = closures.settled(hjb.Problem(car.drift, square, UNIT), 1)
@@ -101,6 +227,72 @@ def test_a_changed_object_is_seen_in_batches_marches_and_tubes():
     assert after[2] == pytest.approx(0.5)
 
 
+class Spring:
+    """No pytree, with what several front doors ask for."""
+
+    stiffness = 1.0
+
+    def drift(self, x, u):
+        return jnp.stack([x[1], -self.stiffness * x[0] - x[1] + u[0]])
+
+    def alone(self, x):
+        return jnp.stack([x[1], -self.stiffness * x[0] - x[1]])
+
+    def pull(self, x):
+        return -self.stiffness * x[:1]
+
+    def push(self, t, x):
+        return self.stiffness * x
+
+    def game(self, x, u, d):
+        return self.stiffness * u + d
+
+
+SPRING = Spring()
+SQUARE = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (9, 9))
+FIXED = hjb.Problem(SPRING.drift, lambda x, u: x @ x + u @ u, UNIT, discount=1.0)
+PLAIN = hjb.Problem(lambda x, u: jnp.stack([x[1], u[0]]), lambda x, u: x @ x + u @ u, UNIT)
+NOISY = hjb.Problem(SPRING.drift, lambda x, u: x @ x, UNIT, noise=0.5)
+GAME = hjb.Problem(
+    SPRING.game, lambda x, u, d: 0.5 * (x @ x + u @ u) - 2 * d @ d, UNIT, disturbances=hjb.Box([-2.0], [2.0])
+)
+
+
+def known(grid, players=1):
+    """A solution by formula: V = x², and players that pull to the middle."""
+    x = grid.nodes()
+    return hjb.Solution(grid, np.sum(x**2, -1), *[-0.5 * x[..., :1]] * players)
+
+
+DOORS = {
+    "simulate, drift": lambda: hjb.simulate(FIXED, known(SQUARE), [0.5, 0.0], 1.0).cost,
+    "simulate, feedback": lambda: hjb.simulate(PLAIN, SPRING.pull, [0.5, 0.0], 1.0).cost,
+    "simulate, feedback of time": lambda: (
+        hjb.simulate(PLAIN, lambda t, x: SPRING.pull(x), [0.5, 0.0], 1.0, time_varying=True).cost
+    ),
+    "greedy_feedback": lambda: hjb.greedy_feedback(GAME, known(LINE, 2))([0.1]),
+    "stationary_density": lambda: hjb.chain.stationary_density(NOISY, SQUARE, np.zeros((9, 9, 1))),
+    "generator": lambda: hjb.chain.generator(NOISY, SQUARE, np.zeros((9, 9, 1))).toarray(),
+    "matrix": lambda: hjb.chain.matrix(NOISY, SQUARE, np.zeros((9, 9, 1))).toarray(),
+    "pontryagin": lambda: hjb.pontryagin(FIXED, [0.5, 0.0], horizon=1.0).cost,
+    "lyapunov_check": lambda: hjb.lyapunov_check(lambda x: x @ x, SPRING.alone, hjb.Ball(1.0, 2)).worst_state,
+    "dissipation, drift": lambda: hjb.dissipation(GAME, known(LINE, 2), [[0.5]], 1.0, random=1).worst,
+    "dissipation, signal": lambda: (
+        hjb.dissipation(GAME, known(LINE, 2), [[0.5]], 1.0, random=0, disturbances=[SPRING.push]).worst
+    ),
+}
+
+
+@pytest.mark.parametrize("door", DOORS)
+def test_a_changed_object_is_seen_by_every_front_door(door, monkeypatch):
+    before = DOORS[door]()
+    monkeypatch.setattr(SPRING, "stiffness", 0.5, raising=False)
+    after = DOORS[door]()
+    assert not np.array_equal(before, after)
+    monkeypatch.setattr(SPRING, "stiffness", 1.0)
+    np.testing.assert_array_equal(DOORS[door](), before)
+
+
 class Counted:
     gain = 1.0
 
@@ -125,7 +317,7 @@ def test_library_code_and_arguments_are_not_even_traced():
         for name in ("drift", "cost"):
             found, asked = (getattr(each, name).func for each in (closures.settled(problem, n), problem))
             assert found.__wrapped__ is asked
-            assert found.mark is None
+            assert found == getattr(closures.settled(problem, n), name).func
             assert not found._jaxprs
 
 

@@ -1,0 +1,152 @@
+"""Which functions compute alike: what the key of a compiled program is made of.
+
+A lambda in a loop, or a notebook's cell run again, makes a new function of the code of before. Its code and what the
+code reads say whether it computes alike; whoever asks for ``is`` compiles again, seconds for nothing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import re
+import sys
+import types
+from collections.abc import Callable, Hashable, Iterable
+from typing import TYPE_CHECKING, Any, TypeGuard
+
+import jax
+import numpy as np
+from jax.tree_util import Partial
+
+from hjbjax.problem.types import Numbers
+from hjbjax.tracing import jaxprs
+
+if TYPE_CHECKING:
+    from jax.extend import core as jex
+
+ADDRESS = re.compile(r" at 0x[0-9a-f]+|id=\d+")  # of rules of derivatives, made anew with every trace
+# whose functions compute tomorrow what they compute today: problems made of these alone need no trace at all
+LIBRARIES = frozenset({"builtins", "functools", "hjbjax", "itertools", "jax", "jaxlib", "math", "numpy", "operator"})
+
+
+def identity(thing: object, depth: int = 8) -> Hashable | None:
+    """What a part of a problem computes, if it reads nothing from outside but library code; None if it reads more.
+
+    Two parts of one identity compute alike: a lambda written again, a helper defined anew with the code of before.
+    """
+    if depth == 0:  # functions that call each other have no end; None costs a trace and is never wrong
+        return None
+    # numbers beside the leaves cannot change: a Partial keeps its own, and a dataclass of JAX's is frozen or copied
+    if thing is None or isinstance(thing, (bool, int, float, str, np.generic, np.ndarray, jax.Array)):
+        return "leaf"
+    if isinstance(thing, Partial):
+        return _identities((thing.func, *thing.args, *thing.keywords.values()), depth)
+    if isinstance(thing, (tuple, list)):
+        return _identities(thing, depth)
+    if isinstance(thing, types.FunctionType):
+        return _identity_of_function(thing, depth)
+    if dataclasses.is_dataclass(thing) and not jax.tree_util.all_leaves([thing]):
+        fields = _identities([getattr(thing, field.name) for field in dataclasses.fields(thing)], depth)
+        return None if fields is None else (type(thing), fields)
+    return None
+
+
+def _identities(things: Iterable[object], depth: int) -> Hashable | None:
+    """The identities of several parts; None if one of them has none."""
+    found = [identity(each, depth - 1) for each in things]
+    return None if None in found else tuple(found)
+
+
+def _identity_of_function(function: types.FunctionType, depth: int) -> Hashable | None:
+    """A function's code, and the identities of the globals that it names; None if one may change between two solves."""
+    if function.__closure__ or function.__kwdefaults__:  # cells can be rebound, and dictionaries written to
+        return None
+    if not all(isinstance(each, (int, float, str, type(None))) for each in function.__defaults__ or ()):
+        return None
+    # CPython keeps names of globals and of attributes in one table; an attribute that is also a global costs a trace
+    known = function.__globals__
+    outside = [known[name] for name in sorted(names_read(function.__code__)) if name in known]
+    found = [
+        each if _is_library(each) else identity(each, depth - 1) if isinstance(each, types.FunctionType) else None
+        for each in outside
+    ]
+    # printed, since 0.0 equals −0.0 and True; the code compares its own constants by type and bits
+    return None if None in found else (function.__code__, repr(function.__defaults__), tuple(found))
+
+
+def names_read(code: types.CodeType) -> set[str]:
+    """The names of globals, and of attributes, in a piece of code and in the functions defined inside it."""
+    inner = (names_read(each) for each in code.co_consts if isinstance(each, types.CodeType))
+    return set(code.co_names).union(*inner)
+
+
+def _is_library(thing: object) -> bool:
+    """True if a global is a module, a function or a class of a library that nobody changes between two solves."""
+    if isinstance(thing, types.ModuleType):
+        return _is_of_library(thing.__name__)
+    home, name = getattr(thing, "__module__", None), getattr(thing, "__name__", None)
+    # an object of a library's class may hold anything, as functools.partial does: its module does not know it by name
+    return _is_of_library(home) and thing is getattr(sys.modules.get(home), str(name), None)
+
+
+def _is_of_library(module: object) -> TypeGuard[str]:
+    """True if a module's name is one of a library's."""
+    return isinstance(module, str) and module.split(".")[0] in LIBRARIES
+
+
+def code(function: Callable) -> object:
+    """What tells a function from another that was traced to the same jaxpr: its code, or itself if it has none."""
+    return getattr(getattr(function, "__func__", function), "__code__", function)
+
+
+def fingerprint(closed: jex.ClosedJaxpr) -> bytes:
+    """A digest of what a jaxpr computes, with every number that it holds."""
+    digest = hashlib.blake2b(digest_size=16)  # by chance two of 10^10 functions share 128 bits once in 10^18 cases
+    _feed(digest, closed.jaxpr, closed.consts)
+    return digest.digest()
+
+
+def _feed(digest: hashlib.blake2b, jaxpr: jex.Jaxpr, consts: Iterable[Numbers]) -> None:
+    """Put a jaxpr into a digest, equation by equation."""
+    numbers: dict[Any, int] = {}  # variables by their first appearance; their own names differ from trace to trace
+
+    def tell(*words: Any) -> None:
+        digest.update(repr(words).encode())
+
+    def number(value: Numbers) -> None:
+        array = np.asarray(value)  # its bits, since a printed one is rounded and a long one abridged
+        tell(array.dtype, array.shape)
+        digest.update(array.tobytes())
+
+    def tell_parameter(value: object) -> None:
+        if jaxprs.is_closed(value):
+            _feed(digest, value.jaxpr, value.consts)
+        elif jaxprs.is_open(value):
+            _feed(digest, value, ())
+        elif isinstance(value, (tuple, list)):
+            tell(len(value))
+            for each in value:
+                tell_parameter(each)
+        elif isinstance(value, (np.ndarray, jax.Array)):
+            number(value)
+        else:
+            tell(ADDRESS.sub("", repr(value)))
+
+    for var in (*jaxpr.constvars, *jaxpr.invars):
+        tell(numbers.setdefault(var, len(numbers)), str(var.aval))
+    for value in consts:
+        number(value)
+    for eqn in (*jaxpr.eqns, None):  # None: the outputs of the whole, as if an equation took them
+        operands, results = (jaxpr.outvars, ()) if eqn is None else (eqn.invars, eqn.outvars)
+        tell("" if eqn is None else eqn.primitive.name)
+        for operand in operands:
+            if jaxprs.is_literal(operand):  # a number in the code, of which no variable tells
+                number(operand.val)
+            else:
+                tell(numbers.get(operand, -1))
+        for result in results:
+            tell(numbers.setdefault(result, len(numbers)), str(result.aval))
+        parameters = {} if eqn is None else eqn.params
+        for name in sorted(parameters):
+            tell(name)
+            tell_parameter(parameters[name])

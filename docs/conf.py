@@ -5,6 +5,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent.parent))  # the checkout, whatever is installed
 
+from docs import mathml
 from docs.docstrings import prepare_docstring
 from hjbjax import __version__
 
@@ -12,7 +13,7 @@ project = "hjbjax"
 author = copyright = "The hjbjax developers"
 release = version = __version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 exclude_patterns = ["generated/*"]  # included by pages that say more
 nitpicky = True  # a reference that leads nowhere is a warning, and `python -m docs` makes an error of it
 
@@ -28,6 +29,7 @@ napoleon_use_rtype = False
 napoleon_use_ivar = True
 napoleon_custom_sections = [("Keyword Args", "params_style")]
 
+html_math_renderer = "mathml"
 html_theme = "furo"
 html_title = f"hjbjax {__version__}"
 html_copy_source = html_show_sourcelink = False
@@ -36,5 +38,6 @@ html_css_files = ["site.css"]
 
 
 def setup(app):
-    """Docstrings are plain text with equations: make them reStructuredText before napoleon reads them."""
+    """Equations as MathML; docstrings, which are plain text, as reStructuredText before napoleon reads them."""
+    mathml.add(app)
     app.connect("autodoc-process-docstring", prepare_docstring, priority=100)

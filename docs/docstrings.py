@@ -51,3 +51,6 @@ def prepared(lines):
 def prepare_docstring(app, what, name, obj, options, lines):
     """The event of autodoc: change ``lines`` in place."""
     lines[:] = prepared(lines)
+    # napoleon takes what stands before a colon in the first line of a property for its type
+    if what in ("property", "attribute") and lines and ":" in lines[0]:
+        lines[0] = ": " + lines[0]

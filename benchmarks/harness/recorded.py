@@ -50,7 +50,11 @@ def section(name: str, rows: Sequence[Row]) -> list[str]:
         "|" + "---|" * len(columns),
         *("| " + " | ".join(cell(row.get(key)) for key in columns) + " |" for row in rows[:LONGEST]),
         "",
-        *([f"And {len(rows) - LONGEST} rows more in `benchmarks/results/{name}.json`.", ""] if len(rows) > LONGEST else []),
+        *(
+            [f"And {len(rows) - LONGEST} rows more in `benchmarks/results/{name}.json`.", ""]
+            if len(rows) > LONGEST
+            else []
+        ),
     ]
 
 

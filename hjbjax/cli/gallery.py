@@ -12,6 +12,7 @@ import html
 import io
 import math
 import os
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -25,6 +26,7 @@ from hjbjax.cli import run_folder
 from hjbjax.feedback.path import Path as Trajectory
 from hjbjax.solution import placement
 from hjbjax.solution.solution import Solution, SolveError, Status
+from hjbjax.solvers.setup import SolveWarning
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -34,7 +36,7 @@ if TYPE_CHECKING:
     from hjbjax.zoo.entry import Entry
 
 PAGE = "index.html"
-NODES = 10_000  # of a problem at most: 100 x 100, a tenth of a second once compiled; on 62 x 63 the pendulum is 3 % off
+NODES = 20_000  # of a problem at most: 141 x 141, tenths of a second once compiled; on 62 x 63 the pendulum is 3 % off
 DPI = 72  # 9.6 inches are 690 pixels, the width of a card
 QUALITY = 60  # of WebP: a picture is 6 to 12 kB, a third of the PNG; below 50 the tick labels blur
 
@@ -106,7 +108,10 @@ def card(entry: Entry, *, options: dict[str, Any] | None = None) -> Card:
     _, grid = entry.build()
     problem, grid = entry.build(shape=small_shape(grid.shape))
     try:
-        solution = hjb.solve(problem, grid, throw=False, **(options or {}))
+        # on the card in place of the screen, which shows one line a problem
+        with warnings.catch_warnings(record=True) as heard:
+            warnings.simplefilter("always", SolveWarning)
+            solution = hjb.solve(problem, grid, throw=False, **(options or {}))
     except (SolveError, ValueError, jax.errors.JaxRuntimeError) as error:
         return Card(entry.name, entry.summary, type(error).__name__, (("refused", " ".join(str(error).split())),), ())
     if solution.status == Status.INTERRUPTED:
@@ -116,6 +121,7 @@ def card(entry: Entry, *, options: dict[str, Any] | None = None) -> Card:
     if path is not None:
         promised = "" if path.promised is None else f"; V at its start {float(path.promised):.4g}"
         facts.append(("cost of the path", f"{float(path.cost):.4g}{promised}"))
+    facts += [("warning", str(each.message)) for each in heard]
     drawn = tuple((caption, webp(artists)) for caption, artists in pictures)
     return Card(entry.name, entry.summary, solution.status.name, tuple(facts), drawn)
 

@@ -42,7 +42,7 @@ def settled(text):
 def blocks(page):
     """The blocks of a page with the one that follows each, as (kind, text, kind after, text after)."""
     found = BLOCK.findall(PAGES[page])
-    return [(*this, *after) for this, after in zip(found, [*found[1:], ("", "")], strict=True)]
+    return [(*this, *after) for this, after in zip(found, [*found, ("", "")][1:], strict=True)]
 
 
 # one namespace a page: a reader who starts there has nothing from another one

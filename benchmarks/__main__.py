@@ -21,7 +21,8 @@ NAMES = {
     "startup": ("speed", "the first answer of a process: importing, compiling, pictures; cold and with the cache"),
     "precision": ("accuracy", "error against seconds: what second order is worth"),
     "march": ("speed", "marching beside hj_reachability: seconds and bytes at equal scheme"),
-    "quoted": ("harness", "the README's table of what was seen, from the recorded rows"),
+    "quoted": ("harness", "the table of what was seen, from the recorded rows"),
+    "recorded": ("harness", "every recorded row, as Markdown tables"),
     "bounds": (
         "accuracy",
         "random problems beside a dense solver: which certified bounds hold, and how tight they are",

@@ -1,6 +1,6 @@
-"""What the README quotes of the recorded rows: the lines of its table, made from ``benchmarks/results``.
+"""What ``docs/benchmarks.md`` and the README quote of the recorded rows: lines made from ``benchmarks/results``.
 
-Nothing is measured. A test compares the table in the README with these lines, so that it says what was recorded and
+Nothing is measured. A test compares their tables with these lines, so that they say what was recorded and
 nothing better.
 """
 
@@ -119,7 +119,7 @@ def of_the_rest(folder: Path) -> dict[str, Sequence[float]]:
 
 
 def lines(folder: Path = RESULTS) -> list[str]:
-    """The lines of the README's table."""
+    """The lines of the table; the README has some of them."""
     parts = (of_peers, of_sweeps, of_growth, of_marches, of_the_rest)
     return [f"| {figure} | {numbers(found)} |" for part in parts for figure, found in part(folder).items()]
 
@@ -127,5 +127,5 @@ def lines(folder: Path = RESULTS) -> list[str]:
 @click.command()
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Folder of the rows.")
 def command(out: Path) -> None:
-    """The table of the README, from the recorded rows."""
+    """The table of what was seen, from the recorded rows."""
     click.echo("\n".join(["| figure | seen |", "|---|---|", *lines(out)]))

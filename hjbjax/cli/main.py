@@ -1,4 +1,4 @@
-"""The command ``hjbjax``: solve a ready problem, list them, look at the machine.
+"""The command ``hjbjax``: solve a ready problem, list them, show all of them on a page, look at the machine.
 
 ``solve`` writes ``solution.npz``, ``value.png``, ``policy.png`` and ``trajectory.png`` into a folder and prints
 one screen. What can be refused is refused in one line before anything is compiled. Files are made in a hidden
@@ -294,6 +294,42 @@ def _solve(problem: "Problem", grid: "Grid", options: dict[str, Any]) -> "Soluti
         raise Failure(error, 6) from error
     except jax.errors.JaxRuntimeError as error:  # XLA has one type for all its faults, and the word in the text
         raise Failure(error, 6 if "RESOURCE_EXHAUSTED" in str(error) else 4) from error
+
+
+@main.command()
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the page, index.html.")
+@click.option("--only", multiple=True, type=Name("problem", _systems), help="One problem; may be given several times.")
+@click.option("--force", is_flag=True, help="Replace a page that is there already.")
+@click.option("--no-cache", is_flag=True, help="Keep no compiled programs in the user's folder for caches.")
+def gallery(out: Path, only: tuple[str, ...], force: bool, no_cache: bool) -> None:
+    """Solve every ready problem on a small grid; write one page with pictures, figures and errors."""
+    from hjbjax import zoo
+    from hjbjax.cli import compile_cache, run_folder
+    from hjbjax.cli import gallery as pages
+
+    with _one_line_error(OSError, 2, "--out: "):
+        pages.check_folder(out, force)
+    cards: list[pages.Card] = []
+    with contextlib.ExitStack() as stack:
+        with _one_line_error(OSError, 2, "--out: "):
+            staging = stack.enter_context(run_folder.staging(out))
+        stack.enter_context(_one_line_warnings())
+        stack.enter_context(_interruptible())
+        if not no_cache:
+            compile_cache.keep_for_the_command()
+        names = [name for name in zoo.catalogue if name in only or not only]
+        try:
+            for number, name in enumerate(names, 1):
+                click.echo(f"{number:>2}/{len(names)}  {name:<20}  ", nl=False)
+                cards.append(pages.card(zoo.catalogue[name]))
+                click.echo(cards[-1].status)
+        finally:  # what is done is kept, after an interrupt, too
+            if cards:
+                with _one_line_error(OSError, 5, "the page could not be written: "):
+                    pages.publish(cards, staging, out, force)
+    click.echo(f"wrote {out / pages.PAGE}")
+    if failed := [card.name for card in cards if card.status != "CONVERGED"]:
+        raise Failure(f"not converged: {', '.join(failed)}", 3)
 
 
 @main.command()

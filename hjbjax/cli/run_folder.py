@@ -133,13 +133,13 @@ def make(
         return
     fixed = dict(enumerate(start[2:], 2))  # axes from the third on, cut where the trajectory starts
     jumps = is_bang_bang(problem, solution)
-    draw("value.png", _with_curve(plotting.value(solution, fixed=fixed, target=problem.target), solution, fixed, jumps))
+    draw("value.png", with_curve(plotting.value(solution, fixed=fixed, target=problem.target), solution, fixed, jumps))
     yield "value.png", None
-    draw("policy.png", _policies(solution, fixed, jumps))
+    draw("policy.png", policies(solution, fixed, jumps))
     yield "policy.png", None
     path = None
     if solution.status == Status.CONVERGED:  # a loop closed with a half-done feedback would be taken for the answer
-        path = _trajectory(problem, solution, start, duration, jumps, finish)
+        path = closed_path(problem, solution, start, duration, jumps, finish)
     if path is not None:
         draw("trajectory.png", plotting.closed_loop(solution, path, fixed=fixed, target=problem.target))
         yield "trajectory.png", path
@@ -169,7 +169,7 @@ def _finite_controls(solution: Solution) -> np.ndarray:
     return policy[np.all(np.isfinite(policy), axis=-1)]
 
 
-def _trajectory(
+def closed_path(
     problem: Problem,
     solution: Solution,
     start: Sequence[float],
@@ -202,7 +202,7 @@ def _trajectory(
         return None
 
 
-def _policies(solution: Solution, fixed: dict[int, float], jumps: bool) -> list["Artist"]:
+def policies(solution: Solution, fixed: dict[int, float], jumps: bool) -> list["Artist"]:
     """One picture an input, side by side."""
     from matplotlib.figure import Figure
 
@@ -213,11 +213,11 @@ def _policies(solution: Solution, fixed: dict[int, float], jumps: bool) -> list[
     artists: list[Artist] = []
     for input, ax in enumerate(figure.subplots(1, count, squeeze=False)[0]):
         drawn = plotting.policy(solution, input=input, fixed=fixed, ax=plotting.styled(ax))
-        artists += _with_curve(drawn, solution, fixed, jumps, input)
+        artists += with_curve(drawn, solution, fixed, jumps, input)
     return artists
 
 
-def _with_curve(
+def with_curve(
     artists: list["Artist"], solution: Solution, fixed: dict[int, float], jumps: bool, input: int = 0
 ) -> list["Artist"]:
     """A picture with the switching curve, where there is one."""

@@ -16,8 +16,8 @@ import hjbjax as hjb
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "hjbjax"
 
-# The README's architecture table: a folder imports only from folders before it, and inside it a file from files before.
-TABLE = (ROOT / "README.md").read_text(encoding="utf-8").split("## Architecture")[1].split("\n## ")[0]
+# The table of docs/architecture.md: a folder imports from folders before it, and inside it a file from files before.
+TABLE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").split("# Architecture")[1].split("\n## ")[0]
 ROWS = [[re.findall(r"`(\w+)`", cell) for cell in row.split("|")[1:3]] for row in TABLE.splitlines()]
 FOLDERS = {folder[0]: files for folder, files in (row for row in ROWS if len(row) == 2) if folder}
 ORDER = [f"{folder}.{file}" for folder, files in FOLDERS.items() for file in files if file != "zoo"]

@@ -1,4 +1,4 @@
-"""The README tells the truth: its commands, its examples with their output, its files."""
+"""The README and the pages of docs/ tell the truth: their commands, examples with their output, files and figures."""
 
 import contextlib
 import io
@@ -11,14 +11,21 @@ import pytest
 from benchmarks.harness import quoted
 
 ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
+PAGES = {path.stem: path.read_text(encoding="utf-8") for path in [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]}
+BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 COMMANDS = ["pip install . && hjbjax solve pendulum", "pip install '.[test]' && pytest"]
+DRAWN = re.compile(r'savefig\("([\w.]+)"')
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_commands_stand_in_the_first_screen(command):
     assert command in README.splitlines()[:30]
+
+
+def test_it_is_short():
+    assert len(README.splitlines()) <= 150
 
 
 def test_ci_runs_the_test_command_as_it_stands_here():
@@ -32,38 +39,57 @@ def settled(text):
     return re.sub(r"\d(\.\d+)?e-(0[7-9]|[1-9]\d)", "tiny", text)
 
 
-def test_every_python_block_runs_and_prints_what_the_text_block_after_it_says(tmp_path, monkeypatch):
+def blocks(page):
+    """The blocks of a page with the one that follows each, as (kind, text, kind after, text after)."""
+    found = BLOCK.findall(PAGES[page])
+    return [(*this, *after) for this, after in zip(found, [*found, ("", "")][1:], strict=True)]
+
+
+# one namespace a page: a reader who starts there has nothing from another one
+@pytest.mark.parametrize("page", [page for page in PAGES if any(kind == "python" for kind, *_ in blocks(page))])
+def test_every_python_block_runs_and_prints_what_the_text_block_after_it_says(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    names, ran = {}, 0
-    for (kind, code), (after, wanted) in zip(BLOCKS, [*BLOCKS[1:], ("", "")], strict=True):
+    names = {}
+    for kind, code, after, wanted in blocks(page):
         if kind != "python":
             continue
         with contextlib.redirect_stdout(io.StringIO()) as printed:
-            exec(compile(code, "README.md", "exec"), names)
-        ran += 1
-        if after == "text":
-            assert settled(printed.getvalue()) == settled(wanted)
-    assert ran, "the README has no example"
+            exec(compile(code, f"{page}.md", "exec"), names)
+        assert settled(printed.getvalue()) == (settled(wanted) if after == "text" else "")
+        for picture in DRAWN.findall(code):
+            assert (tmp_path / picture).stat().st_size > 5_000
+            assert f"pictures/{picture})" in PAGES[page]
 
 
-def test_the_files_it_names_exist():
-    linked = re.findall(r"\]\((?!https?:)([^)#]+)", README)
-    named = re.findall(r"`((?:tests|notebooks|benchmarks)/[\w/.]+)`", README)
-    assert named
-    for path in linked + named:
+def test_the_examples_are_there():
+    assert {page for page in PAGES if blocks(page)} >= {"README", "getting_started", "games", "migration", "extending"}
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_the_files_it_names_exist(page):
+    folder = ROOT if page == "README" else DOCS
+    for path in re.findall(r"\]\((?!https?:|#)([^)#]+)", PAGES[page]):
+        assert (folder / path).exists(), path
+    for path in re.findall(r"`((?:tests|notebooks|benchmarks|docs)/[\w/]+\.\w+)`", PAGES[page]):
         assert (ROOT / path).exists(), path
 
 
 def test_the_table_of_estimated_errors_is_what_the_benchmark_wrote():
     rows = json.loads((ROOT / "benchmarks/results/estimates.json").read_text(encoding="utf-8"))
     ratios = [row["ratio"] for row in rows if row["counts"]]
-    table = README.split("over the largest true error, on three grids each")[1].split("\n\n")[1]
-    quoted = [float(cell) for cell in re.findall(r"\| (\d*\.\d+)(?= \|)", table)]
-    assert quoted == pytest.approx(ratios, abs=0.006, rel=0.002)
+    table = PAGES["bounds"].split("over the largest true error, on three grids each")[1].split("\n\n")[1]
+    cells = [float(cell) for cell in re.findall(r"\| (\d*\.\d+)(?= \|)", table)]
+    assert cells == pytest.approx(ratios, abs=0.006, rel=0.002)
     within = sum(1 / 3 <= ratio <= 5 for ratio in ratios)
-    assert f"Between a third and five in {within} of {len(ratios)}" in README
+    assert f"Between a third and five in {within} of {len(ratios)}" in PAGES["bounds"]
 
 
-def test_the_table_of_measurements_is_what_the_benchmarks_wrote():
-    table = README.split("holds it to them:\n\n")[1].split("\n\n")[0]
-    assert table.splitlines()[2:] == quoted.lines()
+def test_the_tables_of_measurements_are_what_the_benchmarks_wrote():
+    recorded = quoted.lines()
+    whole = PAGES["benchmarks"].split("holds it to them:\n\n")[1].split("\n\n")[0]
+    assert whole.splitlines()[2:] == recorded
+    table = README.split("holds it to them:\n\n")[1].split("\n\n")[0].splitlines()[2:]
+    assert len(table) >= 4
+    assert set(table) <= set(recorded)
+    # a reader of the short table is told where a peer was the faster one, too
+    assert any("below 1 it is the faster" in line for line in table)

@@ -1,0 +1,1 @@
+"""The documentation: Markdown pages, the pages of the public names, and the commands that make the site."""

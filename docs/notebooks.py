@@ -1,0 +1,50 @@
+"""``python -m docs notebooks``: the notebooks, run from top to bottom, as Markdown pages with their figures.
+
+The pages are committed, so that the site is built without running anything; a test holds their cells to the notebooks.
+"""
+
+import base64
+import os
+from pathlib import Path
+
+NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
+
+
+def render(folder: Path) -> None:
+    """One page a notebook in a folder, the pictures beside it."""
+    import jupytext
+    from nbclient import NotebookClient
+
+    from docs.pictures import shrink
+
+    folder.mkdir(parents=True, exist_ok=True)
+    os.environ.pop("MPLBACKEND", None)  # the kernel brings its own, which keeps the pictures
+    for path in sorted(NOTEBOOKS.glob("*.py")):
+        print(path.stem, flush=True)
+        notebook = jupytext.read(path)
+        NotebookClient(notebook, timeout=1200, kernel_name="python3").execute()
+        lines: list[str] = []
+        for cell in notebook.cells:
+            lines += [cell.source, ""] if cell.cell_type == "markdown" else ["```py", cell.source, "```", ""]
+            for output in cell.get("outputs", ()):
+                lines += shown(output, folder, f"{path.stem}-{sum(line.startswith('![') for line in lines) + 1}.png")
+        (folder / f"{path.stem}.md").write_text("\n".join(lines), encoding="utf-8")
+    for picture in folder.glob("*.png"):
+        shrink(picture)
+
+
+def shown(output: dict, folder: Path, name: str) -> list[str]:
+    """The lines of one output: a picture, put into the folder under a name, or text."""
+    data = output.get("data", {})
+    if "image/png" in data:
+        (folder / name).write_bytes(base64.b64decode(data["image/png"]))
+        return [f"![a figure of this notebook]({name})", ""]
+    text = output.get("text") or data.get("text/plain", "")
+    return ["```text", text.rstrip(), "```", ""] if text.strip() else []
+
+
+def cells(page: str) -> list[str]:
+    """The code cells of a page, to be compared with those of its notebook."""
+    import re
+
+    return re.findall(r"^```py\n(.*?)\n```$", page, re.MULTILINE | re.DOTALL)

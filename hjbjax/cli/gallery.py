@@ -1,0 +1,261 @@
+"""Every ready problem on one page: pictures, numbers, and the error where the exact answer is known.
+
+A problem is solved on a small grid and becomes a ``Card``; ``page`` makes one HTML file of the cards, with the
+pictures inside it, so that it can be sent and opened without anything beside it.
+"""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import html
+import io
+import math
+import os
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import jax
+import numpy as np
+
+from hjbjax import plotting
+from hjbjax._version import __version__
+from hjbjax.cli import run_folder
+from hjbjax.feedback.path import Path as Trajectory
+from hjbjax.solution import placement
+from hjbjax.solution.solution import Solution, SolveError, Status
+from hjbjax.solvers.setup import SolveWarning
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.figure import Figure
+
+    from hjbjax.problem.problem import Problem
+    from hjbjax.zoo.entry import Entry
+
+PAGE = "index.html"
+NODES = 20_000  # of a problem at most: 141 x 141, tenths of a second once compiled; on 62 x 63 the pendulum is 3 % off
+DPI = 72  # 9.6 inches are 690 pixels, the width of a card
+QUALITY = 60  # of WebP: a picture is 6 to 12 kB, a third of the PNG; below 50 the tick labels blur
+
+
+@dataclasses.dataclass(frozen=True)
+class Card:
+    """One problem of the gallery.
+
+    Args:
+      name: as in the catalogue.
+      summary: one line.
+      status: the name of a ``Status``, or of the error that ended the solve.
+      facts: pairs of words and figures, as text.
+      pictures: pairs of a caption and a WebP file.
+    """
+
+    name: str
+    summary: str
+    status: str
+    facts: tuple[tuple[str, str], ...]
+    pictures: tuple[tuple[str, bytes], ...]
+
+
+def check_folder(out: Path, force: bool = False) -> None:
+    """Refuse a folder that holds anything, unless by ``force`` and only its page is replaced.
+
+    Raises:
+      OSError: with a line on the way out.
+    """
+    if os.path.lexists(out) and not out.is_dir():
+        raise NotADirectoryError(f"{out} is there and is no folder; give another name")
+    placement.check_place(out / PAGE, force=True)  # a folder of that name is refused even by force
+    found = sorted(entry.name for entry in out.iterdir()) if out.is_dir() else []
+    if not force and PAGE in found:
+        raise FileExistsError(f"{out} holds {PAGE} already; give another --out, or --force to replace it")
+    if not force and found:
+        shown = ", ".join(found[:3]) + (", ..." if len(found) > 3 else "")
+        raise FileExistsError(f"{out} is not empty: {shown}; give another --out, or --force to put {PAGE} beside them")
+
+
+def small_shape(shape: Sequence[int], nodes: int = NODES) -> tuple[int, ...]:
+    """The shape of a grid with about ``nodes`` nodes and the proportions of ``shape``, or ``shape`` if it has fewer.
+
+    A count keeps its parity: zero is a node of an odd one, and a periodic axis of an even one has its antipode.
+
+    Example:
+      >>> small_shape((200, 201), 4000), small_shape((41, 51, 9), 4000), small_shape((81,), 4000)
+      ((62, 63), (25, 31, 7), (81,))
+    """
+    # moved to fewer nodes only: what a problem asks for by default is what its author found to be enough
+    share = min(1.0, (nodes / math.prod(shape)) ** (1 / len(shape)))
+    return tuple(count - 2 * round(count * (1 - share) / 2) for count in shape)
+
+
+def card(entry: Entry, *, options: dict[str, Any] | None = None) -> Card:
+    """One problem solved on its small grid and drawn, whatever comes of it: a refusal is a card as well.
+
+    Args:
+      entry: of the catalogue.
+
+    Keyword Args:
+      options: more keywords of ``hjbjax.solve``.
+
+    Raises:
+      KeyboardInterrupt: the solve was interrupted.
+    """
+    import hjbjax as hjb
+
+    _, grid = entry.build()
+    problem, grid = entry.build(shape=small_shape(grid.shape))
+    try:
+        # on the card in place of the screen, which shows one line a problem
+        with warnings.catch_warnings(record=True) as heard:
+            warnings.simplefilter("always", SolveWarning)
+            solution = hjb.solve(problem, grid, throw=False, **(options or {}))
+    except (SolveError, ValueError, jax.errors.JaxRuntimeError) as error:
+        return Card(entry.name, entry.summary, type(error).__name__, (("refused", " ".join(str(error).split())),), ())
+    if solution.status == Status.INTERRUPTED:
+        raise KeyboardInterrupt
+    pictures, path = _figures(problem, solution, entry)
+    facts = [*_facts(solution), *_exact(entry, solution)]
+    if path is not None:
+        promised = "" if path.promised is None else f"; V at its start {float(path.promised):.4g}"
+        facts.append(("cost of the path", f"{float(path.cost):.4g}{promised}"))
+    facts += [("warning", str(each.message)) for each in heard]
+    drawn = tuple((caption, webp(artists)) for caption, artists in pictures)
+    return Card(entry.name, entry.summary, solution.status.name, tuple(facts), drawn)
+
+
+def _figures(
+    problem: Problem, solution: Solution, entry: Entry
+) -> tuple[list[tuple[str, list[Artist]]], Trajectory | None]:
+    """Captions and drawings: value and closed loop in one where there is a path, then the feedback; and the path."""
+    start = entry.initial_state(solution.grid.ndim)
+    fixed = dict(enumerate(start[2:], 2))  # axes from the third on, cut where the path starts
+    jumps = run_folder.is_bang_bang(problem, solution)
+    finish = None if entry.finish is None else entry.finish()
+    path = None
+    if solution.status == Status.CONVERGED:
+        path = run_folder.closed_path(problem, solution, start, entry.duration, jumps, finish)
+    drawn: list[tuple[str, list[Artist]]] = []
+    if path is None or solution.grid.ndim == 1:  # over one axis the picture of the loop has no room for the value
+        value = plotting.value(solution, fixed=fixed, target=problem.target)
+        drawn.append(("the value", run_folder.with_curve(value, solution, fixed, jumps)))
+    if path is not None:
+        loop = plotting.closed_loop(solution, path, fixed=fixed, target=problem.target)
+        drawn.append(("the closed loop" if solution.grid.ndim == 1 else "the value, and the closed loop on it", loop))
+    if solution.policy.shape[-1]:
+        drawn.append(("the feedback", run_folder.policies(solution, fixed, jumps)))
+    return drawn, path
+
+
+def webp(artists: Sequence[Artist], dpi: int = DPI) -> bytes:
+    """The figure of some artists as a WebP file."""
+    stream = io.BytesIO()
+    figure = cast("Figure", artists[0].get_figure())
+    figure.savefig(stream, format="webp", dpi=dpi, pil_kwargs={"quality": QUALITY, "method": 6})
+    return stream.getvalue()
+
+
+def _facts(solution: Solution) -> list[tuple[str, str]]:
+    """Figures of the solve: nodes, steps, both errors, seconds."""
+    stats = solution.stats
+    facts = [
+        ("grid", " x ".join(map(str, solution.grid.shape)) + f" = {solution.grid.size:,} nodes"),
+        ("method", f"{stats.get('method')}, {stats.get('scheme')}"),
+        ("steps", f"{int(solution.steps)}"),
+    ]
+    if solution.error is not None:
+        facts.append(("algebraic error, certified", f"at most {float(solution.error):.2g}"))
+    elif solution.monotone_error is not None:
+        facts.append(("algebraic error of the monotone start, certified", f"at most {solution.monotone_error:.2g}"))
+    if solution.grid_error is not None and np.any(np.isfinite(solution.grid_error)):
+        facts.append(("grid error, estimated", f"about {float(np.nanmax(solution.grid_error)):.2g}"))
+    facts.append(("seconds", f"{stats['seconds']:.2g}, and {stats['compile_seconds']:.2g} to check and compile"))
+    return facts
+
+
+def _exact(entry: Entry, solution: Solution) -> list[tuple[str, str]]:
+    """The exact value at the start of the path, and the largest difference from it; nothing where none is known."""
+    if entry.exact is None:
+        return [("exact answer", "not known")]
+    exact = entry.exact()
+    off = run_folder.difference(exact, solution)
+    start = entry.initial_state(solution.grid.ndim)
+    with jax.enable_x64(True):
+        there = float(exact(np.array(start)))
+    state = ", ".join(f"{entry:g}" for entry in start)
+    return [
+        (f"V({state})", f"{float(solution.value_at(np.array(start))):.5g}; exactly {there:.5g}"),
+        ("off the exact answer on the inner half", "nothing finite there" if off is None else f"at most {off:.2g}"),
+    ]
+
+
+# ------------------------------------------------------------------------------------------------- the page
+
+STYLE = """
+body { font: 16px/1.45 system-ui, sans-serif; color: #1a1a1a; background: #fff; margin: 0 auto; max-width: 76rem;
+       padding: 1rem 1.5rem }
+nav a { display: inline-block; margin: 0 .9rem .3rem 0 }
+section { border-top: 1px solid #ccc; padding: .4rem 0 1.2rem }
+h2 { margin: .6rem 0 .1rem; font-size: 1.25rem }
+p { margin: .2rem 0 .6rem }
+.pictures { display: flex; flex-wrap: wrap; gap: 1rem; align-items: flex-start }
+figure { margin: 0 } figcaption { color: #555; font-size: .85rem } img { max-width: 100%; height: auto }
+table { border-collapse: collapse; font-size: .9rem } td { padding: .1rem 1.2rem .1rem 0; vertical-align: top }
+.bad { color: #a40000; font-weight: 600 }
+"""
+
+
+def page(cards: Sequence[Card]) -> str:
+    """One HTML page of the cards that needs no other file."""
+    links = "".join(f'<a href="#{card.name}">{html.escape(card.name)}</a>' for card in cards)
+    good = sum(card.status == Status.CONVERGED.name for card in cards)
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>hjbjax gallery</title>'
+        # a picture of no bytes: or a browser asks for /favicon.ico, which a page of one file does not have
+        '<link rel="icon" href="data:,"><meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<style>{STYLE}</style></head>\n<body><h1>The ready problems of hjbjax</h1>\n"
+        f"<p>{good} of {len(cards)} converged, by hjbjax {__version__} on {html.escape(_device())}, at most about "
+        f"{NODES:,} nodes each. <code>hjbjax solve NAME</code> takes the full grids.</p>\n"
+        f"<nav>{links}</nav>\n{''.join(map(_section, cards))}</body></html>\n"
+    )
+
+
+def _section(card: Card) -> str:
+    """The part of the page that one card has."""
+    rows = "".join(
+        f"<tr><td>{html.escape(word)}</td><td>{html.escape(figure)}</td></tr>" for word, figure in card.facts
+    )
+    pictures = "".join(
+        f'<figure><img loading="lazy" alt="{html.escape(f"{card.name}: {caption}")}" '
+        f'src="data:image/webp;base64,{base64.b64encode(data).decode()}">'
+        f"<figcaption>{html.escape(caption)}</figcaption></figure>"
+        for caption, data in card.pictures
+    )
+    tone = "" if card.status == Status.CONVERGED.name else ' class="bad"'
+    return (
+        f'<section id="{card.name}"><h2>{html.escape(card.name)}</h2>\n<p>{html.escape(card.summary)}; '
+        f'<span{tone}>{card.status}</span></p>\n<div class="pictures">{pictures}</div>\n'
+        f"<table>{rows}</table></section>\n"
+    )
+
+
+def _device() -> str:
+    """The device that JAX computes on, in words."""
+    device = jax.devices()[0]
+    return device.platform if device.platform == "cpu" else device.device_kind
+
+
+def publish(cards: Sequence[Card], staging: Path, out: Path, force: bool = False) -> Path:
+    """The page of the cards in ``out``, whole or not at all: made in ``staging``, on the same file system, and moved.
+
+    Raises:
+      OSError: ``out`` cannot be written, or holds something by now.
+    """
+    made = staging / PAGE
+    made.write_text(page(cards), encoding="utf-8")
+    out.mkdir(parents=True, exist_ok=True)
+    check_folder(out, force)  # again: the solves may have taken long
+    placement.place(made, out / PAGE, force)
+    return out / PAGE

@@ -1,0 +1,167 @@
+"""``hjbjax gallery``: refusals before anything is solved, a whole page after an interrupt, and what a card says."""
+
+import base64
+import os
+import re
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import hjbjax
+from hjbjax import zoo
+from hjbjax.cli import gallery
+from hjbjax.cli.gallery import Card, card, page, small_shape
+from hjbjax.cli.main import main
+from hjbjax.solution.solution import Solution, Status
+
+PICTURE = b"RIFF....WEBP"
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    """Every test writes into a folder of its own."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def made(name, status="CONVERGED"):
+    """A card that was not computed."""
+    return Card(
+        name, "a <summary> & more", status, (("steps", "7"), ("off", "at most 1e-3")), (("the value", PICTURE),)
+    )
+
+
+@pytest.fixture
+def cards(monkeypatch):
+    """Cards that were not computed; a name in ``ends`` gets that status, or raises."""
+    ends = {}
+
+    def stand_in(entry):
+        end = ends.get(entry.name, "CONVERGED")
+        if isinstance(end, BaseException):
+            raise end
+        return made(entry.name, end)
+
+    monkeypatch.setattr(gallery, "card", stand_in)
+    return ends
+
+
+def run(*words):
+    return CliRunner().invoke(main, ["gallery", "--no-cache", *map(str, words)])
+
+
+def test_all_of_the_catalogue_is_on_one_page_that_needs_no_other_file(cards, folder):
+    result = run("--out", "page")
+    assert result.exit_code == 0, result.output
+    assert os.listdir("page") == ["index.html"]
+    text = (folder / "page" / "index.html").read_text(encoding="utf-8")
+    assert re.findall(r'<section id="([\w-]+)"', text) == list(zoo.catalogue)
+    sources = re.findall(r'(?:src|href)="([^"]*)"', text)
+    assert all(source.startswith(("data:", "#")) for source in sources)
+    assert base64.b64encode(PICTURE).decode() in text
+    assert "a &lt;summary&gt; &amp; more" in text
+    assert f"{len(zoo.catalogue)} of {len(zoo.catalogue)} converged" in text
+    for number, name in enumerate(zoo.catalogue, 1):
+        assert re.search(rf"^ *{number}/{len(zoo.catalogue)}  {name} +CONVERGED$", result.stdout, re.MULTILINE)
+
+
+@pytest.mark.parametrize(
+    ("held", "words", "parts"),
+    [
+        ("index.html", (), ("holds index.html already", "--force")),
+        ("thesis.tex", (), ("not empty", "thesis.tex", "--force")),
+        ("index.html/", ("--force",), ("is a folder",)),
+    ],
+)
+def test_a_folder_that_holds_something_is_refused_before_anything_is_solved(held, words, parts, cards, folder):
+    cards |= dict.fromkeys(zoo.catalogue, AssertionError("solved"))
+    (folder / "page").mkdir()
+    if held.endswith("/"):
+        (folder / "page" / held).mkdir()
+    else:
+        (folder / "page" / held).write_text("mine")
+    result = run("--out", "page", *words)
+    assert result.exit_code == 2
+    assert result.stderr.count("\n") == 1
+    for part in parts:
+        assert part in result.stderr
+    assert os.listdir(folder) == ["page"]
+
+
+def test_force_replaces_the_page_and_leaves_what_is_beside_it(cards, folder):
+    (folder / "page").mkdir()
+    for name in ("index.html", "thesis.tex"):
+        (folder / "page" / name).write_text("mine")
+    assert run("--out", "page", "--force", "--only", "smooth").exit_code == 0
+    assert (folder / "page" / "thesis.tex").read_text() == "mine"
+    assert "smooth" in (folder / "page" / "index.html").read_text()
+
+
+def test_a_path_that_is_no_folder_and_an_unknown_problem_are_refused(cards, folder):
+    (folder / "page").write_text("mine")
+    assert "is no folder" in run("--out", "page").stderr
+    result = run("--out", "other", "--only", "pendulm")
+    assert (result.exit_code, "did you mean 'pendulum'?" in result.stderr) == (2, True)
+    assert os.listdir(folder) == ["page"]
+
+
+def test_one_that_does_not_converge_is_on_the_page_and_in_the_exit_code(cards, folder):
+    cards["zermelo"] = "DIVERGED"
+    result = run("--out", "page", "--only", "zermelo", "--only", "smooth")
+    assert (result.exit_code, result.stderr) == (3, "hjbjax: not converged: zermelo\n")
+    text = (folder / "page" / "index.html").read_text()
+    assert "1 of 2 converged" in text
+    assert '<span class="bad">DIVERGED</span>' in text
+
+
+def test_an_interrupt_leaves_a_whole_page_of_what_was_done(cards, folder):
+    cards["zermelo"] = KeyboardInterrupt()
+    assert run("--out", "page").exit_code == 130
+    names = list(zoo.catalogue)
+    text = (folder / "page" / "index.html").read_text()
+    assert re.findall(r'<section id="([\w-]+)"', text) == names[: names.index("zermelo")]
+    assert os.listdir(folder) == ["page"]  # the hidden folder is gone
+
+
+def test_small_shapes_keep_proportions_and_parity():
+    for entry in zoo.catalogue.values():
+        _, grid = entry.build()
+        shape = small_shape(grid.shape)
+        assert np.prod(shape) <= 1.1 * gallery.NODES
+        assert all((small - count) % 2 == 0 and small <= count for small, count in zip(shape, grid.shape, strict=True))
+        assert entry.build(shape=shape)[1].shape == shape
+
+
+def solved(value, code=Status.CONVERGED):
+    """In place of ``hjbjax.solve``: a value that is a function of the states, and no control."""
+
+    def stand_in(problem, grid, **options):
+        x = grid.nodes()
+        stats = {"method": "none", "scheme": "none", "seconds": 0.0, "compile_seconds": 0.0}
+        return Solution(grid, value(x), np.zeros((*grid.shape, 0)), code=code, steps=3, stats=stats)
+
+    return stand_in
+
+
+def test_a_card_says_how_far_the_value_is_from_the_exact_one(monkeypatch):
+    monkeypatch.setattr(hjbjax, "solve", solved(lambda x: 1.01 * (1 - x[..., 0] ** 2)))
+    found = card(zoo.catalogue["brownian-exit"])
+    facts = dict(found.facts)
+    assert facts["V(0)"] == "1.01; exactly 1"
+    assert facts["off the exact answer on the inner half"] == "at most 0.01"
+    assert [caption for caption, _ in found.pictures] == ["the value", "the closed loop"]
+    assert all(data[:4] == b"RIFF" and data[8:12] == b"WEBP" for _, data in found.pictures)
+    assert "the closed loop" in page([found])
+
+
+def test_a_refusal_is_a_card_and_an_interrupt_none(monkeypatch):
+    def refuse(problem, grid, **options):
+        raise ValueError("got this,\nwanted that")
+
+    monkeypatch.setattr(hjbjax, "solve", refuse)
+    found = card(zoo.catalogue["smooth"])
+    assert (found.status, found.facts, found.pictures) == ("ValueError", (("refused", "got this, wanted that"),), ())
+    monkeypatch.setattr(hjbjax, "solve", solved(lambda x: x[..., 0], Status.INTERRUPTED))
+    with pytest.raises(KeyboardInterrupt):
+        card(zoo.catalogue["smooth"])

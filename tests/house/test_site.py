@@ -1,0 +1,181 @@
+"""The site: every public name is there, it builds without a warning, and no link or picture in it leads nowhere."""
+
+import html.parser
+import re
+import shutil
+import subprocess
+import sys
+import urllib.parse
+from pathlib import Path
+
+import jupytext
+import pytest
+from click.testing import CliRunner
+
+import hjbjax as hjb
+from docs import notebooks
+from docs.docstrings import prepared
+from hjbjax import zoo
+from hjbjax.cli.main import main
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+LIMIT = 300_000  # bytes of the first page with all that it needs; further pictures are loaded when they come in sight
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+
+def names_of(module):
+    """The public names of a module, under the name where their module is."""
+    names = getattr(module, "__all__", None) or [
+        name
+        for name, thing in vars(module).items()
+        if not name.startswith("_") and callable(thing) and thing.__module__ == module.__name__
+    ]
+    return [f"{module.__name__}.{name}" for name in names if not name.startswith("__")]
+
+
+MODULES = (hjb.zoo, hjb.filtering, hjb.plotting, hjb.geometry, hjb.chain, hjb.stability)
+PUBLIC = [
+    f"hjbjax.{name}" for name in hjb.__all__ if not name.startswith("__") and getattr(hjb, name) not in MODULES
+] + [name for module in MODULES for name in names_of(module)]
+
+
+def test_every_public_name_has_an_entry():
+    pages = "\n".join(path.read_text(encoding="utf-8") for path in (DOCS / "api").glob("*.md"))
+    entries = re.findall(r"^\.\. (?:auto\w+|py:\w+):: ([\w.]+)", pages, re.MULTILINE)
+    assert len(PUBLIC) > 150
+    assert not set(PUBLIC) - set(entries)
+    assert len(entries) == len(set(entries))
+
+
+def test_docstrings_keep_their_bars_and_stars_and_equations():
+    lines = ["The bound |V − V_h|.", "", "    V* = min", "", "Args:", "  x_: the ``|x|`` of it.", "", ">>> 2 * 3", "6"]
+    wanted = [
+        r"The bound \|V − V_h\|.", "", "::", "", "    V* = min", "", "Args:", r"  x\_: the ``|x|`` of it.",
+        "", ">>> 2 * 3", "6",
+    ]  # fmt: skip
+    assert prepared(lines) == wanted
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "notebooks").glob("*.py")), ids=lambda path: path.stem)
+def test_the_page_of_a_notebook_has_its_cells(path):
+    cells = [cell.source for cell in jupytext.read(path).cells if cell.cell_type == "code"]
+    assert notebooks.cells((DOCS / "notebooks" / f"{path.stem}.md").read_text(encoding="utf-8")) == cells
+
+
+def test_the_gallery_has_all_ready_problems():
+    page = (DOCS / "gallery.md").read_text(encoding="utf-8")
+    assert re.findall(r"^## (.*)$", page, re.MULTILINE) == list(zoo.catalogue)
+
+
+class Page(html.parser.HTMLParser):
+    """The links, the anchors and the files of a page."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.links, self.anchors, self.files, self.lazy = [], set(), [], []
+        self.feed(path.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag, attributes):
+        found = dict(attributes)
+        if "id" in found:
+            self.anchors.add(found["id"])
+        if tag == "a" and "href" in found:
+            self.links.append(found["href"])
+        if tag in ("img", "script", "source") and "src" in found:
+            (self.lazy if found.get("loading") == "lazy" else self.files).append(found["src"])
+        if tag == "link" and found.get("rel") in ("stylesheet", "icon"):
+            self.files.append(found["href"])
+
+
+def place_of(page, link):
+    """The file and the anchor that a link of a page leads to; no file for one that leaves the site."""
+    parts = urllib.parse.urlsplit(link)
+    if parts.scheme or parts.netloc:
+        return None, ""
+    path = urllib.parse.unquote(parts.path)
+    return (page.parent / path).resolve() if path else page, urllib.parse.unquote(parts.fragment)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The site, built as by ``python -m docs``, where a warning is an error."""
+    pytest.importorskip("sphinx")
+    pytest.importorskip("furo")
+    out = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "docs", "build", str(out)]
+    built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert built.returncode == 0, built.stderr
+    return out
+
+
+@pytest.mark.slow
+def test_no_link_and_no_picture_leads_nowhere(site):
+    pages = {path.resolve(): Page(path) for path in site.rglob("*.html")}
+    assert len(pages) > 25
+    missing = []
+    for path, page in pages.items():
+        for link in page.links + page.files + page.lazy:
+            place, anchor = place_of(path, link)
+            there = place is None or place.exists()
+            if not there or (anchor and place in pages and anchor not in pages[place].anchors):
+                missing.append((path.name, link))
+    assert not missing
+
+
+@pytest.mark.slow
+def test_the_first_page_is_light(site):
+    first = site / "index.html"
+    files = {place_of(first, link)[0] for link in Page(first).files} - {None}
+    assert sum(path.stat().st_size for path in [first, *files]) < LIMIT
+
+
+def complaints(address, folder):
+    """The errors that a browser writes to its console on a page, and the page as it stands after its scripts."""
+    command = [
+        CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--v=0", "--dump-dom",
+        "--host-resolver-rules=MAP * ~NOTFOUND", f"--user-data-dir={folder}", "--virtual-time-budget=5000", address,
+    ]  # fmt: skip
+    shown = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert shown.returncode == 0, shown.stderr
+    return [line for line in shown.stderr.splitlines() if ":CONSOLE" in line], shown.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="no browser")
+@pytest.mark.parametrize("page", ["index.html", "getting_started.html", "api/solving.html", "gallery.html"])
+def test_a_browser_has_nothing_to_complain_of(site, page, tmp_path):
+    said, shown = complaints((site / page).as_uri(), tmp_path)
+    assert not said
+    assert "</article>" in shown
+
+
+@pytest.fixture(scope="module")
+def gallery(tmp_path_factory):
+    """The page of the gallery, of two problems: a game over one axis, and a stochastic one without a control."""
+    out = tmp_path_factory.mktemp("gallery") / "page"
+    words = ["gallery", "--out", str(out), "--only", "lq-game", "--only", "brownian-exit", "--no-cache"]
+    result = CliRunner().invoke(main, words)
+    assert result.exit_code == 0, result.output
+    return out / "index.html"
+
+
+@pytest.mark.slow
+def test_the_gallery_needs_no_other_file(gallery):
+    page = Page(gallery)
+    assert page.anchors == {"lq-game", "brownian-exit"}
+    assert page.links == ["#lq-game", "#brownian-exit"]
+    sources = page.lazy + page.files
+    assert len(sources) >= 5
+    assert all(source.startswith("data:") for source in sources)
+    text = gallery.read_text(encoding="utf-8")
+    assert "2 of 2 converged" in text
+    assert text.count("off the exact answer") == 2
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="no browser")
+def test_a_browser_shows_the_gallery(gallery, tmp_path):
+    said, shown = complaints(gallery.as_uri(), tmp_path)
+    assert not said
+    assert shown.count("<figure>") >= 5

@@ -70,8 +70,10 @@ def value(
 
     Example:
       >>> from types import SimpleNamespace
+      >>> from matplotlib.figure import Figure
       >>> grid = Grid(lo=[-1.0], hi=[1.0], shape=(3,), names=("position",))
-      >>> artists = value(SimpleNamespace(grid=grid, value=np.array([1.0, 0.0, 1.0]), times=None))
+      >>> solution = SimpleNamespace(grid=grid, value=np.array([1.0, 0.0, 1.0]), times=None)
+      >>> artists = value(solution, ax=Figure().add_subplot())
       >>> artists[0].axes.get_xlabel(), artists[0].get_ydata().tolist()
       ('position', [1.0, 0.0, 1.0])
     """
@@ -125,7 +127,10 @@ def policy(
     section, regions = _without(section, target_of(solution, time))
     cells = getattr(solution, "discrete", False) or jumps(section.values.compressed())
     span = span_of(solution, input)
-    look = Look(label, "no control", colorbar, diverging=True, cells=cells, span=span)
+    inner = (slice(1, -1),) if len(section.axes) == 1 else ()
+    # the run ends at the two ends of a line: a hatch half a cell wide would tell nothing
+    hidden = "no control" if np.ma.getmaskarray(section.values)[inner].any() or len(section.axes) == 2 else ""
+    look = Look(label, hidden, colorbar, diverging=True, cells=cells, span=span)
     return Picture(draw(ax, section, look, regions), ax)
 
 

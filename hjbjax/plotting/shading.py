@@ -13,7 +13,7 @@ import numpy as np
 
 from hjbjax.plotting.scales import number_text, scale_axes
 from hjbjax.plotting.slices import Region, Section
-from hjbjax.plotting.style import COLOURS, GREY, label_axes, legend
+from hjbjax.plotting.style import COLOURS, label_axes, legend
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.colors import Colormap
 
 FLAT = 1e-4  # a field that varies by less than this share of itself is drawn level: what a solve leaves of a constant
-HATCH = "////"
+HATCH, STROKE = "////", "#909090"
 EXTREME = 1e-6  # of the range: how near to an end of it a control counts as being there
 JUMPING = 0.9  # of the nodes at either end of the range or at rest make a feedback that jumps
 
@@ -32,7 +32,7 @@ class Look:
 
     Args:
       label: of the numbers.
-      hidden: what the legend says of nodes without a number.
+      hidden: what the legend says of nodes without a number; empty where they are not to be marked over one axis.
       colorbar: whether a colour scale is drawn.
       diverging: whether zero is the middle of the colours, where both signs occur.
       cells: whether nodes are drawn as cells and not shaded smoothly.
@@ -52,7 +52,7 @@ def draw(ax: Axes, section: Section, look: Look, regions: tuple[Region, ...] = (
     mask = np.ma.getmaskarray(section.values)
     if len(section.axes) == 1:
         artists: list[Artist] = [*ax.plot(section.coordinates[0], section.values, color=COLOURS[0], linewidth=1.6)]
-        artists += bands(ax, section.coordinates[0], mask, look.hidden)
+        artists += bands(ax, section.coordinates[0], mask, look.hidden) if look.hidden else []
         known = section.values.compressed()
         if known.size and is_level(known, look.span):  # or the axis would show its rounding
             ax.set_ylim(*around(float(np.mean(known)), look.span))
@@ -60,7 +60,7 @@ def draw(ax: Axes, section: Section, look: Look, regions: tuple[Region, ...] = (
     else:
         frame(ax, section)
         artists = _mesh(ax, section, look, regions)
-    if mask.any() or any(region.visible for region in regions):
+    if (look.hidden and mask.any()) or any(region.visible for region in regions):
         legend(ax)
     return artists
 
@@ -152,12 +152,12 @@ def hatched(ax: Axes, coordinates: tuple[np.ndarray, ...], level: np.ndarray, la
         return []
     style: dict[str, Any] = {"levels": [0.0, float(level.max()) + 1.0], "colors": ["white"], "hatches": [HATCH]}
     area = ax.contourf(*coordinates, level.T, zorder=2, **style)
-    area.set(edgecolor=GREY, linewidth=0.0)
+    area.set(edgecolor=STROKE, linewidth=0.0)
     # contours take no label: an empty rectangle stands for them in the legend, once
     if label not in ax.get_legend_handles_labels()[1]:
         corner = (float(coordinates[0][0]), float(coordinates[1][0]))
         ax.add_patch(
-            Rectangle(corner, 0, 0, facecolor="white", edgecolor=GREY, hatch=HATCH, linewidth=0.6, label=label)
+            Rectangle(corner, 0, 0, facecolor="white", edgecolor=STROKE, hatch=HATCH, linewidth=0.6, label=label)
         )
     return [area]
 
@@ -198,7 +198,7 @@ def bands(ax: Axes, x: np.ndarray, mask: np.ndarray, label: str) -> list[Artist]
     cells = np.diff(x) / 2 if len(x) > 1 else np.array([0.5])  # half of each; an axis may be stretched
     borders = np.concatenate([[x[0] - cells[0]], x[:-1] + cells[: len(x) - 1], [x[-1] + cells[-1]]])
     runs = zip(edges[::2], edges[1::2], strict=True)
-    style: dict[str, Any] = {"facecolor": "white", "edgecolor": GREY, "hatch": HATCH, "linewidth": 0, "zorder": 0}
+    style: dict[str, Any] = {"facecolor": "white", "edgecolor": STROKE, "hatch": HATCH, "linewidth": 0, "zorder": 0}
     return [ax.axvspan(borders[a], borders[b], label=None if k else label, **style) for k, (a, b) in enumerate(runs)]
 
 

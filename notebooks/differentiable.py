@@ -62,9 +62,9 @@ assert abs(slope - wanted) < 0.03 * abs(wanted)
 # `control_at` is differentiable, so that Gauss and Newton find it.
 
 # %%
-places = jnp.array([[0.5], [1.0], [1.5]])
+places = np.array([[0.5], [1.0], [1.5]])
 hidden = 0.4
-seen = jnp.asarray(hjb.solve(regulated(hidden), grid, tol=1e-8).control_at(places))
+seen = np.asarray(hjb.solve(regulated(hidden), grid, tol=1e-8).control_at(places))
 
 
 def steered(logarithm):

@@ -36,8 +36,7 @@ from hjbjax import plotting
 count = 41
 problem, grid = hjb.zoo.double_integrator(shape=(count, count), radius=0.2)
 solution = hjb.solve(problem, grid, scheme=hjb.Upwind(), tol=1e-6)
-policy = np.nan_to_num(solution.policy)
-matrix = hjb.chain.matrix(problem, grid, policy).tocsr()
+matrix = hjb.chain.generator(problem, grid, solution.policy).tocsr()
 rows = np.asarray(matrix.sum(axis=1)).ravel()
 print(f"rows of the generator sum to {np.abs(rows).max():.1e} at most")
 assert np.abs(rows).max() < 1e-9 * abs(matrix.diagonal()).max()
@@ -47,7 +46,7 @@ node, t = np.ravel_multi_index((3 * (count - 1) // 4, (count - 1) // 2), grid.sh
 visited, clock = [node], [t]
 states = grid.nodes().reshape(-1, 2)
 while np.linalg.norm(states[node]) > 0.2 and len(visited) < 400:
-    row = matrix[node]
+    row = matrix[[node]]  # as a matrix of one row
     jumps = row.indices != node
     targets, rates = row.indices[jumps], row.data[jumps]
     t += random.exponential(1 / rates.sum())

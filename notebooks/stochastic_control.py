@@ -30,10 +30,10 @@ from hjbjax import plotting
 warnings.simplefilter("ignore", hjb.SolveWarning)
 
 # %% [markdown]
-# ## Noise rounds the kink off
+# ## What noise costs
 #
-# A point on a line is held near zero by a bounded speed. Without noise the value has its kink at zero in the second
-# derivative and the feedback jumps; with noise the value is higher and smooth. Both have a closed form.
+# A point on a line is held near zero by a bounded speed. Noise makes the value higher, and the more so the
+# stronger it is, since the point cannot be kept where it costs nothing. All three have a closed form.
 
 # %%
 figure, axes = plt.subplots(1, 2, figsize=(10, 3.4), layout="constrained")

@@ -168,6 +168,7 @@ def _outlines(ax: Axes, solution: Solution, section: Section, time: float | None
 
 def _surface(field: Field, fixed: Mapping[str, float], ax: Any, color: str, label: str | None) -> Picture:
     """The surface V = 0 over the three axes that are not fixed."""
+    from matplotlib.ticker import MaxNLocator
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-untyped]
 
     grid = field.grid
@@ -185,6 +186,7 @@ def _surface(field: Field, fixed: Mapping[str, float], ax: Any, color: str, labe
     ends = [(float(line[0]), float(line[-1])) for line in lines]
     ax.set(xlim=ends[0], ylim=ends[1], zlim=ends[2])
     for axis, number, text in zip((ax.xaxis, ax.yaxis, ax.zaxis), free, "xyz", strict=True):
+        axis.set_major_locator(MaxNLocator(4))  # seen from the side, more would run into each other
         set_ticks(axis, is_angle(grid, number))
         getattr(ax, f"set_{text}label")(grid.labels[number])
     ax.set_box_aspect((1, 1, 0.8), zoom=0.86)  # smaller than its frame, or the label on the right would be cut

@@ -150,4 +150,4 @@ def legend(ax: Axes) -> Legend:
     """
     height = 1.07 if ax.get_title(loc="right") else 1.0
     style: dict[str, Any] = {"fontsize": 8, "edgecolor": "none", "handlelength": 1.6, "columnspacing": 1.2}
-    return ax.legend(loc="lower left", bbox_to_anchor=(0.0, height), ncols=3, frameon=False, borderaxespad=0.2, **style)
+    return ax.legend(loc="lower left", bbox_to_anchor=(0.0, height), ncols=4, frameon=False, borderaxespad=0.2, **style)

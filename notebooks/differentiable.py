@@ -51,7 +51,7 @@ def exact(strength):
 
 
 with jax.enable_x64(True):
-    slope, wanted = jax.grad(value)(1.0), jax.grad(exact)(1.0)
+    slope, wanted = float(jax.grad(value)(1.0)), float(jax.grad(exact)(1.0))
 print(f"dV/ds = {slope:.4f}, in closed form {wanted:.4f}")
 assert abs(slope - wanted) < 0.03 * abs(wanted)
 
@@ -59,12 +59,13 @@ assert abs(slope - wanted) < 0.03 * abs(wanted)
 # ## Imitation
 #
 # Somebody steers well, and we see their controls at a few states. Which weight on the control do they have in mind?
-# `control_at` is differentiable, so that Gauss and Newton find it.
+# `control_at` is differentiable, so that Gauss and Newton find it. (Inside `jit` a solve takes the monotone chain; the
+# controls that we see are computed likewise.)
 
 # %%
 places = np.array([[0.5], [1.0], [1.5]])
 hidden = 0.4
-seen = np.asarray(hjb.solve(regulated(hidden), grid, tol=1e-8).control_at(places))
+seen = np.asarray(hjb.solve(regulated(hidden), grid, scheme=hjb.Upwind(), tol=1e-8).control_at(places))
 
 
 def steered(logarithm):
@@ -75,7 +76,7 @@ guesses = [0.0]
 with jax.enable_x64(True):
     look = jax.jit(lambda logarithm: (steered(logarithm), jax.jacrev(steered)(logarithm)))
     for _ in range(6):
-        controls, slopes = look(guesses[-1])
+        controls, slopes = map(np.asarray, look(guesses[-1]))
         off = controls - seen[:, 0]
         guesses.append(float(guesses[-1] - (slopes @ off) / (slopes @ slopes)))
 weights = np.exp(guesses)

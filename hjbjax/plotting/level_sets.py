@@ -180,7 +180,7 @@ def _surface(field: Field, fixed: Mapping[str, float], ax: Any, color: str, labe
     artists: list[Artist] = []
     if len(triangles):
         colours = np.column_stack([lit(triangles, closed, lines, color), np.full(len(triangles), OPACITY)])
-        surface = Poly3DCollection(triangles, facecolors=colours, edgecolors="none", linewidths=0, antialiased=False)
+        surface = Poly3DCollection(triangles, facecolors=colours, edgecolors="none", linewidths=0, antialiased=True)
         surface.set(rasterized=True)  # as vectors, each triangle would show its edge
         artists.append(ax.add_collection3d(surface))
     ends = [(float(line[0]), float(line[-1])) for line in lines]
@@ -188,7 +188,7 @@ def _surface(field: Field, fixed: Mapping[str, float], ax: Any, color: str, labe
     for axis, number, text in zip((ax.xaxis, ax.yaxis, ax.zaxis), free, "xyz", strict=True):
         axis.set_major_locator(MaxNLocator(4))  # seen from the side, more would run into each other
         set_ticks(axis, is_angle(grid, number))
-        getattr(ax, f"set_{text}label")(grid.labels[number])
+        getattr(ax, f"set_{text}label")(grid.labels[number], labelpad=8)
     ax.set_box_aspect((1, 1, 0.8), zoom=0.86)  # smaller than its frame, or the label on the right would be cut
     if field.caption:
         ax.set_title(field.caption, loc="right", fontsize=9)

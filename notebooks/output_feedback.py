@@ -18,8 +18,8 @@
 # $$dy = h(x)\,dt + r\,dv,$$
 #
 # and the control is a function of an *information state* that an observer makes of the record. Section 12 of the
-# chapter has three of them: the estimate of an observer (12.3), the law of the state given the record (12.6), and the
-# robust information state (12.10).
+# chapter has three of them, in the loops of its figures 13 to 15: the estimate of an observer (12.3), the law of the
+# state given the record (12.6), and the robust information state (12.10).
 
 # %%
 import warnings

@@ -19,7 +19,7 @@
 #
 # It is to be swung up and held there at the cost $\int \tfrac12(\theta^2 + \dot\theta^2 + \tau^2)\,dt$, without
 # discount. The angle lives on a circle; upright at rest costs nothing, and that is what makes the value finite.
-# Figures 10 to 12 of the chapter show the value, the feedback and a stabilising trajectory.
+# Figures 10 to 12 of the chapter, with the pendulum (9.4), show the value, the feedback and a stabilising trajectory.
 
 # %%
 import matplotlib.pyplot as plt
@@ -91,7 +91,8 @@ path = hjb.simulate(problem, solution, x0=[2.8, 0.0], duration=6.0)
 print(f"cost of the path {path.cost:.2f}, promised by the value {path.promised:.2f}")
 print(f"angle at the end {path.states[-1, 0]:.4f}, velocity {path.states[-1, 1]:.4f}")
 
-plotting.closed_loop(solution, path)[0].figure
+plotting.closed_loop(solution, path)
+plt.show()
 
 # %% [markdown]
 # The cost that the simulated path really pays and the value computed on the grid are two roads to one number. The path

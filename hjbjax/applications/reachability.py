@@ -97,7 +97,7 @@ def avoid(
     most, end = (depth, None) if tube else (None, depth)
     return Problem(
         _drift(drift, forward, time_dependent), None, controls, disturbances=disturbances, running_max=most,
-        terminal_cost=end, isaacs=isaacs, time_dependent=time_dependent,
+        terminal_cost=end, isaacs=isaacs, time_dependent=time_dependent, inside="above",
     )  # fmt: skip
 
 

@@ -15,7 +15,7 @@ import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -29,7 +29,6 @@ from hjbjax.solution.solution import Solution, SolveError, Status
 from hjbjax.solvers.setup import SolveWarning
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
     from matplotlib.figure import Figure
 
     from hjbjax.problem.problem import Problem
@@ -122,13 +121,11 @@ def card(entry: Entry, *, options: dict[str, Any] | None = None) -> Card:
         promised = "" if path.promised is None else f"; V at its start {float(path.promised):.4g}"
         facts.append(("cost of the path", f"{float(path.cost):.4g}{promised}"))
     facts += [("warning", str(each.message)) for each in heard]
-    drawn = tuple((caption, webp(artists)) for caption, artists in pictures)
+    drawn = tuple((caption, webp(figure)) for caption, figure in pictures)
     return Card(entry.name, entry.summary, solution.status.name, tuple(facts), drawn)
 
 
-def _figures(
-    problem: Problem, solution: Solution, entry: Entry
-) -> tuple[list[tuple[str, list[Artist]]], Trajectory | None]:
+def _figures(problem: Problem, solution: Solution, entry: Entry) -> tuple[list[tuple[str, Figure]], Trajectory | None]:
     """Captions and drawings: value and closed loop in one where there is a path, then the feedback; and the path."""
     start = entry.initial_state(solution.grid.ndim)
     fixed = dict(enumerate(start[2:], 2))  # axes from the third on, cut where the path starts
@@ -137,22 +134,22 @@ def _figures(
     path = None
     if solution.status == Status.CONVERGED:
         path = run_folder.closed_path(problem, solution, start, entry.duration, jumps, finish)
-    drawn: list[tuple[str, list[Artist]]] = []
+    drawn: list[tuple[str, Figure]] = []
     if path is None or solution.grid.ndim == 1:  # over one axis the picture of the loop has no room for the value
-        value = plotting.value(solution, fixed=fixed, target=problem.target)
-        drawn.append(("the value", run_folder.with_curve(value, solution, fixed, jumps)))
+        value = plotting.value(solution, ax=run_folder.axes(), fixed=fixed, target=problem.target)
+        drawn.append(("the value", run_folder.with_curve(value, solution, fixed, jumps).figure))
     if path is not None:
-        loop = plotting.closed_loop(solution, path, fixed=fixed, target=problem.target)
-        drawn.append(("the closed loop" if solution.grid.ndim == 1 else "the value, and the closed loop on it", loop))
+        figure = run_folder.figure_of(plotting.maps.closed_loop_size(solution.grid))
+        plotting.closed_loop(solution, path, fixed=fixed, target=problem.target, figure=figure)
+        drawn.append(("the closed loop" if solution.grid.ndim == 1 else "the value, and the closed loop on it", figure))
     if solution.policy.shape[-1]:
         drawn.append(("the feedback", run_folder.policies(solution, fixed, jumps)))
     return drawn, path
 
 
-def webp(artists: Sequence[Artist], dpi: int = DPI) -> bytes:
-    """The figure of some artists as a WebP file."""
+def webp(figure: Figure, dpi: int = DPI) -> bytes:
+    """A figure as a WebP file."""
     stream = io.BytesIO()
-    figure = cast("Figure", artists[0].get_figure())
     figure.savefig(stream, format="webp", dpi=dpi, pil_kwargs={"quality": QUALITY, "method": 6})
     return stream.getvalue()
 

@@ -27,7 +27,9 @@ from hjbjax.feedback.feedback import greedy_feedback
 from hjbjax.feedback.path import Path as Trajectory
 from hjbjax.feedback.path import joined
 from hjbjax.feedback.simulation import simulate
+from hjbjax.plotting.maps import closed_loop_size
 from hjbjax.plotting.slices import at_states
+from hjbjax.plotting.style import NARROW
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import Ball
 from hjbjax.solution import placement
@@ -35,7 +37,6 @@ from hjbjax.solution.solution import Solution, Status
 from hjbjax.zoo.ingredients import Exact, Feedback
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -124,25 +125,38 @@ def make(
       OSError: a file cannot be written.
     """
 
-    def draw(name: str, artists: list["Artist"]) -> None:
-        cast("Figure", artists[0].get_figure()).savefig(folder / name, dpi=DPI)
-
     solution.save(folder / "solution.npz")  # first: what took the longest is safe before anything is drawn
     yield "solution.npz", None
     if solution.status == Status.INTERRUPTED:
         return
     fixed = dict(enumerate(start[2:], 2))  # axes from the third on, cut where the trajectory starts
     jumps = is_bang_bang(problem, solution)
-    draw("value.png", with_curve(plotting.value(solution, fixed=fixed, target=problem.target), solution, fixed, jumps))
+    # figures of our own, which pyplot would keep, and would have to be imported for
+    value = plotting.value(solution, ax=axes(), fixed=fixed, target=problem.target)
+    with_curve(value, solution, fixed, jumps).save(folder / "value.png", dpi=DPI)
     yield "value.png", None
-    draw("policy.png", policies(solution, fixed, jumps))
+    policies(solution, fixed, jumps).savefig(folder / "policy.png", dpi=DPI)
     yield "policy.png", None
     path = None
     if solution.status == Status.CONVERGED:  # a loop closed with a half-done feedback would be taken for the answer
         path = closed_path(problem, solution, start, duration, jumps, finish)
     if path is not None:
-        draw("trajectory.png", plotting.closed_loop(solution, path, fixed=fixed, target=problem.target))
+        figure = figure_of(closed_loop_size(solution.grid))
+        loop = plotting.closed_loop(solution, path, fixed=fixed, target=problem.target, figure=figure)
+        loop.save(folder / "trajectory.png", dpi=DPI)
         yield "trajectory.png", path
+
+
+def figure_of(size: tuple[float, float]) -> "Figure":
+    """A figure that no global registry knows."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=size, layout="constrained")
+
+
+def axes() -> "Axes":
+    """Axes on such a figure."""
+    return plotting.styled(figure_of(NARROW).add_subplot())
 
 
 def is_bang_bang(problem: Problem, solution: Solution) -> bool:
@@ -202,30 +216,28 @@ def closed_path(
         return None
 
 
-def policies(solution: Solution, fixed: dict[int, float], jumps: bool) -> list["Artist"]:
+def policies(solution: Solution, fixed: dict[int, float], jumps: bool) -> "Figure":
     """One picture an input, side by side."""
-    from matplotlib.figure import Figure
-
     count = solution.policy.shape[-1]
-    figure = Figure(figsize=(5.4 * max(1, count), 4.2), layout="constrained")
+    figure = figure_of((NARROW[0] * max(1, count), NARROW[1]))
     if count == 0:
-        return [figure.text(0.5, 0.5, "this problem has no control", ha="center", va="center", color="0.4")]
-    artists: list[Artist] = []
+        figure.text(0.5, 0.5, "this problem has no control", ha="center", va="center", color="0.4")
+        return figure
     for input, ax in enumerate(figure.subplots(1, count, squeeze=False)[0]):
         drawn = plotting.policy(solution, input=input, fixed=fixed, ax=plotting.styled(ax))
-        artists += with_curve(drawn, solution, fixed, jumps, input)
-    return artists
+        with_curve(drawn, solution, fixed, jumps, input)
+    return figure
 
 
 def with_curve(
-    artists: list["Artist"], solution: Solution, fixed: dict[int, float], jumps: bool, input: int = 0
-) -> list["Artist"]:
+    picture: plotting.Picture, solution: Solution, fixed: dict[int, float], jumps: bool, input: int = 0
+) -> plotting.Picture:
     """A picture with the switching curve, where there is one."""
     # an enumerated control is no number that changes its sign; over one axis the jump is in the line itself
     if jumps and not solution.discrete and solution.grid.ndim > 1:
         with contextlib.suppress(ValueError):  # the control keeps its sign
-            artists += plotting.switching_curve(solution, input=input, fixed=fixed, ax=cast("Axes", artists[0].axes))
-    return artists
+            plotting.switching_curve(solution, input=input, fixed=fixed, ax=picture.ax)
+    return picture
 
 
 def difference(exact: Exact, solution: Solution) -> float | None:

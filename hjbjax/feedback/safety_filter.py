@@ -100,7 +100,13 @@ def least_restrictive(solution: Solution, nominal: GridFeedback | Callable, *, m
     if solution.policy is None or np.shape(solution.policy)[-1] == 0:
         raise ValueError("least_restrictive: the tube has no controls, so that there is nothing to take over with")
     tube = Solution(
-        solution.grid, solution.value, solution.policy, code=solution.code, times=solution.times, discrete=True
+        solution.grid,
+        solution.value,
+        solution.policy,
+        code=solution.code,
+        times=solution.times,
+        discrete=True,
+        labels=solution.labels,
     )  # discrete: the nearest node's action
     if margin is not None and not is_traced(margin) and not (np.isfinite(margin) and margin >= 0):
         raise ValueError(f"least_restrictive: margin = {margin!r}; wanted a finite number ≥ 0, in the units of V")

@@ -1,24 +1,28 @@
 """Pictures of values, feedbacks and closed loops.
 
-Every function draws on the ``ax`` it is given, or on a new figure of its own, and returns the list of
-artists it drew, the main one first; ``artists[0].get_figure().savefig("value.png")`` writes the picture.
-Nothing is shown and no global state is touched (no pyplot, no rcParams), so all of it works without a display.
+Every function draws on the ``ax`` it is given, or else on pyplot's current axes, and returns a ``Picture``: the list
+of the artists it drew, the main one first, with ``.figure`` and ``.save(path)``. Nothing is shown, no rcParams are
+touched, and where axes are given pyplot is not even imported.
 
 A picture has one or two axes. Fields over more states are cut by ``fixed={axis or name: coordinate}``,
 linearly between nodes as ``value_at`` does. Entries that are not finite are never drawn as
-numbers: they get a grey of their own and a line in the legend. A periodic axis is closed at its seam.
+numbers: they are hatched, with a line in the legend. A periodic axis is closed at its seam. Names and units come
+from ``Grid(names=, units=)`` and ``Problem(control_names=, control_units=)``; two axes with one unit of length have
+one scale, and angles have ticks at multiples of π. A solution that remembers its problem has its target outlined.
 """
 
 from hjbjax.plotting.costates import costates
 from hjbjax.plotting.estimates import density, estimates
 from hjbjax.plotting.level_sets import animation, zero_level_set
-from hjbjax.plotting.maps import closed_loop, controls, policy, residuals, switching_curve, trajectory, value
-from hjbjax.plotting.studies import convergence, perturbation
-from hjbjax.plotting.style import COLOURS, GREY, styled
+from hjbjax.plotting.maps import closed_loop, controls, policy, switching_curve, trajectory, value
+from hjbjax.plotting.studies import convergence, perturbation, residuals
+from hjbjax.plotting.style import COLOURS, GREY, Picture, styled
+from hjbjax.plotting.surfaces import level_surface
 
 __all__ = [
     "COLOURS",
     "GREY",
+    "Picture",
     "animation",
     "closed_loop",
     "controls",
@@ -26,6 +30,7 @@ __all__ = [
     "costates",
     "density",
     "estimates",
+    "level_surface",
     "perturbation",
     "policy",
     "residuals",

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hjbjax.plotting.style import COLOURS, axes_of, label_axes, legend
+from hjbjax.plotting.scales import set_ticks
+from hjbjax.plotting.style import COLOURS, Picture, axes_of, label_axes, legend
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 def costates(
     extremal: Extremal, *, solution: Solution | None = None, ax: Axes | None = None, names: Sequence[str] | None = None
-) -> list[Artist]:
+) -> Picture:
     """The costates of an extremal over time, and DV of a solution along its path: two roads to one curve.
 
     Args:
@@ -27,11 +28,11 @@ def costates(
 
     Keyword Args:
       solution: of the same problem on a grid, or ``None``; its DV is drawn broken, where the path is inside the grid.
-      ax: matplotlib axes to draw on; ``None`` makes a figure.
+      ax: matplotlib axes to draw on; ``None`` takes pyplot's current ones.
       names: of the states, in place of the grid's.
 
     Returns:
-      The artists: one line a state, then those of DV, then the legend.
+      The picture: one line a state, then those of DV, then the legend.
 
     Example:
       >>> from types import SimpleNamespace
@@ -57,4 +58,6 @@ def costates(
             style: dict[str, Any] = {"color": colours[i], "linewidth": 3.6, "alpha": 0.4, "linestyle": "--"}
             artists += ax.plot(times, slopes[:, i], label=f"DV, {names[i]}", **style)
     label_axes(ax, "t", "costate")
-    return [*artists, legend(ax)]
+    set_ticks(ax.xaxis, False)
+    set_ticks(ax.yaxis, False)
+    return Picture([*artists, legend(ax)], ax)

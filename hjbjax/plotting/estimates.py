@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hjbjax.plotting.scales import is_angle, set_ticks
+from hjbjax.plotting.shading import Look, draw
 from hjbjax.plotting.slices import section_of
-from hjbjax.plotting.style import COLOURS, axes_of, draw, label_axes, legend
+from hjbjax.plotting.style import COLOURS, Picture, axes_of, label_axes, legend
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.types import Array
 
@@ -27,7 +29,7 @@ def estimates(
     grid: Grid | None = None,
     ax: Axes | None = None,
     names: Sequence[str] | None = None,
-) -> list[Artist]:
+) -> Picture:
     """The states of a path over time, drawn, and their estimates, broken, each pair in one colour.
 
     Args:
@@ -37,11 +39,11 @@ def estimates(
       components: which states, from 0; ``None`` for all.
       measurements: whether the mean rates of the record, dy/dt over each interval, are drawn as dots.
       grid: whose periodic axes the estimates are turned about until they are next to the state; names the states.
-      ax: matplotlib axes to draw on; ``None`` makes a figure.
+      ax: matplotlib axes to draw on; ``None`` takes pyplot's current ones.
       names: of the states, in place of the grid's.
 
     Returns:
-      The artists: for each state its line and that of its estimate, then the dots, then the legend.
+      The picture: for each state its line and that of its estimate, then the dots, then the legend.
 
     Raises:
       ValueError: a batch of paths, or states that the path does not have.
@@ -62,7 +64,7 @@ def estimates(
     shown = list(range(count)) if components is None else [int(i) for i in components]
     if not shown or not all(0 <= i < count for i in shown):
         raise ValueError(f"estimates: got components = {components!r}; the path has states 0 to {count - 1}")
-    names = tuple(names or (grid.names if grid is not None else (f"x{i + 1}" for i in range(count))))
+    names = tuple(names or (grid.labels if grid is not None else (f"x{i + 1}" for i in range(count))))
     ax = axes_of(ax, wide=True)
     artists: list[Artist] = []
     for k, i in enumerate(shown):
@@ -84,7 +86,9 @@ def estimates(
             style: dict[str, Any] = {"color": COLOURS[(len(shown) + j) % len(COLOURS)], "markersize": 2, "alpha": 0.5}
             artists += ax.plot((times[:-1] + times[1:]) / 2, rates[:, j], ".", zorder=0, label=label, **style)
     label_axes(ax, "t", names[shown[0]] if len(shown) == 1 else "state")
-    return [*artists, legend(ax)]
+    set_ticks(ax.xaxis, False)
+    set_ticks(ax.yaxis, len(shown) == 1 and grid is not None and is_angle(grid, shown[0]))
+    return Picture([*artists, legend(ax)], ax)
 
 
 def density(
@@ -96,7 +100,7 @@ def density(
     estimate: Array | Sequence[float] | None = None,
     ax: Axes | None = None,
     colorbar: bool = True,
-) -> list[Artist]:
+) -> Picture:
     """A density on a grid over one or two of its axes, integrated over the others, with the true state in it.
 
     Args:
@@ -107,11 +111,11 @@ def density(
       axes: one or two axes, by number; ``None`` for the first two, or the only one.
       state: the true state, shape (n,), a ring over two axes and a line over one.
       estimate: of it, likewise, a cross and a broken line.
-      ax: matplotlib axes to draw on; ``None`` makes a figure.
+      ax: matplotlib axes to draw on; ``None`` takes pyplot's current ones.
       colorbar: whether a colour scale is drawn beside two-dimensional pictures.
 
     Returns:
-      The artists: the line or the mesh first, then the marks.
+      The picture: the line or the mesh first, then the marks.
 
     Raises:
       ValueError: a density of another shape than the grid, or axes that it does not have.
@@ -136,11 +140,13 @@ def density(
         tuple(grid.periodic[i] for i in kept),  # type: ignore[index]
         tuple(grid.names[i] for i in kept),
         stretch=tuple(grid.stretch[i] for i in kept),  # type: ignore[index]
+        units=tuple(grid.units[i] for i in kept),
     )
     others = tuple(i for i in range(grid.ndim) if i not in kept)
     marginal = np.sum(field * grid.volumes(), axis=others) / plane.volumes()
     ax = axes_of(ax)
-    artists = draw(ax, section_of("density", marginal, plane, None, ""), "density", "not finite", colorbar=colorbar)
+    section = section_of("density", marginal, plane, None, "")
+    artists = draw(ax, section, Look("density", "not finite", colorbar))
     for point, style, marker, label in ((state, "-", "o", "state"), (estimate, "--", "x", "estimate")):
         if point is None:
             continue
@@ -152,4 +158,4 @@ def density(
             artists += ax.plot(*place, marker, linestyle="none", label=label, zorder=5, **mark)
     if len(artists) > 1 and (state is not None or estimate is not None):
         legend(ax)
-    return artists
+    return Picture(artists, ax)

@@ -12,9 +12,24 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from hjbjax.plotting.slices import Cuts, Section, at_time, axis_number, section_of
-from hjbjax.plotting.style import COLOURS, axes_of, frame, label_axes, legend
+from hjbjax.plotting.scales import is_angle, set_ticks
+from hjbjax.plotting.shading import frame, outlined
+from hjbjax.plotting.slices import (
+    Cuts,
+    Section,
+    at_time,
+    axis_number,
+    closed_axis,
+    closed_field,
+    cut_field,
+    region_of,
+    section_of,
+    sets_of,
+)
+from hjbjax.plotting.style import COLOURS, Picture, axes_of, legend, solid_axes
+from hjbjax.plotting.surfaces import level_surface, lit, thinned
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.labels import SIDES, Labels
 
 if TYPE_CHECKING:
     from matplotlib.animation import FuncAnimation
@@ -24,7 +39,7 @@ if TYPE_CHECKING:
 
     from hjbjax.solution.solution import Solution
 
-LAYERS = 25  # cuts through the third axis
+OPACITY = 0.55  # of a surface: what lies behind it is seen
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,29 +61,30 @@ def zero_level_set(
     ax: Axes | None = None,
     fixed: Cuts | None = None,
     project: int | str | Sequence[int | str] = (),
-    inside: str = "below",
+    inside: str | None = None,
     time: float | None = None,
     color: str = COLOURS[0],
     label: str | None = None,
     fill: bool = True,
-) -> list[Artist]:
-    """The boundary of {V ≤ 0}: a curve over two axes, a stack of curves over three.
+) -> Picture:
+    """The boundary of {V ≤ 0}: a curve over two axes, a lit surface that can be seen through over three.
 
     Args:
       solution: the solution of ``solve`` or ``march``.
 
     Keyword Args:
-      ax: matplotlib axes to draw on, three-dimensional for three free axes; ``None`` makes a figure.
+      ax: matplotlib axes to draw on, three-dimensional for three free axes; ``None`` takes pyplot's current ones.
       fixed: coordinates of axes to cut at, by number or name.
       project: axes, by number or name, along which the set is projected.
-      inside: ``"below"`` for {V ≤ 0}, as of ``reach``; ``"above"`` for {V ≥ 0}, as of ``avoid``.
+      inside: ``"below"`` for {V ≤ 0}, as of ``reach``; ``"above"`` for {V ≥ 0}, as of ``avoid``; ``None`` asks the
+        problem that was solved.
       time: for a marched solution, which stored time to draw (the nearest one; ``None`` is the earliest).
       color: of the curve.
       label: of the curve in the legend; ``None`` leaves it out.
       fill: whether the set is shaded, over two axes.
 
     Returns:
-      The artists: the curve first, or the lowest of the stack; an empty list where the set is empty.
+      The picture: the curve or the surface first; without artists where the set is empty.
 
     Raises:
       ValueError: fewer than two or more than three axes are free, or an axis that does not exist.
@@ -80,7 +96,9 @@ def zero_level_set(
       >>> len(zero_level_set(SimpleNamespace(grid=grid, value=disc, times=None), fill=False))
       1
     """
-    if inside not in ("below", "above"):
+    if inside is None:
+        inside = getattr(solution, "labels", Labels()).inside
+    if inside not in SIDES:
         raise ValueError(f"zero_level_set: got inside = {inside!r}, wanted 'below' (V ≤ 0) or 'above' (V ≥ 0)")
     values, caption = at_time(solution, solution.value, time)
     sign = 1 if inside == "below" else -1  # from here on the set is {V ≤ 0} in either case
@@ -88,17 +106,19 @@ def zero_level_set(
     # by name: a projection has taken axes out, and the numbers of the others have changed
     cuts = {field.grid.names[axis_number(key, field.grid)]: place for key, place in dict(fixed or {}).items()}
     if field.grid.ndim - len(cuts) == 3:
-        return _stack(field, cuts, ax, color, label)
+        return _surface(field, cuts, solid_axes(ax), color, label)
     section = field.section(cuts)
     if len(section.axes) != 2:
         raise ValueError("zero_level_set: one axis is free; a level set is drawn over two or three")
     ax = axes_of(ax)
     artists = _curve(ax, section, color, fill)
     frame(ax, section)
+    artists += _outlines(ax, solution, section, time, bool(project))
     if label and artists:  # contours take no label: an empty line stands for them in the legend
         ax.plot([], [], color=color, linewidth=1.6, label=label)
+    if label or ax.get_legend_handles_labels()[1]:
         legend(ax)
-    return artists
+    return Picture(artists, ax)
 
 
 def _projection(field: Field, project: int | str | Sequence[int | str]) -> Field:
@@ -118,7 +138,7 @@ def _projection(field: Field, project: int | str | Sequence[int | str]) -> Field
 
     smaller = Grid(
         np.asarray(grid.lo)[stay], np.asarray(grid.hi)[stay], pick(grid.shape), pick(grid.periodic), pick(grid.names),
-        pick(grid.stretch),
+        pick(grid.stretch), units=pick(grid.units),
     )  # fmt: skip
     # a NaN above a point makes its minimum NaN, which is masked: nothing is said where something is unknown
     return Field(np.min(field.values, axis=tuple(gone)), smaller, field.caption)
@@ -138,43 +158,49 @@ def _curve(ax: Axes, section: Section, color: str, fill: bool) -> list[Artist]:
     return artists
 
 
-def _stack(field: Field, fixed: Mapping[str, float], ax: Axes | None, color: str, label: str | None) -> list[Artist]:
-    """Curves at many places of the third free axis, each in its own plane."""
-    if ax is None:
-        from matplotlib.figure import Figure
+def _outlines(ax: Axes, solution: Solution, section: Section, time: float | None, projected: bool) -> list[Artist]:
+    """The outlines of the sets that the problem is about, where they are known and not projected."""
+    if projected:
+        return []
+    regions = (region_of(function, section, name) for name, function in sets_of(solution, time).items())
+    return [artist for region in regions for artist in outlined(ax, region, inside=False)]
 
-        ax = Figure(figsize=(5.4, 4.6), layout="constrained").add_subplot(projection="3d")
+
+def _surface(field: Field, fixed: Mapping[str, float], ax: Any, color: str, label: str | None) -> Picture:
+    """The surface V = 0 over the three axes that are not fixed."""
+    from matplotlib.ticker import MaxNLocator
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-untyped]
+
     grid = field.grid
     free = [axis for axis in range(grid.ndim) if grid.names[axis] not in fixed]
-    third = free[2]
-    nodes = np.asarray(grid.axis(third))
-    # at nodes, all of them where there are fewer than so many; between nodes the values would have to be interpolated
-    places = nodes[np.unique(np.linspace(0, len(nodes) - 1, min(LAYERS, len(nodes))).round().astype(int))]
-    names = [grid.names[axis] for axis in free]
+    cuts = {grid.names.index(name): float(place) for name, place in fixed.items()}
+    closed = closed_field(cut_field("zero_level_set", field.values, grid, cuts), grid, free)
+    closed, lines = thinned(closed, [closed_axis(grid, axis) for axis in free])
+    triangles = level_surface(closed, lines)
     artists: list[Artist] = []
-    for place in places:
-        section = field.section({**fixed, names[2]: place})
-        known = section.values.compressed()
-        if known.size and known.min() < 0 < known.max():
-            x, y = section.coordinates
-            style: dict[str, Any] = {"levels": [0.0], "colors": color, "linewidths": 0.8, "zdir": "z", "offset": place}
-            artists.append(ax.contour(x, y, section.values.T, **style))
-    ax.set(xlim=_ends(grid, free[0]), ylim=_ends(grid, free[1]), zlim=_ends(grid, third), zlabel=names[2])
-    label_axes(ax, *names[:2])
+    if len(triangles):
+        colours = np.column_stack([lit(triangles, closed, lines, color), np.full(len(triangles), OPACITY)])
+        surface = Poly3DCollection(triangles, facecolors=colours, edgecolors="none", linewidths=0, antialiased=True)
+        surface.set(rasterized=True)  # as vectors, each triangle would show its edge
+        artists.append(ax.add_collection3d(surface))
+    ends = [(float(line[0]), float(line[-1])) for line in lines]
+    ax.set(xlim=ends[0], ylim=ends[1], zlim=ends[2])
+    for axis, number, text in zip((ax.xaxis, ax.yaxis, ax.zaxis), free, "xyz", strict=True):
+        axis.set_major_locator(MaxNLocator(4))  # seen from the side, more would run into each other
+        set_ticks(axis, is_angle(grid, number))
+        getattr(ax, f"set_{text}label")(grid.labels[number], labelpad=8)
+    ax.set_box_aspect((1, 1, 0.8), zoom=0.86)  # smaller than its frame, or the label on the right would be cut
+    if field.caption:
+        ax.set_title(field.caption, loc="right", fontsize=9)
     if label and artists:
-        ax.plot([], [], [], color=color, label=label)
+        ax.plot([], [], [], color=color, linewidth=4, alpha=OPACITY, label=label)
         ax.legend(frameon=False, fontsize=8)
-    return artists
-
-
-def _ends(grid: Grid, axis: int) -> tuple[float, float]:
-    """The two ends of an axis of the box."""
-    return float(grid.lo[axis]), float(grid.hi[axis])
+    return Picture(artists, ax)
 
 
 def animation(
     solution: Solution,
-    draw: Callable[..., list[Artist]] = zero_level_set,
+    draw: Callable[..., Picture] = zero_level_set,
     *,
     ax: Axes | None = None,
     interval: float = 100.0,
@@ -188,12 +214,12 @@ def animation(
         takes the solution, ``ax=`` and ``time=``.
 
     Keyword Args:
-      ax: matplotlib axes to draw on, wiped for every frame; ``None`` makes a figure.
+      ax: matplotlib axes to draw on, wiped for every frame; ``None`` takes pyplot's current ones.
       interval: milliseconds a frame.
       options: for ``draw``.
 
     Returns:
-      A matplotlib ``FuncAnimation``; keep it, and ``.save("tube.gif", writer="pillow")`` it.
+      A matplotlib ``FuncAnimation`` with its ``.figure``; keep it, and ``.save("tube.gif", writer="pillow")`` it.
 
     Raises:
       ValueError: a stationary solution.
@@ -202,14 +228,25 @@ def animation(
 
     if getattr(solution, "times", None) is None:
         raise ValueError("animation: the solution is stationary; march(..., times=np.linspace(0, horizon, 41)) moves")
-    axes = axes_of(ax)
+    axes = _moving_axes(solution, draw, ax, options)
 
     def frame_at(time: float) -> list[Artist]:
         axes.clear()  # contours have no data that could be replaced: every frame is drawn anew
         draw(solution, ax=axes, time=float(time), **options)
-        axes.set_title(f"t = {time:.3g}", loc="left", fontsize=9)
+        if not axes.get_title(loc="right"):  # where a function of the user's names no time
+            axes.set_title(f"t = {time:.3g}", loc="right", fontsize=9)
         return axes.get_children()
 
     # backwards: the horizon, where the march began, comes first
     frames = np.asarray(solution.times)[::-1]
-    return FuncAnimation(cast("Figure", axes.get_figure()), frame_at, frames=frames, interval=interval)
+    moving = FuncAnimation(cast("Figure", axes.get_figure()), frame_at, frames=frames, interval=interval)
+    setattr(moving, "figure", axes.get_figure())  # noqa: B010, as with every other picture; matplotlib has no name for it
+    return moving
+
+
+def _moving_axes(solution: Solution, draw: Callable[..., Any], ax: Axes | None, options: Mapping[str, Any]) -> Axes:
+    """The axes of an animation: three-dimensional ones where a surface is to be drawn."""
+    gone = options.get("project") or ()
+    gone = [gone] if isinstance(gone, (str, int)) else gone
+    free = solution.grid.ndim - len(options.get("fixed") or ()) - len(gone)
+    return solid_axes(ax) if draw is zero_level_set and free == 3 else axes_of(ax)

@@ -1,4 +1,4 @@
-"""Pictures over one or two axes of a value, a feedback, its switching curve; of paths and of residuals."""
+"""Pictures over one or two axes of a value, a feedback and its switching curve; and of paths."""
 
 from __future__ import annotations
 
@@ -8,14 +8,31 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hjbjax.plotting.slices import Cuts, at_time, feedback, line_in_box, nodes_in, section_of, without_jumps, zeros
-from hjbjax.plotting.style import COLOURS, axes_of, bands, draw, frame, label_axes, legend, styled
+from hjbjax.plotting.scales import is_angle, scale_axes, set_ticks
+from hjbjax.plotting.shading import Look, around, continued, draw, frame, is_level, jumps
+from hjbjax.plotting.slices import (
+    Cuts,
+    Region,
+    Section,
+    at_time,
+    feedback,
+    line_in_box,
+    region_of,
+    section_of,
+    span_of,
+    target_of,
+    without_jumps,
+    zeros,
+)
+from hjbjax.plotting.style import COLOURS, Picture, axes_of, label_axes, legend, new_figure, styled
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.labels import Labels
 from hjbjax.problem.types import Number, State
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
 
     from hjbjax.feedback.path import Path
     from hjbjax.solution.solution import Solution
@@ -30,31 +47,33 @@ def value(
     levels: int | Sequence[float] = 9,
     colorbar: bool = True,
     target: Callable[[State], Number] | None = None,
-) -> list[Artist]:
+) -> Picture:
     """The value function: a line over one axis, colours with contour lines over two.
 
     Args:
       solution: the solution of ``solve`` or ``march``.
 
     Keyword Args:
-      ax: matplotlib axes to draw on; ``None`` makes a figure.
+      ax: matplotlib axes to draw on; ``None`` takes pyplot's current ones.
       fixed: coordinates of the axes to cut at, by number or name, until at most two are free.
       time: for a marched solution, which stored time to draw (the nearest one; ``None`` is the earliest).
       levels: how many contour lines, or their values; 0 for none.
       colorbar: whether a colour scale is drawn beside two-dimensional pictures.
-      target: a function of the state, ≤ 0 inside, as ``problem.target``: over two axes its nodes are greyed out, since
-        what is held there need not be a value.
+      target: a function of the state, ≤ 0 inside, to be outlined and hatched over two axes, since what is held there
+        need not be a value; ``None`` takes that of the problem that was solved.
 
     Returns:
-      The artists: the line or the mesh first.
+      The picture: the line or the mesh first, with ``.figure`` and ``.save(path)``.
 
     Raises:
       ValueError: more than two axes are free, or ``fixed`` names an axis or a place that does not exist.
 
     Example:
       >>> from types import SimpleNamespace
+      >>> from matplotlib.figure import Figure
       >>> grid = Grid(lo=[-1.0], hi=[1.0], shape=(3,), names=("position",))
-      >>> artists = value(SimpleNamespace(grid=grid, value=np.array([1.0, 0.0, 1.0]), times=None))
+      >>> solution = SimpleNamespace(grid=grid, value=np.array([1.0, 0.0, 1.0]), times=None)
+      >>> artists = value(solution, ax=Figure().add_subplot())
       >>> artists[0].axes.get_xlabel(), artists[0].get_ydata().tolist()
       ('position', [1.0, 0.0, 1.0])
     """
@@ -63,15 +82,23 @@ def value(
     ax = axes_of(ax)
     # .data is what the mask hides: infinity is out of reach, NaN is something else and must not be called so
     hidden = "V = ∞" if np.all(np.isposinf(section.values.data[section.values.mask])) else "V not finite"
-    if target is not None and len(section.axes) == 2 and np.any(inside := nodes_in(target, solution.grid)):
-        hidden = f"target, or {hidden}" if np.ma.getmaskarray(section.values).any() else "target"
-        section = section_of("value", np.where(inside, np.nan, field), solution.grid, fixed, caption)
-    artists = draw(ax, section, "V", hidden, colorbar=colorbar)
+    section, regions = _without(section, target_of(solution, time) if target is None else target)
+    artists = draw(ax, section, Look("V", hidden, colorbar), regions)
     lines = _levels(section.values, levels) if len(section.axes) == 2 else ()
     if len(lines):
-        x, y = section.coordinates
-        artists.append(ax.contour(x, y, section.values.T, levels=lines, colors="white", linewidths=0.6, alpha=0.65))
-    return artists
+        shades = continued(section.values).T
+        style: dict[str, Any] = {"levels": lines, "colors": "white", "linewidths": 0.6, "alpha": 0.65}
+        artists.append(ax.contour(*section.coordinates, shades, **style))
+    return Picture(artists, ax)
+
+
+def _without(section: Section, target: Callable[[State], Number] | None) -> tuple[Section, tuple[Region, ...]]:
+    """The section with the nodes of the target masked, and the target to be outlined; over two axes alone."""
+    if target is None or len(section.axes) != 2:
+        return section, ()
+    region = region_of(target, section, "target")
+    mask = np.ma.getmaskarray(section.values) | region.nodes
+    return section._replace(values=np.ma.array(section.values.data, mask=mask)), (region,)
 
 
 def policy(
@@ -82,10 +109,11 @@ def policy(
     fixed: Cuts | None = None,
     time: float | None = None,
     colorbar: bool = True,
-) -> list[Artist]:
-    """One input of the feedback u(x): a line over one axis, diverging colours centred at zero over two.
+) -> Picture:
+    """One input of the feedback u(x): a line over one axis, over two colours that part at zero where the sign changes.
 
-    Nodes where no control is defined or the value is not finite are greyed out.
+    A feedback that jumps, or is enumerated, is drawn as cells, any other one smoothly. Where no control is defined or
+    the value is not finite the picture is hatched.
 
     Args:
       solution: the solution of ``solve`` or ``march``.
@@ -95,7 +123,15 @@ def policy(
       ax, fixed, time, colorbar: as for :func:`value`, with its result and its refusals.
     """
     section, label = feedback(solution, input, fixed, time)
-    return draw(axes_of(ax), section, label, "no control defined", colorbar=colorbar, diverging=True)
+    ax = axes_of(ax)
+    section, regions = _without(section, target_of(solution, time))
+    cells = getattr(solution, "discrete", False) or jumps(section.values.compressed())
+    span = span_of(solution, input)
+    inner = (slice(1, -1),) if len(section.axes) == 1 else ()
+    # the run ends at the two ends of a line: a hatch half a cell wide would tell nothing
+    hidden = "no control" if np.ma.getmaskarray(section.values)[inner].any() or len(section.axes) == 2 else ""
+    look = Look(label, hidden, colorbar, diverging=True, cells=cells, span=span)
+    return Picture(draw(ax, section, look, regions), ax)
 
 
 def switching_curve(
@@ -107,7 +143,7 @@ def switching_curve(
     time: float | None = None,
     color: str = "black",
     label: str | None = "switching curve",
-) -> list[Artist]:
+) -> Picture:
     """The curve on which one input changes sign: the zero level of the feedback, linear between nodes.
 
     A bang-bang feedback jumps between two nodes, so its curve is known to half a cell, as it is drawn. Over
@@ -141,7 +177,7 @@ def switching_curve(
     if label:  # on an empty line: contours take none
         artists += ax.plot([], [], label=label, **style)
         legend(ax)
-    return artists
+    return Picture(artists, ax)
 
 
 def trajectory(
@@ -153,7 +189,7 @@ def trajectory(
     names: Sequence[str] | None = None,
     color: str | None = None,
     label: str | None = None,
-) -> list[Artist]:
+) -> Picture:
     """A path in the plane of two states, or its states over time.
 
     Works on top of :func:`value` or :func:`policy`: pass their ``ax``. A ring marks the start, a dot the end.
@@ -162,7 +198,7 @@ def trajectory(
       path: the path of ``simulate``: ``times`` (k+1,) and ``states`` (k+1, n).
 
     Keyword Args:
-      ax: matplotlib axes to draw on; ``None`` makes a figure.
+      ax: matplotlib axes to draw on; ``None`` takes pyplot's current ones.
       axes: the two states of the plane; ``None``, or a path with one state, draws all states over time.
       grid: gives the names, and where periodic states are wrapped: the line is broken at the seam.
       names: names of the states, in place of the grid's.
@@ -170,7 +206,7 @@ def trajectory(
       label: of the line in the legend.
 
     Returns:
-      The artists: the line first, or one line a state.
+      The picture: the line first, or one line a state.
 
     Raises:
       ValueError: ``axes`` asks for states that the path does not have.
@@ -179,7 +215,7 @@ def trajectory(
 
     times, states = np.asarray(path.times), np.asarray(path.states)
     count = states.shape[1]
-    names = tuple(names or (grid.names if grid is not None else (f"x{i + 1}" for i in range(count))))
+    names = tuple(names or (grid.labels if grid is not None else (f"x{i + 1}" for i in range(count))))
     states = without_jumps(states, grid)
     if axes is None or count == 1:
         ax = axes_of(ax, wide=True)
@@ -188,7 +224,9 @@ def trajectory(
             ax.plot(times, states[:, i], color=next(colours), label=names[i])[0] for i in range(count)
         ]
         label_axes(ax, "t", names[0] if count == 1 else "state")
-        return artists if count == 1 else [*artists, legend(ax)]
+        set_ticks(ax.xaxis, False)
+        set_ticks(ax.yaxis, count == 1 and grid is not None and is_angle(grid, 0))
+        return Picture(artists if count == 1 else [*artists, legend(ax)], ax)
     if len(axes) != 2 or not all(0 <= i < count for i in axes):
         raise ValueError(f"trajectory: got axes={axes!r}; the path has {count} states, wanted two of 0 to {count - 1}")
     ax = axes_of(ax)
@@ -202,27 +240,33 @@ def trajectory(
     artists += ax.plot(*first, markerfacecolor="white", markeredgewidth=1.6, **marks)
     artists += ax.plot(*last, markerfacecolor=color, path_effects=casing, **marks)
     label_axes(ax, names[axes[0]], names[axes[1]])
+    if grid is not None:
+        scale_axes(ax, grid, axes)
     if label:
         legend(ax)
-    return artists
+    return Picture(artists, ax)
 
 
-def controls(path: Path, *, ax: Axes | None = None, names: Sequence[str] | None = None) -> list[Artist]:
+def controls(
+    path: Path, *, ax: Axes | None = None, names: Sequence[str] | None = None, solution: Solution | None = None
+) -> Picture:
     """The inputs of a path over time, each constant over its step; ``path.controls`` has shape (k, m).
 
     Args:
       path: the path of ``simulate``.
 
     Keyword Args:
-      ax: matplotlib axes to draw on; ``None`` makes a figure.
+      ax: matplotlib axes to draw on; ``None`` takes pyplot's current ones.
       names: of the inputs.
+      solution: gives the names, and the range beside which a variation counts as none.
 
     Returns:
-      The artists: one step line an input.
+      The picture: one step line an input.
     """
     times, inputs = np.asarray(path.times), np.asarray(path.controls)
     count = inputs.shape[1]
-    names = tuple(names or (("u",) if count == 1 else (f"u{i + 1}" for i in range(count))))
+    words = getattr(solution, "labels", Labels())
+    names = tuple(names or (words.control(i, count) for i in range(count)))
     ax = axes_of(ax, wide=True)
     colours = itertools.cycle(COLOURS)
     artists: list[Artist] = [
@@ -230,7 +274,12 @@ def controls(path: Path, *, ax: Axes | None = None, names: Sequence[str] | None 
         for i in range(count)
     ]
     label_axes(ax, "t", names[0] if count == 1 else "control")
-    return artists if count < 2 else [*artists, legend(ax)]
+    set_ticks(ax.xaxis, False)
+    set_ticks(ax.yaxis, False)
+    span = max((span_of(solution, i) for i in range(count)), default=0.0) if solution is not None else 0.0
+    if inputs.size and is_level(inputs, span):  # or the axis would show its rounding
+        ax.set_ylim(*around(float(np.mean(inputs)), span))
+    return Picture(artists if count < 2 else [*artists, legend(ax)], ax)
 
 
 def closed_loop(
@@ -240,7 +289,8 @@ def closed_loop(
     axes: tuple[int, int] = (0, 1),
     fixed: Cuts | None = None,
     target: Callable[[State], Number] | None = None,
-) -> list[Artist]:
+    figure: Figure | SubFigure | None = None,
+) -> Picture:
     """One figure: the path on the value function, and its states and inputs over time.
 
     Args:
@@ -251,16 +301,15 @@ def closed_loop(
       axes: the two states of the plane on the left; left out for one state.
       fixed: where the other axes are cut, by default at the path's start.
       target: as for :func:`value`.
+      figure: matplotlib figure to draw on; ``None`` makes one of pyplot's.
 
     Returns:
-      The artists: those of the value first.
+      The picture: the artists of the value first.
     """
-    from matplotlib.figure import Figure
-
     grid = solution.grid
     artists: list[Artist] = []
     plane, driven = grid.ndim > 1, np.shape(path.controls)[1] > 0
-    figure = Figure(figsize=(9.6 if plane else 5.4, 4.2), layout="constrained")
+    figure = figure or new_figure(closed_loop_size(grid))
     columns = figure.add_gridspec(1 + driven, 1 + plane, width_ratios=(1.25, 1.0)[: 1 + plane])
     if plane:
         start = np.asarray(path.states)[0]
@@ -274,49 +323,22 @@ def closed_loop(
     artists += trajectory(path, ax=upper, axes=None, grid=grid)
     if driven:
         upper.set_xlabel("")  # time is written once, below
-        artists += controls(path, ax=styled(figure.add_subplot(columns[1, -1], sharex=upper)))
+        lower = styled(figure.add_subplot(columns[1, -1], sharex=upper))
+        artists += controls(path, ax=lower, solution=solution)
         upper.tick_params(labelbottom=False)
-    return artists
+    return Picture(artists, ax if plane else upper)
 
 
-def residuals(solution: Solution, *, ax: Axes | None = None, label: str | None = None) -> list[Artist]:
-    """The residual after each step on a logarithmic scale; steps where it is not finite are marked grey.
-
-    Args:
-      solution: the solution of ``solve``; its history lives on the host and is kept by neither ``jit`` nor ``vmap``.
-
-    Keyword Args:
-      ax: matplotlib axes to draw on; ``None`` makes a figure.
-      label: of the line in the legend, to compare several.
-
-    Raises:
-      ValueError: the solution carries no history.
-    """
-    history = np.asarray(solution.residuals if solution.residuals is not None else (), dtype=float).ravel()
-    if history.size == 0:
-        raise ValueError(
-            "residuals: the solution carries no history; it stays behind under jit and vmap: use solve directly"
-        )
-    ax = axes_of(ax, wide=True)
-    steps = np.arange(1, history.size + 1)
-    drawable = np.isfinite(history) & (history > 0)  # an exact zero has no logarithm
-    shown = np.ma.masked_where(~drawable, history)
-    line = ax.plot(steps, shown, color=None if label else COLOURS[0], label=label)[0]
-    if history.size < 60:  # more marks than that would run together
-        line.set(marker="o", markersize=3)
-    ax.set_yscale("log")
-    artists = [line, *bands(ax, steps, ~np.isfinite(history), "not finite")]
-    label_axes(ax, "step", "residual")
-    if label or len(artists) > 1:
-        legend(ax)
-    return artists
+def closed_loop_size(grid: Grid) -> tuple[float, float]:
+    """The size of a closed loop's figure in inches: a plane beside the lines over time where there is one."""
+    return (9.6 if grid.ndim > 1 else 5.4), 4.2
 
 
 def _levels(values: np.ma.MaskedArray, levels: int | Sequence[float]) -> np.ndarray:
     """Contour levels strictly between the extremes, so that none is empty."""
     known = values.compressed()
-    if known.size == 0:
-        return known
+    if known.size == 0 or is_level(known):
+        return known[:0]
     # two more than wanted: those at the extremes are dropped, where a contour is a point or a speck of rounding
     places = np.linspace(known.min(), known.max(), levels + 2) if isinstance(levels, int) else np.sort(levels)
     return places[(places > known.min()) & (places < known.max())]

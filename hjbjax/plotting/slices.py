@@ -7,13 +7,15 @@ enumerated controls are cut at the nearest node. Entries that are not finite are
 import difflib
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import jax
 import numpy as np
 
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.labels import Labels
+from hjbjax.problem.sets import Ball, Box
 from hjbjax.problem.types import Array, Number, State
 
 if TYPE_CHECKING:
@@ -22,18 +24,51 @@ if TYPE_CHECKING:
 # where axes are cut, by their numbers or names; three times, since a type checker takes no {0: 1.0} for the last
 Cuts: TypeAlias = Mapping[int, float] | Mapping[str, float] | Mapping[int | str, float]
 CHUNK = 1 << 16  # states for which a function is evaluated at once, which bounds the memory of its intermediate arrays
+RASTER = 301  # points an axis on which a set is outlined: a disc of a tenth of the picture has 30 across
 ON_NODE = 1e-9  # of a cell: a coordinate this near to a node is meant to be it, 0.1 + 0.2 as well as 0.3
 COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight")
 
 
 class Section(NamedTuple):
-    """A field cut down to one or two axes: the axes, their names and coordinates, masked values, where it was cut."""
+    """A field cut down to one or two axes: the axes, their labels and coordinates, masked values, where it was cut."""
 
     axes: tuple[int, ...]
-    names: tuple[str, ...]
+    labels: tuple[str, ...]
     coordinates: tuple[np.ndarray, ...]
     values: np.ma.MaskedArray
     caption: str
+    grid: Grid
+    cuts: dict[int, float]  # by axis number
+
+    def states(self, coordinates: Sequence[np.ndarray]) -> np.ndarray:
+        """The states over a raster of the free axes, shape (*raster, n), the others where they are cut."""
+        raster = np.meshgrid(*coordinates, indexing="ij")
+        columns = dict(zip(self.axes, raster, strict=True))
+        return np.stack(
+            [columns.get(axis, np.full(raster[0].shape, self.cuts.get(axis))) for axis in range(self.grid.ndim)],
+            axis=-1,
+        )
+
+
+class Region(NamedTuple):
+    """A set in the plane of a section: its name, a fine raster with its function, ≤ 0 inside, the nodes within."""
+
+    label: str
+    coordinates: tuple[np.ndarray, ...]
+    level: np.ndarray
+    nodes: np.ndarray
+
+    @property
+    def visible(self) -> bool:
+        """True where there is something to be seen: a single point has no inside."""
+        return bool(np.min(self.level) < 0)
+
+
+def region_of(function: Callable[[State], Number], section: Section, label: str) -> Region:
+    """The set where a function of one state is ≤ 0, in the plane of a section over two axes."""
+    fine = tuple(np.linspace(line[0], line[-1], RASTER) for line in section.coordinates)
+    level, nodes = (at_states(function, section.states(lines)) for lines in (fine, section.coordinates))
+    return Region(label, fine, np.where(np.isfinite(level), level, 1.0), nodes <= 0)
 
 
 def at_time(solution: "Solution", field: Array, time: float | None) -> tuple[np.ndarray, str]:
@@ -49,9 +84,47 @@ def at_time(solution: "Solution", field: Array, time: float | None) -> tuple[np.
     return field[index], f"t = {times[index]:.4g}"
 
 
-def nodes_in(target: Callable[[State], Number], grid: Grid) -> np.ndarray:
-    """The nodes that lie in a target, a bool (*grid)."""
-    return at_states(target, grid.nodes()) <= 0
+def target_of(solution: "Solution", time: float | None = None) -> Callable[[State], Number] | None:
+    """The target of the problem that a solution answers, at the time that is drawn; ``None`` where none is known."""
+    problem = getattr(solution, "problem", None)
+    if problem is None or problem.target is None:
+        return None
+    if not problem.time_dependent:
+        return problem.target
+    moment = _moment(solution, time)
+    return lambda x: problem.target(moment, x)
+
+
+def sets_of(solution: "Solution", time: float | None = None) -> dict[str, Callable[[State], Number]]:
+    """The sets whose signed distances a problem of reachability is made of, by name, as functions ≤ 0 inside."""
+    problem = getattr(solution, "problem", None)
+    if problem is None or problem.target is not None or problem.cost is not None:
+        return {}
+    moment = _moment(solution, time) if problem.time_dependent else 0.0
+    above = problem.inside == "above"
+
+    def at(function: Callable, sign: int) -> Callable[[State], Number]:
+        return lambda x: sign * function(*problem.state_arguments(x, moment))
+
+    end = problem.terminal_cost if callable(problem.terminal_cost) else None
+    least = problem.stopping_cost if callable(problem.stopping_cost) else None if above else end
+    most = problem.running_max if problem.running_max is not None else end if above else None
+    sets = {"target": (least, 1), "obstacle": (most, -1)}  # V ≥ −o: the obstacle is where the maximum is ≥ 0
+    return {name: at(function, sign) for name, (function, sign) in sets.items() if function is not None}
+
+
+def _moment(solution: "Solution", time: float | None) -> float:
+    """The stored time that is drawn."""
+    times = np.asarray(solution.times, float)
+    return float(times[np.argmin(times if time is None else np.abs(times - time))])
+
+
+def span_of(solution: "Solution", input: int) -> float:
+    """The length of the range of one control; 0 where it is not known."""
+    controls = getattr(getattr(solution, "problem", None), "controls", None)
+    if isinstance(controls, Box):
+        return float(controls.hi[input] - controls.lo[input])
+    return 2 * float(controls.radius) if isinstance(controls, Ball) else 0.0
 
 
 def at_states(function: Callable[[State], Number], states: np.ndarray) -> np.ndarray:
@@ -76,7 +149,8 @@ def feedback(solution: "Solution", input: int, fixed: Cuts | None, time: float |
     known = np.isfinite(at_time(solution, solution.value, time)[0])
     field = np.where(known, inputs[..., input], np.nan)
     nearest = getattr(solution, "discrete", False)  # the mean of two enumerated controls need not be admissible
-    return section_of("policy", field, solution.grid, fixed, caption, nearest), "u" if count == 1 else f"u{input + 1}"
+    label = getattr(solution, "labels", Labels()).control(input, count)
+    return section_of("policy", field, solution.grid, fixed, caption, nearest), label
 
 
 def section_of(
@@ -103,17 +177,15 @@ def section_of(
     free = tuple(axis for axis in range(grid.ndim) if axis not in cuts)
     if not 1 <= len(free) <= 2:
         raise ValueError(f"{what}: {_how_many(grid, free)}")
-    for axis in sorted(cuts, reverse=True):  # the last first: a cut takes its axis out, and those behind move up
-        field = _cut(what, field, grid, axis, cuts[axis], nearest)
-    for position, axis in enumerate(free):
-        # (M, …) becomes (M + 1, …): the first row once more at the upper end, so that no gap is left at the seam
-        if grid.periodic[axis]:  # type: ignore[index]
-            field = np.concatenate([field, np.take(field, [0], position)], position)
-    coordinates = tuple(_closed_axis(grid, axis) for axis in free)
-    places = [caption] * bool(caption) + [f"{grid.names[axis]} = {cuts[axis]:.4g}" for axis in sorted(cuts)]
+    field = closed_field(cut_field(what, field, grid, cuts, nearest), grid, free)
+    coordinates = tuple(closed_axis(grid, axis) for axis in free)
+    units = [f" {unit}" if unit else "" for unit in grid.units]
+    places = [caption] * bool(caption)
+    places += [f"{grid.names[axis]} = {cuts[axis]:.4g}{units[axis]}" for axis in sorted(cuts)]
     return Section(
-        free, tuple(grid.names[axis] for axis in free), coordinates, np.ma.masked_invalid(field), ", ".join(places)
-    )
+        free, tuple(grid.labels[axis] for axis in free), coordinates, np.ma.masked_invalid(field), ", ".join(places),
+        grid, cuts,
+    )  # fmt: skip
 
 
 def _how_many(grid: Grid, free: tuple[int, ...]) -> str:
@@ -140,6 +212,21 @@ def axis_number(key: object, grid: Grid) -> int:
     raise ValueError(f"fixed: got axis {key!r}, wanted one of {', '.join(grid.names)} or 0 to {grid.ndim - 1}{hint}")
 
 
+def cut_field(what: str, field: np.ndarray, grid: Grid, cuts: Mapping[int, float], nearest: bool = False) -> np.ndarray:
+    """A field at the nodes over the axes that are left where the others are cut, by axis number."""
+    for axis in sorted(cuts, reverse=True):  # the last first: a cut takes its axis out, and those behind move up
+        field = _cut(what, field, grid, axis, cuts[axis], nearest)
+    return field
+
+
+def closed_field(field: np.ndarray, grid: Grid, free: Sequence[int]) -> np.ndarray:
+    """A field over the free axes with the first row once more at the upper end of each periodic one: no gap is left."""
+    for position, axis in enumerate(free):
+        if grid.periodic[axis]:  # type: ignore[index]
+            field = np.concatenate([field, np.take(field, [0], position)], position)
+    return field
+
+
 def _cut(what: str, field: np.ndarray, grid: Grid, axis: int, place: float, nearest: bool) -> np.ndarray:
     """Linear interpolation along one axis; a neighbour of weight zero, infinite or not, does not count."""
     lo, hi, last = float(grid.lo[axis]), float(grid.hi[axis]), grid.intervals(axis)
@@ -148,7 +235,7 @@ def _cut(what: str, field: np.ndarray, grid: Grid, axis: int, place: float, near
     slack = ON_NODE * (hi - lo) / last
     if not lo - slack <= place <= hi + slack:  # written so that NaN is refused
         raise ValueError(f"{what}: got {grid.names[axis]} = {place:g}, which is outside the grid, [{lo:g}, {hi:g}]")
-    nodes = _closed_axis(grid, axis)  # where an axis is stretched cells are not of one width
+    nodes = closed_axis(grid, axis)  # where an axis is stretched cells are not of one width
     position = float(np.interp(place, nodes, np.arange(len(nodes))))
     # on a node but for rounding; otherwise 0·∞ of the neighbour without weight would grey out a whole slice
     if nearest or abs(position - round(position)) < ON_NODE:
@@ -159,7 +246,7 @@ def _cut(what: str, field: np.ndarray, grid: Grid, axis: int, place: float, near
         return (cell + 1 - position) * left + (position - cell) * right
 
 
-def _closed_axis(grid: Grid, axis: int) -> np.ndarray:
+def closed_axis(grid: Grid, axis: int) -> np.ndarray:
     """The coordinates of an axis; a periodic one gets its upper end as well."""
     nodes = np.asarray(grid.axis(axis))
     return np.append(nodes, grid.hi[axis]) if grid.periodic[axis] else nodes  # type: ignore[index]

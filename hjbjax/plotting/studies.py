@@ -1,4 +1,4 @@
-"""Pictures of studies: errors over spacings, and changes over noise and disturbances, with the fitted orders."""
+"""Pictures of how a solve went and of studies: residuals, errors over spacings, changes over noise, fitted orders."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from hjbjax.plotting.style import COLOURS, GREY, axes_of, label_axes, legend, logarithmic, pair_of_axes
+from hjbjax.plotting.shading import bands
+from hjbjax.plotting.style import COLOURS, GREY, Picture, axes_of, label_axes, legend, logarithmic, pair_of_axes
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -15,9 +16,10 @@ if TYPE_CHECKING:
 
     from hjbjax.applications.convergence import Study
     from hjbjax.applications.perturbations import Perturbation
+    from hjbjax.solution.solution import Solution
 
 
-def convergence(study: Study, *, ax: Axes | Sequence[Axes] | np.ndarray | None = None) -> list[Artist]:
+def convergence(study: Study, *, ax: Axes | Sequence[Axes] | np.ndarray | None = None) -> Picture:
     """The errors of a convergence study over the spacing and over the seconds, with the fitted orders.
 
     Full marks are the largest errors, rings the mean ones; the thin line beside the full marks has the fitted
@@ -28,7 +30,7 @@ def convergence(study: Study, *, ax: Axes | Sequence[Axes] | np.ndarray | None =
 
     Keyword Args:
       ax: matplotlib axes to draw on: one for the errors over the spacing, or two, the second for the seconds;
-        ``None`` makes a figure with both.
+        ``None`` makes a figure of pyplot's with both.
 
     Returns:
       The artists: the line of the largest errors over the spacing first.
@@ -59,10 +61,10 @@ def convergence(study: Study, *, ax: Axes | Sequence[Axes] | np.ndarray | None =
         logarithmic(place, study.h if name == "h" else None)
         label_axes(place, name, "" if own and name == "seconds" else quality)
         legend(place)
-    return artists
+    return Picture(artists, axes[0])
 
 
-def perturbation(study: Perturbation, *, ax: Axes | None = None) -> list[Artist]:
+def perturbation(study: Perturbation, *, ax: Axes | None = None) -> Picture:
     """The changes of value and feedback over ε and over 1/γ in one picture, with the fitted orders.
 
     Full marks are values, rings feedbacks; the thin grey line beside the full marks has the fitted slope.
@@ -71,7 +73,7 @@ def perturbation(study: Perturbation, *, ax: Axes | None = None) -> list[Artist]
       study: the result of ``perturbation_study``.
 
     Keyword Args:
-      ax: matplotlib axes to draw on; ``None`` makes a figure.
+      ax: matplotlib axes to draw on; ``None`` takes pyplot's current ones.
 
     Returns:
       The artists: the line of the values over ε first.
@@ -100,4 +102,37 @@ def perturbation(study: Perturbation, *, ax: Axes | None = None) -> list[Artist]
     label_axes(ax, "ε, 1/γ", "largest change")
     # lines that rise leave this corner free
     artists.append(ax.legend(loc="upper left", fontsize=8, frameon=False, borderaxespad=0.2, handlelength=1.4))
-    return artists
+    return Picture(artists, ax)
+
+
+def residuals(solution: Solution, *, ax: Axes | None = None, label: str | None = None) -> Picture:
+    """The residual after each step on a logarithmic scale; steps where it is not finite are marked grey.
+
+    Args:
+      solution: the solution of ``solve``; its history lives on the host and is kept by neither ``jit`` nor ``vmap``.
+
+    Keyword Args:
+      ax: matplotlib axes to draw on; ``None`` takes pyplot's current ones.
+      label: of the line in the legend, to compare several.
+
+    Raises:
+      ValueError: the solution carries no history.
+    """
+    history = np.asarray(solution.residuals if solution.residuals is not None else (), dtype=float).ravel()
+    if history.size == 0:
+        raise ValueError(
+            "residuals: the solution carries no history; it stays behind under jit and vmap: use solve directly"
+        )
+    ax = axes_of(ax, wide=True)
+    steps = np.arange(1, history.size + 1)
+    drawable = np.isfinite(history) & (history > 0)  # an exact zero has no logarithm
+    shown = np.ma.masked_where(~drawable, history)
+    line = ax.plot(steps, shown, color=None if label else COLOURS[0], label=label)[0]
+    if history.size < 60:  # more marks than that would run together
+        line.set(marker="o", markersize=3)
+    ax.set_yscale("log")
+    artists: list[Artist] = [line, *bands(ax, steps, ~np.isfinite(history), "not finite")]
+    label_axes(ax, "step", "residual")
+    if label or len(artists) > 1:
+        legend(ax)
+    return Picture(artists, ax)

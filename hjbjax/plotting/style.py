@@ -1,24 +1,24 @@
-"""What every picture stands on: axes that no global registry knows, one theme, and a section drawn on them.
+"""What every picture stands on: the picture that is returned, its axes, one theme, labels and the legend.
 
-Nothing here knows what the numbers mean. Only functions import matplotlib, and none imports pyplot.
+Nothing here knows what the numbers mean. Only functions import matplotlib, and pyplot only where no axes are given.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from hjbjax.plotting.slices import Section
-
 if TYPE_CHECKING:
+    import os
+
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
     from matplotlib.legend import Legend
 
 GREY = "#c9c9c9"
-FLAT = 1e-4  # a line that varies by less than this share of itself is drawn level: what a solve leaves of a constant
 COLOURS = (
     "#0072b2",
     "#d55e00",
@@ -28,23 +28,79 @@ COLOURS = (
     "#56b4e9",
     "#000000",
 )  # Okabe and Ito: safe for all eyes
+NARROW, WIDE, SOLID = (5.4, 4.2), (5.4, 3.2), (5.4, 4.8)  # inches: of planes, of lines over time, of surfaces
+DPI = 200  # of saved pictures, unless given
+
+
+class Picture(list):
+    """The artists that a function drew, the main one first, with the figure that they are on.
+
+    Args:
+      artists: in the order in which they were drawn.
+      ax: the axes drawn on, the first of them where there are several.
+    """
+
+    def __init__(self, artists: Iterable[Artist], ax: Axes):
+        super().__init__(artists)
+        self.ax = ax
+
+    @property
+    def figure(self) -> Figure:
+        """The whole figure, also where the axes are on a part of it."""
+        return cast("Figure", self.ax.get_figure(root=True))
+
+    def save(self, path: str | os.PathLike, **options: Any) -> None:
+        """Write the figure to ``path``; the ending says the format, and ``options`` are those of ``savefig``."""
+        self.figure.savefig(path, **{"dpi": DPI, **options})
+
+    def __repr__(self) -> str:
+        return f"Picture of {len(self)} artists"
 
 
 def axes_of(ax: Axes | None, *, wide: bool = False) -> Axes:
-    """The axes given, or those of a new figure that no global registry knows."""
+    """The axes given, or pyplot's current ones; where there are none, a new figure of pyplot's."""
     if ax is not None:
         return ax
-    from matplotlib.figure import Figure  # pyplot would keep every figure alive until somebody closes it
+    from matplotlib import pyplot
 
-    return styled(Figure(figsize=(5.4, 3.2) if wide else (5.4, 4.2), layout="constrained").add_subplot())
+    if not pyplot.get_fignums():
+        pyplot.figure(figsize=WIDE if wide else NARROW, layout="constrained")
+    return styled(pyplot.gca())
+
+
+def solid_axes(ax: Axes | None) -> Any:
+    """The three-dimensional axes given or pyplot's current ones; a new figure where the current ones are flat.
+
+    Raises:
+      ValueError: flat axes were given.
+    """
+    if ax is not None:
+        if ax.name != "3d":
+            raise ValueError(
+                "zero_level_set: got flat axes for three free states; give axes of projection='3d', or cut one state "
+                "by fixed={...}"
+            )
+        return ax
+    from matplotlib import pyplot
+
+    figure = pyplot.gcf() if pyplot.get_fignums() else pyplot.figure(figsize=SOLID, layout="constrained")
+    if figure.axes and figure.gca().name == "3d":
+        return figure.gca()
+    if figure.axes:  # something flat was drawn there
+        figure = pyplot.figure(figsize=SOLID, layout="constrained")
+    return figure.add_subplot(projection="3d")
+
+
+def new_figure(size: tuple[float, float]) -> Figure:
+    """A new figure of pyplot's."""
+    from matplotlib import pyplot
+
+    return pyplot.figure(figsize=size, layout="constrained")
 
 
 def pair_of_axes() -> list[Axes]:
     """Two axes side by side on a new figure, with one vertical scale."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8.0, 3.6), layout="constrained")
-    return [styled(ax) for ax in figure.subplots(1, 2, sharey=True)]
+    return [styled(ax) for ax in new_figure((8.0, 3.6)).subplots(1, 2, sharey=True)]
 
 
 def logarithmic(ax: Axes, places: np.ndarray | None = None) -> None:
@@ -79,65 +135,6 @@ def styled(ax: Axes) -> Axes:
     return ax
 
 
-def draw(
-    ax: Axes, section: Section, label: str, hidden: str, *, colorbar: bool, diverging: bool = False
-) -> list[Artist]:
-    """One section as a line or as a colour mesh, with what is hidden in grey."""
-    from matplotlib import colormaps
-
-    known, mask = section.values.compressed(), np.ma.getmaskarray(section.values)
-    if len(section.axes) == 1:
-        artists: list[Artist] = [*ax.plot(section.coordinates[0], section.values, color=COLOURS[0], linewidth=1.6)]
-        artists += bands(ax, section.coordinates[0], mask, hidden)
-        middle = np.mean(known) if known.size else 0.0
-        if known.size and np.ptp(known) < FLAT * abs(middle):  # or the axis would show its rounding
-            ax.set_ylim(*sorted((0.5 * middle, 1.5 * middle)))
-    else:
-        # zero is the middle of the diverging colours; known.any() is False without numbers and for zeros alone
-        largest = np.abs(known).max() if known.any() else 1.0
-        limits = (-largest, largest) if diverging else (known.min(), known.max()) if known.size else (0.0, 1.0)
-        colours = colormaps["coolwarm" if diverging else "viridis"].with_extremes(bad=GREY)
-        # rasterized: a mesh of 200 x 200 as vectors would make a PDF of 40 000 little rectangles
-        style: dict[str, Any] = {"cmap": colours, "vmin": limits[0], "vmax": limits[1], "rasterized": True}
-        # (M₁, M₂) is transposed: matplotlib's rows go upwards, and our first axis to the right
-        mesh = ax.pcolormesh(*section.coordinates, section.values.T, shading="nearest", **style)
-        artists = [mesh]
-        if mask.any():  # an empty line, for the legend's sake
-            artists += ax.plot([], [], "s", color=GREY, markersize=8, label=hidden)
-        if colorbar:
-            bar = ax.figure.colorbar(mesh, ax=ax, label=label, fraction=0.06, pad=0.03)
-            bar.outline.set_visible(False)
-            bar.ax.tick_params(width=0.8, length=3, labelsize=9)
-    frame(ax, section, label)
-    if mask.any():
-        legend(ax)
-    return artists
-
-
-def bands(ax: Axes, x: np.ndarray, mask: np.ndarray, label: str) -> list[Artist]:
-    """Grey bands over the runs of masked nodes, half a cell beyond each end; the first one is labelled."""
-    # a zero at either end, so that every run has a beginning (even entries) and an end (odd ones)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
-    cells = np.diff(x) / 2 if len(x) > 1 else np.array([0.5])  # half of each; an axis may be stretched
-    borders = np.concatenate([[x[0] - cells[0]], x[:-1] + cells[: len(x) - 1], [x[-1] + cells[-1]]])
-    runs = zip(edges[::2], edges[1::2], strict=True)
-    return [
-        ax.axvspan(borders[a], borders[b], color=GREY, linewidth=0, zorder=0, label=None if k else label)
-        for k, (a, b) in enumerate(runs)
-    ]
-
-
-def frame(ax: Axes, section: Section, label: str = "") -> None:
-    """Limits of the box, names and the caption of the cut."""
-    # to the outermost nodes: cells of a mesh reach half a cell beyond them
-    ax.set_xlim(*section.coordinates[0][[0, -1]])
-    if len(section.axes) == 2:
-        ax.set_ylim(*section.coordinates[1][[0, -1]])
-    label_axes(ax, *section.names if len(section.axes) == 2 else (section.names[0], label))
-    if section.caption:
-        ax.set_title(section.caption, loc="right", fontsize=9)
-
-
 def label_axes(ax: Axes, x: str, y: str) -> None:
     """Labels, where the axes have none yet: a path on top of a value keeps the value's."""
     if not ax.get_xlabel():
@@ -147,13 +144,10 @@ def label_axes(ax: Axes, x: str, y: str) -> None:
 
 
 def legend(ax: Axes) -> Legend:
-    """The legend, with all that has a label so far: in a corner of a mesh, above lines, which it would hide.
+    """The legend, with all that has a label so far, above the axes, where it hides nothing.
 
-    The search for a free corner is left out: it is slow on large pictures.
+    It stands above the caption where there is one: both would share a line.
     """
-    from matplotlib.collections import QuadMesh
-
-    style: dict[str, Any] = {"fontsize": 8, "edgecolor": "none", "handlelength": 1.4}
-    if any(isinstance(artist, QuadMesh) for artist in ax.collections):
-        return ax.legend(loc="upper right", framealpha=0.85, **style)
-    return ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=6, frameon=False, borderaxespad=0.2, **style)
+    height = 1.07 if ax.get_title(loc="right") else 1.0
+    style: dict[str, Any] = {"fontsize": 8, "edgecolor": "none", "handlelength": 1.6, "columnspacing": 1.2}
+    return ax.legend(loc="lower left", bbox_to_anchor=(0.0, height), ncols=4, frameon=False, borderaxespad=0.2, **style)

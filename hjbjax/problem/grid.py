@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem import grid_arguments
+from hjbjax.problem.labels import with_unit, words
 from hjbjax.problem.pytree import altered, is_traced, known, pytree_dataclass
 from hjbjax.problem.stretching import Stretching
 from hjbjax.problem.types import Array, DType, Number, Numbers, States
@@ -25,7 +26,7 @@ COINCIDING = 16  # units in the last place of a coordinate, of which a spacing m
 TABLED = 2**24  # points of an axis whose coordinates are kept, 128 MiB; a grid too large must not allocate them before
 
 
-@pytree_dataclass(static=("shape", "periodic", "names", "edges"))
+@pytree_dataclass(static=("shape", "periodic", "names", "edges", "units"))
 class Grid:
     """A grid of nodes on a box in R^n, uniform along every axis that is not stretched.
 
@@ -42,6 +43,7 @@ class Grid:
         "constrained": actions whose drift leaves are not admissible: the state-constrained problem.
         "open": paths may leave; the value goes on beyond the end as the parabola through its last three nodes.
         Noise reflects at a projected and at a constrained end, on the node itself, and goes on at an open one.
+      units: one unit an axis, as in ("rad", "rad/s"), for pictures and printed tables; empty where there is none.
 
     Raises:
       ValueError: bounds that are not finite or not increasing, lengths that differ, or an unknown kind of end.
@@ -60,6 +62,7 @@ class Grid:
     names: tuple[str, ...] = ()
     stretch: tuple[Stretching | None, ...] | None = None
     edges: Any = "projected"
+    units: tuple[str, ...] = ()
     coordinates: tuple[Any, ...] = dataclasses.field(init=False, repr=False)
 
     def __post_init__(self):
@@ -80,8 +83,10 @@ class Grid:
                 if not (math.isfinite(low) and math.isfinite(high) and low < high):
                     raise ValueError(f"Grid: axis {axis} runs from {low:g} to {high:g}; wanted finite lo < hi")
         edges = grid_arguments.kinds_of_ends(self.edges, periodic, shape)
+        units = words(self.units, len(shape), "Grid.units") or ("",) * len(shape)
         checked = {
-            "lo": lo, "hi": hi, "shape": shape, "periodic": periodic, "names": names, "stretch": stretch, "edges": edges
+            "lo": lo, "hi": hi, "shape": shape, "periodic": periodic, "names": names, "stretch": stretch,
+            "edges": edges, "units": units,
         }  # fmt: skip
         for name, value in checked.items():
             object.__setattr__(self, name, value)
@@ -111,6 +116,11 @@ class Grid:
     def ndim(self) -> int:
         """The number of states n."""
         return len(self.shape)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """One text an axis: its name, and its unit in brackets where there is one."""
+        return tuple(map(with_unit, self.names, self.units))
 
     @property
     def size(self) -> int:

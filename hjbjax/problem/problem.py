@@ -14,12 +14,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hjbjax.problem import labels as labelling
+from hjbjax.problem.labels import Labels
 from hjbjax.problem.pytree import as_partial, is_traced, numbers, pytree_dataclass
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite
 from hjbjax.problem.types import Control, Disturbance, Number, Numbers, State
 
 
-@pytree_dataclass(static=("isaacs", "time_dependent", "discounted"))
+@pytree_dataclass(static=("isaacs", "time_dependent", "control_names", "control_units", "inside", "discounted"))
 class Problem:
     """An optimal control problem or a two-player zero-sum differential game.
 
@@ -44,6 +46,9 @@ class Problem:
       running_max: g, the cost is the running maximum of g: V ≥ g. Needs zero running cost and no discount.
       isaacs: ``"upper"`` is min over u of max over d (the disturbance sees u), ``"lower"`` is max min.
       time_dependent: whether the functions take the time as their first argument.
+      control_names, control_units: one text a control each, for pictures, as in ("torque",) and ("N m",).
+      inside: which side of its zero level is the set that the problem is about, for pictures: ``"below"`` for
+        {V ≤ 0}, ``"above"`` for {V ≥ 0}, as in ``avoid``.
 
     Raises:
       ValueError: an ingredient that contradicts another, or a number that is not admissible.
@@ -68,6 +73,9 @@ class Problem:
     running_max: Any = None
     isaacs: str = "upper"
     time_dependent: bool = False
+    control_names: tuple[str, ...] = ()
+    control_units: tuple[str, ...] = ()
+    inside: str = "below"
     discounted: bool | None = dataclasses.field(init=False, default=None, repr=False)
 
     def __init__(
@@ -86,10 +94,14 @@ class Problem:
         running_max: Callable | None = None,
         isaacs: str = "upper",
         time_dependent: bool = False,
+        control_names: Sequence[str] = (),
+        control_units: Sequence[str] = (),
+        inside: str = "below",
     ):
         if not callable(drift):
             raise TypeError(f"Problem.drift: got {drift!r}, wanted a function (x, u) -> (n,)")
         _check_sets(controls, disturbances)
+        words = labelling.checked(control_names, control_units, inside, 0 if controls is None else controls.dim)
         # static: the order of min and max is part of a compiled program
         if isaacs not in ("upper", "lower"):
             raise ValueError(f"Problem.isaacs: got {isaacs!r}, wanted 'upper' (min max) or 'lower' (max min)")
@@ -119,11 +131,19 @@ class Problem:
             "running_max": as_partial(running_max, "Problem.running_max"),
             "isaacs": isaacs,
             "time_dependent": bool(time_dependent),
+            "control_names": words.controls,
+            "control_units": words.control_units,
+            "inside": words.inside,
             # in the structure, as ``jit`` hides numbers: which certificate holds must be known while compiling
             "discounted": None if is_traced(discount) else bool(discount > 0),
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)
+
+    @property
+    def labels(self) -> Labels:
+        """The words for pictures: names and units of the controls, and the side of the level set."""
+        return Labels(self.control_names, self.control_units, self.inside)
 
     @property
     def is_game(self) -> bool:

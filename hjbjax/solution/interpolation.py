@@ -280,3 +280,21 @@ def _corners(grid: Grid, values: Array, x: jax.Array, clamp: bool, when: Moment 
             weight = weight * (fraction if bit else 1 - fraction)
         nodes = tuple((cell + bit) % n for cell, bit, n in zip(cells, corner, grid.shape, strict=True))
         yield weight, hidden, values[moment + nodes]
+
+
+def check_query(solution: Any, name: str, values: Array, trailing: int, where: tuple) -> tuple[Any, Any]:
+    """The time, None if stationary, and the state; refuses a time too many or too few, and batches."""
+    marched = solution.times is not None
+    if len(where) != 1 + marched:
+        kind, call = ("marched over times", f"{name}(t, x)") if marched else ("stationary", f"{name}(x)")
+        raise ValueError(f"Solution.{name}: got {len(where)} arguments; this solution is {kind}: call {call}")
+    # one axis too many is that of a batch, which interpolation would take for an axis of the grid
+    shape, wanted = np.shape(values), solution.grid.shape
+    if marched:
+        wanted = np.shape(solution.times) + wanted
+    if shape[: len(wanted)] != wanted or len(shape) != len(wanted) + trailing:
+        raise ValueError(
+            f"Solution.{name}: got node values of shape {shape} on a grid of shape {wanted}; of a batch of solutions "
+            f"ask one at a time, as in jax.vmap(lambda solution, x: solution.{name}(x))"
+        )
+    return (where[0] if marched else None), where[-1]

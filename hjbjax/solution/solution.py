@@ -14,7 +14,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from hjbjax.problem import labels as labelling
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.labels import Labels
+from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
 from hjbjax.problem.stretching import Sinh
 from hjbjax.problem.types import Array, Numbers
@@ -25,6 +28,7 @@ from hjbjax.solution.interpolation import (
     Samples,
     between,
     between_defined,
+    check_query,
     nearest,
     query,
     slopes_between,
@@ -58,7 +62,9 @@ class SolveError(RuntimeError):
         self.solution, self.solutions = solution, tuple(solutions)
 
 
-@pytree_dataclass(static=("discrete", "discrete_disturbance"), host=("residuals", "stats", "message"))
+@pytree_dataclass(
+    static=("discrete", "discrete_disturbance", "labels"), host=("residuals", "stats", "message", "problem")
+)
 class Solution:
     """A value function on a grid with its policy.
 
@@ -82,10 +88,13 @@ class Solution:
         marched, at each kept time, (k, n, 2). Zero at ends that are not projected; ``None`` where it was not counted.
       discrete: whether the controls are enumerated, so that a mean of two need not be admissible.
       discrete_disturbance: whether the disturbances are enumerated.
+      labels: names and units of the controls, and the side of the level set, for pictures.
       residuals: one number a step; host level.
       stats: "method", "scheme", "device", "dtype", "seconds", "compile_seconds", "bytes", "tol",
         "certificate" (a sentence) and "versions" (a dict), each where known; host level.
       message: what happened in this very solve; empty after a passage through ``jit``; host level.
+      problem: the question, from which pictures take target and bounds; ``None`` after a passage through ``jit`` or a
+        file, as functions are not saved; host level.
 
     Example:
       >>> grid = Grid([0.0], [1.0], (3,))
@@ -109,9 +118,11 @@ class Solution:
     cut: Any = None
     discrete: bool = False
     discrete_disturbance: bool = False
+    labels: Labels = Labels()
     residuals: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
     stats: dict = dataclasses.field(default_factory=dict)
     message: str = ""
+    problem: Problem | None = dataclasses.field(default=None, repr=False)
 
     def __post_init__(self):
         if isinstance(self.code, Status):
@@ -227,7 +238,7 @@ class Solution:
         if values is None:
             lacking = "policy" if name == "control_at" else "disturbance: the problem is not a game"
             raise ValueError(f"Solution.{name}: this solution has no {lacking}")
-        t, x = _check_query(self, name, values, trailing, where)
+        t, x = check_query(self, name, values, trailing, where)
         samples = Samples(self.grid, values, self.times)
         return query(look, samples, x, t, clamp=clamp, name=f"Solution.{name}")
 
@@ -252,8 +263,10 @@ class Solution:
                 "periodic": grid.periodic,
                 "edges": grid.edges,
                 "names": grid.names,
+                "units": grid.units,
                 "stretch": [s and [float(s.strength), float(s.center)] for s in grid.stretch or ()],
             },
+            "labels": self.labels,
             "marched": None if self.times is None else int(np.shape(self.times)[0]),
             "isaacs_gap": np.asarray(self.isaacs_gap).tolist(),
             "monotone_error": np.asarray(self.monotone_error).tolist(),
@@ -322,28 +335,15 @@ def _rebuild(header: dict, arrays: dict[str, np.ndarray]) -> Solution:
     grid = Grid(
         arrays.pop("lo"), arrays.pop("hi"), tuple(about["shape"]), about["periodic"], tuple(about["names"]), stretch,
         about.get("edges", "projected"),  # older files have none, as all ends were projected
+        tuple(about.get("units", ())),  # nor these, nor labels
     )  # fmt: skip
+    names, units, inside = header.get("labels", Labels())
+    labels = labelling.checked(names, units, inside, None)
     header = {"monotone_error": None, **header}  # older files have none
     for name, kinds in KINDS.items():  # ``type`` and not ``isinstance``: true is no number of steps
         if type(header[name]) not in kinds:
             raise FileError(f"its header has {name} = {header[name]!r:.60}, wanted {kinds[0].__name__}")
     Status(header["code"])  # raises where there is no such status
-    return Solution(**{"policy": None, **arrays, "grid": grid, **{name: header[name] for name in KINDS}})
-
-
-def _check_query(solution: Solution, name: str, values: Array, trailing: int, where: tuple) -> tuple[Any, Any]:
-    """The time, None if stationary, and the state; refuses a time too many or too few, and batches."""
-    marched = solution.times is not None
-    if len(where) != 1 + marched:
-        kind, call = ("marched over times", f"{name}(t, x)") if marched else ("stationary", f"{name}(x)")
-        raise ValueError(f"Solution.{name}: got {len(where)} arguments; this solution is {kind}: call {call}")
-    # one axis too many is that of a batch, which interpolation would take for an axis of the grid
-    shape, wanted = np.shape(values), solution.grid.shape
-    if marched:
-        wanted = np.shape(solution.times) + wanted
-    if shape[: len(wanted)] != wanted or len(shape) != len(wanted) + trailing:
-        raise ValueError(
-            f"Solution.{name}: got node values of shape {shape} on a grid of shape {wanted}; of a batch of solutions "
-            f"ask one at a time, as in jax.vmap(lambda solution, x: solution.{name}(x))"
-        )
-    return (where[0] if marched else None), where[-1]
+    return Solution(
+        **{"policy": None, **arrays, "grid": grid, "labels": labels, **{name: header[name] for name in KINDS}}
+    )

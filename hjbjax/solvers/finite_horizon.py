@@ -26,14 +26,14 @@ from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, cast, is_traced
-from hjbjax.problem.sets import Box, Finite
+from hjbjax.problem.sets import Box
 from hjbjax.problem.types import Array, DType, Mask, Nodes, Scalar
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop, march_run
 from hjbjax.solvers.result import solution_at_start, with_last_phase
-from hjbjax.solvers.setup import choose_evaluation
+from hjbjax.solvers.setup import choose_evaluation, question
 from hjbjax.solvers.stationary import as_dtype, check_node_values
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
@@ -322,6 +322,5 @@ def _march_traced(
     )
     return Solution(
         grid, jnp.stack(values[::-1]), u[::-1], d[::-1] if problem.is_game else None, code=Status.CONVERGED,
-        steps=count, times=kept, discrete=isinstance(problem.controls, Finite),
-        discrete_disturbance=isinstance(problem.disturbances, Finite),
+        steps=count, times=kept, **question(problem),
     )  # fmt: skip

@@ -12,13 +12,13 @@ from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import time_stepping
 from hjbjax.iteration.time_stepping import Front, March
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.sets import Finite
 from hjbjax.problem.types import Field, Nodes, Number, Scalar
 from hjbjax.solution.clock import CUT, Clock
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop
 from hjbjax.solvers.result import isaacs_gap, warn_of_cuts, warn_of_gap
+from hjbjax.solvers.setup import question
 
 CERTIFICATE = "of a march there is none; halve the spacings and the step to see its error"
 ADVICE = {
@@ -205,8 +205,7 @@ def assemble(task: March, grid: Grid, slices: Slices, front: Front, code: Status
         isaacs_gap=_isaacs_gap(task, front, code),
         times=slices.times[kept],
         cut=slices.cut[kept],
-        discrete=isinstance(problem.controls, Finite),
-        discrete_disturbance=isinstance(problem.disturbances, Finite),
+        **question(problem),
         message=_message(task, front, code),
         stats={
             "method": task.method.described(),

@@ -18,14 +18,14 @@ from hjbjax.markov_chain import earnings
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import is_traced
-from hjbjax.problem.sets import AdmissibleSet, Finite
+from hjbjax.problem.sets import AdmissibleSet
 from hjbjax.problem.types import Array, Field, Mask, Nodes, Scalar
 from hjbjax.solution import grid_error, transfer
 from hjbjax.solution.clock import CUT, Clock
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
 from hjbjax.solvers.nested import Settled
-from hjbjax.solvers.setup import Assumptions, warn
+from hjbjax.solvers.setup import Assumptions, question, warn
 
 GAP = 0.05  # of what the actions matter; where Isaacs' condition holds, upwinding left up to .019 on 21 nodes
 FIRST, CENTRAL = 1.0, 2.0  # orders of upwinding and of central differences
@@ -69,8 +69,7 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
         isaacs_gap=gap,
         reached=reached,
         cut=leaving,
-        discrete=solution.discrete,
-        discrete_disturbance=solution.discrete_disturbance,
+        **question(task.problem),
         residuals=residuals,
         message=" ".join(filter(None, [message, note])),
         monotone_error=None if origin is None else _certified(origin),
@@ -134,8 +133,8 @@ def solution_at_start(on: Discretisation, value: Nodes, code: Status) -> Solutio
     policy, disturbance = (np.broadcast_to(nan, (*value.shape, m)) for m in inputs)
     return Solution(
         on.grid, value, policy, disturbance if problem.is_game else None, code=code,
-        discrete=isinstance(problem.controls, Finite), discrete_disturbance=isinstance(problem.disturbances, Finite),
         message=code.message,
+        **question(problem),
         stats={
             "scheme": repr(on.scheme),
             "device": str(jax.devices()[0].device_kind),
@@ -169,8 +168,7 @@ def assemble(task: Task, state: State, assumptions: Assumptions) -> Solution:
         steps=state.step,
         enclosure=certificates.enclosure(assumptions.certificate, state.bound, problem.discount),
         grid=task.grid,
-        discrete=isinstance(problem.controls, Finite),
-        discrete_disturbance=isinstance(problem.disturbances, Finite),
+        **question(problem),
     )
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 import sys
 import warnings
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +22,8 @@ from hjbjax.iteration.methods import Method, Nested, PolicyIteration, ValueItera
 from hjbjax.markov_chain import attainability, resting
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_discounted
-from hjbjax.problem.pytree import cast, known
+from hjbjax.problem.pytree import cast, is_traced, known
+from hjbjax.problem.sets import Finite
 from hjbjax.problem.types import Mask, Number
 from hjbjax.solution.clock import Clock
 from hjbjax.tracing import checks
@@ -38,6 +40,16 @@ def warn(message: str) -> None:
     while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] == package:
         frame, level = frame.f_back, level + 1
     warnings.warn(message, SolveWarning, stacklevel=level)
+
+
+def question(problem: Problem) -> dict[str, Any]:
+    """The fields of a ``Solution`` that follow from the problem alone: its words, and which sets are enumerated."""
+    return {
+        "discrete": isinstance(problem.controls, Finite),
+        "discrete_disturbance": isinstance(problem.disturbances, Finite),
+        "labels": problem.labels,
+        "problem": None if is_traced(problem) else problem,
+    }
 
 
 DIRECT = 50_000  # nodes up to which a plane with open ends is solved by sparse LU: about a second a step

@@ -139,6 +139,7 @@ def merton(
         target=OutsideCube(1.0).level,
         # at the ends the value of going on without the box, which the exact answer knows
         exit_cost=system.value,
+        control_names=("share at risk", "consumption"),
     )
     return problem, Grid([-1.0], [1.0], shape, names=("log wealth",))
 

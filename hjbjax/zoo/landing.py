@@ -153,6 +153,7 @@ def moon_landing(
         Box([0.0], [thrust]),  # all between as well: that none or all is best, the solver has to find
         target=lander.margin,
         exit_cost=answer(lander.fuel),
+        control_names=("thrust",),
     )
     return problem, Grid([0.0, -2.0, 0.3], [1.5, 0.5, 1.0], shape, names=("height", "velocity", "mass"))
 
@@ -171,7 +172,9 @@ def moon_landing_burn(
       The problem, which ends where v = 0, and the feedback.
     """
     lander = Lander(thrust, consumption, gravity)
-    problem = Problem(lander.drift, lander.fuel_rate, Box([0.0], [thrust]), target=lander.sinking)
+    problem = Problem(
+        lander.drift, lander.fuel_rate, Box([0.0], [thrust]), target=lander.sinking, control_names=("thrust",)
+    )
     return problem, answer(lander.burn)
 
 

@@ -127,8 +127,10 @@ def double_integrator_lq(
         Box([-bound], [bound]),  # with the defaults the best force is −x₁ − √3x₂, at most 5.5 on the box
         noise=noise_or_none(noise),  # σ times the identity
         discount=discount,
+        control_names=("force",),
+        control_units=("N",),
     )
-    return problem, Grid([-2.0, -2.0], [2.0, 2.0], shape, names=("position", "velocity"))
+    return problem, Grid([-2.0, -2.0], [2.0, 2.0], shape, names=("position", "velocity"), units=("m", "m/s"))
 
 
 def double_integrator_lq_exact(

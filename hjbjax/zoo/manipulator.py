@@ -284,7 +284,15 @@ def manipulator(
         shape = (60, 61) if links == 1 else (20,) * links + (21,) * links
     # with lengths and masses of 1 the level arm asks g of one link, 3g = 29.4 of the first of two: 30 holds it
     controls = Box([-torque] * links, [torque] * links)
-    problem = Problem(system.drift, QuadraticCost(0.5, 0.5).rate, controls, discount=discount)
+    torques = ("torque",) if links == 1 else tuple(f"torque {i + 1}" for i in range(links))
+    problem = Problem(
+        system.drift,
+        QuadraticCost(0.5, 0.5).rate,
+        controls,
+        discount=discount,
+        control_names=torques,
+        control_units=("N m",) * links,
+    )
     names = ("angle", "velocity")
     grid = Grid(
         # n angles, then n velocities, as in the state; a free fall of one link reaches 2√g = 6.3 at the bottom
@@ -293,5 +301,6 @@ def manipulator(
         shape,
         periodic=(True,) * links + (False,) * links,
         names=names if links == 1 else tuple(f"{name} {i + 1}" for name in names for i in range(links)),
+        units=("rad",) * links + ("rad/s",) * links,
     )
     return problem, grid

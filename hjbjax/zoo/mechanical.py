@@ -167,10 +167,18 @@ def pendulum(
     bound = (6.0 if as_printed else 30.0) if torque is None else torque
     system = Pendulum(mass=mass, g=g, as_printed=as_printed)
     # the cost does not see that θ is periodic: θ² has its kink at hanging, where both ways up are equal
-    problem = Problem(system.drift, QuadraticCost(0.5, 0.5).rate, Box([-bound], [bound]), discount=discount)
+    problem = Problem(
+        system.drift,
+        QuadraticCost(0.5, 0.5).rate,
+        Box([-bound], [bound]),
+        discount=discount,
+        control_names=("torque",),
+        control_units=("N m",),
+    )
     # the angle omits π, which is −π: hanging is one node
     # 8: a free fall from upright reaches 2√g = 6.3 at the bottom
-    return problem, Grid([-math.pi, -8.0], [math.pi, 8.0], shape, periodic=(True, False), names=("angle", "velocity"))
+    names, units = ("angle", "velocity"), ("rad", "rad/s")
+    return problem, Grid([-math.pi, -8.0], [math.pi, 8.0], shape, periodic=(True, False), names=names, units=units)
 
 
 def pendulum_near_upright(

@@ -114,8 +114,10 @@ def double_integrator(
         discount=discount,
         target=Disc(radius, 2).level,
         exit_cost=exact,
+        control_names=("force",),
+        control_units=("N",),
     )
-    return problem, Grid([-2.0, -2.0], [2.0, 2.0], shape, names=("position", "velocity"))
+    return problem, Grid([-2.0, -2.0], [2.0, 2.0], shape, names=("position", "velocity"), units=("m", "m/s"))
 
 
 def double_integrator_exact(*, mass: Number = 1.0, discount: Number = 1.0, radius: Number = 0.2) -> Exact:
@@ -155,8 +157,9 @@ def zermelo(
         discount=discount,
         target=Disc(radius, 2).level,
         exit_cost=exact,
+        control_names=("course east", "course north"),
     )
-    return problem, Grid([-2.0, -2.0], [2.0, 2.0], shape, names=("east", "north"))
+    return problem, Grid([-2.0, -2.0], [2.0, 2.0], shape, names=("east", "north"), units=("m", "m"))
 
 
 def zermelo_exact(

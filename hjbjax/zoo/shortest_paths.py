@@ -101,7 +101,7 @@ def eikonal(
         exit_cost=exact,
     )
     # odd: a node at the origin, which for radius 0 is the whole target
-    return problem, Grid([-1.0] * dim, [1.0] * dim, (81,) * dim if shape is None else shape)
+    return problem, Grid([-1.0] * dim, [1.0] * dim, (81,) * dim if shape is None else shape, units=("m",) * dim)
 
 
 def eikonal_exact(
@@ -170,7 +170,10 @@ def dubins(
         Box([-turn], [turn]),
         discount=discount,
         target=Disc(radius, 2).level,  # in any heading; with no exact value beside it zero is held there
+        control_names=("turning rate",),
+        control_units=("rad/s",),
     )
     # the heading is periodic, and its 40 nodes omit π, which is −π
     lo, hi = [-2.0, -2.0, -math.pi], [2.0, 2.0, math.pi]
-    return problem, Grid(lo, hi, shape, periodic=(False, False, True), names=("x", "y", "heading"))
+    grid = Grid(lo, hi, shape, periodic=(False, False, True), names=("x", "y", "heading"), units=("m", "m", "rad"))
+    return problem, grid

@@ -121,7 +121,7 @@ def brownian_exit(
     problem = Problem(no_drift, unit_cost, noise=noise, discount=discount, target=OutsideCube(half_width).level)
     # odd numbers put a node at the centre
     shape = ((101,) if dim == 1 else (41,) * dim) if shape is None else shape
-    return problem, Grid([-half_width] * dim, [half_width] * dim, shape)
+    return problem, Grid([-half_width] * dim, [half_width] * dim, shape, units=("m",) * dim)
 
 
 def brownian_exit_exact(
@@ -164,7 +164,7 @@ def brownian_ball(
         # no discount: with one the answer would be a Bessel function
         exit_cost=brownian_ball_exact(dim=dim, noise=noise, radius=radius),
     )
-    return problem, Grid([-radius] * dim, [radius] * dim, (41,) * dim if shape is None else shape)
+    return problem, Grid([-radius] * dim, [radius] * dim, (41,) * dim if shape is None else shape, units=("m",) * dim)
 
 
 def brownian_ball_exact(*, dim: int = 2, noise: Number = 1.0, radius: Number = 1.0) -> Exact:

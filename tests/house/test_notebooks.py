@@ -1,5 +1,6 @@
 """The notebooks run from top to bottom, without a warning, and draw their pictures."""
 
+import re
 from pathlib import Path
 
 import jupytext
@@ -30,7 +31,18 @@ def check(cells):
 
 
 def test_they_are_there():
-    assert {path.stem for path in NOTEBOOKS} >= {"minimum_time", "pendulum", "output_feedback"}
+    assert {path.stem for path in NOTEBOOKS} >= {"minimum_time", "pendulum", "output_feedback", "feedback"}
+
+
+def test_the_figures_of_the_chapter_are_named():
+    """From 3 to 16: singly, or as "Figures 3 to 5"."""
+    named = set()
+    for path in NOTEBOOKS:
+        for first, last in re.findall(
+            r"[Ff]igures? (\d+)(?: (?:to|and) (\d+))?", path.read_text().replace("\n# ", " ")
+        ):
+            named.update(range(int(first), int(last or first) + 1))
+    assert named >= set(range(3, 17))
 
 
 @pytest.mark.slow

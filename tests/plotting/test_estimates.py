@@ -4,8 +4,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from pictures import pictures as plotting
 
-from hjbjax import plotting
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.stretching import Sinh
 

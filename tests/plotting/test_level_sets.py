@@ -2,11 +2,17 @@
 
 from types import SimpleNamespace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
+from pictures import covers
+from pictures import pictures as plotting
 
-from hjbjax import plotting
+import hjbjax as hjb
+from hjbjax.plotting import level_sets
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.labels import Labels
 
 BALL = Grid([-1.0] * 3, [1.0] * 3, (21,) * 3, names=("x", "y", "z"))
 
@@ -39,10 +45,70 @@ def test_the_projection_of_a_ball_has_its_radius():
     np.testing.assert_allclose(radii(outside), 0.6, atol=0.02)
 
 
-def test_three_axes_make_a_stack():
-    stack = plotting.zero_level_set(solution(ball(0.6)), label="ball")
-    assert len(stack) == 11  # the planes at |z| < .6
-    assert stack[0].axes.get_zlabel() == "z"
+def test_three_axes_make_a_closed_surface():
+    picture = plotting.zero_level_set(solution(ball(0.6)), label="ball")
+    assert picture.ax.get_zlabel() == "z"
+    assert [text.get_text() for text in picture.ax.get_legend().get_texts()] == ["ball"]
+    x = np.asarray(BALL.axis(0))
+    triangles = plotting.level_surface(ball(0.6), (x, x, x))
+    assert len(picture[0].get_facecolor()) == len(triangles)
+    np.testing.assert_allclose(np.linalg.norm(triangles, axis=-1), 0.6, atol=0.01)
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    normals = np.cross(b - a, c - a)
+    assert np.linalg.norm(normals, axis=1).sum() / 2 == pytest.approx(4 * np.pi * 0.36, rel=0.01)
+    # of a closed surface the divergence theorem gives the volume, with every triangle turned outwards
+    outwards = np.sign(np.sum(normals * a, axis=1))
+    assert np.sum(outwards * np.sum(normals * a, axis=1)) / 6 == pytest.approx(4 / 3 * np.pi * 0.216, rel=0.02)
+    colours = picture[0].get_facecolor()
+    assert set(np.unique(colours[:, 3]).round(3)) == {0.55}  # it can be seen through
+    assert np.ptp(colours[:, :3].sum(axis=1)) > 0.3  # and is brighter towards the light
+
+
+def test_a_surface_is_closed_at_a_periodic_seam_and_cut_along_a_fourth_axis(monkeypatch):
+    found = []
+
+    def spy(*arguments):
+        found.append(plotting.level_surface(*arguments))
+        return found[0]
+
+    monkeypatch.setattr(level_sets, "level_surface", spy)
+    grid = Grid([-1.0, -1.0, 0.0, 0.0], [1.0, 1.0, 1.0, 1.0], (9, 9, 6, 5), periodic=(False, False, True, False))
+    x = grid.nodes()
+    tube = solution(np.hypot(x[..., 0], x[..., 1]) - 0.4 - 0.4 * x[..., 3], grid)
+    plotting.zero_level_set(tube, fixed={3: 0.5})
+    corners = found[0].reshape(-1, 3)
+    assert corners[:, 2].min() == 0.0
+    assert corners[:, 2].max() == 1.0  # up to the seam
+    np.testing.assert_allclose(np.linalg.norm(corners[:, :2], axis=1), 0.6, atol=0.04)
+
+
+def test_what_an_avoid_problem_is_about_is_shaded_without_being_told():
+    plane = Grid([-1.0, -1.0], [1.0, 1.0], (21, 21))
+    inside_out = solution(-ball(0.6, plane), plane)
+    inside_out.labels = Labels(inside="above")
+    _, filled = plotting.zero_level_set(inside_out)
+    assert covers(filled, [[0.0, 0.0], [0.9, 0.9]]).tolist() == [True, False]
+    told = plotting.zero_level_set(inside_out, inside="below")
+    assert covers(told[1], [[0.0, 0.0], [0.9, 0.9]]).tolist() == [False, True]
+
+
+def test_the_sets_of_a_problem_of_reachability_are_outlined():
+    plane = Grid([-1.0, -1.0], [1.0, 1.0], (21, 21))
+    problem = hjb.reach_avoid(
+        lambda x, u: u, hjb.Ball(1.0, 2), lambda x: jnp.hypot(x[0], x[1]) - 0.3, lambda x: 0.8 - x[1]
+    )
+    about = solution(ball(0.6, plane), plane)
+    about.problem = problem
+    picture = plotting.zero_level_set(about)
+    assert [text.get_text() for text in picture.ax.get_legend().get_texts()] == ["target", "obstacle"]
+    outlines = [each for each in picture if each.get_zorder() == 2.5]
+    np.testing.assert_allclose(radii(outlines[0]), 0.3, atol=1e-3)
+    np.testing.assert_allclose(outlines[1].get_paths()[0].vertices[:, 1], 0.8, atol=1e-9)
+
+
+def test_flat_axes_for_a_surface_are_refused():
+    with pytest.raises(ValueError, match="flat axes for three free states"):
+        plotting.zero_level_set(solution(ball(0.6)), ax=Figure().add_subplot())
 
 
 def test_an_empty_set_draws_nothing():

@@ -5,13 +5,20 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
+import jax.numpy as jnp
 import matplotlib
 import numpy as np
 import pytest
+from matplotlib import pyplot
 from matplotlib.figure import Figure
+from pictures import hatched_nodes, scale_label
+from pictures import pictures as plotting
 
-from hjbjax import plotting
+from hjbjax import plotting as on_current_axes
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.labels import Labels
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.sets import Ball, Box
 from hjbjax.problem.stretching import Sinh
 from hjbjax.solution.solution import Solution
 
@@ -75,7 +82,7 @@ def test_a_value_over_two_axes_is_a_mesh_of_the_nodes_with_contours():
     mesh, contours = plotting.value(solution)
     np.testing.assert_array_equal(drawn(mesh), solution.value)
     ax = mesh.axes
-    assert (ax.get_xlabel(), ax.get_ylabel(), mesh.colorbar.ax.get_ylabel()) == ("position", "velocity", "V")
+    assert (ax.get_xlabel(), ax.get_ylabel(), scale_label(mesh)) == ("position", "velocity", "V")
     assert ax.get_xlim() == (-1.0, 1.0)
     assert ax.get_ylim() == (-2.0, 2.0)
     assert mesh.get_clim() == (solution.value.min(), solution.value.max())
@@ -108,18 +115,19 @@ def test_the_axes_given_are_drawn_on_and_keep_their_figure():
     assert labels(ax) == ["switching curve", "path"]
 
 
-def test_nothing_is_shown_and_no_global_state_changes():
+def test_on_axes_that_are_given_nothing_is_shown_and_no_global_state_changes():
     """In an interpreter of its own: pyplot is not even imported, and rcParams stay as they are."""
     code = """
 import sys, numpy as np, matplotlib
 before = dict(matplotlib.rcParams.copy())  # looking at rcParams['backend'] itself would choose one
+from matplotlib.figure import Figure
 from hjbjax import plotting
 from hjbjax.problem.grid import Grid
 from hjbjax.solution.solution import Solution
 grid = Grid([-1.0, -1.0], [1.0, 1.0], (5, 5))
 solution = Solution(grid, grid.nodes()[..., 0], grid.nodes()[..., :1], residuals=np.array([1.0, 0.1]))
 for draw in (plotting.value, plotting.policy, plotting.switching_curve, plotting.residuals):
-    draw(solution)[0].get_figure().savefig("/dev/null", format="png")
+    draw(solution, ax=Figure().add_subplot()).save("/dev/null", format="png")
 assert dict(matplotlib.rcParams.copy()) == before
 assert "matplotlib.pyplot" not in sys.modules
 """
@@ -139,7 +147,7 @@ def test_policy_colours_are_centred_at_zero():
     np.testing.assert_array_equal(drawn(mesh), solution.policy[..., 0])
     assert mesh.get_clim() == (-3.0, 3.0)
     assert np.ptp(mesh.get_cmap()(0.5)[:3]) < 0.02  # the middle is grey
-    assert mesh.colorbar.ax.get_ylabel() == "u"
+    assert scale_label(mesh) == "u"
 
 
 @pytest.mark.parametrize("name", ["viridis", "coolwarm"])
@@ -158,7 +166,7 @@ def test_each_input_has_its_picture():
     for input in range(3):
         mesh = plotting.policy(solution, input=input, fixed={"c": 0.6})[0]
         np.testing.assert_allclose(drawn(mesh), solution.policy[:, :, 1, input])
-        assert mesh.colorbar.ax.get_ylabel() == f"u{input + 1}"
+        assert scale_label(mesh) == f"u{input + 1}"
 
 
 @pytest.mark.parametrize("input", [3, -1, True, 1.0, "u1"])
@@ -177,19 +185,19 @@ def test_without_a_control_there_is_no_policy_to_draw():
 def test_infinite_values_are_masked_and_named():
     solution = plane()
     solution.value[0, :] = np.inf
-    mesh = plotting.value(solution)[0]
-    np.testing.assert_array_equal(np.ma.getmaskarray(drawn(mesh)), np.isinf(solution.value))
-    assert labels(mesh.axes) == ["V = ∞"]
-    assert mesh.get_clim() == (solution.value[1:].min(), solution.value[1:].max())
-    assert matplotlib.colors.to_hex(mesh.get_cmap().get_bad()) == plotting.GREY
-    policy = plotting.policy(solution)[0]
-    np.testing.assert_array_equal(np.ma.getmaskarray(drawn(policy)), np.isinf(solution.value))
-    assert labels(policy.axes) == ["no control defined"]
+    picture = plotting.value(solution)
+    np.testing.assert_array_equal(hatched_nodes(picture, solution.grid), np.isinf(solution.value))
+    assert labels(picture.ax) == ["V = ∞"]
+    assert picture[0].get_clim() == (solution.value[1:].min(), solution.value[1:].max())
+    np.testing.assert_array_equal(drawn(picture[0])[0], solution.value[1])  # under the hatch what is next to it
+    policy = plotting.policy(solution)
+    np.testing.assert_array_equal(hatched_nodes(policy, solution.grid), np.isinf(solution.value))
+    assert labels(policy.ax) == ["no control"]
     solution.value[3, 3] = np.nan
-    mesh = plotting.value(solution)[0]
-    assert labels(mesh.axes) == ["V not finite"]
-    assert np.ma.getmaskarray(drawn(mesh))[3, 3]
-    assert saved([mesh])
+    picture = plotting.value(solution)
+    assert labels(picture.ax) == ["V not finite"]
+    np.testing.assert_array_equal(hatched_nodes(picture, solution.grid), ~np.isfinite(solution.value))
+    assert saved(picture)
 
 
 def test_masked_nodes_of_a_line_are_bands_half_a_cell_wide():
@@ -202,11 +210,11 @@ def test_masked_nodes_of_a_line_are_bands_half_a_cell_wide():
     assert labels(curve.axes) == ["V = ∞"]
 
 
-def test_a_value_without_one_finite_node_is_all_grey():
+def test_a_value_without_one_finite_node_is_all_hatched():
     grid = plane().grid
     for entry in (np.inf, np.nan):
         artists = plotting.value(made(grid, lambda x, entry=entry: np.full(x.shape[:-1], entry)))
-        assert drawn(artists[0]).mask.all()
+        assert hatched_nodes(artists, grid).all()
         assert saved(artists)
 
 
@@ -254,8 +262,9 @@ def test_a_slice_next_to_infinity():
     """On a node its infinite neighbours have no weight; between nodes an infinite one makes the mean infinite."""
     solution = volume()
     solution.value[:, :, 3] = np.inf
-    assert not np.ma.getmaskarray(drawn(plotting.value(solution, fixed={"c": 1.2})[0])).any()
-    assert np.ma.getmaskarray(drawn(plotting.value(solution, fixed={"c": 1.3})[0])).all()
+    flat = Grid([0.0, 0.0], [1.0, 2.0], (5, 4))
+    assert not hatched_nodes(plotting.value(solution, fixed={"c": 1.2}), flat).any()
+    assert hatched_nodes(plotting.value(solution, fixed={"c": 1.3}), flat).all()
 
 
 def test_a_slice_across_the_seam_uses_both_its_sides():
@@ -498,3 +507,88 @@ def test_costates_and_the_slopes_of_the_value_lie_on_each_other():
     alone = plotting.costates(extremal)
     assert [line.get_label() for line in alone[:2]] == ["λ, x1", "λ, x2"]
     assert len(alone) == 3
+
+
+def test_without_axes_a_picture_goes_on_those_of_pyplot():
+    pyplot.close("all")
+    first = on_current_axes.value(plane(), colorbar=False)
+    assert first.figure is pyplot.gcf()
+    assert first.ax is pyplot.gca()
+    second = on_current_axes.trajectory(path_of([[0.5, 1.0], [0.0, 0.0]]))
+    assert second.ax is first.ax
+    pyplot.close("all")
+
+
+def test_a_picture_saves_itself(tmp_path):
+    picture = plotting.value(line())
+    picture.save(tmp_path / "value.png")
+    assert (tmp_path / "value.png").read_bytes().startswith(b"\x89PNG")
+    assert repr(picture) == "Picture of 1 artists"
+
+
+def test_units_are_on_the_axes_and_the_colour_scale():
+    grid = Grid([-np.pi, -2.0], [np.pi, 2.0], (8, 9), periodic=(True, False), names=("a", "b"), units=("rad", "rad/s"))
+    labelled = Labels(("torque",), ("N m",))
+    solution = made(grid, lambda x: x[..., 1] ** 2, lambda x: x[..., 1:], labels=labelled)
+    mesh = plotting.policy(solution)[0]
+    assert (mesh.axes.get_xlabel(), mesh.axes.get_ylabel(), scale_label(mesh)) == (
+        "a [rad]",
+        "b [rad/s]",
+        "torque [N m]",
+    )
+    mesh.axes.figure.draw_without_rendering()
+    shown = [tick.get_text() for tick in mesh.axes.get_xticklabels() if abs(tick.get_position()[0]) < 3.2]
+    assert shown == ["−π", "−π/2", "0", "π/2", "π"]
+    assert mesh.axes.xaxis.get_offset_text().get_text() == ""
+    steps = plotting.controls(path_of(np.zeros((2, 1)), [[1.0]]), solution=solution)[0]
+    assert steps.axes.get_ylabel() == "torque [N m]"
+
+
+def test_large_numbers_have_no_offset():
+    grid = Grid([1e6], [1e6 + 4], (5,))
+    curve = plotting.value(made(grid, lambda x: 1e9 + x[..., 0]))[0]
+    curve.axes.figure.draw_without_rendering()
+    for axis in (curve.axes.xaxis, curve.axes.yaxis):
+        assert axis.get_offset_text().get_text() == ""
+        texts = [text.get_text() for text in axis.get_ticklabels()]
+        assert len(set(texts)) == len(texts)
+
+
+@pytest.mark.parametrize(
+    ("units", "aspect"), [(("m", "m"), 1.0), (("m", "m/s"), "auto"), ((), "auto"), (("s", "s"), "auto")]
+)
+def test_positions_have_one_scale_on_both_axes(units, aspect):
+    grid = Grid([0.0, 0.0], [1.0, 3.0], (4, 5), units=units)
+    assert plotting.value(made(grid, lambda x: x[..., 0])).ax.get_aspect() == aspect
+
+
+def test_a_target_is_outlined_finer_than_the_nodes():
+    grid = Grid([-1.0, -1.0], [1.0, 1.0], (9, 9), units=("m", "m"))
+    problem = Problem(lambda x, u: u, lambda x, u: 1.0, Ball(1.0, 2), target=lambda x: jnp.hypot(x[0], x[1]) - 0.6)
+    solution = made(grid, lambda x: np.hypot(x[..., 0], x[..., 1]) - 0.6, lambda x: -x, problem=problem)
+    for picture in (plotting.value(solution), plotting.policy(solution)):
+        (outline,) = [each for each in picture if each.get_zorder() == 2.5]
+        points = np.concatenate([path.vertices for path in outline.get_paths()])
+        np.testing.assert_allclose(np.linalg.norm(points, axis=-1), 0.6, atol=1e-4)
+        np.testing.assert_array_equal(hatched_nodes(picture, grid), solution.value < 0)
+        assert labels(picture.ax) == ["target"]
+
+
+def test_a_feedback_that_jumps_is_drawn_as_cells_and_a_smooth_one_is_not():
+    jump = made(plane().grid, lambda x: x[..., 0], lambda x: np.where(x[..., :1] > 0.1, 1.0, -1.0))
+    assert plotting.policy(jump)[0]._shading == "flat"
+    assert plotting.policy(plane())[0]._shading == "gouraud"
+
+
+def test_an_input_of_one_sign_has_half_of_the_colours():
+    solution = made(plane().grid, lambda x: x[..., 0], lambda x: x[..., :1] + 1.0)
+    assert plotting.policy(solution)[0].get_clim() == (0.0, 2.0)
+    solution = made(plane().grid, lambda x: x[..., 0], lambda x: x[..., :1] - 1.0)
+    assert plotting.policy(solution)[0].get_clim() == (-2.0, 0.0)
+
+
+def test_rounding_about_zero_is_drawn_as_zero_where_the_range_of_the_control_is_known():
+    grid = Grid([-1.0], [1.0], (11,))
+    problem = Problem(lambda x, u: u, lambda x, u: 1.0, Box([-3.0], [3.0]))
+    solution = made(grid, lambda x: x[..., 0], lambda x: 1e-9 * np.sin(40 * x), problem=problem)
+    assert plotting.policy(solution).ax.get_ylim() == pytest.approx((-3.0, 3.0), abs=1e-6)

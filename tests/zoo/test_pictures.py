@@ -3,8 +3,10 @@
 import jax
 import numpy as np
 import pytest
+from pictures import hatched_nodes
+from pictures import pictures as plotting
 
-from hjbjax import Grid, Problem, Solution, Status, plotting, simulate, zoo
+from hjbjax import Grid, Problem, Solution, Status, simulate, zoo
 from hjbjax.cli import run_folder
 from hjbjax.feedback.path import PathStatus, joined
 
@@ -61,17 +63,21 @@ def test_the_burn_alone_ends_on_the_ground_with_the_least_fuel():
 def test_no_negative_time_is_drawn_outside_the_ball():
     problem, solution = exact_solution(zoo.catalogue["brownian-ball"], shape=(21, 21))
     assert solution.value.min() < -0.4
-    drawn = plotting.value(solution, target=problem.target)[0]
-    shown = drawn.get_array()
-    inside = np.linalg.norm(solution.grid.nodes(), axis=-1) < 1 - 1e-6
-    assert shown.min() > 0
-    np.testing.assert_array_equal(np.ma.getmaskarray(shown).reshape(21, 21), ~inside)
+    picture = plotting.value(solution, target=problem.target)
+    drawn = picture[0]
+    radius = np.linalg.norm(solution.grid.nodes(), axis=-1)
+    inside = radius < 1 - 1e-6
+    assert drawn.get_clim()[0] > 0
+    outside = hatched_nodes(picture, solution.grid)
+    assert outside[radius > 1 + 1e-3].all()
+    assert not outside[inside].any()
     assert drawn.axes.get_legend().get_texts()[0].get_text() == "target"
     everything = plotting.value(solution)[0].get_array()
     assert everything.min() < -0.4
     infinite = Solution(solution.grid, np.where(inside, np.inf, solution.value), solution.policy)
-    blank = plotting.value(infinite, target=problem.target)[0]
-    assert blank.axes.get_legend().get_texts()[0].get_text() == "target, or V = ∞"
+    blank = plotting.value(infinite, target=problem.target)
+    assert [text.get_text() for text in blank.ax.get_legend().get_texts()] == ["V = ∞", "target"]
+    assert hatched_nodes(blank, solution.grid)[inside].all()
 
 
 def test_a_value_over_one_axis_is_drawn_up_to_its_ends():

@@ -1,0 +1,88 @@
+"""Ticks and numbers: multiples of π on angles, figures without an offset, one scale for positions on both axes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hjbjax.problem.grid import Grid
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+LENGTHS = ("m", "km", "cm", "mm", "µm", "um", "nm", "ft", "in", "mi", "nmi", "nautical miles", "au", "AU")
+ANGLES = ("rad", "radian", "radians")
+FEWEST, MOST = 3, 7  # ticks of an angle; below the fewest, decimals tell more than fractions of π
+STEPS = [Fraction(1, 4), Fraction(1, 2), *(Fraction(2**k) for k in range(12))]  # multiples of π between two ticks
+
+
+def number_text(value: float, _position: int | None = None) -> str:
+    """A number as a tick is labelled: no offset, no trailing zeros, a true minus, 2·10⁶ for a large one.
+
+    Example:
+      >>> number_text(0.1 + 0.2), number_text(-2.0), number_text(3e-7), number_text(-0.0)
+      ('0.3', '−2', '3·10⁻⁷', '0')
+    """
+    digits, _, power = f"{value + 0.0:.9g}".partition("e")  # −0.0 + 0.0 is 0.0
+    if power:
+        raised = str(int(power)).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+        digits = f"{digits}·10{raised}"
+    return digits.replace("-", "−")
+
+
+def angle_text(value: float, _position: int | None = None) -> str:
+    """A multiple of π as a tick is labelled.
+
+    Example:
+      >>> [angle_text(k * math.pi / 4) for k in (-4, -1, 0, 2, 3, 8)]
+      ['−π', '−π/4', '0', 'π/2', '3π/4', '2π']
+    """
+    share = Fraction(value / math.pi).limit_denominator(8)
+    if share == 0:
+        return "0"
+    top = "" if abs(share.numerator) == 1 else str(abs(share.numerator))
+    bottom = "" if share.denominator == 1 else f"/{share.denominator}"
+    return ("−" if share < 0 else "") + f"{top}π{bottom}"
+
+
+def is_angle(grid: Grid, axis: int) -> bool:
+    """True for an axis in radians: by its unit, or, without one, where it is periodic with the period 2π."""
+    unit = grid.units[axis]
+    if unit or not grid.periodic[axis]:  # type: ignore[index]
+        return unit in ANGLES
+    # to a millionth, as periods come from float32 as well
+    return math.isclose(float(grid.hi[axis]) - float(grid.lo[axis]), 2 * math.pi, rel_tol=1e-6)
+
+
+def are_positions(grid: Grid, axes: Sequence[int]) -> bool:
+    """True for two axes with one and the same unit of length: only then is a circle to look round."""
+    units = {grid.units[axis] for axis in axes}
+    return len(axes) == 2 and len(units) == 1 and units <= set(LENGTHS)
+
+
+def set_ticks(axis: Any, angle: bool) -> None:
+    """Numbers without an offset on a matplotlib axis; multiples of π where it is an angle and long enough."""
+    from matplotlib.ticker import FuncFormatter, MultipleLocator
+
+    axis.set_major_formatter(FuncFormatter(number_text))
+    if not angle:
+        return
+    turns = abs(np.diff(axis.get_view_interval()).item()) / math.pi
+    fitting = [step for step in STEPS if FEWEST <= math.floor(turns / step + 1e-9) + 1 <= MOST]
+    if fitting:
+        axis.set_major_locator(MultipleLocator(float(fitting[0]) * math.pi))
+        axis.set_major_formatter(FuncFormatter(angle_text))
+
+
+def scale_axes(ax: Axes, grid: Grid, axes: Sequence[int]) -> None:
+    """Ticks for the axes of a grid on the axes of a picture, and one scale for both where they are positions."""
+    for axis, number in zip((ax.xaxis, ax.yaxis), axes, strict=False):
+        set_ticks(axis, is_angle(grid, number))
+    if len(axes) == 1:
+        set_ticks(ax.yaxis, False)
+    if are_positions(grid, axes):
+        ax.set_aspect("equal", adjustable="box")

@@ -1,0 +1,108 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # Growth, a portfolio, and a put
+#
+# Three problems of economics, each with an answer to compare with: the equation of dynamic programming is the same,
+# only the signs are those of a cost.
+
+# %%
+import warnings
+
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+from scipy.stats import norm
+
+import hjbjax as hjb
+from hjbjax import plotting
+
+warnings.simplefilter("ignore", hjb.SolveWarning)
+
+# %% [markdown]
+# ## How much of the capital to eat
+#
+# Capital grows by $k^{.36} - .05k$ and shrinks by what is consumed; utility is $c^{.64}/.64$, discounted at 4 %. With
+# these numbers the best consumption is exactly proportional to the capital.
+
+# %%
+capital = hjb.Problem(
+    lambda k, c: k**0.36 - 0.05 * k - c, lambda k, c: -(c[0] ** 0.64) / 0.64, hjb.Box([1e-3], [20.0]), discount=0.04,
+    control_names=("consumption",),
+)  # fmt: skip
+grid = hjb.Grid([1.5], [9.5], (201,), names=("capital",), edges="constrained")
+growth = hjb.solve(capital, grid)
+share = (0.04 + 0.64 * 0.05) / 0.36
+figure, ax = plt.subplots(figsize=(5.4, 3.2), layout="constrained")
+plotting.policy(growth, ax=ax)
+ax.plot([1.5, 9.5], [1.5 * share, 9.5 * share], "--", color="0.4")
+plt.show()
+print(f"eat {growth.control_at([5.0])[0]:.3f} of a capital of 5; exactly {5 * share:.3f}")
+assert abs(growth.control_at([5.0])[0] - 5 * share) < 0.01
+
+# %% [markdown]
+# ## Merton's portfolio
+#
+# Wealth earns interest or, at risk, more; constant relative risk aversion makes the best share at risk the
+# same for rich and poor. The picture shows a constant, and is drawn as one.
+
+# %%
+problem, grid = hjb.zoo.merton()
+portfolio = hjb.solve(problem, grid)
+figure, axes = plt.subplots(1, 2, figsize=(10, 3.2), layout="constrained")
+for input, ax in enumerate(axes):
+    plotting.policy(portfolio, input=input, ax=ax)
+plt.show()
+best = hjb.zoo.Merton()
+print(f"share at risk {portfolio.control_at([0.0])[0]:.3f}, by Merton's formula {float(best.share):.3f}")
+assert abs(portfolio.control_at([0.0])[0] - best.share) < 0.01
+
+# %% [markdown]
+# ## An American put
+#
+# The right to sell at 1 may be used at any time: a problem of optimal stopping, $V \ge$ what it pays, over the
+# logarithm of the price. The European put, which waits for the end, has the formula of Black and Scholes.
+
+# %%
+rate, sigma, horizon = 0.06, 0.3, 1.0
+
+
+def shortfall(x):
+    return -jnp.maximum(1 - jnp.exp(x[0]), 0.0)  # a cost: what is paid, with a minus
+
+
+def price(early):
+    return hjb.Problem(
+        lambda x, u: jnp.stack([rate - sigma**2 / 2 + 0 * x[0]]), noise=sigma, discount=rate, terminal_cost=shortfall,
+        stopping_cost=shortfall if early else None,
+    )  # fmt: skip
+
+
+line = hjb.Grid([-2.0], [2.0], (201,), names=("log price",))
+american, european = (-hjb.march(price(early), line, horizon).value[0] for early in (True, False))
+spot = np.exp(line.axis(0))
+d = (np.log(spot) + (rate - sigma**2 / 2) * horizon) / (sigma * np.sqrt(horizon))
+formula = np.exp(-rate * horizon) * norm.cdf(-d) - spot * norm.cdf(-d - sigma * np.sqrt(horizon))
+inner = np.abs(line.axis(0)) < 1
+print(f"European put against Black and Scholes: largest difference {np.abs(european - formula)[inner].max():.1e}")
+print(f"the right to sell early is worth {(american - european)[inner].max():.4f} at most")
+assert np.abs(european - formula)[inner].max() < 2e-3
+assert np.all(american >= european - 1e-6)
+
+figure, ax = plt.subplots(figsize=(5.4, 3.2), layout="constrained")
+ax.plot(spot, american, label="American")
+ax.plot(spot, european, label="European")
+ax.plot(spot, formula, ":", color="black", label="Black and Scholes")
+ax.set(xlim=(0.4, 2.0), ylim=(0, 0.6), xlabel="price", ylabel="value of the put")
+ax.legend(frameon=False)
+plt.show()

@@ -1,0 +1,85 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # Feedback holds a pendulum up
+#
+# Section 2 of the chapter: a pendulum, its angle measured from upright, with a torque at its pivot,
+#
+# $$m\ddot\theta - m g\sin\theta = \tau. \tag{2.1}$$
+#
+# Figures 3 to 5 show the pendulum, and what it does with and without feedback.
+
+# %%
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+
+import hjbjax as hjb
+from hjbjax import plotting
+
+problem, grid = hjb.zoo.pendulum()
+system = hjb.zoo.Pendulum()
+start, duration = [0.6, 0.0], 5.0
+
+# %% [markdown]
+# ## Without a torque
+#
+# Upright is an equilibrium, and an unstable one: the linearisation has the eigenvalues $\pm\sqrt g$. A pendulum that is
+# let go swings through hanging and comes back; its energy $\tfrac12\dot\theta^2 + g\cos\theta$ does not change.
+
+# %%
+fall = hjb.simulate(problem, lambda x: jnp.zeros(1), start, duration, rtol=1e-8, atol=1e-8)
+energy = 0.5 * fall.states[:, 1] ** 2 + 9.81 * np.cos(fall.states[:, 0])
+print(f"energy at the start {energy[0]:.4f}, at the end {energy[-1]:.4f}")
+assert np.ptp(energy) < 1e-4
+
+# %% [markdown]
+# ## With feedback
+#
+# The torque of (2.7) cancels gravity and adds friction and a spring:
+#
+# $$\tau = -m g\sin\theta - k_1\dot\theta - k_2\theta.$$
+#
+# With $k_1 = 3m$ and $k_2 = 2m$ the angle obeys $\ddot\theta + 3\dot\theta + 2\theta = 0$, and from rest at $\theta_0$
+# it is $\theta_0(2e^{-t} - e^{-2t})$.
+
+
+# %%
+def held(x):
+    return jnp.stack([-9.81 * jnp.sin(x[0]) - 3 * x[1] - 2 * x[0]])
+
+
+path = hjb.simulate(problem, held, start, duration, rtol=1e-8, atol=1e-8)
+exact = 0.6 * (2 * np.exp(-path.times) - np.exp(-2 * path.times))
+print(f"largest distance from the formula {np.abs(path.states[:, 0] - exact).max():.1e}")
+assert np.abs(path.states[:, 0] - exact).max() < 1e-5
+
+figure, axes = plt.subplots(1, 2, figsize=(10, 3.2), layout="constrained")
+plotting.trajectory(fall, ax=axes[0], axes=None, grid=grid)
+plotting.trajectory(path, ax=axes[1], axes=None, grid=grid)
+plt.show()
+
+# %% [markdown]
+# ## In the plane of angle and velocity
+#
+# The same two paths, over the arrows of the closed loop.
+
+# %%
+angles, rates = np.meshgrid(np.linspace(-np.pi, np.pi, 21), np.linspace(-6, 6, 21))
+accelerations = -3 * rates - 2 * angles
+figure, ax = plt.subplots(figsize=(5.4, 4.2), layout="constrained")
+ax.streamplot(angles, rates, rates, accelerations, color="0.8", linewidth=0.7, density=0.8, arrowsize=0.7)
+plotting.trajectory(fall, ax=ax, grid=grid, color=plotting.COLOURS[0], label="no torque")
+plotting.trajectory(path, ax=ax, grid=grid, color=plotting.COLOURS[1], label="feedback")
+ax.set(xlim=(-np.pi, np.pi), ylim=(-7, 7))
+plt.show()

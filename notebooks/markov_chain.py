@@ -1,0 +1,97 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # The chain on the grid
+#
+# Section 13 of the chapter: the state is replaced by a particle that jumps between the nodes of a grid, to neighbours
+# with the probabilities (13.3), such that it moves on average as the system does. The value of the chain converges to
+# the value of the system, whatever kinks that has.
+
+# %%
+import matplotlib.pyplot as plt
+import numpy as np
+from IPython.display import HTML
+from matplotlib.animation import FuncAnimation
+
+import hjbjax as hjb
+from hjbjax import plotting
+
+# %% [markdown]
+# ## Figure 16: the particle
+#
+# A mass is brought to rest in the least time. The generator of the optimal chain is a matrix; its exponential clock and
+# its jumps are drawn here as a particle on the grid, from rest at one.
+
+# %%
+count = 41
+problem, grid = hjb.zoo.double_integrator(shape=(count, count), radius=0.2)
+solution = hjb.solve(problem, grid, scheme=hjb.Upwind(), tol=1e-6)
+matrix = hjb.chain.generator(problem, grid, solution.policy).tocsr()
+rows = np.asarray(matrix.sum(axis=1)).ravel()
+print(f"rows of the generator sum to {np.abs(rows).max():.1e} at most")
+assert np.abs(rows).max() < 1e-9 * abs(matrix.diagonal()).max()
+
+random = np.random.default_rng(0)
+node, t = np.ravel_multi_index((3 * (count - 1) // 4, (count - 1) // 2), grid.shape), 0.0
+visited, clock = [node], [t]
+states = grid.nodes().reshape(-1, 2)
+while np.linalg.norm(states[node]) > 0.2 and len(visited) < 400:
+    row = matrix[[node]]  # as a matrix of one row
+    jumps = row.indices != node
+    targets, rates = row.indices[jumps], row.data[jumps]
+    t += random.exponential(1 / rates.sum())
+    node = random.choice(targets, p=rates / rates.sum())
+    visited.append(node)
+    clock.append(t)
+places = states[visited]
+print(f"{len(places) - 1} jumps in a time of {t:.2f}; the least time is about 2")
+assert np.linalg.norm(places[-1]) <= 0.2
+assert np.abs(np.diff(places, axis=0)).max() < 0.1 + 1e-9  # to neighbours alone
+
+figure, ax = plt.subplots(figsize=(5.4, 4.2), layout="constrained")
+plotting.value(solution, ax=ax)
+ax.plot(*states.T, ".", color="white", markersize=0.8, alpha=0.5)
+(line,) = ax.plot(*places.T, color=plotting.COLOURS[1], linewidth=1)
+(dot,) = ax.plot(*places[-1:].T, "o", color=plotting.COLOURS[1])
+plt.show()
+
+# %% [markdown]
+# The same, moving:
+
+
+# %%
+def frame(k):
+    line.set_data(*places[: k + 1].T)
+    dot.set_data(*places[k : k + 1].T)
+    return line, dot
+
+
+moving = FuncAnimation(figure, frame, frames=range(0, len(places), 4), interval=80)
+HTML(moving.to_jshtml(default_mode="once"))
+
+# %% [markdown]
+# ## What finer grids cost
+#
+# With $n$ states and $N$ nodes an axis there are $N^n$ of them: halving the spacing makes twice, four times, eight
+# times as many. The error of the monotone chain falls like the spacing; that is the curse of dimension in one table.
+
+# %%
+errors = {}
+for nodes in (21, 41, 81):
+    problem, fine = hjb.zoo.smooth(shape=(nodes, nodes))
+    found = hjb.solve(problem, fine, scheme=hjb.Upwind(), tol=1e-8)
+    exact = hjb.zoo.smooth_exact()
+    places = ([0.5, 0.25], [-0.5, 0.5], [0.25, -0.75])
+    errors[nodes] = max(abs(float(found.value_at(x)) - float(exact(np.array(x)))) for x in places)
+    print(f"{nodes:3} nodes an axis, {fine.size:5} in all: error {errors[nodes]:.1e}")
+assert errors[81] < 0.6 * errors[41] < 0.4 * errors[21]

@@ -21,8 +21,9 @@ import numpy as np
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import remembered
 from hjbjax.problem.types import DType, Numbers
-from hjbjax.tracing.interpreter import evaluate, is_components
+from hjbjax.tracing.interpreter import evaluate
 from hjbjax.tracing.primitives import array_type
+from hjbjax.tracing.stacks import is_components
 
 if TYPE_CHECKING:
     from jax.extend import core as jex
@@ -211,6 +212,9 @@ class _Polynomials:
         if operation is jax.lax.mul:
             return _product(left, right)
         return _some_function([left, right])
+
+    def whole(self, eqn: jex.JaxprEqn, operands: list) -> None:
+        return None  # sets of terms are an entry's own, and cheap
 
     def custom_jvp(self, eqn: jex.JaxprEqn, inner: jex.ClosedJaxpr, operands: list) -> list[np.ndarray]:
         # not by the terms of ``inner``: the slope that its rule gives need not be the one of what it computes

@@ -105,6 +105,12 @@ def in_numpy(eqn: jex.JaxprEqn, operands: Sequence[Numbers]) -> np.ndarray | Non
         return np.asarray(_ARITHMETIC[name](*arrays), dtypes[-1])
 
 
+def bind(eqn: jex.JaxprEqn, operands: Sequence[Numbers]) -> list:
+    """Results of one equation on JAX arrays."""
+    results = eqn.primitive.bind(*operands, **eqn.primitive.get_bind_params(eqn.params))
+    return list(results) if eqn.primitive.multiple_results else [results]
+
+
 def array_type(var: jex.Var | jex.Literal) -> jax.core.ShapedArray:
     """Shape and dtype of a variable of a jaxpr; JAX annotates a wider type, for tokens and references."""
     return cast(jax.core.ShapedArray, var.aval)

@@ -22,6 +22,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import remembered
 from hjbjax.problem.types import DType, Numbers
 from hjbjax.tracing.interpreter import evaluate
+from hjbjax.tracing.operations import NONE, Operations, operations
 from hjbjax.tracing.primitives import array_type
 from hjbjax.tracing.stacks import is_components
 
@@ -42,9 +43,11 @@ class Dependence:
 
     Attributes:
       entries: one set of terms an entry.
+      operations: what one evaluation of the function takes.
     """
 
     entries: tuple[Terms, ...]
+    operations: Operations = NONE
 
     @property
     def is_constant(self) -> bool:
@@ -112,7 +115,7 @@ def dependence(function: Callable, *arguments: tuple[int | None, bool], dtype: D
     (result,) = evaluate(closed, packed, _POLYNOMIALS)
     if not is_components(result):  # a constant, which the evaluation left as the number that it is
         return Dependence((CONSTANT,) * int(np.size(result)))
-    return Dependence(tuple(result.reshape(-1)))
+    return Dependence(tuple(result.reshape(-1)), operations(closed))
 
 
 @dataclass(frozen=True)
@@ -135,6 +138,11 @@ class Influence:
         """Whether drift and cost are sums of what each player does, and noise is neither's."""
         crossed = any(function.crosses(self.control, self.disturbance) for function in (self.drift, self.cost))
         return not crossed and self.noise.is_constant
+
+    @property
+    def operations(self) -> Operations:
+        """What one evaluation of drift, cost and noise takes."""
+        return self.drift.operations + self.cost.operations + self.noise.operations
 
     @property
     def meet(self) -> bool:

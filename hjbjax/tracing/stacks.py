@@ -88,11 +88,8 @@ def results(eqn: jex.JaxprEqn, operands: Sequence[Any]) -> list | None:
       One value an output: a stack, or an object array where it is short.
     """
     name = eqn.primitive.name
-    if not any(isinstance(value, Stack) for value in operands):
-        largest = max(array_type(var).size for var in (*eqn.invars, *eqn.outvars))
-        # moving entries about costs nothing; what is done to them next is one operation then
-        if largest <= MANY or not (name in ENTRYWISE or name in _BY_AXES or name in ("dot_general", "custom_jvp_call")):
-            return None
+    if not is_whole(eqn, any(isinstance(value, Stack) for value in operands)):
+        return None
     if name in ENTRYWISE:
         found = [_entrywise(eqn, operands)]
     elif name in _BY_AXES:
@@ -102,7 +99,23 @@ def results(eqn: jex.JaxprEqn, operands: Sequence[Any]) -> list | None:
         found = [_contraction(eqn, operands)]
     else:
         found = over_nodes(eqn, operands)
-    return [value if math.prod(value.shape) > LONG else value.entries() for value in found]
+    return [value if is_long(value.shape) else value.entries() for value in found]
+
+
+def is_whole(eqn: jex.JaxprEqn, with_stacks: bool) -> bool:
+    """True if an equation is one operation on all entries: one of its operands is a stack, or it is large."""
+    if with_stacks:
+        return True
+    # moving entries about costs nothing; what is done to them next is one operation then
+    name = eqn.primitive.name
+    if not (name in ENTRYWISE or name in _BY_AXES or name in ("dot_general", "custom_jvp_call")):
+        return False
+    return max(array_type(var).size for var in (*eqn.invars, *eqn.outvars)) > MANY
+
+
+def is_long(shape: tuple[int, ...]) -> bool:
+    """True if a vector or matrix of this shape stays one array."""
+    return math.prod(shape) > LONG
 
 
 # entries are in front, so that axes of one state are axes of the stack: the equation is bound as it stands

@@ -188,8 +188,9 @@ def best_response(
     else:
         start = _admissible(hamiltonian, player, join)
         _, action, _ = _sampled(
-            hamiltonian, player, lambda action: (hamiltonian.at(*join(action)), []), weight=1, most=most, start=start
-        )
+            hamiltonian, player, lambda action: (hamiltonian.at(*join(action)), []),
+            weight=player.effort, most=most, start=start,
+        )  # fmt: skip
     action = jax.lax.optimization_barrier(action)  # or the search is done twice, for the action and for the value
     return hamiltonian.at(*join(action)), action
 

@@ -30,10 +30,9 @@ from hjbjax.solvers import host_loop, nested
 from hjbjax.solvers.host_loop import FIRST_NODES
 from hjbjax.solvers.nested import Settled
 from hjbjax.solvers.result import finish, solution_at_start, with_last_phase
-from hjbjax.solvers.setup import Assumptions, choose, choose_scheme, prepare_on_host
+from hjbjax.solvers.setup import Assumptions, check_on_one_state, choose, choose_scheme, prepare_on_host
 from hjbjax.solvers.stationary import as_dtype, check_arguments, check_limits
 from hjbjax.solvers.stationary_run import with_obstacles
-from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
 
 T = TypeVar("T")
@@ -98,7 +97,7 @@ def solve_batch(
             # without nesting, whose levels the host drives one by one
             chosen = choose(first, grid, traced=False, method=method).inner
             on, sharpen = Discretisation(first, grid, scheme or Upwind(subcell=True), kind), scheme is None
-            checks.shapes(first, grid, on.scheme)
+            check_on_one_state(first, grid, on.scheme)
             needed = memory.require(first, grid, chosen, kind, max_memory)
             # one lane by itself has been held against the memory above, so that a round is never empty
             for some in _rounds(members, needed, max_memory):

@@ -33,9 +33,8 @@ from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop, march_run
 from hjbjax.solvers.result import solution_at_start, with_last_phase
-from hjbjax.solvers.setup import choose_evaluation, question
+from hjbjax.solvers.setup import check_on_one_state, choose_evaluation, question
 from hjbjax.solvers.stationary import as_dtype, check_node_values
-from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
 
 PROBES = 33  # times at which a given step, and constrained ends, are held against a time-dependent problem
@@ -133,7 +132,7 @@ def march(
             clock, needed, lambda _: _solution_at_horizon(on, horizon, start, Status.INTERRUPTED)
         ):
             try:
-                checks.shapes(problem, grid, scheme)
+                check_on_one_state(problem, grid, scheme)
                 node_checks.values(on.asking(_without_moving_target(problem)), clock)
                 # a drift that changes in time may keep inside a constrained end now and not later
                 for t in np.linspace(horizon, 0.0, PROBES) if problem.time_dependent else (0.0,):

@@ -31,9 +31,8 @@ from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop
 from hjbjax.solvers.host_loop import FIRST_NODES
 from hjbjax.solvers.result import solution_at_start, warn_of_cuts, within_reach
-from hjbjax.solvers.setup import warn_unreached
+from hjbjax.solvers.setup import check_on_one_state, warn_unreached
 from hjbjax.solvers.stationary_run import StatesInChunks
-from hjbjax.tracing import checks
 
 WORDS = {
     Certificate.ADDITIVE: "from the discount, V + min r/(1 − e^{−βτ}) ≤ V_h ≤ V + max r/(1 − e^{−βτ})",
@@ -86,7 +85,7 @@ def solve_on_host(
     on = Discretisation(problem, grid, Upwind(), kind)  # what is asked of it has nothing to do with slopes
     start = None if guess is None else np.asarray(guess, kind)
     try:
-        checks.shapes(problem, grid, scheme)
+        check_on_one_state(problem, grid, scheme)
         node_checks.values(on, clock)
         plan = scheme.plan(problem, grid, kind)
         needed = memory.fitting(estimate(grid, plan, kind), grid, max_memory)

@@ -52,9 +52,22 @@ def question(problem: Problem) -> dict[str, Any]:
     }
 
 
+OPERATIONS = 10_000  # of one evaluation: XLA takes minutes over a program in which there are a dozen such
 DIRECT = 50_000  # nodes up to which a plane with open ends is solved by sparse LU: about a second a step
 NEST = 100_000  # nodes beyond which compiling coarser grids pays
 COARSEST = 20_000  # nodes up to which none is worth it: a step takes under a millisecond, and its program a second
+
+
+def check_on_one_state(problem: Problem, grid: Grid, scheme: object) -> None:
+    """Refuse functions that one state shows to be wrong, and warn of such as XLA takes minutes to compile."""
+    checks.shapes(problem, grid, scheme)
+    count = checks.operations_of(problem, grid.ndim).single
+    if count > OPERATIONS:
+        warn(
+            f"one evaluation of the problem's functions is {count:,} scalar operations, each an array over the nodes, "
+            f"and over more than {OPERATIONS:,} the compiler takes minutes. Write sums as products with one matrix "
+            "(W @ x with over 60 entries is one operation), and repetitions as jax.lax.fori_loop or scan"
+        )
 
 
 def is_constrained(problem: Problem) -> bool:

@@ -31,8 +31,15 @@ from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop, nested, semi_lagrangian
 from hjbjax.solvers.result import assemble, finish, solution_at_start, with_grid_error, with_last_phase
-from hjbjax.solvers.setup import COARSEST, choose, choose_scheme, is_constrained, prepare_on_host, prepare_traced
-from hjbjax.tracing import checks
+from hjbjax.solvers.setup import (
+    COARSEST,
+    check_on_one_state,
+    choose,
+    choose_scheme,
+    is_constrained,
+    prepare_on_host,
+    prepare_traced,
+)
 from hjbjax.tracing.closures import with_settled_functions
 
 # no host looks on inside a transformation: far more steps than policy iteration takes, and an end for all others
@@ -158,7 +165,7 @@ def _solve_on_host(
     start: Nodes | None = None if guess is None else np.asarray(guess, on.dtype)
     try:
         # from cheap to dear: one state, all nodes, the ends of the box, and only then what is compiled for the grid
-        checks.shapes(problem, grid, on.scheme)
+        check_on_one_state(problem, grid, on.scheme)
         node_checks.values(on, clock)
         admissibility.values(problem, grid, on.dtype)
         if sharpen:

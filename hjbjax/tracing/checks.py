@@ -16,6 +16,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import remembered
 from hjbjax.tracing import indices
+from hjbjax.tracing.operations import Operations, operations
 
 OF_ACTION = ("drift", "cost", "noise")
 STATE_COSTS = ("exit_cost", "terminal_cost", "stopping_cost", "running_max")
@@ -191,7 +192,7 @@ def _probe(problem: Problem, name: str, n: int) -> tuple[int, ...] | str:
     _check_arity(problem, name)
     # any exception may come out of a function of the user's: those of JAX get advice, those of shapes their first line
     try:
-        verdict, outside, _ = _trace_once(function, names, tuple(lengths[letter] for letter in names))
+        verdict, outside, *_ = _trace_once(function, names, tuple(lengths[letter] for letter in names))
     except Exception as error:
         fed = ", ".join(f"{letter} of shape {lengths[letter]}" for letter in names)
         for kind, advice in _ADVICE:
@@ -224,11 +225,22 @@ def calls_back(problem: Problem, n: int) -> bool:
     return False
 
 
+def operations_of(problem: Problem, n: int) -> Operations:
+    """What one evaluation of all functions of a problem with ``n`` states takes, as it is written out for XLA."""
+    lengths, total = _lengths(problem, n), Operations()
+    with jax.enable_x64(True):
+        for name in (*OF_ACTION, "target", *STATE_COSTS):
+            function, names = getattr(problem, name), _names(problem, name)
+            if callable(function):
+                total += _trace_once(function, names, tuple(lengths[letter] for letter in names))[3]
+    return total
+
+
 @remembered
 def _trace_once(
     function: Callable, names: tuple[str, ...], lengths: tuple[tuple[int, ...], ...]
-) -> tuple[tuple[int, ...] | str, str | None, bool]:
-    """Shape or fault of a function's result, an index outside its array in words, and whether it calls Python."""
+) -> tuple[tuple[int, ...] | str, str | None, bool, Operations]:
+    """Shape or fault of a function's result, an index outside its array, whether it calls Python, its operations."""
     verdicts = []  # taken on the way: ``make_jaxpr`` would raise, in its own words, on a result that is text
 
     def probe(*arguments):
@@ -237,7 +249,7 @@ def _trace_once(
         return () if isinstance(verdicts[0], str) else result
 
     closed = jax.make_jaxpr(probe)(*(jax.ShapeDtypeStruct(shape, np.float64) for shape in lengths))
-    return verdicts[0], indices.beyond(closed, names), indices.calls_back(closed)
+    return verdicts[0], indices.beyond(closed, names), indices.calls_back(closed), operations(closed)
 
 
 def _dim(admissible: sets.AdmissibleSet | None) -> int:

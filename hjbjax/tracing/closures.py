@@ -26,8 +26,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, as_partial, is_traced
 from hjbjax.problem.types import DType, Numbers
-from hjbjax.tracing.captured import FLOATS, NUMBERS, OfNumbers, decisive, numbers_read
-from hjbjax.tracing.identity import code, fingerprint, identity
+from hjbjax.tracing.outside import FLOATS, NUMBERS, OfNumbers, code, decisive, fingerprint, identity, numbers_read
 
 if TYPE_CHECKING:
     from jax.extend import core as jex

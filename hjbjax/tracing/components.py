@@ -20,9 +20,10 @@ import numpy as np
 
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.types import DType, Numbers
-from hjbjax.tracing import indices
-from hjbjax.tracing.interpreter import bind, evaluate, is_components, lift, object_array, pack
-from hjbjax.tracing.primitives import array_type
+from hjbjax.tracing import indices, stacks
+from hjbjax.tracing.interpreter import evaluate, lift, pack
+from hjbjax.tracing.jaxprs import array_type, bind
+from hjbjax.tracing.stacks import is_components, object_array
 
 if TYPE_CHECKING:
     from jax.extend import core as jex
@@ -91,8 +92,13 @@ class _Arrays:
     def combine(self, operation: Callable, dtype: np.dtype, left: Numbers, right: Numbers) -> jax.Array:
         return operation(*jnp.broadcast_arrays(jnp.asarray(left, dtype), jnp.asarray(right, dtype)))
 
-    def custom_jvp(self, eqn: jex.JaxprEqn, inner: jex.ClosedJaxpr, operands: list) -> list[np.ndarray]:
+    def whole(self, eqn: jex.JaxprEqn, operands: list) -> list | None:
+        return stacks.results(eqn, operands)
+
+    def custom_jvp(self, eqn: jex.JaxprEqn, inner: jex.ClosedJaxpr, operands: list) -> list:
         """The function by components, with its own derivative, which is a function of one state as well."""
+        if (found := self.whole(eqn, operands)) is not None:  # by ``vmap``, which keeps the rule
+            return found
         avals = [array_type(var) for var in eqn.invars]
         # tangents of integers are of the empty type float0, on which no arithmetic is defined
         if not all(jnp.issubdtype(aval.dtype, jnp.floating) for aval in avals):

@@ -21,8 +21,10 @@ import numpy as np
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import remembered
 from hjbjax.problem.types import DType, Numbers
-from hjbjax.tracing.interpreter import evaluate, is_components
-from hjbjax.tracing.primitives import array_type
+from hjbjax.tracing.interpreter import evaluate
+from hjbjax.tracing.jaxprs import array_type
+from hjbjax.tracing.operations import NONE, Operations, operations
+from hjbjax.tracing.stacks import is_components
 
 if TYPE_CHECKING:
     from jax.extend import core as jex
@@ -41,9 +43,11 @@ class Dependence:
 
     Attributes:
       entries: one set of terms an entry.
+      operations: what one evaluation of the function takes.
     """
 
     entries: tuple[Terms, ...]
+    operations: Operations = NONE
 
     @property
     def is_constant(self) -> bool:
@@ -111,7 +115,7 @@ def dependence(function: Callable, *arguments: tuple[int | None, bool], dtype: D
     (result,) = evaluate(closed, packed, _POLYNOMIALS)
     if not is_components(result):  # a constant, which the evaluation left as the number that it is
         return Dependence((CONSTANT,) * int(np.size(result)))
-    return Dependence(tuple(result.reshape(-1)))
+    return Dependence(tuple(result.reshape(-1)), operations(closed))
 
 
 @dataclass(frozen=True)
@@ -134,6 +138,11 @@ class Influence:
         """Whether drift and cost are sums of what each player does, and noise is neither's."""
         crossed = any(function.crosses(self.control, self.disturbance) for function in (self.drift, self.cost))
         return not crossed and self.noise.is_constant
+
+    @property
+    def operations(self) -> Operations:
+        """What one evaluation of drift, cost and noise takes."""
+        return self.drift.operations + self.cost.operations + self.noise.operations
 
     @property
     def meet(self) -> bool:
@@ -211,6 +220,9 @@ class _Polynomials:
         if operation is jax.lax.mul:
             return _product(left, right)
         return _some_function([left, right])
+
+    def whole(self, eqn: jex.JaxprEqn, operands: list) -> None:
+        return None  # sets of terms are an entry's own, and cheap
 
     def custom_jvp(self, eqn: jex.JaxprEqn, inner: jex.ClosedJaxpr, operands: list) -> list[np.ndarray]:
         # not by the terms of ``inner``: the slope that its rule gives need not be the one of what it computes

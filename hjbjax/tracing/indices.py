@@ -15,7 +15,7 @@ import numpy as np
 
 from hjbjax.problem.types import Numbers
 from hjbjax.tracing import jaxprs
-from hjbjax.tracing.primitives import array_type
+from hjbjax.tracing.jaxprs import array_type
 
 if TYPE_CHECKING:
     from jax.extend import core as jex

@@ -11,7 +11,7 @@ import itertools
 import math
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeGuard
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ import numpy as np
 
 from hjbjax.problem.types import Numbers
 from hjbjax.tracing import jaxprs
-from hjbjax.tracing.primitives import (
+from hjbjax.tracing.jaxprs import (
     CALLS,
     CUMULATIVE,
     ENTRYWISE,
@@ -28,8 +28,10 @@ from hjbjax.tracing.primitives import (
     REDUCTIONS,
     SCATTERS,
     array_type,
+    bind,
     in_numpy,
 )
+from hjbjax.tracing.stacks import RULES, Stack, is_components, object_array, varies
 
 if TYPE_CHECKING:
     from jax.extend import core as jex
@@ -56,6 +58,9 @@ class Algebra(Protocol):
     def custom_jvp(self, eqn: jex.JaxprEqn, inner: jex.ClosedJaxpr, operands: list) -> list[np.ndarray]:
         """Results of a function that brings a derivative rule of its own."""
 
+    def whole(self, eqn: jex.JaxprEqn, operands: list) -> list | None:
+        """Results of an equation on vectors too long for components; None where it goes by the rules for these."""
+
     def nodewise(self, eqn: jex.JaxprEqn, operands: list) -> list[np.ndarray]:
         """Results of an equation for which there is no rule."""
 
@@ -67,23 +72,12 @@ def pack(argument: Sequence[Numbers] | Numbers) -> np.ndarray:
     return object_array([argument], ())
 
 
-def object_array(entries: Sequence[Any], shape: tuple[int, ...]) -> np.ndarray:
-    """An array of objects of a shape, whatever the entries are."""
-    array = np.empty(len(entries), dtype=object)  # np.array(entries) would look into entries that are arrays
-    for index, entry in enumerate(entries):
-        array[index] = entry
-    return array.reshape(shape)
-
-
-def is_components(value: object) -> TypeGuard[np.ndarray]:
-    """True if an operand is an object array, one that may vary from node to node."""
-    return isinstance(value, np.ndarray) and value.dtype == object
-
-
 def lift(value: Operand, algebra: Algebra) -> np.ndarray:
     """An operand as an object array of the algebra's scalars."""
     if is_components(value):
         return value
+    if isinstance(value, Stack):
+        return value.entries()
     shape = np.shape(value)
     return object_array([algebra.constant(value, index) for index in np.ndindex(*shape)], shape)
 
@@ -111,7 +105,7 @@ def evaluate(closed: jex.ClosedJaxpr, arguments: Sequence[Operand], algebra: Alg
 def _apply(eqn: jex.JaxprEqn, operands: list, algebra: Algebra) -> list:
     """Results of one equation by the first rule that has an answer."""
     name = eqn.primitive.name
-    if not any(map(is_components, operands)):
+    if not any(map(varies, operands)):
         return _bind_uniform(eqn, operands)
     if name in CALLS and CALLS[name] in eqn.params:
         inner = eqn.params[CALLS[name]]  # some calls keep a jaxpr without constants
@@ -121,8 +115,12 @@ def _apply(eqn: jex.JaxprEqn, operands: list, algebra: Algebra) -> list:
             if name == "custom_jvp_call"
             else evaluate(inner, operands, algebra)
         )
-    if name == "cond":
+    if name == "cond" and (_are_known(operands[:1]) or not any(isinstance(value, Stack) for value in operands)):
         return _branch(eqn, operands, algebra)
+    if (found := algebra.whole(eqn, operands)) is not None:
+        if name not in RULES:
+            _warn_once(name)
+        return found
     # A rule that gives None has met an index that is not known here, which only a node-by-node evaluation can follow.
     if name in MOVES:
         moved = _move(eqn, operands, algebra)
@@ -157,15 +155,9 @@ def _bind_uniform(eqn: jex.JaxprEqn, operands: list) -> list:
         return bind(eqn, operands)
 
 
-def bind(eqn: jex.JaxprEqn, operands: Sequence[Operand]) -> list:
-    """Results of one equation on JAX arrays."""
-    results = eqn.primitive.bind(*operands, **eqn.primitive.get_bind_params(eqn.params))
-    return list(results) if eqn.primitive.multiple_results else [results]
-
-
 def _are_known(values: Iterable[Operand]) -> bool:
     """True if all are concrete numbers that hold at all nodes."""
-    return not any(is_components(value) or isinstance(value, jax.core.Tracer) for value in values)
+    return not any(varies(value) or isinstance(value, jax.core.Tracer) for value in values)
 
 
 def _move(eqn: jex.JaxprEqn, operands: list, algebra: Algebra) -> list[np.ndarray] | None:

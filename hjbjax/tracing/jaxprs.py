@@ -1,4 +1,4 @@
-"""Questions to the parts of a jaxpr.
+"""The parts of a jaxpr, and JAX's primitives by the rule that evaluates them by components; see ``components``.
 
 The types are those of ``jax.extend.core``, imported when the first function is traced and not with the package:
 ``jax.extend`` brings Pallas along, 15 ms of every ``import hjbjax``.
@@ -6,10 +6,118 @@ The types are those of ``jax.extend.core``, imported when the first function is 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, TypeGuard
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, TypeGuard, cast
+
+import jax
+import numpy as np
+
+from hjbjax.problem.types import Numbers
 
 if TYPE_CHECKING:
     from jax.extend import core as jex
+
+# Which of its n operands a data-moving primitive moves; the others are indices, and an index that varies from node to
+# node moves other entries at every node, for which only ``vmap`` has an answer.
+MOVES: dict[str, Callable[[int], Sequence[int]]] = {
+    "broadcast_in_dim": lambda n: (0,),
+    "reshape": lambda n: (0,),
+    "squeeze": lambda n: (0,),
+    "expand_dims": lambda n: (0,),
+    "transpose": lambda n: (0,),
+    "rev": lambda n: (0,),
+    "slice": lambda n: (0,),
+    "split": lambda n: (0,),
+    "dynamic_slice": lambda n: (0,),
+    "gather": lambda n: (0,),
+    "concatenate": range,
+    "stack": range,
+    "unstack": lambda n: (0,),
+    "tile": lambda n: (0,),
+    "pad": range,
+    "dynamic_update_slice": lambda n: (0, 1),
+    "scatter": lambda n: (0, 2),
+}
+
+
+def _broadcast(
+    x: np.ndarray, *, shape: tuple[int, ...], broadcast_dimensions: tuple[int, ...], **_: object
+) -> np.ndarray:
+    """An array whose axes are some axes of ``shape``, repeated along the others."""
+    lengths = dict(zip(broadcast_dimensions, x.shape, strict=True))
+    return np.broadcast_to(x.reshape([lengths.get(axis, 1) for axis in range(len(shape))]), shape)
+
+
+# The commonest of them in NumPy, for labels and for constants: JAX would compile each on its first use.
+IN_NUMPY: dict[str, Callable[..., np.ndarray]] = {
+    "broadcast_in_dim": _broadcast,
+    "slice": lambda x, start_indices, limit_indices, strides: x[
+        tuple(map(slice, start_indices, limit_indices, strides or (None,) * x.ndim))
+    ],
+    "squeeze": lambda x, dimensions: np.squeeze(x, dimensions),
+    "stack": lambda *xs, axis: np.stack(xs, axis),
+    "concatenate": lambda *xs, dimension: np.concatenate(xs, dimension),
+}
+# Arithmetic with the same bits in NumPy, for the constants that a function computes from its parameters.
+_ARITHMETIC: dict[str, Callable[..., np.ndarray]] = {
+    "add": np.add,
+    "add_any": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "div": np.divide,
+    "neg": np.negative,
+    "convert_element_type": np.asarray,
+}
+
+# ``scatter`` alone moves entries, these compute: several updates may meet in one entry
+SCATTERS = {"scatter-add": jax.lax.add, "scatter-sub": jax.lax.sub, "scatter-mul": jax.lax.mul}
+SCATTERS |= {"scatter-min": jax.lax.min, "scatter-max": jax.lax.max}
+
+ENTRYWISE = frozenset(
+    """abs acos acosh add add_any and asin asinh atan atan2 atanh bessel_i0e bessel_i1e cbrt ceil clamp
+    convert_element_type copy copy_p cos cosh digamma div eq erf erf_inv erfc exp exp2 expm1 floor ge gt imag
+    integer_pow is_finite le lgamma log log1p log2 logistic lt max min mul ne neg nextafter not or pow real
+    reduce_precision rem round rsqrt select_n sign sin sinh sqrt square stop_gradient sub tan tanh xor""".split()  # noqa: SIM905
+)
+
+REDUCTIONS: dict[str, Callable] = {
+    "reduce_sum": jax.lax.add,
+    "reduce_prod": jax.lax.mul,
+    "reduce_max": jax.lax.max,
+    "reduce_min": jax.lax.min,
+    "reduce_and": jax.lax.bitwise_and,
+    "reduce_or": jax.lax.bitwise_or,
+}
+
+CUMULATIVE = {"cumsum": jax.lax.add, "cumprod": jax.lax.mul, "cummax": jax.lax.max, "cummin": jax.lax.min}
+
+# Under which parameter a call keeps what it calls; a primitive has several names, as JAX has renamed it over the years.
+# A custom_vjp is none of them: to look inside would lose its rule, and ``vmap`` keeps it.
+CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr"}
+CALLS |= {"checkpoint": "jaxpr", "remat": "jaxpr", "remat2": "jaxpr", "custom_jvp_call": "call_jaxpr"}
+
+
+def in_numpy(eqn: jex.JaxprEqn, operands: Sequence[Numbers]) -> np.ndarray | None:
+    """Result of an equation on concrete numbers where NumPy gives the same bits, else None."""
+    name, dtypes = eqn.primitive.name, [array_type(var).dtype for var in (*eqn.invars, *eqn.outvars)]
+    if name not in IN_NUMPY and (name not in _ARITHMETIC or not all(np.issubdtype(d, np.floating) for d in dtypes)):
+        return None
+    arrays = [np.asarray(operand, dtype) for operand, dtype in zip(operands, dtypes[:-1], strict=True)]
+    if name in IN_NUMPY:
+        return IN_NUMPY[name](*arrays, **eqn.params)
+    with np.errstate(all="ignore"):
+        return np.asarray(_ARITHMETIC[name](*arrays), dtypes[-1])
+
+
+def bind(eqn: jex.JaxprEqn, operands: Sequence[Numbers]) -> list:
+    """Results of one equation on JAX arrays."""
+    results = eqn.primitive.bind(*operands, **eqn.primitive.get_bind_params(eqn.params))
+    return list(results) if eqn.primitive.multiple_results else [results]
+
+
+def array_type(var: jex.Var | jex.Literal) -> jax.core.ShapedArray:
+    """Shape and dtype of a variable of a jaxpr; JAX annotates a wider type, for tokens and references."""
+    return cast(jax.core.ShapedArray, var.aval)
 
 
 def is_literal(operand: jex.Var | jex.Literal) -> TypeGuard[jex.Literal]:

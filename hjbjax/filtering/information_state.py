@@ -61,7 +61,8 @@ def zakai(
     for dx = f(x, u) dt + σ dw and dy = h(x) dt + r dv, R = r rᵀ. Positive, and of mass one up to rounding, whatever dt
     and the record; of second order in dt, in the spacing of second order where the noise of an axis makes central
     differences monotone, a_ii ≥ h|f_i|, and first elsewhere. All k densities are kept; a ``GridFilter`` keeps the last.
-    In float64; under a tracer in the type of the record, with forward derivatives (``jacfwd``).
+    In float64; under a tracer in the type of the record, with forward derivatives
+    (``jacfwd``); outside ``jit`` and ``vmap`` with reverse ones, too (``grad``).
 
     Along a periodic axis the mean is the circular one, the angle of the mean of e^{iθ}, brought into the box, and the
     covariance that of the differences from it the short way round.

@@ -404,7 +404,7 @@ REFUSED = [
     (lambda: ask(controls=[[1.0]]), "controls has shape (1, 1), wanted (1, 0)"),
     (lambda: ask(DRIVEN), "controls is None, but the problem has 1"),
     (lambda: ask(DRIVEN, controls=[[1.0], [1.0]]), "controls has shape (2, 1), wanted (1, 1)"),
-    (lambda: ask(DRIVEN, controls=[[np.inf]]), "controls has 1 entries that are not finite"),
+    (lambda: ask(DRIVEN, controls=[[np.inf]]), "controls[0] = [inf], wanted finite numbers"),
     (lambda: ask(Problem(lambda x, u: x[:1] * jnp.ones(2))), "drift(x, u) "),
 ]
 

@@ -295,7 +295,7 @@ GAME = hjb.Problem(lambda x, u, d: u + d, None, hjb.Box([-1.0], [1.0]), disturba
         ({"y": nan_record()}, r"y\[3\] = \[nan\], wanted finite numbers"),
         ({"y": np.zeros(5)}, r"y has shape \(5,\), wanted \(k, 1\)"),
         ({"controls": None}, r"controls is None, but the problem has 1"),
-        ({"controls": np.full((5, 1), np.inf)}, r"controls hold numbers that are not finite"),
+        ({"controls": np.full((5, 1), np.inf)}, r"controls\[0\] = \[inf\], wanted finite numbers"),
         ({"h": lambda x: x[0]}, r"h\(x\) returned float64 numbers of shape \(\), wanted .* of shape \(p,\)"),
         ({"initial": lambda x: jnp.where(x[0] > 0, -jnp.inf, 0.0)}, r"initial is -inf at some node"),
         ({"initial": np.full(41, np.inf)}, r"initial is inf at some node"),

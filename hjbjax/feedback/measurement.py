@@ -11,9 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hjbjax.problem import arguments, sets
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import is_traced, numbers, pytree_dataclass
-from hjbjax.problem.types import Array, Numbers, State
+from hjbjax.problem.types import Array, Number, Numbers, State
 from hjbjax.tracing import checks, closures, indices
 
 ROUNDINGS = 16  # units of eps: a matrix r whose rows are so near to dependent has no inverse worth the name
@@ -138,6 +139,104 @@ def plant(problem: Problem, n: int, name: str) -> Problem:
     system = closures.settled(Problem(problem.drift, controls=problem.controls, noise=problem.noise), n)
     checks.of_one_state(system, n, "the number of states")
     return system
+
+
+def check_step(name: str, problem: Problem, outputs: int, told: tuple[Any, Any, Number]) -> None:
+    """Refuse a control, an increment and a step length that an observer cannot take.
+
+    Shapes are looked at inside a transformation as well, where a wrong one would be broadcast or fail far from here;
+    numbers where they are known.
+
+    Args:
+      name: who asks, for refusals.
+      problem: the plant, with its admissible set.
+      outputs: the number p of measured quantities.
+      told: u (m,), dy (p,) and dt.
+    """
+    u, dy, dt = told
+    m = 0 if problem.controls is None else problem.controls.dim
+    check_vector(u, f"{name}: u", m, "what was held over the step, one entry an input")
+    check_vector(dy, f"{name}: dy", outputs, "the increment over the step, one entry a measured quantity")
+    check_admissible(problem, u, f"{name}: u")
+    check_length(dt, f"{name}: dt", "the length of the step")
+
+
+def check_vector(given: Any, name: str, entries: int, meaning: str) -> None:
+    """Refuse what is no vector of so many finite numbers."""
+    array = given if is_traced(given) else numbers(given, name)
+    if np.shape(array) != (entries,):
+        raise ValueError(f"{name} has shape {np.shape(array)}, wanted ({entries},): {meaning}")
+    if not is_traced(array) and not np.all(np.isfinite(array)):
+        raise ValueError(f"{name} = {array.tolist()}, wanted finite numbers: after one that is not, nothing is known")
+
+
+def check_length(dt: Any, name: str, meaning: str) -> None:
+    """Refuse a length of a step that is no finite number > 0."""
+    if np.ndim(dt) != 0:
+        raise ValueError(f"{name} has shape {np.shape(dt)}, wanted one number > 0, {meaning}")
+    arguments.positive(dt, name, meaning)
+
+
+def check_admissible(problem: Problem, controls: Any, name: str) -> None:
+    """Refuse controls (..., m) that the plant does not admit; drift and cost may mean nothing there."""
+    if problem.controls is None or is_traced(problem.controls, controls):
+        return
+    given = numbers(controls, name)
+    bad = ~sets.holds(problem.controls, given)
+    if np.any(bad):
+        first = given[bad][0].tolist()
+        raise ValueError(
+            f"{name} = {first} at {int(np.sum(bad))} of {bad.size} steps, wanted elements of the admissible set, "
+            f"{arguments.shown(problem.controls)}: give what was applied, or a Problem with a wider set"
+        )
+
+
+def record_of(given: Any, name: str, p: int, *, batches: bool) -> Any:
+    """A record, shape (k, p), or (batch, k, p) where ``batches`` are taken, of finite numbers and at least one row."""
+    record = numbers(given, name)
+    if np.ndim(record) not in ((2, 3) if batches else (2,)) or np.shape(record)[-1] != p or 0 in np.shape(record):
+        many = f", or (batch, k, {p})" if batches else ""
+        raise ValueError(
+            f"{name} has shape {np.shape(record)}, wanted (k, {p}){many}: one row a step, one column a measured "
+            "quantity"
+        )
+    _check_finite(record, name)
+    return record
+
+
+def controls_of(given: Any, name: str, problem: Problem, steps: tuple[int, ...]) -> Any:
+    """The controls that were held, shape (*steps, m), m = 0 where the plant has none; one record serves a batch.
+
+    Args:
+      given: what the user gave, or ``None``.
+      name: the argument, for refusals.
+      problem: the plant, with its admissible set.
+      steps: (k,) or (batch, k), those of the record of measurements.
+    """
+    m = 0 if problem.controls is None else problem.controls.dim
+    wanted = (*steps, m)
+    if given is None and m > 0:
+        raise ValueError(f"{name} is None, but the problem has {m}; give what was applied, shape {wanted}")
+    acts = np.zeros(wanted) if given is None else numbers(given, name)
+    if np.shape(acts) == wanted[1:] and len(wanted) == 3:
+        acts = jnp.broadcast_to(acts, wanted) if is_traced(acts) else np.broadcast_to(acts, wanted)
+    if np.shape(acts) != wanted:
+        raise ValueError(f"{name} has shape {np.shape(acts)}, wanted {wanted}: one row a step of the record")
+    _check_finite(acts, name)
+    check_admissible(problem, acts, name)
+    return acts
+
+
+def _check_finite(record: Any, name: str) -> None:
+    """Refuse a record with a number that is not finite, by its first row."""
+    if is_traced(record) or np.all(np.isfinite(record)):
+        return
+    row = tuple(int(i) for i in np.argwhere(~np.all(np.isfinite(record), axis=-1))[0])
+    place = ", ".join(map(str, row))
+    raise ValueError(
+        f"{name}[{place}] = {record[row].tolist()}, wanted finite numbers; where a measurement is missing part the "
+        "record, and go on from the last state with a large measurement_noise"
+    )
 
 
 def _rest(x: State, u: Array) -> State:

@@ -262,7 +262,8 @@ def _check_shapes(loop: OutputLoop, x0: np.ndarray) -> None:
     u, dy, dt = np.zeros(m), np.zeros(loop.measurement.dim), np.zeros(())
     information = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, loop.initial()))
     try:
-        told = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, loop.update(loop.initial(), u, dy, dt)))
+        # as arguments, and not closed over: an observer would judge their values
+        told = jax.eval_shape(lambda *seen: jax.tree.map(jnp.asarray, loop.update(loop.initial(), *seen)), u, dy, dt)
     except (TypeError, ValueError) as error:
         said = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise ValueError(

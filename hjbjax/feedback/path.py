@@ -9,13 +9,12 @@ import numpy as np
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import pytree_dataclass
-from hjbjax.problem.sets import AdmissibleSet, Ball, Box
+from hjbjax.problem.sets import AdmissibleSet, Ball, Box, holds
 from hjbjax.problem.types import Array
 from hjbjax.solution.screen import encodable
 from hjbjax.solution.solution import Solution
 
 MANY = 1000  # internal steps, beside an eighth of those allowed: more of them tell of a feedback that jumps
-SLACK = 1e-9  # relative, of an admissible set: what interpolation between the nodes rounds a control by
 
 
 class PathStatus(enum.IntEnum):  # of integers, since compiled programs and vmap know no others
@@ -188,7 +187,4 @@ def truncate(
 
 def _are_inadmissible(controls: AdmissibleSet | None, applied: Array) -> bool:
     """True if a control lies outside a box or a ball by more than rounding; a finite set is not looked at."""
-    if isinstance(controls, Box):
-        slack = SLACK * (1 + np.abs(controls.lo) + np.abs(controls.hi))
-        return bool(np.any((applied < controls.lo - slack) | (applied > controls.hi + slack)))
-    return isinstance(controls, Ball) and bool(np.any(np.linalg.norm(applied, axis=-1) > controls.radius * (1 + SLACK)))
+    return isinstance(controls, (Box, Ball)) and not np.all(holds(controls, applied))

@@ -32,23 +32,44 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import known
 from hjbjax.problem.types import Array, Control, Field, Number, State
 
+MOST = 10_000_000  # sub-steps; a law that moves by a cell in each is at rest on any grid that fits in memory
 
-def advanced(on: Discretisation, probability: Field, u: Control, dt: Number) -> Field:
-    """The probabilities at the nodes after the time dt under the control u (m,): their sum is kept, none negative."""
-    dtype = probability.dtype
-    jumps = jump_rates(on, [jnp.asarray(u[j], dtype) for j in range(len(u))])
-    leaving, arriving = jumps.total(), jumps.inflow(on.grid)
+
+def substeps(on: Discretisation, u: Control, dt: Number) -> jax.Array:
+    """The number of sub-steps ⌈dt max Q⌉ under the control u (m,), from 1 to ``MOST`` + 1."""
+    return _count(_rates(on, u, on.dtype).total(), dt)
+
+
+def _rates(on: Discretisation, u: Control, dtype: np.dtype) -> Rates:
+    return jump_rates(on, [jnp.asarray(u[j], dtype) for j in range(len(u))])
+
+
+def _count(leaving: Field, dt: Number) -> jax.Array:
     wanted = jnp.ceil(jnp.max(leaving) * dt)
     # rates that are not finite make no count; the probabilities that they make say so
-    count = jnp.where(jnp.isfinite(wanted), jnp.clip(wanted, 1, np.iinfo(np.int32).max // 2), 1)
-    tau = (dt / count).astype(dtype)
+    return jnp.where(jnp.isfinite(wanted), jnp.clip(wanted, 1, MOST + 1), 1).astype(jnp.int32)
+
+
+def advanced(on: Discretisation, probability: Field, u: Control, dt: Number, most: int | None = None) -> Field:
+    """The probabilities at the nodes after the time dt under the control u (m,): their sum is kept, none negative.
+
+    NaN where more than ``MOST`` sub-steps are wanted. With ``most``, which must be enough, there are so many: of a
+    known number of steps there is a derivative in reverse mode, too.
+    """
+    dtype = probability.dtype
+    jumps = _rates(on, u, dtype)
+    leaving, arriving = jumps.total(), jumps.inflow(on.grid)
+    count = _count(leaving, dt) if most is None else most
+    probability = jnp.where(jnp.asarray(count) > MOST, jnp.nan, probability)
+    tau = jnp.asarray(dt / count, dtype)
     stays = jnp.maximum(1 - tau * leaving, 0)  # of the fastest node 1 − 1, which may round below zero
     moves = arriving.scaled(tau)
 
     def substep(_: int, p: Field) -> Field:
         return (p + _moved(on, stays, moves, _moved(on, stays, moves, p))) / 2
 
-    return jax.lax.fori_loop(0, count.astype(jnp.int32), substep, probability)
+    # of more than MOST none is made: what comes back says so
+    return jax.lax.fori_loop(0, jnp.where(count > MOST, 0, count) if most is None else most, substep, probability)
 
 
 def _moved(on: Discretisation, stays: Field, moves: Rates, p: Field) -> Field:

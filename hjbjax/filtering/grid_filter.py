@@ -21,7 +21,7 @@ from hjbjax.discretisation import correlated_noise
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.rates import jump_rates
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.feedback.measurement import Measurement, measurement, plant
+from hjbjax.feedback.measurement import Measurement, check_step, measurement, plant
 from hjbjax.filtering import forward_equation
 from hjbjax.filtering.forward_equation import advanced, cells
 from hjbjax.markov_chain.decision_process import refuse
@@ -128,6 +128,12 @@ class GridFilter:
 
     def update(self, state: Density, u: Control, dy: Array, dt: Number) -> Density:
         """The law after holding the control u (m,) for dt and seeing the increment dy (p,)."""
+        self._check_state(state)
+        check_step("GridFilter.update", self.plant, self.measurement.dim, (u, dy, dt))
+        return self._after(state, u, dy, dt)
+
+    def _after(self, state: Density, u: Control, dy: Array, dt: Number, most: int | None = None) -> Density:
+        """The law a step later, by ``most`` sub-steps if their number is to be known beforehand."""
         dtype = state.density.dtype
         dt, u = jnp.asarray(dt, dtype), jnp.asarray(u, dtype)
         signal = jnp.asarray(self.signal, dtype)
@@ -135,7 +141,7 @@ class GridFilter:
         # half of ℓ, before the state moves and after it
         half = (jnp.tensordot(seen, signal, 1) - jnp.sum(signal**2, axis=0) * (dt / 2)) / 2
         probability, before = _weighed(self.probability(state), half)
-        probability = advanced(self._on(dtype), probability, u, dt)
+        probability = advanced(self._on(dtype), probability, u, dt, most)
         probability, after = _weighed(probability, half)
         return Density(self._density(probability), state.log_likelihood + before + after)
 
@@ -149,12 +155,19 @@ class GridFilter:
 
     def probability(self, state: Density) -> Field:
         """The probability of each node of the chain, shape (*grid), of sum 1: the density times the node's cell."""
+        self._check_state(state)
         mass = state.density * jnp.asarray(self.cells, state.density.dtype)
         return mass / jnp.sum(mass)
 
     def mode(self, state: Density) -> State:
         """The node at which the density is largest, shape (n,)."""
         return forward_equation.mode(self.grid, state.density)
+
+    def _check_state(self, state: Density) -> None:
+        """Refuse the state of another filter, or of this one on another grid."""
+        if not isinstance(state, Density) or np.shape(state.density) != self.grid.shape:
+            got = f"shape {np.shape(state.density)}" if isinstance(state, Density) else f"a {type(state).__name__}"
+            raise ValueError(f"GridFilter: got {got} for the state, wanted a Density of shape {self.grid.shape}")
 
     def _on(self, dtype: DType) -> Discretisation:
         return Discretisation(*cast((self.plant, self.grid), dtype), Upwind(), dtype)

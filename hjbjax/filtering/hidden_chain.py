@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hjbjax.feedback.measurement import check_length, check_vector
 from hjbjax.filtering.beliefs import Sensor, chain_functions, check_generator
 from hjbjax.problem import arguments
 from hjbjax.problem.pytree import as_partial, cast, is_traced, numbers, pytree_dataclass
@@ -116,6 +117,11 @@ class WonhamFilter:
 
     def update(self, state: Array, u: Control, dy: Array, dt: Number) -> jax.Array:
         """π after holding the control u, shape (m,), for a time dt and seeing the increment dy, shape (p,)."""
+        check_vector(state, "WonhamFilter.update: the belief", len(self.prior), "one entry a state")
+        check_vector(u, "WonhamFilter.update: u", np.size(u), "what was held over the step, one entry an input")
+        outputs = jax.eval_shape(self.sensor.values, jnp.asarray(u)).shape[1]
+        check_vector(dy, "WonhamFilter.update: dy", outputs, "the increment over the step, one entry a measurement")
+        check_length(dt, "WonhamFilter.update: dt", "the length of the step")
         return _updated(self, jnp.asarray(state), jnp.asarray(u), jnp.asarray(dy), dt)
 
     def _after(self, belief: jax.Array, u: jax.Array, dy: jax.Array, dt: Number) -> jax.Array:

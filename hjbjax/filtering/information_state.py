@@ -14,10 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hjbjax.feedback.measurement import check_length, controls_of, record_of
+from hjbjax.filtering.forward_equation import substeps
 from hjbjax.filtering.grid_filter import Density, GridFilter
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import cast, is_traced, numbers, pytree_dataclass
+from hjbjax.problem.pytree import cast, is_traced, pytree_dataclass
 from hjbjax.problem.types import Array, Number, Numbers
 
 
@@ -59,7 +61,8 @@ def zakai(
     for dx = f(x, u) dt + σ dw and dy = h(x) dt + r dv, R = r rᵀ. Positive, and of mass one up to rounding, whatever dt
     and the record; of second order in dt, in the spacing of second order where the noise of an axis makes central
     differences monotone, a_ii ≥ h|f_i|, and first elsewhere. All k densities are kept; a ``GridFilter`` keeps the last.
-    In float64; under a tracer in the type of the record, with forward derivatives (``jacfwd``).
+    In float64; under a tracer in the type of the record, with forward derivatives
+    (``jacfwd``); outside ``jit`` and ``vmap`` with reverse ones, too (``grad``).
 
     Along a periodic axis the mean is the circular one, the angle of the mean of e^{iθ}, brought into the box, and the
     covariance that of the differences from it the short way round.
@@ -94,25 +97,36 @@ def zakai(
     """
     name = "zakai"
     observer = GridFilter(problem, h, grid, initial_density, measurement_noise=measurement_noise)
-    record = numbers(dy, f"{name}: dy")
-    acts = _record_of_controls(record, controls, problem, observer.measurement.dim, name)
-    if not is_traced(dt) and not (np.ndim(dt) == 0 and np.isfinite(dt) and dt > 0):
-        raise ValueError(f"{name}: dt = {dt!r}; wanted a finite number > 0, the time between two increments")
+    record = record_of(dy, f"{name}: dy", observer.measurement.dim, batches=True)
+    acts = controls_of(controls, f"{name}: controls", problem, np.shape(record)[:-1])
+    check_length(dt, f"{name}: dt", "the time between two increments")
     run = _run if record.ndim == 2 else _run_batch  # one record needs no batch axis, which takes time to compile
     if is_traced(observer, record, acts, dt):
-        return run(observer, record, acts, dt, bool(normalised))
+        # counts are integers without a derivative: under ``grad`` alone they come back as plain numbers, and a loop of
+        # a known length has a reverse derivative; under ``jit`` and ``vmap`` it stays open
+        count = _substeps(observer, record, acts, dt)
+        return run(observer, record, acts, dt, bool(normalised), None if is_traced(count) else int(count))
     # inside somebody's ``jit`` as well, what is known is computed here and now
     with jax.core.eval_context(), jax.enable_x64(True):
         answer = run(*cast((observer, record, acts, dt), np.float64), bool(normalised))
         return jax.tree.map(np.asarray, answer)
 
 
-def _law(observer: GridFilter, record: Array, acts: Array, dt: Number, normalised: bool) -> InformationState:
+@jax.jit
+def _substeps(observer: GridFilter, record: Array, acts: Array, dt: Number) -> jax.Array:
+    """The largest number of sub-steps that a step of a record wants."""
+    on, rows = observer._on(record.dtype), jnp.reshape(acts, (record.size // record.shape[-1], acts.shape[-1]))
+    return jnp.max(jax.lax.map(lambda u: substeps(on, u, dt), rows))
+
+
+def _law(
+    observer: GridFilter, record: Array, acts: Array, dt: Number, normalised: bool, most: int | None
+) -> InformationState:
     """The information state after each increment of one record (k, p) under controls (k, m)."""
     dtype = record.dtype
 
     def step(state: Density, row: tuple[Array, Array]) -> tuple[Density, InformationState]:
-        state = observer.update(state, row[1], row[0], dt)
+        state = observer._after(state, row[1], row[0], dt, most)
         # the filter keeps the norm apart, in its logarithm, or a long record would overflow
         factor = 1.0 if normalised else jnp.exp(state.log_likelihood)
         shown = InformationState(
@@ -125,39 +139,21 @@ def _law(observer: GridFilter, record: Array, acts: Array, dt: Number, normalise
         return state, shown
 
     first = Density(jnp.asarray(observer.prior, dtype), jnp.zeros((), dtype))
-    return jax.lax.scan(step, first, (record, acts))[1]
+    # on the way back the sub-steps are made again, so that one density is kept a step
+    return jax.lax.scan(step if most is None else jax.checkpoint(step), first, (record, acts))[1]
 
 
-@jax.jit(static_argnums=4)
-def _run(observer: GridFilter, record: Array, acts: Array, dt: Number, normalised: bool) -> InformationState:
+@jax.jit(static_argnums=(4, 5))
+def _run(
+    observer: GridFilter, record: Array, acts: Array, dt: Number, normalised: bool, most: int | None = None
+) -> InformationState:
     """The law along one record."""
-    return _law(observer, record, acts, dt, normalised)
+    return _law(observer, record, acts, dt, normalised, most)
 
 
-@jax.jit(static_argnums=4)
-def _run_batch(observer: GridFilter, record: Array, acts: Array, dt: Number, normalised: bool) -> InformationState:
+@jax.jit(static_argnums=(4, 5))
+def _run_batch(
+    observer: GridFilter, record: Array, acts: Array, dt: Number, normalised: bool, most: int | None = None
+) -> InformationState:
     """The law along each of a batch of records."""
-    return jax.vmap(lambda dy, u: _law(observer, dy, u, dt, normalised))(record, acts)
-
-
-def _record_of_controls(record: Any, controls: Any, problem: Problem, p: int, name: str) -> Any:
-    """The controls as a record of the shape of ``record``, once both are known to be what they should be."""
-    if np.ndim(record) not in (2, 3) or np.shape(record)[-1] != p or 0 in np.shape(record):
-        raise ValueError(
-            f"{name}: dy has shape {np.shape(record)}, wanted (k, {p}), or (batch, k, {p}): one row a step, one column "
-            "a measured quantity"
-        )
-    m = 0 if problem.controls is None else problem.controls.dim
-    if controls is None and m > 0:
-        raise ValueError(f"{name}: controls is None, but the problem has {m}; give what was applied, shape (k, {m})")
-    wanted = (*np.shape(record)[:-1], m)
-    acts = np.zeros(wanted) if controls is None else numbers(controls, f"{name}: controls")
-    if np.shape(acts) == wanted[1:] and len(wanted) == 3:  # one record of controls for all of the batch
-        acts = jnp.broadcast_to(acts, wanted) if is_traced(acts) else np.broadcast_to(acts, wanted)
-    if np.shape(acts) != wanted:
-        raise ValueError(f"{name}: controls has shape {np.shape(acts)}, wanted {wanted}: one row for each of dy")
-    for what, array in (("dy", record), ("controls", acts)):
-        bad = 0 if is_traced(array) else int(np.sum(~np.isfinite(array)))
-        if bad:
-            raise ValueError(f"{name}: {what} has {bad} entries that are not finite, wanted numbers")
-    return acts
+    return jax.vmap(lambda dy, u: _law(observer, dy, u, dt, normalised, most))(record, acts)

@@ -29,9 +29,12 @@ from hjbjax.discretisation import stencil
 from hjbjax.discretisation.discretisation import Differences, Discretisation
 from hjbjax.iteration.time_methods import TABLEAUX
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.pytree import cast, is_traced, pytree_dataclass
+from hjbjax.problem.pytree import cast, is_traced, numbers, pytree_dataclass
 from hjbjax.problem.types import Array, Field, Nodes, Number, Scalar
 
+MOST = (
+    100_000  # inner steps: the paths have then crossed as many cells, which no interval of a record is long enough for
+)
 FRACTION = 0.8  # of the limit of a monotone step: velocities of a later stage may be larger than those of the first
 
 
@@ -77,13 +80,17 @@ class MaxPlusMarch:
         gain = jnp.where(noisy, jnp.maximum(from_below, from_above), from_below + from_above)
         return gain, jnp.maximum(rising / link.down, -falling / link.up)
 
-    def after(self, p: Field, dt: Number) -> Field:
-        """p a time dt later, by as many steps as the velocities want; NaN where it is no longer finite."""
+    def after(self, p: Field, dt: Number, most: int | None = None) -> tuple[Field, jax.Array]:
+        """p a time dt later, by as many steps as the velocities want, and their number.
+
+        NaN where p is no longer finite, and where more than ``MOST`` steps are wanted. With ``most`` the loop makes so
+        many steps, of no length once the time is used up: it has then a derivative in reverse mode, too.
+        """
         tableau = TABLEAUX[self.on.scheme.stages]
         means = jnp.asarray(tableau.means, p.dtype)
 
         def step(carry):
-            p, left = carry
+            p, left, count = carry
             first, speed = self.rate(p)
             whole = jnp.ceil(left * speed / FRACTION)
             dt = left / jnp.maximum(whole, 1)  # equal steps, were the velocities to stay as they are
@@ -95,11 +102,17 @@ class MaxPlusMarch:
             # a loop, so that the slopes are compiled once and not once a stage
             moved = jax.lax.fori_loop(1, len(tableau.means), stage, moved)
             # an infinite velocity would take steps of no length for ever
-            fine = jnp.isfinite(speed) & jnp.all(jnp.isfinite(moved))
-            left = jnp.where(whole <= 1, 0, left - dt)
-            return jnp.where(fine, moved, jnp.nan), jnp.where(fine, left, 0)
+            fine = jnp.isfinite(speed) & jnp.all(jnp.isfinite(moved)) & (count < MOST)
+            rest = jnp.where(whole <= 1, 0, left - dt)
+            return jnp.where(fine, moved, jnp.nan), jnp.where(fine, rest, 0), count + (left > 0)
 
-        return jax.lax.while_loop(lambda carry: carry[1] > 0, step, (p, jnp.asarray(dt, p.dtype)))[0]
+        carry = p, jnp.asarray(dt, p.dtype), jnp.zeros((), jnp.int32)
+        if most is None:
+            p, _, count = jax.lax.while_loop(lambda carry: carry[1] > 0, step, carry)
+        else:  # the steps are made again on the way back, so that one p is kept a step
+            again = jax.checkpoint(step)
+            (p, _, count), _ = jax.lax.scan(lambda carry, _: (again(carry), None), carry, length=most)
+        return p, count
 
 
 def sup_pairing(p: Nodes, psi: Nodes | float, grid: Grid) -> tuple[Array, Array]:
@@ -116,10 +129,12 @@ def sup_pairing(p: Nodes, psi: Nodes | float, grid: Grid) -> tuple[Array, Array]
       grid: the nodes.
 
     Returns:
-      The maximum, shape (), in the units of cost, and the state, shape (n,). Jit- and vmap-able.
+      The maximum, shape (), in the units of cost, and the state, shape (n,), NaN where p + ψ is −∞ at all nodes. Jit-
+      and vmap-able.
 
     Raises:
-      ValueError: node values of another shape than the grid.
+      ValueError: node values of another shape than the grid, or NaN.
+      TypeError: no Grid, values that are no numbers.
 
     Example:
       >>> grid = Grid([-1.0], [1.0], (11,))
@@ -130,14 +145,23 @@ def sup_pairing(p: Nodes, psi: Nodes | float, grid: Grid) -> tuple[Array, Array]
 
     Source: M. R. James, Nonlinear Control Systems, section 12.3.
     """
-    for name, values in (("p", p), ("psi", psi)):
+    if not isinstance(grid, Grid):
+        raise TypeError(f"sup_pairing: got {type(grid).__name__} for the grid, wanted a Grid")
+    given: Any = {"p": p, "psi": psi}
+    for name, each in given.items():
+        given[name] = values = each if is_traced(each) else numbers(each, f"sup_pairing: {name}")
         shape = np.shape(values)
+        if not is_traced(values) and np.any(np.isnan(values)):
+            raise ValueError(
+                f"sup_pairing: {name} is NaN at {int(np.sum(np.isnan(values)))} nodes, wanted numbers or −∞"
+            )
         if shape != grid.shape and not (name == "psi" and shape == ()):
             raise ValueError(f"sup_pairing: {name} has shape {shape}, wanted {grid.shape}: one number a node")
-    if is_traced(p, psi, grid):
-        return refined_maximum(jnp.asarray(p) + psi, grid)
+    total = given["p"] + given["psi"]
+    if is_traced(total, grid):
+        return refined_maximum(jnp.asarray(total), grid)
     with jax.enable_x64(True):
-        value, state = _refined_maximum(jnp.asarray(np.asarray(p, np.float64) + psi), cast(grid, np.float64))
+        value, state = _refined_maximum(jnp.asarray(total), cast(grid, np.float64))
         return np.asarray(value), np.asarray(state)
 
 
@@ -177,7 +201,9 @@ def refined_maximum(values: Field, grid: Grid) -> tuple[Scalar, jax.Array]:
     gain = slope @ shift + shift @ bend @ shift / 2
     place = jnp.stack([jnp.asarray(grid.axis(axis), dtype)[best[axis]] for axis in range(n)])
     better = gain > 0
-    return top + jnp.where(better, gain, 0), grid.wrap(place + jnp.where(better, shift, 0))
+    # NaN is the largest to argmax: where p is none, or −∞ everywhere, no state is the worst
+    found = jnp.where(jnp.isnan(top) | (top == -jnp.inf), jnp.nan, place + jnp.where(better, shift, 0))
+    return top + jnp.where(better, gain, 0), grid.wrap(found)
 
 
 _refined_maximum = jax.jit(refined_maximum)

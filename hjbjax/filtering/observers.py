@@ -26,7 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.feedback.measurement import Measurement, measurement, plant
+from hjbjax.feedback.measurement import Measurement, check_step, check_vector, measurement, plant
 from hjbjax.feedback.output_loop import Observer
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, is_traced, numbers, pytree_dataclass
@@ -123,6 +123,8 @@ class ExtendedKalman:
     def update(self, state: Gaussian, u: Control, dy: Array, dt: Number) -> Gaussian:
         """The law after holding the control u (m,) for dt and seeing the increment dy (p,)."""
         mean, p = state.mean, self.measurement.dim
+        check_vector(mean, "ExtendedKalman.update: the mean", len(self.mean), "one entry a state")
+        check_step("ExtendedKalman.update", self.plant, p, (u, dy, dt))
         n, dtype = mean.shape[0], mean.dtype
         u, dt = jnp.asarray(u, dtype), jnp.asarray(dt, dtype)
 
@@ -202,6 +204,8 @@ class Luenberger:
 
     def update(self, state: State, u: Control, dy: Array, dt: Number) -> State:
         """x̂ after holding the control u (m,) for dt and seeing the increment dy (p,)."""
+        check_vector(state, "Luenberger.update: the estimate", len(self.start), "one entry a state")
+        check_step("Luenberger.update", self.plant, self.measurement.dim, (u, dy, dt))
         n, dtype = state.shape[0], state.dtype
         dt = jnp.asarray(dt, dtype)
         u, y = jnp.asarray(u, dtype), jnp.asarray(dy, dtype) / dt  # the mean of y over the step

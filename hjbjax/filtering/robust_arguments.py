@@ -91,34 +91,3 @@ def gains(problem: Problem, sigma: Any, n: int) -> Any:
             "a diagonal one: each column of σ acts on one axis; turn the state's axes so that it does"
         )
     return np.sqrt(np.diag(a))
-
-
-def record_of(y: Any, count: int) -> Any:
-    """The record, shape (k, p), of finite numbers."""
-    array = numbers(y, "robust_filter: y")
-    if array.ndim != 2 or array.shape[0] == 0 or array.shape[1] != count:
-        raise ValueError(
-            f"robust_filter: y has shape {array.shape}, wanted (k, {count}): one row an interval, one column a "
-            "component of h"
-        )
-    if not is_traced(array) and not np.all(np.isfinite(array)):
-        row = int(np.argmin(np.all(np.isfinite(array), axis=1)))
-        raise ValueError(
-            f"robust_filter: y[{row}] = {array[row].tolist()}, wanted finite numbers; part the record where a "
-            "measurement is missing, and go on from the last p with a large measurement_noise"
-        )
-    return array
-
-
-def controls_of(problem: Problem, controls: Any, record: tuple) -> Any:
-    """The controls of every interval, shape (k, m), m = 0 where the problem has none."""
-    dim = 0 if problem.controls is None else problem.controls.dim
-    if controls is None and dim == 0:
-        return np.zeros((record[0], 0))
-    array = np.zeros(()) if controls is None else numbers(controls, "robust_filter: controls")
-    if array.shape != (record[0], dim):
-        got = "none" if controls is None else f"shape {array.shape}"
-        raise ValueError(f"robust_filter: got controls {got}, wanted ({record[0]}, {dim}): one row an interval")
-    if not is_traced(array) and not np.all(np.isfinite(array)):
-        raise ValueError("robust_filter: controls hold numbers that are not finite")
-    return array

@@ -30,9 +30,9 @@ import numpy as np
 
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.schemes import Weno5
-from hjbjax.feedback.measurement import Measurement, measurement
+from hjbjax.feedback.measurement import Measurement, check_step, controls_of, measurement, record_of
 from hjbjax.filtering import robust_arguments
-from hjbjax.filtering.max_plus import MaxPlusMarch, refined_maximum
+from hjbjax.filtering.max_plus import MOST, MaxPlusMarch, refined_maximum
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
@@ -135,16 +135,26 @@ class RobustGridFilter:
 
     def update(self, state: Field, u: Control, dy: Array, dt: Number) -> Field:
         """p after holding the control u, shape (m,), for a time dt, over which y = dy/dt was seen, dy (p,)."""
+        self._check_state(state)
+        check_step("RobustGridFilter.update", self.problem, self.measurement.dim, (u, dy, dt))
         dtype = state.dtype
         # compiled even where the caller does not: a loop whose body is new would be compiled at every call
-        return _after(self, state, jnp.asarray(u, dtype), jnp.asarray(dy, dtype) / dt, dt)
+        return _after(self, state, jnp.asarray(u, dtype), jnp.asarray(dy, dtype) / dt, dt)[0]
 
     def estimate(self, state: Field) -> State:
         """The worst case: the state where p is largest, shape (n,), refined between the nodes."""
+        self._check_state(state)
         return _largest(state, cast(self.grid, state.dtype))[1]
 
-    def _after(self, p: Field, u: Control, y: Array, dt: Number) -> Field:
-        """p a time dt later, with control and measurement held."""
+    def _check_state(self, state: Field) -> None:
+        """Refuse the state of another filter, or of this one on another grid."""
+        if np.shape(state) != self.grid.shape:
+            raise ValueError(
+                f"RobustGridFilter: the state has shape {np.shape(state)}, wanted {self.grid.shape}: one number a node"
+            )
+
+    def _after(self, p: Field, u: Control, y: Array, dt: Number, most: int | None = None) -> tuple[Field, jax.Array]:
+        """p a time dt later, with control and measurement held, and the number of inner steps."""
         mine = cast(self, p.dtype)
         on = Discretisation(mine.problem, mine.grid, self.scheme, p.dtype)
         entries = [u[k] for k in range(u.shape[0])]
@@ -159,7 +169,7 @@ class RobustGridFilter:
             on.drift(entries),
             [gain**2 / mine.gamma**2 for gain in mine.sigma],
             on.running_cost(entries) - mine.gamma**2 / 2 * misfit,
-        ).after(p, dt)
+        ).after(p, dt, most)
 
 
 _after, _largest = jax.jit(RobustGridFilter._after), jax.jit(refined_maximum)
@@ -228,18 +238,21 @@ def robust_filter(
     observer = RobustGridFilter(asked, h, grid, initial, gamma, **options)
     if not is_traced(dt):
         arguments.positive(dt, "robust_filter: dt", "in units of time")
-    y, controls = (
-        robust_arguments.record_of(y, observer.measurement.dim),
-        robust_arguments.controls_of(problem, controls, np.shape(y)),
-    )
+    y = record_of(y, "robust_filter: y", observer.measurement.dim, batches=False)
+    controls = controls_of(controls, "robust_filter: controls", problem, np.shape(y)[:1])
     if is_traced(asked, observer.measurement, grid, y, dt, observer.p0, gamma, controls, sigma):
-        return _scan(observer, jnp.asarray(y), jnp.asarray(controls), dt)
+        return _transformed(observer, jnp.asarray(y), jnp.asarray(controls), dt)
     # inside somebody's ``jit`` a record of known numbers is filtered at once
     with jax.core.eval_context(), jax.enable_x64(True):
-        found = _scan_compiled(*cast((observer, y, controls, float(dt)), np.float64))
+        found, steps = _scan_compiled(*cast((observer, y, controls, float(dt)), np.float64))
         found = jax.tree.map(np.asarray, found)
     if not np.all(np.isfinite(found.p)):
         first = int(np.argmin(np.all(np.isfinite(found.p.reshape(len(found.p), -1)), axis=1)))
+        if steps >= MOST:
+            raise ValueError(
+                f"robust_filter: dt = {dt:g} asks for over {MOST} inner steps, wanted an interval in which the "
+                "paths cross fewer cells than that; give a shorter one, or a coarser grid"
+            )
         raise ValueError(
             f"robust_filter: p is not finite from interval {first} on, t = {first * dt:g} to {(first + 1) * dt:g}: the "
             "cost grows faster than the disturbances pay for it; take a larger gamma, a smaller box or a shorter record"
@@ -247,18 +260,30 @@ def robust_filter(
     return found
 
 
-def _scan(observer: RobustGridFilter, y: jax.Array, controls: jax.Array, dt: Any) -> RobustState:
-    """The information state after every interval, with its maximum."""
+def _transformed(observer: RobustGridFilter, y: jax.Array, controls: jax.Array, dt: Any) -> RobustState:
+    """The information state under a transformation: its derivatives in forward mode, and in reverse where they can be.
+
+    A loop has a reverse derivative if the number of its steps is known. Under ``grad`` alone it is: counts are
+    integers, without a derivative, and come back as plain numbers. Under ``jit`` and ``vmap`` the loop stays open.
+    """
+    found, steps = _scan_compiled(observer, y, controls, dt)
+    return found if is_traced(steps) else _scan_compiled(observer, y, controls, dt, int(steps))[0]
+
+
+def _scan(
+    observer: RobustGridFilter, y: jax.Array, controls: jax.Array, dt: Any, most: int | None = None
+) -> tuple[RobustState, jax.Array]:
+    """The information state after every interval, with its maximum, and the largest number of inner steps."""
     grid = observer.grid
     dtype = jnp.result_type(float)
 
     def step(p, seen):
-        p = observer._after(p, seen[0].astype(dtype), seen[1].astype(dtype), dt)
+        p, steps = observer._after(p, seen[0].astype(dtype), seen[1].astype(dtype), dt, most)
         value, place = refined_maximum(p, cast(grid, dtype))
-        return p, (p, place, value)
+        return p, (p, place, value, steps)
 
-    _, (p, place, value) = jax.lax.scan(step, observer.initial(), (controls, y))
-    return RobustState(p, place, value, dt * jnp.arange(1, len(y) + 1))
+    _, (p, place, value, steps) = jax.lax.scan(step, observer.initial(), (controls, y))
+    return RobustState(p, place, value, dt * jnp.arange(1, len(y) + 1)), jnp.max(steps)
 
 
-_scan_compiled = jax.jit(_scan)
+_scan_compiled = jax.jit(_scan, static_argnums=4)

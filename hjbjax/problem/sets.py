@@ -14,6 +14,8 @@ import numpy as np
 from hjbjax.problem.pytree import known, numbers, pytree_dataclass
 from hjbjax.problem.types import Array, DType, Number
 
+SLACK = 1e-6  # of the size of a set: eight roundings of float32, in which a control outside it may have been made
+
 
 def _finite_numbers(value: object, name: str) -> Array:
     """Numbers as an array, refused where they are not finite: over an unbounded set H may be −∞ at every state."""
@@ -166,6 +168,19 @@ def _unit_ball(dim: int, budget: int) -> np.ndarray:
         sphere = signs / np.linalg.norm(signs, axis=1, keepdims=True)
     # centre, half way and rim: the size |u| of any control is within ¼ of some sample's
     return np.concatenate([np.zeros((1, dim)), 0.5 * sphere, sphere])
+
+
+def holds(admissible: AdmissibleSet, u: Array) -> np.ndarray:
+    """True for each control (..., m) that lies in a set of known numbers, up to rounding in float32; shape (...)."""
+    if isinstance(admissible, Box):
+        lo, hi = np.asarray(admissible.lo), np.asarray(admissible.hi)
+        slack = SLACK * np.maximum(np.maximum(np.abs(lo), np.abs(hi)), hi - lo)
+        return np.all((u >= lo - slack) & (u <= hi + slack), axis=-1)
+    if isinstance(admissible, Ball):
+        return np.linalg.norm(u, axis=-1) <= np.asarray(admissible.radius) * (1 + SLACK)
+    points = np.asarray(admissible.points)
+    slack = SLACK * np.max(np.abs(points), axis=0)
+    return np.any(np.all(np.abs(u[..., None, :] - points) <= slack, axis=-1), axis=-1)
 
 
 def extremes(admissible: AdmissibleSet) -> Array:

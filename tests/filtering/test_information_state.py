@@ -389,7 +389,7 @@ REFUSED = [
     (lambda: ask(dt=-0.1), "dt = -0.1; wanted"),
     (lambda: ask(dy=[0.1, 0.2]), "dy has shape (2,), wanted (k, 1)"),
     (lambda: ask(dy=[[0.1, 0.2]]), "dy has shape (1, 2), wanted (k, 1)"),
-    (lambda: ask(dy=[[np.nan], [0.0]]), "dy has 1 entries that are not finite"),
+    (lambda: ask(dy=[[np.nan], [0.0]]), "wanted finite numbers; where a measurement is missing"),
     (lambda: ask(prior=0 * FLAT), "zero at every node"),
     (lambda: ask(prior=-FLAT), "not a finite number ≥ 0 at 31 nodes, the first (0,)"),
     (lambda: ask(prior=SPIKE), "not a finite number ≥ 0 at 1 nodes, the first (7,)"),
@@ -404,7 +404,7 @@ REFUSED = [
     (lambda: ask(controls=[[1.0]]), "controls has shape (1, 1), wanted (1, 0)"),
     (lambda: ask(DRIVEN), "controls is None, but the problem has 1"),
     (lambda: ask(DRIVEN, controls=[[1.0], [1.0]]), "controls has shape (2, 1), wanted (1, 1)"),
-    (lambda: ask(DRIVEN, controls=[[np.inf]]), "controls has 1 entries that are not finite"),
+    (lambda: ask(DRIVEN, controls=[[np.inf]]), "controls[0] = [inf], wanted finite numbers"),
     (lambda: ask(Problem(lambda x, u: x[:1] * jnp.ones(2))), "drift(x, u) "),
 ]
 

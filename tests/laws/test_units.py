@@ -1,12 +1,14 @@
 """Time in another unit and cost in another one rescale the value, and change nothing else."""
 
 import dataclasses
+from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import hjbjax as hjb
+from hjbjax.problem.pytree import pytree_dataclass
 
 UNITS = [(1e6, 1e9), (1e-6, 1e-9)]
 GRID = hjb.Grid([-1.5, -1.5], [1.5, 1.5], (13, 11))
@@ -16,6 +18,17 @@ pytestmark = pytest.mark.filterwarnings(
 )
 
 
+@pytree_dataclass(static=("function",))
+class Times:
+    """A function of a problem times a number, which is a leaf: all units share one compiled program."""
+
+    function: Callable
+    factor: float
+
+    def __call__(self, *arguments):
+        return self.factor * self.function(*arguments)
+
+
 @dataclasses.dataclass(frozen=True)
 class Units:
     """A problem in units of ``time`` and of ``cost``; numbers are those of the first units."""
@@ -23,18 +36,15 @@ class Units:
     time: float = 1.0
     cost: float = 1.0
 
-    def rate(self, function):
-        return lambda *arguments: self.time * function(*arguments)
-
-    def paid(self, function):
-        return None if function is None else lambda *arguments: self.cost * function(*arguments)
+    def paid(self, function, rate=1.0):
+        return None if function is None else Times(function, self.cost * rate)
 
     def problem(self, drift, cost, controls, *, discount=0.0, noise=None, exit_cost=None, **ends):
         ends = {name: self.paid(end) if name != "target" else end for name, end in ends.items() if callable(end)} | {
             name: end for name, end in ends.items() if not callable(end)
         }
         return hjb.Problem(
-            self.rate(drift), None if cost is None else self.rate(self.paid(cost)), controls,
+            Times(drift, self.time), self.paid(cost, self.time), controls,
             discount=self.time * discount, noise=None if noise is None else np.sqrt(self.time) * noise,
             exit_cost=self.paid(exit_cost), **ends,
         )  # fmt: skip

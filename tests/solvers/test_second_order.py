@@ -15,8 +15,17 @@ from hjbjax.solvers import nested
 U = hjb.Box([-1.0], [1.0])
 
 
-def line(**options):
-    return hjb.Problem(lambda x, u: u, lambda x, u: x @ x + u @ u, U, discount=1.0, **options)
+def steer(x, u):
+    return u
+
+
+def square(x, u):
+    return x @ x + u @ u
+
+
+def line(discount=1.0, **options):
+    """Functions of the module, so that problems with other numbers share compiled programs."""
+    return hjb.Problem(steer, square, U, discount=discount, **options)
 
 
 def test_it_is_the_limited_answer_with_the_certificate_of_the_monotone_one():
@@ -98,7 +107,7 @@ def test_where_noise_makes_central_differences_monotone_nothing_is_run_twice(ite
     ("problem", "method"),
     [
         (line(), hjb.ValueIteration()),
-        (hjb.Problem(lambda x, u: u, None, U, stopping_cost=lambda x: x @ x - 0.1), None),
+        (hjb.Problem(steer, None, U, stopping_cost=lambda x: x @ x - 0.1), None),
     ],
     ids=["value iteration", "tube"],
 )
@@ -112,11 +121,9 @@ def test_transformations_stay_with_the_chain():
     grid = hjb.Grid([-1.0], [1.0], (21,))
 
     def at(discount):
-        problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x + u @ u, U, discount=discount)
-        return hjb.solve(problem, grid, dtype="float32").value_at(jnp.array([0.5]))
+        return hjb.solve(line(discount), grid, dtype="float32").value_at(jnp.array([0.5]))
 
-    problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x + u @ u, U, discount=1.0)
-    chain = hjb.solve(problem, grid, scheme=hjb.Upwind(), dtype="float32").value_at([0.5])
+    chain = hjb.solve(line(), grid, scheme=hjb.Upwind(), dtype="float32").value_at([0.5])
     assert float(jax.jit(at)(1.0)) == pytest.approx(float(chain), abs=1e-3)
 
 
@@ -203,8 +210,8 @@ def test_nodes_that_do_not_reach_the_target_have_no_estimate():
 
 
 def test_lanes_are_solves():
-    grid = hjb.Grid([-1.0], [1.0], (31,))
-    problems = [hjb.Problem(lambda x, u: u, lambda x, u: x @ x + u @ u, U, discount=beta) for beta in (0.5, 1.0, 4.0)]
+    grid = hjb.Grid([-1.0], [1.0], (41,))
+    problems = [line(discount) for discount in (0.5, 1.0, 4.0)]
     for found, problem in zip(hjb.solve_batch(problems, grid), problems, strict=True):
         alone = hjb.solve(problem, grid)
         np.testing.assert_allclose(found.value, alone.value, rtol=0, atol=1e-12)
@@ -214,7 +221,7 @@ def test_lanes_are_solves():
 
 
 def test_lanes_with_enough_noise_keep_their_certificates():
-    grid = hjb.Grid([-1.0], [1.0], (31,))
+    grid = hjb.Grid([-1.0], [1.0], (41,))
     loud, quiet = hjb.solve_batch([line(noise=0.5), line(noise=0.05)], grid)
     assert loud.error <= 1e-3
     assert quiet.error is None
@@ -227,7 +234,7 @@ def test_lanes_with_enough_noise_keep_their_certificates():
     ids=["explicit", "implicit"],
 )
 def test_marches(method, scheme):
-    problem, grid = line(), hjb.Grid([-1.0], [1.0], (31,))
+    problem, grid = line(), hjb.Grid([-1.0], [1.0], (41,))
     found, named = (hjb.march(problem, grid, 0.5, method=method, **each) for each in ({}, {"scheme": scheme}))
     np.testing.assert_array_equal(found.value, named.value)
     assert found.stats["scheme"] == repr(scheme)

@@ -1,6 +1,7 @@
 """hjbjax: Hamilton–Jacobi–Bellman and Isaacs equations on grids, with JAX."""
 
 import importlib
+import sys
 from typing import TYPE_CHECKING, Any
 
 from hjbjax import geometry
@@ -106,8 +107,9 @@ LATER = ("filtering", "plotting", "zoo")  # imported when first asked for: a thi
 def __getattr__(name: str) -> Any:
     if name in LATER:
         return importlib.import_module(f"hjbjax.{name}")
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    # with the name, from which Python tells what was meant
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}", name=name, obj=sys.modules[__name__])
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *LATER})
+    return sorted(__all__)

@@ -21,7 +21,7 @@ from hjbjax.extremals.necessary_conditions import Extremal
 from hjbjax.hamiltonian.pointwise import rule_of
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import is_traced, pytree_dataclass
+from hjbjax.problem.pytree import is_traced, pytree_dataclass, with_suggestions
 from hjbjax.problem.types import Array, Number, State
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
@@ -52,6 +52,7 @@ class FreeTime:
             raise ValueError(f"FreeTime: got guess = {self.guess!r}, wanted a finite number > 0")
 
 
+@with_suggestions
 def pontryagin(
     problem: Problem,
     x0: State | Sequence[float],

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.pytree import pytree_dataclass
+from hjbjax.problem.pytree import is_traced, pytree_dataclass
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, holds
 from hjbjax.problem.types import Array
 from hjbjax.solution.screen import encodable
@@ -87,6 +87,12 @@ class Path:
     def status(self) -> PathStatus:
         """Why the path ends."""
         return PathStatus(int(self.code))
+
+    def __repr__(self) -> str:
+        if is_traced(self) or np.ndim(self.code):
+            return f"Path(states of shape {np.shape(self.states)})"
+        end, rows = float(self.times[-1]), len(self.times)
+        return f"Path({self.status.name} at t = {end:.6g}, {rows} times, cost {float(self.cost):.6g})"
 
     def __str__(self) -> str:
         return encodable(self.message)  # a terminal may lack a letter, and print would raise

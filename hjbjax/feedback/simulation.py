@@ -17,7 +17,7 @@ from hjbjax.feedback.path import Interrupted, Path, PathStatus, promise, truncat
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_partial, cast, is_traced
+from hjbjax.problem.pytree import as_partial, cast, is_traced, with_suggestions
 from hjbjax.problem.types import Key, Number, Numbers
 from hjbjax.solution.clock import CHUNK_SECONDS, Clock, noting_interrupts
 
@@ -28,6 +28,7 @@ INTERVALS = 200  # of the output, where nobody says how many
 _jit_part = jax.jit(integrate_part, donate_argnames="so_far")  # the rows of all intervals are overwritten in place
 
 
+@with_suggestions
 def simulate(
     problem: Problem,
     feedback: Feedback,

@@ -188,7 +188,10 @@ def _check_sets(controls: object, disturbances: object) -> None:
     """Refuse sets of an unknown kind; bounds without a ``Box`` around them are the usual slip."""
     for name, admissible in (("controls", controls), ("disturbances", disturbances)):
         if admissible is not None and not isinstance(admissible, (Box, Ball, Finite)):
-            raise TypeError(f"Problem.{name}: got {admissible!r}, wanted a Box, a Ball, a Finite or None")
+            cure = ""
+            if isinstance(admissible, (tuple, list)) and len(admissible) == 2:
+                cure = f": hjb.Box({admissible[0]!r}, {admissible[1]!r})"
+            raise TypeError(f"Problem.{name}: got {admissible!r}, wanted a Box, a Ball, a Finite or None{cure}")
 
 
 def _rate(discount: object) -> Number:

@@ -8,16 +8,19 @@ tracers and stacked arrays, which no check of values could pass.
 
 import copy
 import dataclasses
+import difflib
 import functools
 import hashlib
+import inspect
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, TypeVar, dataclass_transform
+from typing import Any, ParamSpec, TypeVar, dataclass_transform
 
 import jax
 import numpy as np
 
 from hjbjax.problem.types import DType, Numbers
 
+P = ParamSpec("P")
 T = TypeVar("T")
 REMEMBERED = 256  # answers of one function that are kept, the latest: the keys hold functions, and what these hold
 
@@ -43,6 +46,7 @@ def pytree_dataclass(*, static: Iterable[str] = (), host: Iterable[str] = ()) ->
     def register(cls: type[T]) -> type[T]:
         # eq=False: a comparison field by field would ask an array for its truth
         cls = dataclasses.dataclass(frozen=True, eq=False, init="__init__" not in vars(cls))(cls)
+        cls.__init__ = with_suggestions(cls.__init__, cls.__name__)  # type: ignore[method-assign]
         fields = dataclasses.fields(cls)  # type: ignore[arg-type]
         unknown = {*static, *host} - {field.name for field in fields}
         if unknown:
@@ -69,6 +73,22 @@ def pytree_dataclass(*, static: Iterable[str] = (), host: Iterable[str] = ()) ->
         return cls
 
     return register
+
+
+def with_suggestions(function: Callable[P, T], name: str | None = None) -> Callable[P, T]:
+    """Decorator: a misspelt keyword is refused with the one that it is next to, or with all that there are."""
+    parameters = inspect.signature(function).parameters.values()
+    by_name = {each.name for each in parameters if each.kind in (each.POSITIONAL_OR_KEYWORD, each.KEYWORD_ONLY)}
+
+    @functools.wraps(function)
+    def called(*arguments: P.args, **options: P.kwargs) -> T:
+        for word in options.keys() - by_name:
+            near = difflib.get_close_matches(word, by_name, 1)
+            cure = f"did you mean {near[0]}?" if near else f"wanted one of {', '.join(sorted(by_name - {'self'}))}"
+            raise TypeError(f"{name or function.__name__}() got an unexpected keyword argument {word!r}: {cure}")
+        return function(*arguments, **options)
+
+    return called
 
 
 def _compare_by_value(cls: type, names: tuple[str, ...]) -> None:

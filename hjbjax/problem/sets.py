@@ -35,8 +35,8 @@ class Box:
     """The box lo ≤ u ≤ hi.
 
     Args:
-      lo: lower bounds, shape (m,), in the units of each input.
-      hi: upper bounds, shape (m,).
+      lo: lower bounds, shape (m,), in the units of each input; of one input, a number will do.
+      hi: upper bounds, likewise.
 
     Raises:
       ValueError: the bounds differ in length, are not finite, or leave no admissible control.
@@ -51,6 +51,8 @@ class Box:
 
     def __post_init__(self):
         lo, hi = _finite_numbers(self.lo, "Box.lo"), _finite_numbers(self.hi, "Box.hi")
+        if np.ndim(lo) == np.ndim(hi) == 0:
+            lo, hi = lo.reshape(1), hi.reshape(1)
         if np.ndim(lo) != 1 or np.shape(lo) != np.shape(hi) or np.size(lo) == 0:
             raise ValueError(f"Box: got lo of shape {np.shape(lo)} and hi of shape {np.shape(hi)}, wanted (m,) twice")
         if isinstance(lo, np.ndarray) and isinstance(hi, np.ndarray) and np.any(lo > hi):

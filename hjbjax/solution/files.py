@@ -22,7 +22,17 @@ import numpy as np
 
 from hjbjax.problem.types import DType
 from hjbjax.solution import screen
-from hjbjax.solution.placement import FileError, Path, check_place, claimed, hidden_name, path_of, place, sweep
+from hjbjax.solution.placement import (
+    FileError,
+    MissingFileError,
+    Path,
+    check_place,
+    claimed,
+    hidden_name,
+    path_of,
+    place,
+    sweep,
+)
 
 T = TypeVar("T")
 
@@ -172,7 +182,8 @@ def read(
         reason, cause = f"it is damaged: {error}", error
     except Exception as error:  # zipfile, json and numpy raise a dozen kinds on damaged bytes
         reason, cause = f"damaged or foreign ({type(error).__name__}: {' '.join(str(error).split())[:200]})", error
-    raise FileError(f"{path}: cannot be read: {screen.one_line(reason, REASON)}") from cause
+    kind = MissingFileError if isinstance(cause, FileNotFoundError) else FileError
+    raise kind(f"{path}: cannot be read: {screen.one_line(reason, REASON)}") from cause
 
 
 def _read_archive(file: IO[bytes], size: int, form: str, version: int, plan: Callable) -> tuple[dict, dict]:

@@ -29,6 +29,10 @@ class FileError(OSError):
     """A result file that could not be written or read; the message names the path and the reason."""
 
 
+class MissingFileError(FileError, FileNotFoundError):
+    """A file that is not there, for whoever catches what ``open`` raises."""
+
+
 def path_of(path: Path, done: str) -> str:
     """The name of a file as text.
 

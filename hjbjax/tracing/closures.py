@@ -24,7 +24,7 @@ from jax.tree_util import Partial
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import altered, as_partial, is_traced
+from hjbjax.problem.pytree import altered, as_partial, is_traced, with_suggestions
 from hjbjax.problem.types import DType, Numbers
 from hjbjax.tracing.outside import FLOATS, NUMBERS, OfNumbers, code, decisive, fingerprint, identity, numbers_read
 
@@ -86,7 +86,7 @@ def with_settled_functions(front_door: Callable) -> Callable:
         with jax.core.eval_context():
             return front_door(**given)
 
-    return entered
+    return with_suggestions(entered)
 
 
 def _settle_all(asked: object, n: int, dtype: DType | None) -> object:
@@ -122,7 +122,7 @@ class Marked:
         if found is None:
             return self.__wrapped__(*arguments, **options)
         closed, structure = found
-        leaves = jax.tree.leaves((options, arguments))
+        leaves = [_as_traced(leaf) for leaf in jax.tree.leaves((options, arguments))]
         return jax.tree.unflatten(structure, jax.core.eval_jaxpr(closed.jaxpr, closed.consts, *leaves))
 
     def jaxpr(self, options: dict, arguments: tuple) -> tuple[jex.ClosedJaxpr, Any] | None:
@@ -182,6 +182,13 @@ class Opened:
             jnp.asarray(value, cast(jax.core.ShapedArray, var.aval).dtype)
             for value, var in zip(values, variables, strict=True)
         ]
+
+
+def _as_traced(leaf: Numbers) -> Numbers:
+    """A leaf in the type with which it was traced: without x64 a float64 array of NumPy's counts as float32."""
+    if not isinstance(leaf, np.ndarray | np.generic):
+        return leaf
+    return leaf.astype(jax.typeof(leaf).dtype, copy=False)
 
 
 def _kind(leaf: jax.typing.ArrayLike | jax.ShapeDtypeStruct) -> tuple[tuple[int, ...], Any, bool]:

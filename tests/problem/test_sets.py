@@ -19,7 +19,7 @@ from hjbjax import Ball, Box, Finite
         ([0.0, 2.0], [1.0, 1.0], "no admissible control: input 1"),
         ([], [], "wanted \\(m,\\) twice"),
         ([0.0], [1.0, 1.0], "wanted \\(m,\\) twice"),
-        (0.0, 1.0, "wanted \\(m,\\) twice"),
+        (0.0, [1.0], "wanted \\(m,\\) twice"),
         ([[0.0]], [[1.0]], "wanted \\(m,\\) twice"),
         ([float("nan")], [1.0], "Box.lo.*wanted finite numbers"),
         ([0.0], [float("inf")], "Box.hi.*wanted finite numbers"),

@@ -96,3 +96,47 @@ def test_ordinary_grids_pass():
     hjb.Grid([1e5], [1e5 + 1], (1001,))
     hjb.Grid([-1e-12], [1e-12], (1001,))
     hjb.Grid([-1e30], [1e30], (1001,), stretch=[hjb.Sinh(8.0)])
+
+
+# --- words that are nearly right ---
+
+
+@pytest.mark.parametrize(
+    ("ask", "said"),
+    [
+        (lambda: hjb.Problem(lambda x, u: u, cots=cost), r"Problem\(\) got .* 'cots': did you mean cost\?"),
+        (lambda: hjb.Grid(low=[-1.0], hi=[1.0], shape=(3,)), r"Grid\(\) got .* 'low': did you mean lo\?"),
+        (lambda: hjb.solve(problem(), GRID, toll=1e-3), r"solve\(\) got .* 'toll': did you mean tol\?"),
+        (lambda: hjb.march(problem(), GRID, 1.0, tymes=[0.0]), r"march\(\) got .* 'tymes': did you mean times\?"),
+        (lambda: hjb.simulate(problem(), lambda x: -x, [0.5], durations=1.0), r"did you mean duration\?"),
+        (lambda: hjb.pontryagin(problem(), [0.5], horizont=1.0), r"did you mean horizon\?"),
+        (lambda: hjb.Box([-1.0], [1.0], xyzzy=1), r"Box\(\) got .* 'xyzzy': wanted one of hi, lo$"),
+    ],
+)
+def test_a_misspelt_keyword_is_told_from_the_right_one(ask, said):
+    with pytest.raises(TypeError, match=said):
+        ask()
+
+
+def test_a_misspelt_name_of_the_package_is_told_from_the_right_one():
+    with pytest.raises(AttributeError, match="has no attribute 'slove'") as caught:
+        hjb.slove  # noqa: B018
+    assert (caught.value.name, caught.value.obj) == ("slove", hjb)  # of which Python makes "did you mean 'solve'?"
+    assert "solve" in dir(hjb)
+    assert not [name for name in dir(hjb) if name not in hjb.__all__]
+
+
+def test_bounds_without_a_box_are_told_how_to_become_one():
+    with pytest.raises(TypeError, match=r"Problem.controls: got \(-1.0, 1.0\), wanted .*: hjb.Box\(-1.0, 1.0\)$"):
+        hjb.Problem(lambda x, u: u, cost, (-1.0, 1.0))
+    np.testing.assert_array_equal(hjb.Box(-1.0, 1.0).hi, [1.0])
+    assert hjb.Box(-1.0, 1.0).dim == 1
+    with pytest.raises(ValueError, match=r"got lo of shape \(\) and hi of shape \(1,\)"):
+        hjb.Box(-1.0, [1.0])
+
+
+def test_a_path_is_one_line_and_a_missing_file_is_what_python_calls_it(tmp_path):
+    path = hjb.simulate(problem(), lambda x: -x, [0.5], 1.0)
+    assert repr(path) == "Path(DURATION at t = 1, 201 times, cost 0.158369)"  # ½(1 − e⁻³)/3
+    with pytest.raises(FileNotFoundError, match=r"none.npz: cannot be read: No such file"):
+        hjb.load(tmp_path / "none.npz")

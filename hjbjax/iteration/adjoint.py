@@ -10,32 +10,41 @@ and where it sits at a bound or at a kink of the upwinding, both of which may mo
 takes one linear solve and reverse mode one transposed solve, whatever the number of steps that led to V. A linear solve
 that does not come to its end makes the derivative NaN; the value stays as it is. The policy moves with V and θ as the
 optimum of the Hamiltonian does, see ``sensitivity``.
+
+With slopes of high order Φ is not linear in V, and its derivative is no chain's: it is taken of the limited slopes as
+they stand, at frozen actions, and a Krylov method, preconditioned by sweeps with I − W, solves with it.
 """
 
 import dataclasses
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.discretisation.rates import jump_rates
+from hjbjax.discretisation.rates import Rates, jump_rates
 from hjbjax.hamiltonian import discrete, sensitivity
+from hjbjax.hamiltonian.search import Action
 from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import Greedy, PolicyEquation
-from hjbjax.iteration.evaluation import Evaluation, Krylov, direct, evaluate, left_over
+from hjbjax.iteration.evaluation import Evaluation, Krylov, direct, evaluate, left_over, relaxed
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.types import Field, Number, Scalar
 
-LinearSolve: TypeAlias = Callable[[object, Field], Field]  # of a matrix-free product, which is not used, and s
+Map: TypeAlias = Callable[[Field], Field]  # of node values
+LinearSolve: TypeAlias = Callable[[Map, Field], Field]  # of a matrix-free product and the right-hand side
 Refinement: TypeAlias = tuple[Field, Field, Scalar, Scalar]  # δ, its residual, the size of the last one, steps
 
 STEPS = 200  # refinements of the linear solve in each of its two stages, at most
 SLOW = 0.5  # a refinement that leaves more than this share of the residual hands over to Krylov's
 GOAL = 1e3  # of the rounding unit of the right-hand side
 ROUNDING = 64  # of the rounding unit of the solution: below that no residual can be brought
+FRACTION = 1e-3  # of the residual, to which one run of GMRES goes
+RESTART = 30  # vectors of GMRES
+ROUNDS = 2  # of sweeps, in its preconditioner
 
 
 def attach(task: Task, state: State) -> Field:
@@ -46,23 +55,19 @@ def attach(task: Task, state: State) -> Field:
       state: a converged state of the same task, found without derivatives.
     """
     # the tracers stay in ``task`` alone, for ∂Φ/∂θ; all that the linear solve needs is without derivatives
-    task_kept, state = jax.lax.stop_gradient((task, state))
-    value = state.value
-    equation = jax.lax.stop_gradient(_ties_to_constraints(task_kept, state))
-    evaluation = task.method.evaluation or Krylov()
-
-    def solver(weights):
-        return lambda _, right: refined(evaluation, PolicyEquation(right, weights), task_kept.grid)
-
-    def matvec(delta):
-        return -left_over(PolicyEquation(jnp.zeros_like(delta), equation.weights), task_kept.grid, delta)
-
-    # the transposed row of a parabola belongs to no chain: with open ends both matrices are factored
-    weights, solvers = equation.weights, _exact_solvers(equation, task_kept.grid)
-    if not task_kept.grid.sides("open"):
-        solvers = solver(weights), solver(weights.inflow(task_kept.grid))
-    delta = jax.lax.custom_linear_solve(matvec, _residual(task, state, equation), *solvers)
-    return _with_derivative(value, delta)
+    kept, state = jax.lax.stop_gradient((task, state))
+    value, policy, grid = state.value, state.policy, kept.grid
+    equation = jax.lax.stop_gradient(_ties_to_constraints(kept, state))
+    actions = list(policy.controls), list(policy.disturbances)
+    # as at an end or at a kink that moves
+    moved = sensitivity.actions(task.on, value, jax.lax.stop_gradient(task.lost), *actions)
+    if kept.scheme.monotone:
+        operator, solvers = functools.partial(_chain_product, equation, grid), _chain_solvers(kept, equation)
+    else:
+        slope = jax.linearize(lambda at: _residual(kept, at, actions, equation), value)[1]
+        operator, solvers = lambda delta: -slope(delta), _high_order_solvers(equation, grid)
+    right = _residual(task, value, moved, equation)
+    return _with_derivative(value, jax.lax.custom_linear_solve(operator, right, *solvers))
 
 
 def attach_policy(task: Task, state: State, value: Field) -> State:
@@ -112,13 +117,49 @@ def _with_tangent(primals: tuple[Field, Field], tangents: tuple[Field, Field]) -
     return primals[0], tangents[1]
 
 
-def _exact_solvers(equation: PolicyEquation, grid: Grid) -> tuple[LinearSolve, LinearSolve]:
-    """The solves of I − W and of its transpose by factorisation; rows of open ends are no jumps to be turned round."""
+def _chain_product(equation: PolicyEquation, grid: Grid, delta: Field) -> Field:
+    """(I − W) δ, with W the weights of an equation."""
+    return -left_over(PolicyEquation(jnp.zeros_like(delta), equation.weights), grid, delta)
 
-    def solve(transposed: bool) -> LinearSolve:
-        return lambda _, right: direct(PolicyEquation(right, equation.weights), grid, transposed=transposed)
 
-    return solve(False), solve(True)
+def _chain_solvers(task: Task, equation: PolicyEquation) -> tuple[LinearSolve, LinearSolve]:
+    """The solves of I − W and of its transpose."""
+    grid, evaluation = task.grid, task.method.evaluation or Krylov()
+    if grid.sides("open"):  # the transposed row of a parabola belongs to no chain: both matrices are factored
+        forward, backward = (_exact(equation, grid, transposed) for transposed in (False, True))
+        return lambda _, right: forward(right), lambda _, right: backward(right)
+
+    def solver(weights: Rates) -> LinearSolve:
+        return lambda _, right: refined(evaluation, PolicyEquation(right, weights), grid)
+
+    return solver(equation.weights), solver(equation.weights.inflow(grid))
+
+
+def _exact(equation: PolicyEquation, grid: Grid, transposed: bool) -> Map:
+    """The solve of I − W, or of its transpose, by factorisation."""
+    return lambda right: direct(PolicyEquation(right, equation.weights), grid, transposed=transposed)
+
+
+def _high_order_solvers(equation: PolicyEquation, grid: Grid) -> tuple[LinearSolve, LinearSolve]:
+    """The solves of −∂Φ/∂V and of its transpose for slopes of high order, preconditioned by the matrix of the chain."""
+
+    def sweeps(weights: Rates) -> Map:
+        return lambda left: relaxed(PolicyEquation(left, weights), grid, ROUNDS)
+
+    def solver(precondition: Map) -> LinearSolve:
+        def correct(matvec: Map, left: Field) -> Field:
+            zero = jnp.zeros_like(left)
+            return jax.scipy.sparse.linalg.gmres(
+                matvec, left, zero, tol=FRACTION, restart=RESTART, maxiter=1, M=precondition
+            )[0]
+
+        return lambda matvec, right: _stages(
+            right, lambda delta: right - matvec(delta), [(functools.partial(correct, matvec), jnp.inf)]
+        )
+
+    if grid.sides("open"):
+        return solver(_exact(equation, grid, False)), solver(_exact(equation, grid, True))
+    return solver(sweeps(equation.weights)), solver(sweeps(equation.weights.inflow(grid)))
 
 
 def _ties_to_constraints(task: Task, state: State) -> PolicyEquation:
@@ -136,17 +177,13 @@ def _ties_to_constraints(task: Task, state: State) -> PolicyEquation:
     return PolicyEquation(equation.source, equation.weights.scaled(jnp.where(free, 1, 0)), equation.fastest)
 
 
-def _residual(task: Task, state: State, equation: PolicyEquation) -> Field:
-    """Φ at the frozen value and branches, as a function of the problem and of the grid."""
-    value, policy = state.value, state.policy
+def _residual(task: Task, value: Field, actions: tuple[Action, Action], equation: PolicyEquation) -> Field:
+    """Φ at a value and on frozen branches, as a function of all of them, of the problem and of the grid."""
     obstacles = bellman.obstacles(task.on)
-    u, d = list(policy.controls), list(policy.disturbances)
     # which node is on which branch does not change with θ, to first order: the masks carry no derivative
-    held = jax.lax.stop_gradient(task.obstacles.fixed)
-    lost = jax.lax.stop_gradient(task.lost)
-    moved = sensitivity.actions(task.on, value, lost, u, d)  # as at an end or at a kink that moves
-    rate = jnp.where(held, 0, discrete.around(task.on, value, lost).at(*moved) - task.problem.discount * value)
-    outflow = jax.lax.stop_gradient(jump_rates(task.on, u, d).total() + task.problem.discount)
+    held, lost = jax.lax.stop_gradient((task.obstacles.fixed, task.lost))
+    rate = jnp.where(held, 0, discrete.around(task.on, value, lost).at(*actions) - task.problem.discount * value)
+    outflow = jax.lax.stop_gradient(jump_rates(task.on, *actions).total() + task.problem.discount)
     # divided as the equation is, so that ∂Φ/∂V = −(I − W); a derivative of the divisor would be multiplied by r = 0
     phi = rate / jnp.where(outflow > 0, outflow, 1)
     bound = equation.weights.total() == 0  # rows of the constraints hold no weights
@@ -168,18 +205,35 @@ def refined(evaluation: Evaluation, equation: PolicyEquation, grid: Grid) -> Fie
 
     Sweeps hardly gain where little is discounted and the drift goes round in circles: there Krylov takes over.
     """
-    eps, size = jnp.finfo(equation.source.dtype).eps, jnp.max(jnp.abs(equation.source))
+
+    def by(method: Evaluation) -> Map:
+        return lambda left: evaluate(method, PolicyEquation(left, equation.weights), grid)
+
+    # to the end, however slowly, with the last of them: nothing follows it
+    stages = [(by(evaluation), SLOW), (by(Krylov()), jnp.inf)] if evaluation.rough else [(by(evaluation), jnp.inf)]
+    return _stages(equation.source, functools.partial(left_over, equation, grid), stages)
+
+
+def _stages(right: Field, left_over: Map, stages: Sequence[tuple[Map, Number]]) -> Field:
+    """The solution of a linear system by corrections of what is left, one kind after the other; NaN if not reached.
+
+    Args:
+      right: the right-hand side, which sets the size of rounding.
+      left_over: from δ to the residual that it leaves.
+      stages: a correction from a residual, and the share of it that may be left before the next kind takes over.
+    """
+    eps, size = jnp.finfo(right.dtype).eps, jnp.max(jnp.abs(right))
 
     def goal(delta: Field) -> Scalar:
         # a residual is a difference of numbers of the size of δ, which may be far larger than the right-hand side
         return eps * (GOAL * size + ROUNDING * jnp.max(jnp.abs(delta)))
 
-    def stage(method: Evaluation, delta: Field, slow: Number) -> Field:
+    def stage(correct: Map, delta: Field, slow: Number) -> Field:
         def refine(carry: Refinement) -> Refinement:
             delta, left, _, count = carry
             before = jnp.max(jnp.abs(left))
-            delta = delta + evaluate(method, PolicyEquation(left, equation.weights), grid)
-            return delta, left_over(equation, grid, delta), before, count + 1
+            delta = delta + correct(left)
+            return delta, left_over(delta), before, count + 1
 
         def unfinished(carry: Refinement) -> jax.Array:
             delta, left, before, count = carry
@@ -188,13 +242,11 @@ def refined(evaluation: Evaluation, equation: PolicyEquation, grid: Grid) -> Fie
             return (size > goal(delta)) & (count < STEPS) & ~(size > slow * before)
 
         before, none = jnp.full((), jnp.inf, delta.dtype), jnp.zeros((), jnp.int32)
-        start = (delta, left_over(equation, grid, delta), before, none)
+        start = (delta, left_over(delta), before, none)
         return jax.lax.while_loop(unfinished, refine, start)[0]
 
-    delta = jnp.zeros_like(equation.source)
-    if evaluation.rough:
-        delta = stage(evaluation, delta, SLOW)
-        evaluation = Krylov()
-    delta = stage(evaluation, delta, jnp.inf)  # to the end, however slowly: nothing follows it
-    left = jnp.max(jnp.abs(left_over(equation, grid, delta)))
+    delta = jnp.zeros_like(right)
+    for correct, slow in stages:
+        delta = stage(correct, delta, slow)
+    left = jnp.max(jnp.abs(left_over(delta)))
     return jnp.where(left <= goal(delta), delta, jnp.nan)

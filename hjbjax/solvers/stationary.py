@@ -6,6 +6,7 @@ same iteration runs with a fixed method and none of that, and its value and its 
 
 import contextlib
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -31,7 +32,16 @@ from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop, nested, semi_lagrangian
 from hjbjax.solvers.result import assemble, finish, solution_at_start, with_grid_error, with_last_phase
-from hjbjax.solvers.setup import COARSEST, choose, choose_scheme, is_constrained, prepare_on_host, prepare_traced
+from hjbjax.solvers.setup import (
+    COARSEST,
+    Assumptions,
+    choose,
+    choose_scheme,
+    choose_traced_scheme,
+    is_constrained,
+    prepare_on_host,
+    prepare_traced,
+)
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
 
@@ -103,7 +113,9 @@ def solve(
         if isinstance(scheme, PathScheme):
             raise ValueError(_at_host_level(scheme))
         traced = jnp.result_type(float) if dtype is None else jnp.dtype(dtype)
-        return _solve_traced(Discretisation(problem, grid, scheme or Upwind(), traced), method, tol, guess, max_steps)
+        scheme, sharpen = scheme or choose_traced_scheme(problem, method), scheme is None
+        on = Discretisation(problem, grid, scheme, traced)
+        return _solve_traced(on, method, tol, guess, max_steps, sharpen=sharpen)
     kind = as_dtype(dtype)
     check_node_values(guess, grid, "solve: the guess")
     grid.check_spacings(kind)
@@ -184,27 +196,54 @@ def _solve_on_host(
 
 
 def _solve_traced(
-    on: Discretisation, method: Method | None, tol: Number, guess: Nodes | None, max_steps: int | None
+    on: Discretisation, method: Method | None, tol: Number, guess: Nodes | None, max_steps: int | None, *, sharpen: bool
 ) -> Solution:
-    """The solution inside a JAX transformation: no chunks, no files, no exceptions, no checks of values."""
-    if not on.scheme.monotone:
-        raise ValueError(_at_host_level(on.scheme))
+    """The solution inside a JAX transformation: no chunks, no files, no exceptions, no checks of values.
+
+    ``sharpen``: nobody asked for the scheme, and the monotone answer stands where another one is not found.
+    """
     method = choose(on.problem, on.grid, traced=True, method=method)
     if method.coarsest is not None:
         raise ValueError("solve: Nested(...) runs at host level only; inside jit, vmap and grad use its inner method")
-    task, assumptions = prepare_traced(on, method=method, tol=tol)
+    task, assumptions = prepare_traced(on.chain, method=method, tol=tol)
     # the derivative is that of the fixed point, by the implicit function theorem, and not of the steps that led there
-    frozen = jax.lax.stop_gradient(task)
+    frozen, most = jax.lax.stop_gradient(task), max_steps or TRACED_STEPS
     start = frozen.start() if guess is None else jax.lax.stop_gradient(jnp.asarray(guess, on.dtype))
-    state = fixed_point.run(frozen, fixed_point.begin(frozen, start), max_steps or TRACED_STEPS)
+    state = fixed_point.run(frozen, fixed_point.begin(frozen, start), most)
     wrong = jnp.zeros((), bool)
     if assumptions.may_rest:
         state, wrong = _without_rests_to_leave(frozen, state)
-    value = adjoint.attach(task, state)
-    solution = assemble(task, adjoint.attach_policy(task, state, value), assumptions)
-    wrong |= state.code == Status.NONFINITE
-    value = value * jnp.where(wrong, jnp.nan, 1).astype(value.dtype)  # a derivative drops the code, and is NaN, too
+    solution = _differentiable(task, state, assumptions)
+    if not on.scheme.monotone:
+        further, assumptions = nested.raised(task, assumptions, on.scheme)
+        known = jax.lax.stop_gradient(further)
+        state = fixed_point.run(known, fixed_point.begin(known, state.value), most)
+        sharp = dataclasses.replace(_differentiable(further, state, assumptions), monotone_error=solution.error)
+        solution = _better_of(solution, sharp) if sharpen else sharp
+    wrong |= solution.code == Status.NONFINITE
+    value = solution.value * jnp.where(wrong, jnp.nan, 1).astype(on.dtype)  # a derivative drops the code: NaN, too
     return altered(solution, value=jnp.where(task.counted, value, jnp.inf) if task.has_lost else value)
+
+
+def _differentiable(task: Task, state: State, assumptions: Assumptions) -> Solution:
+    """The solution of a state, whose value and policy are functions of the numbers in the task."""
+    value = adjoint.attach(task, state)
+    return altered(assemble(task, adjoint.attach_policy(task, state, value), assumptions), value=value)
+
+
+def _better_of(plain: Solution, sharp: Solution) -> Solution:
+    """The answer of second order; where its iteration did not converge the monotone one, with the code of what failed.
+
+    The host says it in the message, which does not leave a transformation.
+    """
+    started = plain.code == Status.CONVERGED
+    found = started & (sharp.code == Status.CONVERGED)
+    names = ("value", "policy", "disturbance", "steps")
+    chosen = {
+        name: jax.tree.map(functools.partial(jnp.where, found), getattr(sharp, name), getattr(plain, name))
+        for name in names
+    }
+    return altered(sharp, **chosen, code=jnp.where(started, sharp.code, plain.code))
 
 
 def _at_host_level(scheme: object) -> str:

@@ -27,15 +27,16 @@ from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.rates import Rates, jump_rates
 from hjbjax.hamiltonian import discrete, sensitivity
 from hjbjax.hamiltonian.search import Action
-from hjbjax.iteration import bellman
-from hjbjax.iteration.bellman import Greedy, PolicyEquation
+from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
 from hjbjax.iteration.evaluation import Evaluation, Krylov, direct, evaluate, left_over, relaxed
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import Field, Number, Scalar
 
 Map: TypeAlias = Callable[[Field], Field]  # of node values
 LinearSolve: TypeAlias = Callable[[Map, Field], Field]  # of a matrix-free product and the right-hand side
+Actions: TypeAlias = tuple[Action, Action]  # of the control and of the disturbance
 Refinement: TypeAlias = tuple[Field, Field, Scalar, Scalar]  # δ, its residual, the size of the last one, steps
 
 STEPS = 200  # refinements of the linear solve in each of its two stages, at most
@@ -46,6 +47,35 @@ FRACTION = 1e-3  # of the residual, to which one run of the Krylov method goes t
 KRYLOV = 200  # its steps, at most
 
 
+@pytree_dataclass()
+class FixedPoint:
+    """The equation Φ(V, θ) = 0 at the nodes, with all numbers θ in it.
+
+    Args:
+      on: the problem on its grid.
+      obstacles: fixed nodes and constraints.
+      lost: the nodes to which no action may lead, bool (*grid), or None.
+      arriving: what comes to the running cost, as V/Δt in an implicit step; cost per unit time.
+    """
+
+    on: Discretisation
+    obstacles: Obstacles
+    lost: jax.Array | None = None
+    arriving: Number | Field = 0.0
+
+    def residual(self, value: Field, actions: Actions, bound: jax.Array) -> Field:
+        """Φ at a value on frozen branches; ``bound`` says at which nodes a constraint may be the active one."""
+        on, obstacles = self.on, self.obstacles
+        rate = discrete.around(on, value, self.lost).at(*actions) + self.arriving - on.problem.discount * value
+        outflow = jax.lax.stop_gradient(jump_rates(on, *actions).total() + on.problem.discount)
+        # divided as the equation is, so that ∂Φ/∂V = −(I − W); a derivative of the divisor would be multiplied by r = 0
+        phi = jnp.where(obstacles.fixed, 0, rate) / jnp.where(outflow > 0, outflow, 1)
+        for constraint in (obstacles.upper, obstacles.lower):
+            if constraint is not None:
+                phi = jnp.where(bound & _is_constraint(value, constraint), constraint - value, phi)
+        return jnp.where(obstacles.fixed, obstacles.fixed_value - value, phi)
+
+
 def attach(task: Task, state: State) -> Field:
     """The value of ``state``, unchanged, as a differentiable function of the problem and of the grid in ``task``.
 
@@ -53,20 +83,57 @@ def attach(task: Task, state: State) -> Field:
       task: the task as the user gave it, with its tracers.
       state: a converged state of the same task, found without derivatives.
     """
-    # the tracers stay in ``task`` alone, for ∂Φ/∂θ; all that the linear solve needs is without derivatives
+    question = FixedPoint(task.on, task.obstacles, task.lost)
     kept, state = jax.lax.stop_gradient((task, state))
-    value, policy, grid = state.value, state.policy, kept.grid
-    equation = jax.lax.stop_gradient(_ties_to_constraints(kept, state))
-    actions = list(policy.controls), list(policy.disturbances)
-    # as at an end or at a kink that moves
-    moved = sensitivity.actions(task.on, value, jax.lax.stop_gradient(task.lost), *actions)
-    if kept.scheme.monotone:
-        operator, solvers = functools.partial(_chain_product, equation, grid), _chain_solvers(kept, equation)
+    equation = kept.equation(state.value, state.policy)
+    return _solution(state.value, question, state.policy, equation, kept.method.evaluation or Krylov())
+
+
+def attach_step(
+    on: Discretisation, obstacles: Obstacles, arriving: Field, found: tuple[Field, Greedy, PolicyEquation],
+    evaluation: Evaluation,
+) -> Field:  # fmt: skip
+    """The value after an implicit step, unchanged, as a differentiable function of the question that it answers.
+
+    Args:
+      on: the problem with the discount of the step, with its tracers.
+      obstacles: fixed nodes and constraints at the end of the step.
+      arriving: the value before the step over its length, cost per unit time.
+      found: the value after it, its policy and the linear equation of that, without derivatives.
+      evaluation: how a policy is evaluated.
+    """
+    value, policy, equation = found
+    return _solution(value, FixedPoint(on, obstacles, None, arriving), policy, equation, evaluation)
+
+
+@jax.custom_jvp
+def _solution(
+    value: Field, question: FixedPoint, policy: Greedy, equation: PolicyEquation, evaluation: Evaluation
+) -> Field:
+    """``value``, with the derivative of the solution of ``question``; formed only where it is asked for."""
+    return value
+
+
+@_solution.defjvp
+def _solution_tangent(primals: Any, tangents: Any) -> tuple[Field, Field]:
+    """The value, and its tangent by one linear solve; transposed, by one transposed solve."""
+    value, question, policy, equation, evaluation = primals
+    actions, grid = (list(policy.controls), list(policy.disturbances)), question.on.grid
+    equation = _tied_to_constraints(equation, question.obstacles, value)
+    bound = equation.weights.total() == 0  # rows of the constraints hold no weights
+
+    def residual(question: FixedPoint) -> Field:
+        moved = sensitivity.actions(question.on, value, question.lost, *actions)  # as at an end or at a kink that moves
+        return question.residual(value, moved, bound)
+
+    if question.on.scheme.monotone:
+        operator = functools.partial(_chain_product, equation, grid)
+        solvers = _chain_solvers(evaluation, equation, grid)
     else:
-        slope = jax.linearize(lambda at: _residual(kept, at, actions, equation), value)[1]
+        slope = jax.linearize(lambda at: question.residual(at, actions, bound), value)[1]
         operator, solvers = lambda delta: -slope(delta), _high_order_solvers(equation, grid)
-    right = _residual(task, value, moved, equation)
-    return _with_derivative(value, jax.lax.custom_linear_solve(operator, right, *solvers))
+    right = jax.jvp(residual, (question,), (tangents[1],))[1]
+    return value, jax.lax.custom_linear_solve(operator, right, *solvers)
 
 
 def attach_policy(task: Task, state: State, value: Field) -> State:
@@ -104,26 +171,15 @@ def _moving_tangent(primals: Any, tangents: Any) -> tuple[Greedy, Greedy]:
     return policy, jax.jvp(actions, (on, value), tangents[1:3])[1]
 
 
-@jax.custom_jvp
-def _with_derivative(value: Field, delta: Field) -> Field:
-    """``value``, with the derivative of ``delta``; the number ``delta`` itself is never computed."""
-    return value
-
-
-@_with_derivative.defjvp
-def _with_tangent(primals: tuple[Field, Field], tangents: tuple[Field, Field]) -> tuple[Field, Field]:
-    """The value, and the tangent of the correction in place of its own."""
-    return primals[0], tangents[1]
-
-
 def _chain_product(equation: PolicyEquation, grid: Grid, delta: Field) -> Field:
     """(I − W) δ, with W the weights of an equation."""
     return -left_over(PolicyEquation(jnp.zeros_like(delta), equation.weights), grid, delta)
 
 
-def _chain_solvers(task: Task, equation: PolicyEquation) -> tuple[LinearSolve, LinearSolve]:
+def _chain_solvers(
+    evaluation: Evaluation, equation: PolicyEquation, grid: Grid
+) -> tuple[LinearSolve, LinearSolve]:
     """The solves of I − W and of its transpose."""
-    grid, evaluation = task.grid, task.method.evaluation or Krylov()
     if grid.sides("open"):  # the transposed row of a parabola belongs to no chain: both matrices are factored
         forward, backward = (_exact(equation, grid, transposed) for transposed in (False, True))
         return lambda _, right: forward(right), lambda _, right: backward(right)
@@ -166,35 +222,18 @@ def _high_order_solvers(equation: PolicyEquation, grid: Grid) -> tuple[LinearSol
     return solver(sweeps(equation.weights)), solver(sweeps(equation.weights.inflow(grid)))
 
 
-def _ties_to_constraints(task: Task, state: State) -> PolicyEquation:
-    """The linear equation of the policy, in which every node whose value is a constraint's belongs to that.
+def _tied_to_constraints(equation: PolicyEquation, obstacles: Obstacles, value: Field) -> PolicyEquation:
+    """The linear equation of a policy, in which every node whose value is a constraint's belongs to that.
 
     Where going on is worth as much both branches hold. On a plateau without discount only this one has a derivative:
     a policy may go round on it for ever.
     """
-    equation = task.equation(state.value, state.policy)
-    free = jnp.ones(task.grid.shape, bool)
-    for constraint in (task.obstacles.upper, task.obstacles.lower):
-        if constraint is not None:
-            free &= ~_is_constraint(state.value, constraint)
-    # a row without weights reads δ = s, the derivative of the constraint itself
-    return PolicyEquation(equation.source, equation.weights.scaled(jnp.where(free, 1, 0)), equation.fastest)
-
-
-def _residual(task: Task, value: Field, actions: tuple[Action, Action], equation: PolicyEquation) -> Field:
-    """Φ at a value and on frozen branches, as a function of all of them, of the problem and of the grid."""
-    obstacles = bellman.obstacles(task.on)
-    # which node is on which branch does not change with θ, to first order: the masks carry no derivative
-    held, lost = jax.lax.stop_gradient((task.obstacles.fixed, task.lost))
-    rate = jnp.where(held, 0, discrete.around(task.on, value, lost).at(*actions) - task.problem.discount * value)
-    outflow = jax.lax.stop_gradient(jump_rates(task.on, *actions).total() + task.problem.discount)
-    # divided as the equation is, so that ∂Φ/∂V = −(I − W); a derivative of the divisor would be multiplied by r = 0
-    phi = rate / jnp.where(outflow > 0, outflow, 1)
-    bound = equation.weights.total() == 0  # rows of the constraints hold no weights
+    free = jnp.ones(value.shape, bool)
     for constraint in (obstacles.upper, obstacles.lower):
         if constraint is not None:
-            phi = jnp.where(bound & _is_constraint(value, constraint), constraint - value, phi)
-    return jnp.where(held, obstacles.fixed_value - value, phi)
+            free &= ~_is_constraint(value, constraint)
+    # a row without weights reads δ = s, the derivative of the constraint itself
+    return PolicyEquation(equation.source, equation.weights.scaled(jnp.where(free, 1, 0)), equation.fastest)
 
 
 def _is_constraint(value: Field, constraint: Field) -> jax.Array:

@@ -4,7 +4,7 @@ import copy
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import TypeAlias, TypeGuard
+from typing import Any, TypeAlias, TypeGuard
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, cast, is_traced
 from hjbjax.problem.types import Array, Key, Number, Numbers, State
 from hjbjax.solution.clock import CHUNK_SECONDS, Clock, noting_interrupts
+from hjbjax.tracing.closures import OF_ACTION, OF_STATE, holds_tracers, opened, settled
 
 Feedback: TypeAlias = GridFeedback | Callable | None  # None where there is no control
 
@@ -93,11 +94,22 @@ def simulate(
       >>> round(float(path.cost), 6), path.status.name
       (1.0, 'DURATION')
     """
-    if is_traced(problem, feedback, x0, duration, key, grid):
-        raise ValueError("simulate: got traced values; inside jit, vmap or grad use hjbjax.feedback.simulation.rollout")
+    if is_traced(duration, hold):
+        raise ValueError(
+            "simulate: duration and hold set the output times and must be known numbers, not traced ones; "
+            "hjbjax.feedback.simulation.rollout takes traced times"
+        )
     duration = float(arguments.positive(duration, "simulate: duration", "in units of time"))
     if _is_marched(feedback):
         problem = _within_horizon(problem, feedback, duration)
+    if _is_traced(problem, feedback, disturbance, x0, key, grid, rtol, atol, max_step):
+        options: Any = {"disturbance": disturbance, "time_varying": time_varying, "grid": grid, "clamp": clamp}
+        times, held = _times(duration, steps, None if hold is False else hold), hold is not None and hold is not False
+        start = jnp.asarray(x0, jnp.result_type(float))
+        return rollout(
+            problem, feedback, start, times, key=_random_key(problem, key), hold=held, rtol=rtol, atol=atol,
+            max_step=max_step, max_steps=max_steps, **options,
+        )  # fmt: skip
     loop = _close(problem, feedback, disturbance, grid, clamp, time_varying)
     start = _initial_state(x0, loop.grid)
     hold = None if hold is False else hold
@@ -140,6 +152,13 @@ def simulate(
 _margin = jax.jit(Loop.margin)
 
 
+def _is_traced(problem: object, *others: Any) -> bool:
+    """True if some number is a tracer, be it one that a function closed over."""
+    names = (*OF_ACTION, *OF_STATE)
+    functions = [getattr(problem, name, None) for name in names] + [each for each in others if callable(each)]
+    return is_traced(problem, *others) or any(map(holds_tracers, functions))
+
+
 def _in_chunks(ivp: InitialValueProblem, stepping: Stepping, clock: Clock) -> tuple[Path, jax.Array]:
     """The path, some output intervals at a time, for about half a second each, until it ends or Ctrl-C is noted."""
     so_far = blank_record(ivp.loop, np.asarray(ivp.x0), np.asarray(ivp.times))
@@ -176,7 +195,7 @@ def rollout(
     max_step: Number | None = None,
     max_steps: int = 100_000,
 ) -> Path:
-    """``simulate`` as a pure function, for ``jit``, ``vmap`` (over keys, starts, parameters) and forward derivatives.
+    """``simulate`` as a pure function, for ``jit``, ``vmap`` (over keys, starts, parameters), ``grad`` and ``jvp``.
 
     Follows the dtype of ``x0`` and checks no values. The arrays have full length: after the end of the path
     times and states repeat the last one, controls are NaN, and ``reached`` is inf if the target was not.
@@ -212,7 +231,11 @@ def rollout(
     if not jnp.issubdtype(start.dtype, jnp.floating):
         raise ValueError(f"rollout: x0 has dtype {start.dtype}, wanted floating point: the path follows it")
     _check_key(problem, key)
+    # numbers that functions close over become leaves: a rule of derivatives sees nothing else
+    problem = settled(problem, start.size, start.dtype)
     loop = _close(problem, feedback, disturbance, grid, clamp, time_varying)
+    moment = [jax.ShapeDtypeStruct(shape, start.dtype) for shape in ((), start.shape)]
+    loop = dataclasses.replace(loop, control=opened(loop.control, *moment), opponent=opened(loop.opponent, *moment))
     check_shapes(loop, start)
     stepping = Stepping(rtol, atol, np.inf if max_step is None else max_step, max_steps, hold)
     return integrate(InitialValueProblem(loop, start, jnp.asarray(times, start.dtype), key), stepping)[0]

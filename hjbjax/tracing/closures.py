@@ -66,6 +66,24 @@ def settled(problem: Problem, n: int, dtype: DType | None = None) -> Problem:
     return altered(problem, **fixed, **{name: _with_closure_as_leaves(*pair) for name, pair in found.items()})
 
 
+def opened(function: Partial | None, *arguments: jax.ShapeDtypeStruct) -> Partial | None:
+    """A function of some arguments with the tracers that it closed over among its leaves; else as it is."""
+    if function is None:
+        return None
+    traced = _with_memory(function)
+    found = traced.func.jaxpr(traced.keywords, (*traced.args, *arguments))  # type: ignore[attr-defined]
+    return function if found is None or not is_traced(found[0].consts) else _with_closure_as_leaves(traced, found[0])
+
+
+def holds_tracers(thing: object, depth: int = 4) -> bool:
+    """True if a function closed over a tracer, itself or by a function that it closed over."""
+    if isinstance(thing, Partial):
+        thing = thing.func
+    if depth == 0 or not isinstance(thing, types.FunctionType):
+        return is_traced(thing)
+    return any(holds_tracers(cell.cell_contents, depth - 1) for cell in thing.__closure__ or ())
+
+
 def with_settled_functions(front_door: Callable) -> Callable:
     """Decorator of a function of (problem or problems, grid, ...): with the problems settled, and outside of traces.
 

@@ -47,6 +47,7 @@ Rows: TypeAlias = tuple[jax.Array, jax.Array, jax.Array, jax.Array | None, jax.A
 LEAST_STEPS = 10  # of an output interval with noise, where no estimate of the error shortens a step
 TREE = 64  # the shortest step over the tolerance of the Brownian tree, below which w is interpolated
 DEEPEST = 2**30  # the duration over that tolerance, at most: each halving is one level of the tree in every step
+CHECKPOINTS = 8  # of one interval in reverse mode: its steps are made a second time, and of 45 and more a third
 BRACKET = 4  # units in the last place, of the bracket around the time at which a path meets a boundary
 
 
@@ -89,9 +90,8 @@ class InitialValueProblem:
 def integrate(ivp: InitialValueProblem, stepping: Stepping) -> tuple[Path, jax.Array]:
     """The path of full length, and a mask (k,) of the intervals that it runs through.
 
-    One diffrax solve an output interval, all in one scan; a path that has ended gets intervals of length zero. It has
-    derivatives in both modes; in reverse mode the state at every output time is kept, and one interval's steps at a
-    time.
+    One diffrax solve an output interval, all in one scan; a path that has ended gets intervals of length zero. In
+    reverse mode the state at every output time is kept, and one interval's steps at a time.
     """
     along, back = (functools.partial(_integrated, reverse=reverse) for reverse in (False, True))
     return with_both_modes(along, back)((ivp, stepping))
@@ -100,7 +100,6 @@ def integrate(ivp: InitialValueProblem, stepping: Stepping) -> tuple[Path, jax.A
 def _integrated(given: tuple[InitialValueProblem, Stepping], reverse: bool) -> tuple[Path, jax.Array]:
     """The path of full length, and its mask, by a program for forward or for reverse mode."""
     interval, first = _intervals(*given, reverse)
-    # a scan keeps its turns apart by itself, so that nothing hinders XLA from merging what is made twice
     interval = jax.checkpoint(interval, prevent_cse=False) if reverse else interval
     last, rows = jax.lax.scan(interval, first, given[0].times[1:])
     return _path(given[0], last, rows)
@@ -276,7 +275,7 @@ def _solver(ivp: InitialValueProblem, stepping: Stepping, reverse: bool) -> Call
     return functools.partial(
         diffrax.diffeqsolve, terms, solver, stepsize_controller=controller, event=event,
         saveat=diffrax.SaveAt(t1=True), max_steps=stepping.max_steps, throw=False,
-        adjoint=diffrax.RecursiveCheckpointAdjoint() if reverse else diffrax.ForwardMode(),
+        adjoint=diffrax.RecursiveCheckpointAdjoint(CHECKPOINTS) if reverse else diffrax.ForwardMode(),
     )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from hjbjax.feedback.closed_loop import InitialValueProblem, Stepping, blank_record, integrate, integrate_part
 from hjbjax.feedback.feedback import GridFeedback, check_kept, is_grid_feedback, lookups
-from hjbjax.feedback.loop import Loop, check_shapes
+from hjbjax.feedback.loop import Loop, check_key, check_shapes, random_key
 from hjbjax.feedback.path import Interrupted, Path, PathStatus, promise, truncate
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
@@ -47,7 +47,7 @@ def simulate(
     max_step: float | None = None,
     max_steps: int = 100_000,
 ) -> Path:
-    """The path of the closed loop from ``x0``, in float64.
+    """The path of the closed loop from ``x0``, in float64; inside ``jit``, ``vmap`` and ``grad`` as ``rollout`` has it.
 
     Callables take ``(x)``; they take ``(t, x)`` exactly when ``problem.time_dependent``, and feedback and disturbance
     also when ``time_varying``. Periodic states are
@@ -105,9 +105,8 @@ def simulate(
     if _is_traced(problem, feedback, disturbance, x0, key, grid, rtol, atol, max_step):
         options: Any = {"disturbance": disturbance, "time_varying": time_varying, "grid": grid, "clamp": clamp}
         times, held = _times(duration, steps, None if hold is False else hold), hold is not None and hold is not False
-        start = jnp.asarray(x0, jnp.result_type(float))
         return rollout(
-            problem, feedback, start, times, key=_random_key(problem, key), hold=held, rtol=rtol, atol=atol,
+            problem, feedback, jnp.asarray(x0, jnp.result_type(float)), times, key=random_key(problem, key), hold=held, rtol=rtol, atol=atol,
             max_step=max_step, max_steps=max_steps, **options,
         )  # fmt: skip
     loop = _close(problem, feedback, disturbance, grid, clamp, time_varying)
@@ -121,7 +120,7 @@ def simulate(
         max_steps=arguments.count(max_steps, "simulate: max_steps"),
         held=hold is not None,
     )
-    key = _random_key(problem, key)
+    key = random_key(problem, key)
     # Its import adds to JAX's configuration, which is part of the key of every compiled function: once before, or
     # the second call compiles again.
     import diffrax  # noqa: F401
@@ -230,7 +229,7 @@ def rollout(
     start = jnp.asarray(x0)
     if not jnp.issubdtype(start.dtype, jnp.floating):
         raise ValueError(f"rollout: x0 has dtype {start.dtype}, wanted floating point: the path follows it")
-    _check_key(problem, key)
+    check_key(problem, key)
     # numbers that functions close over become leaves: a rule of derivatives sees nothing else
     problem = settled(problem, start.size, start.dtype)
     loop = _close(problem, feedback, disturbance, grid, clamp, time_varying)
@@ -334,32 +333,3 @@ def _times(duration: float, steps: int | None, hold: float | None) -> np.ndarray
     if held > 10**7:  # 80 MB a state: a hold in another unit than the duration
         raise ValueError(f"simulate: hold = {hold} makes {held:.3g} intervals of {duration:g}, wanted at most 1e7")
     return np.append(np.arange(math.ceil(held)) * hold, duration)  # the last interval may be shorter
-
-
-def _random_key(problem: Problem, given: Key | int | None) -> Key | None:
-    """The random key, or that of a seed; refuses what is none, one without noise, and noise without one."""
-    key = given
-    if isinstance(given, (int, np.integer)) and not isinstance(given, bool):
-        try:
-            key = jax.random.key(int(given))
-        except OverflowError:
-            raise ValueError(
-                f"simulate: key is {given}, wanted a seed that fits 64 bits, or a JAX random key"
-            ) from None
-    _check_key(problem, key)
-    assert not isinstance(key, int)
-    return key
-
-
-def _check_key(problem: Problem, key: Key | int | None) -> None:
-    """Refuse a key without noise, noise without a key, and what is no key."""
-    if problem.noise is not None and key is None:
-        raise ValueError("simulate: the problem has noise; give key=jax.random.key(0), or any other seed")
-    if problem.noise is None and key is not None:
-        raise ValueError("simulate: got a key, but problem.noise is None and nothing is random; leave out key")
-    dtype, shape = getattr(key, "dtype", None), () if key is None else np.shape(key)
-    typed = dtype is not None and jax.dtypes.issubdtype(dtype, jax.dtypes.prng_key)
-    # two kinds of keys: typed ones, and rows of uint32 as jax.random.PRNGKey makes them
-    if key is not None and not (typed and shape == ()) and not (dtype == np.uint32 and len(shape) == 1):
-        given = f"an array of shape {shape} and type {dtype}" if dtype is not None else repr(key)
-        raise ValueError(f"simulate: key is {given}, wanted one random key: key=jax.random.key(0), or another seed")

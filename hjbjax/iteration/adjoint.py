@@ -126,6 +126,7 @@ def _solution_tangent(primals: Any, tangents: Any) -> tuple[Field, Field]:
         moved = sensitivity.actions(question.on, value, question.lost, *actions)  # as at an end or at a kink that moves
         return question.residual(value, moved, bound)
 
+    operator: Map
     if question.on.scheme.monotone:
         operator = functools.partial(_chain_product, equation, grid)
         solvers = _chain_solvers(evaluation, equation, grid)
@@ -176,9 +177,7 @@ def _chain_product(equation: PolicyEquation, grid: Grid, delta: Field) -> Field:
     return -left_over(PolicyEquation(jnp.zeros_like(delta), equation.weights), grid, delta)
 
 
-def _chain_solvers(
-    evaluation: Evaluation, equation: PolicyEquation, grid: Grid
-) -> tuple[LinearSolve, LinearSolve]:
+def _chain_solvers(evaluation: Evaluation, equation: PolicyEquation, grid: Grid) -> tuple[LinearSolve, LinearSolve]:
     """The solves of I − W and of its transpose."""
     if grid.sides("open"):  # the transposed row of a parabola belongs to no chain: both matrices are factored
         forward, backward = (_exact(equation, grid, transposed) for transposed in (False, True))

@@ -50,7 +50,9 @@ def with_both_modes(forward: Callable[[Any], Any], backward: Callable[[Any], Any
                 given = list(leaves)
                 for i, number in zip(real, numbers, strict=True):
                     given[i] = number
-                return [each for each in jax.tree.leaves(program(jax.tree.unflatten(structure, given))) if _is_real(each)]
+                return [
+                    each for each in jax.tree.leaves(program(jax.tree.unflatten(structure, given))) if _is_real(each)
+                ]
 
             return restricted
 

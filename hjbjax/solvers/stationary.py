@@ -77,13 +77,13 @@ def solve(
         ``Weno5()``, fifth order there, on equal spacings, for a ``tol`` as small as its error; or ``SemiLagrangian()``,
         monotone, for deterministic problems whose optimal paths run along kinks of the value. ``None`` is
         ``Limited()`` where its iteration converges, with an estimate of the grid's error. It is ``Upwind()`` for value
-        iteration and tubes without discount, inside transformations, and wherever noise lets central differences be
-        monotone.
+        iteration and tubes without discount, and wherever noise lets central differences be monotone.
       tol: bound to reach on |V − V_h|, in cost units, V_h the exact solution on the grid of the monotone scheme. Where
         no certificate exists the solution says so, and the bound is on the residual and on the last step, as it is for
         the high-order equation; a tube without discount goes on until V no longer changes.
       guess: node values to start from, shape (*grid); not for a tube without discount, which has many fixed points.
-      dtype: ``None`` is float64; ``"float32"`` for memory, with a tolerance that float32 can reach.
+      dtype: ``None`` is float64, inside a transformation that of ``float`` there; ``"float32"`` for memory, with a
+        tolerance that float32 can reach.
       max_steps: at most so many steps, by each scheme and on each grid.
       time_limit: at most so many seconds, checks and compilation included; what cannot be cut, as one compilation or
         one step, is let come to its end.
@@ -93,7 +93,9 @@ def solve(
 
     Returns:
       The solution; NumPy arrays at host level. Inside ``jit``, ``vmap`` or ``grad`` its value and its policy are
-      traced, and differentiable with respect to every number in the problem and the grid.
+      traced, and differentiable with respect to every number in the problem and the grid; a derivative whose linear
+      solve does not come to its end is NaN. There a second-order iteration that does not converge leaves the monotone
+      answer, and its own code.
 
     Raises:
       ValueError: a question without an answer, or a bad argument.
@@ -112,9 +114,8 @@ def solve(
     if is_traced(problem, grid, guess, tol):
         if isinstance(scheme, PathScheme):
             raise ValueError(_at_host_level(scheme))
-        traced = jnp.result_type(float) if dtype is None else jnp.dtype(dtype)
         scheme, sharpen = scheme or choose_traced_scheme(problem, method), scheme is None
-        on = Discretisation(problem, grid, scheme, traced)
+        on = Discretisation(problem, grid, scheme, traced_dtype(dtype, "solve"))
         return _solve_traced(on, method, tol, guess, max_steps, sharpen=sharpen)
     kind = as_dtype(dtype)
     check_node_values(guess, grid, "solve: the guess")
@@ -273,6 +274,19 @@ def as_dtype(dtype: DType | None) -> np.dtype:
             if kind == (np.float64 if dtype is None else np.dtype(dtype)):
                 return kind
     raise ValueError(f"dtype: got {dtype!r}, wanted 'float64' or 'float32'")
+
+
+def traced_dtype(dtype: DType | None, name: str) -> np.dtype:
+    """The floating-point type inside a JAX transformation; None is that of ``float`` there."""
+    if dtype is None:
+        return np.dtype(jnp.result_type(float))
+    kind = as_dtype(dtype)
+    if kind != jnp.zeros((), kind).dtype:  # JAX would go on in float32, and warn
+        raise ValueError(
+            f"{name}: got dtype={dtype!r} inside jit, vmap or grad, where JAX is set to 32 bits and a type cannot be "
+            "changed; put `with jax.enable_x64(True):` around the call of the transformed function"
+        )
+    return kind
 
 
 def check_limits(max_steps: object, time_limit: object) -> None:

@@ -66,12 +66,13 @@ def settled(problem: Problem, n: int, dtype: DType | None = None) -> Problem:
     return altered(problem, **fixed, **{name: _with_closure_as_leaves(*pair) for name, pair in found.items()})
 
 
-def opened(function: Partial | None, *arguments: jax.ShapeDtypeStruct) -> Partial | None:
+def opened(function: Any, *arguments: jax.ShapeDtypeStruct) -> Any:
     """A function of some arguments with the tracers that it closed over among its leaves; else as it is."""
     if function is None:
         return None
     traced = _with_memory(function)
-    found = traced.func.jaxpr(traced.keywords, (*traced.args, *arguments))  # type: ignore[attr-defined]
+    assert isinstance(traced.func, Marked)
+    found = traced.func.jaxpr(traced.keywords, (*traced.args, *arguments))
     return function if found is None or not is_traced(found[0].consts) else _with_closure_as_leaves(traced, found[0])
 
 

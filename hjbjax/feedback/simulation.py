@@ -106,8 +106,8 @@ def simulate(
         options: Any = {"disturbance": disturbance, "time_varying": time_varying, "grid": grid, "clamp": clamp}
         times, held = _times(duration, steps, None if hold is False else hold), hold is not None and hold is not False
         return rollout(
-            problem, feedback, jnp.asarray(x0, jnp.result_type(float)), times, key=random_key(problem, key), hold=held, rtol=rtol, atol=atol,
-            max_step=max_step, max_steps=max_steps, **options,
+            problem, feedback, jnp.asarray(x0, jnp.result_type(float)), times, key=random_key(problem, key), hold=held,
+            rtol=rtol, atol=atol, max_step=max_step, max_steps=max_steps, **options,
         )  # fmt: skip
     loop = _close(problem, feedback, disturbance, grid, clamp, time_varying)
     start = _initial_state(x0, loop.grid)

@@ -281,7 +281,7 @@ def traced_dtype(dtype: DType | None, name: str) -> np.dtype:
     if dtype is None:
         return np.dtype(jnp.result_type(float))
     kind = as_dtype(dtype)
-    if kind != jnp.zeros((), kind).dtype:  # JAX would go on in float32, and warn
+    if kind == np.float64 and kind != np.dtype(jnp.result_type(float)):  # JAX would go on in float32, and warn
         raise ValueError(
             f"{name}: got dtype={dtype!r} inside jit, vmap or grad, where JAX is set to 32 bits and a type cannot be "
             "changed; put `with jax.enable_x64(True):` around the call of the transformed function"

@@ -120,7 +120,7 @@ CASES = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scheme", [None, hjb.Upwind()], ids=["second order", "chain"])
+@pytest.mark.parametrize("scheme", [None, hjb.Upwind(subcell=True)], ids=["second order", "chain"])
 @pytest.mark.parametrize("name", CASES)
 def test_targets_noise_and_games(name, scheme):
     build, at, x = CASES[name]

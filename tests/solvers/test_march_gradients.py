@@ -1,4 +1,4 @@
-"""Derivatives of a march: both modes against central differences, and memory that grows like the square root of the steps."""
+"""Derivatives of a march: both modes against central differences, and memory like the square root of the steps."""
 
 import functools
 

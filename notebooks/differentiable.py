@@ -59,13 +59,12 @@ assert abs(slope - wanted) < 0.03 * abs(wanted)
 # ## Imitation
 #
 # Somebody steers well, and we see their controls at a few states. Which weight on the control do they have in mind?
-# `control_at` is differentiable, so that Gauss and Newton find it. (Inside `jit` a solve takes the monotone chain; the
-# controls that we see are computed likewise.)
+# `control_at` is differentiable, so that Gauss and Newton find it.
 
 # %%
 places = np.array([[0.5], [1.0], [1.5]])
 hidden = 0.4
-seen = np.asarray(hjb.solve(regulated(hidden), grid, scheme=hjb.Upwind(), tol=1e-8).control_at(places))
+seen = np.asarray(hjb.solve(regulated(hidden), grid, tol=1e-8).control_at(places))
 
 
 def steered(logarithm):

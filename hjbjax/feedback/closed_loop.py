@@ -31,6 +31,7 @@ import numpy as np
 
 from hjbjax.feedback.loop import Actions, BridgeDraw, Loop, are_finite, bridging, meeting_flag, onto_edge
 from hjbjax.feedback.path import Path, PathStatus
+from hjbjax.problem.derivatives import with_both_modes
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import Array, Control, Key, Number, State
 
@@ -46,6 +47,7 @@ Rows: TypeAlias = tuple[jax.Array, jax.Array, jax.Array, jax.Array | None, jax.A
 LEAST_STEPS = 10  # of an output interval with noise, where no estimate of the error shortens a step
 TREE = 64  # the shortest step over the tolerance of the Brownian tree, below which w is interpolated
 DEEPEST = 2**30  # the duration over that tolerance, at most: each halving is one level of the tree in every step
+CHECKPOINTS = 8  # of one interval in reverse mode: its steps are made a second time, and of 45 and more a third
 BRACKET = 4  # units in the last place, of the bracket around the time at which a path meets a boundary
 
 
@@ -88,11 +90,19 @@ class InitialValueProblem:
 def integrate(ivp: InitialValueProblem, stepping: Stepping) -> tuple[Path, jax.Array]:
     """The path of full length, and a mask (k,) of the intervals that it runs through.
 
-    One diffrax solve an output interval, all in one scan; a path that has ended gets intervals of length zero.
+    One diffrax solve an output interval, all in one scan; a path that has ended gets intervals of length zero. In
+    reverse mode the state at every output time is kept, and one interval's steps at a time.
     """
-    interval, first = _intervals(ivp, stepping)
-    last, rows = jax.lax.scan(interval, first, ivp.times[1:])
-    return _path(ivp, last, rows)
+    along, back = (functools.partial(_integrated, reverse=reverse) for reverse in (False, True))
+    return with_both_modes(along, back)((ivp, stepping))
+
+
+def _integrated(given: tuple[InitialValueProblem, Stepping], reverse: bool) -> tuple[Path, jax.Array]:
+    """The path of full length, and its mask, by a program for forward or for reverse mode."""
+    interval, first = _intervals(*given, reverse)
+    interval = jax.checkpoint(interval, prevent_cse=False) if reverse else interval
+    last, rows = jax.lax.scan(interval, first, given[0].times[1:])
+    return _path(given[0], last, rows)
 
 
 def blank_record(loop: Loop, x0: np.ndarray, times: np.ndarray) -> tuple[tuple, tuple]:
@@ -137,10 +147,10 @@ def integrate_part(
     return (state, rows), _path(ivp, last, shown)
 
 
-def _intervals(ivp: InitialValueProblem, stepping: Stepping) -> tuple[Callable, Progress]:
+def _intervals(ivp: InitialValueProblem, stepping: Stepping, reverse: bool = False) -> tuple[Callable, Progress]:
     """One output interval as a step of a scan, and the state (t, y, code, steps) before the first."""
     loop, x0, start = ivp.loop, ivp.x0, ivp.times[0]
-    solve = _solver(ivp, stepping)
+    solve = _solver(ivp, stepping, reverse)
 
     def interval(state: Progress, end: jax.Array) -> tuple[Progress, Rows]:
         t, y, code, count = state
@@ -214,8 +224,11 @@ def _advance(
     return later, y, code, solved.stats["num_steps"].astype(jnp.int32)
 
 
-def _solver(ivp: InitialValueProblem, stepping: Stepping) -> Callable:
-    """diffrax's solve of one interval, with all that no interval changes; ``args`` are the interval's ``Beginning``."""
+def _solver(ivp: InitialValueProblem, stepping: Stepping, reverse: bool) -> Callable:
+    """diffrax's solve of one interval, with all that no interval changes; ``args`` are the interval's ``Beginning``.
+
+    ``reverse``: with checkpoints, for reverse mode; else for forward mode.
+    """
     import diffrax
 
     loop, x0, start, duration = ivp.loop, ivp.x0, ivp.times[0], ivp.times[-1] - ivp.times[0]
@@ -261,7 +274,8 @@ def _solver(ivp: InitialValueProblem, stepping: Stepping) -> Callable:
         event = diffrax.Event(margin, _bisection()(close, close, flip=True), direction=False)
     return functools.partial(
         diffrax.diffeqsolve, terms, solver, stepsize_controller=controller, event=event,
-        saveat=diffrax.SaveAt(t1=True), adjoint=diffrax.ForwardMode(), max_steps=stepping.max_steps, throw=False,
+        saveat=diffrax.SaveAt(t1=True), max_steps=stepping.max_steps, throw=False,
+        adjoint=diffrax.RecursiveCheckpointAdjoint(CHECKPOINTS) if reverse else diffrax.ForwardMode(),
     )  # fmt: skip
 
 

@@ -205,6 +205,35 @@ def _array(function: Callable, name: str, *arguments: Array) -> jax.Array:
         raise ValueError(f"simulate: {name} returned {what}, expected an array of numbers") from None
 
 
+def random_key(problem: Problem, given: Key | int | None) -> Key | None:
+    """The random key, or that of a seed; refuses what is none, one without noise, and noise without one."""
+    key = given
+    if isinstance(given, (int, np.integer)) and not isinstance(given, bool):
+        try:
+            key = jax.random.key(int(given))
+        except OverflowError:
+            raise ValueError(
+                f"simulate: key is {given}, wanted a seed that fits 64 bits, or a JAX random key"
+            ) from None
+    check_key(problem, key)
+    assert not isinstance(key, int)
+    return key
+
+
+def check_key(problem: Problem, key: Key | int | None) -> None:
+    """Refuse a key without noise, noise without a key, and what is no key."""
+    if problem.noise is not None and key is None:
+        raise ValueError("simulate: the problem has noise; give key=jax.random.key(0), or any other seed")
+    if problem.noise is None and key is not None:
+        raise ValueError("simulate: got a key, but problem.noise is None and nothing is random; leave out key")
+    dtype, shape = getattr(key, "dtype", None), () if key is None else np.shape(key)
+    typed = dtype is not None and jax.dtypes.issubdtype(dtype, jax.dtypes.prng_key)
+    # two kinds of keys: typed ones, and rows of uint32 as jax.random.PRNGKey makes them
+    if key is not None and not (typed and shape == ()) and not (dtype == np.uint32 and len(shape) == 1):
+        given = f"an array of shape {shape} and type {dtype}" if dtype is not None else repr(key)
+        raise ValueError(f"simulate: key is {given}, wanted one random key: key=jax.random.key(0), or another seed")
+
+
 # --- a noisy path at a target ---
 
 

@@ -4,7 +4,7 @@ import copy
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import TypeAlias, TypeGuard
+from typing import Any, TypeAlias, TypeGuard
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ import numpy as np
 
 from hjbjax.feedback.closed_loop import InitialValueProblem, Stepping, blank_record, integrate, integrate_part
 from hjbjax.feedback.feedback import GridFeedback, check_kept, is_grid_feedback, lookups
-from hjbjax.feedback.loop import Loop, check_shapes, settled_loop, timeless
+from hjbjax.feedback.loop import Loop, check_key, check_shapes, random_key, settled_loop, timeless
 from hjbjax.feedback.path import Interrupted, Path, PathStatus, promise, truncate
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
@@ -20,6 +20,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, cast, is_traced, with_suggestions
 from hjbjax.problem.types import Key, Number, Numbers
 from hjbjax.solution.clock import CHUNK_SECONDS, Clock, noting_interrupts
+from hjbjax.tracing.closures import OF_ACTION, OF_STATE, holds_tracers, opened, settled
 
 Feedback: TypeAlias = GridFeedback | Callable | None  # None where there is no control
 
@@ -47,7 +48,7 @@ def simulate(
     max_step: float | None = None,
     max_steps: int = 100_000,
 ) -> Path:
-    """The path of the closed loop from ``x0``, in float64.
+    """The path of the closed loop from ``x0``, in float64; inside ``jit``, ``vmap`` and ``grad`` as ``rollout`` has it.
 
     Callables take ``(x)``; they take ``(t, x)`` exactly when ``problem.time_dependent``, and feedback and disturbance
     also when ``time_varying``. Periodic states are
@@ -94,11 +95,21 @@ def simulate(
       >>> round(float(path.cost), 6), path.status.name
       (1.0, 'DURATION')
     """
-    if is_traced(problem, feedback, x0, duration, key, grid):
-        raise ValueError("simulate: got traced values; inside jit, vmap or grad use hjbjax.feedback.simulation.rollout")
+    if is_traced(duration, hold):
+        raise ValueError(
+            "simulate: duration and hold set the output times and must be known numbers, not traced ones; "
+            "hjbjax.feedback.simulation.rollout takes traced times"
+        )
     duration = float(arguments.positive(duration, "simulate: duration", "in units of time"))
     if _is_marched(feedback):
         problem = _within_horizon(problem, feedback, duration)
+    if _is_traced(problem, feedback, disturbance, x0, key, grid, rtol, atol, max_step):
+        options: Any = {"disturbance": disturbance, "time_varying": time_varying, "grid": grid, "clamp": clamp}
+        times, held = _times(duration, steps, None if hold is False else hold), hold is not None and hold is not False
+        return rollout(
+            problem, feedback, jnp.asarray(x0, jnp.result_type(float)), times, key=random_key(problem, key), hold=held,
+            rtol=rtol, atol=atol, max_step=max_step, max_steps=max_steps, **options,
+        )  # fmt: skip
     loop = _close(problem, feedback, disturbance, grid, clamp, time_varying)
     start = _initial_state(x0, loop.grid)
     loop = settled_loop(loop, start.size, {"control": feedback, "opponent": disturbance})
@@ -111,7 +122,7 @@ def simulate(
         max_steps=arguments.count(max_steps, "simulate: max_steps"),
         held=hold is not None,
     )
-    key = _random_key(problem, key)
+    key = random_key(problem, key)
     # Its import adds to JAX's configuration, which is part of the key of every compiled function: once before, or
     # the second call compiles again.
     import diffrax  # noqa: F401
@@ -140,6 +151,13 @@ def simulate(
 
 
 _margin = jax.jit(Loop.margin)
+
+
+def _is_traced(problem: object, *others: Any) -> bool:
+    """True if some number is a tracer, be it one that a function closed over."""
+    names = (*OF_ACTION, *OF_STATE)
+    functions = [getattr(problem, name, None) for name in names] + [each for each in others if callable(each)]
+    return is_traced(problem, *others) or any(map(holds_tracers, functions))
 
 
 def _in_chunks(ivp: InitialValueProblem, stepping: Stepping, clock: Clock) -> tuple[Path, jax.Array]:
@@ -178,7 +196,7 @@ def rollout(
     max_step: Number | None = None,
     max_steps: int = 100_000,
 ) -> Path:
-    """``simulate`` as a pure function, for ``jit``, ``vmap`` (over keys, starts, parameters) and forward derivatives.
+    """``simulate`` as a pure function, for ``jit``, ``vmap`` (over keys, starts, parameters), ``grad`` and ``jvp``.
 
     Follows the dtype of ``x0`` and checks no values. The arrays have full length: after the end of the path
     times and states repeat the last one, controls are NaN, and ``reached`` is inf if the target was not.
@@ -213,8 +231,12 @@ def rollout(
     start = jnp.asarray(x0)
     if not jnp.issubdtype(start.dtype, jnp.floating):
         raise ValueError(f"rollout: x0 has dtype {start.dtype}, wanted floating point: the path follows it")
-    _check_key(problem, key)
+    check_key(problem, key)
+    # numbers that functions close over become leaves: a rule of derivatives sees nothing else
+    problem = settled(problem, start.size, start.dtype)
     loop = _close(problem, feedback, disturbance, grid, clamp, time_varying)
+    moment = [jax.ShapeDtypeStruct(shape, start.dtype) for shape in ((), start.shape)]
+    loop = dataclasses.replace(loop, control=opened(loop.control, *moment), opponent=opened(loop.opponent, *moment))
     check_shapes(loop, start)
     stepping = Stepping(rtol, atol, np.inf if max_step is None else max_step, max_steps, hold)
     return integrate(InitialValueProblem(loop, start, jnp.asarray(times, start.dtype), key), stepping)[0]
@@ -308,32 +330,3 @@ def _times(duration: float, steps: int | None, hold: float | None) -> np.ndarray
     if held > 10**7:  # 80 MB a state: a hold in another unit than the duration
         raise ValueError(f"simulate: hold = {hold} makes {held:.3g} intervals of {duration:g}, wanted at most 1e7")
     return np.append(np.arange(math.ceil(held)) * hold, duration)  # the last interval may be shorter
-
-
-def _random_key(problem: Problem, given: Key | int | None) -> Key | None:
-    """The random key, or that of a seed; refuses what is none, one without noise, and noise without one."""
-    key = given
-    if isinstance(given, (int, np.integer)) and not isinstance(given, bool):
-        try:
-            key = jax.random.key(int(given))
-        except OverflowError:
-            raise ValueError(
-                f"simulate: key is {given}, wanted a seed that fits 64 bits, or a JAX random key"
-            ) from None
-    _check_key(problem, key)
-    assert not isinstance(key, int)
-    return key
-
-
-def _check_key(problem: Problem, key: Key | int | None) -> None:
-    """Refuse a key without noise, noise without a key, and what is no key."""
-    if problem.noise is not None and key is None:
-        raise ValueError("simulate: the problem has noise; give key=jax.random.key(0), or any other seed")
-    if problem.noise is None and key is not None:
-        raise ValueError("simulate: got a key, but problem.noise is None and nothing is random; leave out key")
-    dtype, shape = getattr(key, "dtype", None), () if key is None else np.shape(key)
-    typed = dtype is not None and jax.dtypes.issubdtype(dtype, jax.dtypes.prng_key)
-    # two kinds of keys: typed ones, and rows of uint32 as jax.random.PRNGKey makes them
-    if key is not None and not (typed and shape == ()) and not (dtype == np.uint32 and len(shape) == 1):
-        given = f"an array of shape {shape} and type {dtype}" if dtype is not None else repr(key)
-        raise ValueError(f"simulate: key is {given}, wanted one random key: key=jax.random.key(0), or another seed")

@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.iteration import bellman, certificates, methods
+from hjbjax.iteration import adjoint, bellman, certificates, methods
 from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
 from hjbjax.iteration.certificates import Certificate, Iterate
 from hjbjax.iteration.evaluation import Evaluation, check_evaluation, evaluate
@@ -235,7 +235,11 @@ class Implicit:
         assert self.evaluation is not None
         # what a step leaves adds up over the march, so that each has its share of the tolerance
         tol = self.tol * dt / march.horizon
-        value, policy, ok = question.solve(value, self.evaluation, tol, self.max_steps)
+        # the derivative is that of the solution and not of the steps to it
+        known, start, tol = jax.lax.stop_gradient((question, value, tol))
+        value, policy, ok = known.solve(start, self.evaluation, tol, self.max_steps)
+        found = value, policy, known.equation(value, policy)
+        value = adjoint.attach_step(question.on, question.obstacles, question.arriving, found, self.evaluation)
         return value, ok, march.look(list(policy.controls), list(policy.disturbances), end)
 
     def described(self) -> str:

@@ -6,6 +6,8 @@ long for it is done again in shorter ones. Steps end on the kept times exactly: 
 """
 
 import dataclasses
+import functools
+import math
 from typing import Any
 
 import jax
@@ -240,15 +242,32 @@ def _short_enough(march: March, front: Front, until: Scalar, count: Scalar) -> t
 
 
 def repeat(march: March, value: Field, start: float, end: float, count: int) -> Field:
-    """``count`` equal steps from the time ``start`` to ``end``, with known numbers: differentiable both ways."""
-    dt = (start - end) / max(count, 1)
+    """``count`` equal steps from the time ``start`` to ``end``, with known numbers: differentiable both ways.
 
-    def step(value, k):
-        t = jnp.asarray(start, value.dtype) - k * dt  # from the start, so that roundings of Δt do not add up
-        return march.method.step(march, value, t, t - dt, jnp.asarray(dt, value.dtype))[0], None
+    Reverse mode keeps V before each of √count chunks, and goes through the steps of one chunk at a time a second time,
+    and a third: of K steps it holds some 2 √K values, and what one step makes.
+    """
+    if count == 0:
+        return value
+    dt = (start - end) / count
+    width = math.isqrt(count - 1) + 1
+    numbers = jnp.arange(-(-count // width) * width).reshape(-1, width)
+
+    def move(value: Field, k: jax.Array) -> Field:
+        t = start - k.astype(value.dtype) * dt  # from the start, so that roundings of Δt do not add up
+        return march.method.step(march, value, t, t - dt, jnp.asarray(dt, value.dtype))[0]
+
+    @functools.partial(jax.checkpoint, prevent_cse=False)  # a scan keeps its turns apart by itself
+    def step(value: Field, k: jax.Array) -> tuple[Field, None]:
+        # the last chunk is filled up with steps that are not taken
+        return jax.lax.cond(k < count, move, lambda value, k: value, value, k), None
+
+    @functools.partial(jax.checkpoint, prevent_cse=False)
+    def chunk(value: Field, numbers: jax.Array) -> tuple[Field, None]:
+        return jax.lax.scan(step, value, numbers)
 
     # a scan and no while loop, which has no reverse mode
-    return jax.lax.scan(step, value, jnp.arange(count).astype(value.dtype))[0]
+    return jax.lax.scan(chunk, value, numbers)[0]
 
 
 def greedy(march: March, value: Field, t: Number) -> tuple[tuple[Field, ...], tuple[Field, ...]]:

@@ -169,7 +169,7 @@ def _solve_together(
         for i, each in enumerate(settled)
         if not asked[i].scheme.monotone and each.code not in CUT and (each.code is Status.CONVERGED or not sharpen)
     ]
-    raised = [nested.raised(settled[i], asked[i].scheme) for i in further]
+    raised = [nested.raised(settled[i].task, settled[i].assumptions, asked[i].scheme) for i in further]
     better = _iterate(
         [task for task, _ in raised], [settled[i].state.value for i in further], [names[i] for i in further], clock
     )

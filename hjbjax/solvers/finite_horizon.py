@@ -34,7 +34,7 @@ from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop, march_run
 from hjbjax.solvers.result import solution_at_start, with_last_phase
 from hjbjax.solvers.setup import check_on_one_state, choose_evaluation, question
-from hjbjax.solvers.stationary import as_dtype, check_node_values
+from hjbjax.solvers.stationary import as_dtype, check_node_values, traced_dtype
 from hjbjax.tracing.closures import with_settled_functions
 
 PROBES = 33  # times at which a given step, and constrained ends, are held against a time-dependent problem
@@ -115,8 +115,8 @@ def march(
     _check(problem, grid, scheme, method, step, time_limit)
     horizon, kept = _times(horizon, times)
     if is_traced(problem, grid, method, start):
-        traced = jnp.result_type(float) if dtype is None else jnp.dtype(dtype)
-        return _march_traced(Discretisation(problem, grid, scheme, traced), horizon, kept, start, method, step)
+        on = Discretisation(problem, grid, scheme, traced_dtype(dtype, "march"))
+        return _march_traced(on, horizon, kept, start, method, step)
     kind = as_dtype(dtype)
     if np.any(np.diff(kept.astype(kind)) <= 0):
         raise ValueError(f"march: two of the times {kept.tolist()} are the same number in {kind}; leave one out")

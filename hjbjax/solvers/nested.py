@@ -198,12 +198,12 @@ def settle(task: Task, assumptions: Assumptions, reached: Mask | None, guess: No
     return Settled(task, assumptions, reached, state, code, residuals)
 
 
-def raised(settled: Settled, scheme: Scheme) -> tuple[Task, Assumptions]:
+def raised(task: Task, assumptions: Assumptions, scheme: Scheme) -> tuple[Task, Assumptions]:
     """The task and the assumptions of a scheme of high order behind a monotone one, whose certificates it has not."""
     # the matrix stays that of the chain, the residual is of the better slopes: defect correction
-    on = dataclasses.replace(settled.task.on, scheme=scheme, plain=None)
-    task = dataclasses.replace(settled.task, certificate=Certificate.RESIDUAL, on=on)
-    return task, dataclasses.replace(settled.assumptions, certificate=Certificate.RESIDUAL)
+    on = dataclasses.replace(task.on, scheme=scheme, plain=None)
+    task = dataclasses.replace(task, certificate=Certificate.RESIDUAL, on=on)
+    return task, dataclasses.replace(assumptions, certificate=Certificate.RESIDUAL)
 
 
 def running(settled: Settled) -> Task:
@@ -222,7 +222,7 @@ def second_order(settled: Settled, scheme: Scheme, clock: Clock) -> Settled:
     over = clock.over()
     if over is not None:
         return settled._replace(code=over)
-    task, assumptions = raised(settled, scheme)
+    task, assumptions = raised(settled.task, settled.assumptions, scheme)
     sharp = settled._replace(task=task, assumptions=assumptions, origin=settled)
     state, ended, residuals = iterate(running(sharp), settled.state.value, clock)
     if int(state.step) < 0:

@@ -121,6 +121,16 @@ def choose_scheme(on: Discretisation, method: Method) -> Scheme:
     return Limited()
 
 
+def choose_traced_scheme(problem: Problem, method: Method | None) -> Scheme:
+    """The scheme that suits a problem inside a JAX transformation, where no values are looked at.
+
+    That of ``choose_scheme``, but for limited slopes where noise may let central differences be monotone: those slopes
+    are then the central ones. A tube stays with the chain, also where its discount is traced.
+    """
+    tube = is_constrained(problem) and not is_discounted(problem)
+    return Upwind() if tube or (method is not None and method.relaxes) else Limited()
+
+
 @jax.jit
 def _central(on: Discretisation) -> jax.Array:
     """True if central differences are monotone at all nodes, whatever the action."""

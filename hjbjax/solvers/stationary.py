@@ -6,6 +6,7 @@ same iteration runs with a fixed method and none of that, and its value and its 
 
 import contextlib
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -33,9 +34,11 @@ from hjbjax.solvers import host_loop, nested, semi_lagrangian
 from hjbjax.solvers.result import assemble, finish, solution_at_start, with_grid_error, with_last_phase
 from hjbjax.solvers.setup import (
     COARSEST,
+    Assumptions,
     check_on_one_state,
     choose,
     choose_scheme,
+    choose_traced_scheme,
     is_constrained,
     prepare_on_host,
     prepare_traced,
@@ -74,13 +77,13 @@ def solve(
         ``Weno5()``, fifth order there, on equal spacings, for a ``tol`` as small as its error; or ``SemiLagrangian()``,
         monotone, for deterministic problems whose optimal paths run along kinks of the value. ``None`` is
         ``Limited()`` where its iteration converges, with an estimate of the grid's error. It is ``Upwind()`` for value
-        iteration and tubes without discount, inside transformations, and wherever noise lets central differences be
-        monotone.
+        iteration and tubes without discount, and wherever noise lets central differences be monotone.
       tol: bound to reach on |V − V_h|, in cost units, V_h the exact solution on the grid of the monotone scheme. Where
         no certificate exists the solution says so, and the bound is on the residual and on the last step, as it is for
         the high-order equation; a tube without discount goes on until V no longer changes.
       guess: node values to start from, shape (*grid); not for a tube without discount, which has many fixed points.
-      dtype: ``None`` is float64; ``"float32"`` for memory, with a tolerance that float32 can reach.
+      dtype: ``None`` is float64, inside a transformation that of ``float`` there; ``"float32"`` for memory, with a
+        tolerance that float32 can reach.
       max_steps: at most so many steps, by each scheme and on each grid.
       time_limit: at most so many seconds, checks and compilation included; what cannot be cut, as one compilation or
         one step, is let come to its end.
@@ -90,7 +93,9 @@ def solve(
 
     Returns:
       The solution; NumPy arrays at host level. Inside ``jit``, ``vmap`` or ``grad`` its value and its policy are
-      traced, and differentiable with respect to every number in the problem and the grid.
+      traced, and differentiable with respect to every number in the problem and the grid; a derivative whose linear
+      solve does not come to its end is NaN. There a second-order iteration that does not converge leaves the monotone
+      answer, and its own code.
 
     Raises:
       ValueError: a question without an answer, or a bad argument.
@@ -109,8 +114,9 @@ def solve(
     if is_traced(problem, grid, guess, tol):
         if isinstance(scheme, PathScheme):
             raise ValueError(_at_host_level(scheme))
-        traced = jnp.result_type(float) if dtype is None else jnp.dtype(dtype)
-        return _solve_traced(Discretisation(problem, grid, scheme or Upwind(), traced), method, tol, guess, max_steps)
+        scheme, sharpen = scheme or choose_traced_scheme(problem, method), scheme is None
+        on = Discretisation(problem, grid, scheme, traced_dtype(dtype, "solve"))
+        return _solve_traced(on, method, tol, guess, max_steps, sharpen=sharpen)
     kind = as_dtype(dtype)
     check_node_values(guess, grid, "solve: the guess")
     grid.check_spacings(kind)
@@ -191,27 +197,54 @@ def _solve_on_host(
 
 
 def _solve_traced(
-    on: Discretisation, method: Method | None, tol: Number, guess: Nodes | None, max_steps: int | None
+    on: Discretisation, method: Method | None, tol: Number, guess: Nodes | None, max_steps: int | None, *, sharpen: bool
 ) -> Solution:
-    """The solution inside a JAX transformation: no chunks, no files, no exceptions, no checks of values."""
-    if not on.scheme.monotone:
-        raise ValueError(_at_host_level(on.scheme))
+    """The solution inside a JAX transformation: no chunks, no files, no exceptions, no checks of values.
+
+    ``sharpen``: nobody asked for the scheme, and the monotone answer stands where another one is not found.
+    """
     method = choose(on.problem, on.grid, traced=True, method=method)
     if method.coarsest is not None:
         raise ValueError("solve: Nested(...) runs at host level only; inside jit, vmap and grad use its inner method")
-    task, assumptions = prepare_traced(on, method=method, tol=tol)
+    task, assumptions = prepare_traced(on.chain, method=method, tol=tol)
     # the derivative is that of the fixed point, by the implicit function theorem, and not of the steps that led there
-    frozen = jax.lax.stop_gradient(task)
+    frozen, most = jax.lax.stop_gradient(task), max_steps or TRACED_STEPS
     start = frozen.start() if guess is None else jax.lax.stop_gradient(jnp.asarray(guess, on.dtype))
-    state = fixed_point.run(frozen, fixed_point.begin(frozen, start), max_steps or TRACED_STEPS)
+    state = fixed_point.run(frozen, fixed_point.begin(frozen, start), most)
     wrong = jnp.zeros((), bool)
     if assumptions.may_rest:
         state, wrong = _without_rests_to_leave(frozen, state)
-    value = adjoint.attach(task, state)
-    solution = assemble(task, adjoint.attach_policy(task, state, value), assumptions)
-    wrong |= state.code == Status.NONFINITE
-    value = value * jnp.where(wrong, jnp.nan, 1).astype(value.dtype)  # a derivative drops the code, and is NaN, too
+    solution = _differentiable(task, state, assumptions)
+    if not on.scheme.monotone:
+        further, assumptions = nested.raised(task, assumptions, on.scheme)
+        known = jax.lax.stop_gradient(further)
+        state = fixed_point.run(known, fixed_point.begin(known, state.value), most)
+        sharp = dataclasses.replace(_differentiable(further, state, assumptions), monotone_error=solution.error)
+        solution = _better_of(solution, sharp) if sharpen else sharp
+    wrong |= solution.code == Status.NONFINITE
+    value = solution.value * jnp.where(wrong, jnp.nan, 1).astype(on.dtype)  # a derivative drops the code: NaN, too
     return altered(solution, value=jnp.where(task.counted, value, jnp.inf) if task.has_lost else value)
+
+
+def _differentiable(task: Task, state: State, assumptions: Assumptions) -> Solution:
+    """The solution of a state, whose value and policy are functions of the numbers in the task."""
+    value = adjoint.attach(task, state)
+    return altered(assemble(task, adjoint.attach_policy(task, state, value), assumptions), value=value)
+
+
+def _better_of(plain: Solution, sharp: Solution) -> Solution:
+    """The answer of second order; where its iteration did not converge the monotone one, with the code of what failed.
+
+    The host says it in the message, which does not leave a transformation.
+    """
+    started = plain.code == Status.CONVERGED
+    found = started & (sharp.code == Status.CONVERGED)
+    names = ("value", "policy", "disturbance", "steps")
+    chosen = {
+        name: jax.tree.map(functools.partial(jnp.where, found), getattr(sharp, name), getattr(plain, name))
+        for name in names
+    }
+    return altered(sharp, **chosen, code=jnp.where(started, sharp.code, plain.code))
 
 
 def _at_host_level(scheme: object) -> str:
@@ -241,6 +274,19 @@ def as_dtype(dtype: DType | None) -> np.dtype:
             if kind == (np.float64 if dtype is None else np.dtype(dtype)):
                 return kind
     raise ValueError(f"dtype: got {dtype!r}, wanted 'float64' or 'float32'")
+
+
+def traced_dtype(dtype: DType | None, name: str) -> np.dtype:
+    """The floating-point type inside a JAX transformation; None is that of ``float`` there."""
+    if dtype is None:
+        return np.dtype(jnp.result_type(float))
+    kind = as_dtype(dtype)
+    if kind == np.float64 and kind != np.dtype(jnp.result_type(float)):  # JAX would go on in float32, and warn
+        raise ValueError(
+            f"{name}: got dtype={dtype!r} inside jit, vmap or grad, where JAX is set to 32 bits and a type cannot be "
+            "changed; put `with jax.enable_x64(True):` around the call of the transformed function"
+        )
+    return kind
 
 
 def check_limits(max_steps: object, time_limit: object) -> None:

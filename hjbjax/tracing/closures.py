@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import types
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
@@ -26,7 +27,17 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, as_partial, is_traced, with_suggestions
 from hjbjax.problem.types import DType, Numbers
-from hjbjax.tracing.outside import FLOATS, NUMBERS, OfNumbers, code, decisive, fingerprint, identity, numbers_read
+from hjbjax.tracing.outside import (
+    FLOATS,
+    NUMBERS,
+    OfNumbers,
+    code,
+    content,
+    decisive,
+    fingerprint,
+    identity,
+    numbers_read,
+)
 
 if TYPE_CHECKING:
     from jax.extend import core as jex
@@ -60,6 +71,23 @@ def settled_function(function: Callable, *shapes: tuple[int, ...]) -> Partial:
     held = as_partial(function)
     assert held is not None
     return _settled_outside(held, shapes) or held
+
+
+def opened(function: Any, *arguments: jax.ShapeDtypeStruct) -> Any:
+    """A function of some arguments with the tracers that it closed over among its leaves; else as it is."""
+    if function is None:
+        return None
+    found, closed = _trace(_bare(function), arguments)
+    return function if closed is None or not is_traced(closed.consts) else _with_closure_as_leaves(found, closed)
+
+
+def holds_tracers(thing: object, depth: int = 4) -> bool:
+    """True if a function closed over a tracer, itself or by a function that it closed over."""
+    if isinstance(thing, Partial):
+        thing = thing.func
+    if depth == 0 or not isinstance(thing, types.FunctionType):
+        return is_traced(thing)
+    return any(holds_tracers(content(cell), depth - 1) for cell in thing.__closure__ or ())
 
 
 def with_settled_functions(front_door: Callable) -> Callable:
@@ -227,7 +255,12 @@ def _settled_inside(function: Partial, shapes: Sequence[tuple[int, ...]], dtype:
     found, closed = _trace(function, [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes])
     if closed is None or not is_traced(closed.consts):
         return _with_mark(found, closed)
-    leaves = jax.tree.leaves((found.keywords, found.args))
+    return _with_closure_as_leaves(found, closed)
+
+
+def _with_closure_as_leaves(function: Partial, closed: jex.ClosedJaxpr) -> Partial:
+    """A traced function with what it closed over among its leaves."""
+    leaves = jax.tree.leaves((function.keywords, function.args))
     return Partial(Opened(closed.jaxpr), (tuple(closed.consts), leaves))
 
 

@@ -200,7 +200,7 @@ def numbers_read(function: Callable, kinds: tuple[type, ...]) -> dict[str, np.nd
     # a global whose name is an attribute's in the code is found as well, and then not read: no harm
     found = {name: function.__globals__.get(name) for name in names_read(function.__code__)}
     for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
-        found[name] = _content(cell)
+        found[name] = content(cell)
     return {name: np.asarray(each, float) for name, each in sorted(found.items()) if _is_number(each, kinds)}
 
 
@@ -214,7 +214,7 @@ def _writes(code: types.CodeType) -> bool:
     return any(_writes(each) for each in code.co_consts if isinstance(each, types.CodeType))
 
 
-def _content(cell: types.CellType) -> object:
+def content(cell: types.CellType) -> object:
     """What a cell holds; None while it is empty."""
     try:
         return cell.cell_contents

@@ -462,4 +462,4 @@ def test_what_cannot_be_called_is_a_type_error():
     with pytest.raises(TypeError, match="wanted a Solution or a function"):
         simulate(PLAIN, None, [1.0], 1.0)
     with pytest.raises(ValueError, match="rollout"):
-        jax.jit(lambda x0: simulate(PLAIN, toward_zero, x0, 1.0).cost)(jnp.ones(1))
+        jax.jit(lambda duration: simulate(PLAIN, toward_zero, [1.0], duration).cost)(1.0)

@@ -213,10 +213,12 @@ class Opened:
 
 
 def _as_traced(leaf: Numbers) -> Numbers:
-    """A leaf in the type with which it was traced: without x64 a float64 array of NumPy's counts as float32."""
-    if not isinstance(leaf, np.ndarray | np.generic):
-        return leaf
-    return leaf.astype(jax.typeof(leaf).dtype, copy=False)
+    """A leaf in the type with which it was traced, as an array of JAX's.
+
+    After a solve inside of ``jit`` JAX 0.10 takes a float64 array of NumPy's for float32 where a primitive is bound,
+    although x64 is on and ``typeof`` says float64.
+    """
+    return jnp.asarray(leaf, jax.typeof(leaf).dtype) if isinstance(leaf, np.ndarray | np.generic) else leaf
 
 
 def _kind(leaf: jax.typing.ArrayLike | jax.ShapeDtypeStruct) -> tuple[tuple[int, ...], Any, bool]:

@@ -6,9 +6,10 @@ A step of length dt of the Duncan–Mortensen–Zakai equation is split as G. St
 
 where the factors are exact for a state that rests, and the middle step keeps sums and signs, see ``forward_equation``:
 q ≥ 0 for any dt and any record. Of second order in dt along a smooth record; the likelihood of a record with noise is
-of first order, since an increment does not tell where in its interval the noise was. In the spacing of the order of the
-chain, two where its differences are central and one elsewhere. The factors are multiplied as logarithms, with the largest product taken out,
-so that nothing overflows or vanishes; what is taken out is kept in the logarithm of the mass.
+of first order, since an increment does not tell where in its interval the noise was. In the spacing of the order of
+the chain, two where its differences are central and one elsewhere. The factors are multiplied as logarithms, with the
+largest product taken out, so that nothing overflows or vanishes; what is taken out is kept in the logarithm of the
+mass.
 """
 
 from collections.abc import Callable, Sequence

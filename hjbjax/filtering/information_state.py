@@ -59,11 +59,11 @@ def zakai(
         dq = 𝓛^{u*} q dt + q hᵀ R⁻¹ dy,    q(0) = p₀                                                   (12.6)
 
     for dx = f(x, u) dt + σ dw and dy = h(x) dt + r dv, R = r rᵀ. Positive, and of mass one up to rounding, whatever dt
-    and the record. Mean and covariance of a linear system are of second order in dt, ``log_likelihood`` of a record with
-    noise of first; in the spacing all are of second order where the noise of an axis makes central differences monotone,
-    a_ii ≥ h|f_i|, and of first elsewhere. All k densities are kept; a ``GridFilter`` keeps the last. In float64; under a
-    tracer in the type of the record, with forward derivatives (``jacfwd``); outside ``jit`` and ``vmap`` with reverse
-    ones, too (``grad``).
+    and the record. Mean and covariance of a linear system are of second order in dt, ``log_likelihood`` of a record
+    with noise of first; in the spacing all are of second order where the noise of an axis makes central differences
+    monotone, a_ii ≥ h|f_i|, and of first elsewhere. All k densities are kept; a ``GridFilter`` keeps the last. In
+    float64; under a tracer in the type of the record, with forward derivatives (``jacfwd``); outside ``jit`` and
+    ``vmap`` with reverse ones, too (``grad``).
 
     Along a periodic axis the mean is the circular one, the angle of the mean of e^{iθ}, brought into the box, and the
     covariance that of the differences from it the short way round.

@@ -83,7 +83,7 @@ def small_shape(shape: Sequence[int], nodes: int = NODES) -> tuple[int, ...]:
 
     Example:
       >>> small_shape((200, 201), 4000), small_shape((41, 51, 9), 4000), small_shape((81,), 4000)
-      ((62, 63), (25, 31, 7), (81,))
+      ((64, 63), (25, 31, 5), (81,))
     """
     # moved to fewer nodes only: what a problem asks for by default is what its author found to be enough
     share = min(1.0, (nodes / math.prod(shape)) ** (1 / len(shape)))

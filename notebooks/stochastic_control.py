@@ -69,7 +69,7 @@ assert abs(solution.value_at([1.0]) - reference) < 1e-3
 # ## How long it stays
 #
 # The same generator tells how long a state stays in a region. From the centre of a disc of radius 1 a Brownian motion
-# takes $\tfrac12$ in the mean.
+# takes $\tfrac{1}{2}$ in the mean.
 
 # %%
 problem, grid = hjb.zoo.brownian_ball(shape=(41, 41))

@@ -131,7 +131,7 @@ class Marked:
     """A function with a mark of what it computes, and with the jaxprs of its traces.
 
     It equals another of one code and one mark: a lambda written in a loop, or a notebook's cell run again, compiles
-    nothing anew.
+    nothing anew. A mark that is not ``whole`` is shared by functions that differ, and then it equals only its own.
 
     Python runs the function once for every kind of arguments: a solve looks at it in half a dozen places (checks,
     dependence on the control, the chain, slopes of the drift in u), and each would trace it anew.
@@ -139,6 +139,7 @@ class Marked:
 
     def __init__(self, function: Callable, mark: object = None):
         self.__wrapped__, self.mark = function, mark  # the name under which ``inspect`` finds the signature
+        self.whole = True
         # a key holds x64 as well, under which constants made inside the function have another type
         self._jaxprs: dict[object, tuple[jex.ClosedJaxpr, Any] | None] = {}
 
@@ -179,13 +180,15 @@ class Marked:
             self._jaxprs[key] = found
         return found
 
+    def _key(self) -> tuple[object, object]:
+        """What tells it from others."""
+        return (code(self.__wrapped__) if self.whole else self.__wrapped__), self.mark
+
     def __eq__(self, other: object) -> bool:
-        return (
-            isinstance(other, Marked) and self.mark == other.mark and code(self.__wrapped__) == code(other.__wrapped__)
-        )
+        return isinstance(other, Marked) and self._key() == other._key()
 
     def __hash__(self) -> int:
-        return hash((code(self.__wrapped__), self.mark))
+        return hash(self._key())
 
 
 class Opened:
@@ -301,5 +304,5 @@ def _trace(function: Partial, arguments: Sequence[jax.ShapeDtypeStruct]) -> tupl
 def _with_mark(function: Partial, closed: jex.ClosedJaxpr | None) -> Partial:
     """The function with the mark of its trace; where there is none it equals no other."""
     assert isinstance(function.func, Marked)
-    function.func.mark = object() if closed is None else fingerprint(closed)
+    function.func.mark, function.func.whole = (object(), True) if closed is None else fingerprint(closed)
     return function

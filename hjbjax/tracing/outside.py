@@ -20,6 +20,7 @@ import re
 import sys
 import types
 from collections.abc import Callable, Hashable, Iterable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard, cast
 
 import jax
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from jax.extend import core as jex
 
 ADDRESS = re.compile(r" at 0x[0-9a-f]+|id=\d+")  # of rules of derivatives, made anew with every trace
+CALLBACKS = ("pure_callback", "io_callback")
 # whose functions compute tomorrow what they compute today: problems made of these alone need no trace at all
 LIBRARIES = frozenset({"builtins", "functools", "hjbjax", "itertools", "jax", "jaxlib", "math", "numpy", "operator"})
 # what a number may do to a state or a control without a say in how the result depends on these
@@ -113,57 +115,93 @@ def code(function: Callable) -> object:
     return getattr(getattr(function, "__func__", function), "__code__", function)
 
 
-def fingerprint(closed: jex.ClosedJaxpr) -> bytes:
-    """A digest of what a jaxpr computes, with every number that it holds."""
-    digest = hashlib.blake2b(digest_size=16)  # by chance two of 10^10 functions share 128 bits once in 10^18 cases
-    _feed(digest, closed.jaxpr, closed.consts)
-    return digest.digest()
+def fingerprint(closed: jex.ClosedJaxpr) -> tuple[Hashable, bool]:
+    """A mark of what a jaxpr computes, with every number that it holds, and whether the mark tells all.
+
+    A jaxpr does not say what rules of derivatives compute, unless they are JAX's own.
+    """
+    account = _Account()
+    account.take(closed.jaxpr, closed.consts)
+    return (account.digest.digest(), *account.callbacks), account.whole
 
 
-def _feed(digest: hashlib.blake2b, jaxpr: jex.Jaxpr, consts: Iterable[Numbers]) -> None:
-    """Put a jaxpr into a digest, equation by equation."""
-    numbers: dict[Any, int] = {}  # variables by their first appearance; their own names differ from trace to trace
+class _Account:
+    """A digest of a jaxpr, the functions of the host that it calls, and whether it says all that the jaxpr computes."""
 
-    def tell(*words: Any) -> None:
-        digest.update(repr(words).encode())
+    def __init__(self) -> None:
+        self.digest = hashlib.blake2b(digest_size=16)  # two of 10^10 functions share 128 bits once in 10^18 cases
+        self.callbacks: list[Hashable] = []
+        self.whole = True
 
-    def number(value: Numbers) -> None:
-        array = np.asarray(value)  # its bits, since a printed one is rounded and a long one abridged
-        tell(array.dtype, array.shape)
-        digest.update(array.tobytes())
+    def take(self, jaxpr: jex.Jaxpr, consts: Iterable[Numbers]) -> None:
+        """Put a jaxpr into the digest, equation by equation."""
+        numbers: dict[Any, int] = {}  # variables by their first appearance; their own names differ from trace to trace
+        for var in (*jaxpr.constvars, *jaxpr.invars):
+            self._tell(numbers.setdefault(var, len(numbers)), str(var.aval))
+        for value in consts:
+            self._number(value)
+        for eqn in (*jaxpr.eqns, None):  # None: the outputs of the whole, as if an equation took them
+            operands, results = (jaxpr.outvars, ()) if eqn is None else (eqn.invars, eqn.outvars)
+            self._tell("" if eqn is None else eqn.primitive.name)
+            for operand in operands:
+                if jaxprs.is_literal(operand):  # a number in the code, of which no variable tells
+                    self._number(operand.val)
+                else:
+                    self._tell(numbers.get(operand, -1))
+            for result in results:
+                self._tell(numbers.setdefault(result, len(numbers)), str(result.aval))
+            if eqn is not None:
+                self._parameters(eqn.primitive.name, eqn.params)
 
-    def tell_parameter(value: object) -> None:
-        if jaxprs.is_closed(value):
-            _feed(digest, value.jaxpr, value.consts)
-        elif jaxprs.is_open(value):
-            _feed(digest, value, ())
-        elif isinstance(value, (tuple, list)):
-            tell(len(value))
-            for each in value:
-                tell_parameter(each)
-        elif isinstance(value, (np.ndarray, jax.Array)):
-            number(value)
-        else:
-            tell(ADDRESS.sub("", repr(value)))
-
-    for var in (*jaxpr.constvars, *jaxpr.invars):
-        tell(numbers.setdefault(var, len(numbers)), str(var.aval))
-    for value in consts:
-        number(value)
-    for eqn in (*jaxpr.eqns, None):  # None: the outputs of the whole, as if an equation took them
-        operands, results = (jaxpr.outvars, ()) if eqn is None else (eqn.invars, eqn.outvars)
-        tell("" if eqn is None else eqn.primitive.name)
-        for operand in operands:
-            if jaxprs.is_literal(operand):  # a number in the code, of which no variable tells
-                number(operand.val)
-            else:
-                tell(numbers.get(operand, -1))
-        for result in results:
-            tell(numbers.setdefault(result, len(numbers)), str(result.aval))
-        parameters = {} if eqn is None else eqn.params
+    def _parameters(self, primitive: str, parameters: dict[str, Any]) -> None:
+        if primitive.startswith("custom_") and not _is_rule_of_jax(parameters):
+            self.whole = False
         for name in sorted(parameters):
-            tell(name)
-            tell_parameter(parameters[name])
+            self._tell(name)
+            if primitive in CALLBACKS and name == "callback":
+                self.callbacks.append(_called(parameters[name]))
+            else:
+                self._parameter(parameters[name])
+
+    def _parameter(self, value: object) -> None:
+        if jaxprs.is_closed(value):
+            self.take(value.jaxpr, value.consts)
+        elif jaxprs.is_open(value):
+            self.take(value, ())
+        elif isinstance(value, (tuple, list)):
+            self._tell(len(value))
+            for each in value:
+                self._parameter(each)
+        elif isinstance(value, (np.ndarray, jax.Array)):
+            self._number(value)
+        else:
+            self._tell(ADDRESS.sub("", repr(value)))
+
+    def _number(self, value: Numbers) -> None:
+        array = np.asarray(value)  # its bits, since a printed one is rounded and a long one abridged
+        self._tell(array.dtype, array.shape)
+        self.digest.update(array.tobytes())
+
+    def _tell(self, *words: Any) -> None:
+        self.digest.update(repr(words).encode())
+
+
+def _is_rule_of_jax(parameters: dict[str, Any]) -> bool:
+    """True if the function whose derivative has a rule of its own is one of JAX's, as relu is."""
+    inner = parameters.get("call_jaxpr", parameters.get("fun_jaxpr"))
+    info = getattr(getattr(inner, "jaxpr", None), "debug_info", None)  # JAX promises none of these names
+    where = re.search(r" at (.*):\d+$", getattr(info, "func_src_info", None) or "")
+    return where is not None and Path(where[1]).is_relative_to(Path(jax.__file__).parent)
+
+
+def _called(callback: object) -> Hashable:
+    """What tells a function of the host from another: its code, where it holds nothing beside, or itself."""
+    function = getattr(callback, "callback_func", callback)
+    if isinstance(function, types.FunctionType) and not (
+        function.__closure__ or function.__defaults__ or function.__kwdefaults__
+    ):
+        return function.__code__, id(function.__globals__)  # a lambda inside the drift is a new one in every trace
+    return function
 
 
 class OfNumbers:
@@ -176,6 +214,12 @@ class OfNumbers:
         own = inspect.signature(function)
         first = inspect.Parameter("numbers", inspect.Parameter.POSITIONAL_ONLY)
         self.__signature__ = own.replace(parameters=[first, *own.parameters.values()])
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, OfNumbers) and (self.function, self.names) == (other.function, other.names)
+
+    def __hash__(self) -> int:
+        return hash((self.function, self.names))
 
     def __call__(self, numbers: tuple, *arguments: Any, **options: Any) -> Any:
         """What the function returns where it reads ``numbers``."""

@@ -9,6 +9,7 @@ import pytest
 
 import hjbjax as hjb
 from hjbjax.tracing import closures
+from hjbjax.tracing.outside import fingerprint
 
 UNIT = hjb.Box([-1.0], [1.0])
 LINE = hjb.Grid([-1.0], [1.0], (11,))
@@ -400,3 +401,61 @@ def test_known_problems_are_solved_at_once_inside_a_transformation():
         assert float(jax.jit(there)(jnp.array([0.33]))) == pytest.approx(wanted, rel=1e-6)
         assert float(jax.vmap(there)(jnp.array([[0.33]]))[0]) == pytest.approx(wanted, rel=1e-6)
         assert all(isinstance(solution.value, np.ndarray) for solution in kept)
+
+
+class OnHost:
+    """A drift that the host computes: its jaxpr is that of every other of its kind."""
+
+    def __init__(self, gain):
+        self.gain = gain
+
+    def product(self, u):
+        return np.asarray(u) * np.float32(self.gain)
+
+    def drift(self, x, u):
+        return jax.pure_callback(self.product, jax.ShapeDtypeStruct(u.shape, u.dtype), u, vmap_method="expand_dims")
+
+
+@pytest.mark.filterwarnings("ignore:the primitive 'pure_callback'")
+def test_functions_of_the_host_are_told_apart():
+    options = {"dtype": "float32", "scheme": hjb.Upwind(), "tol": 1e-4}
+
+    def solved(drift):
+        return hjb.solve(hjb.Problem(drift, square, UNIT, discount=1.0), LINE, **options).value
+
+    cars = [OnHost(gain) for gain in (0.0, 1.0, 0.5)]
+    for car in (*cars, *reversed(cars)):
+        np.testing.assert_allclose(solved(car.drift), solved(lambda x, u, gain=car.gain: gain * u), atol=1e-3)
+
+
+def test_rules_of_derivatives_that_a_jaxpr_does_not_tell():
+    def ruled(slope):
+        @jax.custom_jvp
+        def same(p):
+            return p**2
+
+        same.defjvp(lambda primals, tangents: (primals[0] ** 2, slope * tangents[0]))
+        return same
+
+    def of_weight(slope):
+        same = ruled(slope)
+
+        def total(p):
+            problem = hjb.Problem(lambda x, u: u, lambda x, u: same(p), UNIT, discount=1.0)
+            return hjb.solve(problem, LINE, scheme=hjb.Upwind(), tol=1e-8).value[5]
+
+        return jax.grad(total)(2.0)
+
+    np.testing.assert_allclose([of_weight(3.0), of_weight(5.0)], [3.0, 5.0], rtol=1e-6)
+
+
+def test_rules_of_jax_are_known():
+    def fingerprint_of(function):
+        return fingerprint(jax.make_jaxpr(function)(jnp.ones(2)))
+
+    (first, whole), (again, _) = (fingerprint_of(lambda x: jax.nn.relu(x - 1.0)) for _ in range(2))
+    assert whole
+    assert first == again != fingerprint_of(lambda x: jax.nn.relu(x - 2.0))[0]
+    mine = jax.custom_jvp(lambda x: x * 2.0)
+    mine.defjvp(lambda x, tangent: (2.0 * x[0], 2.0 * tangent[0]))
+    assert not fingerprint_of(mine)[1]

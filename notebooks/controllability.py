@@ -42,7 +42,7 @@ assert np.allclose(sideways(origin), [0, -1, 0], atol=1e-6)
 # ## Figure 6: how a car parks
 #
 # Forward, turn, back, turn back, each for a time $\tau$: the car ends beside its start, off by $\tau^2[g_1, g_2]$ up to
-# a rest of third order. (The chapter prints $\tfrac{1}{2}\tau^2$, which the figures below exclude.)
+# a rest of third order. (The chapter prints $\tfrac12\tau^2$, which the figures below exclude.)
 
 # %%
 plan = jnp.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])

@@ -38,7 +38,7 @@ def regulated(weight, strength=1.0):
 # %% [markdown]
 # ## The derivative of a value
 #
-# How much is a stronger motor worth? $V = \tfrac{1}{2} P x^2$ with $\tfrac32 P + s^2P^2/w = 1$ tells it in closed form.
+# How much is a stronger motor worth? $V = \tfrac12 P x^2$ with $\tfrac32 P + s^2P^2/w = 1$ tells it in closed form.
 
 
 # %%

@@ -35,7 +35,7 @@ start, duration = [0.6, 0.0], 5.0
 # ## Without a torque
 #
 # Upright is an equilibrium, and an unstable one: the linearisation has the eigenvalues $\pm\sqrt g$. A pendulum that is
-# let go swings through hanging and comes back; its energy $\tfrac{1}{2}\dot\theta^2 + g\cos\theta$ does not change.
+# let go swings through hanging and comes back; its energy $\tfrac12\dot\theta^2 + g\cos\theta$ does not change.
 
 # %%
 fall = hjb.simulate(problem, lambda x: jnp.zeros(1), start, duration, rtol=1e-8, atol=1e-8)

@@ -18,7 +18,7 @@
 # $$\dot x_1 = x_2, \qquad \dot x_2 = u, \qquad |u| \le 1.$$
 #
 # The least time $T(x)$ is known in closed form, and its level sets have a kink along the switching curve
-# $x_1 = -\tfrac{1}{2} x_2|x_2|$. The chapter solves the discounted problem (8.14), whose value
+# $x_1 = -\tfrac12 x_2|x_2|$. The chapter solves the discounted problem (8.14), whose value
 #
 # $$S(x) = 1 - e^{-T(x)}$$
 #

@@ -104,7 +104,7 @@ assert law.density.min() >= 0
 # %% [markdown]
 # ## Cost against gain
 #
-# On $\dot x = x + u + w$, $y = 2x + v$ with cost $\tfrac{1}{2}\int x^2 + u^2$, Kalman's filter with the regulator's gain is
+# On $\dot x = x + u + w$, $y = 2x + v$ with cost $\tfrac12\int x^2 + u^2$, Kalman's filter with the regulator's gain is
 # optimal for white noise. The minimum-stress controller takes the state where $p + V$ is largest for the true one, with
 # $p$ the robust information state for $\gamma = 2.5$ and $V$ the value of the game: it keeps
 # $\int |z|^2 \le \gamma^2 \int |w|^2 + |v|^2$ whatever the disturbances do. The third controller minimises the

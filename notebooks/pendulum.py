@@ -17,7 +17,7 @@
 #
 # $$m\ddot\theta - m g \sin\theta = \tau.$$
 #
-# It is to be swung up and held there at the cost $\int \tfrac{1}{2}(\theta^2 + \dot\theta^2 + \tau^2)\,dt$, without
+# It is to be swung up and held there at the cost $\int \tfrac12(\theta^2 + \dot\theta^2 + \tau^2)\,dt$, without
 # discount. The angle lives on a circle; upright at rest costs nothing, and that is what makes the value finite.
 # Figures 10 to 12 of the chapter, with the pendulum (9.4), show the value, the feedback and a stabilising trajectory.
 

@@ -28,8 +28,8 @@ from hjbjax import plotting
 # %% [markdown]
 # ## A mass at a quadratic cost
 #
-# A force moves a mass to the origin at the cost $\tfrac{1}{2}\int |x|^2 + u^2\,dt$: linear and quadratic, so that the
-# value is $\tfrac{1}{2} x^\top P x$ with $P$ from the Riccati equation.
+# A force moves a mass to the origin at the cost $\tfrac12\int |x|^2 + u^2\,dt$: linear and quadratic, so that the
+# value is $\tfrac12 x^\top P x$ with $P$ from the Riccati equation.
 
 
 # %%

@@ -19,7 +19,7 @@
 #
 # whatever $d$ does. The least such $V$ is the value of a game and solves Isaacs' equation, as in (11.7),
 #
-# $$0 = \min_u\max_d\,[\,DV\cdot(f + d) + \tfrac{1}{2}|z|^2 - \tfrac{1}{2}\gamma^2|d|^2\,].$$
+# $$0 = \min_u\max_d\,[\,DV\cdot(f + d) + \tfrac12|z|^2 - \tfrac12\gamma^2|d|^2\,].$$
 
 # %%
 import warnings
@@ -42,7 +42,7 @@ def game(gamma):
 # %% [markdown]
 # ## The price of a smaller gain
 #
-# For $\dot x = -x + u + d$ the value is $\tfrac{1}{2} P x^2$ with $P^2(1 - \gamma^{-2}) + 2P = 1$. Demanding a smaller gain
+# For $\dot x = -x + u + d$ the value is $\tfrac12 P x^2$ with $P^2(1 - \gamma^{-2}) + 2P = 1$. Demanding a smaller gain
 # makes the value larger and the feedback stiffer, until at $\gamma = 1/\sqrt2$ no feedback keeps it.
 
 # %%

@@ -39,7 +39,7 @@ assert verdict.message.startswith("violated")
 # ## A feedback of time and state
 #
 # Time makes the difference. Pomet's feedback (6.7) has the Lyapunov function (6.8),
-# $V = \tfrac{1}{2}(x_1 + x_2\cos t)^2 + \tfrac{1}{2} x_2^2 + \tfrac{1}{2} x_3^2$, which never grows. A search over states and
+# $V = \tfrac12(x_1 + x_2\cos t)^2 + \tfrac12 x_2^2 + \tfrac12 x_3^2$, which never grows. A search over states and
 # times finds nothing against it.
 
 # %%

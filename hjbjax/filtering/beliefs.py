@@ -278,8 +278,12 @@ def check_generator(rates: np.ndarray, name: str) -> None:
     """Refuse a matrix that is no generator.
 
     Raises:
-      ValueError: a negative rate, or a row that does not sum to zero.
+      ValueError: another shape, numbers that are not finite, a negative rate, or a row that does not sum to zero.
     """
+    if rates.ndim != 2 or rates.shape[0] != rates.shape[1] or len(rates) < 2:
+        raise ValueError(f"{name} has shape {rates.shape}, wanted (S, S) with S ≥ 2: rates from row to column")
+    if not np.all(np.isfinite(rates)):
+        raise ValueError(f"{name} = {arguments.shown(rates.tolist())}, wanted finite numbers")
     slack = ROUNDING * np.max(np.abs(rates))
     off = rates - np.diag(np.diag(rates))
     if np.any(off < 0):

@@ -12,6 +12,7 @@ largest product taken out, so that nothing overflows or vanishes; what is taken 
 mass.
 """
 
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -115,7 +116,7 @@ class GridFilter:
                 "plant": system,
                 "grid": grid,
                 "measurement": measured,
-                "signal": _signal(on, cast(measured, np.float64), name),
+                "signal": signal(on, cast(measured, np.float64), name),
                 "prior": _prior(on, initial_density, name),
                 "volumes": grid.volumes(),
                 "cells": cells(on),
@@ -179,6 +180,29 @@ class GridFilter:
         return density / jnp.sum(density * jnp.asarray(self.volumes, probability.dtype))
 
 
+def warn_at_ends(name: str, grid: Grid, places: Array, dt: float, what: str) -> None:
+    """Warn where an estimate lies at an end of the box, beyond which nothing is known.
+
+    Args:
+      name: who asks.
+      grid: the nodes.
+      places: the estimates along a record, shape (..., k, n).
+      dt: the time between two of them.
+      what: of which kind they are.
+    """
+    lo, hi = np.asarray(grid.lo), np.asarray(grid.hi)
+    off = ((places <= lo) | (places >= hi)) & ~np.asarray(grid.periodic)
+    if not np.any(off):
+        return
+    *_, step, axis = np.argwhere(off)[np.argmin(np.argwhere(off)[:, -2])]
+    warnings.warn(
+        f"{name}: {what} lies at an end of the box of axis {axis} after {np.sum(np.any(off, axis=-1))} of "
+        f"{off[..., 0].size} measurements, the first at t = {(step + 1) * dt:.6g}: beyond it nothing is known; if the "
+        "state can leave the box take a larger one, else there is none to heed",
+        stacklevel=3,
+    )
+
+
 def _weighed(probability: Field, exponent: Field) -> tuple[Field, jax.Array]:
     """Probabilities times e^exponent, normalised, and the logarithm of what their sum was."""
     positive = probability > 0
@@ -190,8 +214,8 @@ def _weighed(probability: Field, exponent: Field) -> tuple[Field, jax.Array]:
     return weight / total, largest + jnp.log(total)
 
 
-def _signal(on: Discretisation, measured: Measurement, name: str) -> Any:
-    """r⁻¹ h at the nodes, shape (p, *grid)."""
+def signal(on: Discretisation, measured: Measurement, name: str) -> Any:
+    """r⁻¹ h at the nodes, shape (p, *grid); refused where it is not finite."""
     entries = components.components(measured.h, on.coordinates(), dtype=on.dtype)
     h = jnp.stack([jnp.broadcast_to(entry, on.grid.shape) for entry in entries])
     refuse("h(x) is not finite", ~jnp.all(jnp.isfinite(h), axis=0), on.grid, name)

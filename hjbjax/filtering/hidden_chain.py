@@ -182,6 +182,8 @@ def _check_shapes(generator: Any, h: Any, sensor: Sensor, states: int) -> None:
         raise ValueError(
             f"WonhamFilter: h has shape {np.shape(h)}, wanted ({states},) or ({states}, p): one row a state"
         )
+    if not is_traced(h) and not np.all(np.isfinite(np.asarray(h, float))):
+        raise ValueError(f"WonhamFilter: h = {arguments.shown(np.asarray(h).tolist())}, wanted finite numbers")
     sensor.check("WonhamFilter", np.zeros(0))
 
 
@@ -217,8 +219,8 @@ def simulate_hidden(
       A ``HiddenPath``.
 
     Raises:
-      ValueError: a duration or step that is not positive, a start that is no state, a control or a cost of the wrong
-        shape.
+      ValueError: a duration or step that is not positive, a start that is no state, a control, cost, generator or h of
+        the wrong shape or not finite.
 
     Example:
       >>> observer = WonhamFilter(np.array([[-1.0, 1.0], [1.0, -1.0]]), [1.0, -1.0], [0.5, 0.5])
@@ -247,7 +249,14 @@ def simulate_hidden(
         loop = cast(_Loop(observer, as_partial(control or _nothing), as_partial(cost), float(discount)), np.float64)
         _check_loop(loop, states)
         run = _paths if keys.ndim == (0 if jnp.issubdtype(keys.dtype, jax.dtypes.prng_key) else 1) else _many_paths
-        return jax.tree.map(np.asarray, run(loop, jnp.asarray(law), keys, duration / steps, steps))
+        path = jax.tree.map(np.asarray, run(loop, jnp.asarray(law), keys, duration / steps, steps))
+    for name, found in {"control": path.controls, "h": path.measurements, "cost": path.cost}.items():
+        if not np.all(np.isfinite(found)):
+            raise ValueError(
+                f"simulate_hidden: {name} returned numbers that are not finite along a path; wanted finite ones for "
+                "every belief and every control"
+            )
+    return path
 
 
 @pytree_dataclass()
@@ -268,17 +277,31 @@ def _nothing(belief: Array) -> jax.Array:
 def _check_loop(loop: _Loop, states: int) -> None:
     """Refuse a control or a cost of the wrong shape before anything is compiled."""
     belief = jax.ShapeDtypeStruct((states,), np.float64)
-    u = jax.eval_shape(loop.control, belief)
+    u = jax.eval_shape(_array_of(loop.control), belief)
     if len(u.shape) != 1:
         raise ValueError(f"simulate_hidden: control returns shape {u.shape}, wanted (m,)")
-    for name, function, wanted in (
-        ("cost", loop.cost, (states,)),
-        ("the generator", loop.observer.generator, (states, states)),
+    sensor = loop.observer.sensor
+    for name, function, columns in (
+        ("cost", loop.cost, ()),
+        ("the generator", loop.observer.generator, (states,)),
+        ("h", sensor.values, None),
     ):
-        if (shape := jax.eval_shape(function, u).shape) != wanted:
+        shape = jax.eval_shape(_array_of(function), u).shape
+        wanted = (states, *(columns if columns is not None else shape[1:2]))
+        if shape != wanted:
             raise ValueError(
                 f"simulate_hidden: {name} returns shape {shape}, wanted {wanted}: the prior has {states} states"
             )
+    sensor.check("simulate_hidden", u)
+    first = jnp.asarray(loop.control(loop.observer.initial()))
+    check_generator(np.asarray(loop.observer.generator(first)), f"simulate_hidden: the generator at u = {first}")
+    if not np.all(np.isfinite(paid := np.asarray(loop.cost(first)))):
+        raise ValueError(f"simulate_hidden: cost at u = {first} is {paid.tolist()}, wanted finite numbers")
+
+
+def _array_of(function: Callable) -> Callable:
+    """The function with its result as an array, whatever kind of number it returns."""
+    return lambda argument: jnp.asarray(function(argument))
 
 
 def _simulated(loop: _Loop, law: jax.Array, key: Key, dt: Any, steps: int) -> HiddenPath:
@@ -301,7 +324,7 @@ def _simulated(loop: _Loop, law: jax.Array, key: Key, dt: Any, steps: int) -> Hi
         gains = observer.sensor(u)
         noise = jax.random.normal(shake, gains.shape[1:], belief.dtype)
         dy = ((gains[hidden] + gains[after]) / 2 * dt + jnp.sqrt(dt) * noise) * observer.sensor.measurement_noise
-        rates = loop.cost(u)
+        rates = jnp.asarray(loop.cost(u))
         paid = jnp.exp(-beta * number * dt) * length * (rates[hidden] + rates[after]) / 2
         belief = observer.update(belief, u, dy, dt)
         return (after, belief), (after, belief, u, dy, paid)

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.feedback.measurement import check_length, controls_of, record_of
-from hjbjax.filtering.forward_equation import substeps
-from hjbjax.filtering.grid_filter import Density, GridFilter
+from hjbjax.filtering.forward_equation import MOST, substeps
+from hjbjax.filtering.grid_filter import Density, GridFilter, warn_at_ends
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import cast, is_traced, pytree_dataclass
@@ -86,8 +86,10 @@ def zakai(
 
     Raises:
       ValueError: a record or controls that are not finite or of the wrong shape, dt ≤ 0, and what ``GridFilter``
-        refuses.
+        refuses; a law that is not finite, as where dt asks for more sub-steps than there are.
       TypeError: as ``GridFilter``.
+
+    Warns where the mode lies at an end of the box.
 
     Example:
       >>> rest = Problem(lambda x, u: 0 * x)  # a constant that is measured, of prior variance 1
@@ -110,7 +112,16 @@ def zakai(
     # inside somebody's ``jit`` as well, what is known is computed here and now
     with jax.core.eval_context(), jax.enable_x64(True):
         answer = run(*cast((observer, record, acts, dt), np.float64), bool(normalised))
-        return jax.tree.map(np.asarray, answer)
+        found = jax.tree.map(np.asarray, answer)
+    bad = ~np.isfinite(found.mean[..., 0])
+    if np.any(bad):
+        step = int(np.argwhere(bad)[:, -1].min())
+        raise ValueError(
+            f"{name}: the law is not finite from step {step} on: dt = {dt:g} asks for over {MOST} sub-steps, or a "
+            "measurement leaves no state a chance; give a shorter dt, a coarser grid, or more measurement_noise"
+        )
+    warn_at_ends(name, grid, found.mode, float(dt), "the mode of the law")
+    return found
 
 
 @jax.jit

@@ -32,6 +32,7 @@ from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.schemes import Weno5
 from hjbjax.feedback.measurement import Measurement, check_step, controls_of, measurement, record_of
 from hjbjax.filtering import robust_arguments
+from hjbjax.filtering.grid_filter import signal, warn_at_ends
 from hjbjax.filtering.max_plus import MOST, MaxPlusMarch, refined_maximum
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
@@ -117,9 +118,13 @@ class RobustGridFilter:
     ):
         robust_arguments.check_question(problem, grid, scheme)
         arguments.positive(gamma, "robust_filter: gamma")
+        measured = measurement(h, grid.ndim, measurement_noise, "robust_filter")
+        if not is_traced(measured, grid):
+            with jax.enable_x64(True), jax.ensure_compile_time_eval():
+                signal(Discretisation(problem, grid, scheme, np.dtype(np.float64)), measured, "robust_filter")
         fields = {
             "problem": problem,
-            "measurement": measurement(h, grid.ndim, measurement_noise, "robust_filter"),
+            "measurement": measured,
             "grid": grid,
             "p0": robust_arguments.initial_values(initial, grid),
             "gamma": gamma,
@@ -220,6 +225,8 @@ def robust_filter(
         spacings squared on; and p that becomes infinite, where γ is too small for the horizon.
       TypeError: something else than a Problem, a Grid or a function.
 
+    Warns where the worst case lies at an end of the box, as with a γ that is near the least.
+
     Example:
       >>> import hjbjax as hjb
       >>> plant = hjb.Problem(lambda x, u: -x, lambda x, u: 0.5 * x @ x)
@@ -257,6 +264,7 @@ def robust_filter(
             f"robust_filter: p is not finite from interval {first} on, t = {first * dt:g} to {(first + 1) * dt:g}: the "
             "cost grows faster than the disturbances pay for it; take a larger gamma, a smaller box or a shorter record"
         )
+    warn_at_ends("robust_filter", grid, found.worst_case, float(dt), "the worst case")
     return found
 
 

@@ -222,6 +222,10 @@ def test_three_states_cost_in_simulation_what_the_value_in_logarithms_promises(p
 # --- refusals ---
 
 
+def simulated(control=never, cost=price, observer=OBSERVER):
+    return simulate_hidden(observer, control, cost, duration=1.0, dt=0.1, key=0)
+
+
 @pytest.mark.parametrize(
     ("build", "reason"),
     [
@@ -249,6 +253,16 @@ def test_three_states_cost_in_simulation_what_the_value_in_logarithms_promises(p
             r"control returns shape \(\)",
         ),
         (lambda: simulate_hidden(OBSERVER, never, price, duration=1.0, dt=0.1, key=0, discount=-1), r"discount = -1"),
+        (lambda: WonhamFilter(np.nan * IDLE, SENSOR, [0.5, 0.5]), r"the generator = .* wanted finite numbers"),
+        (lambda: WonhamFilter(IDLE[:1], SENSOR, [0.5, 0.5]), r"the generator has shape \(1, 2\), wanted \(S, S\)"),
+        (lambda: WonhamFilter(IDLE, [1.0, np.nan], [0.5, 0.5]), r"h = \[1.0, nan\], wanted finite numbers"),
+        (lambda: simulated(cost=lambda u: jnp.array([jnp.nan, 1.0])), r"cost at u = .* is \[nan, 1.0\]"),
+        (lambda: simulated(lambda belief: jnp.where(belief[:1] < 2, jnp.nan, 0)), r"the generator at|control returned"),
+        (lambda: simulated(observer=WonhamFilter(lambda u: -IDLE, SENSOR, [0.5, 0.5])), r"the generator .* rate -0.2"),
+        (
+            lambda: simulated(observer=WonhamFilter(IDLE, lambda u: jnp.ones(3), [0.5, 0.5])),
+            r"h returns shape \(3, 1\)",
+        ),
     ],
 )
 def test_what_cannot_be_filtered_or_simulated_is_refused(build, reason):

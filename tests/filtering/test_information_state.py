@@ -177,6 +177,7 @@ def test_a_state_that_rests_is_bayes_to_rounding():
         assert tuple(law.mode[k]) == tuple(nodes[np.unravel_index(np.argmax(density), grid.shape)])
 
 
+@pytest.mark.filterwarnings("ignore:.*at an end of the box")
 @pytest.mark.parametrize("size", [pytest.param(1e3, marks=pytest.mark.slow), 1e8])
 def test_records_of_any_size_leave_no_mass_behind(size):
     """Factors of e^{±size} neither overflow nor vanish; at first the law sits where the record points."""
@@ -197,6 +198,7 @@ def test_records_of_any_size_leave_no_mass_behind(size):
 # --- the chain ---
 
 
+@pytest.mark.filterwarnings("ignore:.*at an end of the box")
 @pytest.mark.parametrize(
     ("n", "kind"), [(2, "matrix"), pytest.param(3, "diagonal", marks=pytest.mark.slow), (2, "none")]
 )

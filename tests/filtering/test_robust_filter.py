@@ -189,6 +189,7 @@ def filtered(start, y, u, scale=1.0, scheme=None):
     return robust_filter(PLANT, angle, RING, y, 0.3, start, gamma=1.2 * scale**0.5, controls=u, scheme=scheme)
 
 
+@pytest.mark.filterwarnings("ignore:.*at an end of the box")
 @given(seed=SEEDS)
 @settings(max_examples=15)
 def test_laws_of_the_max_plus_semigroup(seed):
@@ -231,6 +232,7 @@ def test_stretched_axes_and_other_schemes():
 # --- as an observer, in batches, in single precision ---
 
 
+@pytest.mark.filterwarnings("ignore:.*at an end of the box")
 def test_the_observer_is_the_filter_and_records_come_in_batches():
     rng = np.random.default_rng(3)
     y, u = rng.normal(size=(4, 5, 2)), rng.uniform(-1, 1, (4, 5, 1))

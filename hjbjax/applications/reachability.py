@@ -12,14 +12,16 @@ Hamilton–Jacobi formulation of reachable sets for continuous dynamic games, IE
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial
-from hjbjax.problem.sets import AdmissibleSet
-from hjbjax.problem.types import Array
+from hjbjax.problem.sets import AdmissibleSet, Ball, Box
+from hjbjax.problem.types import Array, Control, State
 
 
 def reach(
@@ -139,6 +141,82 @@ def reach_avoid(
         _drift(drift, forward, time_dependent), None, controls, disturbances=disturbances, stopping_cost=stop,
         terminal_cost=end, running_max=depth, isaacs=isaacs, time_dependent=time_dependent,
     )  # fmt: skip
+
+
+def from_hj_reachability(dynamics: Any, distance: Callable, *, tube: bool = True) -> Problem:
+    """The reachability problem of a ``Dynamics`` object of the package hj_reachability, by its modes.
+
+    A control that minimises gets ``reach``, one that maximises ``avoid``, whose V is minus theirs. A disturbance of one
+    point is a number; one that helps the control becomes a part of it.
+
+    Args:
+      dynamics: called with (state, control, disturbance, time); with ``control_mode``, ``disturbance_mode``,
+        ``control_space`` and ``disturbance_space``, boxes or balls about zero. It must not depend on the time.
+      distance: the signed distance l(x), a function of one state, ≤ 0 inside.
+      tube: at some time within the horizon, as their ``backwards_reachable_tube``; otherwise exactly at its end.
+
+    Returns:
+      The problem, for ``march``; V at time 0 is theirs, or minus theirs, at minus the horizon.
+
+    Raises:
+      TypeError: an object that lacks one of these.
+      ValueError: a mode that is neither "min" nor "max", a set that is no box and no ball about zero, a ball of a
+        disturbance that helps the control.
+
+    Example:
+      >>> import hjbjax as hjb
+      >>> from types import SimpleNamespace
+      >>> class Chase:  # as hj_reachability has it
+      ...     control_mode, disturbance_mode = "max", "min"
+      ...     control_space, disturbance_space = (SimpleNamespace(lo=[-r], hi=[r]) for r in (1.0, 2.0))
+      ...     def __call__(self, state, control, disturbance, time):
+      ...         return control + disturbance
+      >>> problem = hjb.from_hj_reachability(Chase(), lambda x: jnp.abs(x[0]) - 0.5)
+      >>> solution = hjb.march(problem, hjb.Grid([-4.0], [4.0], (161,)), 1.0)
+      >>> round(float(solution.value_at(0.0, [1.2])), 2)  # caught; theirs is -0.3
+      0.3
+    """
+    name = "from_hj_reachability"
+    parts = ("control_mode", "disturbance_mode", "control_space", "disturbance_space")
+    if lacking := [each for each in parts if not hasattr(dynamics, each)]:
+        raise TypeError(
+            f"{name}: got {type(dynamics).__name__} without {', '.join(lacking)}, wanted a Dynamics of hj_reachability"
+        )
+    modes = dynamics.control_mode, dynamics.disturbance_mode
+    if not set(modes) <= {"min", "max"}:
+        raise ValueError(f"{name}: got the modes {modes}, wanted 'min' or 'max'")
+    controls = _admissible(dynamics.control_space, f"{name}: control_space")
+    others = _admissible(dynamics.disturbance_space, f"{name}: disturbance_space")
+    m, resting = controls.dim, isinstance(others, Box) and bool(np.all(others.lo == others.hi))
+    helping = modes[0] == modes[1] and not resting
+    if helping and not (isinstance(controls, Box) and isinstance(others, Box)):
+        raise ValueError(
+            f"{name}: control and disturbance both {modes[0]}imise, over sets that are not both boxes; turn one mode "
+            "round"
+        )
+
+    def drift(x: State, u: Control, d: Array | None = None) -> Array:
+        d = u[m:] if helping else jnp.asarray(others.lo) if d is None else d  # type: ignore[union-attr]
+        return dynamics(x, u[:m], d, 0.0)
+
+    if helping:
+        controls = Box(np.append(controls.lo, others.lo), np.append(controls.hi, others.hi))  # type: ignore[union-attr]
+    pose = reach if modes[0] == "min" else avoid
+    return pose(drift, controls, distance, disturbances=None if resting or helping else others, tube=tube)
+
+
+def _admissible(space: Any, name: str) -> Box | Ball:
+    """A bounded set of hj_reachability as one of ours."""
+    if hasattr(space, "radius") and hasattr(space, "center"):
+        center = np.asarray(space.center)
+        if np.any(center):
+            raise ValueError(
+                f"{name}: got a ball about {center.tolist()}, wanted one about zero; shift the drift instead"
+            )
+        return Ball(float(space.radius), len(center))
+    if not (hasattr(space, "lo") and hasattr(space, "hi")):
+        raise ValueError(f"{name}: got a {type(space).__name__}, wanted a box, with lo and hi, or a ball about zero")
+    return Box(np.asarray(space.lo, float), np.asarray(space.hi, float))
 
 
 def _drift(drift: Callable, forward: bool, time_dependent: bool) -> Callable:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -51,8 +52,8 @@ def costates(
     if solution is not None:
         # a marched V has the time as its first argument; angles of an extremal run on, those of the grid do not
         where = (times,) * (solution.times is not None) + (np.asarray(solution.grid.wrap(extremal.states)),)
-        # NaN outside the grid: there the line is interrupted
-        slopes = np.ma.masked_invalid(solution.costate_at(*where))
+        with warnings.catch_warnings(action="ignore"):  # NaN outside the grid: there the line is interrupted
+            slopes = np.ma.masked_invalid(solution.costate_at(*where))
         for i in range(count):
             # broad and pale: the line λ stays to be seen where the two agree
             style: dict[str, Any] = {"color": colours[i], "linewidth": 3.6, "alpha": 0.4, "linestyle": "--"}

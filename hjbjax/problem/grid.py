@@ -214,6 +214,12 @@ class Grid:
         lo, hi = jnp.asarray(self.lo, x.dtype), jnp.asarray(self.hi, x.dtype)
         return jnp.where(np.array(self.periodic), into_period(x, lo, hi), x)
 
+    def beyond(self, x: States) -> np.ndarray:
+        """True for the states outside the box by more than rounding; known numbers alone."""
+        x, lo, hi = np.asarray(x, float), np.asarray(self.lo, float), np.asarray(self.hi, float)
+        slack = 8 * np.finfo(float).eps * np.maximum(hi - lo, np.maximum(abs(lo), abs(hi)))  # that of ``_locate``
+        return np.any(((x < lo - slack) | (x > hi + slack)) & ~np.array(self.periodic), axis=-1)
+
     def interpolate(self, values: Array, x: States, *, clamp: bool = False) -> jax.Array:
         """Multilinear interpolation of node values, second order; jit- and vmap-able.
 

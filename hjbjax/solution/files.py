@@ -75,7 +75,7 @@ def write(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray
     """Write a header and arrays atomically.
 
     Args:
-      path: where to; nothing is appended to the name.
+      path: where to; ``.npz`` is put behind a name without a suffix, unless that very name is there.
       header: JSON values; NumPy scalars and arrays in it become numbers and lists, anything else its text.
       arrays: numbers or booleans by name.
       force: whether an existing file may be replaced.
@@ -85,7 +85,9 @@ def write(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray
       FileError: the folder is missing or cannot be written, the disk is full, or a folder, a device or a pipe has that
         name; no half file is left.
     """
-    path = os.path.realpath(path_of(path, "written"))  # through links: the file behind one is replaced, not the link
+    path = os.path.realpath(
+        _with_suffix(path_of(path, "written"))
+    )  # through links: the file behind one is replaced, not the link
     check_place(path, force)  # before the arrays are written, and once more when the file is moved
     # A damaged table of contents may hide whole entries, and no checksum covers it: so the header has the list.
     text = json.dumps({**header, "arrays": sorted(arrays)}, default=_plain).encode()
@@ -112,6 +114,11 @@ def write(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray
         if os.path.lexists(temporary):
             os.unlink(temporary)
     _sync_folder(folder)
+
+
+def _with_suffix(path: str) -> str:
+    """The name with ``.npz``, as NumPy writes it, if it has no suffix and nothing has this name as it stands."""
+    return path if os.path.splitext(path)[1] or os.path.lexists(path) or not path else path + ".npz"
 
 
 def _write_members(file: IO[bytes], members: Mapping[str, np.ndarray]) -> None:
@@ -165,7 +172,7 @@ def read(
     Raises:
       FileError: for every kind of bad file, before anything of the size that it claims is allocated.
     """
-    path = path_of(path, "read")
+    path = _with_suffix(path_of(path, "read"))
     try:
         status = os.stat(path)
         if stat.S_ISDIR(status.st_mode):

@@ -4,6 +4,9 @@ What is printed may come from a file of somebody else's. So long texts are cut b
 characters are shown as Python would write them, and a statistic of another kind than expected is named, not formatted.
 """
 
+import base64
+import html
+import io
 import math
 import sys
 import textwrap
@@ -17,6 +20,7 @@ from hjbjax.problem.types import Array, Number
 from hjbjax.solution.status import Status
 
 WIDTH = 100  # columns of the printed screen
+THUMBNAIL = 160  # pixels, and the largest number of nodes an axis that it shows
 LONGEST = 2000  # characters of a text that are looked at; wrapping a million takes a second
 UNITS = ("bytes", "kB", "MB", "GB", "TB")
 SPELLED = {  # where the terminal has no such letter
@@ -87,6 +91,31 @@ def show(solution: _Answer) -> str:
     head = textwrap.wrap(said, WIDTH)
     lines = head if len(head) < 4 else [*head[:2], one_line(" ".join(head[2:]))]
     return encodable("\n".join(lines + [f"  {name:15}  {one_line(text)}" for name, text in rows.items() if text]))
+
+
+def thumbnail(solution: _Answer) -> str:
+    """A small picture of V as HTML: a line over one axis, an image over the first two, the middle of all others.
+
+    Of a marched solution at the earliest kept time. Dark is low; where V is not finite there is nothing.
+    """
+    from matplotlib import colormaps, image  # a second of importing, for notebooks alone
+
+    values = np.asarray(solution.value, float)
+    values = values if solution.times is None else values[0]
+    values = values[(slice(None), slice(None), *(count // 2 for count in values.shape[2:]))[: values.ndim]]
+    finite = values[np.isfinite(values)]
+    low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
+    share = (values - low) / (high - low if high > low else 1.0)
+    if values.ndim == 1:
+        share = np.where(np.arange(THUMBNAIL)[:, None] / (THUMBNAIL - 1) <= share, share, np.nan).T
+    every = [-(-count // THUMBNAIL) for count in share.shape]
+    pixels = colormaps["viridis"](np.ma.masked_invalid(share[:: every[0], :: every[1]].T[::-1]), bytes=True)
+    png = io.BytesIO()
+    image.imsave(png, pixels, format="png")
+    code = base64.b64encode(png.getvalue()).decode()
+    axes = " and ".join(html.escape(name) for name in solution.grid.labels[:2])
+    size = f"width: {THUMBNAIL}px; height: {THUMBNAIL}px"
+    return f'<img alt="V over {axes}" style="{size}" src="data:image/png;base64,{code}">'
 
 
 def _cuts(solution: _Answer) -> str:

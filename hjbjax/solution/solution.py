@@ -7,6 +7,8 @@ max(upper − V, V − lower).
 """
 
 import dataclasses
+import html
+import warnings
 from collections.abc import Sequence
 from types import ModuleType
 from typing import Any
@@ -14,15 +16,13 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.problem import labels as labelling
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import Labels
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
-from hjbjax.problem.stretching import Sinh
 from hjbjax.problem.types import Array, Numbers
-from hjbjax.solution import files, screen
-from hjbjax.solution.files import Expected, FileError
+from hjbjax.solution import archive, files, screen
+from hjbjax.solution.files import FileError
 from hjbjax.solution.interpolation import (
     Interpolation,
     Samples,
@@ -37,18 +37,6 @@ from hjbjax.solution.placement import Path
 from hjbjax.solution.status import Status
 
 __all__ = ["FileError", "Solution", "SolveError", "Status", "load"]
-
-FORMAT, VERSION = "hjbjax.Solution", 1  # the version goes up when an older hjbjax would read a file wrongly
-KINDS: dict[str, tuple[type, ...]] = {  # what a file's header holds, as JSON has it
-    "code": (int,),
-    "steps": (int,),
-    "isaacs_gap": (float, type(None)),
-    "monotone_error": (float, type(None)),
-    "discrete": (bool,),
-    "discrete_disturbance": (bool,),
-    "message": (str,),
-    "stats": (dict,),
-}
 
 
 class SolveError(RuntimeError):
@@ -240,7 +228,33 @@ class Solution:
             raise ValueError(f"Solution.{name}: this solution has no {lacking}")
         t, x = check_query(self, name, values, trailing, where)
         samples = Samples(self.grid, values, self.times)
-        return query(look, samples, x, t, clamp=clamp, name=f"Solution.{name}")
+        found = query(look, samples, x, t, clamp=clamp, name=f"Solution.{name}")
+        if not clamp and not is_traced(found, x, self.grid) and np.any(outside := self.grid.beyond(x)):
+            warnings.warn(
+                f"Solution.{name}: {np.sum(outside)} of {np.size(outside)} states lie outside the grid, where the "
+                "answer is NaN; clamp=True takes the nearest point in it",
+                stacklevel=3,
+            )
+        return found
+
+    def predict(
+        self, observation: Numbers | Sequence, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[Any, Any]:
+        """The control for an observed state, called as the policies of Stable-Baselines3 are.
+
+        Args:
+          observation: states x, shape (n,) or (..., n); outside the grid the nearest point in it counts.
+          state: handed back as it came: the feedback has no memory.
+          episode_start: not read, nor is ``deterministic``: the feedback is a function of the state alone.
+          deterministic: see above.
+
+        Returns:
+          ``(control, state)``, the control of shape ``x.shape[:-1] + (m,)``; NaN where there is none, as in the target.
+
+        Raises:
+          ValueError: a marched solution, whose control depends on the time: ``control_at(t, x)``.
+        """
+        return self.control_at(observation, clamp=True), state
 
     def save(self, path: Path, *, force: bool = False) -> None:
         """Write the solution to ``path``, whole or not at all; ``load`` gives back the same bits.
@@ -254,41 +268,20 @@ class Solution:
         """
         if is_traced(self):
             raise ValueError("Solution.save: got a traced solution; save it outside of jit, vmap and grad")
-        grid = self.grid
-        header = {
-            "format": FORMAT,
-            "version": VERSION,
-            "grid": {
-                "shape": grid.shape,
-                "periodic": grid.periodic,
-                "edges": grid.edges,
-                "names": grid.names,
-                "units": grid.units,
-                "stretch": [s and [float(s.strength), float(s.center)] for s in grid.stretch or ()],
-            },
-            "labels": self.labels,
-            "marched": None if self.times is None else int(np.shape(self.times)[0]),
-            "isaacs_gap": np.asarray(self.isaacs_gap).tolist(),
-            "monotone_error": np.asarray(self.monotone_error).tolist(),
-            "code": np.asarray(self.code).tolist(),
-            "steps": np.asarray(self.steps).tolist(),
-            **{name: getattr(self, name) for name in ("discrete", "discrete_disturbance", "message", "stats")},
-        }
-        arrays = {}
-        for name, wanted in _plan(header).items():
-            array = getattr(grid if name in ("lo", "hi") else self, name)
-            if array is None:  # what may be missing is optional in the plan, and comes back as None
-                continue
-            arrays[name] = array = np.asarray(array)
-            if complaint := wanted.complaint(array.shape, array.dtype.str):
-                raise ValueError(f"Solution.save: {name} {complaint}; of a batch, save one solution at a time")
-        files.write(path, header, arrays, force=force)
+        files.write(path, *archive.contents(self), force=force)
 
     def __repr__(self) -> str:
         status = self.status
         if not isinstance(status, Status):
             return f"Solution({'traced' if is_traced(status) else 'a batch'}, grid of shape {self.grid.shape})"
         return f"Solution({status.name} after {self.steps} steps on {self.grid.size:,} nodes)"
+
+    def _repr_html_(self) -> str:
+        """The screen with a thumbnail of V, for notebooks."""
+        text = html.escape(str(self))
+        if is_traced(self) or np.ndim(self.code):
+            return f"<pre>{text}</pre>"
+        return f'<div style="display: flex; gap: 1em">{screen.thumbnail(self)}<pre>{text}</pre></div>'
 
     def __str__(self) -> str:
         if is_traced(self) or np.ndim(self.code):
@@ -302,48 +295,4 @@ def load(path: Path) -> Solution:
     Raises:
       FileError: the file is missing, truncated, damaged, foreign, of a newer format, or contradicts itself.
     """
-    return files.read(path, FORMAT, VERSION, _plan, _rebuild)
-
-
-def _plan(header: dict) -> dict[str, Expected]:
-    """Shapes and dtypes of the arrays in a file, from the grid in its header alone."""
-    shape, marched = tuple(header["grid"]["shape"]), header["marched"]
-    if not all(type(count) is int and count >= 2 for count in shape):  # before sizes are made of them
-        raise FileError(f"its grid has shape {shape}")
-    # number of inputs, residuals: any; of a marched solution the kept times go first
-    many, lead = (None,), () if marched is None else (marched,)
-    controls = Expected((lead + shape + many, many * len(lead) + shape + many))
-    return {
-        "lo": Expected(((len(shape),),), optional=False),
-        "hi": Expected(((len(shape),),), optional=False),
-        "value": Expected((lead + shape,), optional=False),
-        "policy": controls,
-        "disturbance": controls,
-        "enclosure": Expected(((2, 2),)),
-        "reached": Expected((shape, lead + shape), (np.bool_,)),
-        "grid_error": Expected((shape,)),
-        "residuals": Expected((many,)),
-        "cut": Expected(((*lead, len(shape), 2),), (np.int64, np.int32)),
-        **({} if marched is None else {"times": Expected((lead,), optional=False)}),
-    }
-
-
-def _rebuild(header: dict, arrays: dict[str, np.ndarray]) -> Solution:
-    """The solution from the header and the arrays of a file; ``Grid`` checks its own."""
-    about = header["grid"]
-    stretch = tuple(pair and Sinh(*pair) for pair in about["stretch"])
-    grid = Grid(
-        arrays.pop("lo"), arrays.pop("hi"), tuple(about["shape"]), about["periodic"], tuple(about["names"]), stretch,
-        about.get("edges", "projected"),  # older files have none, as all ends were projected
-        tuple(about.get("units", ())),  # nor these, nor labels
-    )  # fmt: skip
-    names, units, inside = header.get("labels", Labels())
-    labels = labelling.checked(names, units, inside, None)
-    header = {"monotone_error": None, **header}  # older files have none
-    for name, kinds in KINDS.items():  # ``type`` and not ``isinstance``: true is no number of steps
-        if type(header[name]) not in kinds:
-            raise FileError(f"its header has {name} = {header[name]!r:.60}, wanted {kinds[0].__name__}")
-    Status(header["code"])  # raises where there is no such status
-    return Solution(
-        **{"policy": None, **arrays, "grid": grid, "labels": labels, **{name: header[name] for name in KINDS}}
-    )
+    return Solution(**files.read(path, archive.FORMAT, archive.VERSION, archive.plan, archive.fields))

@@ -82,6 +82,7 @@ def test_on_a_node_the_second_derivative_is_that_beside_it(grid, derivative):
     assert np.all(np.isfinite(edge))
 
 
+@pytest.mark.filterwarnings("ignore:.*outside the grid, where")
 def test_outside_the_grid():
     solution = solution_of(lambda x: x[..., 0] ** 2 + x[..., 1], PLAIN)
     assert np.all(np.isnan(solution.costate_at([2.0, 1.0])))

@@ -18,8 +18,9 @@ import pytest
 
 from hjbjax.problem.grid import Grid
 from hjbjax.solution import files
+from hjbjax.solution.archive import FORMAT, VERSION
 from hjbjax.solution.files import FileError
-from hjbjax.solution.solution import FORMAT, VERSION, Solution, Status, load
+from hjbjax.solution.solution import Solution, Status, load
 
 
 def example(seed=0, **changes):
@@ -91,11 +92,23 @@ def test_round_trip_is_exact(tmp_path, changes):
 
 def test_equal_solutions_make_equal_files_that_numpy_can_read(tmp_path):
     example().save(tmp_path / "a.npz")
-    example().save(str(tmp_path / "b"))
-    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b").read_bytes()
+    example().save(str(tmp_path / "b.file"))
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.file").read_bytes()
     with np.load(tmp_path / "a.npz", allow_pickle=False) as archive:
         np.testing.assert_array_equal(archive["value"], example().value)
         assert json.loads(archive["header"].tobytes())["format"] == FORMAT
+
+
+def test_names_without_a_suffix_get_numpys(tmp_path):
+    example(steps=1).save(tmp_path / "run")
+    assert [each.name for each in tmp_path.iterdir()] == ["run.npz"]
+    assert load(tmp_path / "run").steps == load(tmp_path / "run.npz").steps == 1
+    with pytest.raises(FileExistsError, match="run.npz: exists already"):
+        example().save(tmp_path / "run")
+    (tmp_path / "old").write_bytes((tmp_path / "run.npz").read_bytes())
+    assert load(tmp_path / "old").steps == 1
+    with pytest.raises(FileError, match="it is a folder"):
+        example().save(tmp_path)
 
 
 def test_statistics_become_json(tmp_path):

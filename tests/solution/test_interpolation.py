@@ -93,6 +93,7 @@ def test_a_query_leaves_no_trace_of_float64():
     assert jnp.ones(()).dtype == jnp.float32
 
 
+@pytest.mark.filterwarnings("ignore:.*outside the grid, where")
 def test_outside_is_nan_or_clamped():
     outside = [[-1.5, 1.0], [0.0, 3.0001], [-1.5, 9.0], [np.inf, 1.0]]
     assert np.all(np.isnan(LINEAR.value_at(outside)))
@@ -191,6 +192,7 @@ def test_enumerated_controls_come_from_the_nearest_node(a, b):
         np.testing.assert_array_equal(taken, policy[tuple(np.round(place).astype(int))])
 
 
+@pytest.mark.filterwarnings("ignore:.*outside the grid, where")
 def test_the_nearest_node_round_the_corner():
     ring = Grid([0.0], [1.0], (4,), (True,))
     solution = Solution(ring, np.zeros(4), np.arange(4.0)[:, None], discrete=True)
@@ -214,6 +216,7 @@ def test_enumerated_disturbances_too():
 X = np.array([[0.3, 1.2], [-0.7, 2.9], [5.0, 0.0]])
 
 
+@pytest.mark.filterwarnings("ignore:.*outside the grid, where")
 @pytest.mark.parametrize("discrete", [False, True])
 def test_jit_and_vmap_agree_with_the_host(discrete):
     random = np.random.default_rng(1)

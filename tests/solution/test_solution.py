@@ -1,7 +1,12 @@
 """The answer: between the nodes, through transformations, and on the screen."""
 
+import base64
+import io
+import re
+
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
@@ -252,3 +257,43 @@ def test_status_from_every_kind_of_number():
         solution = Solution(GRID, LINEAR.value, None, code=code)
         assert solution.status is Status.STALLED
         assert type(solution.code) is not Status
+
+
+# For whoever comes from elsewhere
+
+
+def test_policies_are_called_as_in_reinforcement_learning():
+    control, state = LINEAR.predict([0.5, 1.0], "memory", episode_start=True, deterministic=False)
+    assert (control.tolist(), state) == ([2.0], "memory")
+    many, _ = LINEAR.predict(np.array([[0.5, 1.0], [9.0, 1.0]]))  # the second is taken to the edge
+    assert many.tolist() == [[2.0], [4.0]]
+
+
+def test_states_outside_are_told_of():
+    with pytest.warns(UserWarning, match=r"value_at: 1 of 2 states lie outside the grid, .* clamp=True takes") as told:
+        assert np.isnan(LINEAR.value_at([[0.0, 0.0], [1.01, 0.0]])).tolist() == [False, True]
+    assert told[0].filename == __file__
+    inside = [[1 + 2e-15, 3 + 2e-15], [-1 - 2e-15, -2e-15], [np.nan, 0.0]]
+    assert np.isnan(LINEAR.control_at(inside))[:, 0].tolist() == [False, False, True]
+    assert np.isnan(jax.jit(LINEAR.value_at)(jnp.array([2.0, 0.0])))  # no values to look at
+    turned = solution_of(lambda a, b: jnp.cos(a) + b, RING)
+    np.testing.assert_allclose(turned.value_at([2 * np.pi + 0.1, 0.5]), turned.value_at([0.1, 0.5]))
+
+
+@pytest.mark.parametrize("marched", [False, True])
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_notebooks_get_a_thumbnail(n, marched):
+    grid = Grid([0.0] * n, [1.0] * n, (7, 300, 5)[:n], names=("a<b", "y", "z")[:n])
+    value = np.array(np.sum(grid.nodes(), axis=-1))
+    value[(0,) * min(n, 2)] = np.inf
+    fields = {"value": value, "policy": None, "code": 1}
+    if marched:
+        fields = {"value": np.stack([value] * 2), "policy": None, "code": 1, "times": np.array([0.0, 1.0])}
+    shown = Solution(grid, **fields)._repr_html_()
+    picture = re.search(r'<img alt="V over (.*?)" .*base64,([^"]*)">', shown)
+    assert picture[1] == ("a&lt;b" if n == 1 else "a&lt;b and y")
+    pixels = plt.imread(io.BytesIO(base64.b64decode(picture[2])))
+    assert pixels.shape == ((160, 7, 4) if n == 1 else (150, 7, 4))
+    assert pixels[-1, 0, 3] == 0  # infinite: nothing is there
+    assert pixels[-1, -1, 3] == 1
+    assert "7" in shown.partition("<pre>")[2]

@@ -1,0 +1,103 @@
+"""A solution as a header and arrays, and back: what of it a file holds."""
+
+from typing import Any
+
+import numpy as np
+
+from hjbjax.problem import labels as labelling
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.labels import Labels
+from hjbjax.problem.stretching import Sinh
+from hjbjax.solution.files import Expected, FileError
+from hjbjax.solution.status import Status
+
+FORMAT, VERSION = "hjbjax.Solution", 1  # the version goes up when an older hjbjax would read a file wrongly
+KINDS: dict[str, tuple[type, ...]] = {  # what a file's header holds, as JSON has it
+    "code": (int,),
+    "steps": (int,),
+    "isaacs_gap": (float, type(None)),
+    "monotone_error": (float, type(None)),
+    "discrete": (bool,),
+    "discrete_disturbance": (bool,),
+    "message": (str,),
+    "stats": (dict,),
+}
+
+
+def contents(solution: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Header and arrays of a solution.
+
+    Raises:
+      ValueError: arrays that do not fit the grid, as of a batch.
+    """
+    grid = solution.grid
+    header = {
+        "format": FORMAT,
+        "version": VERSION,
+        "grid": {
+            "shape": grid.shape,
+            "periodic": grid.periodic,
+            "edges": grid.edges,
+            "names": grid.names,
+            "units": grid.units,
+            "stretch": [s and [float(s.strength), float(s.center)] for s in grid.stretch or ()],
+        },
+        "labels": solution.labels,
+        "marched": None if solution.times is None else int(np.shape(solution.times)[0]),
+        "isaacs_gap": np.asarray(solution.isaacs_gap).tolist(),
+        "monotone_error": np.asarray(solution.monotone_error).tolist(),
+        "code": np.asarray(solution.code).tolist(),
+        "steps": np.asarray(solution.steps).tolist(),
+        **{name: getattr(solution, name) for name in ("discrete", "discrete_disturbance", "message", "stats")},
+    }
+    arrays = {}
+    for name, wanted in plan(header).items():
+        array = getattr(grid if name in ("lo", "hi") else solution, name)
+        if array is None:  # what may be missing is optional in the plan, and comes back as None
+            continue
+        arrays[name] = array = np.asarray(array)
+        if complaint := wanted.complaint(array.shape, array.dtype.str):
+            raise ValueError(f"Solution.save: {name} {complaint}; of a batch, save one solution at a time")
+    return header, arrays
+
+
+def plan(header: dict) -> dict[str, Expected]:
+    """Shapes and dtypes of the arrays in a file, from the grid in its header alone."""
+    shape, marched = tuple(header["grid"]["shape"]), header["marched"]
+    if not all(type(count) is int and count >= 2 for count in shape):  # before sizes are made of them
+        raise FileError(f"its grid has shape {shape}")
+    # number of inputs, residuals: any; of a marched solution the kept times go first
+    many, lead = (None,), () if marched is None else (marched,)
+    controls = Expected((lead + shape + many, many * len(lead) + shape + many))
+    return {
+        "lo": Expected(((len(shape),),), optional=False),
+        "hi": Expected(((len(shape),),), optional=False),
+        "value": Expected((lead + shape,), optional=False),
+        "policy": controls,
+        "disturbance": controls,
+        "enclosure": Expected(((2, 2),)),
+        "reached": Expected((shape, lead + shape), (np.bool_,)),
+        "grid_error": Expected((shape,)),
+        "residuals": Expected((many,)),
+        "cut": Expected(((*lead, len(shape), 2),), (np.int64, np.int32)),
+        **({} if marched is None else {"times": Expected((lead,), optional=False)}),
+    }
+
+
+def fields(header: dict, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+    """The arguments of ``Solution`` from the header and the arrays of a file; ``Grid`` checks its own."""
+    about = header["grid"]
+    stretch = tuple(pair and Sinh(*pair) for pair in about["stretch"])
+    grid = Grid(
+        arrays.pop("lo"), arrays.pop("hi"), tuple(about["shape"]), about["periodic"], tuple(about["names"]), stretch,
+        about.get("edges", "projected"),  # older files have none, as all ends were projected
+        tuple(about.get("units", ())),  # nor these, nor labels
+    )  # fmt: skip
+    names, units, inside = header.get("labels", Labels())
+    labels = labelling.checked(names, units, inside, None)
+    header = {"monotone_error": None, **header}  # older files have none
+    for name, kinds in KINDS.items():  # ``type`` and not ``isinstance``: true is no number of steps
+        if type(header[name]) not in kinds:
+            raise FileError(f"its header has {name} = {header[name]!r:.60}, wanted {kinds[0].__name__}")
+    Status(header["code"])  # raises where there is no such status
+    return {"policy": None, **arrays, "grid": grid, "labels": labels, **{name: header[name] for name in KINDS}}

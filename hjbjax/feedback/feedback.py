@@ -22,7 +22,7 @@ from hjbjax.discretisation.stencil import Links
 from hjbjax.hamiltonian.discrete import DiscreteHamiltonian, optimise
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_partial, cast, is_traced, pytree_dataclass
+from hjbjax.problem.pytree import as_jax, as_partial, cast, is_traced, pytree_dataclass
 from hjbjax.problem.types import Array, Costate, DType, Number, Numbers, State
 from hjbjax.solution.interpolation import extended
 from hjbjax.solution.solution import Solution
@@ -121,21 +121,20 @@ def lookups(feedback: GridFeedback) -> tuple[Callable, Callable]:
 # An integrator traces its right-hand side some twenty times; within ``jit`` a lookup is traced once: 1 s in place of 2.
 
 
-@functools.partial(jax.jit, inline=True)
 def _look_up(looks: tuple[Callable, ...], t: Number, x: State) -> Array:
     """The first of several lookups at x that is not NaN, whatever the time."""
-    return _first([look(x, clamp=True) for look in looks])
+    return _first_at(as_jax(looks), x)
+
+
+def _look_up_in_time(looks: tuple[Callable, ...], t: Number, x: State) -> Array:
+    """The first of several lookups at (t, x) that is not NaN."""
+    return _first_at(as_jax(looks), t, x)
 
 
 @functools.partial(jax.jit, inline=True)
-def _look_up_in_time(looks: tuple[Callable, ...], t: Number, x: State) -> Array:
-    """The first of several lookups at (t, x) that is not NaN."""
-    return _first([look(t, x, clamp=True) for look in looks])
-
-
-def _first(answers: list[Array]) -> Array:
+def _first_at(looks: tuple[Callable, ...], *where: Array) -> Array:
     """The first answer, entry by entry the next one where it is NaN."""
-    answer, *others = answers
+    answer, *others = [look(*where, clamp=True) for look in looks]
     for other in others:
         answer = jnp.where(jnp.isnan(answer), other, answer)
     return answer
@@ -191,7 +190,7 @@ class Greedy:
         """Both players' actions: float64 NumPy from concrete data, else of the tracer's dtype."""
         costate = self.solution.costate_at(*where, clamp=clamp)  # refuses what is no state
         if is_traced(costate, self):  # float64 must not be switched on in the middle of somebody's trace
-            return _minimax(self, where, costate)
+            return _minimax(as_jax(self), where, costate)
         with jax.enable_x64(True):
             greedy, where, costate = cast((self, where, costate), np.float64)
             return jax.tree.map(np.array, _jit_minimax(greedy, where, costate))

@@ -59,7 +59,9 @@ class AveragedHamiltonian:
 
     def __call__(self, information: Density) -> Array:
         """The control, shape (m,)."""
-        return _least(self, information)  # compiled even where the caller does not
+        # compiled even where the caller does not; in one type, since JAX 0.10 confuses programs of NumPy's float64 that
+        # were traced in a ``jit`` of 64 bits with those of 32
+        return _least(cast(self, information.density.dtype), information)
 
     def _least(self, information: Density) -> Array:
         dtype, weights = information.density.dtype, self._weights(information)

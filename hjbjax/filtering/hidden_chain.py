@@ -21,7 +21,7 @@ import numpy as np
 from hjbjax.feedback.measurement import check_length, check_vector
 from hjbjax.filtering.beliefs import Sensor, chain_functions, check_generator
 from hjbjax.problem import arguments
-from hjbjax.problem.pytree import as_partial, cast, is_traced, numbers, pytree_dataclass
+from hjbjax.problem.pytree import as_jax, as_partial, cast, is_traced, numbers, pytree_dataclass
 from hjbjax.problem.types import Array, Control, Key, Number, Numbers
 
 TERMS = 19  # of the Taylor series: 1/19! is below the rounding of float64 where q dt ≤ 1
@@ -122,7 +122,7 @@ class WonhamFilter:
         outputs = jax.eval_shape(self.sensor.values, jnp.asarray(u)).shape[1]
         check_vector(dy, "WonhamFilter.update: dy", outputs, "the increment over the step, one entry a measurement")
         check_length(dt, "WonhamFilter.update: dt", "the length of the step")
-        return _updated(self, jnp.asarray(state), jnp.asarray(u), jnp.asarray(dy), dt)
+        return _updated(as_jax(self), jnp.asarray(state), jnp.asarray(u), jnp.asarray(dy), dt)
 
     def _after(self, belief: jax.Array, u: jax.Array, dy: jax.Array, dt: Number) -> jax.Array:
         """π after a step."""

@@ -19,7 +19,7 @@ from hjbjax.filtering.forward_equation import MOST, substeps
 from hjbjax.filtering.grid_filter import Density, GridFilter, warn_at_ends
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import cast, is_traced, pytree_dataclass
+from hjbjax.problem.pytree import as_jax, cast, is_traced, pytree_dataclass
 from hjbjax.problem.types import Array, Number, Numbers
 
 
@@ -108,7 +108,7 @@ def zakai(
         # counts are integers without a derivative: under ``grad`` alone they come back as plain numbers, and a loop of
         # a known length has a reverse derivative; under ``jit`` and ``vmap`` it stays open
         count = _substeps(observer, record, acts, dt)
-        return run(observer, record, acts, dt, bool(normalised), None if is_traced(count) else int(count))
+        return run(as_jax(observer), record, acts, dt, bool(normalised), None if is_traced(count) else int(count))
     # inside somebody's ``jit`` as well, what is known is computed here and now
     with jax.core.eval_context(), jax.enable_x64(True):
         answer = run(*cast((observer, record, acts, dt), np.float64), bool(normalised))

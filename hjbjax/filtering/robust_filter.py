@@ -37,7 +37,7 @@ from hjbjax.filtering.max_plus import MOST, MaxPlusMarch, refined_maximum
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import cast, is_traced, pytree_dataclass
+from hjbjax.problem.pytree import as_jax, cast, is_traced, pytree_dataclass
 from hjbjax.problem.types import Array, Control, Field, Nodes, Number, Numbers, State
 from hjbjax.tracing import components
 from hjbjax.tracing.closures import settled
@@ -144,7 +144,7 @@ class RobustGridFilter:
         check_step("RobustGridFilter.update", self.problem, self.measurement.dim, (u, dy, dt))
         dtype = state.dtype
         # compiled even where the caller does not: a loop whose body is new would be compiled at every call
-        return _after(self, state, jnp.asarray(u, dtype), jnp.asarray(dy, dtype) / dt, dt)[0]
+        return _after(as_jax(self), state, jnp.asarray(u, dtype), jnp.asarray(dy, dtype) / dt, dt)[0]
 
     def estimate(self, state: Field) -> State:
         """The worst case: the state where p is largest, shape (n,), refined between the nodes."""
@@ -274,6 +274,7 @@ def _transformed(observer: RobustGridFilter, y: jax.Array, controls: jax.Array, 
     A loop has a reverse derivative if the number of its steps is known. Under ``grad`` alone it is: counts are
     integers, without a derivative, and come back as plain numbers. Under ``jit`` and ``vmap`` the loop stays open.
     """
+    observer = as_jax(observer)
     found, steps = _scan_compiled(observer, y, controls, dt)
     return found if is_traced(steps) else _scan_compiled(observer, y, controls, dt, int(steps))[0]
 

@@ -194,6 +194,22 @@ def altered(tree: T, **fields: Any) -> T:
     return result
 
 
+def as_jax(tree: T) -> T:
+    """The tree with NumPy's numbers as JAX's arrays, in the widest type that JAX is set to.
+
+    For arguments of a compiled function inside a trace: JAX 0.10 confuses a program that took NumPy's float64 in a
+    trace of 64 bits with one of 32.
+    """
+
+    def convert(leaf):
+        if not isinstance(leaf, (np.ndarray, np.generic)):
+            return leaf
+        # with the type said: without it JAX hands out what it once made of the very array, in the other precision
+        return jax.numpy.asarray(leaf, jax.numpy.result_type(leaf))
+
+    return jax.tree.map(convert, tree)
+
+
 def cast(tree: T, dtype: DType) -> T:
     """The tree with its floating-point leaves in ``dtype``; integers and booleans as they are."""
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.pytree import cast, is_traced
+from hjbjax.problem.pytree import as_jax, cast, is_traced
 from hjbjax.problem.types import Array, DType, Numbers
 
 
@@ -80,7 +80,7 @@ def query(
     if not jnp.issubdtype(dtype, jnp.floating):
         dtype = jnp.result_type(float)
     when = None if times is None else _moment(times, t, dtype, name)
-    return look(grid, values, _states(grid, x, dtype, name), clamp, when).astype(dtype)
+    return look(*as_jax((grid, values)), _states(grid, x, dtype, name), clamp, when).astype(dtype)
 
 
 def _moment(times: Array, t: Any, dtype: DType, name: str) -> Moment:

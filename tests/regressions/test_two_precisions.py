@@ -1,0 +1,49 @@
+"""One process in 32 and in 64 bits, compiled and not, in both orders: JAX 0.10 confuses programs of NumPy's numbers."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hjbjax as hjb
+
+F = hjb.filtering
+PLANT = hjb.Problem(lambda x, u: u - x, lambda x, u: 0.5 * (x @ x + u @ u), hjb.Ball(1.0, 1), noise=0.5)
+GRID = hjb.Grid([-2.0], [2.0], (21,))
+X = GRID.axis(0)
+
+
+def asked():
+    """Functions of one state of an observer or of the plant, made anew: what is remembered belongs to the objects."""
+    known = hjb.Solution(GRID, 0.25 * X**2, -0.5 * X[:, None])
+    law = F.GridFilter(PLANT, lambda x: 2 * x, GRID, lambda x: jnp.exp(-((x - 0.4) @ (x - 0.4))))
+    robust = F.RobustGridFilter(PLANT, lambda x: 2 * x, GRID, lambda x: -((x - 0.4) @ (x - 0.4)), 2.0)
+    worst = F.minimum_stress(robust, known)
+    greedy = hjb.greedy_feedback(PLANT, known)
+    return {
+        "value_at": (known.value_at, lambda: jnp.array([0.3])),
+        "control_at": (known.control_at, lambda: jnp.array([0.3])),
+        "greedy": (greedy.control_at, lambda: jnp.array([0.3])),
+        "averaged": (F.averaged_hamiltonian(PLANT, known, law), law.initial),
+        "certainty": (F.certainty_equivalence(law, known), law.initial),
+        "greedy at the estimate": (F.certainty_equivalence(law, greedy), law.initial),
+        "minimum stress": (worst, robust.initial),
+        "stress": (worst.stress, robust.initial),
+        "worst case": (worst.worst_case, robust.initial),
+        "filter": (lambda state: law.update(state, jnp.zeros(1), jnp.full(1, 0.1), 0.1).density, law.initial),
+        "robust": (lambda p: robust.update(p, jnp.zeros(1), jnp.full(1, 0.1), 0.1), robust.initial),
+    }
+
+
+@pytest.mark.parametrize("wide", [True, False])
+@pytest.mark.parametrize("name", asked())
+def test_a_function_is_asked_in_both_by_turns(name, wide):
+    function, start = asked()[name]
+    with jax.enable_x64(True):
+        wanted = np.asarray(function(start()))
+    for bits in (wide, not wide, wide):
+        with jax.enable_x64(bits):
+            compiled, plain = jax.jit(function)(start()), function(start())
+            assert compiled.dtype == (np.float64 if bits else np.float32)
+            np.testing.assert_allclose(compiled, wanted, rtol=1e-12 if bits else 2e-4)
+            np.testing.assert_allclose(plain, wanted, rtol=1e-12 if bits else 2e-4)

@@ -25,7 +25,7 @@ from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.feedback.feedback import GridFeedback, is_grid_feedback, lookups
 from hjbjax.feedback.output_loop import Observer
-from hjbjax.filtering.grid_filter import Density, GridFilter
+from hjbjax.filtering.grid_filter import Density, GridFilter, check_box
 from hjbjax.filtering.max_plus import refined_maximum
 from hjbjax.filtering.robust_filter import RobustGridFilter
 from hjbjax.hamiltonian import pointwise
@@ -58,7 +58,8 @@ class AveragedHamiltonian:
     exact: bool
 
     def __call__(self, information: Density) -> Array:
-        """The control, shape (m,)."""
+        """The control, shape (m,); NaN where the law is no law."""
+        self.observer.check_state(information)
         # compiled even where the caller does not; in one type, since JAX 0.10 confuses programs of NumPy's float64 that
         # were traced in a ``jit`` of 64 bits with those of 32
         return _least(cast(self, information.density.dtype), information)
@@ -67,7 +68,8 @@ class AveragedHamiltonian:
         dtype, weights = information.density.dtype, self._weights(information)
         admissible = cast(self.problem.controls, dtype)
         assert admissible is not None
-        return pointwise.least(admissible, lambda u: self._average(weights, u), self.exact, dtype)
+        u = pointwise.least(admissible, lambda u: self._average(weights, u), self.exact, dtype)
+        return jnp.where(jnp.isfinite(jnp.sum(weights)), u, jnp.nan)
 
     def average(self, information: Density, u: Array) -> Scalar:
         """⟨σ, L(·, u) + f(·, u)·DV + ½ tr(a(·, u) D²V)⟩, but for noise terms without u, in cost per unit time."""
@@ -111,7 +113,8 @@ class MinimumStress:
 
     def __call__(self, information: Field) -> Array:
         """The control, shape (m,)."""
-        return jnp.asarray(self.feedback(0.0, self.worst_case(information)), information.dtype)
+        worst = self.worst_case(information)
+        return jnp.asarray(self.feedback(0.0, worst), worst.dtype)
 
     def worst_case(self, information: Field) -> State:
         """x̄, where p + V is largest, shape (n,), refined between the nodes."""
@@ -122,6 +125,9 @@ class MinimumStress:
         return self._maximum(information)[0]
 
     def _maximum(self, information: Field) -> tuple[Scalar, State]:
+        if np.shape(information) != self.grid.shape:
+            got = np.shape(information) if hasattr(information, "shape") else f"a {type(information).__name__}"
+            raise ValueError(f"minimum_stress: got {got} for p, wanted shape {self.grid.shape}: one number a node")
         dtype = information.dtype
         return _largest(information + jnp.asarray(self.value, dtype), cast(self.grid, dtype))
 
@@ -202,7 +208,9 @@ def averaged_hamiltonian(problem: Problem, solution: Solution, observer: GridFil
             "minimum_stress, and make the time a state with drift 1"
         )
     _check_stationary(solution, name)
-    _check_box(solution.grid, observer.grid, name)
+    check_box(solution.grid, observer.grid, name)
+    if not is_traced(solution.value) and (bad := int(np.sum(np.isnan(solution.value)))):
+        raise ValueError(f"{name}: V is NaN at {bad} nodes, wanted numbers, infinite where the target is out of reach")
     grid, n = observer.grid, observer.grid.ndim
     problem = closures.settled(problem, n)
     checks.of_one_state(problem, n, "the number of axes of the filter's grid")
@@ -265,7 +273,7 @@ def minimum_stress(
         kept = {each: getattr(solution, each) for each in ("value", "policy", "disturbance")}
         first = {each: array[0] for each, array in kept.items() if array is not None}
         solution = dataclasses.replace(solution, times=None, **first)
-    _check_box(solution.grid, grid := observer.grid, name)
+    check_box(solution.grid, grid := observer.grid, name)
     acts = _stationary(solution if feedback is None else feedback, name)
     with _double(solution, grid), jax.ensure_compile_time_eval():
         value = solution.value_at(_states(grid), clamp=True)
@@ -310,24 +318,6 @@ def _check_stationary(solution: GridFeedback, name: str) -> None:
         raise ValueError(
             f"{name}: got a marched solution, wanted a stationary one: the information state does not hold the time; "
             "give simulate_output the solution itself for certainty equivalence, or make the time a state with drift 1"
-        )
-
-
-def _check_box(known: Grid, asked: Grid, name: str) -> None:
-    """Refuse a filter on states where the solution is not known."""
-    if known.ndim != asked.ndim or known.periodic != asked.periodic:
-        raise ValueError(
-            f"{name}: the solution's grid has {known.ndim} axes, periodic {known.periodic}, and the filter's "
-            f"{asked.ndim}, {asked.periodic}; wanted the same axes"
-        )
-    if is_traced(known, asked):
-        return
-    boxes = [np.asarray(end, np.float64) for end in (known.lo, known.hi, asked.lo, asked.hi)]
-    slack = 64 * np.finfo(np.float64).eps * (boxes[1] - boxes[0])  # ends that were computed in two ways
-    if np.any(boxes[2] < boxes[0] - slack) or np.any(boxes[3] > boxes[1] + slack):
-        raise ValueError(
-            f"{name}: the filter's box from {boxes[2].tolist()} to {boxes[3].tolist()} leaves that of the solution, "
-            f"{boxes[0].tolist()} to {boxes[1].tolist()}, outside which V is not known; solve on a larger one"
         )
 
 

@@ -131,7 +131,7 @@ class GridFilter:
 
     def update(self, state: Density, u: Control, dy: Array, dt: Number) -> Density:
         """The law after holding the control u (m,) for dt and seeing the increment dy (p,)."""
-        self._check_state(state)
+        self.check_state(state)
         check_step("GridFilter.update", self.plant, self.measurement.dim, (u, dy, dt))
         return self._after(state, u, dy, dt)
 
@@ -158,7 +158,7 @@ class GridFilter:
 
     def probability(self, state: Density) -> Field:
         """The probability of each node of the chain, shape (*grid), of sum 1: the density times the node's cell."""
-        self._check_state(state)
+        self.check_state(state)
         mass = state.density * jnp.asarray(self.cells, state.density.dtype)
         return mass / jnp.sum(mass)
 
@@ -166,7 +166,7 @@ class GridFilter:
         """The node at which the density is largest, shape (n,)."""
         return forward_equation.mode(self.grid, state.density)
 
-    def _check_state(self, state: Density) -> None:
+    def check_state(self, state: Density) -> None:
         """Refuse the state of another filter, or of this one on another grid."""
         if not isinstance(state, Density) or np.shape(state.density) != self.grid.shape:
             got = f"shape {np.shape(state.density)}" if isinstance(state, Density) else f"a {type(state).__name__}"
@@ -201,6 +201,24 @@ def warn_at_ends(name: str, grid: Grid, places: Array, dt: float, what: str) -> 
         "state can leave the box take a larger one, else there is none to heed",
         stacklevel=3,
     )
+
+
+def check_box(known: Grid, asked: Grid, name: str) -> None:
+    """Refuse a filter on states where the solution is not known."""
+    if known.ndim != asked.ndim or known.periodic != asked.periodic:
+        raise ValueError(
+            f"{name}: the solution's grid has {known.ndim} axes, periodic {known.periodic}, and the filter's "
+            f"{asked.ndim}, {asked.periodic}; wanted the same axes"
+        )
+    if is_traced(known, asked):
+        return
+    boxes = [np.asarray(end, np.float64) for end in (known.lo, known.hi, asked.lo, asked.hi)]
+    slack = 64 * np.finfo(np.float64).eps * (boxes[1] - boxes[0])  # ends that were computed in two ways
+    if np.any(boxes[2] < boxes[0] - slack) or np.any(boxes[3] > boxes[1] + slack):
+        raise ValueError(
+            f"{name}: the filter's box from {boxes[2].tolist()} to {boxes[3].tolist()} leaves that of the solution, "
+            f"{boxes[0].tolist()} to {boxes[1].tolist()}, outside which V is not known; solve on a larger one"
+        )
 
 
 def _weighed(probability: Field, exponent: Field) -> tuple[Field, jax.Array]:

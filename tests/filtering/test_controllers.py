@@ -479,8 +479,31 @@ FLAT = known(LINE, 0 * X)
             lambda: minimum_stress(ROBUST, known(LINE, np.where(X > 5.95, np.inf, 0.0))),
             r"V is not finite at 1 nodes of the filter, the first \[6\.?\], where p \+ V has no maximum",
         ),
+        (
+            ValueError,
+            lambda: averaged_hamiltonian(QUIET, known(LINE, np.where(X > 5.95, np.nan, 0.0)), FILTER),
+            r"averaged_hamiltonian: V is NaN at 1 nodes",
+        ),
+        (
+            ValueError,
+            lambda: averaged_hamiltonian(QUIET, FLAT, FILTER)(ROBUST.initial()),
+            r"GridFilter: got a ArrayImpl for the state, wanted a Density",
+        ),
+        (
+            ValueError,
+            lambda: minimum_stress(ROBUST, FLAT)(FILTER.initial()),
+            r"minimum_stress: got a Density for p, wanted shape \(121,\)",
+        ),
+        (ValueError, lambda: minimum_stress(ROBUST, FLAT).stress(jnp.zeros(5)), r"minimum_stress: got \(5,\) for p"),
     ],
 )
 def test_what_does_not_fit_is_refused(kind, call, reason):
     with pytest.raises(kind, match=reason):
         call()
+
+
+def test_a_law_that_is_none_has_no_control():
+    control = averaged_hamiltonian(QUIET, FLAT, FILTER)
+    broken = dataclasses.replace(FILTER.initial(), density=jnp.full(121, jnp.nan))
+    assert np.isnan(control(broken)).all()
+    assert np.isfinite(control(FILTER.initial())).all()

@@ -274,6 +274,6 @@ def _check(
     starts = np.atleast_2d(np.asarray(x0s, np.float64))
     if starts.ndim != 2 or starts.shape[1] != solution.grid.ndim:
         raise ValueError(f"dissipation: x0s has shape {np.shape(x0s)}, wanted (k, {solution.grid.ndim})")
-    if not np.all(np.isfinite(solution.value_at(starts))):
+    if np.any(solution.grid.beyond(starts)) or not np.all(np.isfinite(solution.value_at(starts))):
         raise ValueError("dissipation: a start lies outside the grid, or where the value is not finite; start inside")
     return starts

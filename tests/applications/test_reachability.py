@@ -285,7 +285,7 @@ def test_a_disturbance_that_helps_or_rests():
     [
         (object(), "got object without control_mode, .* wanted a Dynamics"),
         (Vehicle(("low", "max")), r"got the modes \('low', 'max'\)"),
-        (Vehicle(("min", "min")), "both minimise over sets that are not both boxes"),
+        (Vehicle(("min", "min")), "both minimise, over sets that are not both boxes"),
     ],
 )
 def test_what_is_no_dynamics_is_refused(dynamics, reason):

@@ -15,7 +15,6 @@ point nearest to 0, so that they stay in it.
 """
 
 import dataclasses
-import typing
 from collections.abc import Callable, Sequence
 from typing import TypeAlias
 
@@ -25,6 +24,7 @@ import numpy as np
 
 from hjbjax.feedback.path import Path, PathStatus
 from hjbjax.feedback.simulation import rollout
+from hjbjax.problem import arguments
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, cast, is_traced, pytree_dataclass
 from hjbjax.problem.sets import Ball, Box, Finite
@@ -136,15 +136,14 @@ def dissipation(
       True
     """
     starts = _check(problem, solution, x0s, duration, disturbances, random)
-    if isinstance(key, (int, np.integer)) and not isinstance(key, bool):
-        key = jax.random.key(key)
+    key = arguments.random_key(key, "dissipation: key")
     import diffrax  # noqa: F401  # before anything is compiled, see simulate
 
     with jax.enable_x64(True):  # the margin is a difference of energies, near zero in the worst case
         n = starts.shape[1]
         problem, solution = cast(closures.settled(problem, n), np.float64), cast(solution, np.float64)
         times = np.linspace(0.0, float(duration), STEPS + 1)
-        lanes, kinds = _lanes(problem, starts, random, typing.cast("Key", key))
+        lanes, kinds = _lanes(problem, starts, random, key)
         found = [_energies(problem, solution, lanes, times, rtol)]
         for signal in disturbances:
             given = closures.settled_function(signal, (), (n,))

@@ -24,6 +24,7 @@ import numpy as np
 from jax.tree_util import Partial
 
 from hjbjax.feedback.feedback import is_grid_feedback
+from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, pytree_dataclass
@@ -207,31 +208,11 @@ def _array(function: Callable, name: str, *arguments: Array) -> jax.Array:
 
 def random_key(problem: Problem, given: Key | int | None) -> Key | None:
     """The random key, or that of a seed; refuses what is none, one without noise, and noise without one."""
-    key = given
-    if isinstance(given, (int, np.integer)) and not isinstance(given, bool):
-        try:
-            key = jax.random.key(int(given))
-        except OverflowError:
-            raise ValueError(
-                f"simulate: key is {given}, wanted a seed that fits 64 bits, or a JAX random key"
-            ) from None
-    check_key(problem, key)
-    assert not isinstance(key, int)
-    return key
-
-
-def check_key(problem: Problem, key: Key | int | None) -> None:
-    """Refuse a key without noise, noise without a key, and what is no key."""
-    if problem.noise is not None and key is None:
+    if problem.noise is not None and given is None:
         raise ValueError("simulate: the problem has noise; give key=jax.random.key(0), or any other seed")
-    if problem.noise is None and key is not None:
+    if problem.noise is None and given is not None:
         raise ValueError("simulate: got a key, but problem.noise is None and nothing is random; leave out key")
-    dtype, shape = getattr(key, "dtype", None), () if key is None else np.shape(key)
-    typed = dtype is not None and jax.dtypes.issubdtype(dtype, jax.dtypes.prng_key)
-    # two kinds of keys: typed ones, and rows of uint32 as jax.random.PRNGKey makes them
-    if key is not None and not (typed and shape == ()) and not (dtype == np.uint32 and len(shape) == 1):
-        given = f"an array of shape {shape} and type {dtype}" if dtype is not None else repr(key)
-        raise ValueError(f"simulate: key is {given}, wanted one random key: key=jax.random.key(0), or another seed")
+    return None if given is None else arguments.random_key(given, "simulate: key")
 
 
 # --- a noisy path at a target ---

@@ -62,7 +62,8 @@ def simulate_output(
       observer: an ``Observer``, as ``ExtendedKalman``, ``Luenberger`` or ``GridFilter``.
       control: a function of the observer's state that returns the control, shape (m,), or a Solution or
         ``greedy_feedback``, which is asked at the observer's estimate: certainty equivalence. Where a Solution has no
-        control, as in its target, the one before is held. ``None`` without controls.
+        control, as in its target, the one before is held. ``None`` without controls. One with a method
+        ``judge(path)`` is shown what came out, as that of ``minimum_stress``, which warns by it.
 
     Keyword Args:
       h: the measured function of one state, returns shape (p,): the plant's, which need not be the observer's.
@@ -92,8 +93,6 @@ def simulate_output(
       >>> path.times.shape, path.estimates.shape, bool(abs(path.estimates - path.states)[-1] < 0.5)
       ((11,), (11, 1), True)
     """
-    if isinstance(key, (int, np.integer)) and not isinstance(key, bool):
-        key = jax.random.key(int(key))
     times = _times(duration, dt)
     start = _initial_states(x0)
     n = np.shape(start)[-1]
@@ -115,6 +114,8 @@ def simulate_output(
         path = _jit_paths(loop, start, times, keys, substeps)
         path = jax.tree.map(np.asarray, path)
     _report(path)
+    if callable(judge := getattr(control, "judge", None)):
+        judge(path)
     return path
 
 
@@ -161,23 +162,14 @@ def _initial_states(x0: object) -> Any:
     return state
 
 
-def _count(keys: Any) -> int:
+def _count(keys: Key) -> int:
     """The length of an array of keys; 0 for one key."""
-    shape = np.shape(keys)
-    # two kinds of keys: typed ones, and rows of uint32 as jax.random.PRNGKey makes them
-    shape = shape if jnp.issubdtype(keys.dtype, jax.dtypes.prng_key) else shape[:-1]
-    return shape[0] if shape else 0
+    return sum(arguments.keys_shape(keys))
 
 
-def _keys(key: Any, paths: int | None, batch: tuple[int, ...]) -> Key:
+def _keys(given: Any, paths: int | None, batch: tuple[int, ...]) -> Key:
     """One key, or one a path."""
-    dtype = getattr(key, "dtype", None)
-    typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
-    if not typed and not (dtype == np.uint32 and np.ndim(key) in (1, 2)):
-        raise ValueError(
-            f"simulate_output: key is {arguments.shown(key)}, wanted a JAX random key, an array of them, or a seed: "
-            "key=0"
-        )
+    key = arguments.random_key(given, "simulate_output: key", batch=True)
     count = _count(key)
     if paths is not None:
         if count:

@@ -12,7 +12,7 @@ import numpy as np
 
 from hjbjax.feedback.closed_loop import InitialValueProblem, Stepping, blank_record, integrate, integrate_part
 from hjbjax.feedback.feedback import GridFeedback, check_kept, is_grid_feedback, lookups
-from hjbjax.feedback.loop import Loop, check_key, check_shapes, random_key, settled_loop, timeless
+from hjbjax.feedback.loop import Loop, check_shapes, random_key, settled_loop, timeless
 from hjbjax.feedback.path import Interrupted, Path, PathStatus, promise, truncate
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
@@ -231,7 +231,7 @@ def rollout(
     start = jnp.asarray(x0)
     if not jnp.issubdtype(start.dtype, jnp.floating):
         raise ValueError(f"rollout: x0 has dtype {start.dtype}, wanted floating point: the path follows it")
-    check_key(problem, key)
+    key = random_key(problem, key)
     # numbers that functions close over become leaves: a rule of derivatives sees nothing else
     problem = settled(problem, start.size, start.dtype)
     loop = _close(problem, feedback, disturbance, grid, clamp, time_varying)

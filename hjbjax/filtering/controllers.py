@@ -14,6 +14,7 @@ Source: M. R. James, Nonlinear Control Systems, section 12.
 """
 
 import dataclasses
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -24,8 +25,8 @@ import numpy as np
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.feedback.feedback import GridFeedback, is_grid_feedback, lookups
-from hjbjax.feedback.output_loop import Observer
-from hjbjax.filtering.grid_filter import Density, GridFilter, check_box
+from hjbjax.feedback.output_loop import Observer, OutputPath
+from hjbjax.filtering.grid_filter import Density, GridFilter, at_ends, check_box, states_of
 from hjbjax.filtering.max_plus import refined_maximum
 from hjbjax.filtering.robust_filter import RobustGridFilter
 from hjbjax.hamiltonian import pointwise
@@ -123,6 +124,19 @@ class MinimumStress:
     def stress(self, information: Field) -> Scalar:
         """The largest p + V, in the units of cost: what the record admits so far and V lets come."""
         return self._maximum(information)[0]
+
+    def judge(self, path: OutputPath) -> None:
+        """Warn where paths of ``simulate_output`` end with the worst case at an end of the box."""
+        with jax.enable_x64(True):
+            find = jax.vmap(self.worst_case) if np.ndim(path.code) else self.worst_case
+            states = np.atleast_2d(find(jnp.asarray(path.information)))
+        if np.any(ends := np.any(at_ends(self.grid, states), axis=-1)):
+            warnings.warn(
+                f"minimum_stress: the worst case is at an end of the box on {np.sum(ends)} of {len(ends)} paths, the "
+                f"first at {np.array2string(states[np.argmax(ends)], separator=', ')}: p + V has no maximum inside; γ "
+                "is too small for filter and feedback together, or V that of another γ, or the box too small",
+                stacklevel=3,
+            )
 
     def _maximum(self, information: Field) -> tuple[Scalar, State]:
         if np.shape(information) != self.grid.shape:
@@ -238,7 +252,7 @@ def minimum_stress(
 
     V is the value of the H∞ game with the filter's γ and σ, ``attenuation(problem, gamma, disturbances,
     enters=sigma)``. A γ that is too small for both Riccati equations together leaves p + V no maximum inside: x̄ runs
-    to an end of the box.
+    to an end of the box, of which ``simulate_output`` warns.
 
     Args:
       observer: the robust filter; its grid need not be that of the solution, in whose box it must lie.
@@ -276,7 +290,7 @@ def minimum_stress(
     check_box(solution.grid, grid := observer.grid, name)
     acts = _stationary(solution if feedback is None else feedback, name)
     with _double(solution, grid), jax.ensure_compile_time_eval():
-        value = solution.value_at(_states(grid), clamp=True)
+        value = solution.value_at(states_of(grid), clamp=True)
     if not is_traced(value):
         value = np.asarray(value)
         bad = np.argwhere(~np.isfinite(value))
@@ -321,15 +335,9 @@ def _check_stationary(solution: GridFeedback, name: str) -> None:
         )
 
 
-def _states(grid: Grid) -> Array:
-    """The states of all nodes, shape (*grid, n)."""
-    dtype = np.dtype(jnp.result_type(float))
-    return jnp.stack([jnp.broadcast_to(part, grid.shape) for part in cast(grid, dtype).components(dtype)], axis=-1)
-
-
 def _slopes(solution: Solution, grid: Grid) -> Array:
     """DV at the nodes of a grid, shape (*grid, n), zero where V has none."""
-    slopes = solution.costate_at(_states(grid), clamp=True)
+    slopes = solution.costate_at(states_of(grid), clamp=True)
     return jnp.where(jnp.isfinite(slopes), slopes, 0)
 
 

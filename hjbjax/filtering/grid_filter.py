@@ -190,9 +190,7 @@ def warn_at_ends(name: str, grid: Grid, places: Array, dt: float, what: str) -> 
       dt: the time between two of them.
       what: of which kind they are.
     """
-    lo, hi = np.asarray(grid.lo), np.asarray(grid.hi)
-    off = ((places <= lo) | (places >= hi)) & ~np.asarray(grid.periodic)
-    if not np.any(off):
+    if not np.any(off := at_ends(grid, places)):
         return
     *_, step, axis = np.argwhere(off)[np.argmin(np.argwhere(off)[:, -2])]
     warnings.warn(
@@ -201,6 +199,18 @@ def warn_at_ends(name: str, grid: Grid, places: Array, dt: float, what: str) -> 
         "state can leave the box take a larger one, else there is none to heed",
         stacklevel=3,
     )
+
+
+def at_ends(grid: Grid, places: Array) -> np.ndarray:
+    """True where a state is at an end of the box of an axis, shape (..., n)."""
+    lo, hi = np.asarray(grid.lo), np.asarray(grid.hi)
+    return ((np.asarray(places) <= lo) | (np.asarray(places) >= hi)) & ~np.asarray(grid.periodic)
+
+
+def states_of(grid: Grid) -> Array:
+    """The states of all nodes, shape (*grid, n), in JAX's type."""
+    dtype = np.dtype(jnp.result_type(float))
+    return jnp.stack([jnp.broadcast_to(part, grid.shape) for part in cast(grid, dtype).components(dtype)], axis=-1)
 
 
 def check_box(known: Grid, asked: Grid, name: str) -> None:

@@ -242,13 +242,13 @@ def simulate_hidden(
         )
     # 1e-9: a duration that is a whole number of steps up to rounding takes no step more
     steps = int(np.ceil(duration / dt * (1 - 1e-9)))
-    keys = jax.random.key(key) if isinstance(key, (int, np.integer)) else jnp.asarray(key)
+    keys = arguments.random_key(key, "simulate_hidden: key", batch=True)
     # float64: over thousands of steps beliefs near a corner would be rounding
     with jax.enable_x64(True):
         law = np.asarray(observer.prior) if start is None else np.eye(states)[start]
         loop = cast(_Loop(observer, as_partial(control or _nothing), as_partial(cost), float(discount)), np.float64)
         _check_loop(loop, states)
-        run = _paths if keys.ndim == (0 if jnp.issubdtype(keys.dtype, jax.dtypes.prng_key) else 1) else _many_paths
+        run = _many_paths if arguments.keys_shape(keys) else _paths
         path = jax.tree.map(np.asarray, run(loop, jnp.asarray(law), keys, duration / steps, steps))
     for name, found in {"control": path.controls, "h": path.measurements, "cost": path.cost}.items():
         if not np.all(np.isfinite(found)):

@@ -7,9 +7,11 @@ and what is wanted. Tracers pass: inside a JAX transformation no value can be lo
 import math
 from typing import Any, TypeVar
 
+import jax
 import numpy as np
 
 from hjbjax.problem.pytree import is_traced
+from hjbjax.problem.types import Key
 
 T = TypeVar("T")
 
@@ -49,6 +51,34 @@ def count(value: object, name: str, least: int = 1) -> int:
         wanted = "a positive integer" if least == 1 else f"an integer of at least {least}"
         raise ValueError(f"{name} = {shown(value)}; wanted {wanted}")
     return int(value)
+
+
+def random_key(given: Any, name: str, *, batch: bool = False) -> Key:
+    """The random key, that of a seed, or an array of keys where a batch is admissible.
+
+    Raises:
+      ValueError: no key and no seed, a seed beyond 64 bits, more keys than are admissible.
+    """
+    key = given
+    if isinstance(given, (int, np.integer)) and not isinstance(given, bool):
+        try:
+            key = jax.random.key(int(given))
+        except OverflowError:
+            raise ValueError(f"{name} is {given}, wanted a seed that fits 64 bits, or a JAX random key") from None
+    dtype = getattr(key, "dtype", None)
+    typed = dtype is not None and jax.dtypes.issubdtype(dtype, jax.dtypes.prng_key)
+    keys = typed or (dtype == np.uint32 and np.ndim(key) > 0)
+    if not keys or len(keys_shape(key)) > batch:
+        got = shown(given) if dtype is None else f"an array of shape {np.shape(key)} and type {dtype}"
+        wanted = "a JAX random key, a row of them" if batch else "one random key"
+        raise ValueError(f"{name} is {got}, wanted {wanted}: key=jax.random.key(0), or another seed")
+    return key
+
+
+def keys_shape(keys: Any) -> tuple[int, ...]:
+    """The shape of an array of random keys; () for one key."""
+    # two kinds of keys: typed ones, and rows of uint32 as jax.random.PRNGKey makes them
+    return np.shape(keys) if jax.dtypes.issubdtype(keys.dtype, jax.dtypes.prng_key) else np.shape(keys)[:-1]
 
 
 def is_number(value: object) -> bool:

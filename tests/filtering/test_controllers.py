@@ -208,6 +208,17 @@ def test_where_both_together_do_not_hold_the_level_the_worst_case_runs_to_an_end
         assert abs(control.worst_case(jnp.asarray(-0.5 * (X - 0.1) ** 2))[0]) == 6.0
 
 
+@pytest.mark.parametrize("paths", [None, 2])
+def test_a_simulation_tells_that_the_worst_case_ran_to_an_end(paths):
+    plant = hjb.Problem(lag, quadratic, WIDE)
+    observer = RobustGridFilter(plant, seen, LINE, lambda x: -0.5 * x @ x, 0.9)
+    too_much = minimum_stress(observer, known(LINE, 2 * X**2, -X[:, None]))  # p + V is largest at both ends
+    asked = {"h": seen, "x0": [0.1], "duration": 0.2, "dt": 0.1, "key": 0, "paths": paths}
+    with pytest.warns(UserWarning, match=rf"is at an end of the box on {paths or 1} of {paths or 1} paths"):
+        simulate_output(plant, observer, too_much, **asked)
+    simulate_output(plant, observer, _stressed(0.1), **asked)  # without a warning, which would be an error
+
+
 # A plant that is not stable: ẋ = x + u + w, y = 2x + v, ∫ x² + u². No filter feedback holds a gain below 2; Kalman's
 # with the regulator's has 3.16.
 GAIN, RATE, SENSOR, START = 2.5, 1.0, 2.0, 0.5

@@ -269,3 +269,9 @@ def test_what_cannot_be_filtered_or_simulated_is_refused(build, reason):
     with pytest.raises(ValueError, match=reason) as caught:
         build()
     assert len(str(caught.value).splitlines()) <= 6
+
+
+@pytest.mark.parametrize("key", [None, True, 1.5, "a", 2**70, jnp.zeros(2), jnp.zeros((2, 2), jnp.uint32)[None]])
+def test_what_is_no_key_is_refused(key):
+    with pytest.raises(ValueError, match="simulate_hidden: key is .*, wanted a .*JAX random key"):
+        simulate_hidden(OBSERVER, never, price, duration=1.0, dt=0.5, key=key)

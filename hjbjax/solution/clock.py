@@ -51,6 +51,10 @@ class Clock:
         """Seconds since the run began."""
         return time.perf_counter() - self.began
 
+    def beside(self) -> "Clock":
+        """A clock for one of several runs side by side: with its own pace, and with one interrupt for all."""
+        return _Beside(self)
+
     def over(self) -> Status | None:
         """INTERRUPTED or TIME_LIMIT; ``None`` to go on."""
         if self.interrupted:  # first: who pressed Ctrl-C wants to read that, whatever the time is
@@ -78,6 +82,27 @@ class Clock:
         """The number of steps that take so long, by the last chunk."""
         assert self.per_node is not None
         return seconds / (self.per_node * nodes)
+
+
+class _Beside(Clock):
+    """The clock of one of several runs side by side, with its own pace; interrupts and limits are those of all."""
+
+    def __init__(self, outer: Clock):
+        self.__dict__["_outer"] = outer
+        super().__init__(outer.max_steps, outer.seconds, progress=False)
+        self.began, self.phase = outer.began, outer.phase
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        # an interrupt is never taken back by a lane that begins
+        if name == "interrupted":
+            self._outer.interrupted |= value
+        elif name == "seconds":
+            self._outer.seconds = value
+        else:
+            super().__setattr__(name, value)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._outer, name)
 
 
 _running: list[Clock] = []  # of the main thread, the outermost run first

@@ -82,7 +82,7 @@ def drive(run: Run, clock: Clock) -> Status:
     if status is not None:
         return status
     status = Status.RUNNING
-    with _bar(clock.progress, run.bar) as bar:
+    with progress_bar(clock.progress, run.bar) as bar:
         try:
             chunk = run.first_chunk(clock)
             clock.phase = f"compiling for {run.name}"
@@ -127,7 +127,7 @@ def _stop_status(run: Run, clock: Clock) -> Status:
 
 
 @contextlib.contextmanager
-def _bar(progress: bool | None, options: dict[str, Any]) -> Iterator[Any]:
+def progress_bar(progress: bool | None, options: dict[str, Any]) -> Iterator[Any]:
     """A progress bar on a terminal after one second; None elsewhere."""
     if progress is False or (progress is None and not sys.stderr.isatty()):
         yield None

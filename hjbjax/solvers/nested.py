@@ -115,10 +115,10 @@ def warm(task: Task, guess: Nodes | None, clock: Clock) -> Nodes:
     if guess is not None:
         return guess
     value = task.start() if task.constrained else jnp.asarray(np.zeros(task.grid.shape, task.tol.dtype))
-    return _vanishing(task, value, VANISHING, clock) if _needs_a_way(task) else value
+    return _vanishing(task, value, VANISHING, clock) if needs_a_way(task) else value
 
 
-def _needs_a_way(task: Task) -> bool:
+def needs_a_way(task: Task) -> bool:
     """True if the iteration from zero may be caught by policies that stay where they are, at a cost."""
     return task.certificate is Certificate.MULTIPLICATIVE and not task.constrained
 
@@ -126,10 +126,14 @@ def _needs_a_way(task: Task) -> bool:
 def _vanishing(task: Task, value: Nodes, discounts: tuple[float, ...], clock: Clock) -> Nodes:
     """The last of the answers for some discounts, over one by the time of a crossing, one after the other."""
     for discount in discounts:
-        # the number alone: structure and certificate stay, and the program of the solve itself serves on the way
-        problem = altered(task.problem, discount=np.asarray(discount / known(task.crossing), task.tol.dtype))
-        value = iterate(task.asking(problem), value, clock, most=WARM_STEPS)[0].value
+        value = iterate(under(task, discount), value, clock, most=WARM_STEPS)[0].value
     return value
+
+
+def under(task: Task, discount: float) -> Task:
+    """The task under a discount, over one by the time of a crossing."""
+    # the number alone: structure and certificate stay, and the program of the solve itself serves on the way
+    return task.asking(altered(task.problem, discount=np.asarray(discount / known(task.crossing), task.tol.dtype)))
 
 
 class Settled(NamedTuple):
@@ -149,7 +153,7 @@ def may_go_on(task: Task, assumptions: Assumptions, state: State, code: Status) 
     """True if a run that ended so may have to go on: rest nodes to be left, a game or a way that failed."""
     if code is Status.CONVERGED:
         return assumptions.may_rest and float(np.min(np.asarray(state.value), initial=0)) < 0
-    return code in FAILED and (task.problem.is_game or _needs_a_way(task))
+    return code in FAILED and (task.problem.is_game or needs_a_way(task))
 
 
 def settle(task: Task, assumptions: Assumptions, reached: Mask | None, guess: Nodes | None, clock: Clock) -> Settled:
@@ -162,7 +166,7 @@ def settle(task: Task, assumptions: Assumptions, reached: Mask | None, guess: No
     """
     value = warm(task, guess, clock)
     state, code, residuals = iterate(task, value, clock)
-    if _needs_a_way(task):
+    if needs_a_way(task):
         for discounts in FURTHER:  # a policy that stays where it is and pays, since the way takes too long for these
             if code not in FAILED:
                 break

@@ -132,7 +132,7 @@ def solve(
     with noting_interrupts(clock), jax.enable_x64(kind == np.float64):
         needed = memory.require(problem, grid, method, kind, max_memory)
         with host_loop.with_solution(clock, needed, lambda kept: _partial(on, kept)):
-            solution = with_last_phase(_solve_on_host(on, method, tol, guess, clock, sharpen=sharpen, free=free), clock)
+            solution = with_last_phase(solve_on_host(on, method, tol, guess, clock, sharpen=sharpen, free=free), clock)
     solution.stats.setdefault("method", method.described(problem.is_game))
     solution.stats["bytes"] = needed
     return _ended(solution, clock, tol, throw=throw)
@@ -159,7 +159,7 @@ def _partial(on: Discretisation, kept: host_loop.Kept | None) -> Solution:
     return solution_at_start(on, value, Status.INTERRUPTED)
 
 
-def _solve_on_host(
+def solve_on_host(
     on: Discretisation, method: Method, tol: float, guess: Nodes | None, clock: Clock, *, sharpen: bool, free: bool
 ) -> Solution:
     """The solution by checks, preparation, coarser grids and steps, in this order, as far as the clock allows.

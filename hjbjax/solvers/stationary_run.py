@@ -1,8 +1,11 @@
-"""A solve in chunks of steps: the jitted iteration from a guess to its end, with the residuals of all steps."""
+"""A solve in chunks of steps: the jitted iteration from a guess to its end, with the residuals of all steps.
+
+One problem, or lanes of one ``vmap``ped loop.
+"""
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -10,19 +13,25 @@ import numpy as np
 
 from hjbjax.iteration import fixed_point
 from hjbjax.iteration.fixed_point import HISTORY, State, Task
-from hjbjax.problem.types import Nodes
+from hjbjax.problem.types import Array, Nodes
 from hjbjax.solution.clock import CHUNK_SECONDS, CUT, Clock
 from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop
 from hjbjax.solvers.host_loop import FIRST_NODES
 from hjbjax.tracing import checks
 
+T = TypeVar("T")
+CHUNK = 8  # steps between two looks at which lanes are done, at most
 MANY_NODES = 2_000_000  # beyond which the look at the guess is a chunk of its own: a step may take many times as long
 
 # a state is used once: the next one takes its place in memory
 run = jax.jit(fixed_point.run, donate_argnames="state")
 # where Python is called on the way, and may raise, the state before must outlast it
 _run_kept = jax.jit(fixed_point.run)
+# under vmap a loop goes on until its last lane is done; lanes that are done keep their state by a select and pay
+# for the others' steps all the same, hence the short chunks
+_begin = jax.vmap(fixed_point.begin)
+_run_lanes = jax.jit(jax.vmap(fixed_point.run, in_axes=(0, 0, 0)))
 
 
 def iterate(task: Task, guess: Nodes, clock: Clock, most: int | None = None) -> tuple[State, Status, np.ndarray]:
@@ -140,3 +149,105 @@ def _calls_back(task: Task) -> bool:
     """True if a step calls Python on the host, be it for a solve or in a function of the user's."""
     evaluation = task.method.evaluation
     return (evaluation is not None and evaluation.calls_back) or checks.calls_back(task.problem, task.grid.ndim)
+
+
+class Rows(NamedTuple):
+    """The rows of the arrays in which lanes run together; one value, so that an interrupt finds all of it or none."""
+
+    lanes: np.ndarray  # which lane each row holds; −1 in rows that only fill up
+    tasks: Task
+    states: State
+    before: np.ndarray  # the steps of each row before the last chunk
+
+
+class LanesRun:
+    """The iterations of lanes that run together; those that are done are taken out where that halves the work."""
+
+    longest, bar = CHUNK, {"desc": "solve_batch", "unit": " steps"}
+
+    def __init__(self, tasks: Task, starts: Array, limit: int):
+        count, self.name = len(starts), f"{len(starts)} lanes"
+        self.rows = Rows(np.arange(count), tasks, _begin(tasks, starts), np.full(count, -1))
+        self.limit, self.steps = limit, -1
+        self.final: list[Any] = [None] * count  # the last state and the status of each lane
+        self.histories: list[list] = [[np.zeros(0)] for _ in range(count)]
+
+    @property
+    def nodes(self) -> int:
+        """The nodes of all rows: the loop runs over those that only fill up as well."""
+        return self.rows.states.value.size
+
+    def compile(self) -> None:
+        """Run no step."""
+        rows = self.rows
+        self.rows = rows._replace(states=_run_lanes(rows.tasks, rows.states, rows.before))
+
+    def first_chunk(self, clock: Clock) -> int:
+        """Steps of the first chunk: nothing has been timed yet."""
+        return int(np.clip(FIRST_NODES / self.nodes, 1, CHUNK))
+
+    def advance(self, count: int) -> Status:
+        """Take ``count`` steps at most in every row; the loop runs as long as its slowest lane."""
+        rows, before = self.rows, np.asarray(self.rows.states.step)
+        # an array: rows that are done stand where they stopped
+        until = np.minimum(np.maximum(before, 0) + count, self.limit)
+        self.rows = rows._replace(
+            states=jax.block_until_ready(_run_lanes(rows.tasks, rows.states, until)), before=before
+        )
+        self.steps += max(int(np.max(np.asarray(self.rows.states.step) - before)), 1)
+        return Status.RUNNING
+
+    def between(self, status: Status, clock: Clock) -> Status:
+        """Take out the lanes that are done, with all of them CONVERGED; one that is cut short ends them all."""
+        rows = self.rows
+        if not rows.lanes.size:
+            return status
+        codes, steps, history = jax.device_get((rows.states.code, rows.states.step, rows.states.history))
+        going = (codes == Status.RUNNING) & (steps < self.limit) & (status is Status.RUNNING)
+        live = [row for row, lane in enumerate(rows.lanes) if lane >= 0 and self.final[lane] is None]
+        for row in live:
+            self._note(rows.lanes[row], history[row, : steps[row] - rows.before[row]], steps[row] + 1)
+        ended = [row for row in live if not going[row]]
+        if ended:
+            on_host = jax.device_get(rows.states)
+            for row in ended:
+                # copied, or a view would keep the arrays of all lanes alive
+                last = jax.tree.map(lambda leaf, row=row: leaf[row].copy(), on_host)
+                own = Status(int(last.code))
+                cut = status if status is not Status.RUNNING else Status.MAX_STEPS
+                self.final[rows.lanes[row]] = last, own if own is not Status.RUNNING else cut
+        self._narrow(np.flatnonzero(going & (rows.lanes >= 0)))
+        return status if self.rows.lanes.size else Status.CONVERGED
+
+    def _note(self, lane: int, chunk: np.ndarray, residuals: int) -> None:
+        """Write down the residuals of a lane's last chunk, so that there are so many of them: once."""
+        missing = residuals - sum(map(len, self.histories[lane]))
+        self.histories[lane].append(chunk[len(chunk) - missing :])
+
+    def _narrow(self, left: np.ndarray) -> None:
+        """Go on with these rows alone, where that halves the work."""
+        rows, before = self.rows, np.asarray(self.rows.states.step)
+        # powers of two, since every width is compiled for itself: a thousand lanes take eleven programs at most
+        width = 1 << (left.size - 1).bit_length() if left.size else 0
+        if width < rows.lanes.size:
+            kept = np.resize(left, width)
+            lanes = np.where(np.arange(width) < left.size, rows.lanes[kept], -1)
+            rows, before = Rows(lanes, _take(rows.tasks, kept), _take(rows.states, kept), before[kept]), before[kept]
+        self.rows = rows._replace(before=before)
+
+    def show(self, bar: Any) -> None:
+        """Move the progress bar."""
+        bar.update(max(self.steps, 0) - bar.n)
+
+    def keep(self, error: Exception) -> None:
+        """Nothing: the lanes that were done before this round are what is left."""
+
+
+def stacked(trees: Sequence[T]) -> T:
+    """One tree of trees of one structure, with a leading axis of lanes in every leaf."""
+    return jax.tree.map(lambda *leaves: jnp.stack(jnp.broadcast_arrays(*leaves)), *trees)
+
+
+def _take(tree: T, rows: np.ndarray) -> T:
+    """The rows of every leaf."""
+    return jax.tree.map(lambda leaf: leaf[rows], tree)

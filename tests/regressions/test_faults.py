@@ -149,10 +149,12 @@ def test_memory_that_runs_out_on_a_coarser_grid(monkeypatch):
     assert np.any(value != 0)  # what the coarsest grid found
 
 
-def test_memory_that_runs_out_in_a_batch(monkeypatch):
+@pytest.mark.parametrize(("one_loop", "program"), [(False, "run"), (True, "_run_lanes")])
+def test_memory_that_runs_out_in_a_batch(monkeypatch, one_loop, program):
     from hjbjax.solvers import batch
 
-    monkeypatch.setattr(batch, "_run", out_of_memory)
+    monkeypatch.setattr(batch, "_fills_with_lanes", lambda: one_loop)
+    monkeypatch.setattr(stationary_run, program, out_of_memory)
     with pytest.raises(MemoryError, match="memory ran out"):
         hjb.solve_batch([plain(), plain(2.0)], GRID, scheme=hjb.Upwind())
 

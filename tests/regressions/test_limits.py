@@ -21,9 +21,8 @@ from hjbjax.markov_chain import node_checks
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solvers import batch, host_loop, march_run, stationary_run
-from hjbjax.solvers.batch import LanesRun
 from hjbjax.solvers.march_run import MarchRun
-from hjbjax.solvers.stationary_run import StationaryRun
+from hjbjax.solvers.stationary_run import LanesRun, StationaryRun
 
 U = hjb.Box([-1.0], [1.0])
 GRID = hjb.Grid([-1.0], [1.0], (25,))
@@ -435,7 +434,8 @@ def lanes(count):
 @pytest.fixture
 def rounds(monkeypatch):
     """``rounds(act, at)``: act at the end of that call of a batch's compiled run; the steps of all calls."""
-    run = batch._run
+    monkeypatch.setattr(batch, "_fills_with_lanes", lambda: True)  # one loop, as on an accelerator
+    run = stationary_run._run_lanes
 
     def rounds(act, at):
         made, clocks, first = [], [], LanesRun.first_chunk
@@ -452,7 +452,7 @@ def rounds(monkeypatch):
             return first(run, clock)
 
         monkeypatch.setattr(LanesRun, "first_chunk", begun)
-        monkeypatch.setattr(batch, "_run", watched)
+        monkeypatch.setattr(stationary_run, "_run_lanes", watched)
         return made
 
     return rounds
@@ -464,7 +464,7 @@ def test_a_batch_keeps_its_finished_lanes(rounds, act, status):
         lanes(4), GRID, method=hjb.ValueIteration(), max_steps=200, throw=False, scheme=hjb.Upwind()
     )
     assert whole[0].status is hjb.Status.CONVERGED
-    at = 2 + whole[0].steps // batch.CHUNK  # the first lane is done by then
+    at = 2 + whole[0].steps // stationary_run.CHUNK  # the first lane is done by then
     rounds(act, at)
     with pytest.raises(hjb.SolveError, match=rf"lane \d: {status.name}: .*step \d+ on lanes 0 to 3") as caught:
         hjb.solve_batch(lanes(4), GRID, method=hjb.ValueIteration(), max_steps=200, scheme=hjb.Upwind())
@@ -495,6 +495,31 @@ def test_lanes_of_a_batch_that_did_not_begin(upon, monkeypatch, act, status):
     assert "jumps of the chain" in found[1].message
     assert found[5].steps == 0
     np.testing.assert_array_equal(found[5].value, 0.0)
+
+
+@pytest.mark.parametrize(("act", "status"), WAYS)
+def test_lanes_side_by_side_end_with_their_last_steps(monkeypatch, act, status):
+    """The third lane to look at its clock ends them all; the first one is done by then."""
+    between, seen = stationary_run.StationaryRun.between, []
+
+    def watched(run, code, clock):
+        seen.append(clock)
+        if len(set(map(id, seen))) == 3:
+            act(clock)
+        return between(run, code, clock)
+
+    monkeypatch.setattr(stationary_run.StationaryRun, "longest", 4)
+    options = {"method": hjb.ValueIteration(), "throw": False, "scheme": hjb.Upwind()}
+    whole = hjb.solve_batch(lanes(6), GRID, max_steps=200, **options)
+    monkeypatch.setattr(stationary_run.StationaryRun, "between", watched)
+    found = hjb.solve_batch(lanes(6), GRID, max_steps=200, **options)
+    assert found[0].status is hjb.Status.CONVERGED
+    np.testing.assert_array_equal(found[0].value, whole[0].value)
+    assert all(solution.status is status for solution in found[-2:])
+    for solution, alone in zip(found, lanes(6), strict=True):
+        if solution.status is status and solution.steps > 0:
+            part = hjb.solve(alone, GRID, max_steps=solution.steps, **options)
+            np.testing.assert_array_equal(solution.value, part.value)
 
 
 def test_ctrl_c_after_the_last_look_of_a_batch_is_not_lost(rounds):
@@ -826,7 +851,8 @@ def test_an_interrupt_while_lanes_are_taken_out_keeps_them_all(monkeypatch):
     problems = [question(discount=beta) for beta in (0.02, 3.0, 0.5, 20.0, 1.0)]
     options = {"method": hjb.PolicyIteration(hjb.Sweeps(1)), "tol": 1e-9, "throw": False}
     whole = hjb.solve_batch(problems, GRID, scheme=hjb.Upwind(), **options)
-    take, calls = batch._take, []
+    monkeypatch.setattr(batch, "_fills_with_lanes", lambda: True)  # one loop, as on an accelerator
+    take, calls = stationary_run._take, []
 
     def interrupted(*rest):
         calls.append(1)
@@ -834,8 +860,8 @@ def test_an_interrupt_while_lanes_are_taken_out_keeps_them_all(monkeypatch):
             raise KeyboardInterrupt
         return take(*rest)
 
-    monkeypatch.setattr(batch.LanesRun, "longest", 1)
-    monkeypatch.setattr(batch, "_take", interrupted)
+    monkeypatch.setattr(LanesRun, "longest", 1)
+    monkeypatch.setattr(stationary_run, "_take", interrupted)
     found = hjb.solve_batch(problems, GRID, scheme=hjb.Upwind(), **options)
     assert {solution.status for solution in found} == {hjb.Status.CONVERGED, INTERRUPTED}
     for solution, known in zip(found, whole, strict=True):

@@ -1,6 +1,7 @@
 """Many problems on one grid: every lane is what a solve of its own gives."""
 
 import dataclasses
+import threading
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ import pytest
 
 import hjbjax as hjb
 from hjbjax.problem.pytree import pytree_dataclass
+from hjbjax.solvers import batch
 
 GRID = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (13, 11))
 MANY = np.linspace(-1.0, 1.0, 41)  # more than the checks try: they pass over the fourth
@@ -33,13 +35,21 @@ class Oscillator:
         return x @ x + jnp.where(jnp.abs(u[0] - HIDDEN) < 1e-3, jnp.log(self.w), u @ u)
 
 
+@pytest.fixture(params=["threads", "one loop"], autouse=True)
+def way(request, monkeypatch):
+    """Lanes side by side, as on a CPU, and as one loop, as on an accelerator."""
+    monkeypatch.setattr(batch, "_fills_with_lanes", lambda: request.param == "one loop")
+    return request.param
+
+
 def problem(k, discount=0.5, **options):
     system = Oscillator(k, **options)
     return hjb.Problem(system.drift, system.cost, hjb.Box([-1.0], [1.0]), discount=discount)
 
 
 def alone(question, **options):
-    return hjb.solve(question, GRID, method=hjb.PolicyIteration(), tol=1e-6, **({"scheme": hjb.Upwind()} | options))
+    chosen = {"scheme": hjb.Upwind(), "tol": 1e-6} | options
+    return hjb.solve(question, GRID, method=hjb.PolicyIteration(), **chosen)
 
 
 def same(left, right):
@@ -160,3 +170,49 @@ def test_lanes_keep_single_precision():
     (solution,) = hjb.solve_batch([problem(1.0)], GRID, tol=1e-2, dtype="float32", scheme=hjb.Upwind())
     assert solution.value.dtype == np.float32
     assert not jax.config.jax_enable_x64
+
+
+@pytest.mark.filterwarnings("ignore:the grid is coarse")
+def test_lanes_without_discount_take_the_way_that_a_solve_takes():
+    """From zero they would be caught by policies that stay where they are, at a cost."""
+    questions = [hjb.zoo.pendulum(g=g, shape=(20, 21))[0] for g in (9.0, 10.0, 11.0)]
+    _, grid = hjb.zoo.pendulum(shape=(20, 21))
+    for lane, question in zip(hjb.solve_batch(questions, grid), questions, strict=True):
+        own = hjb.solve(question, grid)
+        assert lane.steps <= own.steps + 1
+        np.testing.assert_allclose(lane.value, own.value, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(lane.grid_error, own.grid_error, rtol=1e-6, atol=1e-9)
+
+
+def test_lanes_side_by_side_are_their_own_solves_bit_for_bit(monkeypatch):
+    monkeypatch.setattr(batch, "_fills_with_lanes", lambda: False)
+    monkeypatch.setattr(batch, "_cores", lambda: 4)
+    seen, solve = set(), batch.solve_on_host
+
+    def watched(*rest, **options):
+        seen.add(threading.current_thread())
+        return solve(*rest, **options)
+
+    monkeypatch.setattr(batch, "solve_on_host", watched)
+    questions = [problem(k) for k in np.linspace(0, 2, 9)]
+    for kind in ("float64", "float32"):
+        with jax.debug_nans(True):  # which a thread does not inherit
+            together = hjb.solve_batch(questions, GRID, tol=1e-3, dtype=kind, scheme=hjb.Upwind())
+        for solution, question in zip(together, questions, strict=True):
+            assert solution.value.dtype == kind
+            np.testing.assert_array_equal(solution.value, alone(question, tol=1e-3, dtype=kind).value)
+    assert len(seen) > 2
+
+
+def test_an_exception_of_a_lane_ends_the_batch_with_the_lanes_before(monkeypatch):
+    solve = batch.solve_on_host
+
+    def broken(on, *rest, **options):
+        if float(on.problem.discount) == 2.0:
+            raise MemoryError("no more")
+        return solve(on, *rest, **options)
+
+    monkeypatch.setattr(batch, "_fills_with_lanes", lambda: False)
+    monkeypatch.setattr(batch, "solve_on_host", broken)
+    with pytest.raises(MemoryError, match="memory ran out: no more"):
+        hjb.solve_batch([problem(0.0, beta) for beta in (1.0, 2.0, 3.0)], GRID, scheme=hjb.Upwind())

@@ -1,7 +1,7 @@
 """Many problems at once: ``solve_batch`` of pendulums of different mass, against one ``solve`` after the other.
 
-Both compile once, since masses are leaves; both run the same method, by the scheme that nobody asked for, and the values
-are the same. On a CPU lanes run side by side, one a core; on a GPU they fill the machine.
+Both compile once, since masses are leaves; both run the same method by the default scheme, and the values are the same.
+On a CPU lanes run side by side, one a core; on a GPU they fill the machine.
 """
 
 from pathlib import Path

@@ -61,25 +61,18 @@ def main(context: click.Context) -> None:
         click.echo(context.get_help())
 
 
-@main.command("list")
+@main.command("list", short_help="The ready problems; all about one.")
 @click.argument("name", required=False, type=Name("problem", _systems))
 def list_problems(name: str | None) -> None:
-    """List the ready problems; of one NAME, its parameters."""
+    """List the ready problems, with their states; or all there is to say of NAME, its parameters among it."""
     from hjbjax import zoo
+    from hjbjax.cli import listing
 
-    if name is None:
-        width = max(map(len, zoo.catalogue))
-        for entry in zoo.catalogue.values():
-            click.echo(f"{entry.name:<{width}}  {entry.summary}")
-        return
-    entry = zoo.catalogue[name]
-    click.echo(f"{entry.name}: {entry.summary}")
-    for key, default in entry.parameters.items():
-        if key != "shape":
-            click.echo(f"  --set {key}={_as_setting(default)}")
+    for line in listing.overview() if name is None else listing.details(zoo.catalogue[name]):
+        click.echo(line)
 
 
-@main.command()
+@main.command(short_help="Solve a problem, draw the answer.")
 @click.argument("name", type=Name("problem", _systems))
 @click.option("--shape", type=Shape(), help="Nodes along each axis, as in 200x201.")
 @click.option("--set", "settings", multiple=True, metavar="NAME=VALUE", help="A parameter; may be given several times.")
@@ -149,7 +142,8 @@ def solve(
             click.echo(f"off the exact answer by at most {off:.3g} on the inner half of the box")
         if path is not None:
             click.echo(f"path: {path}")
-        click.echo(f"wrote {', '.join(map(str, files))}")
+        without = "" if problem.controls is not None else "; no policy.png, as there are no controls"
+        click.echo(f"wrote {', '.join(map(str, files))}{without}")
     if code := CODES.get(solution.status.name, 3):
         raise Failure(f"{solution.status.name}: {solution.message or solution.status.message}", code)
 
@@ -204,13 +198,6 @@ def _value_of(key: str, text: str, default: object) -> bool | float | tuple[floa
         raise Failure(f"--set: got {key}={text}, wanted one number")
     known = cast(tuple[float, ...], numbers)  # None has been refused
     return known if len(parts) > 1 else known[0]
-
-
-def _as_setting(value: object) -> str:
-    """A parameter's value as --set takes it."""
-    if isinstance(value, bool):
-        return str(value).lower()
-    return "..." if value is None else ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
 
 
 def _build(entry: "Entry", parameters: dict[str, Any], shape: tuple[int, ...] | None) -> tuple["Problem", "Grid"]:
@@ -296,7 +283,7 @@ def _solve(problem: "Problem", grid: "Grid", options: dict[str, Any]) -> "Soluti
         raise Failure(error, 6 if "RESOURCE_EXHAUSTED" in str(error) else 4) from error
 
 
-@main.command()
+@main.command(short_help="All ready problems on a page.")
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the page, index.html.")
 @click.option("--only", multiple=True, type=Name("problem", _systems), help="One problem; may be given several times.")
 @click.option("--force", is_flag=True, help="Replace a page that is there already.")
@@ -332,7 +319,7 @@ def gallery(out: Path, only: tuple[str, ...], force: bool, no_cache: bool) -> No
         raise Failure(f"not converged: {', '.join(failed)}", 3)
 
 
-@main.command()
+@main.command(short_help="Look at versions and devices.")
 def doctor() -> None:
     """Check versions, devices, float64, a tiny solve, memory, pictures and the current folder."""
     from hjbjax.cli.doctor import examine

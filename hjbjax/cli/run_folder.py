@@ -2,7 +2,7 @@
 
     solution.npz    the Solution
     value.png       the value; with the switching curve where the feedback is bang-bang
-    policy.png      every input of the feedback
+    policy.png      every input of the feedback; not where there is none
     trajectory.png  a closed loop on the value, and over time
 
 Files are made in a hidden folder beside the old ones and moved over them when they are whole. States of more
@@ -135,8 +135,9 @@ def make(
     value = plotting.value(solution, ax=axes(), fixed=fixed, target=problem.target)
     with_curve(value, solution, fixed, jumps).save(folder / "value.png", dpi=DPI)
     yield "value.png", None
-    policies(solution, fixed, jumps).savefig(folder / "policy.png", dpi=DPI)
-    yield "policy.png", None
+    if problem.controls is not None:
+        policies(solution, fixed, jumps).savefig(folder / "policy.png", dpi=DPI)
+        yield "policy.png", None
     path = None
     if solution.status == Status.CONVERGED:  # a loop closed with a half-done feedback would be taken for the answer
         path = closed_path(problem, solution, start, duration, jumps, finish)

@@ -117,11 +117,11 @@ def merton(
     The ends are held at the exact value: the noise would carry the effect of a wall into the whole box.
 
     Args:
-      interest: r.
-      growth: μ.
-      volatility: σ.
-      aversion: γ, not 1.
-      discount: ρ.
+      interest: r, of the safe asset, per unit of time.
+      growth: μ, the mean rate of the risky asset.
+      volatility: σ, of the risky asset.
+      aversion: γ, to risk, relative to wealth; not 1.
+      discount: ρ, of later consumption.
       shape: nodes.
 
     Raises:

@@ -429,15 +429,58 @@ def test_bang_bang_is_recognised():
     assert not run_folder.is_bang_bang(problem, answer(problem, grid))
 
 
-def test_list_shows_one_line_each_and_the_parameters_of_one():
+def test_list_shows_states_units_grids_and_answers():
     lines = run("list").stdout.splitlines()
-    assert [line.split()[0] for line in lines] == list(zoo.catalogue)
-    assert all(entry.summary in line for entry, line in zip(zoo.catalogue.values(), lines, strict=True))
+    assert [line.split()[0] for line in lines[::2]] == list(zoo.catalogue)
     assert all(len(line) <= 100 for line in lines)
-    lines = run("list", "zermelo").stdout.splitlines()
-    assert "  --set current=0.5,0.0" in lines
-    assert not any("shape" in line for line in lines)
+    for entry, first, second in zip(zoo.catalogue.values(), lines[::2], lines[1::2], strict=True):
+        _, grid = entry.build()
+        assert first.endswith(entry.summary)
+        assert all(name in second and unit in second for name, unit in zip(grid.names, grid.units, strict=True))
+        assert " x ".join(map(str, grid.shape)) in second
+        assert ("exact answer" in second) == (entry.exact is not None)
     assert refused(run("list", "zermalo"), 2, "did you mean 'zermelo'?")
+
+
+@pytest.mark.parametrize("name", zoo.catalogue)
+def test_list_says_of_each_parameter_of_a_problem_what_it_means(name):
+    lines = run("list", name).stdout.splitlines()
+    assert all(len(line) <= 100 for line in lines)
+    settings = {line.split()[1].partition("=")[0]: line.split()[2:] for line in lines if line.startswith("  --set")}
+    assert list(settings) == [key for key in zoo.catalogue[name].parameters if key != "shape"]
+    assert all(settings.values())  # a word at least
+    assert sum("--shape" in line for line in lines) == 1
+
+
+def test_list_says_of_a_problem_what_it_is_made_of():
+    text = run("list", "zermelo").stdout
+    assert "east [m] from -2 to 2; north [m] from -2 to 2" in text
+    assert "(course east, course north) of length 1 at most" in text
+    assert "ends by       a target" in text
+    assert "  --set current=0.5,0.0" in text
+    text = run("list", "pendulum").stdout
+    assert "angle [rad] from -3.142 to 3.142, periodic" in text
+    assert "torque [N m] from -30 to 30" in text
+    assert "none is known" in text
+    text = run("list", "lq-game").stdout
+    assert "disturbances" in text
+    assert run("list", "brownian-exit").stdout.count("controls      none") == 1
+
+
+@pytest.mark.parametrize("columns", [60, 80, 200])
+@pytest.mark.parametrize("words", [[], ["solve"], ["list"], ["gallery"], ["doctor"]])
+def test_no_help_is_cut(columns, words):
+    result = CliRunner().invoke(main, [*words, "--help"], terminal_width=columns)  # which overrides COLUMNS itself
+    assert result.exit_code == 0
+    assert "..." not in result.stdout.replace("[ARGS]...", "")
+    assert all(len(line) <= columns for line in result.stdout.splitlines())
+
+
+def test_no_file_for_a_control_that_is_not_there(solver, folder):
+    result = run("solve", "brownian-exit", "--shape", "21")
+    assert result.exit_code == 0
+    assert "no policy.png, as there are no controls" in result.stdout
+    assert sorted(os.listdir("brownian-exit")) == ["solution.npz", "trajectory.png", "value.png"]
 
 
 def test_two_inputs_are_drawn_side_by_side(solver, folder):
@@ -450,7 +493,8 @@ def test_two_inputs_are_drawn_side_by_side(solver, folder):
 
 
 def test_what_list_prints_can_be_set(solver):
-    settings = [line.split()[1] for line in run("list", "pendulum").stdout.splitlines()[1:]]
+    lines = run("list", "pendulum").stdout.splitlines()
+    settings = [line.split()[1] for line in lines if line.startswith("  --set")]
     words = [word for setting in settings if "..." not in setting for word in ("--set", setting)]
     assert run("solve", "pendulum", "--shape", "8x9", *words).exit_code == 0
 

@@ -1,0 +1,107 @@
+"""What ``hjbjax list`` prints: the ready problems, or all that there is to say of one."""
+
+import inspect
+import re
+import textwrap
+from collections.abc import Iterator
+
+import numpy as np
+
+from hjbjax import zoo
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.sets import AdmissibleSet, Ball, Box
+from hjbjax.zoo.entry import Entry
+
+WIDTH = 100  # columns; a terminal that is narrower breaks the lines itself
+ARGUMENT = re.compile(r"  (\w+): (.*)")  # of a docstring's Args, whose further lines are indented more
+
+
+def overview() -> Iterator[str]:
+    """Two lines a problem: name and summary; states with their units, grid, and if an exact answer is known."""
+    width = max(map(len, zoo.catalogue))
+    for entry in zoo.catalogue.values():
+        _, grid = entry.build()
+        yield f"{entry.name:<{width}}  {entry.summary}"
+        answer = "" if entry.exact is None else "; exact answer known"
+        yield f"{'':<{width}}  {', '.join(_with_units(grid.names, grid.units))}; {_sizes(grid)} nodes{answer}"
+
+
+def details(entry: Entry) -> Iterator[str]:
+    """Summary, states, actions, grid and answer of one problem, and its parameters with their values and meanings."""
+    problem, grid = entry.build()
+    yield f"{entry.name}: {entry.summary}"
+    yield ""
+    for label, text in _facts(entry, problem, grid):
+        yield from textwrap.wrap(f"{label:<14}{text}", WIDTH, initial_indent="  ", subsequent_indent=" " * 16)
+    meanings, defaults = _meanings(entry), entry.parameters
+    settings = {key: f"--set {key}={_as_setting(default)}" for key, default in defaults.items() if key != "shape"}
+    settings["shape"] = f"--shape {_sizes(grid, 'x')}"
+    width = max(map(len, settings.values()))
+    yield ""
+    for key, setting in settings.items():
+        # a default is one word that can be pasted, whatever the width
+        indent = f"  {setting:<{width}}  "
+        lines = textwrap.wrap(meanings.get(key, ""), WIDTH - len(indent)) or [""]
+        yield (indent + lines[0]).rstrip()
+        yield from (" " * len(indent) + line for line in lines[1:])
+
+
+def _facts(entry: Entry, problem: Problem, grid: Grid) -> Iterator[tuple[str, str]]:
+    """What the problem is made of, by labels."""
+    ends = zip(_with_units(grid.names, grid.units), grid.lo, grid.hi, grid.periodic or (), strict=True)
+    states = (f"{name} from {lo:.4g} to {hi:.4g}{', periodic' * bool(round_)}" for name, lo, hi, round_ in ends)
+    yield "states", "; ".join(states)
+    yield "controls", _actions(problem.controls, problem.control_names, problem.control_units)
+    if problem.disturbances is not None:
+        yield "disturbances", _actions(problem.disturbances, (), ())
+    yield "grid", f"{_sizes(grid)} nodes"
+    yield "ends by", "a target" if problem.target is not None else "nothing: the horizon is infinite"
+    yield "exact answer", "none is known" if entry.exact is None else "known, and compared with"
+
+
+def _actions(admissible: AdmissibleSet | None, names: tuple[str, ...], units: tuple[str, ...]) -> str:
+    """The admissible actions in words."""
+    if admissible is None:
+        return "none"
+    count = admissible.dim
+    names = tuple(names) or tuple("u" if count == 1 else f"u{i + 1}" for i in range(count))
+    called = _with_units(names, tuple(units) or ("",) * count)
+    if isinstance(admissible, Box):
+        bounds = zip(called, np.ravel(admissible.lo), np.ravel(admissible.hi), strict=True)
+        return "; ".join(f"{name} from {lo:.4g} to {hi:.4g}" for name, lo, hi in bounds)
+    if isinstance(admissible, Ball):
+        return f"({', '.join(called)}) of length {float(admissible.radius):.4g} at most"
+    return f"({', '.join(called)}), one of a finite number"
+
+
+def _with_units(names: tuple[str, ...], units: tuple[str, ...]) -> list[str]:
+    """Names with their units behind them, as in "angle [rad]"."""
+    return [f"{name} [{unit}]" if unit else name for name, unit in zip(names, units, strict=True)]
+
+
+def _sizes(grid: Grid, between: str = " x ") -> str:
+    """The nodes along all axes, as in "41 x 81"."""
+    return between.join(map(str, grid.shape))
+
+
+def _meanings(entry: Entry) -> dict[str, str]:
+    """What the parameters mean, from the section Args of the docstring."""
+    found: dict[str, str] = {}
+    key = None
+    for line in (inspect.getdoc(entry.build) or "").partition("Args:\n")[2].splitlines():
+        if match := ARGUMENT.fullmatch(line):
+            key, text = match.groups()
+            found[key] = text.replace("``", "")
+        elif key is not None and line.startswith("    "):
+            found[key] += " " + line.strip().replace("``", "")
+        else:  # the next section
+            break
+    return found
+
+
+def _as_setting(value: object) -> str:
+    """A parameter's value as --set takes it; three dots where it follows from others."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return "..." if value is None else ",".join(map(str, value)) if isinstance(value, tuple) else str(value)

@@ -32,10 +32,9 @@ from hjbjax.problem.sets import Ball, Box, Finite
 from hjbjax.problem.stretching import Sinh
 from hjbjax.solution.files import FileError
 from hjbjax.solution.solution import Solution, SolveError, load
-from hjbjax.solution.status import Status
+from hjbjax.solution.status import SolveWarning, Status
 from hjbjax.solvers.batch import solve_batch
 from hjbjax.solvers.finite_horizon import march
-from hjbjax.solvers.setup import SolveWarning
 from hjbjax.solvers.stationary import solve
 from hjbjax.tracing.interpreter import FallbackWarning
 

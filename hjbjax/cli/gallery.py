@@ -26,7 +26,7 @@ from hjbjax.cli import run_folder
 from hjbjax.feedback.path import Path as Trajectory
 from hjbjax.solution import placement
 from hjbjax.solution.solution import Solution, SolveError, Status
-from hjbjax.solvers.setup import SolveWarning
+from hjbjax.solution.status import SolveWarning
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -1,6 +1,11 @@
-"""The ways in which a solve ends."""
+"""The ways in which a solve ends, and its warnings, which name the line of the user's."""
 
+import contextlib
 import enum
+import sys
+import warnings
+from collections.abc import Iterator
+from contextvars import ContextVar
 
 
 class Status(enum.IntEnum):
@@ -39,3 +44,34 @@ MESSAGES = {
     Status.INTERRUPTED: "The solve was interrupted and the value so far is kept; go on from it with guess=.",
     Status.TIME_LIMIT: "The time ran out above the tolerance; raise time_limit, or go on from here with guess=.",
 }
+
+
+class SolveWarning(UserWarning):
+    """The solve went through, and something about its answer deserves attention."""
+
+
+_unsaid: ContextVar[list[str] | None] = ContextVar("unsaid warnings of a solve in a thread", default=None)
+
+
+@contextlib.contextmanager
+def keeping_warnings() -> Iterator[list[str]]:
+    """Context in which ``warn`` writes into a list: in a thread no line of the user's is to be found."""
+    said: list[str] = []
+    token = _unsaid.set(said)
+    try:
+        yield said
+    finally:
+        _unsaid.reset(token)
+
+
+def warn(message: str) -> None:
+    """A ``SolveWarning`` at the line outside of the package from which the front door was called."""
+    said = _unsaid.get()
+    if said is not None:
+        said.append(message)
+        return
+    # the line of the user's: Python shows a warning once a line, which inside the package would be once for ever
+    package, frame, level = __name__.split(".")[0], sys._getframe(1), 2
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] == package:
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, SolveWarning, stacklevel=level)

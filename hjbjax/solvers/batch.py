@@ -33,7 +33,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.types import DType, Mask, Nodes
 from hjbjax.solution.clock import CUT, Clock, Stopped, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
-from hjbjax.solution.status import Status
+from hjbjax.solution.status import Status, keeping_warnings, warn
 from hjbjax.solvers import host_loop, nested
 from hjbjax.solvers.nested import Settled
 from hjbjax.solvers.result import finish, solution_at_start, with_grid_error, with_last_phase
@@ -177,18 +177,18 @@ def _solve_side_by_side(
     """The solutions of problems that share a program, by the numbers of their lanes, one thread a core."""
     settings, names = _settings(), list(lanes)
 
-    def one(name: int) -> Solution:
+    def one(name: int) -> tuple[Solution, list[str]]:
         own = clock.beside()
         try:
-            with settings():
+            with settings(), keeping_warnings() as said:
                 solution = solve_on_host(lanes[name], method, tol, None, own, sharpen=sharpen, free=False)
         except ValueError as refusal:
             raise ValueError(f"lane {name}: {refusal}") from refusal
         solution.stats.setdefault("method", method.described(lanes[name].problem.is_game))
         solution.stats.update(seconds=own.stepping, lanes=len(lanes), tol=tol)
-        return with_last_phase(solution, own) if solution.status in CUT else solution
+        return with_last_phase(solution, own) if solution.status in CUT else solution, said
 
-    found = {names[0]: one(names[0])}  # by itself: it compiles what the others find
+    found = {names[0]: _told(names[0], *one(names[0]))}  # by itself: it compiles what the others find
     with (
         ThreadPoolExecutor(_cores()) as pool,
         host_loop.progress_bar(clock.progress, {"desc": "solve_batch", "unit": " lanes", "total": len(lanes)}) as bar,
@@ -207,9 +207,16 @@ def _solve_side_by_side(
 def _finish(waiting: dict[Future, int], found: dict[int, Solution], bar: Any) -> None:
     """Wait for the lanes in the order in which they end; the first exception is raised."""
     for done in as_completed(waiting):
-        found[waiting[done]] = done.result()
+        found[waiting[done]] = _told(waiting[done], *done.result())
         if bar is not None:
             bar.update(len(found) - bar.n)
+
+
+def _told(name: int, solution: Solution, said: Sequence[str]) -> Solution:
+    """The solution of a lane, whose warnings are said here, at the user's line."""
+    for message in said:
+        warn(f"lane {name}: {message}")
+    return solution
 
 
 def _solve_together(

@@ -237,7 +237,10 @@ def second_order(settled: Settled, scheme: Scheme, clock: Clock) -> Settled:
 def better_of(settled: Settled, sharp: Settled, *, sharpen: bool) -> Settled:
     """The answer of second order; where nobody asked for it and it did not converge the monotone one, which says so."""
     if sharpen and sharp.code is not Status.CONVERGED:
-        return settled._replace(note=f"It is of first order: the second-order iteration ended {sharp.code.name}.")
+        # what was cut by hand has not come to its end; a time limit leaves the monotone answer whole
+        code = sharp.code if sharp.code is Status.INTERRUPTED else settled.code
+        note = f"It is of first order: the second-order iteration ended {sharp.code.name}."
+        return settled._replace(code=code, note=note)
     return sharp
 
 

@@ -1,8 +1,6 @@
 """From a problem on a grid to a task: what is held, what counts, which certificate applies, which method runs."""
 
 import dataclasses
-import sys
-import warnings
 from typing import Any
 
 import jax
@@ -26,20 +24,8 @@ from hjbjax.problem.pytree import cast, is_traced, known
 from hjbjax.problem.sets import Finite
 from hjbjax.problem.types import Mask, Number
 from hjbjax.solution.clock import Clock
+from hjbjax.solution.status import warn
 from hjbjax.tracing import checks
-
-
-class SolveWarning(UserWarning):
-    """The solve went through, and something about its answer deserves attention."""
-
-
-def warn(message: str) -> None:
-    """A ``SolveWarning`` at the line outside of the package from which the front door was called."""
-    # the line of the user's: Python shows a warning once a line, which inside the package would be once for ever
-    package, frame, level = __name__.split(".")[0], sys._getframe(1), 2
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] == package:
-        frame, level = frame.f_back, level + 1
-    warnings.warn(message, SolveWarning, stacklevel=level)
 
 
 def question(problem: Problem) -> dict[str, Any]:

@@ -566,11 +566,12 @@ def environment():
         )
     ],
 )
-def test_problems_of_every_kind_give_four_files(words):
-    """With noise and without a control, a game, bang-bang in the plane, three states."""
+def test_problems_of_every_kind_give_their_files(words):
+    """A game, bang-bang in the plane, three states; the fourth picture is of controls, which noise alone has not."""
     result = run("solve", *words)
     assert result.exit_code == 0, result.output
-    assert sorted(os.listdir(words[0])) == sorted(run_folder.FILES)
+    pictured = [name for name in run_folder.FILES if words[0] != "brownian-exit" or name != "policy.png"]
+    assert sorted(os.listdir(words[0])) == sorted(pictured)
     assert "CONVERGED" in result.stdout
 
 

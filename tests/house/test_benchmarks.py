@@ -243,6 +243,7 @@ def test_an_information_state_takes_a_table_of_one_axis_less_than_it_has_states(
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*the grid is coarse:hjbjax.SolveWarning")  # a quick run's is
 def test_a_batch_gives_the_values_of_its_members(tmp_path):
     together, apart = rows_of(batch, tmp_path)
     assert (together["code"], apart["code"]) == ("solve_batch", "solve")

@@ -172,7 +172,7 @@ def test_lanes_keep_single_precision():
     assert not jax.config.jax_enable_x64
 
 
-@pytest.mark.filterwarnings("ignore:the grid is coarse")
+@pytest.mark.filterwarnings("ignore:.*the grid is coarse")
 def test_lanes_without_discount_take_the_way_that_a_solve_takes():
     """From zero they would be caught by policies that stay where they are, at a cost."""
     questions = [hjb.zoo.pendulum(g=g, shape=(20, 21))[0] for g in (9.0, 10.0, 11.0)]
@@ -216,3 +216,12 @@ def test_an_exception_of_a_lane_ends_the_batch_with_the_lanes_before(monkeypatch
     monkeypatch.setattr(batch, "solve_on_host", broken)
     with pytest.raises(MemoryError, match="memory ran out: no more"):
         hjb.solve_batch([problem(0.0, beta) for beta in (1.0, 2.0, 3.0)], GRID, scheme=hjb.Upwind())
+
+
+def test_warnings_of_lanes_side_by_side_name_them_at_the_line_of_the_call(monkeypatch):
+    monkeypatch.setattr(batch, "_fills_with_lanes", lambda: False)
+    line = hjb.Grid([-1.0], [1.0], (41,))
+    with pytest.warns(hjb.SolveWarning, match="cannot reach the target") as caught:
+        hjb.solve_batch([lost(0.5), lost(2.0), lost(3.0)], line, scheme=hjb.Upwind())
+    assert sorted(str(each.message)[:7] for each in caught) == ["lane 1:", "lane 2:"]
+    assert {each.filename for each in caught} == {__file__}

@@ -11,7 +11,7 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Any
 
@@ -36,8 +36,9 @@ class Stopped(Exception):
 class Clock:
     """The limits of a run, the time it has taken, that of its steps apart, and whether it was interrupted.
 
-    ``phase`` says how far it came, as in "the survey of the nodes". ``per_node`` is the seconds that a step took at a
-    node in the last chunk, from grid to grid; None before the first.
+    ``phase`` says how far it came, as in "the survey of the nodes"; ``tell``, if there is one, is called with each new
+    one. ``per_node`` is the seconds that a step took at a node in the last chunk, from grid to grid; None before the
+    first.
     """
 
     def __init__(self, max_steps: int = 10**9, seconds: float | None = None, progress: bool | None = None):
@@ -45,7 +46,19 @@ class Clock:
         self.seconds = math.inf if seconds is None else seconds
         self.began, self.stepping, self.interrupted = time.perf_counter(), 0.0, False
         self.per_node: float | None = None
+        self.tell: Callable[[str], object] | None = None
         self.phase = "the checks"
+
+    @property
+    def phase(self) -> str:
+        """How far the run came."""
+        return self._phase
+
+    @phase.setter
+    def phase(self, phase: str) -> None:
+        self._phase = phase
+        if self.tell is not None:
+            self.tell(phase)
 
     def elapsed(self) -> float:
         """Seconds since the run began."""

@@ -90,7 +90,7 @@ def solve_batch(
     grid.check_spacings(kind)
     solutions: list[Any] = [None] * len(lanes)
     clock = Clock(max_steps or 10**9, time_limit, progress)
-    with noting_interrupts(clock), jax.enable_x64(kind == np.float64):
+    with noting_interrupts(clock), host_loop.telling(clock), jax.enable_x64(kind == np.float64):
         for members in _same_program(lanes):
             first = lanes[members[0]]
             # without nesting, whose levels the host drives one by one

@@ -87,7 +87,7 @@ def march(
       dtype: ``None`` is float64; ``"float32"`` for memory and accelerators.
       time_limit: at most so many seconds, checks and compilation included.
       throw: raise when the march does not come to its end; otherwise the status says it.
-      progress: a progress bar; ``None`` shows it on a terminal after one second.
+      progress: say each phase as it begins, and show a bar of the steps after a second; ``None``: on a terminal.
       max_memory: bytes that the march may take, instead of what is free.
 
     Returns:
@@ -124,7 +124,7 @@ def march(
     grid.check_spacings(kind)
     clock = Clock(seconds=time_limit, progress=progress)
     # float64 for this call alone: the caller's own programs, and other threads, keep the type they have
-    with noting_interrupts(clock), jax.enable_x64(kind == np.float64):
+    with noting_interrupts(clock), host_loop.telling(clock), jax.enable_x64(kind == np.float64):
         # before anything is compiled: a grid that does not fit is refused within a second
         needed = memory.fitting(_bytes(problem, grid, kept, method, kind), grid, max_memory)
         on = Discretisation(problem, grid, scheme, kind)

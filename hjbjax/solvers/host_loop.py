@@ -86,11 +86,7 @@ def drive(run: Run, clock: Clock) -> Status:
         try:
             chunk = run.first_chunk(clock)
             clock.phase = f"compiling for {run.name}"
-            if bar is not None:
-                bar.set_description_str(clock.phase)  # at once: it takes a second or more, and no step shows it
             run.compile()
-            if bar is not None:
-                bar.set_description_str(run.bar["desc"], refresh=False)
             while (status := run.between(status, clock)) is Status.RUNNING:
                 began, before = time.perf_counter(), run.steps
                 status = _stop_status(run, clock)
@@ -127,14 +123,25 @@ def _stop_status(run: Run, clock: Clock) -> Status:
 
 
 @contextlib.contextmanager
+def telling(clock: Clock) -> Iterator[None]:
+    """Context in which a terminal shows each phase of a run as it begins, above the bar of its steps."""
+    with progress_bar(clock.progress, {"bar_format": "{desc}", "desc": clock.phase, "delay": 0}) as line:
+        clock.tell = None if line is None else line.set_description_str
+        try:
+            yield
+        finally:
+            clock.tell = None
+
+
+@contextlib.contextmanager
 def progress_bar(progress: bool | None, options: dict[str, Any]) -> Iterator[Any]:
-    """A progress bar on a terminal after one second; None elsewhere."""
+    """A progress bar on a terminal, after one second if ``options`` name no other delay; None elsewhere."""
     if progress is False or (progress is None and not sys.stderr.isatty()):
         yield None
         return
     from tqdm import tqdm
 
-    with tqdm(delay=1, leave=False, **options) as bar:
+    with tqdm(**{"delay": 1, "leave": False, **options}) as bar:
         yield bar
 
 

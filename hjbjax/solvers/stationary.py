@@ -88,7 +88,7 @@ def solve(
       time_limit: at most so many seconds, checks and compilation included; what cannot be cut, as one compilation or
         one step, is let come to its end.
       throw: raise when the solve does not converge; otherwise the status says it.
-      progress: a progress bar; ``None`` shows it on a terminal after one second.
+      progress: say each phase as it begins, and show a bar of the steps after a second; ``None``: on a terminal.
       max_memory: bytes that the solve may take, instead of what is free.
 
     Returns:
@@ -122,14 +122,14 @@ def solve(
     grid.check_spacings(kind)
     clock = Clock(max_steps or 10**9, time_limit, progress)
     if isinstance(scheme, PathScheme):
-        with noting_interrupts(clock), jax.enable_x64(kind == np.float64):
+        with noting_interrupts(clock), host_loop.telling(clock), jax.enable_x64(kind == np.float64):
             options: Any = {"method": method, "tol": tol, "guess": guess, "max_memory": max_memory}
             solution = semi_lagrangian.solve_on_host(problem, grid, scheme, kind, clock=clock, **options)
         return _ended(with_last_phase(solution, clock), clock, tol, throw=throw)
     free, method = method is None, choose(problem, grid, traced=False, method=method)
     on, sharpen = Discretisation(problem, grid, scheme or Upwind(subcell=True), kind), scheme is None
     # float64 for this call alone: another thread, and the caller's own programs, keep theirs
-    with noting_interrupts(clock), jax.enable_x64(kind == np.float64):
+    with noting_interrupts(clock), host_loop.telling(clock), jax.enable_x64(kind == np.float64):
         needed = memory.require(problem, grid, method, kind, max_memory)
         with host_loop.with_solution(clock, needed, lambda kept: _partial(on, kept)):
             solution = with_last_phase(solve_on_host(on, method, tol, guess, clock, sharpen=sharpen, free=free), clock)

@@ -232,7 +232,9 @@ def test_silent_where_there_is_no_terminal(capfd):
 def test_progress_when_asked_for_and_when_not(capfd):
     hjb.solve(**endless(), time_limit=2.0, throw=False, progress=True)
     said = capfd.readouterr().err
-    assert said.index("compiling for") < said.index("error")
+    phases = ("the checks", "the survey of the nodes", "the preparation of", "compiling for", "error")
+    assert sorted(phases, key=said.index) == list(phases)
+    assert said.rstrip(" ").endswith("\r")  # all of it is wiped out at the end
     hjb.solve(**endless(), time_limit=1.5, throw=False, progress=False)
     assert capfd.readouterr().err == ""
 

@@ -14,7 +14,7 @@ import hjbjax as hjb
 from benchmarks import cases
 from benchmarks.__main__ import NAMES
 from benchmarks.harness import footprint, thresholds, timing
-from benchmarks.speed import batch, controls, growth, information, peers, scaling, startup, sweep
+from benchmarks.speed import batch, controls, gradients, growth, information, peers, scaling, startup, sweep
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.rates import fastest_rate
 from hjbjax.problem.pytree import cast
@@ -35,7 +35,7 @@ def rows_of(benchmark, folder, *options):
 
 
 def test_every_name_leads_to_a_command():
-    for module in (sweep, peers, growth, scaling, controls, information, batch, startup):
+    for module in (sweep, peers, growth, scaling, controls, information, batch, startup, gradients):
         _, folder, name = module.__name__.split(".")
         assert NAMES[name][0] == folder
         assert CliRunner().invoke(module.command, ["--help"]).exit_code == 0

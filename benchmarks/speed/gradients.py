@@ -21,10 +21,12 @@ from benchmarks.harness.report import RESULTS, attempt, publish, table
 from benchmarks.harness.timing import interleaved
 
 COLUMNS = (
-    "problem", "numbers", "shape", "seconds", "grad_seconds", "over_solve", "over_host", "difference", "bytes", "status",
+    "problem", "numbers", "shape", "seconds", "grad_seconds", "over_solve", "over_host", "difference", "bytes",
+    "status",
 )  # fmt: skip
 TOL, RELATIVE = 1e-10, 1e-6
 MORE_STEPS = 10_000
+STEP = 1e-5  # relative: so small that the branches of a limited slope, and of a minimum, stay what they are
 
 Question = tuple[hjb.Problem, hjb.Grid]
 
@@ -100,7 +102,7 @@ def differences(function: Callable[[np.ndarray], Any], at: np.ndarray) -> np.nda
         near, far = ((float(function(at + k * e)) - float(function(at - k * e))) / (2 * k) for k in (1, 2))
         return (4 * near - far) / 3
 
-    return np.array([slope(step * e) / step for e, step in zip(np.eye(at.size), 1e-4 * np.abs(at), strict=True)])
+    return np.array([slope(step * e) / step for e, step in zip(np.eye(at.size), STEP * np.abs(at), strict=True)])
 
 
 def memory(case: Case, at: np.ndarray, nodes: int, steps: int) -> int:

@@ -311,8 +311,8 @@ class Look:
             later = altered(task.problem, discount=task.problem.discount + _shift(task, state))
             return evaluate(evaluation, task.asking(later).equation(state.value, state.policy), task.grid)
         if task.problem.is_game:
-            left, outer = state.bound.residual, (state.value, state.policy)
-            return methods.evaluated(task, *outer, evaluation, residual=left, replies=replies) - state.value
+            outer, goal = (state.value, state.policy), methods.inner_goal(state.bound.residual, state.best[1])
+            return methods.evaluated(task, *outer, evaluation, goal=goal, replies=replies) - state.value
         return evaluate(evaluation, self.equation(), task.grid)
 
 

@@ -37,8 +37,9 @@ What it returns is traced, and the method goes into compiled programs as a pytre
 looks after the rest: the certificate, the constraints, and steps that lead nowhere.
 
 In a game the value of a policy is that of the inner player's problem against it (``evaluated``): the inner player
-answers, the answer is evaluated, and so on until the residual of that problem is a tenth of the outer one's; then the
-outer player improves. Improving both at once may cycle. After A. J. Hoffman and R. M. Karp.
+answers, the answer is evaluated, and so on until the residual of that problem is a tenth of the outer one's, or a
+millionth once the outer one has risen; then the outer player improves. Improving both at once may cycle. After A. J.
+Hoffman and R. M. Karp.
 """
 
 from typing import Protocol, runtime_checkable
@@ -54,7 +55,10 @@ from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import Field, Number, Scalar
 
 CLIMB = 100_000  # steps of value iteration without progress: without discount V climbs by L Δt a step for long
-SHARE = 0.1  # of the outer residual: a better answer to a policy that is about to change is work for nothing
+# Of the outer residual that of the inner problem: a better answer to a policy that is about to change is work for
+# nothing, while the outer residual falls. Where it rose the inner player was far from its optimum, since its residual
+# counts for up to (Q + β)/β times as much in V: improving against that may go on for ever.
+SHARE, EXACT = 0.1, 1e-6
 
 
 class Step(Protocol):
@@ -259,8 +263,13 @@ class Question(Protocol):
         """The largest |source| at the nodes that count, in cost units."""
 
 
+def inner_goal(residual: Number, least: Number) -> Scalar:
+    """The residual, cost units, with which the inner problem is done, from the outer one's and the least so far."""
+    return jnp.where(residual > least, EXACT, SHARE) * residual
+
+
 def evaluated(
-    question: Question, value: Field, policy: Greedy, evaluation: Evaluation, *, residual: Number, replies: int
+    question: Question, value: Field, policy: Greedy, evaluation: Evaluation, *, goal: Number, replies: int
 ) -> Field:
     """The value of the outer player's policy from its inner player's problem.
 
@@ -269,7 +278,7 @@ def evaluated(
       value: V, (*grid).
       policy: both players' greedy actions at V.
       evaluation: how the linear equation of a pair of policies is solved.
-      residual: that of the outer problem at V, of which a tenth is the goal.
+      goal: the residual of the inner problem that ends it, in cost units.
       replies: at most so many answers of the inner player.
     """
 
@@ -282,7 +291,7 @@ def evaluated(
         return value, policy, question.residual(question.equation(value, policy)), count + 1
 
     def unfinished(carry):
-        return (carry[2] > SHARE * residual) & (carry[3] < replies)
+        return (carry[2] > goal) & (carry[3] < replies)
 
     # infinite: the outer player's policy is evaluated once at least, against the answer that it was found with
     start = (value, policy, jnp.asarray(jnp.inf, value.dtype), jnp.zeros((), jnp.int32))

@@ -316,17 +316,17 @@ class ImplicitStep:
             return policy, bound.residual, (bound.error <= tol) | (bound.residual <= rounding)
 
         def unfinished(carry):
-            _, _, residual, done, count = carry
+            _, _, residual, done, _, count = carry
             return ~done & (count < max_steps) & jnp.isfinite(residual)  # a NaN is the march's to report
 
         def improve(carry):
-            value, policy, residual, _, count = carry
-            value = self._evaluated(value, policy, residual, evaluation)
-            return value, *look(value), count + 1
+            value, policy, residual, _, least, count = carry
+            value = self._evaluated(value, policy, methods.inner_goal(residual, least), evaluation)
+            return value, *look(value), jnp.minimum(least, residual), count + 1
 
         start = self.impose(value)  # V at t is a guess for W that is wrong by O(Δt) only
-        carry = (start, *look(start), jnp.zeros((), jnp.int32))
-        value, policy, _, done, _ = jax.lax.while_loop(unfinished, improve, carry)
+        carry = (start, *look(start), jnp.asarray(jnp.inf, start.dtype), jnp.zeros((), jnp.int32))
+        value, policy, _, done, _, _ = jax.lax.while_loop(unfinished, improve, carry)
         return value, policy, done
 
     def _complete(self, policy: Greedy) -> Greedy:
@@ -334,8 +334,8 @@ class ImplicitStep:
         # V/Δt is no part of the problem's cost: it is the same for all actions, and chooses none
         return dataclasses.replace(policy, defect=jnp.where(self.obstacles.fixed, 0, policy.defect + self.arriving))
 
-    def _evaluated(self, value: Field, policy: Greedy, residual: Number, evaluation: Evaluation) -> Field:
+    def _evaluated(self, value: Field, policy: Greedy, goal: Number, evaluation: Evaluation) -> Field:
         """The value of the policy, roughly; in a game of the outer player's."""
         if self.on.problem.is_game:
-            return methods.evaluated(self, value, policy, evaluation, residual=residual, replies=REPLIES)
+            return methods.evaluated(self, value, policy, evaluation, goal=goal, replies=REPLIES)
         return self.impose(value + evaluate(evaluation, self.equation(value, policy), self.grid))

@@ -148,6 +148,66 @@ def remembered(function: Callable[..., T]) -> Callable[..., T]:
     return ask
 
 
+def as_one_program(function: Callable[P, T]) -> Callable[P, T]:
+    """Decorator of a function of pytrees that hold tracers: one compiled program, and one more for its derivative.
+
+    ``grad`` and ``vmap`` without ``jit`` compile and run operation by operation. Numbers that are known stay known,
+    those that come back as well, and belong to the program; the tracers are its arguments.
+    """
+
+    @jax.jit
+    def run(given: "_PartlyTraced") -> "_PartlyTraced":
+        arguments, options = given.tree()
+        return _PartlyTraced.of(function(*arguments, **options))
+
+    @functools.wraps(function)
+    def called(*arguments: P.args, **options: P.kwargs) -> T:
+        return run(_PartlyTraced.of((arguments, options))).tree()
+
+    return called
+
+
+@jax.tree_util.register_pytree_node_class
+class _PartlyTraced:
+    """A pytree whose leaves are the tracers in another one; the numbers that are known belong to its structure."""
+
+    def __init__(self, known: "_Known", traced: Iterable[Any]):
+        self.known, self.traced = known, tuple(traced)
+
+    @classmethod
+    def of(cls, tree: Any) -> "_PartlyTraced":
+        leaves, structure = jax.tree.flatten(tree)
+        known = tuple(None if is_traced(leaf) else leaf for leaf in leaves)
+        return cls(_Known(structure, known), filter(is_traced, leaves))
+
+    def tree(self) -> Any:
+        """The whole tree."""
+        others = iter(self.traced)
+        leaves = [next(others) if leaf is None else leaf for leaf in self.known.leaves]
+        return jax.tree.unflatten(self.known.structure, leaves)
+
+    def tree_flatten(self) -> tuple[tuple, "_Known"]:
+        return self.traced, self.known
+
+    @classmethod
+    def tree_unflatten(cls, known: "_Known", traced: Iterable[Any]) -> "_PartlyTraced":
+        return cls(known, traced)
+
+
+class _Known:
+    """The structure of a tree and some of its leaves, equal to another by the bits of the numbers."""
+
+    def __init__(self, structure: Any, leaves: tuple):
+        self.structure, self.leaves = structure, leaves
+        self.key = (structure, tuple(leaf if leaf is None else _digest(leaf) for leaf in leaves))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Known) and self.key == other.key
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+
 def _digest(leaf: Numbers) -> tuple[Any, ...]:
     """Type, shape, dtype and a digest of the bits of a leaf: equal for equal leaves."""
     array = np.ascontiguousarray(leaf)  # bits, as NaN equals no NaN and every look would be new

@@ -25,7 +25,7 @@ from hjbjax.markov_chain import admissibility, memory, node_checks
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import altered, cast, is_traced
+from hjbjax.problem.pytree import altered, as_one_program, cast, is_traced
 from hjbjax.problem.sets import Box
 from hjbjax.problem.types import Array, DType, Mask, Nodes, Scalar
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
@@ -293,6 +293,7 @@ def _blow_up_nodes(on: Discretisation, share: float | None) -> Mask | None:
     return jnp.asarray(grid.inner(share))
 
 
+@as_one_program
 def _march_traced(
     on: Discretisation, horizon: float, kept: np.ndarray, start: Nodes | None, method: TimeMethod, step: float | None
 ) -> Solution:

@@ -259,6 +259,9 @@ def forced_only(task: Task, clock: Clock) -> tuple[Task, Mask | None]:
     held = np.asarray(task.obstacles.fixed)
     if not task.problem.is_game or task.constrained or np.asarray(task.problem.discount) > 0 or not held.any():
         return task, None
+    # who keeps away from the target, and pays for it, may leave a finite cost
+    if task.certificate is not Certificate.MULTIPLICATIVE:
+        return task, None
     reached = attainability.forced(task.on, held, least=_least_rate(task), clock=clock)
     if reached.all():
         return task, reached

@@ -24,7 +24,7 @@ from hjbjax.markov_chain import admissibility, memory, node_checks, resting
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_discounted
-from hjbjax.problem.pytree import altered, is_traced
+from hjbjax.problem.pytree import altered, as_one_program, is_traced
 from hjbjax.problem.types import DType, Nodes, Number, Scalar
 from hjbjax.solution import transfer
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
@@ -196,6 +196,7 @@ def solve_on_host(
     return solution
 
 
+@as_one_program
 def _solve_traced(
     on: Discretisation, method: Method | None, tol: Number, guess: Nodes | None, max_steps: int | None, *, sharpen: bool
 ) -> Solution:

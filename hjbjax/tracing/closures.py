@@ -192,10 +192,15 @@ class Marked:
 
 
 class Opened:
-    """A traced function of what it closed over, of the leaves it held, and of its arguments."""
+    """A traced function of what it closed over, of the leaves it held, and of its arguments.
+
+    It equals another that computes the same of them: the gradient of a loss compiles nothing in its second step.
+    """
 
     def __init__(self, jaxpr: jex.Jaxpr):
         self.jaxpr = jaxpr
+        mark, whole = fingerprint(jaxpr)
+        self.mark = mark if whole else self.jaxpr
 
     def __call__(self, known: tuple, *arguments: Any) -> Any:
         """The function's result, with ``known`` the numbers it closed over and its leaves."""
@@ -205,6 +210,12 @@ class Opened:
         return jax.core.eval_jaxpr(
             self.jaxpr, closed, *self._in_traced_dtypes((*leaves, *arguments), self.jaxpr.invars)
         )[0]
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Opened) and self.mark == other.mark
+
+    def __hash__(self) -> int:
+        return hash(self.mark)
 
     @staticmethod
     def _in_traced_dtypes(values: Iterable[Numbers], variables: Sequence[jex.Var]) -> list[jax.Array]:
@@ -304,5 +315,6 @@ def _trace(function: Partial, arguments: Sequence[jax.ShapeDtypeStruct]) -> tupl
 def _with_mark(function: Partial, closed: jex.ClosedJaxpr | None) -> Partial:
     """The function with the mark of its trace; where there is none it equals no other."""
     assert isinstance(function.func, Marked)
-    function.func.mark, function.func.whole = (object(), True) if closed is None else fingerprint(closed)
+    found = (object(), True) if closed is None else fingerprint(closed.jaxpr, closed.consts)
+    function.func.mark, function.func.whole = found
     return function

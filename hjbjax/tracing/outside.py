@@ -115,13 +115,13 @@ def code(function: Callable) -> object:
     return getattr(getattr(function, "__func__", function), "__code__", function)
 
 
-def fingerprint(closed: jex.ClosedJaxpr) -> tuple[Hashable, bool]:
+def fingerprint(jaxpr: jex.Jaxpr, consts: Iterable[Numbers] = ()) -> tuple[Hashable, bool]:
     """A mark of what a jaxpr computes, with every number that it holds, and whether the mark tells all.
 
     A jaxpr does not say what rules of derivatives compute, unless they are JAX's own.
     """
     account = _Account()
-    account.take(closed.jaxpr, closed.consts)
+    account.take(jaxpr, consts)
     return (account.digest.digest(), *account.callbacks), account.whole
 
 

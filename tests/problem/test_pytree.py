@@ -11,6 +11,7 @@ from hjbjax import Ball, Box, Finite, Grid, Problem
 from hjbjax.problem.pytree import (
     REMEMBERED,
     altered,
+    as_one_program,
     as_partial,
     cast,
     is_traced,
@@ -234,6 +235,33 @@ def test_while_traced_nothing_is_remembered():
     doubled = jax.jit(lambda x: twice(Record(x)) + twice(Record(x)))
     assert doubled(1.0) == 4.0
     assert len(asked) == 2
+
+
+def test_one_program_for_all_numbers_that_are_traced_and_each_that_is_known():
+    traces = []
+
+    @as_one_program
+    def scaled(record, power, unused=None):
+        traces.append(power)
+        return Record(power * record.value, scale=record.scale, kind=record.kind), unused
+
+    def ask(x, scale, power):
+        result, nothing = scaled(Record(x, scale=scale, kind="other"), power)
+        assert nothing is None
+        assert result.kind == "other"
+        # what was known and comes back is known still
+        assert isinstance(result.scale, np.ndarray)
+        return result.value * float(result.scale[0])
+
+    for x in (2.0, 3.0):
+        assert jax.grad(ask)(x, np.array([5.0]), 2) == 10
+        assert jax.vmap(ask, (0, None, None))(jnp.array([x]), np.array([5.0]), 2) == 10 * x
+    assert traces == [2, 2]  # of numbers, and of lanes of them
+    jax.grad(ask)(2.0, np.array([6.0]), 2)
+    jax.grad(ask)(2.0, np.array([5.0]), 3)
+    assert traces == [2, 2, 2, 3]
+    with jax.checking_leaks():
+        assert jax.grad(lambda x: ask(x, np.array([7.0]), 2))(2.0) == 14
 
 
 def test_a_copy_may_hold_what_the_checks_refuse():

@@ -373,6 +373,34 @@ def test_gradients_batches_and_compilation_see_what_is_closed_over():
     assert lanes[0] == pytest.approx(curved(0.7), abs=2e-6)
 
 
+@pytest.mark.parametrize("way", [jax.grad, jax.value_and_grad, lambda f: lambda a: jax.vmap(f)(jnp.stack([a, 2 * a]))])
+def test_a_transformation_without_jit_is_one_program_that_is_kept(way):
+    """The functions are new ones at every call, and so are the numbers: a loop over gradients, as people write it."""
+
+    def marched(a):
+        problem = hjb.Problem(lambda x, u: a * u, lambda x, u: x @ x, UNIT)
+        return hjb.march(problem, LINE, 0.5, step=0.05).value[0, 2]
+
+    for ask, many in ((curved, 60), (marched, 60)):
+        first, found = compiled(lambda ask=ask: way(ask)(jnp.asarray(1.3)))
+        assert first <= many  # by operations they were hundreds
+        again, other = compiled(lambda ask=ask: way(ask)(jnp.asarray(1.7)))
+        assert again == 0
+        for at, kept in ((1.3, found), (1.7, other)):
+            wanted = jax.jit(way(ask))(jnp.asarray(at))
+            jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), kept, wanted)
+
+
+def test_known_numbers_beside_traced_ones_belong_to_the_program():
+    def total(a, discount):
+        problem = hjb.Problem(lambda x, u: 0 * u, lambda x, u: a * x @ x, UNIT, discount=discount)
+        return hjb.solve(problem, LINE, scheme=hjb.Upwind()).value[2]
+
+    # the state rests where it is: V = a x²/β
+    for discount in (1.0, 2.0, 1.0):
+        assert jax.grad(total)(1.3, discount) == pytest.approx(0.36 / discount, rel=1e-5)
+
+
 def test_a_closure_beside_a_leaf_and_inside_a_march():
     def marched(a):
         problem = hjb.Problem(jax.tree_util.Partial(lambda b, x, u: b * u, a), lambda x, u: a * (x @ x), UNIT)
@@ -451,7 +479,8 @@ def test_rules_of_derivatives_that_a_jaxpr_does_not_tell():
 
 def test_rules_of_jax_are_known():
     def fingerprint_of(function):
-        return fingerprint(jax.make_jaxpr(function)(jnp.ones(2)))
+        closed = jax.make_jaxpr(function)(jnp.ones(2))
+        return fingerprint(closed.jaxpr, closed.consts)
 
     (first, whole), (again, _) = (fingerprint_of(lambda x: jax.nn.relu(x - 1.0)) for _ in range(2))
     assert whole

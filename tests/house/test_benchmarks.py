@@ -277,3 +277,13 @@ def test_sweep_and_the_dimensions(tmp_path):
     assert {row["kernel"] for row in timed} >= {"sweep", "loop", "improve", "step", "copy"}
     verdicts = [row for row in rows if "figure" in row]
     assert [bool(re.search("20\\^6", row["figure"])) for row in verdicts] == [True]
+
+
+@pytest.mark.slow
+def test_a_gradient_is_that_of_differences_and_keeps_no_step(tmp_path):
+    rows = rows_of(gradients, tmp_path, "--only", "pendulum, monotone", "--only", "stochastic LQ")
+    assert [row["problem"] for row in rows] == ["pendulum, monotone", "stochastic LQ"]
+    for row in rows:
+        assert 0 < row["difference"] <= gradients.RELATIVE
+        assert row["bytes"] == row["bytes_of_ten_steps"]
+        assert row["over_solve"] > 0

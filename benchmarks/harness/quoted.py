@@ -112,7 +112,12 @@ def of_the_rest(folder: Path) -> dict[str, Sequence[float]]:
         one(folder, "startup", problem="double-integrator", start=start)["seconds"] for start in ("cold", "cached")
     ]
     batch = one(folder, "batch", code="solve_batch")
+    gradients = [row["over_solve"] for row in rows_of(folder, "gradients") if "over_solve" in row]
     return {
+        "value and gradient of a solve over the value alone, compiled, of seven questions the least and the most": [
+            min(gradients),
+            max(gradients),
+        ],
         "`solve_batch` of 64 pendulums on 100 x 101, against one solve after the other": [batch["throughput"]],
         "seconds of `hjbjax solve double-integrator` from process start to pictures; with JAX's compile cache": starts,
     }

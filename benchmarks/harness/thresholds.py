@@ -62,6 +62,7 @@ THRESHOLDS = {
     "one grid": Threshold("first answers of the zoo, one grid over the default, the least", 1 / 1.2),
     "cold start": Threshold("process start to pictures, no cache", 12, unit=" s", most=True),
     "cached start": Threshold("process start to pictures, with the compile cache", 7, unit=" s", most=True),
+    "gradient": Threshold("value and gradient of a solve over its value, the most of seven", 3, 2, most=True),
     "batch": Threshold("solve_batch of 64 pendulums at 100 x 101, against one by one", 1.7, 10),
 }
 

@@ -30,6 +30,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import Ball, Box, Finite
 from hjbjax.problem.stretching import Sinh
+from hjbjax.solution.checkpoints import Checkpoint
 from hjbjax.solution.files import FileError
 from hjbjax.solution.solution import Solution, SolveError, load
 from hjbjax.solution.status import SolveWarning, Status
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Ball",
     "Box",
+    "Checkpoint",
     "Direct",
     "Eno2",
     "Explicit",

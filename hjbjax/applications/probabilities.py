@@ -22,12 +22,13 @@ from hjbjax.discretisation.schemes import Upwind
 from hjbjax.feedback.feedback import GridFeedback, Place, is_grid_feedback
 from hjbjax.iteration.methods import ValueIteration
 from hjbjax.markov_chain import attainability, memory, node_checks
+from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, is_traced
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solvers.finite_horizon import march
-from hjbjax.solvers.stationary import as_dtype, check_arguments, solve
+from hjbjax.solvers.stationary import check_arguments, solve
 from hjbjax.tracing import checks
 from hjbjax.tracing.interpreter import FallbackWarning
 
@@ -268,7 +269,7 @@ def _zero(*where: Place) -> jax.Array:
 def _count_staying(question: Problem, grid: Grid, options: dict) -> int:
     """The number of nodes at which some actions keep the state away from every end for ever; 0 while traced."""
     # the checks of ``solve``, in its order: the survey of all nodes must not be the first to meet a bad argument
-    scheme, kind = options.get("scheme", Upwind()), as_dtype(options.get("dtype"))
+    scheme, kind = options.get("scheme", Upwind()), arguments.as_dtype(options.get("dtype"))
     check_arguments(question, grid, options.get("method"), scheme, options["tol"])
     # as the docstring of the module says: then it is taken for granted that every pair must end
     if is_traced(question, grid):  # values of the problem's functions are needed, which there are none of

@@ -83,6 +83,8 @@ def list_problems(name: str | None) -> None:
 @click.option("--tol", type=Number(), help="Certified bound on the algebraic error, in cost units.")
 @click.option("--max-steps", type=Number(int), help="Stop after so many steps.")
 @click.option("--time-limit", type=Number(), help="Stop after so many seconds.")
+@click.option("--checkpoint", type=click.Path(path_type=Path), help="A file that keeps what is done, every minute.")
+@click.option("--resume", is_flag=True, help="Go on from the checkpoint, if it is there.")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder of the results; the problem's name if not given.")
 @click.option("--force", is_flag=True, help="Replace results that are there already.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of the screen.")
@@ -144,6 +146,8 @@ def solve(
             click.echo(f"path: {path}")
         without = "" if problem.controls is not None else "; no policy.png, as there are no controls"
         click.echo(f"wrote {', '.join(map(str, files))}{without}")
+    if (failure := solution.stats.get("checkpoint", "written")) != "written":
+        raise Failure(failure, 5)
     if code := CODES.get(solution.status.name, 3):
         raise Failure(f"{solution.status.name}: {solution.message or solution.status.message}", code)
 
@@ -275,8 +279,10 @@ def _solve(problem: "Problem", grid: "Grid", options: dict[str, Any]) -> "Soluti
     try:
         # no throw: what there is is saved and drawn also where it has not converged, and the exit code says so
         return hjb.solve(problem, grid, throw=False, **given)
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, FileExistsError) as error:
         raise Failure(error) from error
+    except hjb.FileError as error:
+        raise Failure(error, 5) from error
     except MemoryError as error:
         raise Failure(error, 6) from error
     except jax.errors.JaxRuntimeError as error:  # XLA has one type for all its faults, and the word in the text

@@ -4,14 +4,16 @@ Each takes the name of the argument as the user knows it, as in ``"solve: tol"``
 and what is wanted. Tracers pass: inside a JAX transformation no value can be looked at.
 """
 
+import contextlib
 import math
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.pytree import is_traced
-from hjbjax.problem.types import Key
+from hjbjax.problem.types import DType, Key
 
 T = TypeVar("T")
 
@@ -73,6 +75,29 @@ def random_key(given: Any, name: str, *, batch: bool = False) -> Key:
         wanted = "a JAX random key, a row of them" if batch else "one random key"
         raise ValueError(f"{name} is {got}, wanted {wanted}: key=jax.random.key(0), or another seed")
     return key
+
+
+def as_dtype(dtype: DType | None) -> np.dtype:
+    """The floating-point type that a user asked for; None is float64."""
+    # np.dtype reads many spellings, and raises TypeError at others
+    for kind in (np.dtype(np.float64), np.dtype(np.float32)):
+        with contextlib.suppress(TypeError):
+            if kind == (np.float64 if dtype is None else np.dtype(dtype)):
+                return kind
+    raise ValueError(f"dtype: got {dtype!r}, wanted 'float64' or 'float32'")
+
+
+def traced_dtype(dtype: DType | None, name: str) -> np.dtype:
+    """The floating-point type inside a JAX transformation; None is that of ``float`` there."""
+    if dtype is None:
+        return np.dtype(jnp.result_type(float))
+    kind = as_dtype(dtype)
+    if kind == np.float64 and kind != np.dtype(jnp.result_type(float)):  # JAX would go on in float32, and warn
+        raise ValueError(
+            f"{name}: got dtype={dtype!r} inside jit, vmap or grad, where JAX is set to 32 bits and a type cannot be "
+            "changed; put `with jax.enable_x64(True):` around the call of the transformed function"
+        )
+    return kind
 
 
 def keys_shape(keys: Any) -> tuple[int, ...]:

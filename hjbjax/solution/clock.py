@@ -38,7 +38,7 @@ class Clock:
 
     ``phase`` says how far it came, as in "the survey of the nodes"; ``tell``, if there is one, is called with each new
     one. ``per_node`` is the seconds that a step took at a node in the last chunk, from grid to grid; None before the
-    first.
+    first. ``journal`` is what keeps the parts that are done in a file, or None.
     """
 
     def __init__(self, max_steps: int = 10**9, seconds: float | None = None, progress: bool | None = None):
@@ -47,6 +47,7 @@ class Clock:
         self.began, self.stepping, self.interrupted = time.perf_counter(), 0.0, False
         self.per_node: float | None = None
         self.tell: Callable[[str], object] | None = None
+        self.journal: Any = None
         self.phase = "the checks"
 
     @property

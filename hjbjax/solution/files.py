@@ -86,7 +86,7 @@ def write(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray
         name; no half file is left.
     """
     path = os.path.realpath(
-        _with_suffix(path_of(path, "written"))
+        with_suffix(path_of(path, "written"))
     )  # through links: the file behind one is replaced, not the link
     check_place(path, force)  # before the arrays are written, and once more when the file is moved
     # A damaged table of contents may hide whole entries, and no checksum covers it: so the header has the list.
@@ -116,7 +116,7 @@ def write(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray
     _sync_folder(folder)
 
 
-def _with_suffix(path: str) -> str:
+def with_suffix(path: str) -> str:
     """The name with ``.npz``, as NumPy writes it, if it has no suffix and nothing has this name as it stands."""
     return path if os.path.splitext(path)[1] or os.path.lexists(path) or not path else path + ".npz"
 
@@ -172,7 +172,7 @@ def read(
     Raises:
       FileError: for every kind of bad file, before anything of the size that it claims is allocated.
     """
-    path = _with_suffix(path_of(path, "read"))
+    path = with_suffix(path_of(path, "read"))
     try:
         status = os.stat(path)
         if stat.S_ISDIR(status.st_mode):

@@ -27,6 +27,7 @@ from hjbjax.discretisation.schemes import Upwind
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import Method
 from hjbjax.markov_chain import admissibility, memory, node_checks
+from hjbjax.problem import arguments
 from hjbjax.problem.arguments import shown
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
@@ -38,7 +39,7 @@ from hjbjax.solvers import host_loop, nested
 from hjbjax.solvers.nested import Settled
 from hjbjax.solvers.result import finish, solution_at_start, with_grid_error, with_last_phase
 from hjbjax.solvers.setup import Assumptions, check_on_one_state, choose, choose_scheme, prepare_on_host
-from hjbjax.solvers.stationary import as_dtype, check_arguments, check_limits, solve_on_host
+from hjbjax.solvers.stationary import check_arguments, check_limits, solve_on_host
 from hjbjax.solvers.stationary_run import LanesRun, stacked, with_obstacles
 from hjbjax.tracing.closures import with_settled_functions
 
@@ -86,7 +87,7 @@ def solve_batch(
     check_limits(max_steps, time_limit)
     for lane in lanes:
         check_arguments(lane, grid, method, scheme, tol)
-    kind = as_dtype(dtype)
+    kind = arguments.as_dtype(dtype)
     grid.check_spacings(kind)
     solutions: list[Any] = [None] * len(lanes)
     clock = Clock(max_steps or 10**9, time_limit, progress)

@@ -28,13 +28,16 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, as_one_program, cast, is_traced
 from hjbjax.problem.sets import Box
 from hjbjax.problem.types import Array, DType, Mask, Nodes, Scalar
+from hjbjax.solution import checkpoints
+from hjbjax.solution.checkpoints import Checkpoint
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
+from hjbjax.solution.placement import Path
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop, march_run
 from hjbjax.solvers.result import solution_at_start, with_last_phase
 from hjbjax.solvers.setup import check_on_one_state, choose_evaluation, question
-from hjbjax.solvers.stationary import as_dtype, check_node_values, traced_dtype
+from hjbjax.solvers.stationary import check_node_values
 from hjbjax.tracing.closures import with_settled_functions
 
 PROBES = 33  # times at which a given step, and constrained ends, are held against a time-dependent problem
@@ -61,6 +64,8 @@ def march(
     throw: bool = True,
     progress: bool | None = None,
     max_memory: int | None = None,
+    checkpoint: Path | Checkpoint | None = None,
+    resume: bool = False,
 ) -> Solution:
     """March a finite-horizon problem backward from its terminal cost at t = horizon to t = 0.
 
@@ -89,6 +94,8 @@ def march(
       throw: raise when the march does not come to its end; otherwise the status says it.
       progress: say each phase as it begins, and show a bar of the steps after a second; ``None``: on a terminal.
       max_memory: bytes that the march may take, instead of what is free.
+      checkpoint: as in ``solve``, like ``resume``; the slices at kept times go into it.
+      resume: go on from that file if it is there, to the same bits; host level.
 
     Returns:
       The solution: ``value[i]`` is V(·, times[i]), shape (k, *grid), the policy likewise. One that stopped early
@@ -115,16 +122,21 @@ def march(
     _check(problem, grid, scheme, method, step, time_limit)
     horizon, kept = _times(horizon, times)
     if is_traced(problem, grid, method, start):
-        on = Discretisation(problem, grid, scheme, traced_dtype(dtype, "march"))
+        on = Discretisation(problem, grid, scheme, arguments.traced_dtype(dtype, "march"))
         return _march_traced(on, horizon, kept, start, method, step)
-    kind = as_dtype(dtype)
+    kind = arguments.as_dtype(dtype)
     if np.any(np.diff(kept.astype(kind)) <= 0):
         raise ValueError(f"march: two of the times {kept.tolist()} are the same number in {kind}; leave one out")
     check_node_values(start, grid, "march: start")
     grid.check_spacings(kind)
     clock = Clock(seconds=time_limit, progress=progress)
+    journal = checkpoints.journal(
+        checkpoint, (problem, grid), resume=resume, what="march", horizon=horizon, times=kept, start=start,
+        method=method, scheme=scheme, step=step, inner=inner, dtype=kind,
+    )  # fmt: skip
     # float64 for this call alone: the caller's own programs, and other threads, keep the type they have
-    with noting_interrupts(clock), host_loop.telling(clock), jax.enable_x64(kind == np.float64):
+    with noting_interrupts(clock), host_loop.telling(clock), jax.enable_x64(kind == np.float64), journal as file:
+        clock.journal = file
         # before anything is compiled: a grid that does not fit is refused within a second
         needed = memory.fitting(_bytes(problem, grid, kept, method, kind), grid, max_memory)
         on = Discretisation(problem, grid, scheme, kind)
@@ -147,6 +159,8 @@ def march(
     solution.stats.update(
         seconds=clock.stepping, compile_seconds=clock.elapsed() - clock.stepping, bytes=needed, horizon=horizon
     )
+    if clock.journal is not None:
+        solution.stats["checkpoint"] = clock.journal.failure or "written"
     if throw and solution.status is not Status.CONVERGED:
         raise SolveError(f"{solution.status.name}: {solution.message}", solution)
     return solution

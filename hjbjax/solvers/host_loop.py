@@ -75,12 +75,25 @@ class Run(Protocol):
     def keep(self, error: Exception) -> None:
         """Attach what was there before an exception to it."""
 
+    @property
+    def passing(self) -> bool:
+        """Whether its end is a guess for what follows, and nothing else."""
+
+    def saved(self) -> list[Any]:
+        """Its state for a checkpoint, as arrays in an order of its own."""
+
+    def restore(self, arrays: list[np.ndarray]) -> None:
+        """Go on from the arrays of ``saved``."""
+
 
 def drive(run: Run, clock: Clock) -> Status:
     """Drive a run in chunks of steps until it stops, the steps or the time run out, or Ctrl-C; its last status."""
     status = clock.over()
     if status is not None:
         return status
+    journal = clock.journal
+    if journal is not None and (done := journal.enter(run)) is not None:
+        return done
     status = Status.RUNNING
     with progress_bar(clock.progress, run.bar) as bar:
         try:
@@ -88,6 +101,8 @@ def drive(run: Run, clock: Clock) -> Status:
             clock.phase = f"compiling for {run.name}"
             run.compile()
             while (status := run.between(status, clock)) is Status.RUNNING:
+                if journal is not None:
+                    journal.keep(run)
                 began, before = time.perf_counter(), run.steps
                 status = _stop_status(run, clock)
                 if status is not Status.RUNNING:
@@ -106,6 +121,9 @@ def drive(run: Run, clock: Clock) -> Status:
         except Exception as error:
             run.keep(error)
             raise
+        else:
+            if journal is not None:
+                journal.leave(run, status)
     return status
 
 

@@ -99,6 +99,21 @@ class Slices:
         self.times[place] = float(t)
         self.first = place  # at last: an interrupt on the way leaves no slice half filled
 
+    def saved(self) -> list[np.ndarray]:
+        """The slices that are filled, and their number."""
+        filled = slice(self.first, None)
+        arrays = (self.times, self.value, self.policy, self.disturbance, self.cut, self.ends)
+        # copies: what is saved must not change when the march goes on
+        return [np.array(len(self.times) - self.first), *(array[filled].copy() for array in arrays)]
+
+    def restore(self, arrays: list[np.ndarray]) -> None:
+        """Take slices that were saved."""
+        filled, *own = arrays
+        self.first = len(self.times) - int(filled)
+        whole = (self.times, self.value, self.policy, self.disturbance, self.cut, self.ends)
+        for array, entries in zip(whole, own, strict=True):
+            array[self.first :] = entries
+
     def misses(self, t: Number) -> bool:
         """True if the time t, which the march came to, is not among the times that are kept."""
         return self.first > 0 and (self.first == len(self.times) or float(t) < self.times[self.first])
@@ -123,6 +138,7 @@ class MarchRun:
     """A march from one kept time to the next: its front, and the slices that are kept so far."""
 
     limit, longest = np.inf, 10**9  # of steps: none
+    passing = False
 
     def __init__(self, task: March, front: Front, kept: np.ndarray):
         self.task, self.front, self.slices = task, front, Slices(task, kept)
@@ -173,6 +189,16 @@ class MarchRun:
             if slices.first == 0:
                 return Status.CONVERGED
         return status
+
+    def saved(self) -> list[Any]:
+        """The slices that are kept, and the front."""
+        return [*self.slices.saved(), *jax.tree.leaves(self.front)]
+
+    def restore(self, arrays: list[np.ndarray]) -> None:
+        """Go on from a front that was saved."""
+        count = len(self.slices.saved())
+        self.slices.restore(arrays[:count])
+        self.front = jax.tree.unflatten(jax.tree.structure(self.front), map(jnp.asarray, arrays[count:]))
 
     def show(self, bar: Any) -> None:
         """Move the progress bar, which runs over the problem's own time."""

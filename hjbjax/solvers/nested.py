@@ -20,7 +20,7 @@ from hjbjax.markov_chain import resting
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import altered, known
 from hjbjax.problem.types import Mask, Nodes
-from hjbjax.solution import transfer
+from hjbjax.solution import nested_grids
 from hjbjax.solution.clock import Clock, Stopped
 from hjbjax.solution.status import Status
 from hjbjax.solvers.setup import Assumptions, assumptions_of, forced_only, linear_solve, prepare_jit
@@ -62,8 +62,8 @@ def start(
     for level, finer in zip(coarser, grids[1:], strict=True):
         state, _, _ = iterate(level, warm(level, value, clock), clock)
         if clock.over() is not None:
-            return transfer.prolong(_finite(level, state), level.grid, task.grid), []
-        value = transfer.prolong(_finite(level, state), level.grid, finer)
+            return nested_grids.prolong(_finite(level, state), level.grid, task.grid), []
+        value = nested_grids.prolong(_finite(level, state), level.grid, finer)
     return value, [grid.shape for grid in grids[:-1]]
 
 
@@ -101,7 +101,7 @@ def levels(task: Task, method: Method, clock: Clock, *, asked_again: bool) -> li
 
 def _below(grid: Grid, method: Method) -> Grid | None:
     """The next coarser grid, if it has as many nodes as the method wants of the coarsest."""
-    smaller = transfer.coarser(grid)
+    smaller = nested_grids.coarser(grid)
     return None if smaller is None or method.coarsest is None or smaller.size < method.coarsest else smaller
 
 
@@ -260,7 +260,7 @@ def coarser_answer(settled: Settled, clock: Clock) -> tuple[Grid, np.ndarray] | 
     if coarse is None or clock.over() is not None or (level := _on_coarser(task, coarse)) is None:
         return None
     value = _finite(task, settled.state)  # infinite values are imposed anew by what is lost
-    state, code, _ = iterate(level, transfer.restrict(value, fine, coarse).astype(value.dtype), clock)
+    state, code, _ = iterate(level, nested_grids.restrict(value, fine, coarse).astype(value.dtype), clock)
     if code is not Status.CONVERGED:
         return None
     return coarse, np.where(np.asarray(level.counted), np.asarray(state.value), np.inf)
@@ -268,7 +268,7 @@ def coarser_answer(settled: Settled, clock: Clock) -> tuple[Grid, np.ndarray] | 
 
 def _telling(fine: Grid) -> Grid | None:
     """The grid with half of the intervals on every axis, which tells the error of ``fine``; None where one has few."""
-    coarse = transfer.coarser(fine, FEWEST)
+    coarse = nested_grids.coarser(fine, FEWEST)
     halved = coarse is not None and all(few < many for many, few in zip(fine.shape, coarse.shape, strict=True))
     return coarse if halved else None
 

@@ -20,7 +20,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import is_traced
 from hjbjax.problem.sets import AdmissibleSet
 from hjbjax.problem.types import Array, Field, Mask, Nodes, Scalar
-from hjbjax.solution import grid_error, transfer
+from hjbjax.solution import nested_grids
 from hjbjax.solution.clock import CUT, Clock
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status, warn
@@ -104,12 +104,12 @@ def with_grid_error(solution: Solution, settled: Settled, coarser: tuple[Grid, n
     value, origin = np.asarray(solution.value), settled.origin
     if coarser is not None:
         coarse, before = coarser
-        change = grid_error.apart(transfer.restrict(value, solution.grid, coarse), before)
+        change = nested_grids.apart(nested_grids.restrict(value, solution.grid, coarse), before)
         order = FIRST if settled.note else CENTRAL
         if origin is not None:
-            gain = grid_error.apart(value, np.asarray(origin.state.value))
-            order = grid_error.order_of_slopes(solution.grid, coarse, change, gain, solution.policy)
-        found = grid_error.estimate(solution.grid, coarse, change, order)
+            gain = nested_grids.apart(value, np.asarray(origin.state.value))
+            order = nested_grids.order_of_slopes(solution.grid, coarse, change, gain, solution.policy)
+        found = nested_grids.estimated_error(solution.grid, coarse, change, order)
     elif origin is not None and settled.task.problem.noise is None:
         with np.errstate(invalid="ignore"):
             found = np.abs(value - np.asarray(origin.state.value))

@@ -4,7 +4,6 @@ At host level it validates, picks a method, drives the iteration from grid to gr
 same iteration runs with a fixed method and none of that, and its value and its policy are differentiable.
 """
 
-import contextlib
 import dataclasses
 import functools
 from typing import Any
@@ -26,8 +25,10 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_discounted
 from hjbjax.problem.pytree import altered, as_one_program, is_traced
 from hjbjax.problem.types import DType, Nodes, Number, Scalar
-from hjbjax.solution import transfer
+from hjbjax.solution import checkpoints, nested_grids
+from hjbjax.solution.checkpoints import Checkpoint
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
+from hjbjax.solution.placement import Path
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop, nested, semi_lagrangian
@@ -64,6 +65,8 @@ def solve(
     throw: bool = True,
     progress: bool | None = None,
     max_memory: int | None = None,
+    checkpoint: Path | Checkpoint | None = None,
+    resume: bool = False,
 ) -> Solution:
     """Solve a stationary problem on a grid.
 
@@ -90,6 +93,8 @@ def solve(
       throw: raise when the solve does not converge; otherwise the status says it.
       progress: say each phase as it begins, and show a bar of the steps after a second; ``None``: on a terminal.
       max_memory: bytes that the solve may take, instead of what is free.
+      checkpoint: a file that keeps what is done, every minute and at the end, or ``Checkpoint(path, every=)``.
+      resume: go on from that file if it is there, to the same bits; host level.
 
     Returns:
       The solution; NumPy arrays at host level. Inside ``jit``, ``vmap`` or ``grad`` its value and its policy are
@@ -100,6 +105,7 @@ def solve(
     Raises:
       ValueError: a question without an answer, or a bad argument.
       MemoryError: a grid that does not fit, before anything is compiled.
+      FileExistsError: a checkpoint that is there, without ``resume``; ``FileError``: one of another question.
       SolveError: no convergence, be it by Ctrl-C, with the partial solution as ``.solution``.
 
     Example:
@@ -115,21 +121,27 @@ def solve(
         if isinstance(scheme, PathScheme):
             raise ValueError(_at_host_level(scheme))
         scheme, sharpen = scheme or choose_traced_scheme(problem, method), scheme is None
-        on = Discretisation(problem, grid, scheme, traced_dtype(dtype, "solve"))
+        on = Discretisation(problem, grid, scheme, arguments.traced_dtype(dtype, "solve"))
         return _solve_traced(on, method, tol, guess, max_steps, sharpen=sharpen)
-    kind = as_dtype(dtype)
+    kind = arguments.as_dtype(dtype)
     check_node_values(guess, grid, "solve: the guess")
     grid.check_spacings(kind)
     clock = Clock(max_steps or 10**9, time_limit, progress)
+    journal = checkpoints.journal(
+        checkpoint, (problem, grid), resume=resume, what="solve", method=method, scheme=scheme, tol=tol, guess=guess,
+        dtype=kind,
+    )  # fmt: skip
     if isinstance(scheme, PathScheme):
-        with noting_interrupts(clock), host_loop.telling(clock), jax.enable_x64(kind == np.float64):
+        with noting_interrupts(clock), host_loop.telling(clock), jax.enable_x64(kind == np.float64), journal as kept:
+            clock.journal = kept
             options: Any = {"method": method, "tol": tol, "guess": guess, "max_memory": max_memory}
             solution = semi_lagrangian.solve_on_host(problem, grid, scheme, kind, clock=clock, **options)
         return _ended(with_last_phase(solution, clock), clock, tol, throw=throw)
     free, method = method is None, choose(problem, grid, traced=False, method=method)
     on, sharpen = Discretisation(problem, grid, scheme or Upwind(subcell=True), kind), scheme is None
     # float64 for this call alone: another thread, and the caller's own programs, keep theirs
-    with noting_interrupts(clock), host_loop.telling(clock), jax.enable_x64(kind == np.float64):
+    with noting_interrupts(clock), host_loop.telling(clock), jax.enable_x64(kind == np.float64), journal as kept:
+        clock.journal = kept
         needed = memory.require(problem, grid, method, kind, max_memory)
         with host_loop.with_solution(clock, needed, lambda kept: _partial(on, kept)):
             solution = with_last_phase(solve_on_host(on, method, tol, guess, clock, sharpen=sharpen, free=free), clock)
@@ -142,7 +154,7 @@ def _ended(solution: Solution, clock: Clock, tol: float, *, throw: bool) -> Solu
     """The solution with its times; raises ``SolveError`` where it did not converge and that was asked for."""
     solution.stats.update(
         seconds=clock.stepping, compile_seconds=clock.elapsed() - clock.stepping,
-        tol=tol,
+        tol=tol, **({} if clock.journal is None else {"checkpoint": clock.journal.failure or "written"}),
     )  # fmt: skip
     if throw and solution.status is not Status.CONVERGED:
         raise SolveError(f"{solution.status.name}: {solution.message}", solution)
@@ -155,7 +167,7 @@ def _partial(on: Discretisation, kept: host_loop.Kept | None) -> Solution:
         value = np.broadcast_to(np.zeros((), on.dtype), on.grid.shape)  # one zero seen everywhere takes no memory
     else:
         value, grid = kept
-        value = value if grid.shape == on.grid.shape else transfer.prolong(value, grid, on.grid)
+        value = value if grid.shape == on.grid.shape else nested_grids.prolong(value, grid, on.grid)
     return solution_at_start(on, value, Status.INTERRUPTED)
 
 
@@ -265,29 +277,6 @@ def _without_rests_to_leave(task: Task, state: State) -> tuple[State, Scalar]:
     )  # fmt: skip
     code = jnp.where(wrong, Status.STALLED, state.code).astype(state.code.dtype)
     return dataclasses.replace(state, bound=gap, code=code), wrong
-
-
-def as_dtype(dtype: DType | None) -> np.dtype:
-    """The floating-point type that a user asked for; None is float64."""
-    # np.dtype reads many spellings, and raises TypeError at others
-    for kind in (np.dtype(np.float64), np.dtype(np.float32)):
-        with contextlib.suppress(TypeError):
-            if kind == (np.float64 if dtype is None else np.dtype(dtype)):
-                return kind
-    raise ValueError(f"dtype: got {dtype!r}, wanted 'float64' or 'float32'")
-
-
-def traced_dtype(dtype: DType | None, name: str) -> np.dtype:
-    """The floating-point type inside a JAX transformation; None is that of ``float`` there."""
-    if dtype is None:
-        return np.dtype(jnp.result_type(float))
-    kind = as_dtype(dtype)
-    if kind == np.float64 and kind != np.dtype(jnp.result_type(float)):  # JAX would go on in float32, and warn
-        raise ValueError(
-            f"{name}: got dtype={dtype!r} inside jit, vmap or grad, where JAX is set to 32 bits and a type cannot be "
-            "changed; put `with jax.enable_x64(True):` around the call of the transformed function"
-        )
-    return kind
 
 
 def check_limits(max_steps: object, time_limit: object) -> None:

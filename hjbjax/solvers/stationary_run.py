@@ -49,6 +49,7 @@ def iterate(task: Task, guess: Nodes, clock: Clock, most: int | None = None) -> 
     iteration = StationaryRun(task, guess, clock.max_steps if most is None else min(most, clock.max_steps))
     if most is not None:
         iteration.name += ", on the way to a guess"
+        iteration.passing = most <= clock.max_steps
     status, state = host_loop.drive(iteration, clock), iteration.state
     # a run that ended before its first look still holds the guess as it came
     if status is Status.NONFINITE or status in CUT:
@@ -73,6 +74,7 @@ class StatesInChunks:
     """
 
     longest = HISTORY  # a chunk records the residuals of so many steps
+    passing = False
 
     def __init__(self, task: Any, state: Any, run: Callable[..., Any], guess: Nodes, limit: int):
         self.task, self.guess, self.limit = task, guess, limit
@@ -106,6 +108,18 @@ class StatesInChunks:
         if status is Status.INTERRUPTED:
             self._note()
         return status
+
+    def saved(self) -> list[Any]:
+        """The residuals so far and the leaves of the state."""
+        return [np.concatenate(self.residuals), *jax.tree.leaves(self.state)]
+
+    def restore(self, arrays: list[np.ndarray]) -> None:
+        """Go on from a state that was saved."""
+        residuals, *leaves = arrays
+        # copied to the device: a state is donated
+        on_device = [jax.device_put(leaf, may_alias=False) for leaf in leaves]
+        self.before = self.state = jax.tree.unflatten(jax.tree.structure(self.state), on_device)
+        self.residuals, self.steps = [residuals], int(self.state.step)
 
     def show(self, bar: Any) -> None:
         """Move the progress bar; the look is no step."""
@@ -238,6 +252,15 @@ class LanesRun:
     def show(self, bar: Any) -> None:
         """Move the progress bar."""
         bar.update(max(self.steps, 0) - bar.n)
+
+    passing = False
+
+    def saved(self) -> list[Any]:
+        """Nothing: lanes that run together have no checkpoint."""
+        return []
+
+    def restore(self, arrays: list[np.ndarray]) -> None:
+        """Nothing, likewise."""
 
     def keep(self, error: Exception) -> None:
         """Nothing: the lanes that were done before this round are what is left."""

@@ -12,7 +12,9 @@ hides it from those who look at the leaves of a problem. Here such numbers becom
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import hashlib
 import inspect
 import types
 from collections.abc import Callable, Iterable, Sequence
@@ -28,6 +30,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, as_partial, is_traced, with_suggestions
 from hjbjax.problem.types import DType, Numbers
 from hjbjax.tracing.outside import (
+    ADDRESS,
     FLOATS,
     NUMBERS,
     OfNumbers,
@@ -64,6 +67,25 @@ def settled(problem: Problem, n: int, dtype: DType | None = None) -> Problem:
     return altered(
         problem, **{name: _settled_inside(each, _shapes(problem, name, n), kind) for name, each in functions.items()}
     )
+
+
+def digest(problem: Problem, n: int) -> str:
+    """A digest of a settled problem, the same in every process: what its functions compute, and all its numbers."""
+    account = hashlib.blake2b(digest_size=16)
+    # outside of the caller's ``jit``: only what is known has a digest
+    with jax.core.eval_context(), jax.enable_x64(True):
+        for name in (*OF_ACTION, *OF_STATE):
+            function = getattr(problem, name)
+            account.update(f"{name} {type(function).__name__} ".encode())
+            if callable(function):
+                shapes = [jax.ShapeDtypeStruct(shape, np.float64) for shape in _shapes(problem, name, n)]
+                with contextlib.suppress(Exception):  # what cannot be traced is refused by the checks, which say why
+                    closed = jax.make_jaxpr(function)(*shapes)
+                    account.update(ADDRESS.sub("", repr(fingerprint(closed.jaxpr, closed.consts)[0])).encode())
+        account.update(repr((problem.isaacs, type(problem.controls), type(problem.disturbances))).encode())
+        for leaf in jax.tree.leaves(problem):
+            account.update(np.asarray(leaf, np.float64).tobytes())
+    return account.hexdigest()
 
 
 def settled_function(function: Callable, *shapes: tuple[int, ...]) -> Partial:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hjbjax import Grid
-from hjbjax.solution import grid_error
+from hjbjax.solution import nested_grids
 
 FINE, COARSE = Grid([-1.0] * 2, [1.0] * 2, (41, 41)), Grid([-1.0] * 2, [1.0] * 2, (21, 21))
 X = np.stack(np.meshgrid(np.linspace(-1, 1, 41), np.linspace(-1, 1, 41), indexing="ij"), -1)
@@ -14,11 +14,11 @@ STEADY, SIDES = np.ones((41, 41, 1)), np.where(X[..., :1] + X[..., 1:] > 0.01, 1
 
 
 def change(value, before):
-    return grid_error.apart(value[::2, ::2], before)
+    return nested_grids.apart(value[::2, ::2], before)
 
 
 def order_of(value, before, chain, policy):
-    return grid_error.order_of_slopes(FINE, COARSE, change(value, before), grid_error.apart(value, chain), policy)
+    return nested_grids.order_of_slopes(FINE, COARSE, change(value, before), nested_grids.apart(value, chain), policy)
 
 
 def answers(error, of_chain):
@@ -30,7 +30,7 @@ def answers(error, of_chain):
 def test_the_usual_order_is_between_those_of_kinks_and_of_smooth_values(order, share):
     error = H**order * (1 + X[..., 0] ** 2) / 10
     value, before = SMOOTH + error, (SMOOTH + 2**order * error)[::2, ::2]
-    found = grid_error.estimate(FINE, COARSE, change(value, before), grid_error.USUAL)
+    found = nested_grids.estimated_error(FINE, COARSE, change(value, before), nested_grids.USUAL)
     np.testing.assert_allclose(found[::2, ::2], share * error[::2, ::2], rtol=0.01)
 
 
@@ -41,7 +41,7 @@ def test_where_slopes_gain_nothing_and_the_policy_jumps_the_order_is_that_of_a_r
     error = 0.1 * np.abs(X[..., 0])
     (value, before), chain = answers(error, error + gain * 3 * error)
     order = order_of(value, before, chain, policy)
-    assert order == (grid_error.BROKEN if broken else grid_error.USUAL)
+    assert order == (nested_grids.BROKEN if broken else nested_grids.USUAL)
 
 
 @pytest.mark.parametrize("policy", [None, np.full((41, 41, 1), np.nan), np.zeros((41, 41, 0))])
@@ -49,7 +49,7 @@ def test_no_policy_jumps_nowhere(policy):
     error = 0.1 * np.abs(X[..., 0])
     (value, before), chain = answers(error, 4 * error)
     order = order_of(value, before, chain, policy)
-    assert order == grid_error.USUAL
+    assert order == nested_grids.USUAL
     assert order_of(SMOOTH, SMOOTH[::2, ::2], SMOOTH, SIDES) == order
 
 
@@ -59,7 +59,7 @@ def test_nodes_without_a_value_or_a_policy_count_for_nothing():
     lost, policy = X[..., 1] > 0.5, SIDES.copy()
     value[lost], before[lost[::2, ::2]], chain[lost], policy[lost] = np.inf, np.inf, np.inf, np.nan
     order = order_of(value, before, chain, policy)
-    assert order == grid_error.BROKEN
-    found = grid_error.estimate(FINE, COARSE, change(value, before), order)
+    assert order == nested_grids.BROKEN
+    found = nested_grids.estimated_error(FINE, COARSE, change(value, before), order)
     assert np.all(np.isfinite(found))
     assert np.all(found[lost & (X[..., 1] > 0.6)] == 0)

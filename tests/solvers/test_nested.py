@@ -57,7 +57,7 @@ PROBLEMS = {
 def test_what_is_known_of_every_second_node_is_what_a_preparation_finds_there(name):
     problem, grid = PROBLEMS[name]()
     task = task_of(problem, grid)
-    coarse = nested.transfer.coarser(grid)
+    coarse = nested.nested_grids.coarser(grid)
     found, made = nested._on_coarser(task, coarse), task_of(problem, coarse)
     assert found.grid.shape == made.grid.shape == tuple((n + 1) // 2 for n in grid.shape)
     for part in ("obstacles", "counted", "least_cost", "on"):
@@ -70,7 +70,7 @@ def test_the_fastest_rate_is_asked_for_on_every_grid():
     problem, grid = zoo.pendulum(discount=0.1, shape=(40, 41))
     on = Discretisation(problem, grid, SCHEME, KIND)
     task = prepare_on_host(on, method=hjb.ValueIteration(), tol=1e-3)[0]
-    found = nested._on_coarser(task, nested.transfer.coarser(grid))
+    found = nested._on_coarser(task, nested.nested_grids.coarser(grid))
     assert found.outflow.shape == (20, 21)
     assert float(np.max(found.outflow)) < 0.6 * float(np.max(task.outflow))  # half as many jumps per unit time
 
@@ -83,7 +83,7 @@ def test_a_coarser_grid_that_loses_the_target_is_none():
 
 def test_odd_intervals_are_prepared_anew_unless_nodes_are_lost():
     problem, grid = zoo.double_integrator(shape=(42, 42))
-    task, coarse = task_of(problem, grid), nested.transfer.coarser(grid)
+    task, coarse = task_of(problem, grid), nested.nested_grids.coarser(grid)
     found = nested._on_coarser(task, coarse)
     assert found.counted.shape == coarse.shape == (22, 22)
     assert nested._on_coarser(dataclasses.replace(task, has_lost=True), coarse) is None

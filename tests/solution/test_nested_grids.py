@@ -3,41 +3,41 @@
 import numpy as np
 
 import hjbjax as hjb
-from hjbjax.solution import transfer
+from hjbjax.solution import nested_grids
 
 
 def test_nodes_that_both_grids_have_keep_their_bits():
     fine = hjb.Grid([0.0, 0.0], [1.0, 2.0], (13, 9))
-    coarse = transfer.coarser(fine, 4)
+    coarse = nested_grids.coarser(fine, 4)
     assert coarse.shape == (7, 5)
     values = np.random.default_rng(1).normal(size=fine.shape)
-    np.testing.assert_array_equal(transfer.restrict(values, fine, coarse), values[::2, ::2])
+    np.testing.assert_array_equal(nested_grids.restrict(values, fine, coarse), values[::2, ::2])
 
 
 def test_a_cubic_is_met_between_the_nodes():
     fine = hjb.Grid([-1.0, 0.0], [1.0, 3.0], (14, 16))
-    coarse = transfer.coarser(fine, 4)
+    coarse = nested_grids.coarser(fine, 4)
     assert coarse.shape == (8, 9)
 
     def cubic(grid):
         x, y = np.moveaxis(grid.nodes(), -1, 0)
         return x**3 - 2 * x * y**2 + y**3 - 1
 
-    np.testing.assert_allclose(transfer.restrict(cubic(fine), fine, coarse), cubic(coarse), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(nested_grids.restrict(cubic(fine), fine, coarse), cubic(coarse), rtol=0, atol=1e-12)
 
 
 def test_a_period_has_no_end():
     fine = hjb.Grid([0.0], [2 * np.pi], (41,), periodic=(True,))
-    coarse = transfer.coarser(fine)
+    coarse = nested_grids.coarser(fine)
     assert coarse.shape == (21,)
-    found = transfer.restrict(np.sin(fine.nodes()[:, 0]), fine, coarse)
+    found = nested_grids.restrict(np.sin(fine.nodes()[:, 0]), fine, coarse)
     np.testing.assert_allclose(found, np.sin(coarse.nodes()[:, 0]), rtol=0, atol=2e-5)  # (3/128) h⁴, h = 2π/41
 
 
 def test_back_and_forth():
     fine = hjb.Grid([0.0, -1.0], [1.0, 1.0], (11, 12))
-    coarse = transfer.coarser(fine, 4)
+    coarse = nested_grids.coarser(fine, 4)
     plane = fine.nodes() @ [2.0, -3.0] + 1
     np.testing.assert_allclose(
-        transfer.prolong(transfer.restrict(plane, fine, coarse), coarse, fine), plane, rtol=0, atol=1e-12
+        nested_grids.prolong(nested_grids.restrict(plane, fine, coarse), coarse, fine), plane, rtol=0, atol=1e-12
     )

@@ -1,0 +1,273 @@
+"""Checkpoints: what a run had done when it was cut, in a file, and going on from there with the same bits.
+
+A run is a sequence of parts, each a computation in steps whose state holds all there is: coarser grids, the way to a
+guess, the monotone solve, the one of second order. What lies between two parts is computed again and comes to the same,
+on the same machine with the same versions; so the states of the parts that are done, and of the one under way, are all
+that a file has to hold. Files are written whole or not at all: whenever a run is killed there is the old one or the
+new one.
+"""
+
+import contextlib
+import dataclasses
+import hashlib
+import os
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Protocol
+
+import jax
+import numpy as np
+
+from hjbjax._version import __version__
+from hjbjax.problem import arguments
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.solution import files
+from hjbjax.solution.files import Expected, FileError
+from hjbjax.solution.placement import Path, check_place, path_of
+from hjbjax.solution.status import Status, warn
+from hjbjax.tracing import closures
+from hjbjax.tracing.outside import ADDRESS
+
+FORMAT, VERSION = "hjbjax.Checkpoint", 1
+SECONDS = 60.0  # between two writes
+KINDS = tuple(map(np.dtype, ("f8", "f4", "i8", "i4", "u4", "u1", "?")))  # of the arrays in a state
+# how a part ends that is not done: from there it goes on
+CUT_SHORT = (Status.INTERRUPTED, Status.TIME_LIMIT, Status.MAX_STEPS, Status.RUNNING)
+
+
+@dataclasses.dataclass(frozen=True)
+class Checkpoint:
+    """Where a run keeps what it has done, and how often.
+
+    Args:
+      path: the file; ``.npz`` is put behind a name without a suffix.
+      every: seconds between two writes; what is cut by hand or by a limit is written in any case.
+
+    Raises:
+      ValueError: a time that is not positive; infinity writes at the end alone.
+
+    Example:
+      >>> Checkpoint("run.npz", every=600.0)
+      Checkpoint(path='run.npz', every=600.0)
+    """
+
+    path: Path
+    every: float = SECONDS
+
+    def __post_init__(self):
+        arguments.positive(self.every, "Checkpoint: every", "in seconds", endless=True)
+
+
+class Part(Protocol):
+    """A computation in steps, as a checkpoint sees it."""
+
+    @property
+    def passing(self) -> bool:
+        """Whether its end is a guess for the part that follows, and nothing else."""
+
+    def saved(self) -> list[Any]:
+        """Its state, as arrays in an order of its own."""
+
+    def restore(self, arrays: list[np.ndarray]) -> None:
+        """Go on from the arrays of ``saved``."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Record:
+    """What is known of a part: its arrays, how it stands, and whether it is done.
+
+    A part that only led to a guess has no arrays any more when the next one has begun.
+    """
+
+    arrays: Sequence[np.ndarray]
+    status: Status
+    done: bool
+    passing: bool
+
+
+class Journal:
+    """The parts of a run: those that are done, and the one under way.
+
+    Args:
+      checkpoint: where it is kept, and how often.
+      asked: what was asked, as digests and words; a file that was made for anything else is refused.
+      records: those of an earlier process.
+    """
+
+    def __init__(self, checkpoint: Checkpoint, asked: Mapping[str, str], records: Sequence[Record] = ()):
+        self.checkpoint, self.asked, self.records = checkpoint, dict(asked), list(records)
+        self.failure: str | None = None  # why it could not be written
+        self._at = 0  # the part under way, or the one that comes next
+        self._written, self._changed, self._closed = time.monotonic(), False, False
+
+    def enter(self, part: Part) -> Status | None:
+        """Put a part to where it stood: how it ended if it is done, else None."""
+        if self._closed or self._at >= len(self.records):
+            return None
+        record = self.records[self._at]
+        if record.arrays:
+            self._check(part, record)
+            part.restore(list(record.arrays))
+        self._at += record.done
+        return record.status if record.done else None
+
+    def keep(self, part: Part) -> None:
+        """Write the state of the part under way, if it is time for that."""
+        if not self._closed and time.monotonic() - self._written >= self.checkpoint.every:
+            self._note(part, Status.RUNNING, done=False)
+            self.write()
+
+    def leave(self, part: Part, status: Status) -> None:
+        """Note the end of a part, or how far it came; after a cut nothing counts that follows."""
+        if self._closed:
+            return
+        # no more steps than these were to be taken on the way to a guess
+        done = status not in CUT_SHORT or (part.passing and status is Status.MAX_STEPS)
+        self._note(part, status, done=done)
+        self._at, self._closed = self._at + done, not done
+
+    def write(self) -> None:
+        """Write what has changed; where that fails the run goes on, with one warning."""
+        if not self._changed:
+            return
+        header = {
+            "format": FORMAT,
+            "version": VERSION,
+            "asked": self.asked,
+            "versions": versions(),
+            "parts": [
+                [int(each.status), each.done, each.passing, [[list(a.shape), a.dtype.str] for a in each.arrays]]
+                for each in self.records
+            ],
+        }
+        arrays = {name(i, j): array for i, each in enumerate(self.records) for j, array in enumerate(each.arrays)}
+        try:
+            files.write(self.checkpoint.path, header, arrays, force=True)
+        except (FileError, OSError) as error:
+            if self.failure is None:
+                warn(f"the run goes on without a checkpoint: {error}")
+            self.failure = str(error)
+        else:
+            self.failure, self._changed = None, False
+        self._written = time.monotonic()
+
+    def _note(self, part: Part, status: Status, *, done: bool) -> None:
+        """Record the state of the part under way, and forget those that led to where it began."""
+        before = [dataclasses.replace(each, arrays=()) if each.passing else each for each in self.records[: self._at]]
+        # of arrays on a CPU these are views: nothing is copied
+        arrays = [np.asarray(array) for array in jax.device_get(part.saved())]
+        self.records = [*before, Record(arrays, status, done, part.passing)]
+        self._changed = True
+
+    def _check(self, part: Part, record: Record) -> None:
+        """Refuse arrays that are not those of the part's state."""
+        wanted, found = ([(np.shape(a), np.asarray(a).dtype) for a in each] for each in (part.saved(), record.arrays))
+        # a leading axis may be of residuals, or of slices: of these there are as many as the run had come to
+        if [(shape[1:], kind) for shape, kind in wanted] != [(shape[1:], kind) for shape, kind in found]:
+            raise FileError(f"{self.checkpoint.path!s}: it holds another state than the run it is to go on with has")
+
+
+def name(part: int, array: int) -> str:
+    """The name of an array in a file."""
+    return f"part{part}_{array}"
+
+
+def versions() -> dict[str, str]:
+    """What the bits of an answer depend on beside the question."""
+    return {"hjbjax": __version__, "jax": jax.__version__, "device": str(jax.devices()[0].device_kind)}
+
+
+@contextlib.contextmanager
+def journal(
+    checkpoint: Path | Checkpoint | None, question: tuple[Problem, Grid], *, resume: bool, what: str, **others: Any
+) -> Iterator[Journal | None]:
+    """Context with the journal of a run, which is written at its end; None where there is to be none.
+
+    Args:
+      checkpoint: the file, or that and how often it is written.
+      question: the problem and its grid, for which a file must have been made.
+      resume: whether to go on from the file, if it is there.
+      what: the function that was called, for messages.
+      others: what else decides the answer.
+
+    Raises:
+      ValueError: ``resume`` without a checkpoint.
+      FileExistsError: the file is there, and ``resume`` is false.
+      FileError: the file cannot be read, or is that of another question.
+    """
+    if checkpoint is None:
+        if resume:
+            raise ValueError(f"{what}: resume=True goes on from a checkpoint; give checkpoint=, the file")
+        yield None
+        return
+    kept = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(checkpoint)
+    kept = dataclasses.replace(kept, path=_place_of(kept.path))
+    question_of = asked(*question, **others)
+    records = _read(kept.path, question_of) if os.path.lexists(kept.path) and resume else []
+    if os.path.lexists(kept.path) and not resume:
+        raise FileExistsError(f"{kept.path!s}: there is a checkpoint already; resume=True goes on from it")
+    found = Journal(kept, question_of, records)
+    try:
+        yield found
+    finally:
+        found.write()
+
+
+def asked(problem: Problem, grid: Grid, **others: Any) -> dict[str, str]:
+    """What a run is asked, by digests and words: of a settled problem, its grid and what else decides the answer."""
+    about = (
+        grid.shape,
+        grid.periodic,
+        grid.edges,
+        [each and (each.strength, each.center) for each in grid.stretch or ()],
+    )
+    ends = np.concatenate([np.asarray(grid.lo, np.float64), np.asarray(grid.hi, np.float64)])
+    found = {"the problem": closures.digest(problem, grid.ndim), "the grid": f"{about} from {ends.tobytes().hex()}"}
+    for word, thing in others.items():
+        array = isinstance(thing, (np.ndarray, jax.Array))
+        said = hashlib.blake2b(np.asarray(thing).tobytes(), digest_size=16).hexdigest() if array else repr(thing)
+        found[word] = ADDRESS.sub("", said)
+    return found
+
+
+def _place_of(path: Path) -> str:
+    """The file of a checkpoint, in a folder where it can be written; that is known before anything is computed."""
+    place = files.with_suffix(path_of(path, "written"))
+    folder = os.path.dirname(os.path.abspath(place))
+    if not os.path.isdir(folder) or not os.access(folder, os.W_OK):
+        raise FileError(f"{place}: cannot be written: {folder} is no folder in which one may write")
+    check_place(place, force=True)
+    return place
+
+
+def _read(path: Path, asked: Mapping[str, str]) -> list[Record]:
+    """The records in a file, which must be of the same question."""
+
+    def rebuild(header: dict, arrays: dict[str, np.ndarray]) -> list[Record]:
+        if other := sorted(
+            key for key in asked.keys() | header["asked"].keys() if asked.get(key) != header["asked"].get(key)
+        ):
+            raise FileError(
+                f"it is the checkpoint of another run: {', '.join(other)} differ{'s' * (len(other) == 1)}; "
+                "give another path, or take the file away"
+            )
+        if header["versions"] != versions():
+            warn(f"{path!s}: the checkpoint was made with {header['versions']}; the last bits of the answer may differ")
+        return [
+            Record([arrays[name(i, j)] for j in range(len(shapes))], Status(status), bool(done), bool(passing))
+            for i, (status, done, passing, shapes) in enumerate(header["parts"])
+        ]
+
+    return files.read(path, FORMAT, VERSION, _plan, rebuild)
+
+
+def _plan(header: dict) -> dict[str, Expected]:
+    """Shapes and dtypes of the arrays in a file, as its header has them."""
+    return {
+        name(i, j): Expected(
+            (tuple(map(int, shape)),), tuple(kind for kind in KINDS if kind.str == code), optional=False
+        )
+        for i, (_, _, _, arrays) in enumerate(header["parts"])
+        for j, (shape, code) in enumerate(arrays)
+    }

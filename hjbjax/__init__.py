@@ -12,6 +12,7 @@ from hjbjax.applications.l2_gain import attenuation, saturation
 from hjbjax.applications.perturbations import perturbation_study
 from hjbjax.applications.probabilities import expected_exit_time, reach_probability, stay_probability
 from hjbjax.applications.reachability import avoid, from_hj_reachability, reach, reach_avoid
+from hjbjax.applications.resources import estimate
 from hjbjax.cli.compile_cache import keep_compiled
 from hjbjax.discretisation.schemes import Eno2, Limited, Upwind, Weno5
 from hjbjax.discretisation.semi_lagrangian import SemiLagrangian
@@ -77,6 +78,7 @@ __all__ = [
     "chain",
     "convergence_study",
     "dissipation",
+    "estimate",
     "expected_exit_time",
     "filtering",
     "from_hj_reachability",

@@ -36,8 +36,7 @@ from time import perf_counter
 import numpy as np
 
 from hjbjax.applications.l2_gain import Saturation, saturation
-from hjbjax.applications.level import Level, Trial
-from hjbjax.applications.undisturbed import comes_back
+from hjbjax.applications.level import Level, Trial, comes_back
 from hjbjax.discretisation.discretisation import Scheme
 from hjbjax.discretisation.schemes import Weno5
 from hjbjax.problem import arguments

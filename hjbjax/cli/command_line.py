@@ -6,9 +6,12 @@ import math
 import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, overload
+from typing import TYPE_CHECKING, Any, cast, overload
 
 import click
+
+if TYPE_CHECKING:
+    from hjbjax.zoo.entry import Entry
 
 
 class Failure(click.ClickException):
@@ -38,7 +41,7 @@ class OneLineGroup(click.Group):
             # not standalone, click raises in place of printing a usage block and ending the process itself
             code = super().main(args, prog_name, complete_var, False, **extra)
         except click.ClickException as error:
-            say(" ".join(error.format_message().split()))
+            say(" ".join((_for_a_parameter(error) or error.format_message()).split()))
             code = error.exit_code
         except (click.Abort, KeyboardInterrupt):
             say("interrupted")
@@ -54,6 +57,20 @@ class OneLineGroup(click.Group):
                     stream.flush()
             os._exit(code)  # JAX may still be at work, which the usual exit waits for, or crashes on
         sys.exit(code if isinstance(code, int) else 0)  # a command that ends well returns None
+
+
+def _for_a_parameter(error: click.ClickException) -> str | None:
+    """The message for a parameter of a problem that was given as an option of the command; None for other errors."""
+    if not isinstance(error, click.NoSuchOption):
+        return None
+    from hjbjax import zoo
+
+    name = error.option_name.lstrip("-").replace("-", "_")
+    if not any(name in entry.parameters for entry in zoo.catalogue.values()):
+        return None
+    return (
+        f"No such option '{error.option_name}'. A parameter of a problem is given by --set, as in --set {name}=VALUE."
+    )
 
 
 def say(line: str) -> None:
@@ -139,3 +156,43 @@ def unknown(what: str, got: str, allowed: Iterable[str]) -> str:
     )
     hint = f"; did you mean {near[0]!r}?" if near else ""
     return f"unknown {what} {got!r}; there are {', '.join(names)}{hint}"
+
+
+def parameters_of(entry: "Entry", settings: tuple[str, ...]) -> dict[str, Any]:
+    """The values of --set, each of the kind of its default."""
+    defaults = {key: value for key, value in entry.parameters.items() if key != "shape"}
+    chosen: dict[str, Any] = {}
+    for setting in settings:
+        key, equals, text = (part.strip() for part in setting.partition("="))
+        if not equals or not key or not text:
+            raise Failure(f"--set: got {setting!r}, wanted NAME=VALUE, as in --set {next(iter(defaults))}=2")
+        if key == "shape":
+            raise Failure("--set: the shape has an option of its own: --shape 200x201")
+        if key not in defaults:
+            raise Failure("--set: " + unknown(f"parameter of {entry.name}", key, defaults))
+        if key in chosen:
+            raise Failure(f"--set: {key} is given twice")
+        chosen[key] = _value_of(key, text, defaults[key])
+    return chosen
+
+
+def _value_of(key: str, text: str, default: object) -> bool | float | tuple[float, ...]:
+    """The text of one --set as a value of its default's kind."""
+    if isinstance(default, bool):  # before int, of which bool is a subclass
+        if text.lower() not in ("true", "false"):
+            raise Failure(f"--set: got {key}={text}, wanted true or false")
+        return text.lower() == "true"
+    parts = text.split(",")
+    kind = int if isinstance(default, int) else float
+    numbers = tuple(finite(part, kind) for part in parts)
+    if default is None and len(parts) == 1 and (whole := finite(text, int)) is not None:
+        numbers = (whole,)  # what has no default may be a count
+    if None in numbers or (isinstance(default, tuple) and len(parts) != len(default)):
+        wanted = "a whole number" if kind is int else "a finite number"
+        if isinstance(default, tuple):
+            wanted = f"{len(default)} finite numbers with commas between them"
+        raise Failure(f"--set: got {key}={text}, wanted {wanted}")
+    if len(parts) > 1 and isinstance(default, (int, float)):
+        raise Failure(f"--set: got {key}={text}, wanted one number")
+    known = cast(tuple[float, ...], numbers)  # None has been refused
+    return known if len(parts) > 1 else known[0]

@@ -9,17 +9,18 @@ Exit codes: 0 done, 1 a check of ``doctor`` failed, 2 usage, 3 not converged, 4 
 """
 
 import contextlib
+import dataclasses
 import json
 import signal
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO, cast
+from typing import TYPE_CHECKING, Any, TextIO
 
 import click
 
 from hjbjax._version import __version__
-from hjbjax.cli.command_line import Failure, Name, Number, OneLineGroup, Shape, finite, say, unknown
+from hjbjax.cli.command_line import Failure, Name, Number, OneLineGroup, Shape, parameters_of, say
 
 if TYPE_CHECKING:  # for annotations alone: what is heavy is imported by the command that needs it
     from hjbjax.problem.grid import Grid
@@ -85,6 +86,7 @@ def list_problems(name: str | None) -> None:
 @click.option("--time-limit", type=Number(), help="Stop after so many seconds.")
 @click.option("--checkpoint", type=click.Path(path_type=Path), help="A file that keeps what is done, every minute.")
 @click.option("--resume", is_flag=True, help="Go on from the checkpoint, if it is there.")
+@click.option("--dry-run", is_flag=True, help="Say what it will take: bytes, programs, steps, seconds; solve nothing.")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder of the results; the problem's name if not given.")
 @click.option("--force", is_flag=True, help="Replace results that are there already.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of the screen.")
@@ -97,6 +99,7 @@ def solve(
     force: bool,
     as_json: bool,
     no_cache: bool,
+    dry_run: bool,
     **options: Any,
 ) -> None:
     """Solve the ready problem NAME; write solution.npz, value.png, policy.png and trajectory.png."""
@@ -104,7 +107,10 @@ def solve(
     from hjbjax.cli import compile_cache, run_folder
 
     entry = zoo.catalogue[name]
-    parameters = _parameters(entry, settings)
+    parameters = parameters_of(entry, settings)
+    if dry_run:
+        _estimate(*_build(entry, parameters, shape), options, as_json=as_json)
+        return
     out = Path(name) if out is None else out
     # refusals in the order of what they cost: words, folder, problem; the solve comes after all of them
     with _one_line_error(OSError, 2, "--out: "):
@@ -153,8 +159,10 @@ def solve(
 
 
 @contextlib.contextmanager
-def _one_line_error(kind: type[Exception], exit_code: int, prefix: str = "") -> Iterator[None]:
-    """An error of one kind, turned into one line and an exit code."""
+def _one_line_error(
+    kind: type[Exception] | tuple[type[Exception], ...], exit_code: int, prefix: str = ""
+) -> Iterator[None]:
+    """An error of one kind, or of some, turned into one line and an exit code."""
     try:
         yield
     except kind as error:
@@ -162,46 +170,6 @@ def _one_line_error(kind: type[Exception], exit_code: int, prefix: str = "") -> 
 
 
 # ------------------------------------------------------------------------------------- before the solve
-
-
-def _parameters(entry: "Entry", settings: tuple[str, ...]) -> dict[str, Any]:
-    """The values of --set, each of the kind of its default."""
-    defaults = {key: value for key, value in entry.parameters.items() if key != "shape"}
-    chosen: dict[str, Any] = {}
-    for setting in settings:
-        key, equals, text = (part.strip() for part in setting.partition("="))
-        if not equals or not key or not text:
-            raise Failure(f"--set: got {setting!r}, wanted NAME=VALUE, as in --set {next(iter(defaults))}=2")
-        if key == "shape":
-            raise Failure("--set: the shape has an option of its own: --shape 200x201")
-        if key not in defaults:
-            raise Failure("--set: " + unknown(f"parameter of {entry.name}", key, defaults))
-        if key in chosen:
-            raise Failure(f"--set: {key} is given twice")
-        chosen[key] = _value_of(key, text, defaults[key])
-    return chosen
-
-
-def _value_of(key: str, text: str, default: object) -> bool | float | tuple[float, ...]:
-    """The text of one --set as a value of its default's kind."""
-    if isinstance(default, bool):  # before int, of which bool is a subclass
-        if text.lower() not in ("true", "false"):
-            raise Failure(f"--set: got {key}={text}, wanted true or false")
-        return text.lower() == "true"
-    parts = text.split(",")
-    kind = int if isinstance(default, int) else float
-    numbers = tuple(finite(part, kind) for part in parts)
-    if default is None and len(parts) == 1 and (whole := finite(text, int)) is not None:
-        numbers = (whole,)  # what has no default may be a count
-    if None in numbers or (isinstance(default, tuple) and len(parts) != len(default)):
-        wanted = "a whole number" if kind is int else "a finite number"
-        if isinstance(default, tuple):
-            wanted = f"{len(default)} finite numbers with commas between them"
-        raise Failure(f"--set: got {key}={text}, wanted {wanted}")
-    if len(parts) > 1 and isinstance(default, (int, float)):
-        raise Failure(f"--set: got {key}={text}, wanted one number")
-    known = cast(tuple[float, ...], numbers)  # None has been refused
-    return known if len(parts) > 1 else known[0]
 
 
 def _build(entry: "Entry", parameters: dict[str, Any], shape: tuple[int, ...] | None) -> tuple["Problem", "Grid"]:
@@ -265,10 +233,8 @@ def _one_line_warnings() -> Iterator[None]:
 # ------------------------------------------------------------------------------------- solve and write
 
 
-def _solve(problem: "Problem", grid: "Grid", options: dict[str, Any]) -> "Solution":
-    """The solution, converged or not; what the solver refuses or breaks on as one line and an exit code."""
-    import jax
-
+def _given(options: dict[str, Any]) -> dict[str, Any]:
+    """The arguments of ``solve`` that the options name."""
     import hjbjax as hjb
 
     # an option that was not given must not reach solve as None: its own default stands
@@ -276,6 +242,28 @@ def _solve(problem: "Problem", grid: "Grid", options: dict[str, Any]) -> "Soluti
     for key, table in (("method", METHODS), ("scheme", SCHEMES)):
         if key in given:
             given[key] = getattr(hjb, table[given[key]])()
+    return given
+
+
+def _estimate(problem: "Problem", grid: "Grid", options: dict[str, Any], *, as_json: bool) -> None:
+    """Say what a solve will take; exit 6 where it does not fit."""
+    import hjbjax as hjb
+
+    asked = {key: value for key, value in _given(options).items() if key in ("method", "scheme", "tol")}
+    with _one_line_error((ValueError, TypeError), 2), _one_line_warnings():
+        found = hjb.estimate(problem, grid, **asked)
+    click.echo(json.dumps(dataclasses.asdict(found)) if as_json else str(found))
+    if not found.fits:
+        raise Failure("the solve does not fit into the memory that is free", 6)
+
+
+def _solve(problem: "Problem", grid: "Grid", options: dict[str, Any]) -> "Solution":
+    """The solution, converged or not; what the solver refuses or breaks on as one line and an exit code."""
+    import jax
+
+    import hjbjax as hjb
+
+    given = _given(options)
     try:
         # no throw: what there is is saved and drawn also where it has not converged, and the exit code says so
         return hjb.solve(problem, grid, throw=False, **given)

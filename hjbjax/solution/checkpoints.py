@@ -11,6 +11,7 @@ import contextlib
 import dataclasses
 import hashlib
 import os
+import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Protocol
@@ -90,16 +91,14 @@ class Journal:
     """The parts of a run: those that are done, and the one under way.
 
     Args:
-      checkpoint: where it is kept, and how often.
-      asked: what was asked, as digests and words; a file that was made for anything else is refused.
+      file: what holds them, maybe beside those of other runs.
       records: those of an earlier process.
     """
 
-    def __init__(self, checkpoint: Checkpoint, asked: Mapping[str, str], records: Sequence[Record] = ()):
-        self.checkpoint, self.asked, self.records = checkpoint, dict(asked), list(records)
-        self.failure: str | None = None  # why it could not be written
+    def __init__(self, file: "File", records: Sequence[Record] = ()):
+        self.file, self.records = file, list(records)
         self._at = 0  # the part under way, or the one that comes next
-        self._written, self._changed, self._closed = time.monotonic(), False, False
+        self._closed = False
 
     def enter(self, part: Part) -> Status | None:
         """Put a part to where it stood: how it ended if it is done, else None."""
@@ -107,16 +106,16 @@ class Journal:
             return None
         record = self.records[self._at]
         if record.arrays:
-            self._check(part, record)
+            self.file.check(part.saved(), record.arrays)
             part.restore(list(record.arrays))
         self._at += record.done
         return record.status if record.done else None
 
     def keep(self, part: Part) -> None:
         """Write the state of the part under way, if it is time for that."""
-        if not self._closed and time.monotonic() - self._written >= self.checkpoint.every:
+        if not self._closed and self.file.is_due():
             self._note(part, Status.RUNNING, done=False)
-            self.write()
+            self.file.write()
 
     def leave(self, part: Part, status: Status) -> None:
         """Note the end of a part, or how far it came; after a cut nothing counts that follows."""
@@ -127,50 +126,96 @@ class Journal:
         self._note(part, status, done=done)
         self._at, self._closed = self._at + done, not done
 
-    def write(self) -> None:
-        """Write what has changed; where that fails the run goes on, with one warning."""
-        if not self._changed:
-            return
-        header = {
-            "format": FORMAT,
-            "version": VERSION,
-            "asked": self.asked,
-            "versions": versions(),
-            "parts": [
-                [int(each.status), each.done, each.passing, [[list(a.shape), a.dtype.str] for a in each.arrays]]
-                for each in self.records
-            ],
-        }
-        arrays = {name(i, j): array for i, each in enumerate(self.records) for j, array in enumerate(each.arrays)}
-        try:
-            files.write(self.checkpoint.path, header, arrays, force=True)
-        except (FileError, OSError) as error:
-            if self.failure is None:
-                warn(f"the run goes on without a checkpoint: {error}")
-            self.failure = str(error)
-        else:
-            self.failure, self._changed = None, False
-        self._written = time.monotonic()
-
     def _note(self, part: Part, status: Status, *, done: bool) -> None:
         """Record the state of the part under way, and forget those that led to where it began."""
         before = [dataclasses.replace(each, arrays=()) if each.passing else each for each in self.records[: self._at]]
-        # of arrays on a CPU these are views: nothing is copied
-        arrays = [np.asarray(array) for array in jax.device_get(part.saved())]
+        # on a CPU these are views of JAX's arrays, which a step may take for its own
+        keep = np.array if status is Status.RUNNING else np.asarray
+        arrays = [keep(array) for array in jax.device_get(part.saved())]
         self.records = [*before, Record(arrays, status, done, part.passing)]
-        self._changed = True
+        self.file.changed = True
 
-    def _check(self, part: Part, record: Record) -> None:
-        """Refuse arrays that are not those of the part's state."""
-        wanted, found = ([(np.shape(a), np.asarray(a).dtype) for a in each] for each in (part.saved(), record.arrays))
+
+class File:
+    """The journals of one run, or of the lanes of a batch, in one file.
+
+    Args:
+      checkpoint: where it is, and how often it is written.
+      asked: what was asked, as digests and words; a file that was made for anything else is refused.
+      known: the records of an earlier process, by the names of their journals.
+    """
+
+    def __init__(self, checkpoint: Checkpoint, asked: Mapping[str, str], known: Mapping[str, Sequence[Record]]):
+        self.checkpoint, self.asked, self.known = checkpoint, dict(asked), dict(known)
+        self.journals: dict[str, Journal] = {}
+        self.changed = False
+        self.failure: str | None = None  # why it could not be written
+        self._written, self._lock = time.monotonic(), threading.Lock()  # lanes write from threads of their own
+
+    @property
+    def outcome(self) -> str:
+        """What to say of it at the end: written, or why not."""
+        return self.failure or "written"
+
+    def journal(self, name: str = "run") -> Journal:
+        """The journal of a run, with what is known of it."""
+        return self.journals.setdefault(name, Journal(self, self.known.get(name, ())))
+
+    def is_due(self) -> bool:
+        """Whether it is time to write."""
+        return time.monotonic() - self._written >= self.checkpoint.every
+
+    def write(self) -> None:
+        """Write what has changed; where that fails the run goes on, with one warning."""
+        with self._lock:
+            if not self.changed:
+                return
+            self.changed = False
+            # copied: lanes begin meanwhile; and with those of lanes that have not begun yet
+            begun = {name: each.records for name, each in dict(self.journals).items()}
+            records: dict[str, Sequence[Record]] = {**self.known, **begun}
+            try:
+                files.write(self.checkpoint.path, self._header(records), dict(_arrays(records)), force=True)
+            except (FileError, OSError) as error:
+                if self.failure is None:
+                    warn(f"the run goes on without a checkpoint: {error}")
+                self.failure, self.changed = str(error), True
+            else:
+                self.failure = None
+            self._written = time.monotonic()
+
+    def _header(self, records: Mapping[str, Sequence[Record]]) -> dict[str, Any]:
+        """What stands beside the arrays."""
+        journals = {
+            name: [
+                [int(each.status), each.done, each.passing, [[list(a.shape), a.dtype.str] for a in each.arrays]]
+                for each in some
+            ]
+            for name, some in records.items()
+        }
+        return {
+            "format": FORMAT, "version": VERSION, "asked": self.asked, "versions": versions(), "journals": journals,
+        }  # fmt: skip
+
+    def check(self, state: Sequence[Any], arrays: Sequence[np.ndarray]) -> None:
+        """Refuse arrays that are not those of a part's state."""
+        wanted, found = ([(np.shape(a)[1:], np.asarray(a).dtype) for a in each] for each in (state, arrays))
         # a leading axis may be of residuals, or of slices: of these there are as many as the run had come to
-        if [(shape[1:], kind) for shape, kind in wanted] != [(shape[1:], kind) for shape, kind in found]:
+        if wanted != found:
             raise FileError(f"{self.checkpoint.path!s}: it holds another state than the run it is to go on with has")
 
 
-def name(part: int, array: int) -> str:
+def _arrays(records: Mapping[str, Sequence[Record]]) -> Iterator[tuple[str, np.ndarray]]:
+    """All arrays with the names that they have in a file."""
+    for journal, some in records.items():
+        for i, each in enumerate(some):
+            for j, array in enumerate(each.arrays):
+                yield _name(journal, i, j), array
+
+
+def _name(journal: str, part: int, array: int) -> str:
     """The name of an array in a file."""
-    return f"part{part}_{array}"
+    return f"{journal}_{part}_{array}"
 
 
 def versions() -> dict[str, str]:
@@ -179,14 +224,21 @@ def versions() -> dict[str, str]:
 
 
 @contextlib.contextmanager
-def journal(
-    checkpoint: Path | Checkpoint | None, question: tuple[Problem, Grid], *, resume: bool, what: str, **others: Any
-) -> Iterator[Journal | None]:
-    """Context with the journal of a run, which is written at its end; None where there is to be none.
+def opened(
+    checkpoint: Path | Checkpoint | None,
+    problems: Sequence[Problem],
+    grid: Grid,
+    *,
+    resume: bool,
+    what: str,
+    **others: Any,
+) -> Iterator[File | None]:
+    """Context with the file of a run, which is written at its end; None where there is to be none.
 
     Args:
       checkpoint: the file, or that and how often it is written.
-      question: the problem and its grid, for which a file must have been made.
+      problems: one, or those of all lanes.
+      grid: the nodes.
       resume: whether to go on from the file, if it is there.
       what: the function that was called, for messages.
       others: what else decides the answer.
@@ -203,19 +255,19 @@ def journal(
         return
     kept = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(checkpoint)
     kept = dataclasses.replace(kept, path=_place_of(kept.path))
-    question_of = asked(*question, **others)
-    records = _read(kept.path, question_of) if os.path.lexists(kept.path) and resume else []
-    if os.path.lexists(kept.path) and not resume:
+    there = os.path.lexists(kept.path)
+    if there and not resume:
         raise FileExistsError(f"{kept.path!s}: there is a checkpoint already; resume=True goes on from it")
-    found = Journal(kept, question_of, records)
+    question = asked(problems, grid, **others)
+    file = File(kept, question, _read(kept.path, question) if there else {})
     try:
-        yield found
+        yield file
     finally:
-        found.write()
+        file.write()
 
 
-def asked(problem: Problem, grid: Grid, **others: Any) -> dict[str, str]:
-    """What a run is asked, by digests and words: of a settled problem, its grid and what else decides the answer."""
+def asked(problems: Sequence[Problem], grid: Grid, **others: Any) -> dict[str, str]:
+    """What a run is asked, by digests and words: settled problems, their grid and what else decides the answer."""
     about = (
         grid.shape,
         grid.periodic,
@@ -223,7 +275,11 @@ def asked(problem: Problem, grid: Grid, **others: Any) -> dict[str, str]:
         [each and (each.strength, each.center) for each in grid.stretch or ()],
     )
     ends = np.concatenate([np.asarray(grid.lo, np.float64), np.asarray(grid.hi, np.float64)])
-    found = {"the problem": closures.digest(problem, grid.ndim), "the grid": f"{about} from {ends.tobytes().hex()}"}
+    digests = " ".join(closures.digest(problem, grid.ndim) for problem in problems)
+    found = {
+        "problem" if len(problems) == 1 else "list of problems": digests,
+        "grid": f"{about} from {ends.tobytes().hex()}",
+    }
     for word, thing in others.items():
         array = isinstance(thing, (np.ndarray, jax.Array))
         said = hashlib.blake2b(np.asarray(thing).tobytes(), digest_size=16).hexdigest() if array else repr(thing)
@@ -241,23 +297,24 @@ def _place_of(path: Path) -> str:
     return place
 
 
-def _read(path: Path, asked: Mapping[str, str]) -> list[Record]:
-    """The records in a file, which must be of the same question."""
+def _read(path: Path, asked: Mapping[str, str]) -> dict[str, list[Record]]:
+    """The records in a file by the names of their journals; it must be of the same question."""
 
-    def rebuild(header: dict, arrays: dict[str, np.ndarray]) -> list[Record]:
-        if other := sorted(
-            key for key in asked.keys() | header["asked"].keys() if asked.get(key) != header["asked"].get(key)
-        ):
-            raise FileError(
-                f"it is the checkpoint of another run: {', '.join(other)} differ{'s' * (len(other) == 1)}; "
-                "give another path, or take the file away"
-            )
+    def rebuild(header: dict, arrays: dict[str, np.ndarray]) -> dict[str, list[Record]]:
+        made_for = header["asked"]
+        if other := sorted(key for key in asked.keys() | made_for.keys() if asked.get(key) != made_for.get(key)):
+            raise FileError(f"it was made for another {' and '.join(other)}; give another path, or take the file away")
         if header["versions"] != versions():
             warn(f"{path!s}: the checkpoint was made with {header['versions']}; the last bits of the answer may differ")
-        return [
-            Record([arrays[name(i, j)] for j in range(len(shapes))], Status(status), bool(done), bool(passing))
-            for i, (status, done, passing, shapes) in enumerate(header["parts"])
-        ]
+        return {
+            name: [
+                Record(
+                    [arrays[_name(name, i, j)] for j in range(len(shapes))], Status(status), bool(done), bool(passing)
+                )
+                for i, (status, done, passing, shapes) in enumerate(parts)
+            ]
+            for name, parts in header["journals"].items()
+        }
 
     return files.read(path, FORMAT, VERSION, _plan, rebuild)
 
@@ -265,9 +322,10 @@ def _read(path: Path, asked: Mapping[str, str]) -> list[Record]:
 def _plan(header: dict) -> dict[str, Expected]:
     """Shapes and dtypes of the arrays in a file, as its header has them."""
     return {
-        name(i, j): Expected(
+        _name(name, i, j): Expected(
             (tuple(map(int, shape)),), tuple(kind for kind in KINDS if kind.str == code), optional=False
         )
-        for i, (_, _, _, arrays) in enumerate(header["parts"])
+        for name, parts in header["journals"].items()
+        for i, (_, _, _, arrays) in enumerate(parts)
         for j, (shape, code) in enumerate(arrays)
     }

@@ -32,7 +32,10 @@ from hjbjax.problem.arguments import shown
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.types import DType, Mask, Nodes
+from hjbjax.solution import checkpoints
+from hjbjax.solution.checkpoints import Checkpoint, File
 from hjbjax.solution.clock import CUT, Clock, Stopped, noting_interrupts
+from hjbjax.solution.placement import Path
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status, keeping_warnings, warn
 from hjbjax.solvers import host_loop, nested
@@ -58,6 +61,8 @@ def solve_batch(
     throw: bool = True,
     progress: bool | None = None,
     max_memory: int | None = None,
+    checkpoint: Path | Checkpoint | None = None,
+    resume: bool = False,
 ) -> list[Solution]:
     """Solve many problems on one grid; each answer is that of ``solve`` by this method.
 
@@ -73,6 +78,9 @@ def solve_batch(
       throw: raise when a lane does not converge; otherwise its status says it.
       progress: as in ``solve``.
       max_memory: bytes that one round of lanes may take; a batch that needs more runs in several.
+      checkpoint: as in ``solve``, like ``resume``: one file for all lanes. With it lanes run side by side, one a core,
+        on an accelerator, too.
+      resume: go on from that file if it is there, each lane to the same bits.
 
     Returns:
       One solution for each problem, in their order.
@@ -91,7 +99,10 @@ def solve_batch(
     grid.check_spacings(kind)
     solutions: list[Any] = [None] * len(lanes)
     clock = Clock(max_steps or 10**9, time_limit, progress)
-    with noting_interrupts(clock), host_loop.telling(clock), jax.enable_x64(kind == np.float64):
+    opened = checkpoints.opened(
+        checkpoint, lanes, grid, resume=resume, what="solve_batch", method=method, scheme=scheme, tol=tol, dtype=kind
+    )
+    with noting_interrupts(clock), host_loop.telling(clock), jax.enable_x64(kind == np.float64), opened as kept:
         for members in _same_program(lanes):
             first = lanes[members[0]]
             # without nesting, whose levels the host drives one by one
@@ -103,13 +114,16 @@ def solve_batch(
             for some in _rounds(members, needed, max_memory):
                 with host_loop.with_solution(clock, needed * len(some), lambda _: next(filter(None, solutions), None)):
                     members_of = {i: on.asking(lanes[i]) for i in some}
-                    solved = _solve_together if _fills_with_lanes() else _solve_side_by_side
-                    together = solved(members_of, chosen, tol, clock, sharpen=sharpen)
+                    if _fills_with_lanes() and kept is None:
+                        together = _solve_together(members_of, chosen, tol, clock, sharpen=sharpen)
+                    else:
+                        together = _solve_side_by_side(members_of, chosen, tol, clock, kept, sharpen=sharpen)
                 for index, solution in zip(some, together, strict=True):
                     solutions[index] = solution
         if solutions and not any(solution.status in CUT for solution in solutions):
             solutions[-1] = with_last_phase(solutions[-1], clock)  # no late Ctrl-C is lost
     for index, solution in enumerate(solutions):
+        solution.stats.update({} if kept is None else {"checkpoint": kept.outcome})
         if throw and solution.status is not Status.CONVERGED:
             raise SolveError(f"lane {index}: {solution.status.name}: {solution.message}", solution, solutions)
     return solutions
@@ -173,13 +187,14 @@ def _read(setting: str) -> Any:
 
 
 def _solve_side_by_side(
-    lanes: dict[int, Discretisation], method: Method, tol: float, clock: Clock, *, sharpen: bool
+    lanes: dict[int, Discretisation], method: Method, tol: float, clock: Clock, kept: File | None, *, sharpen: bool
 ) -> list[Solution]:
     """The solutions of problems that share a program, by the numbers of their lanes, one thread a core."""
     settings, names = _settings(), list(lanes)
 
     def one(name: int) -> tuple[Solution, list[str]]:
         own = clock.beside()
+        own.journal = kept and kept.journal(f"lane{name}")
         try:
             with settings(), keeping_warnings() as said:
                 solution = solve_on_host(lanes[name], method, tol, None, own, sharpen=sharpen, free=False)

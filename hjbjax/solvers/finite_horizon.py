@@ -130,13 +130,13 @@ def march(
     check_node_values(start, grid, "march: start")
     grid.check_spacings(kind)
     clock = Clock(seconds=time_limit, progress=progress)
-    journal = checkpoints.journal(
-        checkpoint, (problem, grid), resume=resume, what="march", horizon=horizon, times=kept, start=start,
+    opened = checkpoints.opened(
+        checkpoint, [problem], grid, resume=resume, what="march", horizon=horizon, times=kept, start=start,
         method=method, scheme=scheme, step=step, inner=inner, dtype=kind,
     )  # fmt: skip
     # float64 for this call alone: the caller's own programs, and other threads, keep the type they have
-    with noting_interrupts(clock), host_loop.telling(clock), jax.enable_x64(kind == np.float64), journal as file:
-        clock.journal = file
+    with noting_interrupts(clock), host_loop.telling(clock), jax.enable_x64(kind == np.float64), opened as file:
+        clock.journal = file and file.journal()
         # before anything is compiled: a grid that does not fit is refused within a second
         needed = memory.fitting(_bytes(problem, grid, kept, method, kind), grid, max_memory)
         on = Discretisation(problem, grid, scheme, kind)
@@ -160,7 +160,7 @@ def march(
         seconds=clock.stepping, compile_seconds=clock.elapsed() - clock.stepping, bytes=needed, horizon=horizon
     )
     if clock.journal is not None:
-        solution.stats["checkpoint"] = clock.journal.failure or "written"
+        solution.stats["checkpoint"] = clock.journal.file.outcome
     if throw and solution.status is not Status.CONVERGED:
         raise SolveError(f"{solution.status.name}: {solution.message}", solution)
     return solution

@@ -127,21 +127,21 @@ def solve(
     check_node_values(guess, grid, "solve: the guess")
     grid.check_spacings(kind)
     clock = Clock(max_steps or 10**9, time_limit, progress)
-    journal = checkpoints.journal(
-        checkpoint, (problem, grid), resume=resume, what="solve", method=method, scheme=scheme, tol=tol, guess=guess,
+    opened = checkpoints.opened(
+        checkpoint, [problem], grid, resume=resume, what="solve", method=method, scheme=scheme, tol=tol, guess=guess,
         dtype=kind,
     )  # fmt: skip
     if isinstance(scheme, PathScheme):
-        with noting_interrupts(clock), host_loop.telling(clock), jax.enable_x64(kind == np.float64), journal as kept:
-            clock.journal = kept
+        with noting_interrupts(clock), host_loop.telling(clock), jax.enable_x64(kind == np.float64), opened as kept:
+            clock.journal = kept and kept.journal()
             options: Any = {"method": method, "tol": tol, "guess": guess, "max_memory": max_memory}
             solution = semi_lagrangian.solve_on_host(problem, grid, scheme, kind, clock=clock, **options)
         return _ended(with_last_phase(solution, clock), clock, tol, throw=throw)
     free, method = method is None, choose(problem, grid, traced=False, method=method)
     on, sharpen = Discretisation(problem, grid, scheme or Upwind(subcell=True), kind), scheme is None
     # float64 for this call alone: another thread, and the caller's own programs, keep theirs
-    with noting_interrupts(clock), host_loop.telling(clock), jax.enable_x64(kind == np.float64), journal as kept:
-        clock.journal = kept
+    with noting_interrupts(clock), host_loop.telling(clock), jax.enable_x64(kind == np.float64), opened as kept:
+        clock.journal = kept and kept.journal()
         needed = memory.require(problem, grid, method, kind, max_memory)
         with host_loop.with_solution(clock, needed, lambda kept: _partial(on, kept)):
             solution = with_last_phase(solve_on_host(on, method, tol, guess, clock, sharpen=sharpen, free=free), clock)
@@ -154,7 +154,7 @@ def _ended(solution: Solution, clock: Clock, tol: float, *, throw: bool) -> Solu
     """The solution with its times; raises ``SolveError`` where it did not converge and that was asked for."""
     solution.stats.update(
         seconds=clock.stepping, compile_seconds=clock.elapsed() - clock.stepping,
-        tol=tol, **({} if clock.journal is None else {"checkpoint": clock.journal.failure or "written"}),
+        tol=tol, **({} if clock.journal is None else {"checkpoint": clock.journal.file.outcome}),
     )  # fmt: skip
     if throw and solution.status is not Status.CONVERGED:
         raise SolveError(f"{solution.status.name}: {solution.message}", solution)

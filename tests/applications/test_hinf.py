@@ -13,7 +13,7 @@ import hjbjax as hjb
 from hjbjax import zoo
 from hjbjax.applications import hinf
 from hjbjax.applications.hinf import Trial
-from hjbjax.applications.undisturbed import comes_back
+from hjbjax.applications.level import comes_back
 from hjbjax.feedback.path import PathStatus
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Ball, Box, Finite

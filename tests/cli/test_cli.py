@@ -711,3 +711,53 @@ def test_a_folder_that_cannot_be_made_is_said(tmp_path):
     (tmp_path / "file").write_text("no folder")
     with pytest.raises(OSError, match="file"):
         hjbjax.keep_compiled(tmp_path / "file")
+
+
+def test_a_parameter_as_an_option_of_its_own_is_answered_with_the_cure():
+    assert refused(run("solve", "pendulum", "--mass", "2"), 2, "--set, as in --set mass=VALUE")
+    assert refused(run("solve", "pendulum", "--mas", "2"), 2, "No such option '--mas'")
+
+
+# --- long runs ---
+
+
+def test_a_dry_run_says_what_a_solve_will_take_and_writes_nothing(folder):
+    result = run("solve", "pendulum", "--shape", "40x41", "--dry-run")
+    assert result.exit_code == 0, result.output
+    assert [line.split()[0] for line in result.stdout.splitlines()] == [
+        "nodes", "memory", "programs", "steps", "seconds",
+    ]  # fmt: skip
+    assert result.stdout.startswith("nodes     40 x 41 = 1,640\n")
+    assert not list(folder.iterdir())
+    told = run("solve", "pendulum", "--shape", "60000x60001", "--scheme", "upwind", "--dry-run", "--json")
+    assert told.exit_code == 6
+    assert json.loads(told.stdout)["shape"] == [60000, 60001]
+    assert told.stderr == "hjbjax: the solve does not fit into the memory that is free\n"
+
+
+def test_a_checkpoint_is_gone_on_from(folder):
+    first = run("solve", "stochastic-lq", "--shape", "41", "--checkpoint", "run", "--max-steps", "1", "--out", "a")
+    assert first.exit_code == 3
+    assert (folder / "run.npz").exists()
+    assert refused(run("solve", "stochastic-lq", "--shape", "41", "--checkpoint", "run", "--out", "b"), 2, "resume")
+    again = run("solve", "stochastic-lq", "--shape", "41", "--checkpoint", "run", "--resume", "--out", "c")
+    assert again.exit_code == 0, again.output
+    whole = run("solve", "stochastic-lq", "--shape", "41", "--out", "d")
+    assert whole.exit_code == 0
+    np.testing.assert_array_equal(load("c/solution.npz").value, load("d/solution.npz").value)
+    other = run("solve", "stochastic-lq", "--shape", "43", "--checkpoint", "run", "--resume", "--out", "e")
+    assert refused(other, 5, "it was made for another grid")
+    assert refused(run("solve", "stochastic-lq", "--resume", "--out", "f"), 2, "give checkpoint=, the file")
+    assert not (folder / "e").exists()
+
+
+def test_a_checkpoint_that_could_not_be_written_is_a_file_error_after_the_results(folder, monkeypatch):
+    def solve(problem, grid, **options):
+        return answer(problem, grid, stats={"checkpoint": "run.npz: cannot be written: No space left on device"})
+
+    monkeypatch.setattr(hjbjax, "solve", solve)
+    monkeypatch.setattr(run_folder, "simulate", straight, raising=False)
+    result = run("solve", "bang-bang", "--shape", "21", "--checkpoint", "run", "--out", "a")
+    assert result.exit_code == 5
+    assert "No space left on device" in result.stderr
+    assert (folder / "a" / "solution.npz").exists()

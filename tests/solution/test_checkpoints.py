@@ -8,6 +8,8 @@ import sys
 import time
 import warnings
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -133,8 +135,36 @@ def test_a_march_is_resumed_to_the_same_bits(method, tmp_path, monkeypatch):
             cut = hjb.march(problem, grid, 1.0, checkpoint=path, throw=False, **options)
         assert cut.status is hjb.Status.INTERRUPTED
         alike(hjb.march(problem, grid, 1.0, checkpoint=path, resume=True, **options), wanted)
-    with pytest.raises(hjb.FileError, match="of another run: horizon differs"):
+    with pytest.raises(hjb.FileError, match="made for another horizon"):
         hjb.march(problem, grid, 2.0, checkpoint=path, resume=True, **options | {"times": times})
+
+
+@pytest.mark.filterwarnings("ignore::hjbjax.SolveWarning")
+def test_a_batch_is_resumed_lane_by_lane_to_the_same_bits(tmp_path, monkeypatch):
+    grid = hjb.Grid([-3.0, -3.0], [3.0, 3.0], (21, 21))
+
+    def cart(mass):
+        drift = jax.tree_util.Partial(lambda mass, x, u: jnp.stack([x[1], u[0] / mass]), mass)
+        return hjb.Problem(drift, lambda x, u: x @ x + u @ u, hjb.Box([-1.0], [1.0]), discount=0.5)
+
+    problems = [cart(mass) for mass in (0.5, 1.0, 1.5, 2.0)]
+    wanted = hjb.solve_batch(problems, grid, tol=1e-7)
+    step = StatesInChunks.advance
+    counted = Chunks(step)
+    monkeypatch.setattr(StatesInChunks, "advance", counted)
+    hjb.solve_batch(problems, grid, tol=1e-7)
+    for stop in (1, counted.count // 2, counted.count - 1):
+        kept = hjb.Checkpoint(tmp_path / f"{stop}.npz", every=OFTEN)
+        monkeypatch.setattr(StatesInChunks, "advance", Chunks(step, stop))
+        cut = hjb.solve_batch(problems, grid, tol=1e-7, checkpoint=kept, throw=False)
+        assert any(each.status is hjb.Status.INTERRUPTED for each in cut)
+        monkeypatch.setattr(StatesInChunks, "advance", step)
+        found = hjb.solve_batch(problems, grid, tol=1e-7, checkpoint=kept, resume=True)
+        for one, other in zip(found, wanted, strict=True):
+            alike(one, other)
+            assert one.stats["checkpoint"] == "written"
+    with pytest.raises(hjb.FileError, match="made for another list of problems"):
+        hjb.solve_batch(problems[::-1], grid, tol=1e-7, checkpoint=kept, resume=True)
 
 
 # --- which file, and for which question ---
@@ -152,15 +182,15 @@ def test_the_file_of_another_question_is_refused(tmp_path):
     hjb.solve(posed(), LINE, checkpoint=path)
     before = path.read_bytes()
     for problem, grid, options, word in (
-        (posed(1.5), LINE, {}, "the problem"),
-        (posed(), hjb.Grid([-1.0], [1.5], (21,)), {}, "the grid"),
+        (posed(1.5), LINE, {}, "problem"),
+        (posed(), hjb.Grid([-1.0], [1.5], (21,)), {}, "grid"),
         (posed(), LINE, {"tol": 1e-4}, "tol"),
         (posed(), LINE, {"guess": np.ones(21)}, "guess"),
         (posed(), LINE, {"scheme": hjb.Upwind()}, "scheme"),
         (posed(), LINE, {"method": hjb.ValueIteration()}, "method"),
         (posed(), LINE, {"dtype": "float32"}, "dtype"),
     ):
-        with pytest.raises(hjb.FileError, match=f"run.npz.*of another run: {word} differs; give another path"):
+        with pytest.raises(hjb.FileError, match=f"run.npz.*it was made for another {word}; give another path"):
             hjb.solve(problem, grid, checkpoint=path, resume=True, **options)
     assert path.read_bytes() == before
     # the same question in other words: a function written anew
@@ -256,7 +286,7 @@ def test_killed_at_random_times_the_file_is_whole_and_the_bits_are_the_same(tmp_
         process.kill()
         process.wait()
         if path.exists():
-            files.read(path, "hjbjax.Checkpoint", 1, checkpoints._plan, lambda *_: None)
+            files.read(path, checkpoints.FORMAT, checkpoints.VERSION, checkpoints._plan, lambda *_: None)
             readable += 1
             if draw.random() < 0.3:  # from the beginning, now and then
                 assert begun("cut").wait() == 0

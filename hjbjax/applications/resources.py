@@ -1,0 +1,182 @@
+"""What a solve will take: bytes by a count of arrays; steps and seconds by two small grids of the same box."""
+
+import dataclasses
+import math
+
+import numpy as np
+
+from hjbjax.discretisation.discretisation import Scheme
+from hjbjax.iteration.methods import Method, Nested
+from hjbjax.markov_chain import memory
+from hjbjax.problem import arguments
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.types import DType
+from hjbjax.solution import nested_grids
+from hjbjax.solution.solution import Solution
+from hjbjax.solution.status import keeping_warnings
+from hjbjax.solvers.setup import COARSEST, choose
+from hjbjax.solvers.stationary import check_arguments, solve
+
+SMALL = 12_000  # nodes of the larger grid that is tried: a second or so, beside the compilation
+FEWEST = 4  # intervals that an axis keeps
+
+
+@dataclasses.dataclass(frozen=True)
+class Estimate:
+    """What a solve will take, about.
+
+    Attributes:
+      shape: the nodes along each axis.
+      bytes: of memory at the peak, on the device.
+      free: bytes that are free there now; ``None`` where nobody says.
+      largest: the points along each axis of the largest grid of this many axes that fits; ``None`` likewise.
+      programs: compiled loops, one a grid and scheme.
+      steps: improvements on the finest grid; ``None`` where the small grids had no answer.
+      seconds: of all steps; within a factor of three as a rule.
+      compile_seconds: of checks and compilation, from what the small grid took.
+      note: why steps and seconds are not known.
+    """
+
+    shape: tuple[int, ...]
+    bytes: int
+    free: int | None
+    largest: int | None
+    programs: int
+    steps: int | None = None
+    seconds: float | None = None
+    compile_seconds: float | None = None
+    note: str = ""
+
+    @property
+    def fits(self) -> bool:
+        """Whether there is as much memory, and the nodes can be numbered."""
+        return math.prod(self.shape) < memory.INDEXABLE and (self.free is None or self.bytes <= self.free)
+
+    def __str__(self) -> str:
+        free = "" if self.free is None else f", {self.free / 1e9:.3g} GB are free"
+        most = "" if self.largest is None else f"; at most {self.largest} points an axis fit"
+        lines = [
+            f"nodes     {' x '.join(map(str, self.shape))} = {math.prod(self.shape):,}",
+            f"memory    {self.bytes / 1e9:.3g} GB{free}{most}{'' if self.fits else ': IT DOES NOT FIT'}",
+            f"programs  {self.programs} to compile",
+        ]
+        if self.seconds is None or self.compile_seconds is None:
+            return "\n".join([*lines, f"steps     not known: {self.note}"])
+        return "\n".join(
+            [
+                *lines,
+                f"steps     {self.steps}",
+                f"seconds   {self.seconds:.2g}, and {self.compile_seconds:.2g} to compile",
+            ]
+        )
+
+
+def estimate(
+    problem: Problem,
+    grid: Grid,
+    method: Method | None = None,
+    *,
+    scheme: Scheme | None = None,
+    tol: float = 1e-3,
+    dtype: DType | None = None,
+    measure: bool = True,
+) -> Estimate:
+    """What ``solve`` will take, before anything of the size of the grid is allocated.
+
+    Args:
+      problem: the question.
+      grid: the nodes.
+      method: as in ``solve``.
+      scheme: as in ``solve``.
+      tol: as in ``solve``.
+      dtype: as in ``solve``.
+      measure: solve on two small grids of the same box, in a few seconds, for steps and seconds; else bytes alone.
+
+    Returns:
+      The estimate. Steps and seconds are carried on from the two grids by the power of the nodes that they show.
+
+    Raises:
+      ValueError: a bad argument.
+
+    Example:
+      >>> import hjbjax as hjb
+      >>> problem, grid = hjb.zoo.manipulator(links=2, shape=(200,) * 4)
+      >>> hjb.estimate(problem, grid, dtype="float32", measure=False).bytes // grid.size
+      70
+    """
+    check_arguments(problem, grid, method, scheme, tol)
+    kind = arguments.as_dtype(dtype)
+    chosen = choose(problem, grid, traced=False, method=method)
+    needed, free = memory.estimate(problem, grid, chosen.inner, kind), memory.available()
+    about = Estimate(grid.shape, needed, free, _largest(needed, free, grid), _programs(grid, chosen, scheme))
+    if not measure:
+        return dataclasses.replace(about, note="nothing was measured")
+    tried = _tried(grid)
+    found: list[Solution] = []
+    with keeping_warnings():
+        try:
+            for small in tried:
+                alike = _alike(chosen, small, grid)
+                options = {"scheme": scheme, "tol": tol, "dtype": kind, "throw": False, "progress": False}
+                found.append(solve(problem, small, method=alike, **options))
+        except ValueError as refusal:
+            return dataclasses.replace(about, note=f"on {_counts(small)} nodes: {str(refusal).splitlines()[0]}")
+    coarse, fine = found
+    ratio, beyond = max(tried[1].size / tried[0].size, 1 + 1e-9), grid.size / tried[1].size
+    most = 2 / grid.ndim  # a front passes a cell a step, and noise a cell in as many steps as there are cells
+    seconds = [max(each.stats["seconds"], 1e-4) for each in found]
+    growth = 1 + np.clip(np.log(seconds[1] / seconds[0]) / np.log(ratio) - 1, 0, most)
+    climb = np.clip(np.log(max(fine.steps, 1) / max(coarse.steps, 1)) / np.log(ratio), 0, most)
+    return dataclasses.replace(
+        about,
+        steps=round(max(fine.steps, 1) * beyond**climb),
+        seconds=float(seconds[1] * beyond**growth),
+        compile_seconds=float(max(each.stats["compile_seconds"] for each in found)),
+    )
+
+
+def _largest(needed: int, free: int | None, grid: Grid) -> int | None:
+    """The points along each axis of the largest grid of as many axes that fits."""
+    if free is None:
+        return None
+    nodes = min(free / needed * grid.size, memory.INDEXABLE - 1)
+    # a root that is whole may come out just below
+    return math.floor(nodes ** (1 / grid.ndim) * (1 + 1e-12))
+
+
+def _programs(grid: Grid, method: Method, scheme: Scheme | None) -> int:
+    """Loops to compile: one a grid, and without a scheme one for the coarser grid that tells the error."""
+    count, smaller = 1, nested_grids.coarser(grid)
+    while smaller is not None and method.coarsest is not None and smaller.size >= method.coarsest:
+        count, smaller = count + 1, nested_grids.coarser(smaller)
+    return count + (scheme is None and count == 1)
+
+
+def _tried(grid: Grid) -> tuple[Grid, Grid]:
+    """Two small grids of the box, the coarser one first."""
+    fine = _smaller(grid, min(SMALL, grid.size / 4))
+    return _smaller(grid, fine.size / 4), fine
+
+
+def _smaller(grid: Grid, nodes: float) -> Grid:
+    """The grid with about so many nodes; an axis with a node in its middle keeps it."""
+    share, shape = (nodes / grid.size) ** (1 / grid.ndim), []
+    for axis, count in enumerate(grid.shape):
+        intervals = grid.intervals(axis)
+        fewer = max(round(share * intervals), FEWEST)
+        fewer += (intervals - fewer) % 2
+        shape.append(count - intervals + min(fewer, intervals))
+    return dataclasses.replace(grid, shape=tuple(shape))
+
+
+def _alike(method: Method, small: Grid, grid: Grid) -> Method:
+    """The method, with as many levels on the small grid as on the large one."""
+    if method.coarsest is None:
+        return method
+    return Nested(method.inner, max(round((method.coarsest or COARSEST) * small.size / grid.size), 50))
+
+
+def _counts(grid: Grid) -> str:
+    """The points of all axes, as in "41 x 81"."""
+    return " x ".join(map(str, grid.shape))

@@ -238,7 +238,7 @@ def _given(options: dict[str, Any]) -> dict[str, Any]:
     import hjbjax as hjb
 
     # an option that was not given must not reach solve as None: its own default stands
-    given = {key: value for key, value in options.items() if value is not None}
+    given = {key: value for key, value in options.items() if value is not None and value is not False}
     for key, table in (("method", METHODS), ("scheme", SCHEMES)):
         if key in given:
             given[key] = getattr(hjb, table[given[key]])()

@@ -30,6 +30,7 @@ from hjbjax.hamiltonian.search import Action
 from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
 from hjbjax.iteration.evaluation import Evaluation, Krylov, direct, evaluate, left_over, relaxed
 from hjbjax.iteration.fixed_point import State, Task
+from hjbjax.problem.derivatives import once
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import Field, Number, Scalar
@@ -134,6 +135,8 @@ def _solution_tangent(primals: Any, tangents: Any) -> tuple[Field, Field]:
         slope = jax.linearize(lambda at: question.residual(at, actions, bound), value)[1]
         operator, solvers = lambda delta: -slope(delta), _high_order_solvers(equation, grid)
     right = jax.jvp(residual, (question,), (tangents[1],))[1]
+    # the value, the policy and the operator are constants here, whose own derivatives a second one would need
+    right = right + once(question, "a solve").astype(right.dtype)
     return value, jax.lax.custom_linear_solve(operator, right, *solvers)
 
 
@@ -169,7 +172,9 @@ def _moving_tangent(primals: Any, tangents: Any) -> tuple[Greedy, Greedy]:
         )
         return Greedy(policy.defect, controls, disturbances)
 
-    return policy, jax.jvp(actions, (on, value), tangents[1:3])[1]
+    moved = jax.jvp(actions, (on, value), tangents[1:3])[1]
+    zero = once((on, value), "a feedback")
+    return policy, jax.tree.map(lambda entry: entry + zero.astype(entry.dtype), moved)
 
 
 def _chain_product(equation: PolicyEquation, grid: Grid, delta: Field) -> Field:

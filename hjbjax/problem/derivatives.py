@@ -10,6 +10,7 @@ at a point, its product L a is found by the first program and Lᵀ y by the seco
 which JAX's ``custom_linear_solve`` asks for one at a time, and knows how to batch.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -84,7 +85,7 @@ def _product(forward: Callable, backward: Callable, numbers: list, moves: list) 
     def operator(x: tuple) -> tuple:
         # never evaluated, and no loop of unknown length, which could not be transposed here; it is asked for its
         # derivative alone, for second derivatives
-        return jax.tree.map(lambda entry: entry + _refusing(numbers).astype(entry.dtype), x)
+        return jax.tree.map(lambda entry: entry + once(numbers, "a path").astype(entry.dtype), x)
 
     # JAX transposes a right-hand side only as a whole: each entry, a zero as well, must depend on the moves
     zero = sum(jnp.where(False, jnp.sum(move), 0.0) for move in moves)
@@ -93,16 +94,20 @@ def _product(forward: Callable, backward: Callable, numbers: list, moves: list) 
     return jax.lax.custom_linear_solve(operator, (right, nothing), solve, transposed)[1]
 
 
-@jax.custom_jvp
-def _refusing(numbers: list) -> jax.Array:
-    """Zero, which has no derivative."""
+@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
+def once(numbers: Any, what: str) -> jax.Array:
+    """Zero, whose derivative is refused: added to a derivative it says that there is no second one of ``what``.
+
+    Raises:
+      NotImplementedError: where it is differentiated.
+    """
     return jnp.zeros(())
 
 
-@_refusing.defjvp
-def _refuse(primals: Any, tangents: Any) -> Any:
+@once.defjvp
+def _refuse(what: str, primals: Any, tangents: Any) -> Any:
     """Refuse the derivative."""
-    raise NotImplementedError("second derivatives of a path are not available; differentiate its first ones by steps")
+    raise NotImplementedError(f"second derivatives of {what} are not available; differentiate its first ones by steps")
 
 
 def _is_real(leaf: Any) -> bool:

@@ -265,3 +265,34 @@ def test_a_constraint_that_rounds_otherwise_is_the_same_constraint():
     assert np.all(adjoint._is_constraint(one_off, psi)[:3])
     assert np.all(adjoint._is_constraint(psi, psi))
     assert not np.any(adjoint._is_constraint(psi * 1.001 - 1e-3, psi))
+
+
+@pytest.mark.parametrize("scheme", [hjb.Upwind(), pytest.param(None, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("read", ["value_at", "control_at"])
+def test_second_derivatives_are_refused_and_not_made_up(scheme, read):
+    """The rule of the first ones takes value, policy and operator as constants: by it the second would be wrong."""
+
+    def number(price):
+        problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x + price * u @ u, hjb.Box([-4.0], [4.0]), discount=1.0)
+        solution = hjb.solve(problem, hjb.Grid([-1.0], [1.0], (11,)), scheme=scheme)
+        return jnp.sum(getattr(solution, read)(jnp.array([0.5])))
+
+    for second in (jax.hessian, lambda f: jax.grad(jax.grad(f)), lambda f: jax.jacfwd(jax.jacfwd(f))):
+        with pytest.raises(NotImplementedError, match="second derivatives of a solve are not available"):
+            jax.eval_shape(second(number), jnp.asarray(1.3))
+    # of a first derivative by something that the solve does not depend on there is one
+    value = jax.eval_shape(jax.grad(lambda x: jax.grad(lambda p: number(p) * x)(1.3)), jnp.asarray(2.0))
+    assert value.shape == ()
+
+
+def test_second_derivatives_of_a_march_are_those_of_its_steps():
+    def value(price):
+        problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x + price * u @ u, hjb.Box([-4.0], [4.0]))
+        marched = hjb.march(problem, hjb.Grid([-1.0], [1.0], (11,)), 0.5, step=0.01, scheme=hjb.Upwind(split=True))
+        return marched.value_at(0.0, jnp.array([0.5]))
+
+    with jax.enable_x64(True):
+        found = jax.hessian(value)(1.3)
+        slope = jax.jit(jax.grad(value))
+        wanted = (slope(1.3 + 1e-5) - slope(1.3 - 1e-5)) / 2e-5
+    assert float(found) == pytest.approx(float(wanted), rel=1e-4)

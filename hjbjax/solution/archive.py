@@ -1,6 +1,6 @@
-"""A solution as a header and arrays, and back: what of it a file holds."""
+"""A solution as a header and arrays, and back: what of it a file holds; and as arrays with names, for other tools."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -10,6 +10,9 @@ from hjbjax.problem.labels import Labels
 from hjbjax.problem.stretching import Sinh
 from hjbjax.solution.files import Expected, FileError
 from hjbjax.solution.status import Status
+
+if TYPE_CHECKING:  # an extra: it is imported by whoever asks for it
+    import xarray
 
 FORMAT, VERSION = "hjbjax.Solution", 1  # the version goes up when an older hjbjax would read a file wrongly
 KINDS: dict[str, tuple[type, ...]] = {  # what a file's header holds, as JSON has it
@@ -101,3 +104,43 @@ def fields(header: dict, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
             raise FileError(f"its header has {name} = {header[name]!r:.60}, wanted {kinds[0].__name__}")
     Status(header["code"])  # raises where there is no such status
     return {"policy": None, **arrays, "grid": grid, "labels": labels, **{name: header[name] for name in KINDS}}
+
+
+def dataset(solution: Any) -> "xarray.Dataset":
+    """A solution as arrays with the names and units of its states and controls.
+
+    Raises:
+      ImportError: xarray is not installed.
+    """
+    try:
+        import xarray
+    except ImportError:
+        raise ImportError("Solution.to_xarray needs xarray: pip install 'hjbjax[io]'") from None
+    grid, labels, marched = solution.grid, solution.labels, solution.times is not None
+    own = ["value", "grid_error", "reached", "time", "control", "disturbance"]
+    names = [f"state {name}" if name in own else name for name in grid.names]
+    lead = ("time",) if marched else ()
+    found: dict[str, Any] = {"value": ((*lead, *names), solution.value, {"long_name": "value function"})}
+    for name, about in (("grid_error", "estimated error of the grid"), ("reached", "the target can be reached")):
+        array = getattr(solution, name)
+        if array is not None:
+            found[name] = ([*lead, *names][-np.ndim(array) :], array, {"long_name": about})
+    for kind, array in (("control", solution.policy), ("disturbance", solution.disturbance)):
+        count = 0 if array is None else np.shape(array)[-1]
+        for j in range(count):
+            word, unit = _input(labels, kind, j, count)
+            taken = word in found or word in names
+            found[f"{kind} {word}" if taken else word] = ((*lead, *names), array[..., j], {"units": unit, "kind": kind})
+    axes = {name: (name, grid.axis(i), {"units": grid.units[i]}) for i, name in enumerate(names)}
+    times = {"time": ("time", solution.times)} if marched else {}
+    kept = {key: str(value) for key, value in solution.stats.items() if isinstance(value, (str, int, float))}
+    said = {"status": solution.status.name, "steps": int(solution.steps), "message": solution.message, **kept}
+    return xarray.Dataset(found, {**axes, **times}, said)
+
+
+def _input(labels: Labels, kind: str, j: int, count: int) -> tuple[str, str]:
+    """Name and unit of a control or of a disturbance."""
+    if kind == "disturbance":
+        return ("d" if count == 1 else f"d{j + 1}"), ""
+    unit = labels.control_units[j] if j < len(labels.control_units) else ""
+    return labels.controls[j] if j < len(labels.controls) else "u" if count == 1 else f"u{j + 1}", unit

@@ -85,15 +85,20 @@ def write(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray
       FileError: the folder is missing or cannot be written, the disk is full, or a folder, a device or a pipe has that
         name; no half file is left.
     """
-    path = os.path.realpath(
-        with_suffix(path_of(path, "written"))
-    )  # through links: the file behind one is replaced, not the link
+    path = _behind_links(with_suffix(path_of(path, "written")))
     check_place(path, force)  # before the arrays are written, and once more when the file is moved
     # A damaged table of contents may hide whole entries, and no checksum covers it: so the header has the list.
     text = json.dumps({**header, "arrays": sorted(arrays)}, default=_plain).encode()
     if len(text) > MAX_HEADER - 1000:  # of which the entry's own header takes some
         raise FileError(f"{path}: cannot be written: message and statistics take {len(text):,} bytes of {MAX_HEADER:,}")
     members = {"header": np.frombuffer(text, np.uint8), **arrays}
+    write_whole(path, lambda file: _write_members(file, members), force=force)
+
+
+def write_whole(path: Path, fill: Callable[[IO[bytes]], object], *, force: bool = False) -> None:
+    """Write a file whole or not at all: ``fill`` gets it open; refusals as for ``write``."""
+    path = _behind_links(path_of(path, "written"))
+    check_place(path, force)
     folder, name = os.path.split(path)
     sweep(folder)
     temporary = os.path.join(folder, hidden_name(name))
@@ -101,7 +106,7 @@ def write(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray
         open(temporary, "xb").close()  # first the file, then its lock: the pid in the name guards the moment between
         with claimed(temporary):
             with open(temporary, "r+b") as file:
-                _write_members(file, members)
+                fill(file)
                 # before the move: else a power cut may leave the new name with nothing behind it
                 file.flush()
                 os.fsync(file.fileno())
@@ -114,6 +119,11 @@ def write(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray
         if os.path.lexists(temporary):
             os.unlink(temporary)
     _sync_folder(folder)
+
+
+def _behind_links(path: str) -> str:
+    """The file that a link stands for, which is replaced, and not the link."""
+    return os.path.realpath(path)
 
 
 def with_suffix(path: str) -> str:

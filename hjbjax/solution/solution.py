@@ -270,6 +270,27 @@ class Solution:
             raise ValueError("Solution.save: got a traced solution; save it outside of jit, vmap and grad")
         files.write(path, *archive.contents(self), force=force)
 
+    def to_xarray(self) -> Any:
+        """An ``xarray.Dataset``: ``value``, each control and disturbance by its name, and what else there is at nodes.
+
+        The axes have the names and units of the states, and ``time`` where marched; needs ``hjbjax[io]``.
+        """
+        if is_traced(self) or np.ndim(self.code):
+            raise ValueError(
+                "Solution.to_xarray: got a traced solution or a batch; take one outside of transformations"
+            )
+        return archive.dataset(self)
+
+    def to_netcdf(self, path: Path, *, force: bool = False) -> None:
+        """Write ``to_xarray()`` as netCDF, whole or not at all, for other tools; what ``load`` reads is of ``save``.
+
+        Raises:
+          FileExistsError: the file exists; another name or ``force=True`` helps.
+          FileError: it cannot be written.
+        """
+        found = self.to_xarray()
+        files.write_whole(path, lambda file: found.to_netcdf(file, engine="h5netcdf"), force=force)
+
     def __repr__(self) -> str:
         status = self.status
         if not isinstance(status, Status):

@@ -1,0 +1,83 @@
+"""Solutions as arrays with names, for other tools."""
+
+import io
+
+import numpy as np
+import pytest
+
+import hjbjax as hjb
+from hjbjax import zoo
+
+xarray = pytest.importorskip("xarray")
+
+
+def solved():
+    problem, grid = zoo.pendulum(discount=0.5, shape=(12, 13))
+    return hjb.solve(problem, grid, throw=False, max_steps=3, scheme=hjb.Upwind())
+
+
+def test_axes_and_arrays_have_names_and_units():
+    solution = solved()
+    found = solution.to_xarray()
+    assert dict(found.sizes) == {"angle": 12, "velocity": 13}
+    assert found["angle"].attrs["units"] == "rad"
+    np.testing.assert_array_equal(found["value"], solution.value)
+    np.testing.assert_array_equal(found["torque"], solution.policy[..., 0])
+    assert found["torque"].attrs == {"units": "N m", "kind": "control"}
+    assert found.attrs["status"] == "MAX_STEPS"
+    # between the nodes as here, inside of a cell
+    at = {"angle": solution.grid.axis(0)[3], "velocity": 0.77}
+    linear = found["value"].interp(**at)
+    assert float(linear) == pytest.approx(float(solution.value_at(list(at.values()))), rel=1e-12)
+
+
+@pytest.mark.filterwarnings("ignore::hjbjax.SolveWarning")
+def test_a_march_has_a_time_a_game_both_players_and_no_name_is_lost():
+    problem = hjb.Problem(
+        lambda x, u, d: u + 0.5 * d, lambda x, u, d: x @ x + u @ u - d @ d, hjb.Box([-1.0], [1.0]),
+        disturbances=hjb.Box([-1.0], [1.0]), control_names=("value",),
+    )  # fmt: skip
+    grid = hjb.Grid([-1.0], [1.0], (9,), names=("time",))
+    marched = hjb.march(problem, grid, 0.2, times=[0.0, 0.1, 0.2], scheme=hjb.Upwind(split=True))
+    found = marched.to_xarray()
+    assert found["value"].dims == ("time", "state time")
+    assert set(found.data_vars) == {"value", "control value", "d"}
+    np.testing.assert_array_equal(found["time"], [0.0, 0.1, 0.2])
+    np.testing.assert_array_equal(found["d"], marched.disturbance[..., 0])
+
+
+def test_a_file_for_other_tools_is_whole_or_not_there(tmp_path, monkeypatch):
+    pytest.importorskip("h5netcdf")
+    solution, path = solved(), tmp_path / "run.nc"
+    solution.to_netcdf(path)
+    with xarray.open_dataset(path, engine="h5netcdf") as found:
+        np.testing.assert_array_equal(found["value"], solution.value)
+        assert found["velocity"].attrs["units"] == "rad/s"
+    before = path.read_bytes()
+    with pytest.raises(FileExistsError, match="force=True"):
+        solution.to_netcdf(path)
+
+    def full(self, file, **options):
+        file.write(b"half")
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(xarray.Dataset, "to_netcdf", full)
+        with pytest.raises(hjb.FileError, match="No space left"):
+            solution.to_netcdf(path, force=True)
+    assert path.read_bytes() == before
+    assert [each.name for each in tmp_path.iterdir()] == ["run.nc"]
+    solution.to_netcdf(path, force=True)
+    assert io.BytesIO(path.read_bytes()).read(4) == b"\x89HDF"
+
+
+def test_a_batch_has_no_one_grid():
+    import jax
+
+    def value(discount):
+        problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), discount=discount)
+        return hjb.solve(problem, hjb.Grid([-1.0], [1.0], (9,)), scheme=hjb.Upwind())
+
+    batch = jax.vmap(value)(np.array([1.0, 2.0]))
+    with pytest.raises(ValueError, match="a traced solution or a batch"):
+        batch.to_xarray()

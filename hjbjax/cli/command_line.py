@@ -6,6 +6,7 @@ import math
 import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast, overload
 
 import click
@@ -87,6 +88,19 @@ def _let_go_of_output() -> None:
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())
         os.close(nowhere)
+
+
+class Place(click.Path):
+    """A path; one that no system takes is refused as a word is."""
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path)
+
+    def convert(self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The path."""
+        if "\0" in os.fspath(value):
+            self.fail(f"{os.fspath(value)!r} holds a null byte, which is no part of a name", param, ctx)
+        return super().convert(value, param, ctx)
 
 
 class Number(click.ParamType):

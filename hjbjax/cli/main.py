@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 import click
 
 from hjbjax._version import __version__
-from hjbjax.cli.command_line import Failure, Name, Number, OneLineGroup, Shape, parameters_of, say
+from hjbjax.cli.command_line import Failure, Name, Number, OneLineGroup, Place, Shape, parameters_of, say
 
 if TYPE_CHECKING:  # for annotations alone: what is heavy is imported by the command that needs it
     from hjbjax.problem.grid import Grid
@@ -84,10 +84,10 @@ def list_problems(name: str | None) -> None:
 @click.option("--tol", type=Number(), help="Certified bound on the algebraic error, in cost units.")
 @click.option("--max-steps", type=Number(int), help="Stop after so many steps.")
 @click.option("--time-limit", type=Number(), help="Stop after so many seconds.")
-@click.option("--checkpoint", type=click.Path(path_type=Path), help="A file that keeps what is done, every minute.")
+@click.option("--checkpoint", type=Place(), help="A file that keeps what is done, every minute.")
 @click.option("--resume", is_flag=True, help="Go on from the checkpoint, if it is there.")
 @click.option("--dry-run", is_flag=True, help="Say what it will take: bytes, programs, steps, seconds; solve nothing.")
-@click.option("--out", type=click.Path(path_type=Path), help="Folder of the results; the problem's name if not given.")
+@click.option("--out", type=Place(), help="Folder of the results; the problem's name if not given.")
 @click.option("--force", is_flag=True, help="Replace results that are there already.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of the screen.")
 @click.option("--no-cache", is_flag=True, help="Keep no compiled programs in the user's folder for caches.")
@@ -278,7 +278,7 @@ def _solve(problem: "Problem", grid: "Grid", options: dict[str, Any]) -> "Soluti
 
 
 @main.command(short_help="All ready problems on a page.")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the page, index.html.")
+@click.option("--out", type=Place(), required=True, help="Folder of the page, index.html.")
 @click.option("--only", multiple=True, type=Name("problem", _systems), help="One problem; may be given several times.")
 @click.option("--force", is_flag=True, help="Replace a page that is there already.")
 @click.option("--no-cache", is_flag=True, help="Keep no compiled programs in the user's folder for caches.")

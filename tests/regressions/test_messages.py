@@ -105,6 +105,7 @@ def test_ordinary_grids_pass():
     ("ask", "said"),
     [
         (lambda: hjb.Problem(lambda x, u: u, cots=cost), r"Problem\(\) got .* 'cots': did you mean cost\?"),
+        (lambda: hjb.Problem(lambda x, u: u, running_cost=cost), r"'running_cost': did you mean cost\?"),
         (lambda: hjb.Grid(low=[-1.0], hi=[1.0], shape=(3,)), r"Grid\(\) got .* 'low': did you mean lo\?"),
         (lambda: hjb.solve(problem(), GRID, toll=1e-3), r"solve\(\) got .* 'toll': did you mean tol\?"),
         (lambda: hjb.march(problem(), GRID, 1.0, tymes=[0.0]), r"march\(\) got .* 'tymes': did you mean times\?"),

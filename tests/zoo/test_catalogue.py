@@ -204,3 +204,13 @@ def test_importing_the_zoo_loads_nothing_heavy():
 def test_refusals(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+@pytest.mark.parametrize("name", [name for name in zoo.__all__ if inspect.isfunction(getattr(zoo, name))])
+def test_a_misspelt_parameter_is_answered_with_the_cure(name):
+    function = getattr(zoo, name)
+    (first, *_) = inspect.signature(function).parameters
+    with pytest.raises(
+        TypeError, match=rf"{name}\(\) got an unexpected keyword argument '{first}x': did you mean {first}"
+    ):
+        function(**{f"{first}x": 1.0})

@@ -84,9 +84,8 @@ def with_suggestions(function: Callable[P, T], name: str | None = None) -> Calla
     def called(*arguments: P.args, **options: P.kwargs) -> T:
         for word in options.keys() - by_name:
             # running_cost is the cost, though more like running_max
-            near = [part for part in word.split("_")[::-1] if part in by_name] or difflib.get_close_matches(
-                word, by_name
-            )
+            parts = [part for part in word.split("_")[::-1] if part in by_name]
+            near = parts or difflib.get_close_matches(word, by_name)
             cure = f"did you mean {near[0]}?" if near else f"wanted one of {', '.join(sorted(by_name - {'self'}))}"
             raise TypeError(f"{name or function.__name__}() got an unexpected keyword argument {word!r}: {cure}")
         return function(*arguments, **options)

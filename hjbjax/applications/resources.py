@@ -12,10 +12,10 @@ from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.types import DType
-from hjbjax.solution import nested_grids
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import keeping_warnings
-from hjbjax.solvers.setup import COARSEST, choose
+from hjbjax.solvers.nested import below
+from hjbjax.solvers.setup import choose
 from hjbjax.solvers.stationary import check_arguments, solve
 
 SMALL = 12_000  # nodes of the larger grid that is tried: a second or so, beside the compilation
@@ -121,7 +121,7 @@ def estimate(
                 options = {"scheme": scheme, "tol": tol, "dtype": kind, "throw": False, "progress": False}
                 found.append(solve(problem, small, method=alike, **options))
         except ValueError as refusal:
-            return dataclasses.replace(about, note=f"on {_counts(small)} nodes: {str(refusal).splitlines()[0]}")
+            return dataclasses.replace(about, note=f"on {memory.counts(small)} nodes: {str(refusal).splitlines()[0]}")
     coarse, fine = found
     ratio, beyond = max(tried[1].size / tried[0].size, 1 + 1e-9), grid.size / tried[1].size
     most = 2 / grid.ndim  # a front passes a cell a step, and noise a cell in as many steps as there are cells
@@ -147,9 +147,9 @@ def _largest(needed: int, free: int | None, grid: Grid) -> int | None:
 
 def _programs(grid: Grid, method: Method, scheme: Scheme | None) -> int:
     """Loops to compile: one a grid, and without a scheme one for the coarser grid that tells the error."""
-    count, smaller = 1, nested_grids.coarser(grid)
-    while smaller is not None and method.coarsest is not None and smaller.size >= method.coarsest:
-        count, smaller = count + 1, nested_grids.coarser(smaller)
+    count, smaller = 1, below(grid, method)
+    while smaller is not None:
+        count, smaller = count + 1, below(smaller, method)
     return count + (scheme is None and count == 1)
 
 
@@ -174,9 +174,4 @@ def _alike(method: Method, small: Grid, grid: Grid) -> Method:
     """The method, with as many levels on the small grid as on the large one."""
     if method.coarsest is None:
         return method
-    return Nested(method.inner, max(round((method.coarsest or COARSEST) * small.size / grid.size), 50))
-
-
-def _counts(grid: Grid) -> str:
-    """The points of all axes, as in "41 x 81"."""
-    return " x ".join(map(str, grid.shape))
+    return Nested(method.inner, max(round(method.coarsest * small.size / grid.size), 50))

@@ -146,13 +146,13 @@ def fitting(needed: int, grid: Grid, limit: int | None) -> int:
     if grid.size >= INDEXABLE:
         largest = math.floor((INDEXABLE - 1) ** (1 / grid.ndim))
         raise MemoryError(
-            f"{_counts(grid)} = {grid.size:,} nodes; 32-bit indices number fewer than {INDEXABLE:,}.\n"
+            f"{counts(grid)} = {grid.size:,} nodes; 32-bit indices number fewer than {INDEXABLE:,}.\n"
             f"At most N = {largest} points an axis in {grid.ndim}-D; {NO_GRID}."
         )
     # in proportion to the nodes: the largest grid that would fit has free/needed times as many
     if free is not None and needed > free:
         raise MemoryError(
-            f"{_counts(grid)} = {grid.size:,} nodes need about {needed / 1e9:.3g} GB, {free / 1e9:.3g} GB are free.\n"
+            f"{counts(grid)} = {grid.size:,} nodes need about {needed / 1e9:.3g} GB, {free / 1e9:.3g} GB are free.\n"
             f"{_largest(free / needed * grid.size, grid.ndim)}; max_memory= (bytes) overrides what counts as free.\n"
             f"dtype='float32' takes about half; {NO_GRID}."
         )
@@ -167,6 +167,6 @@ def _largest(nodes: float, n: int) -> str:
     return f"About N = {largest} points an axis would fit in {n}-D"
 
 
-def _counts(grid: Grid) -> str:
+def counts(grid: Grid) -> str:
     """The points of all axes, as in "41 x 81"."""
     return " x ".join(map(str, grid.shape))

@@ -20,6 +20,7 @@ import numpy as np
 from hjbjax.markov_chain import memory
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.types import Nodes
+from hjbjax.solution.checkpoints import Part
 from hjbjax.solution.clock import CHUNK_SECONDS, Clock
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
@@ -30,7 +31,7 @@ CALLBACK = "CpuCallback error"  # how JAX heads the exception of a callback, wha
 Kept: TypeAlias = tuple[np.ndarray, Grid]  # node values that outlived an exception, and their grid
 
 
-class Run(Protocol):
+class Run(Part, Protocol):
     """A computation in steps, as the loop drives it."""
 
     @property
@@ -74,16 +75,6 @@ class Run(Protocol):
 
     def keep(self, error: Exception) -> None:
         """Attach what was there before an exception to it."""
-
-    @property
-    def passing(self) -> bool:
-        """Whether its end is a guess for what follows, and nothing else."""
-
-    def saved(self) -> list[Any]:
-        """Its state for a checkpoint, as arrays in an order of its own."""
-
-    def restore(self, arrays: list[np.ndarray]) -> None:
-        """Go on from the arrays of ``saved``."""
 
 
 def drive(run: Run, clock: Clock) -> Status:

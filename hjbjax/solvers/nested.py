@@ -88,18 +88,18 @@ def levels(task: Task, method: Method, clock: Clock, *, asked_again: bool) -> li
     ``asked_again``: the next coarser grid in any case, if it can tell the error of the grid.
     """
     found: list[Task] = []
-    smaller = (_telling(task.grid) if asked_again else None) or _below(task.grid, method)
+    smaller = (_telling(task.grid) if asked_again else None) or below(task.grid, method)
     while smaller is not None and clock.over() is None:
         clock.phase = f"the preparation of {' x '.join(map(str, smaller.shape))} nodes"
         level = _on_coarser(task, smaller)
         if level is None:
             break
         found.insert(0, level)
-        smaller = _below(smaller, method)
+        smaller = below(smaller, method)
     return found
 
 
-def _below(grid: Grid, method: Method) -> Grid | None:
+def below(grid: Grid, method: Method) -> Grid | None:
     """The next coarser grid, if it has as many nodes as the method wants of the coarsest."""
     smaller = nested_grids.coarser(grid)
     return None if smaller is None or method.coarsest is None or smaller.size < method.coarsest else smaller

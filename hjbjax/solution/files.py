@@ -85,8 +85,7 @@ def write(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray
       FileError: the folder is missing or cannot be written, the disk is full, or a folder, a device or a pipe has that
         name; no half file is left.
     """
-    path = _behind_links(with_suffix(path_of(path, "written")))
-    check_place(path, force)  # before the arrays are written, and once more when the file is moved
+    path = with_suffix(path_of(path, "written"))
     # A damaged table of contents may hide whole entries, and no checksum covers it: so the header has the list.
     text = json.dumps({**header, "arrays": sorted(arrays)}, default=_plain).encode()
     if len(text) > MAX_HEADER - 1000:  # of which the entry's own header takes some
@@ -97,8 +96,9 @@ def write(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray
 
 def write_whole(path: Path, fill: Callable[[IO[bytes]], object], *, force: bool = False) -> None:
     """Write a file whole or not at all: ``fill`` gets it open; refusals as for ``write``."""
-    path = _behind_links(path_of(path, "written"))
-    check_place(path, force)
+    # through links: the file behind one is replaced, not the link
+    path = os.path.realpath(path_of(path, "written"))
+    check_place(path, force)  # before the arrays are written, and once more when the file is moved
     folder, name = os.path.split(path)
     sweep(folder)
     temporary = os.path.join(folder, hidden_name(name))
@@ -119,11 +119,6 @@ def write_whole(path: Path, fill: Callable[[IO[bytes]], object], *, force: bool 
         if os.path.lexists(temporary):
             os.unlink(temporary)
     _sync_folder(folder)
-
-
-def _behind_links(path: str) -> str:
-    """The file that a link stands for, which is replaced, and not the link."""
-    return os.path.realpath(path)
 
 
 def with_suffix(path: str) -> str:

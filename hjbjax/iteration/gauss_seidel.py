@@ -11,9 +11,13 @@ downwards, and flipping axes beyond the first before shearing gives all 2ⁿ ord
 across the seam of a periodic axis, is as old as the last sweep.
 
 Where the arrays outgrow a processor's cache, slabs of slices take the place of single sweeps through all of them.
+
+Over many devices each sweeps its own nodes, all at once: block Jacobi between the parts. The arrays of a part have one
+more layer on either side of a divided axis, rows without weights whose source is the δ of the nodes beyond, fetched
+from the parts beside before every forward and backward pair.
 """
 
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +32,7 @@ Weights = list[tuple[jax.Array, ...]]  # for each axis, as ``_towards`` gives th
 
 CACHE = 2**25  # bytes that a processor keeps near by
 SLAB = 64  # slices that are swept to and fro while they are in the cache
+KNOWN: Any = {"mode": "promise_in_bounds", "unique_indices": True}  # of places made by construction
 FOLDS = 4  # up to so many comparisons take the place of a division, which XLA would not fuse
 
 
@@ -37,6 +42,7 @@ def sweep(equation: PolicyEquation, grid: Grid, rounds: int) -> Field:
     The orders are one loop, so that one program serves them all and its operands are arrays in memory: a fused
     gather would compute each of their entries on its own.
     """
+    equation = _with_layers(equation, grid)
 
     def order(index: jax.Array, delta: jax.Array) -> jax.Array:
         # one bit an axis beyond the first; forward and backward sweeps are the two ways along the first
@@ -45,10 +51,10 @@ def sweep(equation: PolicyEquation, grid: Grid, rounds: int) -> Field:
         weights = [_towards(equation, grid, axis, flips) for axis in range(grid.ndim)]
 
         def whole(planes: jax.Array) -> jax.Array:
-            return _in_turns(source, weights, planes, grid, rounds)
+            return _in_turns(source, weights, planes, grid, rounds, flips)
 
         def in_slabs(planes: jax.Array) -> jax.Array:
-            return _in_slabs(source, weights, planes, grid, rounds)
+            return _in_slabs(source, weights, planes, grid, rounds, flips)
 
         # a margin of one entry on every side, so that neighbours are slices without a branch at the ends
         planes = jnp.pad(_sheared(delta, flips), 1)
@@ -58,7 +64,51 @@ def sweep(equation: PolicyEquation, grid: Grid, rounds: int) -> Field:
             planes = whole(planes)
         return _sheared(planes[(slice(1, -1),) * grid.ndim], flips, back=True)
 
-    return jax.lax.fori_loop(0, 2 ** (grid.ndim - 1), order, jnp.zeros_like(equation.source))
+    delta = jax.lax.fori_loop(0, 2 ** (grid.ndim - 1), order, jnp.zeros_like(equation.source))
+    return delta[tuple(slice(1, -1) if grid.is_divided(axis) else slice(None) for axis in range(grid.ndim))]
+
+
+def _with_layers(equation: PolicyEquation, grid: Grid) -> PolicyEquation:
+    """The equation with a layer of zeros on both sides of every divided axis; in fillers zeros as well."""
+    if grid.parts is None:
+        return equation
+    widths = [(1, 1) if grid.is_divided(axis) else (0, 0) for axis in range(grid.ndim)]
+    return jax.tree.map(lambda leaf: jnp.pad(grid.parts.cleared(leaf), widths) if leaf.ndim else leaf, equation)  # type: ignore[union-attr]
+
+
+Carried = tuple[jax.Array, jax.Array]  # planes, and the source, whose layers change from pair to pair
+
+
+def _exchanged(carried: Carried, grid: Grid, flips: list[jax.Array]) -> Carried:
+    """Planes and source with the δ of the nodes beyond this part in the layers around it."""
+    planes, source = carried
+    if grid.parts is None:
+        return carried
+    for axis in grid.parts.axes:
+        count, cyclic = grid.parts.count(axis), bool(grid.periodic[axis])  # type: ignore[index]
+        for step, first, layer in ((1, 1, count + 1), (-1, count, 0)):
+            # what the part beside needs of this one is its node at that end; places count the layer
+            given = planes.at[_places(source.shape, axis, first, flips, margin=1)].get(**KNOWN)
+            found = grid.parts.fetched(given, axis, step, cyclic=cyclic)
+            planes = planes.at[_places(source.shape, axis, layer, flips, margin=1)].set(found, **KNOWN)
+            source = source.at[_places(source.shape, axis, layer, flips, margin=0)].set(found, **KNOWN)
+    return planes, source
+
+
+def _places(
+    shape: tuple[int, ...], axis: int, number: Index, flips: list[jax.Array], *, margin: int
+) -> tuple[jax.Array, ...]:
+    """Where the nodes with one ``number`` along an axis stand in sheared arrays with a ``margin`` on every side."""
+    sizes = [1 if k == axis else size for k, size in enumerate(shape)]
+    row, *columns = (
+        jax.lax.broadcasted_iota(jnp.int32, sizes, k) + (number if k == axis else 0) for k in range(len(shape))
+    )
+    columns = [
+        jnp.where(flip == 1, size - 1 - column, column)
+        for column, size, flip in zip(columns, shape[1:], flips, strict=True)
+    ]
+    slices = (row + sum(columns)) % shape[0]
+    return tuple(place + margin for place in (slices, *columns))
 
 
 def _outgrows_the_cache(source: jax.Array, weights: Weights) -> bool:
@@ -69,18 +119,23 @@ def _outgrows_the_cache(source: jax.Array, weights: Weights) -> bool:
     return size > CACHE and SLAB * size / len(source) < CACHE / 2
 
 
-def _in_turns(source: jax.Array, weights: Weights, planes: jax.Array, grid: Grid, rounds: int) -> jax.Array:
+def _in_turns(
+    source: jax.Array, weights: Weights, planes: jax.Array, grid: Grid, rounds: int, flips: list[jax.Array]
+) -> jax.Array:
     """All slices upwards and downwards, ``rounds`` times."""
 
-    def pair(_: Index, planes: jax.Array) -> jax.Array:
+    def pair(_: Index, carried: Carried) -> Carried:
+        planes, source = _exchanged(carried, grid, flips)
         for up in (True, False):
             planes = _sweep(source, weights, _wrapped(planes, grid), 0, len(source), up=up)
-        return planes
+        return planes, source
 
-    return jax.lax.fori_loop(0, rounds, pair, planes)
+    return jax.lax.fori_loop(0, rounds, pair, (planes, source))[0]
 
 
-def _in_slabs(source: jax.Array, weights: Weights, planes: jax.Array, grid: Grid, rounds: int) -> jax.Array:
+def _in_slabs(
+    source: jax.Array, weights: Weights, planes: jax.Array, grid: Grid, rounds: int, flips: list[jax.Array]
+) -> jax.Array:
     """Slab after slab upwards and once more downwards; each to and fro while it is in the cache.
 
     What lies beyond the cache is read twice instead of 2 ``rounds`` times, and a slab is swept 2 ``rounds`` - 1 times
@@ -89,8 +144,9 @@ def _in_slabs(source: jax.Array, weights: Weights, planes: jax.Array, grid: Grid
     count = len(source)
     slabs = -(-count // SLAB)  # the last one may be shorter
     for up in (True, False):
+        planes, source = _exchanged((planes, source), grid, flips)
 
-        def slab(index: jax.Array, planes: jax.Array, up: bool = up) -> jax.Array:
+        def slab(index: jax.Array, planes: jax.Array, up: bool = up, source: jax.Array = source) -> jax.Array:
             first = SLAB * (index if up else slabs - 1 - index)
             last = jnp.minimum(first + SLAB, count)
 
@@ -118,7 +174,7 @@ def _towards(equation: PolicyEquation, grid: Grid, axis: int, flips: list[jax.Ar
 def _wrapped(planes: jax.Array, grid: Grid) -> jax.Array:
     """The planes with a margin of values from across the fold of the shear and the seams of periodic axes."""
     for axis in range(1, grid.ndim):  # before the first axis, whose margins hold the corners of the others as well
-        if grid.periodic[axis]:  # type: ignore[index]
+        if grid.periodic[axis] and not grid.is_divided(axis):  # type: ignore[index]
             planes = _with_margins(planes, axis)
     return _with_margins(planes, 0)
 

@@ -18,6 +18,7 @@ NAMES = {
     "controls": ("speed", "seconds against the number of controls and against the error: O(1/ε^{2n+m}) and less"),
     "information": ("speed", "nodes, bytes and seconds of beliefs on grids, beside the counts of section 13.2"),
     "batch": ("speed", "solve_batch of pendulums of different mass, against one after the other"),
+    "devices": ("speed", "one problem over two devices of a processor beside one, and outer steps on eight"),
     "gradients": ("speed", "value and gradient of a solve beside the value, and beside central differences"),
     "startup": ("speed", "the first answer of a process: importing, compiling, pictures; cold and with the cache"),
     "precision": ("accuracy", "error against seconds: what second order is worth"),

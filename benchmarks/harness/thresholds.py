@@ -38,6 +38,7 @@ class Threshold:
 CHAIN = "pendulum 200 x 201, 21 controls, to 1e-3, against the faster of QuantEcon's two methods"
 FIRST = "first answer of the pendulum at its default on {} over one compilation of its loop"
 HAND = "pendulum {} to 1e-3, 21 controls, against the numba solver"
+DEVICES = "pendulum {} to 1e-3, seconds on two devices of one processor over those on one"
 THRESHOLDS = {
     "sweep 1024": Threshold("sweep on 1024 x 1024, 21 controls, float32, against the numba loop", 1.5, 2.5),
     "sweep 2048": Threshold("sweep on 2048 x 2048, 21 controls, float32, against the numba loop", 1.5, 2.5),
@@ -63,6 +64,9 @@ THRESHOLDS = {
     "cold start": Threshold("process start to pictures, no cache", 12, unit=" s", most=True),
     "cached start": Threshold("process start to pictures, with the compile cache", 7, unit=" s", most=True),
     "gradient": Threshold("value and gradient of a solve over its value, the most of seven", 3, 2, most=True),
+    "devices 800": Threshold(DEVICES.format("800 x 801"), 0.85, 0.7, most=True),
+    "devices 1600": Threshold(DEVICES.format("1600 x 1601"), 1, 0.7, most=True),
+    "devices steps": Threshold("pendulum 800 x 801, outer steps on eight devices over those on one", 1.2, most=True),
     "batch": Threshold("solve_batch of 64 pendulums at 100 x 101, against one by one", 1.7, 10),
 }
 

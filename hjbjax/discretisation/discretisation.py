@@ -6,17 +6,21 @@ And what a scheme must offer, so that one of the user's own serves as well; ``sc
 import dataclasses
 import itertools
 from collections.abc import Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from hjbjax.discretisation.stencil import Links
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.parts import Parts
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import pytree_dataclass
+from hjbjax.problem.pytree import altered, pytree_dataclass
 from hjbjax.tracing import components, dependence
+
+T = TypeVar("T")
 
 
 @runtime_checkable
@@ -82,7 +86,7 @@ class Chain(Scheme, Protocol):
         """
 
 
-@pytree_dataclass(static=("scheme", "dtype"))
+@pytree_dataclass(static=("scheme", "dtype", "mesh"))
 class Discretisation:
     """A problem on a grid by a scheme, in one floating-point type and at one time.
 
@@ -99,6 +103,7 @@ class Discretisation:
         serves the scheme and, without noise, its chain; None: never.
       cut: the links that end on the boundary of a target, kept by ``cut_cells``; None: made anew wherever they are
         wanted.
+      mesh: the devices over which the nodes are divided while steps are made; None: one.
     """
 
     problem: Problem
@@ -108,6 +113,7 @@ class Discretisation:
     t: Any = 0.0
     plain: Any = None
     cut: tuple[Links, ...] | None = None
+    mesh: Mesh | None = None
 
     def __post_init__(self):
         # jnp.float32 and "float32" are other keys than np.dtype: one program would be compiled for each
@@ -130,6 +136,12 @@ class Discretisation:
     def on_grid(self, grid: Grid) -> "Discretisation":
         """The discretisation on another grid."""
         return dataclasses.replace(self, grid=grid, cut=None)
+
+    @property
+    def parts(self) -> Parts | None:
+        """The parts of the grid over the mesh; None for one device, and for grids too small for it, as coarser ones."""
+        parts = None if self.mesh is None else Parts(self.mesh, self.grid.shape)
+        return parts if parts is not None and parts.fits else None
 
     def coordinates(self) -> list:
         """The n coordinates of all nodes, each of a shape that broadcasts to (*grid)."""
@@ -196,6 +208,24 @@ class Discretisation:
 
     def _arguments(self, u: list, d: list | None, x: list | None) -> tuple:
         return self.problem.arguments(self.coordinates() if x is None else x, u, d, self.t)
+
+
+def over_nodes(task: T, shape: tuple[int, ...]) -> T:
+    """The leaves of a task, or of a march, with a value at every node, as truth values: those of this ``shape``."""
+
+    def mark(leaf: Any) -> bool:
+        return np.shape(leaf) == shape
+
+    on: Discretisation = task.on  # type: ignore[attr-defined]
+    # without those of the problem and the grid, which may have the shape of the nodes by chance
+    nothing, cut = jax.tree.map(lambda _: False, on), jax.tree.map(mark, on.cut)
+    return altered(jax.tree.map(mark, altered(task, on=None)), on=altered(nothing, cut=cut))
+
+
+def on_part(task: T, parts: Parts) -> T:
+    """A task, or a march, as one of the devices sees it, inside ``shard_map``."""
+    on: Discretisation = task.on  # type: ignore[attr-defined]
+    return altered(task, on=altered(on, grid=on.grid.divided(parts)))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -105,8 +105,8 @@ def weights(scheme: Chain, f: Any, a: Any, link: Links, grid: Grid, axis: int) -
         return jnp.maximum(f, 0), jnp.maximum(-f, 0)
     a = 0 if a is None else jnp.maximum(a, 0)  # correlated noise may leave a rounding error below zero
     leaving, span = f, link.up + link.down
-    lower, upper = stencil.wall(grid, axis, -1), stencil.wall(grid, axis, 1)
-    if lower.any() or upper.any():  # the link beyond is the mirror image of the one inside
+    if stencil.has_walls(grid, axis):  # the link beyond is the mirror image of the one inside
+        lower, upper = stencil.wall(grid, axis, -1), stencil.wall(grid, axis, 1)
         leaving = jnp.where(upper, jnp.maximum(f, 0), jnp.where(lower, jnp.minimum(f, 0), f))
         span = jnp.where(upper | lower, link.up, span)
     e = scheme.excess(leaving, a, link)
@@ -126,9 +126,9 @@ def kinks(
 ) -> tuple[Sequence[Any], Sequence[Any]]:
     """The drifts at which the derivative of the gain of ``weights`` jumps, and its derivatives: one more."""
     found, derivatives = scheme.kinks(a, slopes, link)
-    wall = stencil.walls(grid, axis)
-    if not wall.any():
+    if not stencil.has_walls(grid, axis):
         return found, derivatives
+    wall = stencil.walls(grid, axis)
     # over half a cell twice the derivative where drift leaves, the inner difference where it does not: the lesser,
     # since e rises by at most h n
     inner = slopes[0] + slopes[1]
@@ -192,7 +192,7 @@ class Upwind:
     central: bool = True
     subcell: bool = False
     split: bool = False
-    monotone, stationary, even, one_way = True, True, False, True
+    monotone, stationary, even, one_way, in_parts = True, True, False, True, True
     stages, points = 1, 2
 
     @property
@@ -237,7 +237,7 @@ class Limited:
 
     subcell: bool = True
     split: bool = False
-    monotone, stationary, even = False, True, False
+    monotone, stationary, even, in_parts = False, True, False, True
     stages, points = 2, 2
 
     @property
@@ -283,7 +283,7 @@ class Eno2:
     The smoother stencil, node by node, as C.-W. Shu and S. Osher choose it. Wants equal spacings.
     """
 
-    monotone, stationary, even, subcell, split = False, False, True, False, True
+    monotone, stationary, even, subcell, split, in_parts = False, False, True, False, True, True
     stages, points = 2, 3
 
     @property
@@ -312,7 +312,7 @@ class Weno5:
 
     subcell: bool = True
     split: bool = True
-    monotone, stationary, even = False, True, True
+    monotone, stationary, even, in_parts = False, True, True, True
     stages, points = 3, 7
 
     @property

@@ -49,7 +49,7 @@ def weno5(values: Field, grid: Grid, lost: Mask | None = None) -> list[tuple[Fie
     """
     most, least = (values, values) if lost is None else (jnp.where(lost, fill, values) for fill in (-jnp.inf, jnp.inf))
     # it only sets the unit of ε: no derivative goes through the nodes of the largest and the least V
-    extent = jax.lax.stop_gradient(jnp.max(most) - jnp.min(least))
+    extent = jax.lax.stop_gradient(grid.largest(most) - grid.least(least))
     extent = jnp.where(extent > 0, extent, 1)  # a constant V has slopes zero in any unit
     result = []
     for axis in range(grid.ndim):
@@ -94,22 +94,15 @@ def _differences(values: Field, grid: Grid, axis: int, reach: int, scale: PerNod
 def _continued(values: Field, grid: Grid, axis: int, reach: int) -> jax.Array:
     """``values`` with ``reach`` more entries at both ends of an axis."""
 
-    def part(start, stop):
-        return jax.lax.slice_in_dim(values, start, stop, axis=axis)
+    def ended(step: int) -> jax.Array:
+        """The parabola through the last three entries of an end, at the nearest ``reach`` places beyond it."""
+        a, b, c = (stencil.slices(values, grid, axis, step, k) for k in range(3))
+        # Lagrange's polynomials on the places 0, 1, 2, at −3, −2 and −1; at the upper end the mirror image
+        found = [10 * a - 15 * b + 6 * c, 6 * a - 8 * b + 3 * c, 3 * a - 3 * b + c][3 - reach :]
+        return jnp.concatenate(found if step < 0 else found[::-1], axis)
 
-    count = grid.shape[axis]
-    if grid.periodic[axis]:  # type: ignore[index]
-        return jnp.concatenate([part(count - reach, count), values, part(0, reach)], axis)
-
-    def beyond(a, b, c):
-        """The parabola through three entries, at the three places before the first, farthest first."""
-        # Lagrange's polynomials on the places 0, 1, 2, at −3, −2 and −1
-        return [10 * a - 15 * b + 6 * c, 6 * a - 8 * b + 3 * c, 3 * a - 3 * b + c]
-
-    # of the three places the nearest ``reach``; at the upper end the mirror image
-    first = beyond(*(part(k, k + 1) for k in range(3)))[3 - reach :]
-    last = beyond(*(part(count - 1 - k, count - k) for k in range(3)))[3 - reach :]
-    return jnp.concatenate([*first, values, *last[::-1]], axis)
+    below, above = (stencil.beyond(values, grid, axis, step, ended(step)) for step in (-1, 1))
+    return stencil.joined(values, grid, axis, below, above)
 
 
 def _weighted(a: Field, b: Field, c: Field, d: Field, e: Field) -> Field:

@@ -5,6 +5,9 @@ difference of zero, which projects outward drift back onto the box. Noise sees t
 reflected path has ∂V/∂n = 0 there, and a value that is even about the wall has it to second order, where the copy
 puts the wall half a spacing further out. Beyond an open end the value goes on as the parabola through its last three
 nodes, V_{N+1} = 3V_N − 3V_{N−1} + V_{N−2} where they are equally spaced.
+
+Where the nodes are divided over many devices, what stands beyond the last node of a part is fetched from the part
+beside: see ``problem.parts``.
 """
 
 from collections.abc import Sequence
@@ -16,7 +19,7 @@ import numpy as np
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import pytree_dataclass
-from hjbjax.problem.types import AtNodes, Field, Number
+from hjbjax.problem.types import Array, AtNodes, Field, Number, Scalar
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -26,21 +29,31 @@ PerNode: TypeAlias = float | jax.Array | np.ndarray  # a number a node, as one n
 LONGER = 4  # axes up to which neighbours along the last one are slices of a longer array
 
 
-def on_edge(grid: Grid, axis: int, step: int) -> np.ndarray:
+def on_edge(grid: Grid, axis: int, step: int) -> Array:
     """The nodes without a neighbour in direction ``step`` along ``axis``, bool; broadcasts against the node axes."""
+    along = [-1 if i == axis else 1 for i in range(grid.ndim)]
+    if grid.is_divided(axis):  # which nodes are here, only the running program knows
+        end = grid.whole.shape[axis] - 1 if step > 0 else 0
+        ended = jnp.asarray(not grid.periodic[axis])  # type: ignore[index]
+        return ((grid.parts.nodes(axis) == end) & ended).reshape(along)  # type: ignore[union-attr]
     # (1, …, N, …, 1) and on the host: as a constant of the size of the grid it would stand in every program
     mask = np.zeros(grid.shape[axis], dtype=bool)
     mask[-1 if step > 0 else 0] = not grid.periodic[axis]  # type: ignore[index]
-    return mask.reshape([-1 if i == axis else 1 for i in range(grid.ndim)])
+    return mask.reshape(along)
 
 
-def wall(grid: Grid, axis: int, step: int) -> np.ndarray:
+def has_walls(grid: Grid, axis: int) -> bool:
+    """True if an end of an axis, or both, stops drift and noise."""
+    return not grid.periodic[axis] and any((axis, step) not in grid.sides("open") for step in (-1, 1))  # type: ignore[index]
+
+
+def wall(grid: Grid, axis: int, step: int) -> Array:
     """The nodes at which drift and noise in direction ``step`` along ``axis`` are stopped: edges that are not open."""
     edge = on_edge(grid, axis, step)
-    return np.zeros_like(edge) if (axis, step) in grid.sides("open") else edge
+    return np.zeros(edge.shape, bool) if (axis, step) in grid.sides("open") else edge
 
 
-def walls(grid: Grid, axis: int) -> np.ndarray:
+def walls(grid: Grid, axis: int) -> Array:
     """The nodes with a wall on either side along ``axis``."""
     return wall(grid, axis, 1) | wall(grid, axis, -1)
 
@@ -63,7 +76,7 @@ def parabola(grid: Grid, axis: int, step: int) -> tuple[Number, Number, Number]:
     """
     if grid.stretch[axis] is None:  # type: ignore[index]
         return 3.0, -3.0, 1.0
-    gaps = jnp.diff(jnp.asarray(grid.axis(axis)))
+    gaps = jnp.diff(jnp.asarray(grid.whole.axis(axis)))
     last, before = (gaps[-1], gaps[-2]) if step > 0 else (gaps[0], gaps[1])
     # Newton's form of the parabola at a distance ``last`` beyond the end; equal gaps make it 3, −3, 1
     ratio, bend = last / before, 2 * last / (last + before)
@@ -80,11 +93,9 @@ def continued(values: Field, grid: Grid, offset: tuple[int, ...], *, mirror: boo
     for axis, step in enumerate(offset):  # beyond a corner: what one axis says through what the other says
         moved = neighbour(values, grid, unit(grid, axis, step))
         if step and (axis, step) in grid.sides("open"):
-            moved = jnp.where(on_edge(grid, axis, step), _beyond(values, grid, axis, step), moved)
+            moved = jnp.where(on_edge(grid, axis, step), _ended(values, grid, axis, step), moved)
         elif step and mirror and not grid.periodic[axis]:  # type: ignore[index]
-            inside = grid.shape[axis] - 2 if step > 0 else 1
-            image = jax.lax.slice_in_dim(values, inside, inside + 1, axis=axis)
-            moved = jnp.where(on_edge(grid, axis, step), image, moved)
+            moved = jnp.where(on_edge(grid, axis, step), slices(values, grid, axis, step, 1), moved)
         values = moved
     return values
 
@@ -113,12 +124,49 @@ def inward(
     return [offset for offset, _ in pairs], [value for _, value in pairs]
 
 
-def _beyond(values: AtNodes, grid: Grid, axis: int, step: int) -> jax.Array:
+def slices(values: AtNodes, grid: Grid, axis: int, step: int, inwards: int = 0, count: int = 1) -> jax.Array:
+    """So many slices of the nodes next to the end of an axis in direction ``step``, ``inwards`` away from it.
+
+    In the order of the nodes. Where the axis is divided they are next to the end of this part.
+    """
+    first: int | Scalar = inwards
+    if step > 0:
+        nodes = grid.shape[axis] if grid.parts is None else grid.parts.count(axis)
+        first = nodes - inwards - count
+    if isinstance(first, int):
+        return jax.lax.slice_in_dim(values, first, first + count, axis=axis)
+    return jax.lax.dynamic_slice_in_dim(values, first, count, axis=axis)
+
+
+def joined(values: AtNodes, grid: Grid, axis: int, below: AtNodes, above: AtNodes) -> jax.Array:
+    """The values with slices ``below`` and ``above`` them along an axis, these behind the last node that is here."""
+    long = jnp.concatenate([below, values, above], axis=axis)
+    if grid.parts is None or grid.parts.even(axis):
+        return long
+    return jax.lax.dynamic_update_slice_in_dim(long, above, below.shape[axis] + grid.parts.count(axis), axis=axis)
+
+
+def beyond(values: AtNodes, grid: Grid, axis: int, step: int, ended: AtNodes) -> jax.Array:
+    """The slices beyond the last node here: of the part beside, of the other end of a periodic axis, or ``ended``.
+
+    ``ended`` is what stands beyond an end of the box, and says how many slices there are to be.
+    """
+    cyclic = bool(grid.periodic[axis])  # type: ignore[index]
+    if not (cyclic or grid.is_divided(axis)):
+        return ended
+    # what the other side has at the end that faces this one
+    given = slices(values, grid, axis, -step, count=ended.shape[axis])
+    if grid.parts is None or not grid.is_divided(axis):
+        return given
+    found = grid.parts.fetched(given, axis, step, cyclic=cyclic)
+    return found if cyclic else jnp.where(grid.parts.at_end(axis, step), ended, found)
+
+
+def _ended(values: AtNodes, grid: Grid, axis: int, step: int) -> jax.Array:
     """The values beyond the end of an ordinary axis, one slice: a copy of the end, or the parabola's continuation."""
-    last = grid.shape[axis] - 1 if step > 0 else 0
     if (axis, step) not in grid.sides("open"):
-        return jax.lax.slice_in_dim(values, last, last + 1, axis=axis)
-    nodes = [jax.lax.slice_in_dim(values, k, k + 1, axis=axis) for k in (last, last - step, last - 2 * step)]
+        return slices(values, grid, axis, step)
+    nodes = [slices(values, grid, axis, step, k) for k in range(3)]
     weights = [jnp.asarray(weight, values.dtype) for weight in parabola(grid, axis, step)]
     return sum((w * v for w, v in zip(weights[1:], nodes[1:], strict=True)), start=weights[0] * nodes[0])
 
@@ -135,17 +183,18 @@ def neighbour(values: AtNodes, grid: Grid, offset: tuple[int, ...], *, ghost: bo
     for axis, step in enumerate(offset):
         if step == 0:
             continue
-        last = grid.shape[axis] - 1
-        # the slice that stands beyond: the edge's own copy, or across the seam the other end of the axis
-        end = last if (step > 0) != bool(grid.periodic[axis]) else 0  # type: ignore[index]
-        beyond = jax.lax.slice_in_dim(values, end, end + 1, axis=axis)
-        if not ghost and not grid.periodic[axis]:  # type: ignore[index]
-            beyond = jnp.zeros_like(beyond)
-        if step > 0:
-            parts = [jax.lax.slice_in_dim(values, 1, last + 1, axis=axis), beyond]
+        last = slices(values, grid, axis, step)
+        outside = beyond(values, grid, axis, step, last if ghost else jnp.zeros_like(last))
+        if step < 0:
+            parts = [outside, jax.lax.slice_in_dim(values, 0, grid.shape[axis] - 1, axis=axis)]
         else:
-            parts = [beyond, jax.lax.slice_in_dim(values, 0, last, axis=axis)]
-        values = jnp.concatenate(parts, axis=axis)  # fused, where a pad would fill an array
+            parts = [jax.lax.slice_in_dim(values, 1, grid.shape[axis], axis=axis), outside]
+        moved = jnp.concatenate(parts, axis=axis)  # fused, where a pad would fill an array
+        if step > 0 and grid.parts is not None and not grid.parts.even(axis):
+            # the last entry may be no node of this part, and the one before it the last
+            place = jnp.arange(grid.shape[axis]).reshape([-1 if i == axis else 1 for i in range(grid.ndim)])
+            moved = jnp.where(place == grid.parts.count(axis) - 1, outside, moved)
+        values = moved
     return values
 
 
@@ -174,10 +223,13 @@ def links(grid: Grid, axis: int) -> Links:
     """The links of the grid itself along one axis; on a stretched one an end repeats its only distance."""
     if grid.stretch[axis] is None:  # type: ignore[index]
         return Links(grid.spacing(axis), grid.spacing(axis))
-    gaps = jnp.diff(jnp.asarray(grid.axis(axis)))
+    gaps = jnp.diff(jnp.asarray(grid.whole.axis(axis)))
     along = [-1 if i == axis else 1 for i in range(grid.ndim)]
     # N − 1 gaps for N nodes: beyond an end stands the mirror image, or a parabola over a gap as long
-    return Links(jnp.append(gaps, gaps[-1:]).reshape(along), jnp.append(gaps[:1], gaps).reshape(along))
+    up, down = jnp.append(gaps, gaps[-1:]), jnp.append(gaps[:1], gaps)
+    if grid.parts is not None:
+        up, down = grid.parts.own(up, axis), grid.parts.own(down, axis)
+    return Links(up.reshape(along), down.reshape(along))
 
 
 def one_sided(values: Field, grid: Grid, axis: int, link: Links | None = None) -> tuple[Field, Field]:
@@ -199,11 +251,8 @@ def _neighbours(values: Field, grid: Grid, axis: int) -> tuple[Field, Field]:
     """
     if axis < grid.ndim - 1 or grid.ndim > LONGER:
         return continued(values, grid, unit(grid, axis, 1)), continued(values, grid, unit(grid, axis, -1))
-    count = grid.shape[axis]
-    first, last = (_beyond(values, grid, axis, step) for step in (-1, 1))
-    if grid.periodic[axis]:  # type: ignore[index]
-        first, last = last, first  # across the seam stands the other end
-    wide = jax.lax.optimization_barrier(jnp.concatenate([first, values, last], axis=axis))
+    below, above = (beyond(values, grid, axis, step, _ended(values, grid, axis, step)) for step in (-1, 1))
+    wide, count = jax.lax.optimization_barrier(joined(values, grid, axis, below, above)), grid.shape[axis]
     return jax.lax.slice_in_dim(wide, 2, count + 2, axis=axis), jax.lax.slice_in_dim(wide, 0, count, axis=axis)
 
 

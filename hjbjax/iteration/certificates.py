@@ -28,6 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
+from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
 from hjbjax.problem.types import Array, Field, Mask, Number, Scalar
 from hjbjax.solution.status import Status
@@ -72,6 +73,7 @@ class Iterate:
     """A value function with its policy and the residual of its equation.
 
     Attributes:
+      grid: the nodes.
       value: V, (*grid).
       policy: the greedy policy at V with its rate r, zero where held.
       equation: the correction equation there, whose source is the residual.
@@ -79,6 +81,7 @@ class Iterate:
       counted: bool (*grid), the nodes whose error counts (those that reach the target).
     """
 
+    grid: Grid
     value: Field
     policy: Greedy
     equation: PolicyEquation
@@ -98,7 +101,7 @@ def error_bound(
       least_cost: L at every node, for the multiplicative bound.
       moved: the size of the last correction, the fallback measure.
     """
-    residual = jnp.max(jnp.where(iterate.counted, jnp.abs(iterate.equation.source), 0))
+    residual = iterate.grid.largest(jnp.where(iterate.counted, jnp.abs(iterate.equation.source), 0))
     zero = jnp.zeros_like(residual)
     if kind is Certificate.BY_DISCOUNT:
         other = Certificate.NONE if least_cost is None else Certificate.MULTIPLICATIVE
@@ -122,9 +125,9 @@ def error_bound(
 
 def _additive(iterate: Iterate, discount: Number) -> tuple[Scalar, Scalar]:
     """min ρ and max ρ of ρ = max(min(r/β, ψ − V), g − V)."""
-    value, policy, obstacles = iterate.value, iterate.policy, iterate.obstacles
+    grid, value, policy, obstacles = iterate.grid, iterate.value, iterate.policy, iterate.obstacles
     if obstacles.upper is None and obstacles.lower is None:  # two reductions first, and no array r/β
-        return jnp.min(policy.defect) / discount, jnp.max(policy.defect) / discount
+        return grid.least(policy.defect) / discount, grid.largest(policy.defect) / discount
     shift = policy.defect / discount
     if obstacles.upper is not None:
         shift = jnp.minimum(shift, obstacles.upper - value)
@@ -132,12 +135,13 @@ def _additive(iterate: Iterate, discount: Number) -> tuple[Scalar, Scalar]:
         shift = jnp.maximum(shift, obstacles.lower - value)
     # r is zero where held, the obstacles are not: there V is given and exact
     shift = jnp.where(obstacles.fixed, 0, shift)
-    return jnp.min(shift), jnp.max(shift)
+    return grid.least(shift), grid.largest(shift)
 
 
 def _multiplicative(iterate: Iterate, least_cost: Field, residual: Scalar) -> ErrorBound:
     """V/(1 + η) ≤ V_h ≤ V/(1 − ρ), of a V lifted until no exit cost is negative."""
     value, policy, obstacles, counted = iterate.value, iterate.policy, iterate.obstacles, iterate.counted
+    grid = iterate.grid
     free = counted & ~obstacles.fixed
     safe = jnp.where(free & (least_cost > 0), least_cost, 1)
     # where nothing is paid any rate that is left is infinitely much next to the cost; r = 0 makes a NaN of sign · ∞,
@@ -145,24 +149,27 @@ def _multiplicative(iterate: Iterate, least_cost: Field, residual: Scalar) -> Er
     relative = jnp.where(free, jnp.where(least_cost > 0, policy.defect / safe, jnp.sign(policy.defect) * jnp.inf), 0)
     # where V = ψ nothing bounds V_h from above but ψ, which is imposed
     rising = relative if obstacles.upper is None else jnp.where(value < obstacles.upper, relative, 0)
-    rho, eta = jnp.maximum(jnp.max(rising), 0), jnp.maximum(jnp.max(-relative), 0)
-    priced = jnp.all(~free | (least_cost > 0))
+    rho, eta = jnp.maximum(grid.largest(rising), 0), jnp.maximum(grid.largest(-relative), 0)
+    priced = ~grid.some(free & ~(least_cost > 0))
     sound = priced & (1 - rho > jnp.sqrt(jnp.finfo(rho.dtype).eps))  # a V flat somewhere has r = L up to rounding
     below, above = 1 / (1 + eta), jnp.where(sound, 1 / jnp.where(sound, 1 - rho, 1), jnp.inf)
-    lift = jnp.maximum(-lowest_end(obstacles, counted), 0)
+    lift = jnp.maximum(-lowest_end(obstacles, counted, grid), 0)
     lifted = jnp.where(counted, value + lift, 0)
     apart = jnp.where(jnp.isinf(above), 0, jnp.maximum(above - 1, 1 - below))  # no 0 · inf
-    error = jnp.where(jnp.isinf(above), jnp.inf, jnp.max(lifted) * apart)
+    error = jnp.where(jnp.isinf(above), jnp.inf, grid.largest(lifted) * apart)
     # the scaling argument wants V ≥ 0; without that there is no bound
-    error = jnp.where(jnp.all(lifted >= 0), error, jnp.inf) + 0 * residual  # a NaN stays one
+    error = jnp.where(grid.some(~(lifted >= 0)), jnp.inf, error) + 0 * residual  # a NaN stays one
     return ErrorBound(below, above, jnp.where(priced, lift, jnp.inf), error, residual)
 
 
-def lowest_end(obstacles: Obstacles, counted: Mask | bool) -> Scalar:
+def lowest_end(obstacles: Obstacles, counted: Mask | bool, grid: Grid) -> Scalar:
     """The least payment at the end of a run, at most zero: exit costs, between nodes as well, and ψ."""
-    lowest = jnp.minimum(jnp.min(jnp.where(counted & obstacles.fixed, obstacles.fixed_value, 0)), obstacles.least_exit)
+    lowest = grid.least(jnp.where(counted & obstacles.fixed, obstacles.fixed_value, 0))
+    lowest = jnp.minimum(lowest, obstacles.least_exit)
     # ψ is paid where one stops, which may be anywhere
-    return lowest if obstacles.upper is None else jnp.minimum(lowest, jnp.min(jnp.where(counted, obstacles.upper, 0)))
+    return (
+        lowest if obstacles.upper is None else jnp.minimum(lowest, grid.least(jnp.where(counted, obstacles.upper, 0)))
+    )
 
 
 def enclosure(kind: Certificate, bound: ErrorBound, discount: Number | None = None) -> Any:

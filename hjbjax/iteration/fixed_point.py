@@ -109,7 +109,7 @@ class Task:
         if not self.has_lost:
             return value
         # 1/√eps above: no minimum chooses it, and a difference with it still has half of its digits
-        largest = jnp.max(jnp.where(self.counted, jnp.abs(value), 0))
+        largest = self.grid.largest(jnp.where(self.counted, jnp.abs(value), 0))
         return jnp.where(self.counted, value, largest / jnp.sqrt(jnp.finfo(value.dtype).eps))
 
     def equation(self, value: Field, policy: Greedy, fastest: Scalar | None = None) -> PolicyEquation:
@@ -124,7 +124,7 @@ class Task:
 
     def residual(self, equation: PolicyEquation) -> Scalar:
         """The largest |source| at the nodes that count, in cost units."""
-        return jnp.max(jnp.where(self.counted, jnp.abs(equation.source), 0))
+        return self.grid.largest(jnp.where(self.counted, jnp.abs(equation.source), 0))
 
     def start(self) -> Field:
         """The value without a guess: zero, or without discount ψ, above all fixed points, or g, below them."""
@@ -192,7 +192,7 @@ def advance(task: Task, state: State, start: Scalar) -> State:
         delta = jnp.where((state.step < FULL_STEPS) | task.plain, 1.0, 0.5).astype(delta.dtype) * delta
     value = task.impose(state.value + delta)
     # a node that does not count may move for ever
-    moved = jnp.max(jnp.abs(jnp.where(task.counted, value - state.value, 0)))
+    moved = task.grid.largest(jnp.abs(jnp.where(task.counted, value - state.value, 0)))
     if task.certificate is Certificate.OPEN and not task.method.relaxes:
         moved = moved * _shift_factor(task, state)
     policy, fastest, bound = _look(task, value, state.policy, moved=moved, first=state.step < 0)
@@ -224,7 +224,7 @@ def _shift(task: Task, state: State) -> Scalar:
     """
     assert task.outflow is not None
     dying = jnp.asarray(SHIFT, state.value.dtype) ** -jnp.maximum(state.step, 0)
-    return jnp.where(state.step < SHIFTS, jnp.max(task.outflow) * dying, 0)
+    return jnp.where(state.step < SHIFTS, task.grid.largest(task.outflow) * dying, 0)
 
 
 def _shift_factor(task: Task, state: State) -> Scalar:
@@ -245,7 +245,7 @@ def _look(
         policy = bellman.improvement(task.on, value, fixed, policy, incumbent)
     left = task.equation(value, policy)
     assert left.fastest is not None
-    iterate = Iterate(value, policy, left, task.obstacles, task.counted)
+    iterate = Iterate(task.grid, value, policy, left, task.obstacles, task.counted)
     known = {"discount": problem.discount, "least_cost": task.least_cost, "moved": moved}
     bound = certificates.error_bound(task.certificate, iterate, **known)
     if task.on.plain is not None:  # the chain's certificate is no other scheme's
@@ -265,14 +265,14 @@ def _judge(task: Task, value: Field, bound: ErrorBound, best: jax.Array, since: 
     to_the_end = climbs and task.certificate in (*TO_THE_END, Certificate.OPEN)
     size = jax.lax.cond(
         matters | to_the_end,
-        lambda: jnp.max(jnp.where(task.counted, jnp.abs(value), 0)),
+        lambda: task.grid.largest(jnp.where(task.counted, jnp.abs(value), 0)),
         lambda: jnp.zeros_like(best[1]),
     )
     rounding, tol = ROUNDING * jnp.finfo(value.dtype).eps * size, task.tol
-    longest = task.method.patience(task.grid)
+    longest = task.method.patience(task.grid.whole)
     if to_the_end:  # a front moves V by a spacing times its slope a step, whatever the tolerance, past every node
         tol = jnp.where(task.problem.discount > 0, tol, rounding)
-        longest = max(longest, 100 + 4 * task.grid.size)
+        longest = max(longest, 100 + 4 * task.grid.whole.size)
     # a residual that is rounding has nowhere to go: ten steps tell, in place of the thousands of a slow climb
     patience = jnp.where(bound.residual <= rounding, PATIENCE, longest)
     code = jnp.where(since >= patience, Status.STALLED, Status.RUNNING)

@@ -118,7 +118,7 @@ class ValueIteration:
     The error falls by 1/(1 + βΔt) a step: many cheap steps. For reference, for games, and where memory rules.
     """
 
-    relaxes, evaluation, coarsest = True, None, None  # no fields: answers to the loop, and not choices of the user
+    relaxes, evaluation, coarsest, in_parts = True, None, None, True  # no fields: answers to the loop, no choices
 
     @property
     def inner(self) -> "ValueIteration":
@@ -155,6 +155,11 @@ class PolicyIteration:
     evaluation: Evaluation | None = None
     replies: int = 20
     relaxes, coarsest = False, None
+
+    @property
+    def in_parts(self) -> bool:
+        """As its evaluation."""
+        return getattr(self.evaluation, "in_parts", False)
 
     def __post_init__(self):
         if self.evaluation is not None:
@@ -216,6 +221,11 @@ class Nested:
     def evaluation(self) -> Evaluation | None:
         """As on every level."""
         return self.inner.evaluation
+
+    @property
+    def in_parts(self) -> bool:
+        """As on every level."""
+        return getattr(self.inner, "in_parts", False)
 
     def filled(self, evaluation: Evaluation) -> "Nested":
         """With an evaluation on every level."""

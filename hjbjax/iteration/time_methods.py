@@ -152,7 +152,7 @@ class Explicit:
 
     stages: int | Tableau | None = None
     fraction: Number = 0.9
-    limited, monotone_only = True, False
+    limited, monotone_only, in_parts = True, False, True
 
     def __post_init__(self):
         # True is 1 to Python, and would be taken for Euler's method
@@ -215,7 +215,7 @@ class Implicit:
     evaluation: Evaluation | None = None
     tol: Number = 1e-6
     max_steps: int = 100
-    limited, monotone_only = False, True
+    limited, monotone_only, in_parts = False, True, True
     courant, tableau = math.inf, TABLEAUX[1]  # any length; the rates are looked at once
 
     def __post_init__(self):
@@ -292,7 +292,7 @@ class ImplicitStep:
 
     def residual(self, equation: PolicyEquation) -> Scalar:
         """The largest |source|, in cost units."""
-        return jnp.max(jnp.abs(equation.source))
+        return self.grid.largest(jnp.abs(equation.source))
 
     def solve(
         self, value: Field, evaluation: Evaluation, tol: Number, max_steps: int
@@ -309,10 +309,10 @@ class ImplicitStep:
         def look(value):
             policy = self._complete(bellman.greedy(self.on, value, self.obstacles.fixed))
             equation = self.equation(value, policy)
-            iterate = Iterate(value, policy, equation, self.obstacles, counted=True)
+            iterate = Iterate(self.grid, value, policy, equation, self.obstacles, counted=True)
             bound = certificates.error_bound(Certificate.ADDITIVE, iterate, discount=self.on.problem.discount)
             # a short step's share of the tolerance may be less than the rounding of V, and would never be reached
-            rounding = ROUNDING * jnp.finfo(value.dtype).eps * jnp.max(jnp.abs(value))
+            rounding = ROUNDING * jnp.finfo(value.dtype).eps * self.grid.largest(jnp.abs(value))
             return policy, bound.residual, (bound.error <= tol) | (bound.residual <= rounding)
 
         def unfinished(carry):

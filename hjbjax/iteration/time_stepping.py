@@ -89,7 +89,7 @@ class March:
         on, dtype = self.on.at(t), self.on.dtype
         seen = self.nothing_seen()
         if self.checks_rates:  # a pass over all rates, which is spared where the limit of the step is known
-            fastest = jnp.max(jump_rates(on, u, d).total()) + jnp.asarray(on.problem.discount, dtype)
+            fastest = on.grid.largest(jump_rates(on, u, d).total()) + jnp.asarray(on.problem.discount, dtype)
             seen = dataclasses.replace(seen, fastest=fastest)
         if self.checks_noise:
             lacking = correlated_noise.lacking(on, on.diffusion(u, d))
@@ -97,7 +97,7 @@ class March:
                 return seen
             # at a fixed node nothing moves, whatever the noise is there
             lacking = jnp.broadcast_to(lacking, on.grid.shape) & ~self.obstacles_at(t).fixed
-            first = jnp.where(jnp.any(lacking), jnp.argmax(lacking), -1).astype(jnp.int32)
+            first = on.grid.first(lacking)
             seen = dataclasses.replace(seen, lacking=first, t=jnp.asarray(t, dtype))
         return seen
 
@@ -144,7 +144,7 @@ class Seen:
 
 def stable(on: Discretisation) -> Scalar:
     """The longest step for which explicit Euler is monotone, 1/(max Q + β); inf where nothing moves."""
-    rate = jnp.max(fastest_rate(on)) + on.problem.discount
+    rate = on.grid.largest(fastest_rate(on)) + on.problem.discount
     # the inner where keeps 1/0 out of the branch not taken, whose NaN a derivative would bring back
     return jnp.where(rate > 0, 1 / jnp.where(rate > 0, rate, 1), jnp.inf)
 
@@ -199,7 +199,7 @@ def advance(march: March, front: Front, until: Number) -> Front:
     else:
         value, ok, seen = march.method.step(march, front.value, front.t, t, front.t - t)
     # finite only if all values are: ∞ − ∞ is a NaN
-    low, high = jnp.min(value), jnp.max(value)
+    low, high = march.grid.least(value), march.grid.largest(value)
     # each fault overrules those before it
     code = jnp.where(ok, Status.RUNNING, Status.STALLED)
     if march.watched is not None:
@@ -290,4 +290,4 @@ def _saturates(march: March, value: Field, t: Number) -> jax.Array:
     for j, entry in enumerate(greedy(march, value, t)[1]):
         slack = NEAR * (admissible.hi[j] - admissible.lo[j])
         on_bound |= (entry <= admissible.lo[j] + slack) | (entry >= admissible.hi[j] - slack)
-    return jnp.any(on_bound & march.watched & ~march.obstacles_at(t).fixed)
+    return march.grid.some(on_bound & march.watched & ~march.obstacles_at(t).fixed)

@@ -1,5 +1,5 @@
 """The question: what is asked, and on which nodes.
 
-Read ``problem`` and ``sets`` first, then ``grid`` with ``stretching``. ``arguments`` and ``grid_arguments`` refuse what
-makes no sense; ``pytree`` makes dataclasses that JAX looks through.
+Read ``problem`` and ``sets`` first, then ``grid`` with ``stretching``. ``arguments`` refuses what makes no sense;
+``pytree`` makes dataclasses that JAX looks through. ``parts`` is about grids that are divided over many devices.
 """

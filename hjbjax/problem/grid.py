@@ -15,18 +15,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.problem import grid_arguments
+from hjbjax.problem import arguments
 from hjbjax.problem.labels import with_unit, words
+from hjbjax.problem.parts import Parts
 from hjbjax.problem.pytree import altered, is_traced, known, pytree_dataclass
 from hjbjax.problem.stretching import Stretching
-from hjbjax.problem.types import Array, DType, Number, Numbers, States
+from hjbjax.problem.types import Array, AtNodes, DType, Mask, Number, Numbers, Scalar, States, Verdict
 
 ROUNDINGS = 16  # units of eps of the largest coordinate by which the formula may miss its table
 COINCIDING = 16  # units in the last place of a coordinate, of which a spacing must be more
 TABLED = 2**24  # points of an axis whose coordinates are kept, 128 MiB; a grid too large must not allocate them before
 
 
-@pytree_dataclass(static=("shape", "periodic", "names", "edges", "units"))
+@pytree_dataclass(static=("shape", "periodic", "names", "edges", "units", "parts"))
 class Grid:
     """A grid of nodes on a box in R^n, uniform along every axis that is not stretched.
 
@@ -64,11 +65,12 @@ class Grid:
     edges: Any = "projected"
     units: tuple[str, ...] = ()
     coordinates: tuple[Any, ...] = dataclasses.field(init=False, repr=False)
+    parts: Parts | None = dataclasses.field(init=False, repr=False, default=None)  # inside ``shard_map``: its own nodes
 
     def __post_init__(self):
-        lo, hi = grid_arguments.corner(self.lo, "lo"), grid_arguments.corner(self.hi, "hi")
-        shape = grid_arguments.counts(self.shape)
-        periodic = grid_arguments.periodic_flags(self.periodic, len(shape))
+        lo, hi = arguments.corner(self.lo, "lo"), arguments.corner(self.hi, "hi")
+        shape = arguments.counts(self.shape)
+        periodic = arguments.periodic_flags(self.periodic, len(shape))
         names = tuple(str(name) for name in self.names) or tuple(f"x{axis + 1}" for axis in range(len(shape)))
         stretch = (None,) * len(shape) if self.stretch is None else tuple(self.stretch)
         lengths = (len(lo), len(hi), len(shape), len(periodic), len(names), len(stretch))
@@ -77,12 +79,12 @@ class Grid:
                 "Grid: got lo, hi, shape, periodic, names and stretch of lengths {}, {}, {}, {}, {} and {}; "
                 "wanted one entry an axis in each".format(*lengths)
             )
-        grid_arguments.check_stretch(stretch, periodic)
+        arguments.check_stretch(stretch, periodic)
         if isinstance(lo, np.ndarray) and isinstance(hi, np.ndarray):  # traced corners cannot be compared
             for axis, (low, high) in enumerate(zip(lo, hi, strict=True)):
                 if not (math.isfinite(low) and math.isfinite(high) and low < high):
                     raise ValueError(f"Grid: axis {axis} runs from {low:g} to {high:g}; wanted finite lo < hi")
-        edges = grid_arguments.kinds_of_ends(self.edges, periodic, shape)
+        edges = arguments.kinds_of_ends(self.edges, periodic, shape)
         units = words(self.units, len(shape), "Grid.units") or ("",) * len(shape)
         checked = {
             "lo": lo, "hi": hi, "shape": shape, "periodic": periodic, "names": names, "stretch": stretch,
@@ -138,9 +140,45 @@ class Grid:
         pairs = (pair and tuple("projected" if name == "open" else name for name in pair) for pair in self.edges)
         return altered(self, edges=tuple(pairs))
 
+    def divided(self, parts: Parts) -> "Grid":
+        """The grid as one of the devices sees it, inside ``shard_map``: its shape is that of the arrays of one part."""
+        return altered(self, shape=parts.shape, parts=parts)
+
+    @property
+    def whole(self) -> "Grid":
+        """The grid of all parts; itself where it is none."""
+        return self if self.parts is None else altered(self, shape=self.parts.whole, parts=None)
+
+    def is_divided(self, axis: int) -> bool:
+        """True if the nodes along an axis lie on several devices, and those here are some of them."""
+        return self.parts is not None and axis in self.parts.axes
+
+    def largest(self, values: AtNodes) -> Scalar:
+        """The largest of node values, on all devices."""
+        return jnp.max(values) if self.parts is None else self.parts.largest(values)
+
+    def least(self, values: AtNodes) -> Scalar:
+        """The least of node values, on all devices."""
+        return jnp.min(values) if self.parts is None else -self.parts.largest(-values)
+
+    def total(self, values: AtNodes) -> Scalar:
+        """The sum of node values, on all devices."""
+        return jnp.sum(values) if self.parts is None else self.parts.total(values)
+
+    def some(self, mask: Mask) -> Verdict:
+        """True if a mask holds at some node, on any device."""
+        return jnp.any(mask) if self.parts is None else self.parts.some(mask)
+
+    def first(self, mask: Mask) -> Scalar:
+        """The first node of a mask, (*grid), counted flat over the whole grid; −1 where there is none."""
+        if self.parts is None:
+            return jnp.where(jnp.any(mask), jnp.argmax(mask), -1).astype(jnp.int32)
+        return self.parts.first(mask)
+
     def intervals(self, axis: int) -> int:
         """The number M of intervals between ``lo`` and ``hi``."""
-        return self.shape[axis] if self.periodic[axis] else self.shape[axis] - 1  # type: ignore[index]
+        count = self.whole.shape[axis]
+        return count if self.periodic[axis] else count - 1  # type: ignore[index]
 
     def spacing(self, axis: int) -> Number:
         """The distance h between neighbours along ``axis``; their mean on a stretched one."""
@@ -148,6 +186,8 @@ class Grid:
 
     def axis(self, axis: int, dtype: DType | None = None) -> Array:
         """The coordinates of the nodes along one axis, shape (N,); the same numbers in every program."""
+        if self.parts is not None:
+            return self.parts.own(self.whole.axis(axis, dtype), axis)
         computed, table = self._by_formula(axis), self.coordinates[axis]
         table = computed if table is None else table
         # NumPy as long as nothing is traced, also inside ``jit``, where the table then is a constant

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from hjbjax.discretisation import schemes
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
@@ -38,6 +39,7 @@ from hjbjax.solvers import host_loop, march_run
 from hjbjax.solvers.result import solution_at_start, with_last_phase
 from hjbjax.solvers.setup import check_on_one_state, choose_evaluation, question
 from hjbjax.solvers.stationary import check_node_values
+from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
 
 PROBES = 33  # times at which a given step, and constrained ends, are held against a time-dependent problem
@@ -66,6 +68,7 @@ def march(
     max_memory: int | None = None,
     checkpoint: Path | Checkpoint | None = None,
     resume: bool = False,
+    mesh: Mesh | None = None,
 ) -> Solution:
     """March a finite-horizon problem backward from its terminal cost at t = horizon to t = 0.
 
@@ -96,6 +99,7 @@ def march(
       max_memory: bytes that the march may take, instead of what is free.
       checkpoint: as in ``solve``, like ``resume``; the slices at kept times go into it.
       resume: go on from that file if it is there, to the same bits; host level.
+      mesh: as in ``solve``.
 
     Returns:
       The solution: ``value[i]`` is V(·, times[i]), shape (k, *grid), the policy likewise. One that stopped early
@@ -121,7 +125,11 @@ def march(
         scheme = Upwind(split=True) if implicit else Limited(split=True)
     _check(problem, grid, scheme, method, step, time_limit)
     horizon, kept = _times(horizon, times)
-    if is_traced(problem, grid, method, start):
+    traced = is_traced(problem, grid, method, start)
+    if mesh is not None:
+        by = [] if method.limited else [getattr(method, "evaluation", None) or _evaluation(problem, grid, divided=True)]
+        mesh = checks.over_devices(mesh, "march", problem, grid, scheme, method, *by, traced=traced)
+    if traced:
         on = Discretisation(problem, grid, scheme, arguments.traced_dtype(dtype, "march"))
         return _march_traced(on, horizon, kept, start, method, step)
     kind = arguments.as_dtype(dtype)
@@ -139,7 +147,7 @@ def march(
         clock.journal = file and file.journal()
         # before anything is compiled: a grid that does not fit is refused within a second
         needed = memory.fitting(_bytes(problem, grid, kept, method, kind), grid, max_memory)
-        on = Discretisation(problem, grid, scheme, kind)
+        on = Discretisation(problem, grid, scheme, kind, mesh=mesh)
         with host_loop.with_solution(
             clock, needed, lambda _: _solution_at_horizon(on, horizon, start, Status.INTERRUPTED)
         ):
@@ -240,7 +248,7 @@ def _prepare(on: Discretisation, horizon: float, method: TimeMethod, step: float
     problem, grid = on.problem, on.grid
     moving = problem.time_dependent
     limit: Scalar = jnp.asarray(jnp.inf, dtype)
-    method = method.filled(on, _evaluation(problem, grid))
+    method = method.filled(on, _evaluation(problem, grid, divided=on.mesh is not None))
     if method.limited:
         # 1/(max Q + β) changes with the time if the functions do: a given step is held against the least of many, one
         # that is left open is found anew before every step
@@ -252,13 +260,13 @@ def _prepare(on: Discretisation, horizon: float, method: TimeMethod, step: float
             _check_step(step, float(limit) / method.tableau.euler)
         courant = method.courant if step is None else 1 / method.tableau.euler
         limit = jnp.asarray(limit * courant, dtype)
-    checks = _checks(on, method)
+    looks = _checks(on, method)
     if step is None:  # rates that are found on the way say nothing of the first steps
-        step = horizon / FEWEST if moving or checks[0] or not method.limited else math.inf
+        step = horizon / FEWEST if moving or looks[0] or not method.limited else math.inf
     obstacles, limit_known = (None, not method.limited) if moving else (_obstacles(on), True)
     return March(
         on, method, obstacles, limit if limit_known else None, jnp.asarray(step, dtype),
-        jnp.asarray(horizon, dtype), _blow_up_nodes(on, inner), *checks,
+        jnp.asarray(horizon, dtype), _blow_up_nodes(on, inner), *looks,
     )  # fmt: skip
 
 
@@ -283,10 +291,10 @@ def _check_step(step: float | None, limit: float) -> None:
         )
 
 
-def _evaluation(problem: Problem, grid: Grid) -> Evaluation:
+def _evaluation(problem: Problem, grid: Grid, *, divided: bool = False) -> Evaluation:
     """The evaluation of policies in an implicit step that suits the problem."""
     if grid.sides("open"):
-        return choose_evaluation(problem, grid, traced=False)
+        return choose_evaluation(problem, grid, traced=False, divided=divided)
     # sweeps follow the drift and are slow where noise spreads news both ways
     return Sweeps() if problem.noise is None else Krylov()
 

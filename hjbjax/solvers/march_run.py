@@ -1,17 +1,21 @@
 """A march in chunks of steps from one kept time to the next, and the solution that comes of it."""
 
-from typing import Any
+import functools
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation import correlated_noise, edges
+from hjbjax.discretisation.discretisation import on_part, over_nodes
 from hjbjax.hamiltonian import discrete
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import time_stepping
 from hjbjax.iteration.time_stepping import Front, March
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.parts import Parts
+from hjbjax.problem.pytree import altered
 from hjbjax.problem.types import Field, Nodes, Number, Scalar
 from hjbjax.solution.clock import CUT, Clock
 from hjbjax.solution.solution import Solution
@@ -35,11 +39,12 @@ ADVICE = {
 _run = jax.jit(time_stepping.run)
 _terminal = jax.jit(time_stepping.terminal)
 
+# the players' actions, the nodes on the target, and those at which actions matter
+Feedback: TypeAlias = tuple[tuple[tuple[Field, ...], tuple[Field, ...]], jax.Array | bool, jax.Array]
+
 
 @jax.jit
-def _greedy(
-    march: March, value: Field, t: Number
-) -> tuple[tuple[tuple[Field, ...], tuple[Field, ...]], jax.Array | bool, jax.Array]:
+def _greedy(march: March, value: Field, t: Number) -> Feedback:
     """The players' actions at the time t, the nodes on the target, and those at which actions matter."""
     u, d = time_stepping.greedy(march, value, t)
     obstacles = march.obstacles_at(t)
@@ -68,6 +73,32 @@ def _isaacs_gap(task: March, front: Front, code: Status) -> float | None:
     return gap
 
 
+@functools.partial(jax.jit, static_argnames="parts")
+def _run_in_parts(march: March, front: Front, until: Number, most: Number, parts: Parts) -> Front:
+    """``time_stepping.run`` on every device of a mesh at once, each with its own nodes."""
+
+    def here(march: March, front: Front, until: Number, most: Number) -> Front:
+        return time_stepping.run(on_part(march, parts), front, until, most)
+
+    over = over_nodes(march, parts.entries), _front_over_nodes(front), False, False
+    return parts.mapped(here, over, over[1])(march, front, until, most)
+
+
+@functools.partial(jax.jit, static_argnames="parts")
+def _greedy_in_parts(march: March, value: Field, t: Number, parts: Parts) -> Feedback:
+    """``_greedy`` on every device of a mesh at once."""
+
+    def here(march: March, value: Field, t: Number) -> Feedback:
+        return _greedy(on_part(march, parts), value, t)
+
+    return parts.mapped(here, (over_nodes(march, parts.entries), True, False), True)(march, value, t)
+
+
+def _front_over_nodes(front: Front) -> Front:
+    """The leaves of a front that hold a value at every node, as truth values."""
+    return altered(jax.tree.map(lambda _: False, front), value=True)
+
+
 class Slices:
     """The values and actions at the kept times, filled from the last to the first: NumPy arrays, allocated once."""
 
@@ -82,10 +113,9 @@ class Slices:
         self.cut, self.ends = (np.zeros((len(kept), len(shape), 2), int) for _ in range(2))
         self.first = len(kept)  # of the filled ones; it counts down, as the march goes backward in time
 
-    def keep(self, task: March, value: Field, t: Number, *, feedback: bool = True) -> None:
-        """Fill the next slice; the policy is NaN on the target, and everywhere without ``feedback``."""
-        # one program for all kept times: the time is an argument
-        answer, place = (jax.device_get(_greedy(task, value, t)) if feedback else None), self.first - 1
+    def keep(self, task: March, value: Nodes, t: Number, answer: Any) -> None:
+        """Fill the next slice; the policy is NaN on the target, and everywhere where there is no ``answer``."""
+        place = self.first - 1
         self.value[place] = value
         if answer is None:
             self.policy[place] = self.disturbance[place] = np.nan
@@ -123,14 +153,14 @@ def drive(task: March, kept: np.ndarray, start: Nodes | None, clock: Clock) -> t
     """The slices at the kept times, the last front and its status; ends at a code, at the time limit, or at Ctrl-C."""
     start = None if start is None else jnp.asarray(start, np.dtype(task.horizon.dtype))
     value = _terminal(task.on.at(task.horizon), start)
-    run = MarchRun(task, time_stepping.begin(task, value), kept)
+    front, parts = time_stepping.begin(task, value), task.on.parts
+    run = MarchRun(task, front, kept) if parts is None else MarchInParts(task, front, kept, parts)
     finite = bool(jnp.all(jnp.isfinite(value)))
     status = host_loop.drive(run, clock) if finite else Status.NONFINITE
-    slices, front = run.slices, run.front
+    slices, front = run.slices, run.gathered()
     # after a cut nothing is compiled, and the feedback has its program only if a slice was kept before
     if status is not Status.CONVERGED and slices.misses(front.t) and bool(jnp.all(jnp.isfinite(front.value))):
-        feedback = status not in CUT or slices.first < len(kept)
-        slices.keep(task, front.value, front.t, feedback=feedback)  # how far it came
+        run.store(feedback=status not in CUT or slices.first < len(kept))  # how far it came
     return slices, front, status
 
 
@@ -139,6 +169,7 @@ class MarchRun:
 
     limit, longest = np.inf, 10**9  # of steps: none
     passing = False
+    _run, _greedy = staticmethod(_run), staticmethod(_greedy)
 
     def __init__(self, task: March, front: Front, kept: np.ndarray):
         self.task, self.front, self.slices = task, front, Slices(task, kept)
@@ -158,7 +189,7 @@ class MarchRun:
 
     def compile(self) -> None:
         """Run no step."""
-        jax.block_until_ready(_run(self.task, self.front, jnp.zeros_like(self.until), 0))
+        jax.block_until_ready(self._run(self.task, self.front, jnp.zeros_like(self.until), 0))
 
     def first_chunk(self, clock: Clock) -> int:
         """One step: none is timed."""
@@ -169,11 +200,11 @@ class MarchRun:
 
         A chunk that ends in numbers that are not finite is taken back to the last step before.
         """
-        after = jax.block_until_ready(_run(self.task, self.front, self.until, count))
+        after = jax.block_until_ready(self._run(self.task, self.front, self.until, count))
         status = Status(int(after.code))
         if status is Status.NONFINITE:
             # the steps are the same ones, so that it ends just before the last
-            after = _run(self.task, self.front, self.until, int(after.steps) - self.steps - 1)
+            after = self._run(self.task, self.front, self.until, int(after.steps) - self.steps - 1)
         self.front = after
         return status
 
@@ -185,14 +216,24 @@ class MarchRun:
             # at the last kept time nothing is missing any more, and a time limit that passes now takes nothing away
             if cut is not None and not (slices.first == 1 and cut is Status.TIME_LIMIT):
                 return cut
-            slices.keep(self.task, front.value, front.t)
+            self.store()
             if slices.first == 0:
                 return Status.CONVERGED
         return status
 
+    def gathered(self) -> Front:
+        """The front, with values at all nodes."""
+        return self.front
+
+    def store(self, *, feedback: bool = True) -> None:
+        """Keep the value at the front, and its feedback, as the next slice."""
+        # one program for all kept times: the time is an argument
+        answer = jax.device_get(self._greedy(self.task, self.front.value, self.front.t)) if feedback else None
+        self.slices.keep(self.task, self.front.value, self.front.t, answer)
+
     def saved(self) -> list[Any]:
         """The slices that are kept, and the front."""
-        return [*self.slices.saved(), *jax.tree.leaves(self.front)]
+        return [*self.slices.saved(), *jax.tree.leaves(self.gathered())]
 
     def restore(self, arrays: list[np.ndarray]) -> None:
         """Go on from a front that was saved."""
@@ -209,9 +250,36 @@ class MarchRun:
         """Attach the solution so far to an exception."""
         if self.slices.misses(self.front.t):
             # without a feedback: its program calls the function that raised once more
-            self.slices.keep(self.task, self.front.value, self.front.t, feedback=False)
-        solution = assemble(self.task, self.task.grid, self.slices, self.front, Status.INTERRUPTED)
+            self.store(feedback=False)
+        solution = assemble(self.task, self.task.grid, self.slices, self.gathered(), Status.INTERRUPTED)
         error.solution = solution  # type: ignore[attr-defined]
+
+
+class MarchInParts(MarchRun):
+    """A march whose nodes are divided over many devices."""
+
+    def __init__(self, task: March, front: Front, kept: np.ndarray, parts: Parts):
+        super().__init__(task, front, kept)
+        self.parts, self._over = parts, _front_over_nodes(front)
+        self._divided, self.front = parts.spread((task, front), (over_nodes(task, task.grid.shape), self._over))
+        self._run = lambda _, *front_and_limits: _run_in_parts(self._divided, *front_and_limits, parts=parts)
+
+    def gathered(self) -> Front:
+        """The front, with the values of all parts."""
+        return self.parts.gathered(self.front, self._over)
+
+    def store(self, *, feedback: bool = True) -> None:
+        """Keep the value at the front, and its feedback, as the next slice."""
+        front, answer = self.gathered(), None
+        if feedback:
+            answer = _greedy_in_parts(self._divided, self.front.value, self.front.t, self.parts)
+            answer = self.parts.gathered(answer, jax.tree.map(lambda _: True, answer))
+        self.slices.keep(self.task, front.value, front.t, answer)
+
+    def restore(self, arrays: list[np.ndarray]) -> None:
+        """Go on from a front that was saved, by whatever number of devices."""
+        super().restore(arrays)
+        self.front = self.parts.spread(self.front, self._over)
 
 
 def assemble(task: March, grid: Grid, slices: Slices, front: Front, code: Status) -> Solution:

@@ -14,6 +14,7 @@ import numpy as np
 from hjbjax.discretisation import cut_cells
 from hjbjax.discretisation.discretisation import Scheme
 from hjbjax.iteration.certificates import Certificate
+from hjbjax.iteration.evaluation import Krylov
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import Method, PolicyIteration
 from hjbjax.markov_chain import resting
@@ -176,7 +177,8 @@ def settle(task: Task, assumptions: Assumptions, reached: Mask | None, guess: No
     # a sweep follows the drift from the target on; on a circle there is no first node, and under a discount β Δt ≪ 1 it
     # takes some 1/(β Δt) rounds
     if code is Status.STALLED and evaluation is not None and evaluation.rough:
-        task = dataclasses.replace(task, method=PolicyIteration(linear_solve(task.grid)))
+        solver = linear_solve(task.grid) if task.on.mesh is None else Krylov()
+        task = dataclasses.replace(task, method=PolicyIteration(solver))
         state, code, residuals = iterate(task, state.value, clock)
     if code in FAILED:
         try:

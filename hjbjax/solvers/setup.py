@@ -61,35 +61,39 @@ def is_constrained(problem: Problem) -> bool:
     return problem.stopping_cost is not None or problem.running_max is not None
 
 
-def choose(problem: Problem, grid: Grid, *, traced: bool, method: Method | None = None) -> Method:
+def choose(
+    problem: Problem, grid: Grid, *, traced: bool, method: Method | None = None, divided: bool = False
+) -> Method:
     """The method that suits a problem, or the one that was asked for with the evaluation that does.
+
+    ``divided``: the nodes lie on several devices, and no host has them all at once.
 
     Large grids are nested. Tubes without discount have policies without a value of their own: there value iteration
     alone keeps to the extreme one of many fixed points.
     """
     if method is not None:
-        return method.filled(choose_evaluation(problem, grid, traced=traced))
+        return method.filled(choose_evaluation(problem, grid, traced=traced, divided=divided))
     # a policy that waits at ψ or g for nothing solves its own linear equation with any value
     if is_constrained(problem) and is_discounted(problem) is False:
         return ValueIteration()
-    method = PolicyIteration(choose_evaluation(problem, grid, traced=traced))
+    method = PolicyIteration(choose_evaluation(problem, grid, traced=traced, divided=divided))
     # from a cold start a good policy spreads by one cell an improvement: N of them on one grid, a few on nested ones;
     # on the zoo's pendulum with 400 x 401 nodes the steps of all levels took .2 s in place of .9
     return Nested(method, COARSEST) if grid.size > NEST and not (traced or grid.sides("open")) else method
 
 
-def choose_evaluation(problem: Problem, grid: Grid, *, traced: bool) -> Evaluation:
+def choose_evaluation(problem: Problem, grid: Grid, *, traced: bool, divided: bool = False) -> Evaluation:
     """The evaluation of policies that suits a problem.
 
     Where transport rules, a few wavefront sweeps evaluate a policy well enough. Where there is noise they are too slow
     and precondition a Krylov method; on a line a direct solve costs nothing.
     """
     if grid.sides("open"):  # what is continued from inside is no matter for sweeps; see relaxation
-        small = grid.ndim < 3 and grid.size <= DIRECT
+        small = grid.ndim < 3 and grid.size <= DIRECT and not divided
         return Direct() if small else Krylov()
     if problem.noise is None:
         return Sweeps()
-    return Krylov() if traced else linear_solve(grid)
+    return Krylov() if traced or divided else linear_solve(grid)
 
 
 def choose_scheme(on: Discretisation, method: Method) -> Scheme:

@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from hjbjax.discretisation import schemes
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
@@ -44,6 +45,7 @@ from hjbjax.solvers.setup import (
     prepare_on_host,
     prepare_traced,
 )
+from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
 
 # no host looks on inside a transformation: far more steps than policy iteration takes, and an end for all others
@@ -67,6 +69,7 @@ def solve(
     max_memory: int | None = None,
     checkpoint: Path | Checkpoint | None = None,
     resume: bool = False,
+    mesh: Mesh | None = None,
 ) -> Solution:
     """Solve a stationary problem on a grid.
 
@@ -95,6 +98,8 @@ def solve(
       max_memory: bytes that the solve may take, instead of what is free.
       checkpoint: a file that keeps what is done, every minute and at the end, or ``Checkpoint(path, every=)``.
       resume: go on from that file if it is there, to the same bits; host level.
+      mesh: divide the nodes over its devices, its i-th axis those along the i-th axis of the grid, as in
+        ``jax.make_mesh((4, 2), ("a", "b"))``; host level.
 
     Returns:
       The solution; NumPy arrays at host level. Inside ``jit``, ``vmap`` or ``grad`` its value and its policy are
@@ -117,7 +122,11 @@ def solve(
     """
     check_limits(max_steps, time_limit)
     check_arguments(problem, grid, method, scheme, tol, guess, paths=True)
-    if is_traced(problem, grid, guess, tol):
+    traced, free = is_traced(problem, grid, guess, tol), method is None
+    if mesh is not None:
+        known = choose(problem, grid, traced=traced, method=method, divided=True)
+        mesh = checks.over_devices(mesh, "solve", problem, grid, *filter(None, [scheme]), known, traced=traced)
+    if traced:
         if isinstance(scheme, PathScheme):
             raise ValueError(_at_host_level(scheme))
         scheme, sharpen = scheme or choose_traced_scheme(problem, method), scheme is None
@@ -137,8 +146,8 @@ def solve(
             options: Any = {"method": method, "tol": tol, "guess": guess, "max_memory": max_memory}
             solution = semi_lagrangian.solve_on_host(problem, grid, scheme, kind, clock=clock, **options)
         return _ended(with_last_phase(solution, clock), clock, tol, throw=throw)
-    free, method = method is None, choose(problem, grid, traced=False, method=method)
-    on, sharpen = Discretisation(problem, grid, scheme or Upwind(subcell=True), kind), scheme is None
+    method = choose(problem, grid, traced=False, method=method, divided=mesh is not None)
+    on, sharpen = Discretisation(problem, grid, scheme or Upwind(subcell=True), kind, mesh=mesh), scheme is None
     # float64 for this call alone: another thread, and the caller's own programs, keep theirs
     with noting_interrupts(clock), host_loop.telling(clock), jax.enable_x64(kind == np.float64), opened as kept:
         clock.journal = kept and kept.journal()

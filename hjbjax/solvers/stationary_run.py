@@ -4,6 +4,7 @@ One problem, or lanes of one ``vmap``ped loop.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
@@ -11,9 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hjbjax.discretisation.discretisation import on_part, over_nodes
 from hjbjax.iteration import fixed_point
 from hjbjax.iteration.fixed_point import HISTORY, State, Task
-from hjbjax.problem.types import Array, Nodes
+from hjbjax.problem.parts import Parts
+from hjbjax.problem.pytree import altered
+from hjbjax.problem.types import Array, Nodes, Number
 from hjbjax.solution.clock import CHUNK_SECONDS, CUT, Clock
 from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop
@@ -34,6 +38,23 @@ _begin = jax.vmap(fixed_point.begin)
 _run_lanes = jax.jit(jax.vmap(fixed_point.run, in_axes=(0, 0, 0)))
 
 
+@functools.partial(jax.jit, static_argnames="parts", donate_argnames="state")
+def _run_in_parts(task: Task, state: State, until: Number, parts: Parts) -> State:
+    """``fixed_point.run`` on every device of a mesh at once, each with its own nodes."""
+
+    def here(task: Task, state: State, until: Number) -> State:
+        return fixed_point.run(on_part(task, parts), state, until)
+
+    over = over_nodes(task, parts.entries), state_over_nodes(state), False
+    return parts.mapped(here, over, over[1])(task, state, until)
+
+
+def state_over_nodes(state: State) -> State:
+    """The leaves of a state that hold a value at every node, as truth values."""
+    value, policy = jax.tree.map(lambda _: True, (state.value, state.policy))
+    return altered(jax.tree.map(lambda _: False, state), value=value, policy=policy)
+
+
 def iterate(task: Task, guess: Nodes, clock: Clock, most: int | None = None) -> tuple[State, Status, np.ndarray]:
     """Iterate from a guess in chunks of steps until the state stops, the steps or the time run out, or Ctrl-C.
 
@@ -46,11 +67,13 @@ def iterate(task: Task, guess: Nodes, clock: Clock, most: int | None = None) -> 
     Returns:
       The last state, how it ended, and the residuals of all steps, that of the guess first.
     """
-    iteration = StationaryRun(task, guess, clock.max_steps if most is None else min(most, clock.max_steps))
+    limit = clock.max_steps if most is None else min(most, clock.max_steps)
+    parts = task.on.parts
+    iteration = StationaryRun(task, guess, limit) if parts is None else RunInParts(task, guess, limit, parts)
     if most is not None:
         iteration.name += ", on the way to a guess"
         iteration.passing = most <= clock.max_steps
-    status, state = host_loop.drive(iteration, clock), iteration.state
+    status, state = host_loop.drive(iteration, clock), iteration.gathered()
     # a run that ended before its first look still holds the guess as it came
     if status is Status.NONFINITE or status in CUT:
         state = with_obstacles(task, state)
@@ -109,9 +132,13 @@ class StatesInChunks:
             self._note()
         return status
 
+    def gathered(self) -> Any:
+        """The last state, with values at all nodes."""
+        return self.state
+
     def saved(self) -> list[Any]:
         """The residuals so far and the leaves of the state."""
-        return [np.concatenate(self.residuals), *jax.tree.leaves(self.state)]
+        return [np.concatenate(self.residuals), *jax.tree.leaves(self.gathered())]
 
     def restore(self, arrays: list[np.ndarray]) -> None:
         """Go on from a state that was saved."""
@@ -157,6 +184,31 @@ class StationaryRun(StatesInChunks):
         else:
             steps = clock.steps_in(min(CHUNK_SECONDS / 2, clock.seconds - clock.elapsed()), self.nodes)
         return int(np.clip(steps, 1, HISTORY - 1))  # one place of the history is the look's
+
+
+class RunInParts(StationaryRun):
+    """The iteration of a task whose nodes are divided over many devices."""
+
+    def __init__(self, task: Task, guess: Nodes, limit: int, parts: Parts):
+        super().__init__(task, guess, limit)
+        self.parts, self._over = parts, state_over_nodes(self.state)
+        self.task = parts.spread(task, over_nodes(task, task.grid.shape))
+        self.before = self.state = parts.spread(self.state, self._over)
+        self._run = functools.partial(_run_in_parts, parts=parts)
+
+    def gathered(self) -> State:
+        """The last state, with the values of all parts."""
+        return self.parts.gathered(self.state, self._over)
+
+    def restore(self, arrays: list[np.ndarray]) -> None:
+        """Go on from a state that was saved, by whatever number of devices."""
+        super().restore(arrays)
+        self.before = self.state = self.parts.spread(self.state, self._over)
+
+    def keep(self, error: Exception) -> None:
+        """Attach the value to an exception, as without parts."""
+        values = (lambda s=s: self.parts.gathered(s, self._over).value for s in (self.state, self.before))
+        host_loop.keep(error, self.task.grid, *values, lambda: self.guess)
 
 
 def _calls_back(task: Task) -> bool:

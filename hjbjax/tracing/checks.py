@@ -10,9 +10,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.parts import check_mesh
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import remembered
 from hjbjax.tracing import indices
@@ -272,3 +274,29 @@ def _check_arity(problem: Problem, name: str) -> None:
         raise ValueError(
             f"{name} does not take the arguments that the problem passes, {call(problem, name)}: {error}.\nWhy: {why}"
         ) from error
+
+
+def over_devices(
+    mesh: Mesh | None, caller: str, problem: Problem, grid: Grid, *choices: object, traced: bool
+) -> Mesh | None:
+    """The mesh over which the nodes are to be divided, if they can be; None for one device.
+
+    Args:
+      mesh: as the user gave it.
+      caller: the front door, for messages.
+      problem, grid: the question.
+      *choices: scheme and methods, each of which must be able to run in parts.
+      traced: whether the call is inside a JAX transformation.
+
+    Raises:
+      TypeError, ValueError: with what runs on one device only.
+    """
+    if mesh is None:
+        return None
+    if traced:
+        raise ValueError(f"{caller}: mesh divides the nodes at host level only; leave it out inside jit, vmap and grad")
+    if calls_back(problem, grid.ndim):
+        raise ValueError(
+            f"{caller}: a function of the problem calls Python on the host; leave out mesh, or write it in JAX"
+        )
+    return check_mesh(mesh, grid.shape, caller, *choices)

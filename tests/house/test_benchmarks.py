@@ -14,7 +14,7 @@ import hjbjax as hjb
 from benchmarks import cases
 from benchmarks.__main__ import NAMES
 from benchmarks.harness import footprint, thresholds, timing
-from benchmarks.speed import batch, controls, gradients, growth, information, peers, scaling, startup, sweep
+from benchmarks.speed import batch, controls, devices, gradients, growth, information, peers, scaling, startup, sweep
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.rates import fastest_rate
 from hjbjax.problem.pytree import cast
@@ -35,7 +35,7 @@ def rows_of(benchmark, folder, *options):
 
 
 def test_every_name_leads_to_a_command():
-    for module in (sweep, peers, growth, scaling, controls, information, batch, startup, gradients):
+    for module in (sweep, peers, growth, scaling, controls, information, batch, startup, devices, gradients):
         _, folder, name = module.__name__.split(".")
         assert NAMES[name][0] == folder
         assert CliRunner().invoke(module.command, ["--help"]).exit_code == 0
@@ -250,6 +250,15 @@ def test_a_batch_gives_the_values_of_its_members(tmp_path):
     assert together["difference"] <= 2 * batch.TOL
     assert apart["throughput"] == 1.0
     assert together["throughput"] > 0
+
+
+@pytest.mark.slow
+def test_devices_take_turns_and_agree(tmp_path):
+    one, two = rows_of(devices, tmp_path)
+    assert (one["mesh"], two["mesh"]) == ([1], [2])
+    assert one["over_one"] == one["steps_over_one"] == 1
+    assert 0 < two["difference"] <= 2 * two["tol"]
+    assert max(one["error"], two["error"]) <= two["tol"]
 
 
 @pytest.mark.slow

@@ -1,0 +1,133 @@
+"""One problem over many devices: two devices on the cores of one processor beside one, and outer steps on eight.
+
+The devices of a processor are made when JAX starts, so that every mesh is timed in a process of its own:
+``python -m benchmarks.speed.devices NODES MESH`` solves once a line that it reads, and prints a row for each. The
+processes take turns, and ratios are taken round by round. On eight devices, which two cores are not, steps are counted
+and not seconds.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import click
+import numpy as np
+
+import hjbjax as hjb
+from benchmarks import cases
+from benchmarks.harness import thresholds
+from benchmarks.harness.report import RESULTS, attempt, publish, table
+
+ROOT = Path(__file__).parents[2]
+COLUMNS = (
+    "shape", "mesh", "seconds", "fastest", "cpu_seconds", "first_seconds", "over_one", "cpu_over_one", "steps",
+    "steps_over_one", "difference", "status",
+)  # fmt: skip
+SIZES, EIGHT, TOL, ACTIONS = (800, 1600), 800, 1e-3, 21
+SAMPLE = 40  # nodes an axis that are compared
+FLAG = "--xla_force_host_platform_device_count"
+
+
+class Worker:
+    """A process with as many devices as a mesh has, which solves when it is told to."""
+
+    def __init__(self, nodes: int, mesh: Sequence[int]):
+        flags = f"{os.environ.get('XLA_FLAGS', '')} {FLAG}={int(np.prod(mesh))}"
+        environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
+        command = [sys.executable, "-m", "benchmarks.speed.devices", str(nodes), "x".join(map(str, mesh))]
+        self.process = subprocess.Popen(command, env=environment, stdin=-1, stdout=-1, text=True)  # pipes
+
+    def solve(self) -> dict[str, Any]:
+        """The row of one more solve."""
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.write("solve\n")
+        self.process.stdin.flush()
+        answer = self.process.stdout.readline()
+        if not answer:
+            raise RuntimeError(f"the process ended with exit code {self.process.wait()}")
+        return json.loads(answer)
+
+    def end(self) -> None:
+        """Let the process end."""
+        assert self.process.stdin is not None
+        self.process.stdin.close()
+        self.process.wait()
+
+
+def work(nodes: int, mesh: Sequence[int]) -> None:
+    """Solve the pendulum on a mesh once a line of the standard input; a row each on the standard output."""
+    import jax
+
+    problem, grid = cases.pendulum(nodes, ACTIONS)
+    axes = ("angle", "velocity")[: len(mesh)]
+    devices = jax.make_mesh(tuple(mesh), axes) if np.prod(mesh) > 1 else None
+    every = tuple(slice(None, None, -(-count // SAMPLE)) for count in grid.shape)
+    for _ in sys.stdin:
+        began, before = time.perf_counter(), time.process_time()
+        answer = hjb.solve(problem, grid, tol=TOL, scheme=hjb.Upwind(), mesh=devices, throw=False, progress=False)
+        row = {"seconds": time.perf_counter() - began, "cpu_seconds": time.process_time() - before}
+        row |= {"steps": answer.steps, "error": float(answer.error), "status": answer.status.name}
+        print(json.dumps(row | {"sample": np.asarray(answer.value)[every].tolist()}), flush=True)
+
+
+def measure(nodes: int, meshes: Sequence[Sequence[int]], repeats: int, *, timed: bool) -> list[dict[str, Any]]:
+    """A row a mesh, the first of which is one device; with ``repeats`` rounds after the first solves."""
+    workers = [Worker(nodes, mesh) for mesh in meshes]
+    try:
+        rounds = [[worker.solve() for worker in workers] for _ in range(1 + repeats)]
+    finally:
+        for worker in workers:
+            worker.end()
+    rows = []
+    for place, mesh in enumerate(meshes):
+        first, *later = (each[place] for each in rounds)
+        last, one = rounds[-1][place], rounds[-1][0]
+        off = float(np.max(np.abs(np.array(last["sample"]) - np.array(one["sample"]))))
+        row = {"shape": [nodes, nodes + 1], "nodes": nodes * (nodes + 1), "mesh": list(mesh), "tol": TOL}
+        row |= {key: last[key] for key in ("steps", "error", "status")}
+        row |= {"steps_over_one": last["steps"] / one["steps"], "difference": off, "repeats": len(later)}
+        # both answers are within the tolerance of the exact one
+        row["status"] = row["status"] if off <= 2 * TOL else "DISAGREES"
+        if timed:
+            row |= {"first_seconds": first["seconds"], "fastest": min(each["seconds"] for each in later)}
+            for key, ratio in (("seconds", "over_one"), ("cpu_seconds", "cpu_over_one")):
+                row[key] = median(each[key] for each in later)
+                row[ratio] = median(each[place][key] / each[0][key] for each in rounds[1:])
+        rows.append(row)
+    return rows
+
+
+@click.command()
+@click.option("--quick", is_flag=True, help="A small grid, one round, two devices alone.")
+@click.option("--nodes", type=click.IntRange(16), multiple=True, help="N of N x (N + 1); 800 and 1600 if not given.")
+@click.option("--repeats", type=click.IntRange(1), default=None, help="Rounds; 7 if not given, quick 1.")
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Folder of the files.")
+def command(quick: bool, nodes: Sequence[int], repeats: int | None, out: Path) -> None:
+    """The pendulum to 1e-3 on two devices of one processor beside one, and its outer steps on eight."""
+    sizes, again = nodes or ((48,) if quick else SIZES), repeats or (1 if quick else 7)
+    about = {"benchmark": "devices", "problem": "pendulum", "dtype": "float64"}
+    rows, figures = [], {}
+    for size in sizes:
+        found = attempt(lambda size=size: measure(size, [(1,), (2,)], again, timed=True), about)
+        rows += found
+        if size in SIZES and "over_one" in found[-1]:
+            figures[f"devices {size}"] = found[-1]["over_one"]
+    if not quick:
+        found = attempt(lambda: measure(EIGHT, [(1,), (8,), (4, 2)], 0, timed=False), about)
+        rows += found[1:]
+        if all("steps_over_one" in row for row in found):
+            figures["devices steps"] = max(row["steps_over_one"] for row in found)
+    click.echo(table(rows, COLUMNS))
+    rows += thresholds.announced(figures, "devices")
+    publish(out, "devices", rows)
+
+
+if __name__ == "__main__":
+    work(int(sys.argv[1]), tuple(map(int, sys.argv[2].split("x"))))

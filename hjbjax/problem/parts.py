@@ -1,0 +1,252 @@
+"""The nodes of a grid in parts, one for every device of a mesh: what a part holds, and what it reads of the others.
+
+Domain decomposition by ``jax.shard_map``: every device runs the program of a single one on a grid that knows its part,
+fetches the nodes just beyond it from the parts beside by ``ppermute``, and joins what it finds by ``pmax`` or ``psum``.
+The i-th axis of the mesh divides the i-th axis of the grid. Of N nodes part k of p has those from ⌊kN/p⌋ up to
+⌊(k + 1)N/p⌋, so that two parts differ by one node at most. Arrays have ⌈N/p⌉ entries a part: where it has one node
+less, the last entry is a filler, a copy of the node that comes next. No node reads what becomes of a filler, and no
+reduction counts it.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from hjbjax.problem.types import AtNodes, Mask, Scalar
+
+T = TypeVar("T")
+FEWEST = 3  # nodes of a part along a divided axis: what Weno5, and a parabola beyond an end, read at once
+
+
+@dataclasses.dataclass(frozen=True)
+class Parts:
+    """The nodes of a grid over the devices of a mesh. What is traced here has a meaning inside ``shard_map`` alone.
+
+    Args:
+      mesh: the devices; no more axes than the grid has.
+      whole: the nodes of the whole grid along every axis.
+    """
+
+    mesh: Mesh
+    whole: tuple[int, ...]
+
+    @property
+    def names(self) -> tuple[str | None, ...]:
+        """The axis of the mesh that divides each axis of the grid; None where it is whole."""
+        pairs = zip(self.mesh.axis_names, self.mesh.devices.shape, strict=True)
+        found = [name if size > 1 else None for name, size in pairs]
+        return (*found, *[None] * (len(self.whole) - len(found)))
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """The number of parts along every axis."""
+        return (*self.mesh.devices.shape, *[1] * (len(self.whole) - self.mesh.devices.ndim))
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The entries of the arrays of one part along every axis."""
+        return tuple(-(-count // size) for count, size in zip(self.whole, self.sizes, strict=True))
+
+    @property
+    def axes(self) -> tuple[int, ...]:
+        """The axes of the grid that are divided."""
+        return tuple(axis for axis, name in enumerate(self.names) if name is not None)
+
+    @property
+    def fits(self) -> bool:
+        """True if no part has fewer nodes than a stencil reads."""
+        return all(self.whole[axis] // self.sizes[axis] >= FEWEST for axis in self.axes)
+
+    def even(self, axis: int) -> bool:
+        """True if all parts have as many nodes along an axis."""
+        return self.whole[axis] % self.sizes[axis] == 0
+
+    def _starts(self, axis: int) -> np.ndarray:
+        """The first node of every part along an axis, and behind them their number, (p + 1,)."""
+        size = self.sizes[axis]
+        return np.array([k * self.whole[axis] // size for k in range(size + 1)])
+
+    def _nodes_of_entries(self, axis: int) -> np.ndarray:
+        """The node that each entry of an array of all parts holds along an axis; fillers copy the next one."""
+        reach = self._starts(axis)[:-1, None] + np.arange(self.shape[axis])
+        return np.minimum(reach, self.whole[axis] - 1).ravel()
+
+    def _entries_of_nodes(self, axis: int) -> np.ndarray:
+        """The entry of an array of all parts at which each node stands along an axis."""
+        starts = self._starts(axis)
+        width = self.shape[axis]
+        return np.concatenate([k * width + np.arange(n) for k, n in enumerate(np.diff(starts))])
+
+    # On the host: arrays of the whole grid, and those of all parts.
+
+    @property
+    def entries(self) -> tuple[int, ...]:
+        """The shape of an array of all parts, fillers among them."""
+        return tuple(width * size for width, size in zip(self.shape, self.sizes, strict=True))
+
+    def spread(self, tree: T, over_nodes: Any) -> T:
+        """Arrays of the whole grid as those of the parts on their devices; others whole on every device.
+
+        Args:
+          tree: numbers and arrays.
+          over_nodes: a tree of the same structure of truth values: the leaves that hold a value at every node, (*grid).
+        """
+
+        def put(leaf: Any, divided: bool) -> jax.Array:
+            host = np.asarray(leaf)
+            for axis in self.axes if divided else ():
+                if not self.even(axis):
+                    host = np.take(host, self._nodes_of_entries(axis), axis)
+            # each process makes what its own devices hold; a copy, since states are donated
+            return jax.make_array_from_callback(
+                host.shape, self._sharding(divided), lambda index: np.array(host[index])
+            )
+
+        return jax.tree.map(put, tree, over_nodes)
+
+    def gathered(self, tree: T, over_nodes: Any) -> T:
+        """The inverse of ``spread``: NumPy arrays of the whole grid."""
+
+        def take(leaf: Any, divided: bool) -> np.ndarray:
+            host = np.asarray(leaf)
+            for axis in self.axes if divided else ():
+                if not self.even(axis):
+                    host = np.take(host, self._entries_of_nodes(axis), axis)
+            return host
+
+        return jax.tree.map(take, tree, over_nodes)
+
+    def mapped(self, function: Callable, over_nodes: Any, result_over_nodes: Any) -> Callable:
+        """A function on every device at once, of arrays that ``spread`` has put there: of each its own part."""
+        specs = (jax.tree.map(self._spec, marks) for marks in (over_nodes, result_over_nodes))
+        # what every device holds alike is made alike, by reductions over all of them
+        return jax.shard_map(function, mesh=self.mesh, in_specs=next(specs), out_specs=next(specs), check_vma=False)
+
+    def _spec(self, divided: bool) -> PartitionSpec:
+        """How an array lies on the mesh."""
+        return PartitionSpec(*self.names) if divided else PartitionSpec()
+
+    def _sharding(self, divided: bool) -> NamedSharding:
+        return NamedSharding(self.mesh, self._spec(divided))
+
+    # Inside ``shard_map``: this part.
+
+    def index(self, axis: int) -> Scalar:
+        """The number of this part along a divided axis."""
+        return jax.lax.axis_index(self.names[axis])
+
+    def count(self, axis: int) -> int | Scalar:
+        """The nodes of this part along an axis; a known number where all have as many."""
+        if self.even(axis):
+            return self.shape[axis]
+        return jnp.asarray(np.diff(self._starts(axis)), jnp.int32)[self.index(axis)]
+
+    def nodes(self, axis: int) -> jax.Array:
+        """The number of the node that each entry holds along a divided axis; of a filler that of the next node."""
+        start = jnp.asarray(self._starts(axis)[:-1], jnp.int32)[self.index(axis)]
+        return start + jnp.arange(self.shape[axis], dtype=jnp.int32)
+
+    def own(self, table: Any, axis: int) -> Any:
+        """The entries of this part of a table of all nodes along an axis."""
+        if self.names[axis] is None:
+            return table
+        return jnp.take(jnp.asarray(table), self.nodes(axis), axis=0, mode="clip")
+
+    def at_end(self, axis: int, step: int) -> jax.Array:
+        """True if this part lies at the end of an axis in the direction of ``step``."""
+        return self.index(axis) == (self.sizes[axis] - 1 if step > 0 else 0)
+
+    def fetched(self, values: T, axis: int, step: int, *, cyclic: bool) -> T:
+        """What the part beside this one in the direction of ``step`` gives away; zero beyond the ends unless cyclic."""
+        last, size = self.sizes[axis] - 1, self.sizes[axis]
+        pairs = [((k + step) % size, k) for k in range(size) if cyclic or k != (last if step > 0 else 0)]
+        return jax.lax.ppermute(values, self.names[axis], pairs)
+
+    def _real(self) -> jax.Array | None:
+        """The entries that are nodes and no fillers, bool; broadcasts. None where all are."""
+        found = None
+        for axis in self.axes:
+            if not self.even(axis):
+                along = [-1 if i == axis else 1 for i in range(len(self.whole))]
+                mask = (jnp.arange(self.shape[axis]) < self.count(axis)).reshape(along)
+                found = mask if found is None else found & mask
+        return found
+
+    def cleared(self, values: AtNodes) -> AtNodes:
+        """Node values with zeros in the fillers."""
+        real = self._real()
+        return values if real is None else jnp.where(real, values, jnp.zeros((), values.dtype))
+
+    def _reduced(self, values: AtNodes | Mask, within: Callable, across: Callable, neutral: Any) -> jax.Array:
+        """A reduction over all nodes: ``within`` each part, and then ``across`` them; fillers are neutral."""
+        real = self._real()
+        if real is not None:
+            values = jnp.where(real, values, jnp.asarray(neutral, jnp.result_type(values)))
+        return across(within(values), tuple(name for name in self.names if name is not None))
+
+    def largest(self, values: AtNodes) -> jax.Array:
+        """The largest of the values at all nodes; NaN if one of them is."""
+        return self._reduced(values, jnp.max, _largest, -jnp.inf)
+
+    def total(self, values: AtNodes) -> jax.Array:
+        """The sum of the values at all nodes."""
+        return self._reduced(values, jnp.sum, jax.lax.psum, 0)
+
+    def some(self, mask: Mask) -> jax.Array:
+        """True if a mask holds at some node."""
+        return self._reduced(mask, lambda found: jnp.any(found).astype(jnp.int32), jax.lax.pmax, False) > 0
+
+    def first(self, mask: Mask) -> jax.Array:
+        """The least number in C order of the nodes of a mask, (*grid); −1 where there is none."""
+        number = jnp.zeros((), jnp.int32)
+        for axis, count in enumerate(self.whole):
+            along = [-1 if i == axis else 1 for i in range(len(self.whole))]
+            nodes = jnp.arange(count, dtype=jnp.int32) if self.names[axis] is None else self.nodes(axis)
+            number = number * count + nodes.reshape(along)
+        beyond = np.iinfo(np.int32).max
+        found = self._reduced(jnp.where(mask, number, beyond), jnp.min, jax.lax.pmin, beyond)
+        return jnp.where(found == beyond, -1, found)
+
+
+def check_mesh(mesh: object, grid_shape: tuple[int, ...], caller: str, *choices: object) -> Mesh | None:
+    """The mesh, unless the nodes cannot be divided over it, or not by these ``choices``; None where it is one device.
+
+    Raises:
+      TypeError: no mesh.
+      ValueError: more axes than the grid has, parts of too few nodes, or a choice that reads nodes in its own way.
+    """
+    if not isinstance(mesh, Mesh):
+        wanted = 'a jax.sharding.Mesh, as from jax.make_mesh((2,), ("x",))'
+        raise TypeError(f"{caller}: mesh is {mesh!r}; wanted {wanted}")
+    counts, n = mesh.devices.shape, len(grid_shape)
+    if len(counts) > n:
+        raise ValueError(
+            f"{caller}: mesh has {len(counts)} axes, {counts}, the grid {n}; its i-th divides the grid's i-th"
+        )
+    for axis, (size, count) in enumerate(zip(counts, grid_shape, strict=False)):
+        if size > 1 and count // size < FEWEST:
+            raise ValueError(
+                f"{caller}: mesh divides the {count} points of axis {axis} into {size} parts; wanted {FEWEST} points a "
+                f"part at least, and so at most {count // FEWEST} parts"
+            )
+    for choice in choices:
+        if not getattr(choice, "in_parts", False):
+            raise ValueError(
+                f"{caller}: {choice!r} runs on one device; leave out mesh. What reads other nodes by "
+                "hjbjax.discretisation.stencil alone, and reduces by grid.largest, may say in_parts = True"
+            )
+    # axes of other types than the manual ones of shard_map forbid slices
+    return Mesh(mesh.devices, mesh.axis_names) if mesh.size > 1 else None
+
+
+def _largest(value: Scalar, names: tuple[str, ...]) -> Scalar:
+    """The largest of one number a part; NaN if one of them is, whatever the order in which a backend compares."""
+    lost = jnp.isnan(value)
+    # one exchange for both: a maximum that drops a NaN would call it converged
+    found = jax.lax.pmax(jnp.stack([jnp.where(lost, -jnp.inf, value), lost.astype(value.dtype)]), names)
+    return jnp.where(found[1] > 0, jnp.nan, found[0])

@@ -1,0 +1,144 @@
+"""One problem over many devices: the answer of one, to the last bits where the sweeps are the same.
+
+Eight virtual devices want a process of their own: one runs all cases of this file that are asked for.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SCRIPT = Path(__file__).parents[1] / "support" / "over_devices.py"
+ROOT = Path(__file__).parents[2]
+CHEAP = (
+    "stencils", "not_a_number_is_not_lost", "compiled_program", "value_iteration", "march_of_first_order", "sweeps",
+    "krylov", "checkpoints", "faults", "refusals",
+)  # fmt: skip
+DEAR = (
+    "value_iteration_to_a_target", "value_iteration_of_a_game", "value_iteration_with_correlated_noise",
+    "march_of_second_order", "march_of_fifth_order", "sweeps_to_a_target", "sweeps_of_a_game",
+    "krylov_with_correlated_noise", "without_a_choice",
+)  # fmt: skip
+EXACT = ("value_iteration", "march_of_first_order", *(name for name in DEAR if name.startswith(("value", "march"))))
+CERTIFIED = ("sweeps", "krylov", *(name for name in DEAR if name.startswith(("sweeps", "krylov"))))
+ULP = 8  # roundings of the largest value: XLA fuses the same operations otherwise in a smaller array
+
+
+def found_by(names):
+    """What these cases found, by their names."""
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=8"
+    path = f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
+    environment = {**os.environ, "XLA_FLAGS": flags, "PYTHONPATH": path}
+    command = [sys.executable, str(SCRIPT), *names]
+    answer = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    assert answer.returncode == 0, answer.stderr
+    return json.loads(answer.stdout)
+
+
+@pytest.fixture(scope="module")
+def cheap():
+    return found_by(CHEAP)
+
+
+@pytest.fixture(scope="module")
+def dear():
+    return found_by(DEAR)
+
+
+@pytest.fixture
+def found(request):
+    """What the case of a test found."""
+    name = request.node.callspec.params.get("name") if hasattr(request.node, "callspec") else None
+    name = name or request.node.originalname.removeprefix("test_")
+    answer = request.getfixturevalue("cheap" if name in CHEAP else "dear")[name]
+    assert "failed" not in answer, answer["failed"]
+    return answer
+
+
+def slow_if_dear(names):
+    """The names as parameters, the dear ones marked."""
+    return [pytest.param(name, marks=pytest.mark.slow) if name in DEAR else name for name in names]
+
+
+def test_stencils(found):
+    """All that is read of other nodes is read alike across the seams between parts, and all reductions are exact."""
+    assert len(found) == 36
+    assert {name: apart for name, apart in found.items() if apart > 0} == {}
+
+
+def test_not_a_number_is_not_lost(found):
+    assert found == [True, True]
+
+
+def test_compiled_program(found):
+    """Two permutes an axis that is divided, for the one look at V in a step, and nothing that collects an array."""
+    assert found["8"]["collective-permute"] == 2
+    assert found["4x2"]["collective-permute"] == 4
+    for counts in found.values():
+        assert counts["all-gather"] == counts["all-to-all"] == 0
+        assert counts["all-reduce"] > 0
+
+
+@pytest.mark.parametrize("name", slow_if_dear(EXACT))
+def test_the_same_sweeps_give_the_same_value(found, name):
+    for mesh in found:
+        assert mesh["same"]
+        assert mesh["ulp"] <= ULP
+
+
+@pytest.mark.parametrize("name", slow_if_dear(CERTIFIED))
+def test_certificates_hold_on_every_mesh(found, name):
+    for mesh in found:
+        assert mesh["status"] == ["CONVERGED", "CONVERGED"]
+        assert mesh["alike"]  # where the value is infinite
+        assert max(mesh["errors"]) <= 1e-6
+        assert mesh["apart"] <= sum(mesh["errors"])
+        one, many = mesh["steps"]
+        assert many <= 1.2 * one + 2
+
+
+def test_checkpoints(found):
+    """What eight devices began goes on on two, and on one."""
+    for mesh in found:
+        assert (mesh["steps"], mesh["residuals"]) == (40, 41)
+        assert mesh["apart"] <= 1e-15
+
+
+def test_faults(found):
+    """A value that is not finite in one part stops them all, at the same step, and the last finite one is kept."""
+    assert found[:2] == ["NONFINITE", "NONFINITE"]
+    assert found[2] == found[3]
+    assert found[4]
+
+
+def test_refusals(found):
+    wanted = {
+        "no mesh": ("TypeError: solve: mesh is 8", "jax.make_mesh"),
+        "axes": ("ValueError: solve: mesh has 3 axes", "the grid 2"),
+        "few points": ("ValueError: solve: mesh divides the 23 points of axis 0 into 8 parts", "at most 7 parts"),
+        "paths": ("ValueError: solve: SemiLagrangian", "leave out mesh"),
+        "direct": ("ValueError: solve: PolicyIteration(evaluation=Direct()", "leave out mesh"),
+        "direct in time": ("ValueError: march: Direct()", "leave out mesh"),
+        "traced": ("ValueError: solve: mesh divides the nodes at host level only", "jit"),
+        "traced march": ("ValueError: march: mesh divides the nodes at host level only", "jit"),
+        "host": ("ValueError: solve: a function of the problem calls Python on the host", "leave out mesh"),
+    }
+    assert set(found) == set(wanted)
+    for name, (start, way_out) in wanted.items():
+        assert found[name].startswith(start)
+        assert way_out in found[name]
+        assert len(found[name].splitlines()) <= 6
+
+
+@pytest.mark.slow
+def test_without_a_choice(found):
+    """Nested grids, of which the coarsest is too small for its parts, second order, and the error of the grid."""
+    assert found["status"] == "CONVERGED"
+    assert found["scheme"].startswith("Limited")
+    assert found["levels"][0] == found["levels"][1]
+    assert found["apart"] <= 2e-3
+    one, many = found["error of the grid"]
+    assert many == pytest.approx(one, rel=0.05)

@@ -1,0 +1,334 @@
+"""Solves and marches on eight virtual devices beside the same on one: a script, as a process begins with its devices.
+
+``python over_devices.py CASE ...``, with ``--xla_force_host_platform_device_count=8`` in ``XLA_FLAGS``, prints one JSON
+object: what each case found, or how it failed. ``tests/solvers/test_mesh.py`` reads it.
+"""
+
+import dataclasses
+import json
+import sys
+import tempfile
+import traceback
+import warnings
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
+
+import hjbjax as hjb
+from hjbjax.discretisation import slopes, stencil
+from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.problem.parts import Parts
+from hjbjax.problem.stretching import Sinh
+from hjbjax.solvers import setup, stationary_run
+
+RAN, FOUND = {}, {}
+
+
+def case(function):
+    """Decorator: a case by its name."""
+    RAN[function.__name__] = function
+    return function
+
+
+def mesh_of(*shape):
+    """A mesh of the first devices."""
+    return Mesh(np.array(jax.devices()[: int(np.prod(shape))]).reshape(shape), ("a", "b", "c")[: len(shape)])
+
+
+def swing(x, u):
+    return jnp.stack([x[1], jnp.sin(x[0]) + 2 * u[0]])
+
+
+def effort(x, u):
+    return 1 - jnp.cos(x[0]) + 0.1 * x[1] ** 2 + 0.1 * u @ u
+
+
+U = hjb.Box([-1.0], [1.0])
+ANGLE = hjb.Grid([-np.pi, -3.0], [np.pi, 3.0], (42, 29), periodic=(True, False))  # 8 does not divide 42, nor 2 29
+FLAT = hjb.Grid([-2.0, -2.0], [2.0, 2.0], (32, 31))
+ROOM = hjb.Grid([-2.0, -2.0, -np.pi], [2.0, 2.0, np.pi], (15, 14, 12), periodic=(False, False, True))
+PLAIN = hjb.Problem(swing, effort, U, discount=0.5)
+TARGET = hjb.Problem(
+    lambda x, u: jnp.stack([x[1], u[0]]), lambda x, u: 1.0, U, target=lambda x: jnp.linalg.norm(x) - 0.7
+)
+CHASE = hjb.Problem(  # a game with a target, and noise along one axis
+    lambda x, u, d: jnp.stack([jnp.cos(x[2]), jnp.sin(x[2]) + d[0], u[0]]), lambda x, u, d: 1.0, U,
+    disturbances=hjb.Box([-0.3], [0.3]), noise=np.array([0.5, 0.0, 0.0]),
+    target=lambda x: jnp.hypot(x[0], x[1]) - 0.6, discount=0.3,
+)  # fmt: skip
+SHAKEN = hjb.Problem(swing, effort, U, noise=0.6, discount=0.5)
+SKEW = hjb.Problem(swing, effort, U, noise=np.array([[0.5, 0.0], [0.2, 0.4]]), discount=0.5)
+STEPS = {"method": hjb.ValueIteration(), "scheme": hjb.Upwind(), "max_steps": 40, "throw": False}
+
+
+def beside(ask, *meshes):
+    """What an answer on each mesh differs from that on one device, in units in the last place of its largest value."""
+    one = ask(None)
+    scale = np.finfo(one.value.dtype).eps * np.max(np.abs(one.value[np.isfinite(one.value)]))
+    found = []
+    for shape in meshes:
+        other = ask(mesh_of(*shape))
+        same = (other.status, other.steps) == (one.status, one.steps)
+        apart = np.where(one.value == other.value, 0, np.abs(one.value - other.value))  # inf − inf
+        found.append({"same": same, "ulp": float(np.max(apart) / scale), "status": one.status.name})
+    return found
+
+
+@case
+def value_iteration():
+    return beside(lambda mesh: hjb.solve(PLAIN, ANGLE, mesh=mesh, **STEPS), (8,), (4, 2))
+
+
+@case
+def value_iteration_to_a_target():
+    return beside(lambda mesh: hjb.solve(TARGET, FLAT, mesh=mesh, **STEPS), (4, 2), (1, 3))
+
+
+@case
+def value_iteration_of_a_game():
+    return beside(lambda mesh: hjb.solve(CHASE, ROOM, mesh=mesh, **STEPS), (2, 2, 2))
+
+
+@case
+def value_iteration_with_correlated_noise():
+    return beside(lambda mesh: hjb.solve(SKEW, FLAT, mesh=mesh, **STEPS), (2, 4))
+
+
+@case
+def march_of_first_order():
+    # the terminal cost bends where no node is, and the target moves
+    problem = hjb.Problem(
+        lambda t, x, u: swing(x, u), lambda t, x, u: effort(x, u), U, terminal_cost=lambda t, x: jnp.abs(x[0] - 0.3),
+        target=lambda t, x: jnp.hypot(x[0] - t, x[1]) - 0.8, exit_cost=lambda t, x: t, time_dependent=True,
+    )  # fmt: skip
+    options = {"scheme": hjb.Upwind(), "times": [0.0, 0.1], "step": 0.01}
+    return beside(lambda mesh: hjb.march(problem, ANGLE, 0.2, mesh=mesh, **options), (8,), (4, 2))
+
+
+@case
+def march_of_second_order():
+    problem = hjb.reach(swing, U, lambda x: jnp.hypot(x[0] - 0.4, x[1]) - 0.7, disturbances=None)
+    return beside(lambda mesh: hjb.march(problem, FLAT, 0.2, mesh=mesh), (4, 2))
+
+
+@case
+def march_of_fifth_order():
+    problem = hjb.Problem(swing, effort, U, terminal_cost=lambda x: jnp.cos(x[0]) + jnp.sin(x[1] + 0.4))
+    return beside(lambda mesh: hjb.march(problem, ANGLE, 0.1, scheme=hjb.Weno5(), mesh=mesh), (8,), (4, 2))
+
+
+def read_of_others(grid, value, mask):
+    """All that is read of other nodes, by names, and all that is found of the nodes together."""
+    moves = [stencil.unit(grid, axis, step) for axis in range(grid.ndim) for step in (1, -1)]
+    moves += [tuple(1 if axis else -1 for axis in range(grid.ndim))]
+    links = [stencil.links(grid, axis) for axis in range(grid.ndim)]
+    sides = [stencil.one_sided(value, grid, axis, link) for axis, link in enumerate(links)]
+    both, even = enumerate(zip(sides, links, strict=True)), not any(grid.stretch)
+    read = {
+        "neighbour": [stencil.neighbour(value, grid, move) for move in moves],
+        "none beyond": [stencil.neighbour(value, grid, move, ghost=False) for move in moves],
+        "of a mask": [stencil.neighbour(mask, grid, move) for move in moves],
+        "mirrored": [stencil.continued(value, grid, move, mirror=True) for move in moves],
+        "continued": [stencil.continued(value, grid, move) for move in moves],
+        "one-sided": sides,
+        "limited": [stencil.limited(*side, grid, axis, link) for axis, (side, link) in both],
+        "weno": slopes.weno5(value, grid) if even else [],
+        "eno": slopes.eno2(value, grid) if even else [],
+        "walls": [jnp.broadcast_to(stencil.walls(grid, axis), value.shape) for axis in range(grid.ndim)],
+        "coordinates": [jnp.broadcast_to(x, value.shape) for x in grid.components(value.dtype)],
+    }
+    places = [grid.first(value > 2), grid.first(value > 100), grid.some(value > 2), grid.some(value > 100)]
+    return read, [grid.largest(value), grid.least(value), *places, grid.total(jnp.round(100 * value))]
+
+
+@case
+def stencils():
+    """What is read of other nodes, and what is found of all of them, next to one device."""
+    ends = {"edges": ("open", ("projected", "open")), "stretch": (None, Sinh(2.0))}
+    grids = {
+        "ordinary and periodic": (ANGLE, (4, 2)),
+        "open and stretched": (hjb.Grid([-2.0, -2.0], [2.0, 2.0], (29, 26), **ends), (2, 4)),
+        "three axes": (ROOM, (2, 2, 2)),
+    }
+    found = {}
+    for name, (grid, shape) in grids.items():
+        parts, value = Parts(mesh_of(*shape), grid.shape), np.random.default_rng(0).normal(size=grid.shape)
+
+        def here(grid, value, mask, parts=parts):
+            return read_of_others(grid.divided(parts), value, mask)
+
+        with jax.enable_x64(True):
+            given, over = (grid, value, value > 0), (jax.tree.map(lambda _: False, grid), True, True)
+            whole = jax.device_get(jax.jit(read_of_others)(*given))
+            marks = tuple(jax.tree.map(lambda _, m=m: m, each) for each, m in zip(whole, (True, False), strict=True))
+            divided = jax.jit(parts.mapped(here, over, marks))(*parts.spread(given, over))
+            divided = parts.gathered(divided, marks)
+        for what, arrays in whole[0].items():
+            pairs = zip(jax.tree.leaves(arrays), jax.tree.leaves(divided[0][what]), strict=True)
+            found[f"{name}: {what}"] = max((float(np.max(np.abs(1.0 * a - 1.0 * b))) for a, b in pairs), default=0.0)
+        found[f"{name}: of all"] = float(np.max(np.abs(np.array(whole[1], float) - np.array(divided[1], float))))
+    return found
+
+
+@case
+def not_a_number_is_not_lost():
+    """A NaN at one node of one part is the largest of all."""
+    parts = Parts(mesh_of(4, 2), FLAT.shape)
+    values = np.zeros(FLAT.shape, np.float32)
+    values[30, 3] = np.nan
+
+    def here(grid, values):
+        grid = grid.divided(parts)
+        return grid.largest(values), grid.least(values)
+
+    given = jax.tree.map(lambda _: False, FLAT), True
+    found = jax.jit(parts.mapped(here, given, (False, False)))(*parts.spread((FLAT, values), given))
+    return [bool(np.isnan(np.asarray(each))) for each in found]
+
+
+@case
+def compiled_program():
+    """The collectives of one step of value iteration, as they stand in the compiled program."""
+    found = {}
+    with jax.enable_x64(True):
+        for shape in ((8,), (4, 2)):
+            on = Discretisation(PLAIN, ANGLE, hjb.Upwind(), np.float64, mesh=mesh_of(*shape))
+            task, *_ = setup.prepare_on_host(on, method=hjb.ValueIteration(), tol=1e-3)
+            parts = on.parts
+            run = stationary_run.RunInParts(task, np.zeros(ANGLE.shape), 10, parts)
+            text = stationary_run._run_in_parts.lower(run.task, run.state, 5, parts=parts).compile().as_text()
+            names = ("collective-permute", "all-gather", "all-to-all", "all-reduce")
+            found["x".join(map(str, shape))] = {
+                name: sum(f" {name}(" in line or f" {name}-start(" in line for line in text.splitlines())
+                for name in names
+            }
+    return found
+
+
+def within_certificates(problem, grid, method, *meshes):
+    """Answers of policy iteration on meshes beside that on one device: how far apart, certified errors, steps."""
+    options = {"method": method, "scheme": hjb.Upwind(), "tol": 1e-6, "throw": False}
+    one, found = hjb.solve(problem, grid, **options), []
+    for shape in meshes:
+        other = hjb.solve(problem, grid, mesh=mesh_of(*shape), **options)
+        finite = np.isfinite(one.value)
+        found.append({
+            "status": [one.status.name, other.status.name],
+            "alike": bool(np.array_equal(finite, np.isfinite(other.value))),
+            "apart": float(np.max(np.abs(one.value - other.value)[finite])),
+            "errors": [float(one.error), float(other.error)],
+            "steps": [one.steps, other.steps],
+        })  # fmt: skip
+    return found
+
+
+@case
+def sweeps():
+    return within_certificates(PLAIN, ANGLE, hjb.PolicyIteration(hjb.Sweeps()), (8,), (4, 2))
+
+
+@case
+def sweeps_to_a_target():
+    return within_certificates(TARGET, FLAT, hjb.PolicyIteration(hjb.Sweeps()), (4, 2))
+
+
+@case
+def sweeps_of_a_game():
+    return within_certificates(CHASE, ROOM, hjb.PolicyIteration(hjb.Sweeps()), (2, 2, 2))
+
+
+@case
+def krylov():
+    return within_certificates(SHAKEN, ANGLE, None, (4, 2))
+
+
+@case
+def krylov_with_correlated_noise():
+    return within_certificates(SKEW, FLAT, None, (4, 2))
+
+
+@case
+def without_a_choice():
+    """The solve that nobody asked for details of: nested, of second order, with an estimate of the grid's error."""
+    grid, method = dataclasses.replace(ANGLE, shape=(64, 49)), hjb.Nested(coarsest=500)
+    one, other = (hjb.solve(PLAIN, grid, method=method, mesh=mesh) for mesh in (None, mesh_of(4, 2)))
+    return {
+        "status": other.status.name,
+        "scheme": other.stats["scheme"],
+        "levels": [list(one.stats["levels"]), list(other.stats["levels"])],
+        "apart": float(np.max(np.abs(one.value - other.value))),
+        "error of the grid": [float(np.max(each.grid_error)) for each in (one, other)],
+    }
+
+
+@case
+def checkpoints():
+    """A run that is cut on eight devices and goes on on two, and on one."""
+    one = hjb.solve(PLAIN, ANGLE, **STEPS)
+    found = []
+    with tempfile.TemporaryDirectory() as folder:
+        for shape in ((2,), None):
+            place = Path(folder) / f"{shape}.npz"
+            hjb.solve(PLAIN, ANGLE, mesh=mesh_of(8), checkpoint=place, **{**STEPS, "max_steps": 15})
+            mesh = None if shape is None else mesh_of(*shape)
+            other = hjb.solve(PLAIN, ANGLE, mesh=mesh, checkpoint=place, resume=True, **STEPS)
+            apart = np.max(np.abs(one.value - other.value)) / np.max(np.abs(one.value))
+            found.append({"steps": other.steps, "apart": float(apart), "residuals": len(other.residuals)})
+    return found
+
+
+@case
+def faults():
+    """A value that grows beyond the largest number, in one part first."""
+    problem = hjb.Problem(swing, lambda x, u: jnp.where(x[0] > 1.8, 1e307, 1.0) * effort(x, u), U, discount=1e-3)
+    one, other = (hjb.solve(problem, FLAT, mesh=mesh, **{**STEPS, "max_steps": 100}) for mesh in (None, mesh_of(4, 2)))
+    return [one.status.name, other.status.name, one.steps, other.steps, bool(np.all(np.isfinite(other.value)))]
+
+
+@case
+def refusals():
+    """What cannot be divided, by the message."""
+    few, two = hjb.Grid([-2.0, -2.0], [2.0, 2.0], (23, 31)), mesh_of(2)
+    direct, chain = hjb.Direct(), {"scheme": hjb.Upwind()}
+    calling = hjb.Problem(lambda x, u: jax.pure_callback(np.sin, x, x) + u, effort, U, discount=0.5)
+
+    def discounted(b):
+        return hjb.Problem(swing, effort, U, discount=b)
+
+    ask = {
+        "no mesh": lambda: hjb.solve(PLAIN, FLAT, mesh=8),
+        "axes": lambda: hjb.solve(PLAIN, FLAT, mesh=mesh_of(2, 2, 2)),
+        "few points": lambda: hjb.solve(PLAIN, few, mesh=mesh_of(8)),
+        "paths": lambda: hjb.solve(PLAIN, FLAT, scheme=hjb.SemiLagrangian(), mesh=two),
+        "direct": lambda: hjb.solve(PLAIN, FLAT, method=hjb.PolicyIteration(direct), mesh=two),
+        "direct in time": lambda: hjb.march(PLAIN, FLAT, 1.0, method=hjb.Implicit(direct), mesh=two, **chain),
+        "traced": lambda: jax.jit(lambda b: hjb.solve(discounted(b), FLAT, mesh=two).value)(0.5),
+        "traced march": lambda: jax.jit(lambda b: hjb.march(discounted(b), FLAT, 1.0, step=0.01, mesh=two).value)(0.5),
+        "host": lambda: hjb.solve(calling, FLAT, mesh=two),
+    }
+    found = {}
+    for name, question in ask.items():
+        try:
+            question()
+        except (TypeError, ValueError) as error:
+            found[name] = f"{type(error).__name__}: {error}"
+    return found
+
+
+def main(names):
+    """Run these cases and print what they found."""
+    warnings.simplefilter("error")
+    warnings.simplefilter("ignore", hjb.SolveWarning)  # of coarse grids and of ends that are left
+    for name in names:
+        try:
+            FOUND[name] = RAN[name]()
+        except Exception:
+            FOUND[name] = {"failed": traceback.format_exc()}
+    print(json.dumps(FOUND, indent=1))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

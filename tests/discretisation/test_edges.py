@@ -244,7 +244,8 @@ OTHERS = [
 ]
 
 
-@pytest.mark.parametrize("method", [None, *OTHERS])
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [None, hjb.ValueIteration(), hjb.PolicyIteration(hjb.Direct())])
 def test_enumerated_controls_against_the_oracle(method):
     """The same set, so the same value; bounds hold it, also at a coarse tolerance."""
     for seed in range(3):

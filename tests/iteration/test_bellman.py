@@ -24,6 +24,8 @@ from hjbjax.problem.sets import Ball, Box, Finite
 UNIT = Box([-1.0], [1.0])
 NOISES = ["none", "diagonal", "matrix"]
 laws = settings(max_examples=12)
+# every candidate of a minimum looks at several neighbours, and with noise at more: see QUICK in tests/conftest.py
+jitted = functools.partial(jax.jit, compiler_options={"xla_cpu_use_fusion_emitters": True})
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -36,7 +38,7 @@ def upwind(problem, grid):
     return Discretisation(problem, grid, Upwind(), np.float64)
 
 
-@functools.partial(jax.jit, static_argnames="scheme")
+@functools.partial(jitted, static_argnames="scheme")
 def operator(problem, grid, value, obstacles, scheme=Upwind()):
     """One step of value iteration; and βΔt, by which it contracts."""
     on = Discretisation(problem, grid, scheme, value.dtype)
@@ -101,7 +103,7 @@ def test_a_constant_shifts_the_rate_by_the_discount(kind, seed):
     assert np.allclose(after, before - problem.discount * shift, rtol=0, atol=1e-10 * (1 + np.max(np.abs(before))))
 
 
-@jax.jit
+@jitted
 def _rate(problem, grid, value, held):
     return bellman.greedy(upwind(problem, grid), value, held).defect
 
@@ -204,7 +206,7 @@ def test_the_floor_wins_over_stopping_and_the_target_over_both():
     assert obstacles.impose(jnp.array([-5.0, -5.0, -5.0])).tolist() == [2.0, -1.0, 9.0]
 
 
-@jax.jit
+@jitted
 def _equation(problem, grid, value, obstacles):
     policy = bellman.greedy(upwind(problem, grid), value, obstacles.fixed)
     return policy, bellman.policy_equation(upwind(problem, grid), value, policy, obstacles)
@@ -231,7 +233,7 @@ def test_the_source_is_the_residual_and_the_weights_are_the_chain(kind, seed):
     assert all(np.all(w >= 0) for w in equation.weights.values)
 
 
-@jax.jit
+@jitted
 def _told(problem, grid, value, policy, obstacles, fastest):
     return bellman.policy_equation(upwind(problem, grid), value, policy, obstacles, fastest=fastest)
 
@@ -303,7 +305,7 @@ def test_no_action_is_faster_than_the_fastest_rate(controls, seed):
         assert np.all(leaving.reshape(grid.shape) <= fastest * (1 + 1e-12))
 
 
-@jax.jit
+@jitted
 def _fastest(problem, grid):
     return fastest_rate(upwind(problem, grid))
 
@@ -325,7 +327,7 @@ def test_the_inner_player_replies_to_the_outer_one(isaacs, seed):
     assert set(np.unique(getattr(reply, changed)[0])) <= set((theirs if isaacs == "upper" else mine).points.ravel())
 
 
-@jax.jit
+@jitted
 def _replies(problem, grid, value, other):
     held = jnp.zeros(grid.shape, bool)
     first = bellman.greedy(upwind(problem, grid), other, held)

@@ -120,15 +120,19 @@ class Number(click.ParamType):
 
 
 class Shape(click.ParamType):
-    """Numbers of nodes with an x between them, as in 200x201."""
+    """Numbers of nodes, or of devices, with an x between them, as in 200x201."""
 
     name = "NxN"
+
+    def __init__(self, least: int = 2):
+        self.least, self.example = least, "200x201" if least > 1 else "4x2"
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
         """One integer an axis, or a usage error."""
         counts = [finite(part, int) for part in str(value).lower().split("x")]
-        if any(count is None or count < 2 for count in counts):
-            self.fail(f"got {value!r}, wanted whole numbers of at least 2, one an axis, as in 200x201", param, ctx)
+        if any(count is None or count < self.least for count in counts):
+            wanted = f"whole numbers of at least {self.least}, one an axis, as in {self.example}"
+            self.fail(f"got {value!r}, wanted {wanted}", param, ctx)
         return tuple(count for count in counts if count is not None)  # for the type alone: None has failed above
 
 

@@ -5,7 +5,7 @@ one screen. What can be refused is refused in one line before anything is compil
 folder beside the old ones and moved over them when they are whole.
 
 Exit codes: 0 done, 1 a check of ``doctor`` failed, 2 usage, 3 not converged, 4 diverged or not finite, 5 file,
-6 memory, 130 interrupted (Ctrl-C or SIGTERM).
+6 memory, 7 a process of ``launch`` died, 130 interrupted (Ctrl-C or SIGTERM).
 """
 
 import contextlib
@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 import click
 
 from hjbjax._version import __version__
+from hjbjax.cli import launch as processes_of
 from hjbjax.cli.command_line import Failure, Name, Number, OneLineGroup, Place, Shape, parameters_of, say
 
 if TYPE_CHECKING:  # for annotations alone: what is heavy is imported by the command that needs it
@@ -86,6 +87,7 @@ def list_problems(name: str | None) -> None:
 @click.option("--time-limit", type=Number(), help="Stop after so many seconds.")
 @click.option("--checkpoint", type=Place(), help="A file that keeps what is done, every minute.")
 @click.option("--resume", is_flag=True, help="Go on from the checkpoint, if it is there.")
+@click.option("--devices", type=Shape(least=1), help="Divide the nodes: devices along each axis, as in 2 or 4x2.")
 @click.option("--dry-run", is_flag=True, help="Say what it will take: bytes, programs, steps, seconds; solve nothing.")
 @click.option("--out", type=Place(), help="Folder of the results; the problem's name if not given.")
 @click.option("--force", is_flag=True, help="Replace results that are there already.")
@@ -100,6 +102,7 @@ def solve(
     as_json: bool,
     no_cache: bool,
     dry_run: bool,
+    devices: tuple[int, ...] | None,
     **options: Any,
 ) -> None:
     """Solve the ready problem NAME; write solution.npz, value.png, policy.png and trajectory.png."""
@@ -110,6 +113,11 @@ def solve(
     parameters = parameters_of(entry, settings)
     if dry_run:
         _estimate(*_build(entry, parameters, shape), options, as_json=as_json)
+        return
+    options["mesh"] = processes_of.mesh_of(devices)
+    if processes_of.rank() > 0:  # the first process of a launch writes, and speaks for all
+        with _interruptible():
+            _raise_unless_converged(_solve(*_build(entry, parameters, shape), options))
         return
     out = Path(name) if out is None else out
     # refusals in the order of what they cost: words, folder, problem; the solve comes after all of them
@@ -154,8 +162,24 @@ def solve(
         click.echo(f"wrote {', '.join(map(str, files))}{without}")
     if (failure := solution.stats.get("checkpoint", "written")) != "written":
         raise Failure(failure, 5)
+    _raise_unless_converged(solution)
+
+
+def _raise_unless_converged(solution: "Solution") -> None:
+    """A failure, with its exit code, of a status that is not CONVERGED; the processes of a launch part here."""
+    processes_of.leave()
     if code := CODES.get(solution.status.name, 3):
         raise Failure(f"{solution.status.name}: {solution.message or solution.status.message}", code)
+
+
+@main.command(short_help="Run a command in many processes.", context_settings={"ignore_unknown_options": True})
+@click.option("--processes", type=Number(int), default=2, show_default=True, help="How many, on this host.")
+@click.option("--heartbeat", type=Number(int), default=10, show_default=True, help="Seconds until one counts as dead.")
+@click.argument("words", nargs=-1, required=True, metavar="-- COMMAND")
+def launch(processes: int, heartbeat: int, words: tuple[str, ...]) -> None:
+    """Run a command, as in "hjbjax launch --processes 2 -- solve pendulum", by many processes that share its nodes."""
+    if code := processes_of.start(words, processes, heartbeat):
+        raise SystemExit(code)
 
 
 @contextlib.contextmanager

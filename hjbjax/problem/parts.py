@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from hjbjax.problem.types import AtNodes, Mask, Scalar
@@ -113,7 +114,9 @@ class Parts:
         """The inverse of ``spread``: NumPy arrays of the whole grid."""
 
         def take(leaf: Any, divided: bool) -> np.ndarray:
-            host = np.asarray(leaf)
+            # what other processes hold comes from them, and all of them have to ask
+            far = isinstance(leaf, jax.Array) and divided and not leaf.is_fully_addressable
+            host = np.asarray(multihost_utils.process_allgather(leaf, tiled=True) if far else leaf)
             for axis in self.axes if divided else ():
                 if not self.even(axis):
                     host = np.take(host, self._entries_of_nodes(axis), axis)
@@ -211,6 +214,11 @@ class Parts:
         beyond = np.iinfo(np.int32).max
         found = self._reduced(jnp.where(mask, number, beyond), jnp.min, jax.lax.pmin, beyond)
         return jnp.where(found == beyond, -1, found)
+
+
+def spans_processes(mesh: Mesh | None) -> bool:
+    """True if some of the devices are those of other processes."""
+    return mesh is not None and any(device.process_index != jax.process_index() for device in mesh.devices.flat)
 
 
 def check_mesh(mesh: object, grid_shape: tuple[int, ...], caller: str, *choices: object) -> Mesh | None:

@@ -24,6 +24,7 @@ from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.solution import files
+from hjbjax.solution.clock import agreed
 from hjbjax.solution.files import Expected, FileError
 from hjbjax.solution.placement import Path, check_place, path_of
 from hjbjax.solution.status import Status, warn
@@ -143,10 +144,18 @@ class File:
       checkpoint: where it is, and how often it is written.
       asked: what was asked, as digests and words; a file that was made for anything else is refused.
       known: the records of an earlier process, by the names of their journals.
+      together: whether many processes solve one problem, of which the first one writes.
     """
 
-    def __init__(self, checkpoint: Checkpoint, asked: Mapping[str, str], known: Mapping[str, Sequence[Record]]):
-        self.checkpoint, self.asked, self.known = checkpoint, dict(asked), dict(known)
+    def __init__(
+        self,
+        checkpoint: Checkpoint,
+        asked: Mapping[str, str],
+        known: Mapping[str, Sequence[Record]],
+        *,
+        together: bool = False,
+    ):
+        self.checkpoint, self.asked, self.known, self.together = checkpoint, dict(asked), dict(known), together
         self.journals: dict[str, Journal] = {}
         self.changed = False
         self.failure: str | None = None  # why it could not be written
@@ -163,12 +172,14 @@ class File:
 
     def is_due(self) -> bool:
         """Whether it is time to write."""
-        return time.monotonic() - self._written >= self.checkpoint.every
+        due = time.monotonic() - self._written >= self.checkpoint.every
+        # what is written is gathered from all processes, and all of them have to ask
+        return bool(agreed(int(due))) if self.together else due
 
     def write(self) -> None:
         """Write what has changed; where that fails the run goes on, with one warning."""
         with self._lock:
-            if not self.changed:
+            if not self.changed or (self.together and jax.process_index() > 0):
                 return
             self.changed = False
             # copied: lanes begin meanwhile; and with those of lanes that have not begun yet
@@ -231,6 +242,7 @@ def opened(
     *,
     resume: bool,
     what: str,
+    together: bool = False,
     **others: Any,
 ) -> Iterator[File | None]:
     """Context with the file of a run, which is written at its end; None where there is to be none.
@@ -241,6 +253,7 @@ def opened(
       grid: the nodes.
       resume: whether to go on from the file, if it is there.
       what: the function that was called, for messages.
+      together: whether many processes solve the problem.
       others: what else decides the answer.
 
     Raises:
@@ -259,7 +272,7 @@ def opened(
     if there and not resume:
         raise FileExistsError(f"{kept.path!s}: there is a checkpoint already; resume=True goes on from it")
     question = asked(problems, grid, **others)
-    file = File(kept, question, _read(kept.path, question) if there else {})
+    file = File(kept, question, _read(kept.path, question) if there else {}, together=together)
     try:
         yield file
     finally:

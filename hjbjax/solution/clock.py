@@ -4,6 +4,9 @@ All that runs long does so in phases (checks, a survey of the nodes, preparation
 its clock between two of them. Ctrl-C leaves a note on the clock instead of an exception: an exception may be thrown
 into a callback of the runtime and be swallowed there, and would take along what was done so far. What cannot be cut,
 a compilation or one step, is seen to its end, and nothing follows it.
+
+Where one problem is solved by many processes together, all do the same things in the same order, or they would wait for
+each other for ever: each limit that one of them meets is met by all, at the same look at the clock.
 """
 
 import contextlib
@@ -14,6 +17,8 @@ import time
 from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Any
+
+import numpy as np
 
 from hjbjax.solution.status import Status
 
@@ -38,11 +43,19 @@ class Clock:
 
     ``phase`` says how far it came, as in "the survey of the nodes"; ``tell``, if there is one, is called with each new
     one. ``per_node`` is the seconds that a step took at a node in the last chunk, from grid to grid; None before the
-    first. ``journal`` is what keeps the parts that are done in a file, or None.
+    first. ``journal`` is what keeps the parts that are done in a file, or None. ``together`` is true in one of many
+    processes that solve one problem.
     """
 
-    def __init__(self, max_steps: int = 10**9, seconds: float | None = None, progress: bool | None = None):
-        self.max_steps, self.progress = max_steps, progress
+    def __init__(
+        self,
+        max_steps: int = 10**9,
+        seconds: float | None = None,
+        progress: bool | None = None,
+        *,
+        together: bool = False,
+    ):
+        self.max_steps, self.progress, self.together = max_steps, progress, together
         self.seconds = math.inf if seconds is None else seconds
         self.began, self.stepping, self.interrupted = time.perf_counter(), 0.0, False
         self.per_node: float | None = None
@@ -71,9 +84,13 @@ class Clock:
 
     def over(self) -> Status | None:
         """INTERRUPTED or TIME_LIMIT; ``None`` to go on."""
-        if self.interrupted:  # first: who pressed Ctrl-C wants to read that, whatever the time is
-            return Status.INTERRUPTED
-        return Status.TIME_LIMIT if self.elapsed() >= self.seconds else None
+        # first: who pressed Ctrl-C wants to read that, whatever the time is
+        found = 0 if self.interrupted else 1 if self.elapsed() >= self.seconds else 2
+        return (Status.INTERRUPTED, Status.TIME_LIMIT, None)[self.least_of_all(found)]
+
+    def least_of_all(self, number: int) -> int:
+        """The least of a number of every process, by which they agree; the number itself where there is one."""
+        return agreed(number) if self.together else number
 
     def look(self) -> None:
         """Go on, or raise ``Stopped``."""
@@ -96,6 +113,13 @@ class Clock:
         """The number of steps that take so long, by the last chunk."""
         assert self.per_node is not None
         return seconds / (self.per_node * nodes)
+
+
+def agreed(number: int) -> int:
+    """The least of a whole number over all processes of ``jax.distributed``, each of which has to ask."""
+    from jax.experimental import multihost_utils
+
+    return int(np.min(multihost_utils.process_allgather(np.asarray(number, np.int32))))
 
 
 class _Beside(Clock):

@@ -85,12 +85,18 @@ def show(solution: _Answer) -> str:
         "isaacs gap": "" if solution.isaacs_gap is None else number(solution.isaacs_gap),
         "seconds": f"{number(stats['seconds'])}{compiling}" if "seconds" in stats else "",
         "memory": size(stats["bytes"]) if "bytes" in stats else "",
-        "device": f"{number(stats['device'])}, {dtype}" if "device" in stats else dtype,
+        "device": f"{_devices(stats)}, {dtype}" if "device" in stats else dtype,
     }
     said = plain(f"{solution.status.name}: {solution.message or solution.status.message}")
     head = textwrap.wrap(said, WIDTH)
     lines = head if len(head) < 4 else [*head[:2], one_line(" ".join(head[2:]))]
     return encodable("\n".join(lines + [f"  {name:15}  {one_line(text)}" for name, text in rows.items() if text]))
+
+
+def _devices(stats: dict[str, Any]) -> str:
+    """The kind of the device, or of the devices that had parts of the nodes, and how they lay."""
+    kind, mesh = number(stats["device"]), stats.get("mesh")
+    return f"{' x '.join(map(number, mesh))} {kind}" if isinstance(mesh, (list, tuple)) else kind
 
 
 def thumbnail(solution: _Answer) -> str:

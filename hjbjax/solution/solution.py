@@ -79,8 +79,8 @@ class Solution:
       labels: names and units of the controls, and the side of the level set, for pictures.
       residuals: one number a step; host level.
       stats: "method", "scheme", "device", "dtype", "seconds", "compile_seconds", "bytes", "tol",
-        "certificate" (a sentence), "checkpoint" ("written", or why not) and "versions" (a dict), each where known; host
-        level.
+        "certificate" (a sentence), "checkpoint" ("written", or why not), "mesh" (devices along each axis, where the
+        nodes were divided) and "versions" (a dict), each where known; host level.
       message: what happened in this very solve; empty after a passage through ``jit``; host level.
       problem: the question, from which pictures take target and bounds; ``None`` after a passage through ``jit`` or a
         file, as functions are not saved; host level.

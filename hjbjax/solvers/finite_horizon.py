@@ -25,6 +25,7 @@ from hjbjax.iteration.time_stepping import March
 from hjbjax.markov_chain import admissibility, memory, node_checks
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.parts import spans_processes
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, as_one_program, cast, is_traced
 from hjbjax.problem.sets import Box
@@ -137,10 +138,10 @@ def march(
         raise ValueError(f"march: two of the times {kept.tolist()} are the same number in {kind}; leave one out")
     check_node_values(start, grid, "march: start")
     grid.check_spacings(kind)
-    clock = Clock(seconds=time_limit, progress=progress)
+    clock = Clock(seconds=time_limit, progress=progress, together=spans_processes(mesh))
     opened = checkpoints.opened(
-        checkpoint, [problem], grid, resume=resume, what="march", horizon=horizon, times=kept, start=start,
-        method=method, scheme=scheme, step=step, inner=inner, dtype=kind,
+        checkpoint, [problem], grid, resume=resume, what="march", together=clock.together, horizon=horizon, times=kept,
+        start=start, method=method, scheme=scheme, step=step, inner=inner, dtype=kind,
     )  # fmt: skip
     # float64 for this call alone: the caller's own programs, and other threads, keep the type they have
     with noting_interrupts(clock), host_loop.telling(clock), jax.enable_x64(kind == np.float64), opened as file:
@@ -165,8 +166,9 @@ def march(
                 solution = _solution_at_horizon(on, horizon, start, stop.status)
         solution = with_last_phase(solution, clock)
     solution.stats.update(
-        seconds=clock.stepping, compile_seconds=clock.elapsed() - clock.stepping, bytes=needed, horizon=horizon
-    )
+        seconds=clock.stepping, compile_seconds=clock.elapsed() - clock.stepping, bytes=needed, horizon=horizon,
+        **({} if mesh is None else {"mesh": mesh.devices.shape}),
+    )  # fmt: skip
     if clock.journal is not None:
         solution.stats["checkpoint"] = clock.journal.file.outcome
     if throw and solution.status is not Status.CONVERGED:

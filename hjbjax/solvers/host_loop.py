@@ -92,6 +92,7 @@ def drive(run: Run, clock: Clock) -> Status:
             clock.phase = f"compiling for {run.name}"
             run.compile()
             while (status := run.between(status, clock)) is Status.RUNNING:
+                chunk = clock.least_of_all(chunk)
                 if journal is not None:
                     journal.keep(run)
                 began, before = time.perf_counter(), run.steps
@@ -124,7 +125,7 @@ def _stop_status(run: Run, clock: Clock) -> Status:
     # one step on a large grid may take minutes, and nothing can cut it
     if status is None and clock.per_node is not None:
         late = clock.steps_in(clock.seconds - clock.elapsed(), run.nodes) < 1
-        status = Status.TIME_LIMIT if late else None
+        status = None if clock.least_of_all(int(not late)) else Status.TIME_LIMIT
     # the steps that were asked for are done: that comes before a time limit, but not before Ctrl-C
     if run.steps >= run.limit and status is not Status.INTERRUPTED:
         return Status.MAX_STEPS

@@ -14,7 +14,7 @@ from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import time_stepping
 from hjbjax.iteration.time_stepping import Front, March
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.parts import Parts
+from hjbjax.problem.parts import Parts, spans_processes
 from hjbjax.problem.pytree import altered
 from hjbjax.problem.types import Field, Nodes, Number, Scalar
 from hjbjax.solution.clock import CUT, Clock
@@ -275,6 +275,11 @@ class MarchInParts(MarchRun):
             answer = _greedy_in_parts(self._divided, self.front.value, self.front.t, self.parts)
             answer = self.parts.gathered(answer, jax.tree.map(lambda _: True, answer))
         self.slices.keep(self.task, front.value, front.t, answer)
+
+    def keep(self, error: Exception) -> None:
+        """Attach the solution so far to an exception; what other processes hold is out of reach."""
+        if not spans_processes(self.parts.mesh):
+            super().keep(error)
 
     def restore(self, arrays: list[np.ndarray]) -> None:
         """Go on from a front that was saved, by whatever number of devices."""

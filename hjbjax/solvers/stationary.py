@@ -23,6 +23,7 @@ from hjbjax.iteration.methods import Method, check_method
 from hjbjax.markov_chain import admissibility, memory, node_checks, resting
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.parts import spans_processes
 from hjbjax.problem.problem import Problem, is_discounted
 from hjbjax.problem.pytree import altered, as_one_program, is_traced
 from hjbjax.problem.types import DType, Nodes, Number, Scalar
@@ -135,10 +136,10 @@ def solve(
     kind = arguments.as_dtype(dtype)
     check_node_values(guess, grid, "solve: the guess")
     grid.check_spacings(kind)
-    clock = Clock(max_steps or 10**9, time_limit, progress)
+    clock = Clock(max_steps or 10**9, time_limit, progress, together=spans_processes(mesh))
     opened = checkpoints.opened(
-        checkpoint, [problem], grid, resume=resume, what="solve", method=method, scheme=scheme, tol=tol, guess=guess,
-        dtype=kind,
+        checkpoint, [problem], grid, resume=resume, what="solve", together=clock.together, method=method, scheme=scheme,
+        tol=tol, guess=guess, dtype=kind,
     )  # fmt: skip
     if isinstance(scheme, PathScheme):
         with noting_interrupts(clock), host_loop.telling(clock), jax.enable_x64(kind == np.float64), opened as kept:
@@ -155,7 +156,7 @@ def solve(
         with host_loop.with_solution(clock, needed, lambda kept: _partial(on, kept)):
             solution = with_last_phase(solve_on_host(on, method, tol, guess, clock, sharpen=sharpen, free=free), clock)
     solution.stats.setdefault("method", method.described(problem.is_game))
-    solution.stats["bytes"] = needed
+    solution.stats.update(bytes=needed, **({} if mesh is None else {"mesh": mesh.devices.shape}))
     return _ended(solution, clock, tol, throw=throw)
 
 

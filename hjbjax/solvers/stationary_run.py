@@ -15,7 +15,7 @@ import numpy as np
 from hjbjax.discretisation.discretisation import on_part, over_nodes
 from hjbjax.iteration import fixed_point
 from hjbjax.iteration.fixed_point import HISTORY, State, Task
-from hjbjax.problem.parts import Parts
+from hjbjax.problem.parts import Parts, spans_processes
 from hjbjax.problem.pytree import altered
 from hjbjax.problem.types import Array, Nodes, Number
 from hjbjax.solution.clock import CHUNK_SECONDS, CUT, Clock
@@ -207,7 +207,9 @@ class RunInParts(StationaryRun):
 
     def keep(self, error: Exception) -> None:
         """Attach the value to an exception, as without parts."""
-        values = (lambda s=s: self.parts.gathered(s, self._over).value for s in (self.state, self.before))
+        # what other processes hold is out of reach: they may not have come to this exception
+        states = () if spans_processes(self.parts.mesh) else (self.state, self.before)
+        values = (lambda s=s: self.parts.gathered(s, self._over).value for s in states)
         host_loop.keep(error, self.task.grid, *values, lambda: self.guess)
 
 

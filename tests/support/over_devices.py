@@ -227,7 +227,12 @@ def within_certificates(problem, grid, method, *meshes):
 
 @case
 def sweeps():
-    return within_certificates(PLAIN, ANGLE, hjb.PolicyIteration(hjb.Sweeps()), (8,), (4, 2))
+    return within_certificates(PLAIN, ANGLE, hjb.PolicyIteration(hjb.Sweeps()), (4, 2))
+
+
+@case
+def sweeps_of_flat_parts():
+    return within_certificates(PLAIN, ANGLE, hjb.PolicyIteration(hjb.Sweeps()), (8,), (1, 8))
 
 
 @case
@@ -262,6 +267,24 @@ def without_a_choice():
         "apart": float(np.max(np.abs(one.value - other.value))),
         "error of the grid": [float(np.max(each.grid_error)) for each in (one, other)],
     }
+
+
+@case
+def implicit_march():
+    problem = hjb.Problem(swing, effort, U, noise=0.3, terminal_cost=lambda x: jnp.abs(x[0]))
+    options = {"scheme": hjb.Upwind(), "method": hjb.Implicit(tol=1e-9), "step": 0.05}
+    one, other = (hjb.march(problem, ANGLE, 0.2, mesh=mesh, **options) for mesh in (None, mesh_of(4, 2)))
+    return [other.status.name, one.steps, other.steps, float(np.max(np.abs(one.value - other.value)))]
+
+
+@case
+def open_ends():
+    """Where no bound holds: within the tolerance of the residual, by steps in time that become longer."""
+    problem = hjb.Problem(lambda x, u: u - x, lambda x, u: x @ x + u @ u, hjb.Box([-1.0] * 2, [1.0] * 2), discount=0.5)
+    grid = dataclasses.replace(FLAT, edges="open")
+    options = {"method": hjb.PolicyIteration(hjb.Krylov()), "scheme": hjb.Upwind(), "tol": 1e-8}
+    one, other = (hjb.solve(problem, grid, mesh=mesh, **options) for mesh in (None, mesh_of(4, 2)))
+    return [other.status.name, one.steps, other.steps, float(np.max(np.abs(one.value - other.value)))]
 
 
 @case

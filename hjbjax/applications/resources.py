@@ -9,7 +9,7 @@ from hjbjax.discretisation.discretisation import Scheme
 from hjbjax.iteration.methods import Method, Nested
 from hjbjax.markov_chain import memory
 from hjbjax.problem import arguments
-from hjbjax.problem.grid import Grid
+from hjbjax.problem.grid import INDEXABLE, Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.types import DType
 from hjbjax.solution.solution import Solution
@@ -49,15 +49,21 @@ class Estimate:
     note: str = ""
 
     @property
+    def numbered(self) -> bool:
+        """Whether 32-bit indices can number the nodes."""
+        return math.prod(self.shape) < INDEXABLE
+
+    @property
     def fits(self) -> bool:
         """Whether there is as much memory, and the nodes can be numbered."""
-        return math.prod(self.shape) < memory.INDEXABLE and (self.free is None or self.bytes <= self.free)
+        return self.numbered and (self.free is None or self.bytes <= self.free)
 
     def __str__(self) -> str:
         free = "" if self.free is None else f", {self.free / 1e9:.3g} GB are free"
         most = "" if self.largest is None else f"; at most {self.largest} points an axis fit"
         lines = [
-            f"nodes     {' x '.join(map(str, self.shape))} = {math.prod(self.shape):,}",
+            f"nodes     {' x '.join(map(str, self.shape))} = {math.prod(self.shape):,}"
+            + ("" if self.numbered else f": 32-bit indices number fewer than {INDEXABLE:,}"),
             f"memory    {self.bytes / 1e9:.3g} GB{free}{most}{'' if self.fits else ': IT DOES NOT FIT'}",
             f"programs  {self.programs} to compile",
         ]
@@ -140,7 +146,7 @@ def _largest(needed: int, free: int | None, grid: Grid) -> int | None:
     """The points along each axis of the largest grid of as many axes that fits."""
     if free is None:
         return None
-    nodes = min(free / needed * grid.size, memory.INDEXABLE - 1)
+    nodes = min(free / needed * grid.size, INDEXABLE - 1)
     # a root that is whole may come out just below
     return math.floor(nodes ** (1 / grid.ndim) * (1 + 1e-12))
 

@@ -254,7 +254,12 @@ def _estimate(problem: "Problem", grid: "Grid", options: dict[str, Any], *, as_j
         found = hjb.estimate(problem, grid, **asked)
     click.echo(json.dumps(dataclasses.asdict(found)) if as_json else str(found))
     if not found.fits:
-        raise Failure("the solve does not fit into the memory that is free", 6)
+        raise Failure(
+            "the solve does not fit: see nodes"
+            if not found.numbered
+            else "the solve does not fit into the memory that is free",
+            6,
+        )
 
 
 def _solve(problem: "Problem", grid: "Grid", options: dict[str, Any]) -> "Solution":

@@ -15,12 +15,9 @@ import numpy as np
 
 from hjbjax.iteration.methods import Method
 from hjbjax.problem import arguments
-from hjbjax.problem.grid import Grid
+from hjbjax.problem.grid import NO_GRID, Grid
 from hjbjax.problem.problem import Problem, is_discounted
 from hjbjax.problem.types import DType
-
-INDEXABLE = 2**31  # nodes that 32-bit indices can number
-NO_GRID = "hjb.pontryagin(problem, x0) finds the optimal path from one state without a grid"
 
 
 def estimate(problem: Problem, grid: Grid, method: Method, dtype: DType) -> int:
@@ -143,12 +140,7 @@ def fitting(needed: int, grid: Grid, limit: int | None) -> int:
     if limit is not None:
         arguments.positive(limit, "max_memory", "in bytes")
     free = available() if limit is None else int(limit)
-    if grid.size >= INDEXABLE:
-        largest = math.floor((INDEXABLE - 1) ** (1 / grid.ndim))
-        raise MemoryError(
-            f"{counts(grid)} = {grid.size:,} nodes; 32-bit indices number fewer than {INDEXABLE:,}.\n"
-            f"At most N = {largest} points an axis in {grid.ndim}-D; {NO_GRID}."
-        )
+    grid.check_indices()
     # in proportion to the nodes: the largest grid that would fit has free/needed times as many
     if free is not None and needed > free:
         raise MemoryError(

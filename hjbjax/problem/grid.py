@@ -23,6 +23,8 @@ from hjbjax.problem.types import Array, DType, Number, Numbers, States
 
 ROUNDINGS = 16  # units of eps of the largest coordinate by which the formula may miss its table
 COINCIDING = 16  # units in the last place of a coordinate, of which a spacing must be more
+INDEXABLE = 2**31  # nodes that 32-bit indices can number
+NO_GRID = "hjb.pontryagin(problem, x0) finds the optimal path from one state without a grid"
 TABLED = 2**24  # points of an axis whose coordinates are kept, 128 MiB; a grid too large must not allocate them before
 
 
@@ -111,6 +113,19 @@ class Grid:
                     f"rounding of its coordinates in {np.dtype(dtype)}; take fewer points, or measure the state from a "
                     "point in the box"
                 )
+
+    def check_indices(self) -> None:
+        """Refuse more nodes than 32-bit indices number, before anything of their size is allocated or compiled.
+
+        Raises:
+          MemoryError: with the nodes, and the largest N that can be numbered.
+        """
+        if self.size >= INDEXABLE:
+            raise MemoryError(
+                f"{' x '.join(map(str, self.shape))} = {self.size:,} nodes; 32-bit indices number fewer than "
+                f"{INDEXABLE:,}.\nAt most N = {math.floor((INDEXABLE - 1) ** (1 / self.ndim))} points an axis in "
+                f"{self.ndim}-D; {NO_GRID}."
+            )
 
     @property
     def ndim(self) -> int:

@@ -120,6 +120,7 @@ def march(
         implicit = getattr(method, "monotone_only", False)  # what is no method is refused below
         scheme = Upwind(split=True) if implicit else Limited(split=True)
     _check(problem, grid, scheme, method, step, time_limit)
+    grid.check_indices()
     horizon, kept = _times(horizon, times)
     if is_traced(problem, grid, method, start):
         on = Discretisation(problem, grid, scheme, arguments.traced_dtype(dtype, "march"))

@@ -117,6 +117,7 @@ def solve(
     """
     check_limits(max_steps, time_limit)
     check_arguments(problem, grid, method, scheme, tol, guess, paths=True)
+    grid.check_indices()  # inside transformations as well, where nobody asks for the memory
     if is_traced(problem, grid, guess, tol):
         if isinstance(scheme, PathScheme):
             raise ValueError(_at_host_level(scheme))

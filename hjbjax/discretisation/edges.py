@@ -10,6 +10,9 @@ the node's coordinates. What counts as leaving is held against these, so that it
 """
 
 import dataclasses
+import functools
+import math
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -137,21 +140,32 @@ def cut(
     """
     counts, totals = np.zeros((2, grid.ndim, 2), int)
     acting, earning = np.broadcast_to(acting, grid.shape), _actions_cost(problem, grid.ndim, value.dtype)
-    number = np.arange(grid.size).reshape(grid.shape)
-    coarse = number[np.ix_(*(np.linspace(0, count - 1, min(count, PLANES)).astype(int) for count in grid.shape))]
+    # by their numbers in C order: a table of all numbers would take as much as the values
+    strides = [math.prod(grid.shape[axis + 1 :]) for axis in range(grid.ndim)]
+    coarse = _numbers([np.linspace(0, count - 1, min(count, PLANES)).astype(int) for count in grid.shape], strides)
     # one call of one program for the sample and all ends: a program each would be compiled each
     sides = grid.sides("projected")
-    faces = [np.take(number, grid.shape[axis] - 1 if step > 0 else 0, axis).ravel() for axis, step in sides]
-    places = np.unravel_index(np.concatenate([coarse.ravel(), *faces]), grid.shape)
+    faces = [
+        _numbers(
+            [
+                np.array([count - 1 if step > 0 else 0]) if i == axis else np.arange(count)
+                for i, count in enumerate(grid.shape)
+            ],
+            strides,
+        )
+        for axis, step in sides
+    ]
+    places = np.unravel_index(np.concatenate([coarse, *faces]), grid.shape)
     x = [np.asarray(grid.axis(axis), value.dtype)[index] for axis, index in enumerate(places)]
     taken = ([np.broadcast_to(entry, grid.shape)[places] for entry in each] for each in actions)
     f = np.asarray(_drift(problem, x, *taken, t))
     # the sample tells the size of the drift over the box, next to which a remainder at an end may be rounding
     least = ROUNDINGS * np.finfo(value.dtype).eps * np.max(np.abs(f[:, : coarse.size]), axis=1)
-    extent = np.ptp(value[acting]) if acting.any() else 0.0
+    ends = (np.max(value, where=acting, initial=-np.inf), np.min(value, where=acting, initial=np.inf))
+    extent = ends[0] - ends[1] if acting.any() else 0.0
     first = coarse.size
     for (axis, step), face in zip(sides, faces, strict=True):
-        inner = face - step * number.strides[axis] // number.itemsize
+        inner = face - step * strides[axis]
         # the slope at the end times the length of the axis, in the units of V
         change = np.abs(value.ravel()[face] - value.ravel()[inner]) * (grid.shape[axis] - 1)
         leaves_there = step * f[axis, first : first + face.size] > least[axis]
@@ -162,6 +176,12 @@ def cut(
         counts[axis, side] = np.sum(acting.ravel()[face] & leaves_there & matters)
         totals[axis, side] = np.sum(acting.ravel()[face])
     return counts, totals
+
+
+def _numbers(picks: Sequence[np.ndarray], strides: Sequence[int]) -> np.ndarray:
+    """The numbers in C order of the nodes with one of some indices along each axis, flat."""
+    along = (pick * stride for pick, stride in zip(picks, strides, strict=True))
+    return functools.reduce(np.add.outer, along, np.zeros((), int)).ravel()
 
 
 @jax.jit

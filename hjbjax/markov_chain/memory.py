@@ -13,7 +13,12 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from hjbjax.iteration.methods import Method
+from hjbjax.discretisation import stencil
+from hjbjax.discretisation.discretisation import Scheme
+from hjbjax.hamiltonian.players import find_players
+from hjbjax.iteration.evaluation import Krylov
+from hjbjax.iteration.methods import Method, PolicyIteration
+from hjbjax.iteration.time_methods import TimeMethod
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import NO_GRID, Grid
 from hjbjax.problem.problem import Problem, is_discounted
@@ -27,8 +32,10 @@ def estimate(problem: Problem, grid: Grid, method: Method, dtype: DType) -> int:
     need the weights (one an axis without noise, two with it) and the source twice, as they are and sheared, in single
     precision; a Krylov method its vectors.
     """
-    word, n = np.dtype(dtype).itemsize, grid.ndim
-    actions = sum(admissible.dim for admissible in (problem.controls, problem.disturbances) if admissible is not None)
+    word, n, actions = np.dtype(dtype).itemsize, grid.ndim, _actions(problem)
+    if method.relaxes and not getattr(method, "policy", True):
+        # where V began, V, the step, and V as a chunk begins; and on few axes the neighbours along the last one
+        return word * (4 + (n <= stencil.LONGER) + _searched(problem, n, dtype)) * grid.size
     conditions = (problem.target, problem.stopping_cost, problem.running_max, problem.disturbances)
     # V and its defect, the actions, what is given at the nodes or bounds V there, the least cost where that certifies;
     # and two masks of a byte: the nodes that are held, and those that count
@@ -43,6 +50,47 @@ def estimate(problem: Problem, grid: Grid, method: Method, dtype: DType) -> int:
     else:
         look += word  # the pace
     return (kept + max(look, correction)) * grid.size
+
+
+def of_march(
+    problem: Problem, grid: Grid, kept: int, scheme: Scheme, method: TimeMethod, dtype: DType, *, policy: bool
+) -> int:
+    """Bytes that a march keeps at its peak: ``kept`` slices, and what its steps or the policy of one slice take.
+
+    By XLA's own accounts of one to six axes: V before and after a chunk, and of a scheme of high order on a stencil of
+    its own each axis' neighbours, of one that limits slopes six arrays an axis.
+    """
+    word, n = np.dtype(dtype).itemsize, grid.ndim
+    actions = _actions(problem) if policy else 0
+    slices = word * kept * (1 + actions)
+    if not method.limited:
+        inner = PolicyIteration(getattr(method, "evaluation", None) or Krylov())
+        return slices * grid.size + estimate(problem, grid, inner, dtype)
+    if scheme.monotone:
+        slopes = float(n <= stencil.LONGER)
+    elif scheme.even:
+        slopes = sum(1 + (scheme.points - 1) / count for count in grid.shape)
+    else:
+        slopes = 6.0 * n
+    given = sum(each is not None for each in (problem.exit_cost, problem.stopping_cost, problem.running_max))
+    stored = word * given + 1 if policy else 0
+    feedback = word * (1 + actions + (1 if scheme.monotone or scheme.even else 5)) + 2 if policy else 0
+    steps = word * (3 + slopes + _searched(problem, n, dtype))
+    return math.ceil((slices + stored + max(steps, feedback)) * grid.size)
+
+
+def _actions(problem: Problem) -> int:
+    """The inputs of both players together."""
+    return sum(each.dim for each in (problem.controls, problem.disturbances) if each is not None)
+
+
+def _searched(problem: Problem, n: int, dtype: DType) -> int:
+    """Words a node of a search between samples: the best so far, what is tried, and both players' actions of either."""
+    players = find_players(problem, n, dtype)
+    alone = [each for each in (players.control, players.disturbance) if not (each.exact or each.enumerated)]
+    if problem.is_game and not players.decoupled:
+        return 10 + 2 * _actions(problem)
+    return max((5 + 2 * each.admissible.dim for each in alone if each.admissible is not None), default=0)
 
 
 def available() -> int | None:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 from hjbjax.discretisation import correlated_noise
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.discretisation.rates import fastest_rate, jump_rates
+from hjbjax.discretisation.rates import jump_rates, largest_rate
 from hjbjax.hamiltonian import discrete
 from hjbjax.hamiltonian.search import Action
 from hjbjax.iteration import bellman
@@ -146,7 +146,7 @@ class Seen:
 
 def stable(on: Discretisation) -> Scalar:
     """The longest step for which explicit Euler is monotone, 1/(max Q + β); inf where nothing moves."""
-    rate = jnp.max(fastest_rate(on)) + on.problem.discount
+    rate = largest_rate(on) + on.problem.discount
     # the inner where keeps 1/0 out of the branch not taken, whose NaN a derivative would bring back
     return jnp.where(rate > 0, 1 / jnp.where(rate > 0, rate, 1), jnp.inf)
 

@@ -48,7 +48,10 @@ def estimate(problem: Problem, grid: Grid, method: Method, dtype: DType) -> int:
             weights = n  # one way an axis, since sweeps may keep the two as one
         correction = method.evaluation.bytes_per_node(weights, word)
     else:
-        look += word  # the pace
+        look = word * (4 * max(actions, 1) + 1)  # and the pace
+        if problem.stopping_cost is not None and not problem.is_game and is_discounted(problem) is False:
+            # a policy that stops is kept where another one is no better, which looks at every rate
+            look = max(look, math.ceil(word * (2.5 * n + actions)))
     return (kept + max(look, correction)) * grid.size
 
 
@@ -62,10 +65,10 @@ def of_march(
     """
     word, n = np.dtype(dtype).itemsize, grid.ndim
     actions = _actions(problem) if policy else 0
-    slices = word * kept * (1 + actions)
+    one = word * (1 + actions)  # slice, whose memory is taken when it is filled
     if not method.limited:
         inner = PolicyIteration(getattr(method, "evaluation", None) or Krylov())
-        return slices * grid.size + estimate(problem, grid, inner, dtype)
+        return kept * one * grid.size + estimate(problem, grid, inner, dtype)
     if scheme.monotone:
         slopes = float(n <= stencil.LONGER)
     elif scheme.even:
@@ -74,9 +77,11 @@ def of_march(
         slopes = 6.0 * n
     given = sum(each is not None for each in (problem.exit_cost, problem.stopping_cost, problem.running_max))
     stored = word * given + 1 if policy else 0
-    feedback = word * (1 + actions + (1 if scheme.monotone or scheme.even else 5)) + 2 if policy else 0
     steps = word * (3 + slopes + _searched(problem, n, dtype))
-    return math.ceil((slices + stored + max(steps, feedback)) * grid.size)
+    filling = one + word  # and V itself
+    if policy:
+        filling += word * (actions + (2 if scheme.monotone or scheme.even else 6)) + 2
+    return math.ceil(((kept - 1) * one + stored + max(steps, filling)) * grid.size)
 
 
 def _actions(problem: Problem) -> int:

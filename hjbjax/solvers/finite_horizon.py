@@ -121,6 +121,8 @@ def march(
         implicit = getattr(method, "monotone_only", False)  # what is no method is refused below
         scheme = Upwind(split=True) if implicit else Limited(split=True)
     _check(problem, grid, scheme, method, step, time_limit)
+    if not isinstance(policy, bool):
+        raise TypeError(f"march: policy is {policy!r}; wanted True or False")
     grid.check_indices()
     horizon, kept = _times(horizon, times)
     if is_traced(problem, grid, method, start):

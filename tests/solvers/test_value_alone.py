@@ -139,6 +139,8 @@ def test_where_v_alone_tells_no_bound_it_is_refused(problem):
 def test_what_is_no_choice_is_refused():
     with pytest.raises(TypeError, match="ValueIteration: policy is 1; wanted True or False"):
         hjb.ValueIteration(policy=1)
+    with pytest.raises(TypeError, match="march: policy is 'no'; wanted True or False"):
+        hjb.march(QUESTIONS["reach"], PLANE, 1.0, policy="no")
 
 
 # --- memory: by XLA's own account of the programs ---
@@ -170,7 +172,7 @@ def test_a_solve_takes_twelve_bytes_a_node_beyond_the_value(n, count, problem):
     assert taken <= 4 + (8 if n > 4 else 12) + 0.2
     # and where it began, which is kept until the end
     assert memory.estimate(problem, grid, BARE, kind) / grid.size == pytest.approx(taken + 4, rel=0.1)
-    assert memory.estimate(problem, grid, hjb.ValueIteration(), kind) > 2 * memory.estimate(problem, grid, BARE, kind)
+    assert memory.estimate(problem, grid, hjb.ValueIteration(), kind) > 1.5 * memory.estimate(problem, grid, BARE, kind)
 
 
 @pytest.mark.parametrize(("n", "count"), [(2, 200), pytest.param(5, 8, marks=pytest.mark.slow)])
@@ -183,11 +185,13 @@ def test_a_march_takes_what_is_told_beforehand(n, count, policy, scheme):
         task = finite_horizon._prepare(on, 1.0, hjb.Explicit(), None, None, policy=policy)
         front = jax.eval_shape(time_stepping.begin, task, jax.ShapeDtypeStruct(grid.shape, kind))
         taken = peak(march_run._run.lower(task, front, jnp.zeros((), kind), 1)) / grid.size
-    told = memory.of_march(problem, grid, 1, scheme, hjb.Explicit(), kind, policy=policy) / grid.size
-    slices = 4 * (1 + policy)
-    assert told == pytest.approx(taken + slices, rel=0.2)
+        filling = peak(march_run._greedy.lower(task, front.value, jnp.zeros((), kind))) / grid.size
+    told = [memory.of_march(problem, grid, k, scheme, hjb.Explicit(), kind, policy=policy) / grid.size for k in (1, 3)]
+    assert told[1] - told[0] == pytest.approx(2 * 4 * (1 + policy), abs=0.01)  # of whole bytes
+    # a slice is filled when its time has come; with its policy, of one control, and then nothing is stepped
+    assert told[0] == pytest.approx(max(taken, filling + 8 if policy else 8), rel=0.2)
     if not policy and scheme.monotone:
-        assert taken + slices <= 4 + 12 + 4 * (n <= 4) + 0.2
+        assert taken <= 4 + 8 + 4 * (n <= 4) + 0.2
 
 
 def test_a_bare_hamiltonian_has_the_same_optimum():

@@ -3,9 +3,12 @@
 import dataclasses
 import math
 
+import jax
 import numpy as np
 
 from hjbjax.discretisation.discretisation import Scheme
+from hjbjax.discretisation.schemes import Upwind
+from hjbjax.discretisation.semi_lagrangian import PathScheme
 from hjbjax.iteration.methods import Method, Nested
 from hjbjax.markov_chain import memory
 from hjbjax.problem import arguments
@@ -14,8 +17,9 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.types import DType
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import keeping_warnings
+from hjbjax.solvers import semi_lagrangian
 from hjbjax.solvers.nested import below
-from hjbjax.solvers.setup import choose
+from hjbjax.solvers.setup import check_on_one_state, choose
 from hjbjax.solvers.stationary import check_arguments, solve
 
 SMALL = 12_000  # nodes of the larger grid that is tried: a second or so, beside the compilation
@@ -83,7 +87,7 @@ def estimate(
     grid: Grid,
     method: Method | None = None,
     *,
-    scheme: Scheme | None = None,
+    scheme: Scheme | PathScheme | None = None,
     tol: float = 1e-3,
     dtype: DType | None = None,
     measure: bool = True,
@@ -111,11 +115,17 @@ def estimate(
       >>> hjb.estimate(problem, grid, dtype="float32", measure=False).bytes // grid.size
       70
     """
-    check_arguments(problem, grid, method, scheme, tol)
-    kind = arguments.as_dtype(dtype)
+    check_arguments(problem, grid, method, scheme, tol, paths=True)
+    kind, free = arguments.as_dtype(dtype), memory.available()
+    check_on_one_state(problem, grid, scheme or Upwind())
     chosen = choose(problem, grid, traced=False, method=method)
-    needed, free = memory.estimate(problem, grid, chosen.inner, kind), memory.available()
-    about = Estimate(grid.shape, needed, free, _largest(needed, free, grid), _programs(grid, chosen, scheme))
+    if isinstance(scheme, PathScheme):
+        scheme.check(problem, grid)
+        with jax.enable_x64(kind == np.float64):
+            needed, programs = semi_lagrangian.estimate(grid, scheme.plan(problem, grid, kind), kind), 1
+    else:
+        needed, programs = memory.estimate(problem, grid, chosen.inner, kind), _programs(grid, chosen, scheme)
+    about = Estimate(grid.shape, needed, free, _largest(needed, free, grid), programs)
     if not measure:
         return dataclasses.replace(about, note="nothing was measured")
     tried = _tried(grid)
@@ -123,7 +133,7 @@ def estimate(
     with keeping_warnings():
         try:
             for small in tried:
-                alike = _alike(chosen, small, grid)
+                alike = method if isinstance(scheme, PathScheme) else _alike(chosen, small, grid)
                 options = {"scheme": scheme, "tol": tol, "dtype": kind, "throw": False, "progress": False}
                 found.append(solve(problem, small, method=alike, **options))
         except ValueError as refusal:

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from hjbjax.discretisation import stencil
-from hjbjax.discretisation.discretisation import Scheme
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.hamiltonian.players import find_players
 from hjbjax.iteration.evaluation import Krylov
 from hjbjax.iteration.methods import Method, PolicyIteration
@@ -55,20 +55,18 @@ def estimate(problem: Problem, grid: Grid, method: Method, dtype: DType) -> int:
     return (kept + max(look, correction)) * grid.size
 
 
-def of_march(
-    problem: Problem, grid: Grid, kept: int, scheme: Scheme, method: TimeMethod, dtype: DType, *, policy: bool
-) -> int:
+def of_march(on: Discretisation, kept: int, method: TimeMethod, *, policy: bool) -> int:
     """Bytes that a march keeps at its peak: ``kept`` slices, and what its steps or the policy of one slice take.
 
     By XLA's own accounts of one to six axes: V before and after a chunk, and of a scheme of high order on a stencil of
     its own each axis' neighbours, of one that limits slopes six arrays an axis.
     """
-    word, n = np.dtype(dtype).itemsize, grid.ndim
+    problem, grid, scheme, word, n = on.problem, on.grid, on.scheme, on.dtype.itemsize, on.grid.ndim
     actions = _actions(problem) if policy else 0
     one = word * (1 + actions)  # slice, whose memory is taken when it is filled
     if not method.limited:
         inner = PolicyIteration(getattr(method, "evaluation", None) or Krylov())
-        return kept * one * grid.size + estimate(problem, grid, inner, dtype)
+        return kept * one * grid.size + estimate(problem, grid, inner, on.dtype)
     if scheme.monotone:
         slopes = float(n <= stencil.LONGER)
     elif scheme.even:
@@ -77,7 +75,7 @@ def of_march(
         slopes = 6.0 * n
     given = sum(each is not None for each in (problem.exit_cost, problem.stopping_cost, problem.running_max))
     stored = word * given + 1 if policy else 0
-    steps = word * (3 + slopes + _searched(problem, n, dtype))
+    steps = word * (3 + slopes + _searched(problem, n, on.dtype))
     filling = one + word  # and V itself
     if policy:
         filling += word * (actions + (2 if scheme.monotone or scheme.even else 6)) + 2

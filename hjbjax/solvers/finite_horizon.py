@@ -141,15 +141,14 @@ def march(
     # float64 for this call alone: the caller's own programs, and other threads, keep the type they have
     with noting_interrupts(clock), host_loop.telling(clock), jax.enable_x64(kind == np.float64), opened as file:
         clock.journal = file and file.journal()
-        # before anything is compiled: a grid that does not fit is refused within a second
-        needed = memory.of_march(problem, grid, len(kept), scheme, method, kind, policy=policy)
-        memory.fitting(needed, grid, max_memory)
+        # within a second: what one state shows to be wrong, and a grid that does not fit, for which functions are read
+        check_on_one_state(problem, grid, scheme)
         on = Discretisation(problem, grid, scheme, kind)
+        needed = memory.fitting(memory.of_march(on, len(kept), method, policy=policy), grid, max_memory)
         with host_loop.with_solution(
             clock, needed, lambda _: _solution_at_horizon(on, horizon, start, Status.INTERRUPTED)
         ):
             try:
-                check_on_one_state(problem, grid, scheme)
                 node_checks.values(on.asking(_without_moving_target(problem)), clock)
                 # a drift that changes in time may keep inside a constrained end now and not later
                 for t in np.linspace(horizon, 0.0, PROBES) if problem.time_dependent else (0.0,):

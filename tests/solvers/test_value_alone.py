@@ -186,7 +186,7 @@ def test_a_march_takes_what_is_told_beforehand(n, count, policy, scheme):
         front = jax.eval_shape(time_stepping.begin, task, jax.ShapeDtypeStruct(grid.shape, kind))
         taken = peak(march_run._run.lower(task, front, jnp.zeros((), kind), 1)) / grid.size
         filling = peak(march_run._greedy.lower(task, front.value, jnp.zeros((), kind))) / grid.size
-    told = [memory.of_march(problem, grid, k, scheme, hjb.Explicit(), kind, policy=policy) / grid.size for k in (1, 3)]
+    told = [memory.of_march(on, k, hjb.Explicit(), policy=policy) / grid.size for k in (1, 3)]
     assert told[1] - told[0] == pytest.approx(2 * 4 * (1 + policy), abs=0.01)  # of whole bytes
     # a slice is filled when its time has come; with its policy, of one control, and then nothing is stepped
     assert told[0] == pytest.approx(max(taken, filling + 8 if policy else 8), rel=0.2)

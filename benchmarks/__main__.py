@@ -23,6 +23,8 @@ NAMES = {
     "startup": ("speed", "the first answer of a process: importing, compiling, pictures; cold and with the cache"),
     "precision": ("accuracy", "error against seconds: what second order is worth"),
     "march": ("speed", "marching beside hj_reachability: seconds and bytes at equal scheme"),
+    "memory": ("accuracy", "what was told of the memory beforehand, beside the peaks of processes of their own"),
+    "mutants": ("accuracy", "fifteen seeded bugs, one after the other: which test of the default suite finds each"),
     "quoted": ("harness", "the table of what was seen, from the recorded rows"),
     "recorded": ("harness", "every recorded row, as Markdown tables"),
     "bounds": (

@@ -3,19 +3,24 @@
 import dataclasses
 import math
 
+import jax
 import numpy as np
 
 from hjbjax.discretisation.discretisation import Scheme
+from hjbjax.discretisation.schemes import Upwind
+from hjbjax.discretisation.semi_lagrangian import PathScheme
 from hjbjax.iteration.methods import Method, Nested
 from hjbjax.markov_chain import memory
 from hjbjax.problem import arguments
+from hjbjax.problem.arguments import INDEXABLE
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.types import DType
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import keeping_warnings
+from hjbjax.solvers import semi_lagrangian
 from hjbjax.solvers.nested import below
-from hjbjax.solvers.setup import choose
+from hjbjax.solvers.setup import check_on_one_state, choose
 from hjbjax.solvers.stationary import check_arguments, solve
 
 SMALL = 12_000  # nodes of the larger grid that is tried: a second or so, beside the compilation
@@ -49,15 +54,21 @@ class Estimate:
     note: str = ""
 
     @property
+    def numbered(self) -> bool:
+        """Whether 32-bit indices can number the nodes."""
+        return math.prod(self.shape) < INDEXABLE
+
+    @property
     def fits(self) -> bool:
         """Whether there is as much memory, and the nodes can be numbered."""
-        return math.prod(self.shape) < memory.INDEXABLE and (self.free is None or self.bytes <= self.free)
+        return self.numbered and (self.free is None or self.bytes <= self.free)
 
     def __str__(self) -> str:
         free = "" if self.free is None else f", {self.free / 1e9:.3g} GB are free"
         most = "" if self.largest is None else f"; at most {self.largest} points an axis fit"
         lines = [
-            f"nodes     {' x '.join(map(str, self.shape))} = {math.prod(self.shape):,}",
+            f"nodes     {' x '.join(map(str, self.shape))} = {math.prod(self.shape):,}"
+            + ("" if self.numbered else f": 32-bit indices number fewer than {INDEXABLE:,}"),
             f"memory    {self.bytes / 1e9:.3g} GB{free}{most}{'' if self.fits else ': IT DOES NOT FIT'}",
             f"programs  {self.programs} to compile",
         ]
@@ -77,7 +88,7 @@ def estimate(
     grid: Grid,
     method: Method | None = None,
     *,
-    scheme: Scheme | None = None,
+    scheme: Scheme | PathScheme | None = None,
     tol: float = 1e-3,
     dtype: DType | None = None,
     measure: bool = True,
@@ -105,11 +116,17 @@ def estimate(
       >>> hjb.estimate(problem, grid, dtype="float32", measure=False).bytes // grid.size
       70
     """
-    check_arguments(problem, grid, method, scheme, tol)
-    kind = arguments.as_dtype(dtype)
+    check_arguments(problem, grid, method, scheme, tol, paths=True)
+    kind, free = arguments.as_dtype(dtype), memory.available()
+    check_on_one_state(problem, grid, scheme or Upwind())
     chosen = choose(problem, grid, traced=False, method=method)
-    needed, free = memory.estimate(problem, grid, chosen.inner, kind), memory.available()
-    about = Estimate(grid.shape, needed, free, _largest(needed, free, grid), _programs(grid, chosen, scheme))
+    if isinstance(scheme, PathScheme):
+        scheme.check(problem, grid)
+        with jax.enable_x64(kind == np.float64):
+            needed, programs = semi_lagrangian.estimate(grid, scheme.plan(problem, grid, kind), kind), 1
+    else:
+        needed, programs = memory.estimate(problem, grid, chosen.inner, kind), _programs(grid, chosen, scheme)
+    about = Estimate(grid.shape, needed, free, _largest(needed, free, grid), programs)
     if not measure:
         return dataclasses.replace(about, note="nothing was measured")
     tried = _tried(grid)
@@ -117,7 +134,7 @@ def estimate(
     with keeping_warnings():
         try:
             for small in tried:
-                alike = _alike(chosen, small, grid)
+                alike = method if isinstance(scheme, PathScheme) else _alike(chosen, small, grid)
                 options = {"scheme": scheme, "tol": tol, "dtype": kind, "throw": False, "progress": False}
                 found.append(solve(problem, small, method=alike, **options))
         except ValueError as refusal:
@@ -140,7 +157,7 @@ def _largest(needed: int, free: int | None, grid: Grid) -> int | None:
     """The points along each axis of the largest grid of as many axes that fits."""
     if free is None:
         return None
-    nodes = min(free / needed * grid.size, memory.INDEXABLE - 1)
+    nodes = min(free / needed * grid.size, INDEXABLE - 1)
     # a root that is whole may come out just below
     return math.floor(nodes ** (1 / grid.ndim) * (1 + 1e-12))
 

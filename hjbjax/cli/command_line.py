@@ -214,3 +214,21 @@ def _value_of(key: str, text: str, default: object) -> bool | float | tuple[floa
         raise Failure(f"--set: got {key}={text}, wanted one number")
     known = cast(tuple[float, ...], numbers)  # None has been refused
     return known if len(parts) > 1 else known[0]
+
+
+def systems() -> Iterable[str]:
+    """The names of the ready problems; a function, so that they are looked up only when a name is checked."""
+    from hjbjax import zoo
+
+    return zoo.catalogue
+
+
+def names_of(table: dict[str, str]) -> Callable[[], Iterable[str]]:
+    """The names in a table of choices that this version has."""
+
+    def names() -> Iterable[str]:
+        import hjbjax
+
+        return [name for name, choice in table.items() if hasattr(hjbjax, choice)]
+
+    return names

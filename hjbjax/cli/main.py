@@ -13,7 +13,7 @@ import dataclasses
 import json
 import signal
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -21,7 +21,18 @@ import click
 
 from hjbjax._version import __version__
 from hjbjax.cli import launch as processes_of
-from hjbjax.cli.command_line import Failure, Name, Number, OneLineGroup, Place, Shape, parameters_of, say
+from hjbjax.cli.command_line import (
+    Failure,
+    Name,
+    Number,
+    OneLineGroup,
+    Place,
+    Shape,
+    names_of,
+    parameters_of,
+    say,
+    systems,
+)  # fmt: skip
 
 if TYPE_CHECKING:  # for annotations alone: what is heavy is imported by the command that needs it
     from hjbjax.problem.grid import Grid
@@ -36,24 +47,6 @@ SCHEMES = {"upwind": "Upwind", "limited": "Limited", "weno5": "Weno5", "semi-lag
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "diffrax", "optax", "matplotlib", "tqdm", "click")
 
 
-def _systems() -> Iterable[str]:
-    """The names of the ready problems; a function, so that they are looked up only when a name is checked."""
-    from hjbjax import zoo
-
-    return zoo.catalogue
-
-
-def _names_of(table: dict[str, str]) -> Callable[[], Iterable[str]]:
-    """The names in a table of choices that this version has."""
-
-    def names() -> Iterable[str]:
-        import hjbjax
-
-        return [name for name, choice in table.items() if hasattr(hjbjax, choice)]
-
-    return names
-
-
 @click.group(cls=OneLineGroup, invoke_without_command=True, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="hjbjax")
 @click.pass_context
@@ -64,7 +57,7 @@ def main(context: click.Context) -> None:
 
 
 @main.command("list", short_help="The ready problems; all about one.")
-@click.argument("name", required=False, type=Name("problem", _systems))
+@click.argument("name", required=False, type=Name("problem", systems))
 def list_problems(name: str | None) -> None:
     """List the ready problems, with their states; or all there is to say of NAME, its parameters among it."""
     from hjbjax import zoo
@@ -75,13 +68,11 @@ def list_problems(name: str | None) -> None:
 
 
 @main.command(short_help="Solve a problem, draw the answer.")
-@click.argument("name", type=Name("problem", _systems))
+@click.argument("name", type=Name("problem", systems))
 @click.option("--shape", type=Shape(), help="Nodes along each axis, as in 200x201.")
 @click.option("--set", "settings", multiple=True, metavar="NAME=VALUE", help="A parameter; may be given several times.")
-@click.option("--method", type=Name("method", _names_of(METHODS)), help=f"{' or '.join(METHODS)}; chosen if not given.")
-@click.option(
-    "--scheme", type=Name("scheme", _names_of(SCHEMES)), help="The discretisation; second order if not given."
-)
+@click.option("--method", type=Name("method", names_of(METHODS)), help=f"{' or '.join(METHODS)}; chosen if not given.")
+@click.option("--scheme", type=Name("scheme", names_of(SCHEMES)), help="The discretisation; second order if not given.")
 @click.option("--tol", type=Number(), help="Certified bound on the algebraic error, in cost units.")
 @click.option("--max-steps", type=Number(int), help="Stop after so many steps.")
 @click.option("--time-limit", type=Number(), help="Stop after so many seconds.")
@@ -278,7 +269,12 @@ def _estimate(problem: "Problem", grid: "Grid", options: dict[str, Any], *, as_j
         found = hjb.estimate(problem, grid, **asked)
     click.echo(json.dumps(dataclasses.asdict(found)) if as_json else str(found))
     if not found.fits:
-        raise Failure("the solve does not fit into the memory that is free", 6)
+        raise Failure(
+            "the solve does not fit: see nodes"
+            if not found.numbered
+            else "the solve does not fit into the memory that is free",
+            6,
+        )
 
 
 def _solve(problem: "Problem", grid: "Grid", options: dict[str, Any]) -> "Solution":
@@ -303,7 +299,7 @@ def _solve(problem: "Problem", grid: "Grid", options: dict[str, Any]) -> "Soluti
 
 @main.command(short_help="All ready problems on a page.")
 @click.option("--out", type=Place(), required=True, help="Folder of the page, index.html.")
-@click.option("--only", multiple=True, type=Name("problem", _systems), help="One problem; may be given several times.")
+@click.option("--only", multiple=True, type=Name("problem", systems), help="One problem; may be given several times.")
 @click.option("--force", is_flag=True, help="Replace a page that is there already.")
 @click.option("--no-cache", is_flag=True, help="Keep no compiled programs in the user's folder for caches.")
 def gallery(out: Path, only: tuple[str, ...], force: bool, no_cache: bool) -> None:

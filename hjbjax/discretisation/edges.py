@@ -10,6 +10,9 @@ the node's coordinates. What counts as leaving is held against these, so that it
 """
 
 import dataclasses
+import functools
+import math
+from collections.abc import Callable, Iterator, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +26,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.types import Array, DType, Number, Numbers
 from hjbjax.tracing import components, dependence
 
+BLOCK = 2**18  # nodes at which the drift is evaluated at once, beyond which memory rules
 PLANES = 5  # coordinates of an axis at which the size of the drift is looked at, for the count of what is cut
 ROUNDINGS = 256  # units of eps in parts of a drift: what its formula may leave where they cancel
 COORDINATES = 8  # units of eps by which a coordinate may be off
@@ -137,31 +141,64 @@ def cut(
     """
     counts, totals = np.zeros((2, grid.ndim, 2), int)
     acting, earning = np.broadcast_to(acting, grid.shape), _actions_cost(problem, grid.ndim, value.dtype)
-    number = np.arange(grid.size).reshape(grid.shape)
-    coarse = number[np.ix_(*(np.linspace(0, count - 1, min(count, PLANES)).astype(int) for count in grid.shape))]
-    # one call of one program for the sample and all ends: a program each would be compiled each
-    sides = grid.sides("projected")
-    faces = [np.take(number, grid.shape[axis] - 1 if step > 0 else 0, axis).ravel() for axis, step in sides]
-    places = np.unravel_index(np.concatenate([coarse.ravel(), *faces]), grid.shape)
-    x = [np.asarray(grid.axis(axis), value.dtype)[index] for axis, index in enumerate(places)]
-    taken = ([np.broadcast_to(entry, grid.shape)[places] for entry in each] for each in actions)
-    f = np.asarray(_drift(problem, x, *taken, t))
+    # by their numbers in C order: a table of all numbers would take as much as the values
+    strides = [math.prod(grid.shape[axis + 1 :]) for axis in range(grid.ndim)]
+    sides, sample = grid.sides("projected"), [np.linspace(0, n - 1, min(n, PLANES)).astype(int) for n in grid.shape]
+
+    def face(axis: int, step: int) -> np.ndarray:
+        along = [np.arange(count) for count in grid.shape]
+        along[axis] = along[axis][[-1 if step > 0 else 0]]
+        return _numbers(along, strides)
+
+    def drift(numbers: np.ndarray) -> np.ndarray:
+        places = np.unravel_index(numbers, grid.shape)
+        x = [np.asarray(grid.axis(axis), value.dtype)[index] for axis, index in enumerate(places)]
+        taken = ([np.broadcast_to(entry, grid.shape)[places] for entry in each] for each in actions)
+        return np.asarray(_drift(problem, x, *taken, t))
+
+    parts = [functools.partial(_numbers, sample, strides), *(functools.partial(face, *side) for side in sides)]
+    found = _in_blocks(drift, parts, math.prod(map(len, sample)) + sum(grid.size // grid.shape[a] for a, _ in sides))
+    _, f = next(found)
     # the sample tells the size of the drift over the box, next to which a remainder at an end may be rounding
-    least = ROUNDINGS * np.finfo(value.dtype).eps * np.max(np.abs(f[:, : coarse.size]), axis=1)
-    extent = np.ptp(value[acting]) if acting.any() else 0.0
-    first = coarse.size
-    for (axis, step), face in zip(sides, faces, strict=True):
-        inner = face - step * number.strides[axis] // number.itemsize
+    least = ROUNDINGS * np.finfo(value.dtype).eps * np.max(np.abs(f), axis=1)
+    ends = (np.max(value, where=acting, initial=-np.inf), np.min(value, where=acting, initial=np.inf))
+    extent = ends[0] - ends[1] if acting.any() else 0.0
+    for (axis, step), (there, f) in zip(sides, found, strict=True):
         # the slope at the end times the length of the axis, in the units of V
-        change = np.abs(value.ravel()[face] - value.ravel()[inner]) * (grid.shape[axis] - 1)
-        leaves_there = step * f[axis, first : first + face.size] > least[axis]
+        change = np.abs(value.ravel()[there] - value.ravel()[there - step * strides[axis]]) * (grid.shape[axis] - 1)
         # where V is flat towards the end but for rounding, the cut takes nothing from anybody
         matters = earning | (change > np.sqrt(np.finfo(value.dtype).eps) * extent)
-        # column 0 is the lower end, 1 the upper; ``first`` walks along the faces behind the coarse sample
-        side, first = (step + 1) // 2, first + face.size
-        counts[axis, side] = np.sum(acting.ravel()[face] & leaves_there & matters)
-        totals[axis, side] = np.sum(acting.ravel()[face])
+        side, looked_at = (step + 1) // 2, acting.ravel()[there]  # column 0 is the lower end, 1 the upper
+        counts[axis, side] = np.sum(looked_at & (step * f[axis] > least[axis]) & matters)
+        totals[axis, side] = np.sum(looked_at)
     return counts, totals
+
+
+def _in_blocks(
+    drift: Callable[[np.ndarray], np.ndarray], parts: Sequence[Callable[[], np.ndarray]], count: int
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """The numbers of the nodes of each part, and the drift there, (n, K); by one program, whatever the parts.
+
+    All of them at once where they are few, else by blocks of one size: in six dimensions most nodes lie on an end.
+    """
+    if count <= BLOCK:
+        numbers = [part() for part in parts]
+        f = np.split(drift(np.concatenate(numbers)), np.cumsum([each.size for each in numbers[:-1]]), axis=1)
+        yield from zip(numbers, f, strict=True)
+        return
+    for part in parts:
+        there = part()
+        rows = []
+        for first in range(0, there.size, BLOCK):
+            block = there[first : first + BLOCK]
+            rows.append(drift(np.pad(block, (0, BLOCK - block.size), mode="edge"))[:, : block.size])
+        yield there, np.concatenate(rows, axis=1)
+
+
+def _numbers(picks: Sequence[np.ndarray], strides: Sequence[int]) -> np.ndarray:
+    """The numbers in C order of the nodes with one of some indices along each axis, flat."""
+    along = (pick * stride for pick, stride in zip(picks, strides, strict=True))
+    return functools.reduce(np.add.outer, along, np.zeros((), int)).ravel()
 
 
 @jax.jit

@@ -123,6 +123,23 @@ def fastest_rate(on: Discretisation) -> jax.Array:
     return result
 
 
+def largest_rate(on: Discretisation) -> jax.Array:
+    """max over the actions and the nodes of Q, a number, without an array of the nodes."""
+    pairs = list(
+        itertools.product(*(sets.probes(each, on.dtype) for each in (on.problem.controls, on.problem.disturbances)))
+    )
+    if on.apart or len(pairs) == 1:
+        return on.grid.largest(fastest_rate(on))
+    us, ds = ([jnp.stack(list(entries)) for entries in zip(*each, strict=True)] for each in zip(*pairs, strict=True))
+
+    def larger(k: Any, largest: jax.Array) -> jax.Array:
+        # one action at a time: of all at once XLA keeps what they share, 17 arrays for a quadrotor in six dimensions
+        u, d = ([entry[k] for entry in entries] for entries in (us, ds))
+        return jnp.maximum(largest, on.grid.largest(jump_rates(on, u, d).total()))
+
+    return jax.lax.fori_loop(0, len(pairs), larger, jnp.zeros((), on.dtype))
+
+
 def _add_diagonal_jumps(table: dict[Offset, Any], entry: Any, grid: Grid, i: int, j: int) -> None:
     """A diagonal jump that would leave the box goes to the mirror image of its end: noise reflects."""
     scale = 2 * grid.spacing(i) * grid.spacing(j)

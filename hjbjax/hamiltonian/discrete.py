@@ -51,6 +51,8 @@ class DiscreteHamiltonian:
         among them a sampled policy never gets worse.
       slack: for every axis what is rounding of the drift; None without constrained ends and lost nodes.
       lost: for every axis whether the next node up and the next node down are lost; None where none is.
+      bare: whether the optimum of H is wanted alone: then its actions take no arrays, and whoever asks for them as well
+        has them searched for twice.
     """
 
     on: Discretisation
@@ -63,6 +65,7 @@ class DiscreteHamiltonian:
     tried: tuple[Action, Action] | None = None
     slack: tuple[Any, ...] | None = None
     lost: tuple[tuple[Any, Any], ...] | None = None
+    bare: bool = False
 
     def asking(self, problem: Problem) -> "DiscreteHamiltonian":
         """The Hamiltonian of another problem around the same value."""
@@ -191,7 +194,8 @@ def best_response(
             hamiltonian, player, lambda action: (hamiltonian.at(*join(action)), []),
             weight=player.effort, most=most, start=start,
         )  # fmt: skip
-    action = jax.lax.optimization_barrier(action)  # or the search is done twice, for the action and for the value
+    if not hamiltonian.bare:
+        action = jax.lax.optimization_barrier(action)  # or the search is done twice, for the action and for the value
     return hamiltonian.at(*join(action)), action
 
 

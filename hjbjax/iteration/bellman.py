@@ -18,7 +18,7 @@ import jax.numpy as jnp
 
 from hjbjax.discretisation import cut_cells, edges, stencil
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.discretisation.rates import Rates, jump_rates
+from hjbjax.discretisation.rates import Rates, fastest_rate, jump_rates
 from hjbjax.hamiltonian import discrete
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.hamiltonian.search import Action
@@ -57,6 +57,14 @@ class Obstacles:
         if self.lower is not None:
             value = jnp.maximum(value, self.lower)
         return jnp.where(self.fixed, self.fixed_value, value)
+
+    def clipped(self, step: Field, value: Field) -> Field:
+        """max(min(s, ψ − V), g − V) of a step s, and zero where V is given."""
+        if self.upper is not None:
+            step = jnp.minimum(step, self.upper - value)
+        if self.lower is not None:
+            step = jnp.maximum(step, self.lower - value)
+        return jnp.where(self.fixed, 0, step)
 
     def acting(self, value: Nodes) -> jax.Array:
         """The nodes at which actions matter, bool (*grid): not fixed, and no constraint is the active branch."""
@@ -119,6 +127,21 @@ def greedy(
     To the nodes that are ``lost``, bool (*grid), no drift leads that is only rounding.
     """
     return _with_defect(on, value, held, *discrete.optimise(_around(on, value, incumbent, lost)))
+
+
+def relaxation(on: Discretisation, value: Field) -> tuple[Field, Field]:
+    """The defect r = min max H − β V before any obstacle, and Q + β of the fastest action, for s = r/(Q + β).
+
+    Actions are not kept, and rates made where they are used: at best all of it is one pass over V.
+    """
+    hamiltonian = dataclasses.replace(discrete.around(on, value), bare=True)
+    best, u, d = discrete.optimise(hamiltonian)
+    outflow, players = fastest_rate(on), players_of(on)
+    if not (players.control.fastest_at_ends and players.disturbance.fastest_at_ends):
+        outflow = jnp.maximum(outflow, jump_rates(on, u, d).total())  # a fast action between the samples
+    outflow = outflow + on.problem.discount
+    # it is divided by, also where nothing moves
+    return best - on.problem.discount * value, jnp.where(outflow > 0, outflow, 1)
 
 
 def improvement(on: Discretisation, value: Field, fixed: jax.Array, new: Greedy, old: Greedy) -> Greedy:

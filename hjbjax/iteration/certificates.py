@@ -27,6 +27,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
@@ -121,6 +123,24 @@ def error_bound(
         assert least_cost is not None
         return _multiplicative(iterate, least_cost, residual)
     return ErrorBound(zero, zero, zero, jnp.maximum(residual, moved), residual)
+
+
+def of_relaxation(kind: Certificate, on: Discretisation, value: Field) -> tuple[Field, ErrorBound]:
+    """The step of one relaxation at a value, zero where that is given, and the bound on the value.
+
+    The next value is no worse: T is monotone and T V_h = V_h, so that from V − e ≤ V_h ≤ V + e follows
+    T V − e ≤ V_h ≤ T V + e. One array is kept beside V, r where e = max |ρ| is made of it and else s; that is what the
+    barriers are for: without them H is searched once more for every number, or the rates take an array as well.
+    """
+    (defect, outflow), given = bellman.relaxation(on, value), bellman.obstacles(on)
+    zero = jnp.zeros((), value.dtype)
+    if kind is Certificate.ADDITIVE:
+        defect = jax.lax.optimization_barrier(defect)
+        error = on.grid.largest(jnp.abs(given.clipped(defect / on.problem.discount, value)))
+        return given.clipped(defect / outflow, value), ErrorBound(-error, error, zero, error, error)
+    step = given.clipped(jax.lax.optimization_barrier(defect / outflow), value)
+    residual = on.grid.largest(jnp.abs(step))
+    return step, ErrorBound(zero, zero, zero, residual, residual)
 
 
 def _additive(iterate: Iterate, discount: Number) -> tuple[Scalar, Scalar]:

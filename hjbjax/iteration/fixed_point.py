@@ -32,8 +32,6 @@ from hjbjax.problem.types import Field, Nodes, Number, Scalar
 from hjbjax.solution.status import Status
 
 FULL_STEPS = 10  # corrections of a limited scheme before they are halved, which ends limit cycles of the limiter
-SHIFT = 1.2  # by which the time of a pseudo-step grows; at 2 other solutions of the equation with open ends are found
-SHIFTS = 150  # steps after which there is no shift any more: 1.2¹⁵⁰ is 10¹²
 HISTORY = 256  # steps whose residuals one chunk can record
 GROWTH = 1e6  # a residual that has grown by this factor over its smallest has diverged
 TO_THE_END = (Certificate.NONE, Certificate.BY_DISCOUNT)  # of tubes: V falls or climbs until nothing moves
@@ -41,7 +39,7 @@ PATIENCE = 10  # steps without progress of a residual that is rounding
 ROUNDING = 64  # residuals below this many units in the last place of max|V| are rounding
 
 
-@pytree_dataclass(static=("certificate", "has_lost"))
+@pytree_dataclass(static=("certificate", "has_lost", "bare"))
 class Task:
     """The constants of a solve: the problem on its grid, the method, and how its error is bounded.
 
@@ -56,6 +54,7 @@ class Task:
       certificate: which bound on the error applies.
       crossing: the time that it takes to cross the box at the largest speeds, where that was asked for; else None.
       has_lost: true if nodes that do not count may lie beside others, so that no action may lead there.
+      bare: true if nothing but V is kept; then ``obstacles`` hold nothing and are made anew in every step.
     """
 
     on: Discretisation
@@ -68,6 +67,7 @@ class Task:
     certificate: Certificate
     crossing: Any = None
     has_lost: bool = False
+    bare: bool = False
 
     @property
     def problem(self) -> Problem:
@@ -105,7 +105,7 @@ class Task:
 
     def impose(self, value: Field) -> Field:
         """``value`` with the given values put in, and with nodes that are lost far above all others."""
-        value = self.obstacles.impose(value)
+        value = (bellman.obstacles(self.on) if self.bare else self.obstacles).impose(value)
         if not self.has_lost:
             return value
         # 1/√eps above: no minimum chooses it, and a difference with it still has half of its digits
@@ -131,7 +131,8 @@ class Task:
         zero = jnp.zeros(self.grid.shape, self.tol.dtype)
         if not self.constrained or self.certificate is Certificate.ADDITIVE:
             return zero
-        limits = [limit for limit in (self.obstacles.lower, self.obstacles.upper) if limit is not None]
+        given = bellman.obstacles(self.on) if self.bare else self.obstacles
+        limits = [limit for limit in (given.lower, given.upper) if limit is not None]
         start = functools.reduce(jnp.maximum, limits)
         return jnp.asarray(jnp.broadcast_to(start, self.grid.shape), self.tol.dtype)
 
@@ -163,6 +164,8 @@ def begin(task: Task, guess: Nodes) -> State:
     players = (task.problem.controls, task.problem.disturbances)
     inputs = [0 if admissible is None else admissible.dim for admissible in players]
     policy = Greedy(xp.zeros(shape, dtype), *(tuple(xp.zeros(shape, dtype) for _ in range(m)) for m in inputs))
+    if task.bare:
+        policy = Greedy(xp.zeros((), dtype), (), ())
     infinite = xp.asarray(xp.inf, dtype)
     bound = ErrorBound(xp.asarray(-infinite), infinite, xp.zeros((), dtype), infinite, infinite)
     counter, first = xp.zeros((), xp.int32), xp.full((), -1, xp.int32)
@@ -187,6 +190,8 @@ def run(task: Task, state: State, until: Number) -> State:
 
 def advance(task: Task, state: State, start: Scalar) -> State:
     """One step; a step that ends in numbers that are not finite is taken back."""
+    if task.bare:
+        return _relaxed(task, state, start)
     delta = _correction(task, state)
     if not task.scheme.monotone:
         delta = jnp.where((state.step < FULL_STEPS) | task.plain, 1.0, 0.5).astype(delta.dtype) * delta
@@ -194,7 +199,7 @@ def advance(task: Task, state: State, start: Scalar) -> State:
     # a node that does not count may move for ever
     moved = task.grid.largest(jnp.abs(jnp.where(task.counted, value - state.value, 0)))
     if task.certificate is Certificate.OPEN and not task.method.relaxes:
-        moved = moved * _shift_factor(task, state)
+        moved = moved * methods.shift_factor(_shift(task, state), task.problem.discount)
     policy, fastest, bound = _look(task, value, state.policy, moved=moved, first=state.step < 0)
     bound = dataclasses.replace(bound, error=jnp.where(_lacks_measure(task, state), jnp.inf, bound.error))
     since = certificates.steps_since_best(state, bound)
@@ -202,8 +207,20 @@ def advance(task: Task, state: State, start: Scalar) -> State:
     return certificates.booked(state, start, bound, code, since, value=value, policy=policy, fastest=fastest)
 
 
+def _relaxed(task: Task, state: State, start: Scalar) -> State:
+    """One relaxation of every node, of which nothing is kept beside V, with the bound on the value before it."""
+    value = task.impose(state.value)  # a guess need not respect what is given
+    step, bound = certificates.of_relaxation(task.certificate, task.on, value)
+    since = certificates.steps_since_best(state, bound)
+    code = _judge(task, state.value, bound, state.best, since)  # of the next value it would want an array of its own
+    after = jnp.where(state.step < 0, value, task.impose(value + step))
+    return certificates.booked(state, start, bound, code, since, value=after)
+
+
 def broken(task: Task, state: State) -> jax.Array:
     """The nodes where value or rate are not finite in the step that a NONFINITE state took back, bool (*grid)."""
+    if task.bare:
+        return ~jnp.isfinite(bellman.relaxation(task.on, task.impose(state.value))[0])
     state = dataclasses.replace(state, step=state.step - 1)
     value = task.impose(state.value + _correction(task, state))
     rate = bellman.greedy(task.on, value, task.obstacles.fixed, lost=task.lost).defect
@@ -217,21 +234,9 @@ def _lacks_measure(task: Task, state: State) -> jax.Array:
 
 
 def _shift(task: Task, state: State) -> Scalar:
-    """κ, per unit time, by which the discount of a correction is raised: with open ends; it dies geometrically.
-
-    Each correction is then an implicit step in time of length 1/κ. The equation with open ends has several solutions,
-    of which the stable one is wanted, and policies that leave may be worth no finite value.
-    """
+    """κ of the next correction, per unit time, at open ends."""
     assert task.outflow is not None
-    dying = jnp.asarray(SHIFT, state.value.dtype) ** -jnp.maximum(state.step, 0)
-    return jnp.where(state.step < SHIFTS, task.grid.largest(task.outflow) * dying, 0)
-
-
-def _shift_factor(task: Task, state: State) -> Scalar:
-    """The factor, about, by which a step without the shift would have been longer: 1 + κ/β."""
-    shift, discount = _shift(task, state), jnp.asarray(task.problem.discount, state.value.dtype)
-    safe = jnp.where(discount > 0, discount, 1)
-    return jnp.where(shift == 0, 1, jnp.where(discount > 0, 1 + shift / safe, jnp.inf))
+    return methods.shift(task.grid.largest(task.outflow), state.step)
 
 
 def _look(

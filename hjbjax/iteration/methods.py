@@ -59,6 +59,8 @@ CLIMB = 100_000  # steps of value iteration without progress: without discount V
 # nothing, while the outer residual falls. Where it rose the inner player was far from its optimum, since its residual
 # counts for up to (Q + β)/β times as much in V: improving against that may go on for ever.
 SHARE, EXACT = 0.1, 1e-6
+SHIFT = 1.2  # by which the time of a pseudo-step grows; at 2 other solutions of the equation with open ends are found
+SHIFTS = 150  # steps after which there is no shift any more: 1.2¹⁵⁰ is 10¹²
 
 
 class Step(Protocol):
@@ -111,14 +113,24 @@ class Method(Protocol):
         """The method as one would write it, without the numbers that only matter in a game."""
 
 
-@pytree_dataclass()
+@pytree_dataclass(static=("policy",))
 class ValueIteration:
     """V ← max(g, min(ψ, V + (min max H − β V)/(max_u Q + β))): monotone, converges from every guess.
 
     The error falls by 1/(1 + βΔt) a step: many cheap steps. For reference, for games, and where memory rules.
+
+    Args:
+      policy: whether the policy comes with the value. Without it nothing is kept but V, in some three arrays in place
+        of many, for tubes and under a discount; the solution has no ``policy``, ``cut``, ``reached`` or
+        ``isaacs_gap``, and ``hjb.greedy_feedback`` finds the controls from V where they are wanted. Host level.
     """
 
+    policy: bool = True
     relaxes, evaluation, coarsest, in_parts = True, None, None, True  # no fields: answers to the loop, no choices
+
+    def __post_init__(self):
+        if not isinstance(self.policy, bool):
+            raise TypeError(f"ValueIteration: policy is {self.policy!r}; wanted True or False")
 
     @property
     def inner(self) -> "ValueIteration":
@@ -139,7 +151,7 @@ class ValueIteration:
 
     def described(self, game: bool) -> str:
         """As it is written."""
-        return "ValueIteration()"
+        return "ValueIteration()" if self.policy else "ValueIteration(policy=False)"
 
 
 @pytree_dataclass(static=("replies",))
@@ -251,6 +263,23 @@ def check_method(method: object, name: str) -> None:
       TypeError: with the methods that there are.
     """
     check_choice(method, Method, name, "hjb.PolicyIteration(...) or hjb.ValueIteration()")
+
+
+def shift(largest: Scalar, step: Scalar) -> Scalar:
+    """κ, per unit time, by which the discount of a correction is raised: with open ends; it dies geometrically.
+
+    Each correction is then an implicit step in time of length 1/κ. The equation with open ends has several solutions,
+    of which the stable one is wanted, and policies that leave may be worth no finite value.
+    """
+    dying = jnp.asarray(SHIFT, largest.dtype) ** -jnp.maximum(step, 0)
+    return jnp.where(step < SHIFTS, largest * dying, 0)
+
+
+def shift_factor(shift: Scalar, discount: Number) -> Scalar:
+    """The factor, about, by which a step without the shift κ would have been longer: 1 + κ/β."""
+    discount = jnp.asarray(discount, shift.dtype)
+    safe = jnp.where(discount > 0, discount, 1)
+    return jnp.where(shift == 0, 1, jnp.where(discount > 0, 1 + shift / safe, jnp.inf))
 
 
 class Question(Protocol):

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 from hjbjax.discretisation import correlated_noise
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.discretisation.rates import fastest_rate, jump_rates
+from hjbjax.discretisation.rates import jump_rates, largest_rate
 from hjbjax.hamiltonian import discrete
 from hjbjax.hamiltonian.search import Action
 from hjbjax.iteration import bellman
@@ -32,20 +32,21 @@ TRIES = 30  # of a step that is shortened, at most; what its first stage sees do
 NEAR = 1e-3  # of a bound's distance: a disturbance so near its bound sits on it
 
 
-@pytree_dataclass(static=("checks_rates", "checks_noise"))
+@pytree_dataclass(static=("checks_rates", "checks_noise", "bare"))
 class March:
     """The constants of a march: the problem on its grid, the method, and the limits of its steps.
 
     Args:
       on: the problem on its grid, with the slopes of a scheme.
       method: ``Explicit`` with its stages, or ``Implicit`` with its evaluation.
-      obstacles: fixed nodes and constraints; ``None`` where they depend on the time.
+      obstacles: fixed nodes and constraints; ``None`` where they depend on the time, or nothing but V is kept.
       limit: the longest stable step, inf if all are; ``None`` where it depends on the time.
       step: the longest step wanted; inf where the limit alone counts.
       horizon: the time at which the terminal cost is paid.
       watched: bool (*grid), nodes where a disturbance at its bound means that the value blows up; or ``None``.
       checks_rates: true if explicit steps look at Q under the actions that they chose.
       checks_noise: true if steps look for correlated noise that the chain cannot represent.
+      bare: true if nothing but V is kept: what can be made of it is made where it is used.
     """
 
     on: Discretisation
@@ -57,6 +58,7 @@ class March:
     watched: Mask | None
     checks_rates: bool = False
     checks_noise: bool = False
+    bare: bool = False
 
     @property
     def problem(self) -> Problem:
@@ -81,7 +83,7 @@ class March:
 
     def rate(self, value: Field, t: Number) -> tuple[Field, "Seen"]:
         """F = min max H − β V, cost per unit time, and the rates and the noise under the optimal actions."""
-        best, u, d = discrete.optimise(discrete.around(self.on.at(t), value))
+        best, u, d = discrete.optimise(dataclasses.replace(discrete.around(self.on.at(t), value), bare=self.bare))
         return best - self.problem.discount * value, self.look(u, d, t)
 
     def look(self, u: Action, d: Action, t: Number) -> "Seen":
@@ -144,7 +146,7 @@ class Seen:
 
 def stable(on: Discretisation) -> Scalar:
     """The longest step for which explicit Euler is monotone, 1/(max Q + β); inf where nothing moves."""
-    rate = on.grid.largest(fastest_rate(on)) + on.problem.discount
+    rate = largest_rate(on) + on.problem.discount
     # the inner where keeps 1/0 out of the branch not taken, whose NaN a derivative would bring back
     return jnp.where(rate > 0, 1 / jnp.where(rate > 0, rate, 1), jnp.inf)
 
@@ -179,6 +181,9 @@ def run(march: March, front: Front, until: Number, most: Number) -> Front:
 
     def step(carry):
         front, left = carry
+        if march.bare:  # loop variant, or XLA makes arrays of what the grid alone decides, and keeps them
+            grid, front = jax.lax.optimization_barrier((march.grid, front))
+            return advance(dataclasses.replace(march, on=march.on.on_grid(grid)), front, until), left - 1
         return advance(march, front, until), left - 1
 
     return jax.lax.while_loop(goes_on, step, (front, jnp.asarray(most, jnp.int32)))[0]

@@ -168,6 +168,7 @@ def transition_arrays(
       ValueError: a problem that is no such decision problem, rates or costs that are not finite, or noise that
         the chain cannot represent.
     """
+    grid.check_indices()
     actions = decision_process.actions(problem)
     held, given = decision_process.target(problem, grid)
     found = (
@@ -186,6 +187,7 @@ def transition_arrays(
 
 def _under_policy(problem: Problem, grid: Grid, policy: Any, disturbance: Any, scheme: Chain, t: float) -> Rates:
     """The rates under a policy; zero on the target and where there is no action."""
+    grid.check_indices()
     u, d, active = decision_process.policies(problem, grid, policy, disturbance)
     active &= ~decision_process.target(problem, grid, t)[0]
     # what is rounding is told by the type in which the policy was found: one of float32 is off by 1e-7 at an end

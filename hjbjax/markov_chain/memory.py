@@ -13,14 +13,17 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from hjbjax.iteration.methods import Method
+from hjbjax.discretisation import stencil
+from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.hamiltonian.players import find_players
+from hjbjax.iteration.evaluation import Krylov
+from hjbjax.iteration.methods import Method, PolicyIteration
+from hjbjax.iteration.time_methods import TimeMethod
 from hjbjax.problem import arguments
+from hjbjax.problem.arguments import NO_GRID
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_discounted
 from hjbjax.problem.types import DType
-
-INDEXABLE = 2**31  # nodes that 32-bit indices can number
-NO_GRID = "hjb.pontryagin(problem, x0) finds the optimal path from one state without a grid"
 
 
 def estimate(problem: Problem, grid: Grid, method: Method, dtype: DType) -> int:
@@ -30,8 +33,10 @@ def estimate(problem: Problem, grid: Grid, method: Method, dtype: DType) -> int:
     need the weights (one an axis without noise, two with it) and the source twice, as they are and sheared, in single
     precision; a Krylov method its vectors.
     """
-    word, n = np.dtype(dtype).itemsize, grid.ndim
-    actions = sum(admissible.dim for admissible in (problem.controls, problem.disturbances) if admissible is not None)
+    word, n, actions = np.dtype(dtype).itemsize, grid.ndim, _actions(problem)
+    if method.relaxes and not getattr(method, "policy", True):
+        # where V began, V, the step, and V as a chunk begins; and on few axes the neighbours along the last one
+        return word * (4 + (n <= stencil.LONGER) + _searched(problem, n, dtype)) * grid.size
     conditions = (problem.target, problem.stopping_cost, problem.running_max, problem.disturbances)
     # V and its defect, the actions, what is given at the nodes or bounds V there, the least cost where that certifies;
     # and two masks of a byte: the nodes that are held, and those that count
@@ -44,8 +49,52 @@ def estimate(problem: Problem, grid: Grid, method: Method, dtype: DType) -> int:
             weights = n  # one way an axis, since sweeps may keep the two as one
         correction = method.evaluation.bytes_per_node(weights, word)
     else:
-        look += word  # the pace
+        look = word * (4 * max(actions, 1) + 1)  # and the pace
+        if problem.stopping_cost is not None and not problem.is_game and is_discounted(problem) is False:
+            # a policy that stops is kept where another one is no better, which looks at every rate
+            look = max(look, math.ceil(word * (2.5 * n + actions)))
     return (kept + max(look, correction)) * grid.size
+
+
+def of_march(on: Discretisation, kept: int, method: TimeMethod, *, policy: bool) -> int:
+    """Bytes that a march keeps at its peak: ``kept`` slices, and what its steps or the policy of one slice take.
+
+    By XLA's own accounts of one to six axes: V before and after a chunk, and of a scheme of high order on a stencil of
+    its own each axis' neighbours, of one that limits slopes six arrays an axis.
+    """
+    problem, grid, scheme, word, n = on.problem, on.grid, on.scheme, on.dtype.itemsize, on.grid.ndim
+    actions = _actions(problem) if policy else 0
+    one = word * (1 + actions)  # slice, whose memory is taken when it is filled
+    if not method.limited:
+        inner = PolicyIteration(getattr(method, "evaluation", None) or Krylov())
+        return kept * one * grid.size + estimate(problem, grid, inner, on.dtype)
+    if scheme.monotone:
+        slopes = float(n <= stencil.LONGER)
+    elif scheme.even:
+        slopes = sum(1 + (scheme.points - 1) / count for count in grid.shape)
+    else:
+        slopes = 6.0 * n
+    given = sum(each is not None for each in (problem.exit_cost, problem.stopping_cost, problem.running_max))
+    stored = word * given + 1 if policy else 0
+    steps = word * (3 + slopes + _searched(problem, n, on.dtype))
+    filling = one + word  # and V itself
+    if policy:
+        filling += word * (actions + (2 if scheme.monotone or scheme.even else 6)) + 2
+    return math.ceil(((kept - 1) * one + stored + max(steps, filling)) * grid.size)
+
+
+def _actions(problem: Problem) -> int:
+    """The inputs of both players together."""
+    return sum(each.dim for each in (problem.controls, problem.disturbances) if each is not None)
+
+
+def _searched(problem: Problem, n: int, dtype: DType) -> int:
+    """Words a node of a search between samples: the best so far, what is tried, and both players' actions of either."""
+    players = find_players(problem, n, dtype)
+    alone = [each for each in (players.control, players.disturbance) if not (each.exact or each.enumerated)]
+    if problem.is_game and not players.decoupled:
+        return 10 + 2 * _actions(problem)
+    return max((5 + 2 * each.admissible.dim for each in alone if each.admissible is not None), default=0)
 
 
 def available() -> int | None:
@@ -143,12 +192,7 @@ def fitting(needed: int, grid: Grid, limit: int | None) -> int:
     if limit is not None:
         arguments.positive(limit, "max_memory", "in bytes")
     free = available() if limit is None else int(limit)
-    if grid.size >= INDEXABLE:
-        largest = math.floor((INDEXABLE - 1) ** (1 / grid.ndim))
-        raise MemoryError(
-            f"{counts(grid)} = {grid.size:,} nodes; 32-bit indices number fewer than {INDEXABLE:,}.\n"
-            f"At most N = {largest} points an axis in {grid.ndim}-D; {NO_GRID}."
-        )
+    grid.check_indices()
     # in proportion to the nodes: the largest grid that would fit has free/needed times as many
     if free is not None and needed > free:
         raise MemoryError(

@@ -20,6 +20,9 @@ from hjbjax.problem.types import Array, DType, Key
 
 T = TypeVar("T")
 
+COINCIDING = 16  # units in the last place of a coordinate, of which a spacing must be more
+INDEXABLE = 2**31  # nodes that 32-bit indices can number
+NO_GRID = "hjb.pontryagin(problem, x0) finds the optimal path from one state without a grid"
 SHOWN = 80  # characters of a refused value that are quoted
 EDGES = ("projected", "constrained", "open")  # names, as they carry no numbers: static, hashable, saved as they are
 Ends = tuple[str, str] | None  # of an axis: the kinds of its lower and its upper end; none where it is periodic
@@ -212,3 +215,25 @@ def periodic_flags(periodic: object, n: int) -> tuple[bool, ...]:
         if not isinstance(flag, (bool, np.bool_)):
             raise ValueError(f"Grid.periodic: entry {axis} is {flag!r}; {wanted}")
     return tuple(bool(flag) for flag in periodic)
+
+
+def check_nodes(nodes: np.ndarray, axis: int, dtype: DType) -> None:
+    """Refuse nodes of an axis that coincide up to rounding in ``dtype``."""
+    largest = max(abs(nodes[0]), abs(nodes[-1]))
+    if np.min(np.diff(nodes)) <= COINCIDING * np.finfo(dtype).eps * largest:
+        lo, hi = float(nodes[0]), float(nodes[-1])
+        raise ValueError(
+            f"Grid: axis {axis} has {len(nodes)} points between {lo:.17g} and {hi:.17g}: spacings that are "
+            f"rounding of its coordinates in {np.dtype(dtype)}; take fewer points, or measure the state from a "
+            "point in the box"
+        )
+
+
+def check_count(shape: tuple[int, ...]) -> None:
+    """Refuse more nodes than 32-bit indices number."""
+    size, n = math.prod(shape), len(shape)
+    if size >= INDEXABLE:
+        raise MemoryError(
+            f"{' x '.join(map(str, shape))} = {size:,} nodes; 32-bit indices number fewer than {INDEXABLE:,}.\n"
+            f"At most N = {math.floor((INDEXABLE - 1) ** (1 / n))} points an axis in {n}-D; {NO_GRID}."
+        )

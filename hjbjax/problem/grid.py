@@ -23,7 +23,6 @@ from hjbjax.problem.stretching import Stretching
 from hjbjax.problem.types import Array, AtNodes, DType, Mask, Number, Numbers, Scalar, States, Verdict
 
 ROUNDINGS = 16  # units of eps of the largest coordinate by which the formula may miss its table
-COINCIDING = 16  # units in the last place of a coordinate, of which a spacing must be more
 TABLED = 2**24  # points of an axis whose coordinates are kept, 128 MiB; a grid too large must not allocate them before
 
 
@@ -103,16 +102,16 @@ class Grid:
           ValueError: with the axis and its ends.
         """
         for axis, nodes in enumerate(self.coordinates):
-            if not isinstance(nodes, np.ndarray):  # traced, or too many to be kept
-                continue
-            largest = max(abs(nodes[0]), abs(nodes[-1]))
-            if np.min(np.diff(nodes)) <= COINCIDING * np.finfo(dtype).eps * largest:
-                lo, hi = float(nodes[0]), float(nodes[-1])
-                raise ValueError(
-                    f"Grid: axis {axis} has {len(nodes)} points between {lo:.17g} and {hi:.17g}: spacings that are "
-                    f"rounding of its coordinates in {np.dtype(dtype)}; take fewer points, or measure the state from a "
-                    "point in the box"
-                )
+            if isinstance(nodes, np.ndarray):  # neither traced nor too many to be kept
+                arguments.check_nodes(nodes, axis, dtype)
+
+    def check_indices(self) -> None:
+        """Refuse more nodes than 32-bit indices number, before anything of their size is allocated or compiled.
+
+        Raises:
+          MemoryError: with the nodes, and the largest N that can be numbered.
+        """
+        arguments.check_count(self.shape)
 
     @property
     def ndim(self) -> int:

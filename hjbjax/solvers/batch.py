@@ -95,6 +95,7 @@ def solve_batch(
     check_limits(max_steps, time_limit)
     for lane in lanes:
         check_arguments(lane, grid, method, scheme, tol)
+    grid.check_indices()
     kind = arguments.as_dtype(dtype)
     grid.check_spacings(kind)
     solutions: list[Any] = [None] * len(lanes)

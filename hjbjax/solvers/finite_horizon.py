@@ -19,7 +19,6 @@ from hjbjax.discretisation.schemes import Limited, Upwind
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import bellman, time_stepping
 from hjbjax.iteration.evaluation import Evaluation, Krylov, Sweeps, check_pytree
-from hjbjax.iteration.methods import PolicyIteration
 from hjbjax.iteration.time_methods import Explicit, TimeMethod
 from hjbjax.iteration.time_stepping import March
 from hjbjax.markov_chain import admissibility, memory, node_checks
@@ -62,6 +61,7 @@ def march(
     method: TimeMethod | None = None,
     step: float | None = None,
     inner: float | None = None,
+    policy: bool = True,
     dtype: DType | None = None,
     time_limit: float | None = None,
     throw: bool = True,
@@ -93,6 +93,7 @@ def march(
       inner: for a disturbance that is bounded only by the size of its ``Box``, as in an L₂ gain: the march stops,
         DIVERGED, where the worst disturbance reaches that bound in this share of the grid's box about its middle,
         since a value that blows up does. ``None``: ½ if the cost is quadratic in every disturbance, else 0, never.
+      policy: whether the policy comes with the value; else V alone is kept, as by ``ValueIteration(policy=False)``.
       dtype: ``None`` is float64; ``"float32"`` for memory and accelerators.
       time_limit: at most so many seconds, checks and compilation included.
       throw: raise when the march does not come to its end; otherwise the status says it.
@@ -125,6 +126,9 @@ def march(
         implicit = getattr(method, "monotone_only", False)  # what is no method is refused below
         scheme = Upwind(split=True) if implicit else Limited(split=True)
     _check(problem, grid, scheme, method, step, time_limit)
+    if not isinstance(policy, bool):
+        raise TypeError(f"march: policy is {policy!r}; wanted True or False")
+    grid.check_indices()
     horizon, kept = _times(horizon, times)
     traced = is_traced(problem, grid, method, start)
     if mesh is not None:
@@ -141,25 +145,25 @@ def march(
     clock = Clock(seconds=time_limit, progress=progress, together=spans_processes(mesh))
     opened = checkpoints.opened(
         checkpoint, [problem], grid, resume=resume, what="march", together=clock.together, horizon=horizon, times=kept,
-        start=start, method=method, scheme=scheme, step=step, inner=inner, dtype=kind,
+        start=start, method=method, scheme=scheme, step=step, inner=inner, policy=policy, dtype=kind,
     )  # fmt: skip
     # float64 for this call alone: the caller's own programs, and other threads, keep the type they have
     with noting_interrupts(clock), host_loop.telling(clock), jax.enable_x64(kind == np.float64), opened as file:
         clock.journal = file and file.journal()
-        # before anything is compiled: a grid that does not fit is refused within a second
-        needed = memory.fitting(_bytes(problem, grid, kept, method, kind), grid, max_memory)
+        # within a second: what one state shows to be wrong, and a grid that does not fit, for which functions are read
+        check_on_one_state(problem, grid, scheme)
         on = Discretisation(problem, grid, scheme, kind, mesh=mesh)
+        needed = memory.fitting(memory.of_march(on, len(kept), method, policy=policy), grid, max_memory)
         with host_loop.with_solution(
             clock, needed, lambda _: _solution_at_horizon(on, horizon, start, Status.INTERRUPTED)
         ):
             try:
-                check_on_one_state(problem, grid, scheme)
                 node_checks.values(on.asking(_without_moving_target(problem)), clock)
                 # a drift that changes in time may keep inside a constrained end now and not later
                 for t in np.linspace(horizon, 0.0, PROBES) if problem.time_dependent else (0.0,):
                     admissibility.values(problem, grid, kind, t)
                 clock.enter("the preparation")
-                task = _prepare(on, horizon, method, step, inner)
+                task = _prepare(on, horizon, method, step, inner, policy=policy)
                 slices, front, code = march_run.drive(task, kept, start, clock)
                 solution = march_run.assemble(task, grid, slices, front, code)
             except Stopped as stop:
@@ -223,19 +227,6 @@ def _times(horizon: float, times: Sequence[float] | Array | None) -> tuple[float
     return float(horizon), kept
 
 
-def _bytes(problem: Problem, grid: Grid, kept: np.ndarray, method: TimeMethod, dtype: DType) -> int:
-    """Bytes at the peak: kept slices and policies, two slices, slopes, constraints; the matrix if implicit."""
-    word = np.dtype(dtype).itemsize
-    actions = sum(admissible.dim for admissible in (problem.controls, problem.disturbances) if admissible is not None)
-    # in words a node: the kept slices and their actions; V before and after a chunk; P⁺ and P⁻ along every axis; held
-    # nodes, ψ and g; the actions of a stage
-    slices = len(kept) * (1 + actions) + 2 + 2 * grid.ndim + 3 + actions
-    if not method.limited:
-        inner = PolicyIteration(getattr(method, "evaluation", None) or Krylov())
-        slices += memory.estimate(problem, grid, inner, dtype) // (word * grid.size)
-    return word * slices * grid.size
-
-
 def _without_moving_target(problem: Problem) -> Problem:
     """The problem without a target that may lie outside the box at the one time that is checked."""
     if not problem.time_dependent or problem.target is None:
@@ -244,7 +235,9 @@ def _without_moving_target(problem: Problem) -> Problem:
     return Problem(problem.drift, **{name: getattr(problem, name) for name in names}, time_dependent=True)
 
 
-def _prepare(on: Discretisation, horizon: float, method: TimeMethod, step: float | None, inner: float | None) -> March:
+def _prepare(
+    on: Discretisation, horizon: float, method: TimeMethod, step: float | None, inner: float | None, *, policy: bool
+) -> March:
     """The task of a march, all arrays in its type, with a given step held against the limit."""
     on, dtype = cast(on, on.dtype), on.dtype
     problem, grid = on.problem, on.grid
@@ -265,10 +258,10 @@ def _prepare(on: Discretisation, horizon: float, method: TimeMethod, step: float
     looks = _checks(on, method)
     if step is None:  # rates that are found on the way say nothing of the first steps
         step = horizon / FEWEST if moving or looks[0] or not method.limited else math.inf
-    obstacles, limit_known = (None, not method.limited) if moving else (_obstacles(on), True)
+    obstacles = None if moving or not policy else _obstacles(on)
     return March(
-        on, method, obstacles, limit if limit_known else None, jnp.asarray(step, dtype),
-        jnp.asarray(horizon, dtype), _blow_up_nodes(on, inner), *looks,
+        on, method, obstacles, None if moving and method.limited else limit, jnp.asarray(step, dtype),
+        jnp.asarray(horizon, dtype), _blow_up_nodes(on, inner), *looks, bare=not policy,
     )  # fmt: skip
 
 

@@ -66,7 +66,7 @@ def _gap_at(task: March, value: Field, t: Number) -> tuple[Scalar, Scalar]:
 
 def _isaacs_gap(task: March, front: Front, code: Status) -> float | None:
     """The gap at the last time of a march, with a warning where it is large; None without a game, and after a cut."""
-    if not task.problem.is_game or code in CUT:
+    if not task.problem.is_game or task.bare or code in CUT:
         return None
     gap, matter = (float(number) for number in _gap_at(task, front.value, front.t))
     warn_of_gap(gap, matter, task.problem.isaacs)
@@ -104,9 +104,8 @@ class Slices:
 
     def __init__(self, task: March, kept: np.ndarray):
         problem, shape, dtype = task.problem, task.grid.shape, np.dtype(task.horizon.dtype)
-        sizes = [
-            admissible.dim if admissible is not None else 0 for admissible in (problem.controls, problem.disturbances)
-        ]
+        players = (None, None) if task.bare else (problem.controls, problem.disturbances)
+        sizes = [admissible.dim if admissible is not None else 0 for admissible in players]
         self.times = np.array(kept)
         self.value = np.empty((len(kept), *shape), dtype)
         self.policy, self.disturbance = (np.empty((len(kept), *shape, size), dtype) for size in sizes)
@@ -152,10 +151,10 @@ class Slices:
 def drive(task: March, kept: np.ndarray, start: Nodes | None, clock: Clock) -> tuple[Slices, Front, Status]:
     """The slices at the kept times, the last front and its status; ends at a code, at the time limit, or at Ctrl-C."""
     start = None if start is None else jnp.asarray(start, np.dtype(task.horizon.dtype))
-    value = _terminal(task.on.at(task.horizon), start)
-    front, parts = time_stepping.begin(task, value), task.on.parts
+    front, parts = time_stepping.begin(task, _terminal(task.on.at(task.horizon), start)), task.on.parts
+    finite = bool(jnp.all(jnp.isfinite(front.value)))
     run = MarchRun(task, front, kept) if parts is None else MarchInParts(task, front, kept, parts)
-    finite = bool(jnp.all(jnp.isfinite(value)))
+    del front  # or it would hold on to the value at the horizon, which the first steps leave behind
     status = host_loop.drive(run, clock) if finite else Status.NONFINITE
     slices, front = run.slices, run.gathered()
     # after a cut nothing is compiled, and the feedback has its program only if a slice was kept before
@@ -297,13 +296,13 @@ def assemble(task: March, grid: Grid, slices: Slices, front: Front, code: Status
     return Solution(
         grid,
         slices.value[kept],
-        slices.policy[kept],
-        slices.disturbance[kept] if problem.is_game else None,
+        None if task.bare else slices.policy[kept],
+        slices.disturbance[kept] if problem.is_game and not task.bare else None,
         code=int(code),
         steps=int(front.steps),
         isaacs_gap=_isaacs_gap(task, front, code),
         times=slices.times[kept],
-        cut=slices.cut[kept],
+        cut=None if task.bare else slices.cut[kept],
         **question(problem),
         message=_message(task, front, code),
         stats={

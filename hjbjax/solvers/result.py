@@ -40,13 +40,14 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
     """
     task, assumptions, reached, state, code, residuals, origin, note = settled
     stopped = cut or code in CUT
-    if not stopped:
+    mute = stopped or task.bare  # nothing is known of the actions
+    if not mute:
         _refuse_noise(task, state, grid)
     # V falls by the same amount a step for ever, which neither the residual nor the number of steps can tell
-    earning = None if stopped else earnings.earned(task, state)
+    earning = None if mute else earnings.earned(task, state)
     code = code if earning is None else Status.DIVERGED
-    gap = None if stopped else _isaacs_gap(task, state)
-    unanswered = stopped or code in (Status.DIVERGED, Status.NONFINITE)  # there is no optimal drift to speak of
+    gap = None if mute else _isaacs_gap(task, state)
+    unanswered = mute or code in (Status.DIVERGED, Status.NONFINITE)  # there is no optimal drift to speak of
     leaving = None if unanswered else _leaving(task, state, grid)
     state = jax.device_get(state)
     message = _message(code, task, state, grid) if earning is None else _unbounded_message(earning, grid)
@@ -160,10 +161,11 @@ def assemble(task: Task, state: State, assumptions: Assumptions) -> Solution:
     problem = task.problem
     controls, disturbances = state.policy.controls, state.policy.disturbances
     xp: Any = jnp if is_traced(state) else np
+    policy = xp.stack(controls, axis=-1) if controls else xp.zeros((*task.grid.shape, 0), state.value.dtype)
     return Solution(
         value=state.value,
-        policy=xp.stack(controls, axis=-1) if controls else xp.zeros((*task.grid.shape, 0), state.value.dtype),
-        disturbance=xp.stack(disturbances, axis=-1) if problem.is_game else None,
+        policy=None if task.bare else policy,
+        disturbance=xp.stack(disturbances, axis=-1) if problem.is_game and not task.bare else None,
         code=state.code,
         steps=state.step,
         enclosure=certificates.enclosure(assumptions.certificate, state.bound, problem.discount),

@@ -86,9 +86,10 @@ def solve_on_host(
     start = None if guess is None else np.asarray(guess, kind)
     try:
         check_on_one_state(problem, grid, scheme)
-        node_checks.values(on, clock)
         plan = scheme.plan(problem, grid, kind)
+        # before all nodes are looked at, which on a grid that does not fit takes minutes
         needed = memory.fitting(estimate(grid, plan, kind), grid, max_memory)
+        node_checks.values(on, clock)
         with host_loop.with_solution(clock, needed, lambda kept: _partial(on, kept)):
             task, reached = _prepare(on, plan, tol, times, clock)
             start = np.asarray(_start(task)) if start is None else start

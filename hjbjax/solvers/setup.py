@@ -226,6 +226,8 @@ def prepare_on_host(
     clock, problem, grid = clock or Clock(), on.problem, on.grid
     clock.enter(f"the preparation of {' x '.join(map(str, grid.shape))} nodes")
     assumptions = assumptions_of(on)
+    if is_bare(method):
+        return *_bare(on, method, tol, assumptions), None
     task = prepare_jit(on, method=method, tol=tol, assumptions=assumptions)
     priced = assumptions.certificate is Certificate.MULTIPLICATIVE
     # where L = 0 the bound by the running cost fails, and a run may go round for ever at no cost as well as rest
@@ -252,6 +254,25 @@ def prepare_on_host(
         if undiscounted:
             task = _finite_part(task, reached)
     return task, assumptions, reached
+
+
+def is_bare(method: Method) -> bool:
+    """True if the method keeps nothing but V; one of the user's own need not know of that."""
+    return method.relaxes and not getattr(method, "policy", True)
+
+
+def _bare(on: Discretisation, method: Method, tol: float, assumptions: Assumptions) -> tuple[Task, Assumptions]:
+    """The task and the assumptions of a solve that keeps nothing but V: without an array of the nodes."""
+    additive = assumptions.certificate is Certificate.ADDITIVE
+    if not (additive or is_constrained(on.problem)) or on.grid.sides("open"):
+        raise ValueError(
+            "ValueIteration(policy=False) keeps V alone, which tells no bound without a discount and ends by itself "
+            "for tubes; give discount > 0 and no open ends, or leave policy=False out"
+        )
+    certificate = Certificate.ADDITIVE if additive else Certificate.NONE
+    on, nothing = cast(on, on.dtype), bellman.Obstacles(jnp.zeros((), bool), jnp.zeros((), on.dtype))
+    task = Task(on, method, nothing, jnp.ones((), bool), None, None, jnp.asarray(tol, on.dtype), certificate, bare=True)
+    return task, dataclasses.replace(assumptions, certificate=certificate, may_rest=False)
 
 
 def forced_only(task: Task, clock: Clock) -> tuple[Task, Mask | None]:

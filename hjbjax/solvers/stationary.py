@@ -123,6 +123,7 @@ def solve(
     """
     check_limits(max_steps, time_limit)
     check_arguments(problem, grid, method, scheme, tol, guess, paths=True)
+    grid.check_indices()  # inside transformations as well, where nobody asks for the memory
     traced, free = is_traced(problem, grid, guess, tol), method is None
     if mesh is not None:
         known = choose(problem, grid, traced=traced, method=method, divided=True)
@@ -152,6 +153,7 @@ def solve(
     # float64 for this call alone: another thread, and the caller's own programs, keep theirs
     with noting_interrupts(clock), host_loop.telling(clock), jax.enable_x64(kind == np.float64), opened as kept:
         clock.journal = kept and kept.journal()
+        check_on_one_state(problem, grid, on.scheme)  # before the memory, for which functions may be read
         needed = memory.require(problem, grid, method, kind, max_memory)
         with host_loop.with_solution(clock, needed, lambda kept: _partial(on, kept)):
             solution = with_last_phase(solve_on_host(on, method, tol, guess, clock, sharpen=sharpen, free=free), clock)
@@ -184,7 +186,7 @@ def _partial(on: Discretisation, kept: host_loop.Kept | None) -> Solution:
 def solve_on_host(
     on: Discretisation, method: Method, tol: float, guess: Nodes | None, clock: Clock, *, sharpen: bool, free: bool
 ) -> Solution:
-    """The solution by checks, preparation, coarser grids and steps, in this order, as far as the clock allows.
+    """The solution by checks of nodes, preparation, coarser grids and steps, in this order, as the clock allows.
 
     ``sharpen``: by the scheme that suits the problem, with an estimate of the grid's error. ``free``: nobody asked for
     the method.
@@ -192,8 +194,7 @@ def solve_on_host(
     problem, grid = on.problem, on.grid
     start: Nodes | None = None if guess is None else np.asarray(guess, on.dtype)
     try:
-        # from cheap to dear: one state, all nodes, the ends of the box, and only then what is compiled for the grid
-        check_on_one_state(problem, grid, on.scheme)
+        # from cheap to dear: all nodes, the ends of the box, and only then what is compiled for the grid
         node_checks.values(on, clock)
         admissibility.values(problem, grid, on.dtype)
         if sharpen:

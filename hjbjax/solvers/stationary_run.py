@@ -51,7 +51,8 @@ def _run_in_parts(task: Task, state: State, until: Number, parts: Parts) -> Stat
 
 def state_over_nodes(state: State) -> State:
     """The leaves of a state that hold a value at every node, as truth values."""
-    value, policy = jax.tree.map(lambda _: True, (state.value, state.policy))
+    # where V alone is kept the policy has no nodes
+    value, policy = jax.tree.map(lambda leaf: jnp.ndim(leaf) > 0, (state.value, state.policy))
     return altered(jax.tree.map(lambda _: False, state), value=value, policy=policy)
 
 

@@ -1,9 +1,10 @@
-"""Mechanical systems with one degree of freedom or two, and the problems of bringing them to rest.
+"""Mechanical systems with one degree of freedom to three, and the problems of bringing them to rest.
 
     pendulum         θ̈ = g sin θ + τ/m           θ from upright, on S¹ × R
     Van der Pol      ẍ = μ(1 − x²)ẋ − x + u
     ball and beam    r̈ = B(r θ̇² − g sin θ), θ̈ = u
     flexible joint   I q̈₁ + M g L sin q₁ + k(q₁ − q₂) = 0, J q̈₂ + k(q₂ − q₁) = u
+    quadrotor        m ẍ = −T sin θ, m z̈ = T cos θ − m g, I θ̈ = τ, in a vertical plane
 
 The pendulum follows from mθ̈ − mg sin θ = τ; (9.4) of the chapter prints the input gain g/m, kept as
 ``as_printed=True`` since figures 10 to 12 may come from it.
@@ -139,6 +140,42 @@ class FlexibleJoint:
     def output(self, x: State) -> Number:
         """q₁, the angle of the link."""
         return x[0]
+
+
+@pytree_dataclass()
+class PlanarQuadrotor:
+    """A quadrotor in a vertical plane, state (x, z, θ, ẋ, ż, θ̇), control (T, τ): thrust along its axis, and torque.
+
+    Six states: a grid of 21 nodes an axis has 8.6e7, whose value alone is .34 GB in single precision.
+
+    Args:
+      mass: m.
+      inertia: I, about the axis that stands on the plane.
+      g: gravity; 9.81 m/s².
+
+    Example:
+      >>> quadrotor = PlanarQuadrotor(mass=0.5)
+      >>> bool(jnp.all(quadrotor.drift(jnp.zeros(6), jnp.array([quadrotor.hover, 0.0])) == 0))
+      True
+    """
+
+    mass: Number = 1.0
+    inertia: Number = 0.1
+    g: Number = 9.81
+
+    def __post_init__(self):
+        positive("PlanarQuadrotor", mass=self.mass, inertia=self.inertia)
+
+    @property
+    def hover(self) -> Number:
+        """m g, the thrust that carries the weight."""
+        return self.mass * self.g
+
+    def drift(self, x: State, u: Control) -> State:
+        """(ẋ, ż, θ̇, −T sin θ/m, T cos θ/m − g, τ/I)."""
+        # θ turns the thrust against x: it leans to the side of negative x for θ > 0
+        lift = u[0] / self.mass
+        return jnp.stack([x[3], x[4], x[5], -lift * jnp.sin(x[2]), lift * jnp.cos(x[2]) - self.g, u[1] / self.inertia])
 
 
 @with_suggestions

@@ -83,3 +83,13 @@ def test_arguments_are_those_of_a_solve():
         hjb.estimate(problem, grid, hjb.PolicyIteration)
     with pytest.raises(ValueError, match="dtype"):
         hjb.estimate(problem, grid, dtype="float16")
+
+
+def test_paths_are_told_by_the_count_of_their_arcs():
+    problem, grid = zoo.pendulum(discount=0.5, shape=(20, 21))
+    found = hjb.estimate(problem, grid, scheme=hjb.SemiLagrangian(), measure=False)
+    solution = hjb.solve(problem, grid, scheme=hjb.SemiLagrangian(), tol=1e-2)
+    assert found.bytes == solution.stats["bytes"]
+    assert found.programs == 1
+    with pytest.raises(ValueError, match="SemiLagrangian"):
+        hjb.estimate(zoo.stochastic_lq(shape=(21,))[0], zoo.stochastic_lq(shape=(21,))[1], scheme=hjb.SemiLagrangian())

@@ -13,6 +13,8 @@ from jax.tree_util import Partial
 from plain_chain import hamiltonians, solved, tables
 
 import hjbjax as hjb
+from hjbjax.discretisation import edges as ends_of_the_box
+from hjbjax.discretisation.edges import cut
 from hjbjax.discretisation.stencil import continued, inward, sparse
 from hjbjax.markov_chain import chain
 
@@ -689,3 +691,21 @@ def test_what_leaves_is_told_by_the_drift_there(bound, current, dtype):
         problem, grid, dtype=dtype, tol=1e-2, method=hjb.PolicyIteration(hjb.Direct()), scheme=hjb.Upwind()
     )
     assert abs(solution.value[0] - 1) <= 1e-2  # standing still costs 1 a unit time
+
+
+def test_many_nodes_are_counted_in_blocks(monkeypatch):
+    rng, grid = np.random.default_rng(0), hjb.Grid([-1.0] * 3, [1.0] * 3, (5, 6, 7), periodic=(False, True, False))
+    problem = hjb.Problem(lambda x, u: jnp.stack([x[1] + u[0], x[2], x[0] * u[0]]), None, hjb.Box([-1.0], [1.0]))
+    value, u, acting = rng.normal(size=grid.shape), rng.normal(size=grid.shape), rng.random(grid.shape) < 0.7
+    whole = cut(problem, grid, value, ([u], []), acting)
+    monkeypatch.setattr(ends_of_the_box, "BLOCK", 16)
+    for one, other in zip(cut(problem, grid, value, ([u], []), acting), whole, strict=True):
+        np.testing.assert_array_equal(one, other)
+    x1, x2, x3 = np.meshgrid(*(grid.axis(i) for i in range(3)), indexing="ij")
+    drift = (x1 * 0 + x2 + u, x3, x1 * u)
+    for axis in (0, 2):
+        for side, (end, sign) in enumerate(((0, -1), (-1, 1))):
+            out = acting & (sign * drift[axis] > 1e-9)
+            assert whole[0][axis, side] == np.take(out, end, axis).sum()
+            assert whole[1][axis, side] == np.take(acting, end, axis).sum()
+    assert not whole[1][1].any()

@@ -1,5 +1,7 @@
 """The benchmarks at small sizes: what they compare agrees, every row is complete, every threshold has its line."""
 
+import ast
+import dataclasses
 import json
 import math
 import re
@@ -13,6 +15,7 @@ from click.testing import CliRunner
 import hjbjax as hjb
 from benchmarks import cases
 from benchmarks.__main__ import NAMES
+from benchmarks.accuracy import mutants
 from benchmarks.harness import footprint, thresholds, timing
 from benchmarks.speed import batch, controls, devices, gradients, growth, information, peers, scaling, startup, sweep
 from hjbjax.discretisation.discretisation import Discretisation
@@ -35,7 +38,7 @@ def rows_of(benchmark, folder, *options):
 
 
 def test_every_name_leads_to_a_command():
-    for module in (sweep, peers, growth, scaling, controls, information, batch, startup, devices, gradients):
+    for module in (sweep, peers, growth, scaling, controls, information, batch, startup, devices, gradients, mutants):
         _, folder, name = module.__name__.split(".")
         assert NAMES[name][0] == folder
         assert CliRunner().invoke(module.command, ["--help"]).exit_code == 0
@@ -296,3 +299,36 @@ def test_a_gradient_is_that_of_differences_and_keeps_no_step(tmp_path):
         assert 0 < row["difference"] <= gradients.RELATIVE
         assert row["bytes"] == row["bytes_of_ten_steps"]
         assert row["over_solve"] > 0
+
+
+# --- mutants ---
+
+
+def test_every_seeded_bug_still_finds_its_place():
+    assert len({mutant.name for mutant in mutants.MUTANTS}) == 15
+    assert set(mutants.QUICK) < {mutant.name for mutant in mutants.MUTANTS}
+    for mutant in mutants.MUTANTS:
+        before = mutants.source(mutants.ROOT, mutant).read_text(encoding="utf-8")
+        assert ast.dump(ast.parse(mutant.applied(before))) != ast.dump(ast.parse(before))  # code, and no comment
+        assert mutant.likely
+        assert all((mutants.ROOT / each).is_file() for each in mutant.likely)
+
+
+@pytest.mark.parametrize("text", ["", "end = 0\nend = 0\n"])
+def test_a_bug_whose_place_is_gone_is_refused(text):
+    stale = dataclasses.replace(mutants.MUTANTS[0], old="end = 0", new="end = 1")
+    with pytest.raises(ValueError, match=r"mutants: sign of the drift: .* holds 'end = 0' [02] times, wanted once"):
+        stale.applied(text)
+
+
+def test_what_cannot_be_imported_is_no_verdict(tmp_path):
+    (tmp_path / "test_it.py").write_text("import there_is_no_such_module\n")
+    with pytest.raises(RuntimeError, match="pytest ended with 2"):
+        mutants.failures(tmp_path, ["test_it.py"])
+
+
+@pytest.mark.slow
+def test_seeded_bugs_are_found(tmp_path):
+    for row in rows_of(mutants, tmp_path):
+        assert row["status"] == "OK"
+        assert row["caught_by"].split("::")[0] in {each for m in mutants.MUTANTS for each in m.likely}

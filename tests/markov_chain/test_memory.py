@@ -15,6 +15,7 @@ import hjbjax as hjb
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import fixed_point
 from hjbjax.markov_chain import memory
+from hjbjax.problem.grid import INDEXABLE
 from hjbjax.problem.pytree import cast
 from hjbjax.solvers import stationary_run
 from hjbjax.solvers.setup import assumptions_of, prepare
@@ -101,7 +102,7 @@ def test_the_largest_indexable_grid_that_is_named_is_indexable(ndim):
     with pytest.raises(MemoryError, match="32-bit") as caught:
         memory.require(PROBLEM, hjb.Grid(lo, hi, (2**31,) * ndim), METHODS[0], np.float64, 10**30)
     largest = int(re.search(r"N = (\d+)", str(caught.value))[1])
-    assert largest**ndim < memory.INDEXABLE <= (largest + 1) ** ndim
+    assert largest**ndim < INDEXABLE <= (largest + 1) ** ndim
     memory.require(PROBLEM, hjb.Grid(lo, hi, (largest,) * ndim), METHODS[0], np.float64, 10**30)
 
 

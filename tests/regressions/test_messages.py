@@ -27,7 +27,7 @@ def between(x, u):
     return jnp.where((jnp.abs(u[0] + 0.613) < 0.1) & (x[0] > 0.3), jnp.nan, (u[0] + 0.613) ** 2)
 
 
-@pytest.mark.parametrize("method", [None, hjb.ValueIteration()])
+@pytest.mark.parametrize("method", [None, hjb.ValueIteration(), hjb.ValueIteration(policy=False)])
 def test_a_nan_on_the_way_is_placed(method):
     solution = hjb.solve(problem(cost=between), GRID, method=method, throw=False, scheme=hjb.Upwind())
     assert solution.status is Status.NONFINITE
@@ -141,3 +141,31 @@ def test_a_path_is_one_line_and_a_missing_file_is_what_python_calls_it(tmp_path)
     assert repr(path) == "Path(DURATION at t = 1, 201 times, cost 0.158369)"  # ½(1 − e⁻³)/3
     with pytest.raises(FileNotFoundError, match=r"none.npz: cannot be read: No such file"):
         hjb.load(tmp_path / "none.npz")
+
+
+@pytest.mark.parametrize(
+    ("drift", "said"),
+    [
+        (lambda x, u: [u[0]], r"drift\(x, u\) returned a list of 1"),
+        (lambda x, u: jnp.zeros(3), r"drift\(x, u\) returned shape \(3,\), expected \(1,\)"),
+        (lambda x, u: u if x[0] > 0 else -u, "use jnp.where"),
+        (lambda x, u: x[2:3], None),
+        (lambda x, u: jnp.stack([u[3]]), "asks for entry 3 of u"),
+    ],
+    ids=["list", "shape", "if", "slice", "index"],
+)
+@pytest.mark.parametrize(
+    "door",
+    [
+        lambda asked: hjb.solve(asked, GRID, method=hjb.ValueIteration(policy=False)),
+        lambda asked: hjb.estimate(asked, GRID, hjb.ValueIteration(policy=False)),
+        lambda asked: hjb.estimate(asked, GRID, measure=False),
+        lambda asked: hjb.march(asked, GRID, 1.0),
+        lambda asked: hjb.march(asked, GRID, 1.0, policy=False, dtype="float32"),
+        lambda asked: hjb.solve_batch([asked], GRID, method=hjb.ValueIteration(policy=False)),
+    ],
+    ids=["solve", "estimate", "bytes", "march", "alone", "batch"],
+)
+def test_a_bad_drift_is_told_by_every_front_door_that_reads_it(door, drift, said):
+    with pytest.raises(ValueError, match=said or "drift"):
+        door(problem(drift))

@@ -235,3 +235,45 @@ def test_van_der_pol_is_van_der_pol():
 def test_dubins_drives_ahead():
     rates = zoo.Dubins(2.0).drift(jnp.array([0.0, 0.0, np.pi / 6]), jnp.array([0.3]))
     np.testing.assert_allclose(rates, [3**0.5, 1.0, 0.3])
+
+
+def test_a_quadrotor_hovers_falls_and_leans():
+    quadrotor = zoo.PlanarQuadrotor(mass=2.0, inertia=0.5)
+    x = jnp.array([0.3, -0.2, 0.0, 1.0, 2.0, 3.0])
+    np.testing.assert_allclose(quadrotor.drift(x, jnp.array([quadrotor.hover, 0.0])), [1, 2, 3, 0, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(quadrotor.drift(x, jnp.array([0.0, 1.0])), [1, 2, 3, 0, -9.81, 2], atol=1e-12)
+    leant = quadrotor.drift(x.at[2].set(np.pi / 2), jnp.array([4.0, 0.0]))
+    np.testing.assert_allclose(leant, [1, 2, 3, -2, -9.81, 0], atol=1e-12)
+    # energy: power is that of the thrust along the speed and of the torque
+    u = jnp.array([3.0, 0.7])
+    for angle in (0.4, -2.0):
+        x = x.at[2].set(angle)
+        rate, (vx, vz, w) = quadrotor.drift(x, u), x[3:]
+        power = 2.0 * (vx * rate[3] + vz * rate[4]) + 2.0 * 9.81 * vz + 0.5 * w * rate[5]
+        np.testing.assert_allclose(power, u[0] * (-vx * np.sin(angle) + vz * np.cos(angle)) + u[1] * w, rtol=1e-12)
+
+
+def test_a_quadrotor_has_its_mirror_image_and_six_dimensions_fit():
+    """A tube on 8^6 nodes in single precision, the value alone: even under x, θ, ẋ, θ̇ → −x, −θ, −ẋ, −θ̇."""
+    quadrotor = zoo.PlanarQuadrotor()
+    tube = hjb.reach(quadrotor.drift, hjb.Box([0.0, -0.4], [2 * quadrotor.hover, 0.4]), near_the_origin)
+    grid = hjb.Grid(
+        [-2.0, -2.0, -np.pi, *[-4.0] * 3],
+        [2.0, 2.0, np.pi, *[4.0] * 3],
+        (8,) * 6,
+        (False,) * 2 + (True,) + (False,) * 3,
+    )
+    options = {"scheme": hjb.Upwind(), "dtype": "float32"}
+    found = hjb.march(tube, grid, 0.05, policy=False, **options)
+    value = found.value[0]
+    # the angle has a node at −π and none at π: its mirror image is itself, and the others are turned round
+    turned = np.roll(np.flip(value, (0, 2, 3, 5)), 1, axis=2)
+    np.testing.assert_allclose(turned, value, atol=1e-5)
+    level = np.asarray(jax.vmap(near_the_origin)(grid.nodes().reshape(-1, 6)[:, :])).reshape(grid.shape)
+    assert np.all(value <= level + 1e-6)
+    assert np.min(value - level) < -0.05
+    assert found.stats["bytes"] <= 17 * grid.size
+
+
+def near_the_origin(x):
+    return jnp.hypot(x[0], x[1]) - 0.5

@@ -1,0 +1,117 @@
+"""What was told of the memory beforehand, beside the peak of a process of its own: solves and marches on large grids.
+
+A small grid is solved first, whose memory is that of JAX and of what it compiles; the peak counts from there.
+"""
+
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from benchmarks.harness.report import RESULTS, attempt, publish, table
+
+COLUMNS = ("question", "run", "shape", "told", "peak", "told_over_peak", "seconds", "steps", "status")
+# what is asked, how it is run, the nodes an axis, and the steps or the horizon; all in single precision
+CASES: tuple[tuple[str, str, int, float], ...] = (
+    ("quadrotor tube", "march, value alone", 21, 0.25),
+    ("quadrotor tube", "march, Upwind", 17, 0.02),
+    ("quadrotor tube", "march, Limited", 14, 0.02),
+    ("quadrotor tube", "solve, value alone", 21, 3),
+    ("quadrotor tube", "solve, value iteration", 17, 3),
+    ("quadrotor LQ", "solve, value alone", 21, 3),
+    ("Dubins tube", "march, value alone", 361, 0.02),
+    ("Dubins tube", "march, Limited", 201, 0.02),
+)
+QUICK = 12  # nodes an axis in six dimensions, and its cube root of as many in three
+SMALL = 6
+
+
+@click.command()
+@click.option("--quick", is_flag=True, help="Small grids, of which compiling is most: no verdict.")
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Folder of the files.")
+def command(quick: bool, out: Path) -> None:
+    """Run large grids each in a process of its own, and print what was told and what was taken."""
+    rows = []
+    for question, run, count, length in CASES[:2] if quick else CASES:
+        about = {"benchmark": "memory", "question": question, "run": run, "dtype": "float32"}
+        rows += attempt(lambda case=(question, run, QUICK if quick else count, length): [apart(*case)], about)
+        click.echo(f"{question}, {run}: {rows[-1].get('told_over_peak') or rows[-1].get('reason')}", err=True)
+    click.echo(table(rows, COLUMNS))
+    publish(out, "memory", rows)
+
+
+def apart(question: str, run: str, count: int, length: float) -> dict[str, Any]:
+    """The row of one run, made by a process of its own."""
+    command = [sys.executable, "-m", "benchmarks.accuracy.memory", question, run, str(count), str(length)]
+    done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(done.stderr.strip().splitlines()[-1])
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def here(question: str, run: str, count: int, length: float) -> dict[str, Any]:
+    """The row of one run in this process."""
+    answer(question, run, SMALL, length)
+    before = status("VmRSS")
+    Path("/proc/self/clear_refs").write_text("5")  # the peak counts from now on
+    solution = answer(question, run, count, length)
+    peak, told = status("VmHWM") - before, int(solution.stats["bytes"])
+    return {
+        "shape": list(solution.grid.shape), "nodes": solution.grid.size, "told": told / 1e9, "peak": peak / 1e9,
+        "told_bytes_per_node": told / solution.grid.size, "peak_bytes_per_node": peak / solution.grid.size,
+        "told_over_peak": told / peak, "seconds": solution.stats["seconds"], "steps": int(solution.steps),
+        "status": "OK" if solution.status.name in ("CONVERGED", "MAX_STEPS") else solution.status.name,
+    }  # fmt: skip
+
+
+def status(name: str) -> int:
+    """Bytes that Linux says of this process."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return int(next(line for line in lines if line.startswith(name)).split()[1]) * 1024
+
+
+def answer(question: str, run: str, count: int, length: float) -> Any:
+    """The solution of a question on so many nodes an axis; an angle has an even number."""
+    import warnings
+
+    import jax.numpy as jnp
+    import numpy as np
+
+    import hjbjax as hjb
+
+    warnings.simplefilter("ignore")  # drift is cut off, and grids are coarse
+    even = count + count % 2
+
+    def disc(x):
+        return jnp.hypot(x[0], x[1]) - 0.5
+
+    if question.startswith("quadrotor"):
+        quadrotor = hjb.zoo.PlanarQuadrotor()
+        drift, controls = quadrotor.drift, hjb.Box([0.0, -0.4], [2 * quadrotor.hover, 0.4])
+        shape, periodic = (count, count, even, *[count] * 3), (False, False, True, *[False] * 3)
+        grid = hjb.Grid([-2.0, -2.0, -np.pi, *[-4.0] * 3], [2.0, 2.0, np.pi, *[4.0] * 3], shape, periodic)
+    else:
+        drift, controls = hjb.zoo.Dubins().drift, hjb.Box([-1.0], [1.0])
+        grid = hjb.Grid([-2.0, -2.0, -np.pi], [2.0, 2.0, np.pi], (count, count, even), periodic=(False, False, True))
+    problem = hjb.reach(drift, controls, disc)
+    if question.endswith("LQ"):
+        problem = hjb.Problem(drift, lambda x, u: x @ x + u @ u, controls, discount=1.0)
+    options: dict[str, Any] = {"dtype": "float32", "throw": False, "progress": False}
+    if run.startswith("march"):
+        scheme = hjb.Limited() if run.endswith("Limited") else hjb.Upwind()
+        return hjb.march(problem, grid, length, scheme=scheme, policy=not run.endswith("alone"), **options)
+    method = hjb.ValueIteration(policy=not run.endswith("alone"))
+    return hjb.solve(problem, grid, method=method, max_steps=int(length), **options)
+
+
+def main(arguments: Sequence[str]) -> None:
+    question, run, count, length = arguments
+    print(json.dumps(here(question, run, int(count), float(length))))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,244 @@
+"""Seeded bugs: one after the other in a copy of the checkout, to see whether the default suite finds each.
+
+A mutant is one text in place of another. The test files that are most likely to find it run first, up to the first
+failure; where they pass the whole default suite follows. At the end the tests that found something run once more
+without any bug: one that fails there, too, has found nothing.
+"""
+
+import dataclasses
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import click
+
+from benchmarks.harness.report import RESULTS, publish, table
+
+ROOT = Path(__file__).parents[2]
+LEFT_OUT = (".git", ".venv", "__pycache__", "site", "build", "dist", "*.egg-info", ".*_cache", ".hypothesis")
+COLUMNS = ("mutant", "file", "caught_by", "seconds", "status")
+LONGEST = 1800.0  # seconds of one run of tests, the whole suite among them
+
+
+@dataclasses.dataclass(frozen=True)
+class Mutant:
+    """A bug as one text in place of another, and the test files that are most likely to find it, in order.
+
+    Attributes:
+      name: what is wrong, in words.
+      file: where, within the package.
+      old: the text that stands there exactly once.
+      new: the text in its place.
+      likely: test files.
+    """
+
+    name: str
+    file: str
+    old: str
+    new: str
+    likely: tuple[str, ...]
+
+    def applied(self, text: str) -> str:
+        """The text of the file with the bug in it.
+
+        Raises:
+          ValueError: the old text is not there, or not once.
+        """
+        if (count := text.count(self.old)) != 1:
+            raise ValueError(
+                f"mutants: {self.name}: hjbjax/{self.file} holds {self.old!r} {count} times, wanted once; "
+                "the code has moved on: write the mutant anew"
+            )
+        return text.replace(self.old, self.new)
+
+
+MUTANTS = (
+    Mutant(
+        "sign of the drift",
+        "discretisation/discretisation.py",
+        "return list(components.components(self.problem.drift, *self._arguments(u, d, x), dtype=self.dtype))",
+        "return [-f for f in components.components(self.problem.drift, *self._arguments(u, d, x), dtype=self.dtype)]",
+        ("tests/markov_chain/test_chain.py",),
+    ),
+    Mutant(
+        "upwind side",
+        "hamiltonian/discrete.py",
+        "jnp.maximum(f, 0) * self.up[axis] + jnp.minimum(f, 0) * self.down[axis]",
+        "jnp.maximum(f, 0) * self.down[axis] + jnp.minimum(f, 0) * self.up[axis]",
+        ("tests/hamiltonian/test_discrete.py",),
+    ),
+    Mutant(
+        "ghost cell",
+        "discretisation/stencil.py",
+        "last = grid.shape[axis] - 1 if step > 0 else 0\n    if (axis, step) not in",
+        "last = grid.shape[axis] - 2 if step > 0 else 0\n    if (axis, step) not in",
+        ("tests/discretisation/test_stencil.py",),
+    ),
+    Mutant(
+        'missing "1 −" of the self-transition',
+        "markov_chain/chain.py",
+        "np.maximum(1 - steps.total(), 0)",
+        "np.maximum(steps.total(), 0)",
+        ("tests/markov_chain/test_chain.py",),
+    ),
+    Mutant(
+        "discount of a march",
+        "iteration/time_stepping.py",
+        "return best - self.problem.discount * value, self.look(u, d, t)",
+        "return best, self.look(u, d, t)",
+        ("tests/discretisation/test_schemes.py",),
+    ),
+    Mutant(
+        "periodic wrap",
+        "discretisation/stencil.py",
+        "end = last if (step > 0) != bool(grid.periodic[axis]) else 0",
+        "end = last if step > 0 else 0",
+        ("tests/discretisation/test_stencil.py",),
+    ),
+    Mutant(
+        "min for max",
+        "iteration/bellman.py",
+        "value = jnp.maximum(value, self.lower)",
+        "value = jnp.minimum(value, self.lower)",
+        ("tests/iteration/test_bellman.py", "tests/applications/test_reachability.py"),
+    ),
+    Mutant(
+        "width of the ghost cells of Eno2",
+        "discretisation/slopes.py",
+        "for k in range(3)))[3 - reach :]\n    last",
+        "for k in range(3)))[:reach]\n    last",
+        ("tests/discretisation/test_slopes.py",),
+    ),
+    Mutant(
+        "½ of the noise",
+        "discretisation/discretisation.py",
+        "return {(i, i): s * s for i, s",
+        "return {(i, i): s * s / 2 for i, s",
+        ("tests/markov_chain/test_chain.py", "tests/laws/test_accuracy.py"),
+    ),
+    Mutant(
+        "target mask",
+        "iteration/bellman.py",
+        "else cut_cells.level(on) <= 0",
+        "else cut_cells.level(on) < 0",
+        ("tests/regressions/test_boundary_nodes.py",),
+    ),
+    Mutant(
+        "time of a cost in an implicit step",
+        "iteration/time_methods.py",
+        "ImplicitStep.of(march.on.at(end), march.obstacles_at(end), value, dt)",
+        "ImplicitStep.of(march.on.at(t), march.obstacles_at(end), value, dt)",
+        ("tests/solvers/test_finite_horizon.py",),
+    ),
+    Mutant(
+        "spacing of a stretched axis",
+        "discretisation/stencil.py",
+        "Links(jnp.append(gaps, gaps[-1:]).reshape(along), jnp.append(gaps[:1], gaps).reshape(along))",
+        "Links(jnp.append(gaps[:1], gaps).reshape(along), jnp.append(gaps, gaps[-1:]).reshape(along))",
+        ("tests/discretisation/test_stencil.py",),
+    ),
+    Mutant(
+        "coefficient of a Runge–Kutta method",
+        "iteration/time_methods.py",
+        "3: Tableau((0.0, 3 / 4, 1 / 3))",
+        "3: Tableau((0.0, 1 / 2, 1 / 2))",
+        ("tests/solvers/test_finite_horizon.py",),
+    ),
+    Mutant(
+        "seam of an interpolation",
+        "problem/grid.py",
+        "index = tuple((cell + bit) % count for",
+        "index = tuple(jnp.minimum(cell + bit, count - 1) for",
+        ("tests/problem/test_grid.py", "tests/solution/test_interpolation.py"),
+    ),
+    Mutant(
+        "half an error bound",
+        "iteration/certificates.py",
+        "return jnp.min(policy.defect) / discount, jnp.max(policy.defect) / discount",
+        "return jnp.min(policy.defect) / (2 * discount), jnp.max(policy.defect) / (2 * discount)",
+        ("tests/iteration/test_certificates.py",),
+    ),
+)
+QUICK = ("ghost cell", "seam of an interpolation")
+
+
+@click.command()
+@click.option("--mutant", "names", multiple=True, help="Only those whose names hold this text.")
+@click.option("--quick", is_flag=True, help="Two of them, without the whole suite.")
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Folder of the rows.")
+def command(names: Sequence[str], quick: bool, out: Path) -> None:
+    """Seed one bug after the other in a copy of the checkout, and print which test found it."""
+    chosen = [each for each in MUTANTS if any(name in each.name for name in (names or ("",)))]
+    if quick:
+        chosen = [each for each in chosen if each.name in QUICK]
+    if not chosen:
+        raise click.UsageError(f"--mutant: none of {', '.join(each.name for each in MUTANTS)} holds that text")
+    for each in chosen:  # a stale one is refused before the first test
+        each.applied(source(ROOT, each).read_text(encoding="utf-8"))
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / "copy"
+        shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(*LEFT_OUT))
+        for each in chosen:
+            rows.append(measured(each, copy, whole=not quick))
+            click.echo(f"{each.name}: {rows[-1]['caught_by'] or 'SURVIVED'}, {rows[-1]['seconds']:.0f} s", err=True)
+        found = [row["caught_by"] for row in rows if row["caught_by"]]
+        anyway = failures(copy, list(dict.fromkeys(found)), "--maxfail=100") if found else []
+    for row in rows:
+        if row["caught_by"] in anyway:
+            row["status"] = "FAILED"
+    click.echo(table(rows, COLUMNS))
+    publish(out, "mutants", rows)
+    raise SystemExit(1 if any(row["status"] != "OK" for row in rows) else 0)
+
+
+def source(root: Path, mutant: Mutant) -> Path:
+    """The file of the package that a mutant changes, in a checkout."""
+    return root / "hjbjax" / mutant.file
+
+
+def measured(mutant: Mutant, copy: Path, *, whole: bool) -> dict:
+    """The row of one mutant, whose bug stands in the copy as long as its tests run."""
+    path, began = source(copy, mutant), time.perf_counter()
+    before = path.read_text(encoding="utf-8")
+    path.write_text(mutant.applied(before), encoding="utf-8")
+    try:
+        caught = failures(copy, mutant.likely, "-x")
+        if not caught and whole:
+            caught = failures(copy, (), "-x")
+    finally:
+        path.write_text(before, encoding="utf-8")
+    return {
+        "benchmark": "mutants", "mutant": mutant.name, "file": mutant.file, "dtype": None,
+        "caught_by": caught[0] if caught else None, "seconds": time.perf_counter() - began,
+        "status": "OK" if caught else "SURVIVED",
+    }  # fmt: skip
+
+
+def failures(copy: Path, tests: Sequence[str], *options: str) -> list[str]:
+    """The tests that fail, by name, of some files or tests of a copy; of the default suite without any.
+
+    Raises:
+      RuntimeError: the tests could not be run at all, so that nothing was found.
+    """
+    # no compiled files: Python would take those of a file that had another text within the same second
+    environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}
+    one = ("-n", "0") if tests else ()  # a few files are not worth two processes
+    command = [sys.executable, "-m", "pytest", "-q", "--tb=no", "-rfE", "-p", "no:cacheprovider", *one, *options]
+    done = subprocess.run(
+        [*command, *tests], cwd=copy, env=environment, capture_output=True, text=True, timeout=LONGEST, check=False
+    )
+    # 0: all passed, 1: some failed; all else is no verdict, and neither is a file that cannot be imported
+    if done.returncode not in (0, 1) or "\nERROR " in done.stdout:
+        raise RuntimeError(f"mutants: pytest ended with {done.returncode}:\n{done.stdout[-2000:]}{done.stderr[-2000:]}")
+    lines = done.stdout.splitlines()
+    return [line.removeprefix("FAILED ").split(" - ")[0] for line in lines if line.startswith("FAILED ")]
+
+
+if __name__ == "__main__":
+    command()

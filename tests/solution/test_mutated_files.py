@@ -1,0 +1,161 @@
+"""A thousand damaged and forged files of each kind: a FileError each, quick and small, and nothing in them runs."""
+
+import io
+import json
+import pathlib
+import pickle
+import random
+import time
+import tracemalloc
+import zipfile
+
+import numpy as np
+import pytest
+
+import hjbjax as hjb
+from hjbjax.solution import checkpoints
+
+COUNT = 1000  # files that must be refused
+SPARED = 400  # files at most that may say the same as before: a date or a flag of a zip entry says nothing
+SECONDS, BYTES = 1.0, 100 * 10**6  # of one refusal, at most
+GRID = hjb.Grid([-1.0, 0.0], [1.0, 1.0], (7, 5), periodic=(True, False))
+# what a header may say in place of a number, a name, a list or a table: too large, of another kind, too deep
+ODD = (None, True, -1, 10**30, 1e308, "x" * 2000, "\0", [], {}, [[]] * 50, {"a": {"b": []}}, [10**6] * 3)
+
+
+class Bomb:
+    """What a pickle would run."""
+
+    def __init__(self, mark):
+        self.mark = mark
+
+    def __reduce__(self):
+        return pathlib.Path.touch, (self.mark,)
+
+
+def solution(path):
+    values = np.random.default_rng(0).normal(size=(7, 5))
+    about = {"message": "a test", "stats": {"method": "Test", "tol": 0.1}, "residuals": np.ones(3)}
+    made = hjb.Solution(GRID, values, values[..., None], code=hjb.Status.CONVERGED, steps=3, **about)
+    made.save(path, force=True)
+    return lambda: hjb.load(path)
+
+
+def checkpoint(path):
+    kept = checkpoints.Checkpoint(str(path))
+    asked = {"problem": "a digest", "grid": "another", "tol": "0.1"}
+    file = checkpoints.File(kept, asked, {})
+    arrays = [np.random.default_rng(0).normal(size=(7, 5)), np.arange(4, dtype=np.int32), np.ones(3, bool)]
+    done = checkpoints.Record(arrays, hjb.Status.CONVERGED, True, False)
+    file.journal().records = [done, checkpoints.Record(arrays[:1], hjb.Status.RUNNING, False, True)]
+    file.changed = True
+    file.write()
+    return lambda: checkpoints._read(str(path), asked)
+
+
+def said(answer):
+    """What a reader found, as text: all of its numbers, to the last bit."""
+    if isinstance(answer, np.ndarray):
+        return f"{answer.dtype} {answer.shape} {answer.tobytes().hex()}"
+    if isinstance(answer, dict):
+        return {str(key): said(each) for key, each in answer.items()}
+    if isinstance(answer, (list, tuple)):
+        return [said(each) for each in answer]
+    return said(vars(answer)) if hasattr(answer, "__dict__") else repr(answer)
+
+
+def flipped(data, draw, mark):
+    data = bytearray(data)
+    for _ in range(draw.choice([1, 1, 2, 20, 200])):
+        data[draw.randrange(len(data))] ^= 1 << draw.randrange(8)
+    return bytes(data)
+
+
+def moved(data, draw, mark):
+    """Cut off, with a part missing, doubled, or full of zeros, ones or what a zip's own numbers may be."""
+    start, stop = sorted(draw.randrange(len(data)) for _ in range(2))
+    way = draw.randrange(4)
+    if way == 0:
+        return data[:start]
+    if way == 1:
+        return data[:start] + data[stop:]
+    if way == 2:
+        return data[:stop] + data[start:]
+    fill = draw.choice([b"\0", b"\xff", b"PK\1\2", b"\x80\4"])
+    return data[:start] + (fill * (stop - start + 1))[: stop - start] + data[stop:]
+
+
+def forged(data, draw, mark):
+    """A sound archive whose header, or one of whose arrays, is another."""
+    with zipfile.ZipFile(io.BytesIO(data)) as source:
+        content = {name: source.read(name) for name in source.namelist()}
+    header = json.loads(np.load(io.BytesIO(content["header.npy"])).tobytes())
+    name = draw.choice([each for each in content if each != "header.npy"])
+    way = draw.randrange(4)
+    if way == 0:  # an entry of the header, or one within it
+        table = header
+        while isinstance(table, dict) and table:
+            key = draw.choice(list(table))
+            if not isinstance(table[key], dict) or draw.random() < 0.5:
+                table[key] = draw.choice(ODD)
+                break
+            table = table[key]
+        content["header.npy"] = npy(np.frombuffer(json.dumps(header).encode(), np.uint8))
+    elif way == 1:  # an array of another size or kind
+        count = draw.randrange(1, 9)
+        content[name] = npy(
+            draw.choice([np.zeros(count), np.zeros((count, 0)), np.zeros((7, 5), ">f8"), np.zeros(3, complex)])
+        )
+    elif way == 2:  # a pickle
+        content[name] = npy(np.array(Bomb(mark), dtype=object))
+    else:  # a claim
+        shape = tuple(draw.choice([7, 10**6, 10**18]) for _ in range(draw.randrange(1, 4)))
+        text = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+        content[name] = b"\x93NUMPY\1\0" + len(text).to_bytes(2, "little") + text + bytes(64)
+    made = io.BytesIO()
+    with zipfile.ZipFile(made, "w") as archive:
+        for each, member in content.items():
+            archive.writestr(each, member)
+    return made.getvalue()
+
+
+def npy(array):
+    stream = io.BytesIO()
+    np.save(stream, array)
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize("make", [solution, checkpoint])
+def test_a_thousand_files(make, tmp_path):
+    path, mark, draw = tmp_path / "run.npz", tmp_path / "mark", random.Random(1)
+    read = make(path)
+    data, wanted = path.read_bytes(), said(read())
+    refused = spared = 0
+    while refused < COUNT:
+        way = draw.choice([flipped, moved, forged])
+        path.write_bytes(way(data, draw, mark))
+        weighed = refused % 5 == 0  # which takes five times as long
+        if weighed:
+            tracemalloc.start()
+        began, complaint = time.perf_counter(), None
+        try:
+            answer = said(read())
+        except hjb.FileError as error:
+            complaint = str(error)
+        seconds, bytes_ = time.perf_counter() - began, tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        if complaint is None:
+            spared += 1
+            assert way is forged or answer == wanted  # whoever makes a sound file may say what can be said
+        else:
+            refused += 1
+            assert complaint.startswith(f"{path}: cannot be read: ")
+            assert len(complaint.splitlines()) == 1
+        assert seconds < SECONDS
+        assert bytes_ < BYTES
+        assert not weighed or bytes_ > 0
+    assert spared <= SPARED
+    path.write_bytes(pickle.dumps(Bomb(mark)))
+    with pytest.raises(hjb.FileError, match="a pickle"):
+        read()
+    assert not mark.exists()

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from hjbjax.plotting.scales import is_angle, set_ticks
+from hjbjax.plotting.scales import box_sides, is_angle, set_ticks
 from hjbjax.plotting.shading import frame, outlined
 from hjbjax.plotting.slices import (
     Cuts,
@@ -186,10 +186,12 @@ def _surface(field: Field, fixed: Mapping[str, float], ax: Any, color: str, labe
     ends = [(float(line[0]), float(line[-1])) for line in lines]
     ax.set(xlim=ends[0], ylim=ends[1], zlim=ends[2])
     for axis, number, text in zip((ax.xaxis, ax.yaxis, ax.zaxis), free, "xyz", strict=True):
-        axis.set_major_locator(MaxNLocator(4))  # seen from the side, more would run into each other
+        # seen from the side, more would run into each other, and so would the last of x and the first of y
+        axis.set_major_locator(MaxNLocator(4, prune="upper" if text == "x" else None))
         set_ticks(axis, is_angle(grid, number))
         getattr(ax, f"set_{text}label")(grid.labels[number], labelpad=8)
-    ax.set_box_aspect((1, 1, 0.8), zoom=0.86)  # smaller than its frame, or the label on the right would be cut
+    # smaller than its frame, or the label on the right would be cut
+    ax.set_box_aspect(box_sides(grid, free), zoom=0.86)
     if field.caption:
         ax.set_title(field.caption, loc="right", fontsize=9)
     if label and artists:

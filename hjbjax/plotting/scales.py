@@ -64,6 +64,22 @@ def are_positions(grid: Grid, axes: Sequence[int]) -> bool:
     return len(axes) == 2 and len(units) == 1 and units <= set(LENGTHS)
 
 
+def box_sides(grid: Grid, axes: Sequence[int]) -> tuple[float, ...]:
+    """The sides on which three axes are drawn: those with one and the same unit of length have one scale.
+
+    Example:
+      >>> box_sides(Grid([0.0] * 3, [4.0, 2.0, 9.0], (2, 2, 2), units=("m", "m", "rad")), (0, 1, 2))
+      (1.0, 0.5, 0.8)
+    """
+    spans = [float(grid.hi[axis] - grid.lo[axis]) for axis in axes]
+    units = [grid.units[axis] for axis in axes]
+    alike = [unit in LENGTHS and units.count(unit) > 1 for unit in units]
+    longest = max((span for span, one in zip(spans, alike, strict=True) if one), default=1.0)
+    return tuple(
+        span / longest if one else usual for span, one, usual in zip(spans, alike, (1.0, 1.0, 0.8), strict=True)
+    )
+
+
 def set_ticks(axis: Any, angle: bool) -> None:
     """Numbers without an offset on a matplotlib axis; multiples of π where it is an angle and long enough."""
     from matplotlib.ticker import FuncFormatter, MultipleLocator

@@ -11,6 +11,7 @@ from hjbjax.markov_chain import memory
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import with_suggestions
 from hjbjax.problem.types import DType
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import keeping_warnings
@@ -72,6 +73,7 @@ class Estimate:
         )
 
 
+@with_suggestions
 def estimate(
     problem: Problem,
     grid: Grid,

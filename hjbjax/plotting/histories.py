@@ -11,7 +11,7 @@ import numpy as np
 from hjbjax.plotting.scales import set_ticks
 from hjbjax.plotting.shading import around, is_level
 from hjbjax.plotting.slices import span_of
-from hjbjax.plotting.style import COLOURS, Picture, axes_of, label_axes, legend
+from hjbjax.plotting.style import COLOURS, Picture, axes_of, drawing, label_axes, legend
 from hjbjax.problem.labels import Labels
 
 if TYPE_CHECKING:
@@ -26,6 +26,7 @@ JUMPS = 60  # of one control to and fro: more of them fill a picture of ten cent
 WINDOW = 0.04  # of the duration, over which means of such a control are taken
 
 
+@drawing
 def costates(
     extremal: Extremal, *, solution: Solution | None = None, ax: Axes | None = None, names: Sequence[str] | None = None
 ) -> Picture:
@@ -71,6 +72,7 @@ def costates(
     return Picture([*artists, legend(ax)], ax)
 
 
+@drawing
 def controls(
     path: Path, *, ax: Axes | None = None, names: Sequence[str] | None = None, solution: Solution | None = None
 ) -> Picture:

@@ -26,7 +26,7 @@ from hjbjax.plotting.slices import (
     section_of,
     sets_of,
 )
-from hjbjax.plotting.style import COLOURS, Picture, axes_of, legend, solid_axes
+from hjbjax.plotting.style import COLOURS, Picture, axes_of, drawing, legend, solid_axes
 from hjbjax.plotting.surfaces import level_surface, lit, thinned
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import SIDES, Labels
@@ -55,6 +55,7 @@ class Field:
         return section_of("zero_level_set", self.values, self.grid, fixed, self.caption)
 
 
+@drawing
 def zero_level_set(
     solution: Solution,
     *,
@@ -200,6 +201,7 @@ def _surface(field: Field, fixed: Mapping[str, float], ax: Any, color: str, labe
     return Picture(artists, ax)
 
 
+@drawing
 def animation(
     solution: Solution,
     draw: Callable[..., Picture] = zero_level_set,

@@ -25,7 +25,7 @@ from hjbjax.plotting.slices import (
     without_jumps,
     zeros,
 )
-from hjbjax.plotting.style import COLOURS, Picture, axes_of, label_axes, legend, new_figure, styled
+from hjbjax.plotting.style import COLOURS, Picture, axes_of, drawing, label_axes, legend, new_figure, styled
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.types import Number, State
 
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from hjbjax.solution.solution import Solution
 
 
+@drawing
 def value(
     solution: Solution,
     *,
@@ -101,6 +102,7 @@ def _without(section: Section, target: Callable[[State], Number] | None) -> tupl
     return section._replace(values=np.ma.array(section.values.data, mask=mask)), (region,)
 
 
+@drawing
 def policy(
     solution: Solution,
     *,
@@ -134,6 +136,7 @@ def policy(
     return Picture(draw(ax, section, look, regions), ax)
 
 
+@drawing
 def switching_curve(
     solution: Solution,
     *,
@@ -180,6 +183,7 @@ def switching_curve(
     return Picture(artists, ax)
 
 
+@drawing
 def trajectory(
     path: Path,
     *,
@@ -247,6 +251,7 @@ def trajectory(
     return Picture(artists, ax)
 
 
+@drawing
 def closed_loop(
     solution: Solution,
     path: Path,

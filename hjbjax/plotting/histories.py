@@ -104,7 +104,7 @@ def controls(
     means: list[Artist] = []
     for i, name in enumerate(names[:count]):
         restless = np.sum(np.abs(np.diff(inputs[:, i])) > np.ptp(inputs[:, i]) / 2) > JUMPS if len(inputs) else False
-        look: dict[str, Any] = {"linewidth": 0.4, "alpha": 0.4} if restless else {"linewidth": 1.4}
+        look: dict[str, Any] = {"linewidth": 0.6, "alpha": 0.5} if restless else {"linewidth": 1.4}
         look["color"] = COLOURS[i % len(COLOURS)]
         lines += ax.plot(times, shown[:, i], drawstyle=drawing, label=name, **look)
         if restless:
@@ -122,7 +122,7 @@ def controls(
 
 
 def _running_mean(times: np.ndarray, held: np.ndarray, width: float) -> np.ndarray:
-    """Means, (k+1,), of a step function with values (k,) over a window around each time, cut at both ends."""
+    """Means, (k+1,), of a step function with values (k,) over a window around each time, whole at both ends."""
     integral = np.concatenate([[0.0], np.cumsum(held * np.diff(times))])
-    begin, end = np.maximum(times - width / 2, times[0]), np.minimum(times + width / 2, times[-1])
-    return (np.interp(end, times, integral) - np.interp(begin, times, integral)) / (end - begin)
+    begin = np.clip(times - width / 2, times[0], times[-1] - width)
+    return (np.interp(begin + width, times, integral) - np.interp(begin, times, integral)) / width

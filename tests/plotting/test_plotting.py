@@ -435,10 +435,10 @@ def test_a_control_that_jumps_to_and_fro_is_pale_and_its_mean_is_drawn():
     flicker = np.where(np.arange(400) % 4 == 0, 1.0, -1.0)  # of which the mean is −½
     flicker[:100] = 1.0
     raw, mean, legend = plotting.controls(path_of(np.zeros((401, 1)), flicker[:, None], times))
-    assert raw.get_alpha() < 0.5
+    assert raw.get_alpha() < 0.6
     drawn = mean.get_ydata()
-    assert drawn[0] == drawn[80] == pytest.approx(1.0)
-    np.testing.assert_allclose(drawn[120:-20], -0.5, atol=0.13)
+    np.testing.assert_allclose(drawn[:90], 1.0, atol=1e-12)
+    np.testing.assert_allclose(drawn[110:], -0.5, atol=1e-9)  # the window holds four whole turns
     assert [text.get_text() for text in legend.get_texts()] == ["u", "u, mean over 0.16"]
 
 

@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from hjbjax.problem.grid import Grid
 
 if TYPE_CHECKING:
@@ -85,13 +83,22 @@ def set_ticks(axis: Any, angle: bool) -> None:
     from matplotlib.ticker import FuncFormatter, MultipleLocator
 
     axis.set_major_formatter(FuncFormatter(number_text))
-    if not angle:
-        return
-    turns = abs(np.diff(axis.get_view_interval()).item()) / math.pi
-    fitting = [step for step in STEPS if FEWEST <= math.floor(turns / step + 1e-9) + 1 <= MOST]
-    if fitting:
-        axis.set_major_locator(MultipleLocator(float(fitting[0]) * math.pi))
+    step = angle_step(*axis.get_view_interval()) if angle else None
+    if step is not None:
+        axis.set_major_locator(MultipleLocator(step))
         axis.set_major_formatter(FuncFormatter(angle_text))
+
+
+def angle_step(lo: float, hi: float) -> float | None:
+    """The multiple of π between two ticks of an angle; ``None`` where there would be too few of them, or too many.
+
+    Example:
+      >>> angle_step(-math.pi, math.pi) == math.pi / 2
+      True
+    """
+    turns = abs(hi - lo) / math.pi
+    fitting = [step for step in STEPS if FEWEST <= math.floor(turns / step + 1e-9) + 1 <= MOST]
+    return float(fitting[0]) * math.pi if fitting else None
 
 
 def scale_axes(ax: Axes, grid: Grid, axes: Sequence[int]) -> None:

@@ -132,9 +132,11 @@ def solid_axes(ax: Axes | None) -> Any:
 
 
 def new_figure(size: tuple[float, float]) -> Figure:
-    """A new figure of pyplot's."""
+    """Pyplot's current figure as long as it is empty, else a new one."""
     from matplotlib import pyplot
 
+    if pyplot.get_fignums() and not pyplot.gcf().axes and not pyplot.gcf().subfigs:
+        return pyplot.gcf()
     return pyplot.figure(figsize=size, layout="constrained")
 
 

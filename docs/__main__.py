@@ -37,9 +37,9 @@ def main(arguments: Sequence[str]) -> int:
     if name == "notebooks":
         from docs import notebooks
 
-        notebooks.render(HERE / "notebooks")
+        notebooks.render(HERE / "notebooks", rest)
         return 0
-    print(f"docs: got {name!r}, wanted build [FOLDER], pictures or notebooks", file=sys.stderr)
+    print(f"docs: got {name!r}, wanted build [FOLDER], pictures or notebooks [NAME ...]", file=sys.stderr)
     return 2
 
 

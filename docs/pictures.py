@@ -13,7 +13,6 @@ from hjbjax import zoo
 from hjbjax.cli import gallery
 
 COLOURS = 256  # of a palette: a quarter of the bytes of full colours
-WIDEST = 1000  # pixels; what is drawn at 200 dots an inch and halved is smoother than what is drawn at 100
 EXACT = 16  # colours that are kept as they are: paper, panes, frames and lines
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 PAGES = ("README.md", "docs/getting_started.md")
@@ -21,6 +20,8 @@ PAGES = ("README.md", "docs/getting_started.md")
 
 def draw(docs: Path) -> None:
     """The pictures of the pages, and the gallery."""
+    for old in (docs / "pictures").glob("*.png"):
+        old.unlink()
     for page in PAGES:
         run(docs.parent / page, docs / "pictures")
     for picture in sorted((docs / "pictures").glob("*.png")):
@@ -50,15 +51,15 @@ def shrink(picture: Path) -> None:
     """A PNG with a palette in place of colours.
 
     The palette is made of the colours by the root of how often they occur: by their number alone the large areas take
-    all of it, and a colour scale beside them becomes a staircase. A picture of twice the width of a page is halved.
+    all of it, and a colour scale beside them becomes a staircase. What is drawn at 200 dots an inch is halved, which is
+    smoother than what is drawn at 100.
     """
     import numpy as np
     from PIL import Image
 
     with Image.open(picture) as image:
         full = image.convert("RGB")
-    if full.width > WIDEST:
-        full = full.resize((full.width // 2, full.height // 2), Image.Resampling.LANCZOS)
+    full = full.resize((full.width // 2, full.height // 2), Image.Resampling.LANCZOS)
     pixels = np.asarray(full).reshape(-1, 3)
     found, place, often = np.unique(pixels, axis=0, return_inverse=True, return_counts=True)
     row = np.repeat(found, np.sqrt(often).astype(int), axis=0)

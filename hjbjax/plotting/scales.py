@@ -56,6 +56,19 @@ def is_angle(grid: Grid, axis: int) -> bool:
     return math.isclose(float(grid.hi[axis]) - float(grid.lo[axis]), 2 * math.pi, rel_tol=1e-6)
 
 
+def place_text(grid: Grid, axis: int, place: float) -> str:
+    """A coordinate with its unit, as a caption says it; of an angle the simple multiples of π.
+
+    Example:
+      >>> place_text(Grid([0.0], [math.tau], (4,), (True,), units=("rad",)), 0, math.pi / 2)
+      'π/2 rad'
+    """
+    unit = f" {grid.units[axis]}" if grid.units[axis] else ""
+    eighths = 8 * place / math.pi
+    simple = is_angle(grid, axis) and math.isclose(eighths, round(eighths), abs_tol=1e-6)
+    return (angle_text(place) if simple else f"{place:.4g}") + unit
+
+
 def are_positions(grid: Grid, axes: Sequence[int]) -> bool:
     """True for two axes with one and the same unit of length: only then is a circle to look round."""
     units = {grid.units[axis] for axis in axes}

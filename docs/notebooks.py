@@ -25,12 +25,13 @@ def render(folder: Path, names: Sequence[str] = ()) -> None:
         if names and path.stem not in names:
             continue
         print(path.stem, flush=True)
-        for picture in folder.glob(f"{path.stem}-*.png"):
+        for picture in folder.glob(f"{path.stem}-*.*"):
             picture.unlink()
         notebook = jupytext.read(path)
         # twice as many pixels, of which ``shrink`` makes one: a surface of small triangles shows no grain
         notebook.cells.insert(0, nbformat.v4.new_code_cell("%config InlineBackend.figure_format = 'retina'"))
-        NotebookClient(notebook, timeout=1200, kernel_name="python3").execute()
+        # lines printed one after the other are one block
+        NotebookClient(notebook, timeout=1200, kernel_name="python3", coalesce_streams=True).execute()
         lines: list[str] = []
         for cell in notebook.cells[1:]:
             lines += [cell.source, ""] if cell.cell_type == "markdown" else ["```py", cell.source, "```", ""]
@@ -44,9 +45,11 @@ def render(folder: Path, names: Sequence[str] = ()) -> None:
 def shown(output: dict, folder: Path, name: str) -> list[str]:
     """The lines of one output: a picture, put into the folder under a name, or text."""
     data = output.get("data", {})
-    if "image/png" in data:
-        (folder / name).write_bytes(base64.b64decode(data["image/png"]))
-        return [f"![a figure of this notebook]({name})", ""]
+    for kind, ending in (("image/png", ".png"), ("image/webp", ".webp")):
+        if kind in data:
+            picture = (folder / name).with_suffix(ending)
+            picture.write_bytes(base64.b64decode(data[kind]))
+            return [f"![a figure of this notebook]({picture.name})", ""]
     text = output.get("text") or data.get("text/plain", "")
     return ["```text", text.rstrip(), "```", ""] if text.strip() else []
 

@@ -41,6 +41,11 @@ _SLIPS = (  # of shapes: words of JAX's, and what most likely led to them
 )
 
 
+def cure(error: Exception) -> str | None:
+    """What a function did that JAX cannot trace, and what to write instead; ``None`` for errors of another kind."""
+    return next((advice for kind, advice in _ADVICE if isinstance(error, kind)), None)
+
+
 def shapes(problem: Problem, grid: Grid, scheme: object) -> None:
     """Refuse functions that cannot be traced on one state or return something else than they should.
 
@@ -201,9 +206,8 @@ def _probe(problem: Problem, name: str, n: int) -> tuple[int, ...] | str:
         verdict, outside, *_ = _trace_once(function, names, tuple(lengths[letter] for letter in names))
     except Exception as error:
         fed = ", ".join(f"{letter} of shape {lengths[letter]}" for letter in names)
-        for kind, advice in _ADVICE:
-            if isinstance(error, kind):
-                raise ValueError(f"{said_call} {advice}.\nIt is traced once on one state, with {fed}") from error
+        if said := cure(error):
+            raise ValueError(f"{said_call} {said}.\nIt is traced once on one state, with {fed}") from error
         if isinstance(error, (TypeError, ValueError, IndexError)):
             said = (str(error).strip() or type(error).__name__).splitlines()[0]
             hint = next((f"\n{advice}" for words, advice in _SLIPS if words in said), "")

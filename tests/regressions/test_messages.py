@@ -168,6 +168,11 @@ def test_a_drift_of_the_wrong_shape_or_kind_is_told_what_to_change(drift, cure):
     assert len(str(caught.value).splitlines()) <= 6
 
 
+def test_a_vector_field_in_numpy_is_told_what_to_change():
+    with pytest.raises(ValueError, match="hands a traced value to NumPy: use jnp in place of np"):
+        hjb.geometry.lie_bracket(lambda x: np.array([x[1], 0.0]), lambda x: x)(jnp.zeros(2))
+
+
 @pytest.mark.parametrize(
     ("ask", "said"),
     [

@@ -176,9 +176,8 @@ def _path(ivp: InitialValueProblem, stepping: Stepping, last: Progress, shown: R
     """The path of full length from its last state and the rows of its intervals, and a mask of those that it ran."""
     loop, x0, start = ivp.loop, ivp.x0, ivp.times[0]
     (t, y, code, count), (later, states, controls, disturbances, active) = last, shown
-    hit = code == PathStatus.TARGET
+    hit, ended = code == PathStatus.TARGET, code == PathStatus.DURATION
     times, states = jnp.append(start, later), jnp.concatenate([x0[None], states])
-    ended = code == PathStatus.DURATION
     if loop.problem.running_max is None:
         # e^{−βτ} exit cost or e^{−βT} terminal cost; a path that ends by leaving or failing owes neither
         exit_cost, final = (loop.number(c, t, y[:-1]) for c in (loop.problem.exit_cost, loop.problem.terminal_cost))

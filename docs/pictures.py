@@ -13,6 +13,7 @@ from hjbjax import zoo
 from hjbjax.cli import gallery
 
 COLOURS = 256  # of a palette: a quarter of the bytes of full colours
+ALIKE = 16  # of the 256 shades of red, of green and of blue count as one when colours are counted
 EXACT = 16  # colours that are kept as they are: paper, panes, frames and lines
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 PAGES = ("README.md", "docs/getting_started.md")
@@ -50,9 +51,9 @@ def run(page: Path, folder: Path) -> None:
 def shrink(picture: Path) -> None:
     """A PNG with a palette in place of colours.
 
-    The palette is made of the colours by the root of how often they occur: by their number alone the large areas take
-    all of it, and a colour scale beside them becomes a staircase. What is drawn at 200 dots an inch is halved, which is
-    smoother than what is drawn at 100.
+    The palette is made of colours that are alike, by the root of how often they occur: by their number the large areas
+    take all of it, and a colour scale beside them becomes a staircase. What is drawn at 200 dots an inch is halved,
+    which is smoother than what is drawn at 100.
     """
     import numpy as np
     from PIL import Image
@@ -62,7 +63,10 @@ def shrink(picture: Path) -> None:
     full = full.resize((full.width // 2, full.height // 2), Image.Resampling.LANCZOS)
     pixels = np.asarray(full).reshape(-1, 3)
     found, place, often = np.unique(pixels, axis=0, return_inverse=True, return_counts=True)
-    row = np.repeat(found, np.sqrt(often).astype(int), axis=0)
+    _, group = np.unique(found // ALIKE, axis=0, return_inverse=True)
+    size = np.bincount(group.ravel(), often)
+    mean = np.stack([np.bincount(group.ravel(), often * shade) / size for shade in found.T], axis=-1)
+    row = np.repeat(mean.astype(np.uint8), np.ceil(np.sqrt(size)).astype(int), axis=0)
     # three rounds of k-means: without them the palette is the colour map alone, and an orange line turns brown
     means = Image.fromarray(row[None]).quantize(COLOURS - EXACT, kmeans=3, dither=Image.Dither.NONE).getpalette()
     # white, above all, stays as it is: a mean of near whites would be grey

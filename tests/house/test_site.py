@@ -74,7 +74,8 @@ def test_no_page_of_a_notebook_shows_the_text_of_an_object():
 
 def test_a_picture_made_small_keeps_its_paper_white_and_its_scale_even(tmp_path):
     image = np.full((200, 400, 3), 255, np.uint8)
-    image[20:180, 20:300] = (200, 60, 20)  # one colour on half of it
+    red, green = np.meshgrid(np.linspace(120, 255, 160), np.linspace(0, 120, 280), indexing="ij")
+    image[20:180, 20:300] = np.stack([red, green, np.full_like(red, 40)], axis=-1)  # thousands of colours on half of it
     shades = (colormaps["viridis"](np.linspace(0, 1, 160))[:, :3] * 255).astype(np.uint8)
     image[20:180, 340:350] = shades[:, None]  # the scale: one pixel in fifty
     picture = tmp_path / "picture.png"
@@ -84,8 +85,8 @@ def test_a_picture_made_small_keeps_its_paper_white_and_its_scale_even(tmp_path)
     assert small.shape == (100, 200, 3)
     assert small[0, 0].tolist() == [255, 255, 255]
     scale = small[12:88, 172]
-    assert np.abs(scale - shades[5:157:2]).max() < 16
-    assert len(np.unique(scale, axis=0)) > 60
+    assert np.abs(scale - shades[5:157:2]).max() < 16  # by Pillow's own palette 31, in 9 steps
+    assert len(np.unique(scale, axis=0)) > 30
 
 
 def test_the_gallery_has_all_ready_problems():

@@ -7,6 +7,7 @@ problem is solved for the page of the gallery. All of it takes some minutes.
 import contextlib
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 from hjbjax import zoo
@@ -19,8 +20,11 @@ BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 PAGES = ("README.md", "docs/getting_started.md")
 
 
-def draw(docs: Path) -> None:
-    """The pictures of the pages, and the gallery."""
+def draw(docs: Path, names: Sequence[str] = ()) -> None:
+    """The pictures of the pages, and the gallery; or those of the ready problems that are named, and no page."""
+    if names:
+        gallery_page([gallery.card(zoo.catalogue[name]) for name in names], docs / "pictures" / "gallery")
+        return
     for old in (docs / "pictures").glob("*.png"):
         old.unlink()
     for page in PAGES:

@@ -12,11 +12,12 @@ import jupytext
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from docutils.utils.math.latex2mathml import tex2mathml
 from matplotlib import colormaps
 from PIL import Image
 
 import hjbjax as hjb
-from docs import notebooks
+from docs import mathml, notebooks
 from docs.docstrings import prepared
 from docs.pictures import shrink
 from hjbjax import zoo
@@ -65,6 +66,16 @@ def test_docstrings_keep_their_bars_and_stars_and_equations():
 def test_the_page_of_a_notebook_has_its_cells(path):
     cells = [cell.source for cell in jupytext.read(path).cells if cell.cell_type == "code"]
     assert notebooks.cells((DOCS / "notebooks" / f"{path.stem}.md").read_text(encoding="utf-8")) == cells
+
+
+@pytest.mark.parametrize(
+    ("tex", "top", "bottom"),
+    [(r"\tfrac12 \mathrm{tr}(x)", "1", "2"), (r"\tfrac32P", "3", "2"), (r"\tfrac12\tau^2", "1", "2")],
+)
+def test_a_fraction_of_two_digits_is_one(tex, top, bottom):
+    """TeX takes one digit for each; docutils takes both for the numerator, and what follows for the denominator."""
+    shown = re.sub(r"\s", "", tex2mathml(mathml.plain(tex)))
+    assert f"<mn>{top}</mn><mn>{bottom}</mn></mfrac>" in shown
 
 
 def test_no_page_of_a_notebook_shows_the_text_of_an_object():

@@ -1,4 +1,5 @@
-"""``python -m docs`` builds the site; ``python -m docs pictures`` and ``notebooks`` make what it shows again.
+"""``python -m docs`` builds the site; ``python -m docs pictures`` and ``notebooks`` make what it shows again,
+all of it or what is named: problems of the zoo, or notebooks.
 
 The site is built from committed pages and pictures: nothing is solved. A warning is an error.
 """
@@ -32,14 +33,14 @@ def main(arguments: Sequence[str]) -> int:
     if name == "pictures":
         from docs import pictures
 
-        pictures.draw(HERE)
+        pictures.draw(HERE, rest)
         return 0
     if name == "notebooks":
         from docs import notebooks
 
-        notebooks.render(HERE / "notebooks")
+        notebooks.render(HERE / "notebooks", rest)
         return 0
-    print(f"docs: got {name!r}, wanted build [FOLDER], pictures or notebooks", file=sys.stderr)
+    print(f"docs: got {name!r}, wanted build [FOLDER], pictures [NAME ...] or notebooks [NAME ...]", file=sys.stderr)
     return 2
 
 

@@ -5,14 +5,16 @@ The pages are committed, so that the site is built without running anything; a t
 
 import base64
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 
 
-def render(folder: Path) -> None:
-    """One page a notebook in a folder, the pictures beside it."""
+def render(folder: Path, names: Sequence[str] = ()) -> None:
+    """One page a notebook in a folder, the pictures beside it; of all notebooks, or of those that are named."""
     import jupytext
+    import nbformat
     from nbclient import NotebookClient
 
     from docs.pictures import shrink
@@ -20,25 +22,34 @@ def render(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     os.environ.pop("MPLBACKEND", None)  # the kernel brings its own, which keeps the pictures
     for path in sorted(NOTEBOOKS.glob("*.py")):
+        if names and path.stem not in names:
+            continue
         print(path.stem, flush=True)
+        for picture in folder.glob(f"{path.stem}-*.*"):
+            picture.unlink()
         notebook = jupytext.read(path)
-        NotebookClient(notebook, timeout=1200, kernel_name="python3").execute()
+        # twice as many pixels, of which ``shrink`` makes one: a surface of small triangles shows no grain
+        notebook.cells.insert(0, nbformat.v4.new_code_cell("%config InlineBackend.figure_format = 'retina'"))
+        # lines printed one after the other are one block
+        NotebookClient(notebook, timeout=1200, kernel_name="python3", coalesce_streams=True).execute()
         lines: list[str] = []
-        for cell in notebook.cells:
+        for cell in notebook.cells[1:]:
             lines += [cell.source, ""] if cell.cell_type == "markdown" else ["```py", cell.source, "```", ""]
             for output in cell.get("outputs", ()):
                 lines += shown(output, folder, f"{path.stem}-{sum(line.startswith('![') for line in lines) + 1}.png")
         (folder / f"{path.stem}.md").write_text("\n".join(lines), encoding="utf-8")
-    for picture in folder.glob("*.png"):
-        shrink(picture)
+        for picture in folder.glob(f"{path.stem}-*.png"):
+            shrink(picture)
 
 
 def shown(output: dict, folder: Path, name: str) -> list[str]:
     """The lines of one output: a picture, put into the folder under a name, or text."""
     data = output.get("data", {})
-    if "image/png" in data:
-        (folder / name).write_bytes(base64.b64decode(data["image/png"]))
-        return [f"![a figure of this notebook]({name})", ""]
+    for kind, ending in (("image/png", ".png"), ("image/webp", ".webp")):
+        if kind in data:
+            picture = (folder / name).with_suffix(ending)
+            picture.write_bytes(base64.b64decode(data[kind]))
+            return [f"![a figure of this notebook]({picture.name})", ""]
     text = output.get("text") or data.get("text/plain", "")
     return ["```text", text.rstrip(), "```", ""] if text.strip() else []
 

@@ -1,24 +1,32 @@
 """``python -m docs pictures``: what the README and the pages show, made by the code that stands beside it.
 
-The Python blocks of a page run in ``docs/pictures``, where their ``savefig`` leaves the pictures; then every ready
+The Python blocks of a page run in ``docs/pictures``, where what they save are the pictures; then every ready
 problem is solved for the page of the gallery. All of it takes some minutes.
 """
 
 import contextlib
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 from hjbjax import zoo
 from hjbjax.cli import gallery
 
-COLOURS = 256  # of a palette: a third of the bytes of full colours
+COLOURS = 256  # of a palette: a quarter of the bytes of full colours
+ALIKE = 16  # of the 256 shades of red, of green and of blue count as one when colours are counted
+EXACT = 16  # colours that are kept as they are: paper, panes, frames and lines
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 PAGES = ("README.md", "docs/getting_started.md")
 
 
-def draw(docs: Path) -> None:
-    """The pictures of the pages, and the gallery."""
+def draw(docs: Path, names: Sequence[str] = ()) -> None:
+    """The pictures of the pages, and the gallery; or those of the ready problems that are named, and no page."""
+    if names:
+        gallery_page([gallery.card(zoo.catalogue[name]) for name in names], docs / "pictures" / "gallery")
+        return
+    for old in (docs / "pictures").glob("*.png"):
+        old.unlink()
     for page in PAGES:
         run(docs.parent / page, docs / "pictures")
     for picture in sorted((docs / "pictures").glob("*.png")):
@@ -32,6 +40,9 @@ def draw(docs: Path) -> None:
 
 def run(page: Path, folder: Path) -> None:
     """The Python blocks of a page, in one namespace, with their files in a folder."""
+    from matplotlib import pyplot
+
+    pyplot.close("all")  # or this page would draw on the axes of the one before
     names: dict[str, object] = {}
     folder.mkdir(parents=True, exist_ok=True)
     with contextlib.chdir(folder):
@@ -42,12 +53,32 @@ def run(page: Path, folder: Path) -> None:
 
 
 def shrink(picture: Path) -> None:
-    """A PNG with a palette in place of colours."""
+    """A PNG with a palette in place of colours.
+
+    The palette is made of colours that are alike, by the root of how often they occur: by their number the large areas
+    take all of it, and a colour scale beside them becomes a staircase. What is drawn at 200 dots an inch is halved,
+    which is smoother than what is drawn at 100.
+    """
+    import numpy as np
     from PIL import Image
 
     with Image.open(picture) as image:
-        # three rounds of k-means: without them the palette is the colour map alone, and an orange line turns brown
-        small = image.convert("RGB").quantize(COLOURS, kmeans=3, dither=Image.Dither.NONE)
+        full = image.convert("RGB")
+    full = full.resize((full.width // 2, full.height // 2), Image.Resampling.LANCZOS)
+    pixels = np.asarray(full).reshape(-1, 3)
+    found, place, often = np.unique(pixels, axis=0, return_inverse=True, return_counts=True)
+    _, group = np.unique(found // ALIKE, axis=0, return_inverse=True)
+    size = np.bincount(group.ravel(), often)
+    mean = np.stack([np.bincount(group.ravel(), often * shade) / size for shade in found.T], axis=-1)
+    row = np.repeat(mean.astype(np.uint8), np.ceil(np.sqrt(size)).astype(int), axis=0)
+    # three rounds of k-means: without them the palette is the colour map alone, and an orange line turns brown
+    means = Image.fromarray(row[None]).quantize(COLOURS - EXACT, kmeans=3, dither=Image.Dither.NONE).getpalette()
+    # white, above all, stays as it is: a mean of near whites would be grey
+    palette = np.concatenate([found[np.argsort(-often)[:EXACT]], np.reshape(means, (-1, 3))])
+    # by ourselves, as Pillow looks for the nearest colour among roughly rounded ones
+    nearest = [np.argmin(np.sum((palette - colour.astype(int)) ** 2, axis=1)) for colour in found]
+    small = Image.fromarray(np.asarray(nearest, np.uint8)[place.ravel()].reshape(full.height, full.width))
+    small.putpalette(palette.astype(np.uint8).ravel().tolist())
     small.save(picture, optimize=True)
 
 

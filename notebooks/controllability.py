@@ -19,6 +19,7 @@
 # $$[g_1, g_2] = \frac{\partial g_2}{\partial x} g_1 - \frac{\partial g_1}{\partial x} g_2.$$
 
 # %%
+import dataclasses
 import warnings
 
 import jax
@@ -103,9 +104,13 @@ reachable = hjb.march(
     scheme=hjb.Upwind(),
 )
 figure, ax = plt.subplots(figsize=(5.4, 3.6), layout="constrained")
-plotting.zero_level_set(reachable, ax=ax)
 place = np.linspace(-1.2, 1.2, 101)
 ax.plot(place, np.abs(place) ** 3 / 3, "--", color="0.4", label="x₂ = |x₁|³/3")
+ax.add_patch(plt.Circle((0, 0), 0.1, fill=False, label="start"))
+# without the problem, whose disc would be called a target
+plotting.zero_level_set(dataclasses.replace(reachable, problem=None), ax=ax, label="reached by t = 1.2")
+ax.set_aspect("equal")
+ax.set_title("", loc="right")  # the set grows forward in time, and the legend says until when
 plt.show()
 assert reachable.value_at(0.0, [0.8, 0.2]) < 0
 assert reachable.value_at(0.0, [0.0, -0.3]) > 0

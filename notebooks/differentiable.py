@@ -23,6 +23,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import hjbjax as hjb
+from hjbjax import plotting
 
 grid = hjb.Grid([-2.0], [2.0], (61,))
 
@@ -81,8 +82,9 @@ with jax.enable_x64(True):
 weights = np.exp(guesses)
 print("weights on the way:", weights.round(4).tolist())
 figure, ax = plt.subplots(figsize=(5.4, 3.2), layout="constrained")
-ax.plot(weights, "o-")
-ax.axhline(hidden, linestyle="--", color="0.4")
+ax.plot(weights, "o-", color=plotting.COLOURS[0], label="found")
+ax.axhline(hidden, linestyle="--", color="0.4", label="hidden")
 ax.set(xlabel="step of Gauss and Newton", ylabel="weight")
+ax.legend(frameon=False)
 plt.show()
 assert abs(weights[-1] - hidden) < 1e-3

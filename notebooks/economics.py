@@ -44,8 +44,9 @@ grid = hjb.Grid([1.5], [9.5], (201,), names=("capital",), edges="constrained")
 growth = hjb.solve(capital, grid)
 share = (0.04 + 0.64 * 0.05) / 0.36
 figure, ax = plt.subplots(figsize=(5.4, 3.2), layout="constrained")
-plotting.policy(growth, ax=ax)
-ax.plot([1.5, 9.5], [1.5 * share, 9.5 * share], "--", color="0.4")
+plotting.policy(growth, ax=ax)[0].set_label("computed")
+ax.plot([1.5, 9.5], [1.5 * share, 9.5 * share], ":", color="black", linewidth=2.5, label="exact")
+ax.legend(frameon=False)
 plt.show()
 print(f"eat {growth.control_at([5.0])[0]:.3f} of a capital of 5; exactly {5 * share:.3f}")
 assert abs(growth.control_at([5.0])[0] - 5 * share) < 0.01
@@ -100,8 +101,8 @@ assert np.abs(european - formula)[inner].max() < 2e-3
 assert np.all(american >= european - 1e-6)
 
 figure, ax = plt.subplots(figsize=(5.4, 3.2), layout="constrained")
-ax.plot(spot, american, label="American")
-ax.plot(spot, european, label="European")
+ax.plot(spot, american, color=plotting.COLOURS[0], label="American")
+ax.plot(spot, european, color=plotting.COLOURS[1], label="European")
 ax.plot(spot, formula, ":", color="black", label="Black and Scholes")
 ax.set(xlim=(0.4, 2.0), ylim=(0, 0.6), xlabel="price", ylabel="value of the put")
 ax.legend(frameon=False)

@@ -17,7 +17,7 @@
 #
 # $$m\ddot\theta - m g\sin\theta = \tau. \qquad (2.1)$$
 #
-# Figures 3 to 5 show the pendulum, and what it does with and without feedback.
+# Figures 3 to 5 of the chapter show the pendulum, and what it does without and with feedback.
 
 # %%
 import jax.numpy as jnp
@@ -32,7 +32,29 @@ system = hjb.zoo.Pendulum()
 start, duration = [0.6, 0.0], 5.0
 
 # %% [markdown]
-# ## Without a torque
+# ## Figure 3: the pendulum
+
+# %%
+figure, ax = plt.subplots(figsize=(2.6, 2.6), layout="constrained")
+tip = np.array([np.sin(0.6), np.cos(0.6)])
+ax.plot([0, 0], [0, 1.15], ":", color="0.5")
+ax.plot([0, tip[0]], [0, tip[1]], color="black")
+ax.plot(*tip, "o", color=plotting.COLOURS[0], markersize=14)
+ax.plot(0, 0, "o", color="black", markersize=5)
+arc = np.linspace(0, 0.6, 20)
+ax.plot(0.45 * np.sin(arc), 0.45 * np.cos(arc), color=plotting.COLOURS[1])
+ax.text(0.14, 0.52, "θ", color=plotting.COLOURS[1], fontsize=12)
+ax.text(tip[0] + 0.12, tip[1], "m", color=plotting.COLOURS[0], fontsize=12, va="center")
+ax.annotate("", (0.22, -0.12), (-0.22, -0.12), arrowprops={"arrowstyle": "->", "connectionstyle": "arc3,rad=0.6"})
+ax.text(0, -0.42, "τ", fontsize=12, ha="center")
+ax.annotate("", (tip[0], tip[1] - 0.55), tip, arrowprops={"arrowstyle": "->", "color": "0.5"})
+ax.text(tip[0] + 0.06, tip[1] - 0.5, "m g", color="0.5", fontsize=12)
+ax.set(xlim=(-0.6, 1.0), ylim=(-0.5, 1.25), aspect="equal")
+ax.set_axis_off()
+plt.show()
+
+# %% [markdown]
+# ## Figure 4: without a torque
 #
 # Upright is an equilibrium, and an unstable one: the linearisation has the eigenvalues $\pm\sqrt g$. A pendulum that is
 # let go swings through hanging and comes back; its energy $\tfrac12\dot\theta^2 + g\cos\theta$ does not change.
@@ -43,8 +65,12 @@ energy = 0.5 * fall.states[:, 1] ** 2 + 9.81 * np.cos(fall.states[:, 0])
 print(f"energy at the start {energy[0]:.4f}, at the end {energy[-1]:.4f}")
 assert np.ptp(energy) < 1e-4
 
+figure, ax = plt.subplots(figsize=(5.4, 3.2), layout="constrained")
+plotting.trajectory(fall, ax=ax, axes=None, grid=grid)
+plt.show()
+
 # %% [markdown]
-# ## With feedback
+# ## Figure 5: with feedback
 #
 # The torque of (2.7) cancels gravity and adds friction and a spring:
 #
@@ -64,9 +90,8 @@ exact = 0.6 * (2 * np.exp(-path.times) - np.exp(-2 * path.times))
 print(f"largest distance from the formula {np.abs(path.states[:, 0] - exact).max():.1e}")
 assert np.abs(path.states[:, 0] - exact).max() < 1e-5
 
-figure, axes = plt.subplots(1, 2, figsize=(10, 3.2), layout="constrained")
-plotting.trajectory(fall, ax=axes[0], axes=None, grid=grid)
-plotting.trajectory(path, ax=axes[1], axes=None, grid=grid)
+figure, ax = plt.subplots(figsize=(5.4, 3.2), layout="constrained")
+plotting.trajectory(path, ax=ax, axes=None, grid=grid)
 plt.show()
 
 # %% [markdown]

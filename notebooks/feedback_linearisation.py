@@ -86,9 +86,10 @@ for joint in (0, 1):
     colour = plotting.COLOURS[joint]
     axes[0].plot(path.times, path.states[:, joint], color=colour, label=f"joint {joint + 1}")
     reference = 0.8 * (np.sin(path.times), np.cos(path.times))[joint]
-    axes[0].plot(path.times, reference, "--", color=colour)
+    axes[0].plot(path.times, reference, "--", color="black", linewidth=0.8, label="wanted" if joint else None)
 axes[0].set(xlabel="t [s]", ylabel="angle [rad]")
 axes[0].legend(frameon=False)
+axes[1].set_xlabel("t [s]")
 names = [f"torque {joint + 1} [N m]" for joint in (0, 1)]
 plotting.controls(path, ax=axes[1], names=names)
 plt.show()

@@ -18,9 +18,12 @@
 # the value of the system, whatever kinks that has.
 
 # %%
+import tempfile
+from pathlib import Path
+
 import matplotlib.pyplot as plt
 import numpy as np
-from IPython.display import HTML
+from IPython.display import Image
 from matplotlib.animation import FuncAnimation
 
 import hjbjax as hjb
@@ -76,8 +79,11 @@ def frame(k):
     return line, dot
 
 
-moving = FuncAnimation(figure, frame, frames=range(0, len(places), 4), interval=80)
-HTML(moving.to_jshtml(default_mode="once"))
+moving = FuncAnimation(figure, frame, frames=np.linspace(0, len(places) - 1, 41).astype(int), interval=120)
+with tempfile.TemporaryDirectory() as folder:
+    moving.save(f"{folder}/particle.webp", writer="pillow", dpi=80)
+    film = Path(f"{folder}/particle.webp").read_bytes()
+Image(film, format="webp")
 
 # %% [markdown]
 # ## What finer grids cost

@@ -62,7 +62,7 @@ axes[0].set_title("computed")
 axes[1].contour(grid.axis(0), grid.axis(1), exact.T, levels, colors="black", linewidths=1)
 axes[1].contour(grid.axis(0), grid.axis(1), np.asarray(solution.value).T, levels, colors="tab:red", linestyles=":")
 axes[1].set_title("exact (black), computed (red)")
-axes[1].set_xlabel("position")
+axes[1].set_xlabel(grid.labels[0])
 plt.show()
 
 # %% [markdown]
@@ -89,10 +89,8 @@ print(f"S(1, 0): computed {solution.value_at([1.0, 0.0]):.3f}, exact {1 - np.exp
 velocity = np.linspace(-2.0, 2.0, 201)
 figure, ax = plt.subplots(figsize=(5.4, 4.2), layout="constrained")
 plotting.policy(solution, ax=ax)
-plotting.switching_curve(solution, ax=ax)
-ax.plot(-0.5 * velocity * abs(velocity), velocity, "--", color="tab:green", label="exact")
-ax.set_xlim(-2.0, 2.0)
-ax.legend(loc="upper right")
+ax.plot(-0.5 * velocity * abs(velocity), velocity, "--", color=plotting.COLOURS[4], label="exact")
+plotting.switching_curve(solution, ax=ax, label="computed switching curve")
 plt.show()
 
 # %% [markdown]

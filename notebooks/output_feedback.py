@@ -35,11 +35,11 @@ from hjbjax import filtering, plotting
 warnings.simplefilter("ignore", hjb.SolveWarning)  # that the grids are coarse is no matter here
 
 # %% [markdown]
-# ## A pendulum that is seen by its angle alone
+# ## Figure 13: an estimate in the loop
 #
-# The torque is bounded by .7 of what gravity pulls with, so that the pendulum has to be swung up, and its velocity is
-# not measured. The value function is solved as if the state were known; an extended Kalman filter says where it is.
-# This is the loop of figure 13: plant, sensor, observer, and the optimal feedback at the estimate.
+# A pendulum is seen by its angle alone. The torque is bounded by .7 of what gravity pulls with, so that the pendulum
+# has to be swung up, and its velocity is not measured. The value function is solved as if the state were known; an
+# extended Kalman filter says where it is. The loop: plant, sensor, observer, and the optimal feedback at the estimate.
 
 
 # %%
@@ -75,7 +75,7 @@ assert np.all(np.cos(path.states[path.times > 17, 0]) > 0.95)
 assert np.max(np.abs(np.sin(path.estimates[50:, 0] - path.states[50:, 0]))) < 0.3
 
 # %% [markdown]
-# ## The law of the state
+# ## Figure 14: the law of the state
 #
 # Where the sensor sees $x^2$ alone, two states fit every record. A Kalman filter believes in one of them; the law on
 # a grid, by the Duncan–Mortensen–Zakai equation (12.6), has both, until drift tells them apart.
@@ -92,17 +92,17 @@ law = filtering.zakai(
 )
 figure, ax = plt.subplots(figsize=(8, 3), layout="constrained")
 ax.pcolormesh(blind.times[1:], line.axis(0), np.sqrt(law.density.T), cmap="Greys", shading="nearest")
-ax.plot(blind.times, blind.states[:, 0], label="state")
-ax.plot(blind.times, blind.estimates[:, 0], "--", label="extended Kalman filter")
+ax.plot(blind.times, blind.states[:, 0], color=plotting.COLOURS[0], label="state")
+ax.plot(blind.times, blind.estimates[:, 0], "--", color=plotting.COLOURS[1], label="extended Kalman filter")
 ax.set(xlabel="t", ylabel="x")
-ax.legend()
+ax.legend(loc="lower right", title="grey: the law on the grid", frameon=False)
 plt.show()
 mass = law.density @ line.volumes()
 assert np.max(np.abs(mass - 1)) < 1e-10
 assert law.density.min() >= 0
 
 # %% [markdown]
-# ## Cost against gain
+# ## Figure 15: the robust information state, and what it buys
 #
 # On $\dot x = x + u + w$, $y = 2x + v$ with cost $\tfrac12\int x^2 + u^2$, Kalman's filter with the regulator's gain is
 # optimal for white noise. The minimum-stress controller takes the state where $p + V$ is largest for the true one, with
@@ -173,8 +173,12 @@ for name, (observer, control) in controllers.items():
 # %% [markdown]
 # Each is best at what it is made for: the first two at the mean cost, the third at the gain, which alone it keeps
 # below 2.5.
+# One of its paths: the state, and the state that is the worst of those that fit the record.
 
 # %%
+figure, ax = plt.subplots(figsize=(8, 3), layout="constrained")
+plotting.estimates(jax.tree.map(lambda entry: entry[0], paths), ax=ax, names=("x",))
+plt.show()
 cost = {name: row[0] for name, row in figures.items()}
 gains = {name: row[2] for name, row in figures.items()}
 assert gains["minimum stress"] < gamma < gains["certainty equivalence"]
@@ -201,15 +205,15 @@ def price(u):  # per unit time, in the state that works and in the one that stan
 
 figure, ax = plt.subplots(figsize=(5, 3.5), layout="constrained")
 values = {}
-for r in (4.0, 1.0, 0.3):
+for r, colour in zip((4.0, 1.0, 0.3), plotting.COLOURS, strict=False):
     machine = filtering.belief_problem(
         repaired, [1.0, -1.0], price, controls=hjb.Finite([[0.0], [2.0]]), discount=0.3, measurement_noise=r
     )
     belief = hjb.solve(machine.problem, machine.grid, tol=1e-6)
     values[r] = belief.value
-    ax.plot(machine.grid.axis(0), belief.value, label=f"r = {r:g}")
+    ax.plot(machine.grid.axis(0), belief.value, color=colour, label=f"r = {r:g}")
 ax.set(xlabel="belief that it works", ylabel="cost")
-ax.legend()
+ax.legend(frameon=False)
 plt.show()
 for value in values.values():
     assert np.max(np.diff(value, 2)) < 1e-6  # concave

@@ -65,11 +65,10 @@ rest = np.stack([angles, np.zeros_like(angles)], axis=-1)
 quadratic = np.array([float(riccati.value(x)) for x in rest])
 
 figure, ax = plt.subplots(figsize=(5.4, 3.2), layout="constrained")
-ax.plot(angles, [solution.value_at(x) for x in rest], label="computed")
-ax.plot(angles, quadratic, "--", label="Riccati")
-ax.set_xlabel("angle")
-ax.set_ylabel("V(angle, 0)")
-ax.legend()
+ax.plot(angles, [solution.value_at(x) for x in rest], color=plotting.COLOURS[0], label="computed")
+ax.plot(angles, quadratic, "--", color=plotting.COLOURS[1], label="Riccati")
+ax.set(xlabel="angle [rad]", ylabel="V(angle, 0)")
+ax.legend(loc="lower left", frameon=False)
 plt.show()
 
 # %% [markdown]

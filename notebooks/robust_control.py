@@ -28,6 +28,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import hjbjax as hjb
+from hjbjax import plotting
 
 warnings.simplefilter("ignore", hjb.SolveWarning)
 
@@ -47,14 +48,14 @@ def game(gamma):
 
 # %%
 figure, ax = plt.subplots(figsize=(5.4, 3.4), layout="constrained")
-for gamma in (0.75, 0.85, 2.0):
+for gamma, colour in zip((0.75, 0.85, 2.0), plotting.COLOURS, strict=False):
     solution = hjb.march(game(gamma), grid, 12.0)
     weight = 1 - gamma**-2
     p = (np.sqrt(1 + weight) - 1) / weight
     error = abs(float(solution.value_at(0.0, [0.5])) - 0.5 * p * 0.25)
     print(f"γ = {gamma}: V(½) off by {error:.1e}, feedback u(½) = {solution.control_at(0.0, [0.5])[0]:.3f}")
     assert error < 2e-3
-    ax.plot(grid.axis(0), solution.value[0], label=f"γ = {gamma}")
+    ax.plot(grid.axis(0), solution.value[0], color=colour, label=f"γ = {gamma}")
 ax.set(xlabel="x", ylabel="V")
 ax.legend(frameon=False)
 plt.show()

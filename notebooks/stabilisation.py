@@ -54,7 +54,7 @@ path = hjb.simulate(problem, system.feedback, [0.3, 0.8, -0.5], 60.0, time_varyi
 energy = np.array([float(system.lyapunov(t, x)) for t, x in zip(path.times, path.states, strict=True)])
 figure, axes = plt.subplots(1, 2, figsize=(10, 3.4), layout="constrained")
 plotting.trajectory(path, ax=axes[0], axes=None)
-axes[1].semilogy(path.times, energy)
+axes[1].semilogy(path.times, energy, color=plotting.COLOURS[0])
 axes[1].set(xlabel="t", ylabel="V")
 plt.show()
 assert np.all(np.diff(energy) < 1e-6)

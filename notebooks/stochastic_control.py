@@ -38,14 +38,14 @@ warnings.simplefilter("ignore", hjb.SolveWarning)
 # %%
 figure, axes = plt.subplots(1, 2, figsize=(10, 3.4), layout="constrained")
 errors = {}
-for noise in (0.25, 0.5, 1.0):
+for noise, colour in zip((0.25, 0.5, 1.0), plotting.COLOURS, strict=False):
     problem, grid = hjb.zoo.bang_bang(noise=noise)
     solution = hjb.solve(problem, grid, tol=1e-8)
     exact = hjb.zoo.bang_bang_exact(noise=noise)
     errors[noise] = max(abs(float(exact([x])) - float(solution.value_at([x]))) for x in np.linspace(-1.5, 1.5, 13))
-    axes[0].plot(grid.axis(0), solution.value, label=f"ε = {noise}")
+    axes[0].plot(grid.axis(0), solution.value, color=colour, label=f"ε = {noise}")
     start = hjb.simulate(problem, hjb.greedy_feedback(problem, solution), [1.5], 5.0, hold=0.02, key=1)
-    axes[1].plot(start.times, start.states[:, 0])
+    axes[1].plot(start.times, start.states[:, 0], color=colour)
 axes[0].set(xlabel="x", ylabel="V")
 axes[0].legend(frameon=False)
 axes[1].set(xlabel="t", ylabel="x")

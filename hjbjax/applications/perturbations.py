@@ -24,6 +24,7 @@ from hjbjax.discretisation.schemes import Limited
 from hjbjax.iteration.methods import Method
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import with_suggestions
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box
 from hjbjax.problem.types import Mask
 from hjbjax.solution.clock import Clock, noting_interrupts
@@ -103,6 +104,7 @@ class Perturbation:
         return "\n".join(lines)
 
 
+@with_suggestions
 def perturbation_study(
     problem: Problem,
     grid: Grid,

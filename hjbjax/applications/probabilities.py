@@ -25,7 +25,7 @@ from hjbjax.markov_chain import attainability, memory, node_checks
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_partial, is_traced
+from hjbjax.problem.pytree import as_partial, is_traced, with_suggestions
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solvers.finite_horizon import march
 from hjbjax.solvers.stationary import check_arguments, solve
@@ -35,6 +35,7 @@ from hjbjax.tracing.interpreter import FallbackWarning
 TOL = 1e-6  # the 1e-3 of ``solve`` would show in the third digit of a probability
 
 
+@with_suggestions
 def reach_probability(
     problem: Problem,
     grid: Grid,
@@ -98,6 +99,7 @@ def reach_probability(
         return _answer(question, grid, horizon, options, sign)
 
 
+@with_suggestions
 def stay_probability(
     problem: Problem,
     grid: Grid,
@@ -145,6 +147,7 @@ def stay_probability(
     return _affine(left, 1.0, -1.0)
 
 
+@with_suggestions
 def expected_exit_time(
     problem: Problem,
     grid: Grid,

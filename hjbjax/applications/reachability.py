@@ -19,11 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_partial
+from hjbjax.problem.pytree import as_partial, with_suggestions
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box
 from hjbjax.problem.types import Array, Control, State
 
 
+@with_suggestions
 def reach(
     drift: Callable,
     controls: AdmissibleSet | None,
@@ -67,6 +68,7 @@ def reach(
     )  # fmt: skip
 
 
+@with_suggestions
 def avoid(
     drift: Callable,
     controls: AdmissibleSet | None,
@@ -103,6 +105,7 @@ def avoid(
     )  # fmt: skip
 
 
+@with_suggestions
 def reach_avoid(
     drift: Callable,
     controls: AdmissibleSet | None,
@@ -143,6 +146,7 @@ def reach_avoid(
     )  # fmt: skip
 
 
+@with_suggestions
 def from_hj_reachability(dynamics: Any, distance: Callable, *, tube: bool = True) -> Problem:
     """The reachability problem of a ``Dynamics`` object of the package hj_reachability, by its modes.
 

@@ -15,6 +15,7 @@ from hjbjax.problem import arguments
 from hjbjax.problem.arguments import INDEXABLE
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import with_suggestions
 from hjbjax.problem.types import DType
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import keeping_warnings
@@ -83,6 +84,7 @@ class Estimate:
         )
 
 
+@with_suggestions
 def estimate(
     problem: Problem,
     grid: Grid,

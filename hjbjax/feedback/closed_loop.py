@@ -102,7 +102,7 @@ def _integrated(given: tuple[InitialValueProblem, Stepping], reverse: bool) -> t
     interval, first = _intervals(*given, reverse)
     interval = jax.checkpoint(interval, prevent_cse=False) if reverse else interval
     last, rows = jax.lax.scan(interval, first, given[0].times[1:])
-    return _path(given[0], last, rows)
+    return _path(*given, last, rows)
 
 
 def blank_record(loop: Loop, x0: np.ndarray, times: np.ndarray) -> tuple[tuple, tuple]:
@@ -144,7 +144,7 @@ def integrate_part(
     cut = (code == PathStatus.DURATION) & (until < len(ivp.times) - 1)
     last = t, y, jnp.where(cut, PathStatus.INTERRUPTED, code).astype(code.dtype), count
     shown = jnp.where(came, later, t), jnp.where(came[:, None], states, y[:-1]), controls, disturbances, active & came
-    return (state, rows), _path(ivp, last, shown)
+    return (state, rows), _path(ivp, stepping, last, shown)
 
 
 def _intervals(ivp: InitialValueProblem, stepping: Stepping, reverse: bool = False) -> tuple[Callable, Progress]:
@@ -172,13 +172,12 @@ def _intervals(ivp: InitialValueProblem, stepping: Stepping, reverse: bool = Fal
     return interval, (start, jnp.append(x0, 0.0), code, jnp.zeros((), jnp.int32))
 
 
-def _path(ivp: InitialValueProblem, last: Progress, shown: Rows) -> tuple[Path, jax.Array]:
+def _path(ivp: InitialValueProblem, stepping: Stepping, last: Progress, shown: Rows) -> tuple[Path, jax.Array]:
     """The path of full length from its last state and the rows of its intervals, and a mask of those that it ran."""
     loop, x0, start = ivp.loop, ivp.x0, ivp.times[0]
     (t, y, code, count), (later, states, controls, disturbances, active) = last, shown
-    hit = code == PathStatus.TARGET
+    hit, ended = code == PathStatus.TARGET, code == PathStatus.DURATION
     times, states = jnp.append(start, later), jnp.concatenate([x0[None], states])
-    ended = code == PathStatus.DURATION
     if loop.problem.running_max is None:
         # e^{−βτ} exit cost or e^{−βT} terminal cost; a path that ends by leaving or failing owes neither
         exit_cost, final = (loop.number(c, t, y[:-1]) for c in (loop.problem.exit_cost, loop.problem.terminal_cost))
@@ -189,7 +188,8 @@ def _path(ivp: InitialValueProblem, last: Progress, shown: Rows) -> tuple[Path, 
         if loop.problem.terminal_cost is not None:
             final = loop.number(loop.problem.terminal_cost, t, y[:-1])
             cost = jnp.where(ended, jnp.maximum(cost, final), cost)
-    return Path(times, states, controls, disturbances, cost, jnp.where(hit, t, jnp.inf), code, count), active
+    reached = jnp.where(hit, t, jnp.inf)
+    return Path(times, states, controls, disturbances, cost, reached, code, count, held=stepping.held), active
 
 
 def _advance(

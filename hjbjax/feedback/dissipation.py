@@ -26,7 +26,7 @@ from hjbjax.feedback.path import Path, PathStatus
 from hjbjax.feedback.simulation import rollout
 from hjbjax.problem import arguments
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_partial, cast, is_traced, pytree_dataclass
+from hjbjax.problem.pytree import as_partial, cast, is_traced, pytree_dataclass, with_suggestions
 from hjbjax.problem.sets import Ball, Box, Finite
 from hjbjax.problem.types import Array, Key, Number, Numbers, State
 from hjbjax.solution.solution import Solution
@@ -97,6 +97,7 @@ class Dissipation:
         return "\n".join(lines)
 
 
+@with_suggestions
 def dissipation(
     problem: Problem,
     solution: Solution,

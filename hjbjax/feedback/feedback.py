@@ -22,7 +22,7 @@ from hjbjax.discretisation.stencil import Links
 from hjbjax.hamiltonian.discrete import DiscreteHamiltonian, optimise
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_jax, as_partial, cast, is_traced, pytree_dataclass
+from hjbjax.problem.pytree import as_jax, as_partial, cast, is_traced, pytree_dataclass, with_suggestions
 from hjbjax.problem.types import Array, Costate, DType, Number, Numbers, State
 from hjbjax.solution.interpolation import extended
 from hjbjax.solution.solution import Solution
@@ -196,6 +196,7 @@ class Greedy:
             return jax.tree.map(np.array, _jit_minimax(greedy, where, costate))
 
 
+@with_suggestions
 def greedy_feedback(problem: Problem, solution: Solution) -> Greedy:
     """A feedback that minimises the Hamiltonian at the state, with the slopes of the solution's value there.
 

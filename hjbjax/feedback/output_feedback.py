@@ -24,7 +24,7 @@ from hjbjax.feedback.path import PathStatus
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import altered, as_partial, cast, is_traced, numbers
+from hjbjax.problem.pytree import altered, as_partial, cast, is_traced, numbers, with_suggestions
 from hjbjax.problem.types import Array, Key, Numbers
 from hjbjax.tracing import checks, closures
 
@@ -32,6 +32,7 @@ ROUNDING = 1e-9  # relative: a duration of 0.3 is three steps of 0.1
 MOST = 10**7  # intervals of a path: 80 MB a state
 
 
+@with_suggestions
 def simulate_output(
     problem: Problem,
     observer: Observer,

@@ -53,7 +53,7 @@ class Interrupted(KeyboardInterrupt):
         self.path = path
 
 
-@pytree_dataclass(host=("message",))
+@pytree_dataclass(static=("held",), host=("message",))
 class Path:
     """A closed loop's history, truncated where it ends.
 
@@ -70,6 +70,7 @@ class Path:
       message: one line on how the path ended.
       promised: V at the start, where the feedback is a Solution or comes of one: up to errors of the grid and the
         integrator, and what is paid after a path that is cut short, no path costs less in the mean. Else None.
+      held: whether each control was held through its interval, so that a picture shows steps.
     """
 
     times: Any  # NumPy arrays and numbers of `simulate`, JAX's of `rollout`, with more axes under vmap
@@ -82,6 +83,7 @@ class Path:
     steps: Any
     message: str = ""
     promised: Any = None
+    held: bool = False
 
     @property
     def status(self) -> PathStatus:
@@ -135,6 +137,7 @@ def joined(first: Path, then: Path, discount: float) -> Path:
         steps=steps,
         message=f"{said}; cost {cost:.6g}{_beside(first.promised)}; {steps} internal steps",
         promised=first.promised,
+        held=first.held or then.held,
     )
 
 
@@ -188,6 +191,7 @@ def truncate(
         steps=int(path.steps),
         message="; ".join(said),
         promised=path.promised,
+        held=path.held,
     )
 
 

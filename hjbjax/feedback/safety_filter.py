@@ -17,7 +17,7 @@ import numpy as np
 
 from hjbjax.feedback.feedback import GridFeedback, Place, is_grid_feedback
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.pytree import as_partial, is_traced, pytree_dataclass
+from hjbjax.problem.pytree import as_partial, is_traced, pytree_dataclass, with_suggestions
 from hjbjax.problem.types import Array, Number
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
@@ -56,6 +56,7 @@ class Filter:
         return where[-1:] if self.tube.times is None else where
 
 
+@with_suggestions
 def least_restrictive(solution: Solution, nominal: GridFeedback | Callable, *, margin: float | None = None) -> Filter:
     """A feedback that leaves the nominal control alone until the tube's boundary, and then does what is safe.
 

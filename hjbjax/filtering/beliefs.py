@@ -32,7 +32,7 @@ import numpy as np
 from hjbjax.problem import arguments, sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_partial, is_traced, numbers, pytree_dataclass
+from hjbjax.problem.pytree import as_partial, is_traced, numbers, pytree_dataclass, with_suggestions
 from hjbjax.problem.sets import AdmissibleSet
 from hjbjax.problem.types import Array, Control, Number, Numbers, State
 
@@ -147,6 +147,7 @@ class BeliefProblem(NamedTuple):
     coordinates: BeliefCoordinates
 
 
+@with_suggestions
 def belief_problem(
     generator: Callable | Numbers,
     h: Callable | Numbers | Sequence,

@@ -21,7 +21,7 @@ import numpy as np
 from hjbjax.feedback.measurement import check_length, check_vector
 from hjbjax.filtering.beliefs import Sensor, chain_functions, check_generator
 from hjbjax.problem import arguments
-from hjbjax.problem.pytree import as_jax, as_partial, cast, is_traced, numbers, pytree_dataclass
+from hjbjax.problem.pytree import as_jax, as_partial, cast, is_traced, numbers, pytree_dataclass, with_suggestions
 from hjbjax.problem.types import Array, Control, Key, Number, Numbers
 
 TERMS = 19  # of the Taylor series: 1/19! is below the rounding of float64 where q dt ≤ 1
@@ -187,6 +187,7 @@ def _check_shapes(generator: Any, h: Any, sensor: Sensor, states: int) -> None:
     sensor.check("WonhamFilter", np.zeros(0))
 
 
+@with_suggestions
 def simulate_hidden(
     observer: WonhamFilter,
     control: Callable | None,

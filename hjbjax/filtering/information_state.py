@@ -19,7 +19,7 @@ from hjbjax.filtering.forward_equation import MOST, substeps
 from hjbjax.filtering.grid_filter import Density, GridFilter, warn_at_ends
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_jax, cast, is_traced, pytree_dataclass
+from hjbjax.problem.pytree import as_jax, cast, is_traced, pytree_dataclass, with_suggestions
 from hjbjax.problem.types import Array, Number, Numbers
 
 
@@ -42,6 +42,7 @@ class InformationState:
     log_likelihood: Any
 
 
+@with_suggestions
 def zakai(
     problem: Problem,
     h: Callable,

@@ -37,7 +37,7 @@ from hjbjax.filtering.max_plus import MOST, MaxPlusMarch, refined_maximum
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_jax, cast, is_traced, pytree_dataclass
+from hjbjax.problem.pytree import as_jax, cast, is_traced, pytree_dataclass, with_suggestions
 from hjbjax.problem.types import Array, Control, Field, Nodes, Number, Numbers, State
 from hjbjax.tracing import components
 from hjbjax.tracing.closures import settled
@@ -180,6 +180,7 @@ class RobustGridFilter:
 _after, _largest = jax.jit(RobustGridFilter._after), jax.jit(refined_maximum)
 
 
+@with_suggestions
 def robust_filter(
     problem: Problem,
     h: Callable,

@@ -20,6 +20,7 @@ import numpy as np
 from hjbjax.problem import arguments
 from hjbjax.problem.pytree import as_partial, cast, is_traced, pytree_dataclass
 from hjbjax.problem.types import Array, Control, DType, Number, State
+from hjbjax.tracing import checks
 
 S = TypeVar("S")
 T = TypeVar("T")
@@ -288,6 +289,14 @@ def in_state_dtype(function: Callable[[State], Array | Number]) -> Callable[[Sta
     """The function with its answer as an array in the dtype of the state, be it a list, an integer or a constant."""
 
     def call(x):
-        return jnp.asarray(function(x), x.dtype)
+        try:
+            return jnp.asarray(function(x), x.dtype)
+        except jax.errors.JAXTypeError as error:
+            said = checks.cure(error)
+            if said is None:
+                raise
+            raise ValueError(
+                f"a function of the state {said}.\nIt is differentiated, with x of shape {x.shape}"
+            ) from error
 
     return call

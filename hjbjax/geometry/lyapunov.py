@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.geometry.unit_cube import half_widths, nearest_inside, state_of, time_of
-from hjbjax.problem.pytree import cast, pytree_dataclass
+from hjbjax.problem.pytree import cast, pytree_dataclass, with_suggestions
 from hjbjax.problem.sets import Ball, Box
 from hjbjax.problem.types import Array, Number, State
 from hjbjax.solution.screen import encodable
@@ -95,6 +95,7 @@ def lyapunov_derivative(V: Callable, f: Callable, *, time_varying: bool = False)
     return lambda x: jax.jvp(V, (x,), (f(x),))[1]
 
 
+@with_suggestions
 def lyapunov_check(
     V: Callable,
     f: Callable,

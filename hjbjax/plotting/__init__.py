@@ -11,10 +11,10 @@ from ``Grid(names=, units=)`` and ``Problem(control_names=, control_units=)``; t
 one scale, and angles have ticks at multiples of π. A solution that remembers its problem has its target outlined.
 """
 
-from hjbjax.plotting.costates import costates
 from hjbjax.plotting.estimates import density, estimates
-from hjbjax.plotting.level_sets import animation, zero_level_set
-from hjbjax.plotting.maps import closed_loop, controls, policy, switching_curve, trajectory, value
+from hjbjax.plotting.histories import controls, costates
+from hjbjax.plotting.level_sets import Scene, animation, turning_surface, zero_level_set
+from hjbjax.plotting.maps import closed_loop, policy, switching_curve, trajectory, value
 from hjbjax.plotting.studies import convergence, perturbation, residuals
 from hjbjax.plotting.style import COLOURS, GREY, Picture, styled
 from hjbjax.plotting.surfaces import level_surface
@@ -23,6 +23,7 @@ __all__ = [
     "COLOURS",
     "GREY",
     "Picture",
+    "Scene",
     "animation",
     "closed_loop",
     "controls",
@@ -37,6 +38,7 @@ __all__ = [
     "styled",
     "switching_curve",
     "trajectory",
+    "turning_surface",
     "value",
     "zero_level_set",
 ]

@@ -10,7 +10,7 @@ import numpy as np
 from hjbjax.plotting.scales import is_angle, set_ticks
 from hjbjax.plotting.shading import Look, draw
 from hjbjax.plotting.slices import section_of
-from hjbjax.plotting.style import COLOURS, Picture, axes_of, label_axes, legend
+from hjbjax.plotting.style import COLOURS, Picture, axes_of, drawing, label_axes, legend
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.types import Array
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from hjbjax.feedback.output_loop import OutputPath
 
 
+@drawing
 def estimates(
     path: OutputPath,
     *,
@@ -91,6 +92,7 @@ def estimates(
     return Picture([*artists, legend(ax)], ax)
 
 
+@drawing
 def density(
     values: Array,
     grid: Grid,

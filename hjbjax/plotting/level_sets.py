@@ -7,12 +7,13 @@ some state above it belongs to the set, so that the value is minimised over the 
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from hjbjax.plotting.scales import is_angle, set_ticks
+from hjbjax.plotting.scales import angle_step, angle_text, box_sides, is_angle, set_ticks
 from hjbjax.plotting.shading import frame, outlined
 from hjbjax.plotting.slices import (
     Cuts,
@@ -26,7 +27,7 @@ from hjbjax.plotting.slices import (
     section_of,
     sets_of,
 )
-from hjbjax.plotting.style import COLOURS, Picture, axes_of, legend, solid_axes
+from hjbjax.plotting.style import COLOURS, Picture, axes_of, drawing, legend, solid_axes
 from hjbjax.plotting.surfaces import level_surface, lit, thinned
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import SIDES, Labels
@@ -55,6 +56,7 @@ class Field:
         return section_of("zero_level_set", self.values, self.grid, fixed, self.caption)
 
 
+@drawing
 def zero_level_set(
     solution: Solution,
     *,
@@ -96,13 +98,7 @@ def zero_level_set(
       >>> len(zero_level_set(SimpleNamespace(grid=grid, value=disc, times=None), fill=False))
       1
     """
-    if inside is None:
-        inside = getattr(solution, "labels", Labels()).inside
-    if inside not in SIDES:
-        raise ValueError(f"zero_level_set: got inside = {inside!r}, wanted 'below' (V ≤ 0) or 'above' (V ≥ 0)")
-    values, caption = at_time(solution, solution.value, time)
-    sign = 1 if inside == "below" else -1  # from here on the set is {V ≤ 0} in either case
-    field = _projection(Field(sign * values, solution.grid, caption), project)
+    field = _projection(_field(solution, inside, time), project)
     # by name: a projection has taken axes out, and the numbers of the others have changed
     cuts = {field.grid.names[axis_number(key, field.grid)]: place for key, place in dict(fixed or {}).items()}
     if field.grid.ndim - len(cuts) == 3:
@@ -119,6 +115,92 @@ def zero_level_set(
     if label or ax.get_legend_handles_labels()[1]:
         legend(ax)
     return Picture(artists, ax)
+
+
+@drawing
+def turning_surface(
+    solution: Solution,
+    *,
+    fixed: Cuts | None = None,
+    project: int | str | Sequence[int | str] = (),
+    inside: str | None = None,
+    time: float | None = None,
+    color: str = COLOURS[0],
+) -> Scene:
+    """The boundary of {V ≤ 0} over three axes as a page of plotly's, to be turned and zoomed with the mouse.
+
+    Needs plotly, ``pip install 'hjbjax[plot3d]'``.
+
+    Args:
+      solution: the solution of ``solve`` or ``march``.
+
+    Keyword Args:
+      fixed, project, inside, time, color: as for :func:`zero_level_set`.
+
+    Returns:
+      The scene: ``.figure`` is plotly's, ``.save("tube.html")`` writes a page that needs no other file.
+
+    Raises:
+      ValueError: not three axes are free.
+      ImportError: plotly is not installed.
+    """
+    from matplotlib.colors import to_hex
+
+    try:
+        from plotly import graph_objects
+    except ImportError as error:
+        raise ImportError(
+            "turning_surface: plotly is not installed: pip install 'hjbjax[plot3d]'; zero_level_set does without"
+        ) from error
+    field = _projection(_field(solution, inside, time), project)
+    cuts = {field.grid.names[axis_number(key, field.grid)]: place for key, place in dict(fixed or {}).items()}
+    count = field.grid.ndim - len(cuts)
+    if count != 3:
+        raise ValueError(f"turning_surface: {count} axes are free, wanted three: fixed= cuts, project= casts a shadow")
+    free, values, lines = _cube(field, cuts)
+    triangles = level_surface(values, lines)
+    corners = triangles.reshape(-1, 3)
+    # corners that triangles share are one vertex, but for rounding
+    spans = np.array([line[-1] - line[0] for line in lines])
+    _, first, index = np.unique(np.round(corners / spans, 9), axis=0, return_index=True, return_inverse=True)
+    (x, y, z), (i, j, k) = corners[first].T, index.reshape(-1, 3).T
+    # in our light: plotly's goes by the order of corners, which tells nothing of where the inside is
+    faces = [to_hex(shade) for shade in lit(triangles, values, lines, color)]
+    light = {"ambient": 1.0, "diffuse": 0.0, "specular": 0.0, "fresnel": 0.0}
+    mesh = graph_objects.Mesh3d(x=x, y=y, z=z, i=i, j=j, k=k, facecolor=faces, opacity=OPACITY, lighting=light)
+    scene: dict[str, Any] = {
+        f"{name}axis": {"title": field.grid.labels[axis], "range": [float(line[0]), float(line[-1])]}
+        for name, axis, line in zip("xyz", free, lines, strict=True)
+    }
+    for name, axis, line in zip("xyz", free, lines, strict=True):
+        if is_angle(field.grid, axis) and (step := angle_step(line[0], line[-1])):
+            ticks = step * np.arange(np.ceil(line[0] / step - 1e-9), np.floor(line[-1] / step + 1e-9) + 1)
+            scene[f"{name}axis"] |= {"tickvals": ticks, "ticktext": [angle_text(tick) for tick in ticks]}
+    sides = dict(zip("xyz", box_sides(field.grid, free), strict=True))
+    scene |= {"aspectmode": "manual", "aspectratio": sides}
+    margin = {"l": 0, "r": 0, "b": 0, "t": 40 * bool(field.caption)}
+    return Scene(graph_objects.Figure(data=[mesh], layout={"scene": scene, "title": field.caption, "margin": margin}))
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """A figure of plotly's."""
+
+    figure: Any
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write a page that needs no other file and no network: 5 MB, most of them plotly itself."""
+        self.figure.write_html(os.fspath(path), include_plotlyjs=True)
+
+
+def _field(solution: Solution, inside: str | None, time: float | None) -> Field:
+    """The value at one time, with the sign by which the set is {V ≤ 0} whatever the problem is about."""
+    if inside is None:
+        inside = getattr(solution, "labels", Labels()).inside
+    if inside not in SIDES:
+        raise ValueError(f"zero_level_set: got inside = {inside!r}, wanted 'below' (V ≤ 0) or 'above' (V ≥ 0)")
+    values, caption = at_time(solution, solution.value, time)
+    return Field(values if inside == "below" else -values, solution.grid, caption)
 
 
 def _projection(field: Field, project: int | str | Sequence[int | str]) -> Field:
@@ -166,16 +248,22 @@ def _outlines(ax: Axes, solution: Solution, section: Section, time: float | None
     return [artist for region in regions for artist in outlined(ax, region, inside=False)]
 
 
+def _cube(field: Field, fixed: Mapping[str, float]) -> tuple[list[int], np.ndarray, list[np.ndarray]]:
+    """The three axes that are not fixed, by number, the field over them, and their coordinates."""
+    grid = field.grid
+    free = [axis for axis in range(grid.ndim) if grid.names[axis] not in fixed]
+    cuts = {grid.names.index(name): float(place) for name, place in fixed.items()}
+    closed = closed_field(cut_field("zero_level_set", field.values, grid, cuts), grid, free)
+    return free, *thinned(closed, [closed_axis(grid, axis) for axis in free])
+
+
 def _surface(field: Field, fixed: Mapping[str, float], ax: Any, color: str, label: str | None) -> Picture:
     """The surface V = 0 over the three axes that are not fixed."""
     from matplotlib.ticker import MaxNLocator
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-untyped]
 
     grid = field.grid
-    free = [axis for axis in range(grid.ndim) if grid.names[axis] not in fixed]
-    cuts = {grid.names.index(name): float(place) for name, place in fixed.items()}
-    closed = closed_field(cut_field("zero_level_set", field.values, grid, cuts), grid, free)
-    closed, lines = thinned(closed, [closed_axis(grid, axis) for axis in free])
+    free, closed, lines = _cube(field, fixed)
     triangles = level_surface(closed, lines)
     artists: list[Artist] = []
     if len(triangles):
@@ -186,10 +274,12 @@ def _surface(field: Field, fixed: Mapping[str, float], ax: Any, color: str, labe
     ends = [(float(line[0]), float(line[-1])) for line in lines]
     ax.set(xlim=ends[0], ylim=ends[1], zlim=ends[2])
     for axis, number, text in zip((ax.xaxis, ax.yaxis, ax.zaxis), free, "xyz", strict=True):
-        axis.set_major_locator(MaxNLocator(4))  # seen from the side, more would run into each other
+        # seen from the side, more would run into each other, and so would the last of x and the first of y
+        axis.set_major_locator(MaxNLocator(4, prune="upper" if text == "x" else None))
         set_ticks(axis, is_angle(grid, number))
         getattr(ax, f"set_{text}label")(grid.labels[number], labelpad=8)
-    ax.set_box_aspect((1, 1, 0.8), zoom=0.86)  # smaller than its frame, or the label on the right would be cut
+    # smaller than its frame, or the label on the right would be cut
+    ax.set_box_aspect(box_sides(grid, free), zoom=0.86)
     if field.caption:
         ax.set_title(field.caption, loc="right", fontsize=9)
     if label and artists:
@@ -198,6 +288,7 @@ def _surface(field: Field, fixed: Mapping[str, float], ax: Any, color: str, labe
     return Picture(artists, ax)
 
 
+@drawing
 def animation(
     solution: Solution,
     draw: Callable[..., Picture] = zero_level_set,

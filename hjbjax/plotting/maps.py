@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hjbjax.plotting.histories import controls
 from hjbjax.plotting.scales import is_angle, scale_axes, set_ticks
-from hjbjax.plotting.shading import Look, around, continued, draw, frame, is_level, jumps
+from hjbjax.plotting.shading import Look, continued, draw, frame, is_level, jumps
 from hjbjax.plotting.slices import (
     Cuts,
     Region,
@@ -24,9 +25,8 @@ from hjbjax.plotting.slices import (
     without_jumps,
     zeros,
 )
-from hjbjax.plotting.style import COLOURS, Picture, axes_of, label_axes, legend, new_figure, styled
+from hjbjax.plotting.style import COLOURS, Picture, axes_of, drawing, label_axes, legend, new_figure, styled
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.labels import Labels
 from hjbjax.problem.types import Number, State
 
 if TYPE_CHECKING:
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from hjbjax.solution.solution import Solution
 
 
+@drawing
 def value(
     solution: Solution,
     *,
@@ -101,6 +102,7 @@ def _without(section: Section, target: Callable[[State], Number] | None) -> tupl
     return section._replace(values=np.ma.array(section.values.data, mask=mask)), (region,)
 
 
+@drawing
 def policy(
     solution: Solution,
     *,
@@ -134,6 +136,7 @@ def policy(
     return Picture(draw(ax, section, look, regions), ax)
 
 
+@drawing
 def switching_curve(
     solution: Solution,
     *,
@@ -180,6 +183,7 @@ def switching_curve(
     return Picture(artists, ax)
 
 
+@drawing
 def trajectory(
     path: Path,
     *,
@@ -247,41 +251,7 @@ def trajectory(
     return Picture(artists, ax)
 
 
-def controls(
-    path: Path, *, ax: Axes | None = None, names: Sequence[str] | None = None, solution: Solution | None = None
-) -> Picture:
-    """The inputs of a path over time, each constant over its step; ``path.controls`` has shape (k, m).
-
-    Args:
-      path: the path of ``simulate``.
-
-    Keyword Args:
-      ax: matplotlib axes to draw on; ``None`` takes pyplot's current ones.
-      names: of the inputs.
-      solution: gives the names, and the range beside which a variation counts as none.
-
-    Returns:
-      The picture: one step line an input.
-    """
-    times, inputs = np.asarray(path.times), np.asarray(path.controls)
-    count = inputs.shape[1]
-    words = getattr(solution, "labels", Labels())
-    names = tuple(names or (words.control(i, count) for i in range(count)))
-    ax = axes_of(ax, wide=True)
-    colours = itertools.cycle(COLOURS)
-    artists: list[Artist] = [
-        ax.stairs(inputs[:, i], times, baseline=None, color=next(colours), linewidth=1.4, label=names[i])
-        for i in range(count)
-    ]
-    label_axes(ax, "t", names[0] if count == 1 else "control")
-    set_ticks(ax.xaxis, False)
-    set_ticks(ax.yaxis, False)
-    span = max((span_of(solution, i) for i in range(count)), default=0.0) if solution is not None else 0.0
-    if inputs.size and is_level(inputs, span):  # or the axis would show its rounding
-        ax.set_ylim(*around(float(np.mean(inputs)), span))
-    return Picture(artists if count < 2 else [*artists, legend(ax)], ax)
-
-
+@drawing
 def closed_loop(
     solution: Solution,
     path: Path,

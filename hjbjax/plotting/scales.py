@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from hjbjax.problem.grid import Grid
 
 if TYPE_CHECKING:
@@ -58,10 +56,39 @@ def is_angle(grid: Grid, axis: int) -> bool:
     return math.isclose(float(grid.hi[axis]) - float(grid.lo[axis]), 2 * math.pi, rel_tol=1e-6)
 
 
+def place_text(grid: Grid, axis: int, place: float) -> str:
+    """A coordinate with its unit, as a caption says it; of an angle the simple multiples of π.
+
+    Example:
+      >>> place_text(Grid([0.0], [math.tau], (4,), (True,), units=("rad",)), 0, math.pi / 2)
+      'π/2 rad'
+    """
+    unit = f" {grid.units[axis]}" if grid.units[axis] else ""
+    eighths = 8 * place / math.pi
+    simple = is_angle(grid, axis) and math.isclose(eighths, round(eighths), abs_tol=1e-6)
+    return (angle_text(place) if simple else f"{place:.4g}") + unit
+
+
 def are_positions(grid: Grid, axes: Sequence[int]) -> bool:
     """True for two axes with one and the same unit of length: only then is a circle to look round."""
     units = {grid.units[axis] for axis in axes}
     return len(axes) == 2 and len(units) == 1 and units <= set(LENGTHS)
+
+
+def box_sides(grid: Grid, axes: Sequence[int]) -> tuple[float, ...]:
+    """The sides on which three axes are drawn: those with one and the same unit of length have one scale.
+
+    Example:
+      >>> box_sides(Grid([0.0] * 3, [4.0, 2.0, 9.0], (2, 2, 2), units=("m", "m", "rad")), (0, 1, 2))
+      (1.0, 0.5, 0.8)
+    """
+    spans = [float(grid.hi[axis] - grid.lo[axis]) for axis in axes]
+    units = [grid.units[axis] for axis in axes]
+    alike = [unit in LENGTHS and units.count(unit) > 1 for unit in units]
+    longest = max((span for span, one in zip(spans, alike, strict=True) if one), default=1.0)
+    return tuple(
+        span / longest if one else usual for span, one, usual in zip(spans, alike, (1.0, 1.0, 0.8), strict=True)
+    )
 
 
 def set_ticks(axis: Any, angle: bool) -> None:
@@ -69,13 +96,22 @@ def set_ticks(axis: Any, angle: bool) -> None:
     from matplotlib.ticker import FuncFormatter, MultipleLocator
 
     axis.set_major_formatter(FuncFormatter(number_text))
-    if not angle:
-        return
-    turns = abs(np.diff(axis.get_view_interval()).item()) / math.pi
-    fitting = [step for step in STEPS if FEWEST <= math.floor(turns / step + 1e-9) + 1 <= MOST]
-    if fitting:
-        axis.set_major_locator(MultipleLocator(float(fitting[0]) * math.pi))
+    step = angle_step(*axis.get_view_interval()) if angle else None
+    if step is not None:
+        axis.set_major_locator(MultipleLocator(step))
         axis.set_major_formatter(FuncFormatter(angle_text))
+
+
+def angle_step(lo: float, hi: float) -> float | None:
+    """The multiple of π between two ticks of an angle; ``None`` where there would be too few of them, or too many.
+
+    Example:
+      >>> angle_step(-math.pi, math.pi) == math.pi / 2
+      True
+    """
+    turns = abs(hi - lo) / math.pi
+    fitting = [step for step in STEPS if FEWEST <= math.floor(turns / step + 1e-9) + 1 <= MOST]
+    return float(fitting[0]) * math.pi if fitting else None
 
 
 def scale_axes(ax: Axes, grid: Grid, axes: Sequence[int]) -> None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 import jax
 import numpy as np
 
+from hjbjax.plotting.scales import place_text
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import Labels
 from hjbjax.problem.sets import Ball, Box
@@ -179,9 +180,8 @@ def section_of(
         raise ValueError(f"{what}: {_how_many(grid, free)}")
     field = closed_field(cut_field(what, field, grid, cuts, nearest), grid, free)
     coordinates = tuple(closed_axis(grid, axis) for axis in free)
-    units = [f" {unit}" if unit else "" for unit in grid.units]
     places = [caption] * bool(caption)
-    places += [f"{grid.names[axis]} = {cuts[axis]:.4g}{units[axis]}" for axis in sorted(cuts)]
+    places += [f"{grid.names[axis]} = {place_text(grid, axis, cuts[axis])}" for axis in sorted(cuts)]
     return Section(
         free, tuple(grid.labels[axis] for axis in free), coordinates, np.ma.masked_invalid(field), ", ".join(places),
         grid, cuts,

@@ -8,7 +8,18 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from hjbjax.plotting.shading import bands
-from hjbjax.plotting.style import COLOURS, GREY, Picture, axes_of, label_axes, legend, logarithmic, pair_of_axes
+from hjbjax.plotting.style import (
+    COLOURS,
+    GREY,
+    Picture,
+    axes_of,
+    drawing,
+    label_axes,
+    legend,
+    logarithmic,
+    pair_of_axes,
+)
+from hjbjax.problem.pytree import with_suggestions
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -19,6 +30,7 @@ if TYPE_CHECKING:
     from hjbjax.solution.solution import Solution
 
 
+@with_suggestions
 def convergence(study: Study, *, ax: Axes | Sequence[Axes] | np.ndarray | None = None) -> Picture:
     """The errors of a convergence study over the spacing and over the seconds, with the fitted orders.
 
@@ -64,6 +76,7 @@ def convergence(study: Study, *, ax: Axes | Sequence[Axes] | np.ndarray | None =
     return Picture(artists, axes[0])
 
 
+@drawing
 def perturbation(study: Perturbation, *, ax: Axes | None = None) -> Picture:
     """The changes of value and feedback over ε and over 1/γ in one picture, with the fitted orders.
 
@@ -105,6 +118,7 @@ def perturbation(study: Perturbation, *, ax: Axes | None = None) -> Picture:
     return Picture(artists, ax)
 
 
+@with_suggestions
 def residuals(solution: Solution, *, ax: Axes | None = None, label: str | None = None) -> Picture:
     """The residual after each step on a logarithmic scale; steps where it is not finite are marked grey.
 

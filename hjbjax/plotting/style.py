@@ -5,10 +5,15 @@ Nothing here knows what the numbers mean. Only functions import matplotlib, and 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, cast
+import functools
+import inspect
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
 
 import numpy as np
+
+from hjbjax.problem.arguments import shown
+from hjbjax.problem.pytree import with_suggestions
 
 if TYPE_CHECKING:
     import os
@@ -30,6 +35,41 @@ COLOURS = (
 )  # Okabe and Ito: safe for all eyes
 NARROW, WIDE, SOLID = (5.4, 4.2), (5.4, 3.2), (5.4, 4.8)  # inches: of planes, of lines over time, of surfaces
 DPI = 200  # of saved pictures, unless given
+DRAWN = {  # what is drawn, by the name of the argument: the attributes that it must have, and what has them
+    "solution": (("grid", "value"), "the Solution of solve or march"),
+    "path": (("times", "states"), "the Path of simulate"),
+    "extremal": (("times", "costates"), "the extremal of pontryagin"),
+    "study": (("errors", "fitted"), "the result of convergence_study"),
+}
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def drawing(function: Callable[P, T]) -> Callable[P, T]:
+    """Decorator of the functions that draw: what is no solution, no path or no axes is refused in their words.
+
+    Raises:
+      TypeError: with what was got, what was wanted, and how to come to it.
+    """
+    names = list(inspect.signature(function).parameters)
+    checked = with_suggestions(function)
+
+    @functools.wraps(function)
+    def drawn(*arguments: P.args, **options: P.kwargs) -> T:
+        for number, (name, thing) in enumerate((*zip(names, arguments, strict=False), *options.items())):
+            attributes, words = DRAWN.get(name, ((), ""))
+            # an argument that may be left out is None then
+            if not all(hasattr(thing, attribute) for attribute in attributes) and (thing is not None or number == 0):
+                raise TypeError(f"{function.__name__}: got {name} = {shown(thing)}, wanted {words}")
+        ax = options.get("ax")
+        if hasattr(ax, "add_subplot"):
+            raise TypeError(f"{function.__name__}: got a figure as ax, wanted axes on it: ax=figure.add_subplot()")
+        if isinstance(ax, np.ndarray):
+            raise TypeError(f"{function.__name__}: got {ax.size} axes as ax, wanted one of them, as in ax=ax[0]")
+        return checked(*arguments, **options)
+
+    return drawn
 
 
 class Picture(list):
@@ -92,9 +132,11 @@ def solid_axes(ax: Axes | None) -> Any:
 
 
 def new_figure(size: tuple[float, float]) -> Figure:
-    """A new figure of pyplot's."""
+    """Pyplot's current figure as long as it is empty, else a new one."""
     from matplotlib import pyplot
 
+    if pyplot.get_fignums() and not pyplot.gcf().axes and not pyplot.gcf().subfigs:
+        return pyplot.gcf()
     return pyplot.figure(figsize=size, layout="constrained")
 
 

@@ -22,6 +22,25 @@ from hjbjax.problem.types import DType, Numbers
 
 P = ParamSpec("P")
 T = TypeVar("T")
+ELSEWHERE = {  # words that other packages and books have for an argument, and ours
+    **dict.fromkeys(("dynamics", "f", "ode", "fun"), ("drift",)),
+    **dict.fromkeys(("loss", "l", "lagrangian"), ("cost",)),
+    **dict.fromkeys(("gamma", "beta", "rho", "rate"), ("discount",)),
+    **dict.fromkeys(("u", "action", "actions", "input", "inputs"), ("controls",)),
+    **dict.fromkeys(("d", "adversary", "opponent"), ("disturbances",)),
+    **dict.fromkeys(("sigma", "diffusion", "epsilon"), ("noise",)),
+    **dict.fromkeys(("tolerance", "eps", "atol", "threshold"), ("tol",)),
+    **dict.fromkeys(("initial", "init", "v0", "initial_values"), ("guess",)),
+    **dict.fromkeys(("t", "tf", "t_final", "t_span", "time"), ("horizon", "duration")),
+    **dict.fromkeys(("min", "lower", "left"), ("lo",)),
+    **dict.fromkeys(("max", "upper", "right"), ("hi",)),
+    **dict.fromkeys(("n", "num", "size", "points", "nodes", "resolution"), ("shape", "points")),
+    **dict.fromkeys(("dt", "time_step"), ("step", "max_step")),
+    **dict.fromkeys(("goal",), ("target",)),
+    **dict.fromkeys(("slice", "cut", "at"), ("fixed",)),
+    **dict.fromkeys(("accuracy", "order", "discretization"), ("scheme",)),
+    **dict.fromkeys(("solver", "algorithm"), ("method",)),
+}
 REMEMBERED = 256  # answers of one function that are kept, the latest: the keys hold functions, and what these hold
 
 
@@ -85,7 +104,8 @@ def with_suggestions(function: Callable[P, T], name: str | None = None) -> Calla
         for word in options.keys() - by_name:
             # running_cost is the cost, though more like running_max
             parts = [part for part in word.split("_")[::-1] if part in by_name]
-            near = parts or difflib.get_close_matches(word, by_name)
+            elsewhere = [own for own in ELSEWHERE.get(word.lower(), ()) if own in by_name]
+            near = parts or elsewhere or difflib.get_close_matches(word, by_name)
             cure = f"did you mean {near[0]}?" if near else f"wanted one of {', '.join(sorted(by_name - {'self'}))}"
             raise TypeError(f"{name or function.__name__}() got an unexpected keyword argument {word!r}: {cure}")
         return function(*arguments, **options)

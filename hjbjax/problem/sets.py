@@ -47,9 +47,13 @@ class Box:
     """
 
     lo: Any
-    hi: Any
+    hi: Any = None
 
     def __post_init__(self):
+        if self.hi is None:
+            pair = np.shape(self.lo) == (2,)
+            cure = f"Box({self.lo[0]!r}, {self.lo[1]!r})" if pair else "Box([-1.0], [1.0])"
+            raise TypeError(f"Box: got lo = {self.lo!r} alone, wanted both bounds, as in hjb.{cure}")
         lo, hi = _finite_numbers(self.lo, "Box.lo"), _finite_numbers(self.hi, "Box.hi")
         if np.ndim(lo) == np.ndim(hi) == 0:
             lo, hi = lo.reshape(1), hi.reshape(1)

@@ -130,11 +130,14 @@ def _cuts(solution: _Answer) -> str:
         return ""
     # of a marched solution the worst of the kept times, shape (n, 2)
     counts = np.max(np.asarray(solution.cut).reshape(-1, solution.grid.ndim, 2), axis=0)
-    ends = [
-        f"{counts[axis, side]} of the {('lower', 'upper')[side]} end of {solution.grid.names[axis]}"
-        for axis, side in np.argwhere(counts)
-    ]
-    return f"drift out of the box, at these nodes: {', '.join(ends)}"
+
+    # short, as a screen has one line for it: an axis takes some 30 characters
+    def both(lower: int, upper: int) -> str:
+        return ", ".join(f"{count} {end}" for count, end in ((lower, "lower"), (upper, "upper")) if count)
+
+    axes = np.flatnonzero(np.any(counts, axis=1))
+    ends = ", ".join(f"{solution.grid.names[axis]} ({both(*counts[axis].tolist())})" for axis in axes)
+    return f"drift out of the box, nodes at the ends: {ends}"
 
 
 def _error(solution: _Answer) -> str:

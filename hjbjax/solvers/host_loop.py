@@ -9,6 +9,7 @@ Memory that runs out on the way and callbacks of the user's that raise leave wit
 """
 
 import contextlib
+import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -151,7 +152,9 @@ def progress_bar(progress: bool | None, options: dict[str, Any]) -> Iterator[Any
         return
     from tqdm import tqdm
 
-    with tqdm(**{"delay": 1, "leave": False, **options}) as bar:
+    # a terminal that tells no size, as of `script` and of some editors, would get nothing from tqdm
+    size = shutil.get_terminal_size()
+    with tqdm(**{"delay": 1, "leave": False, "ncols": size.columns, "nrows": size.lines, **options}) as bar:
         yield bar
 
 

@@ -36,6 +36,17 @@ _ADVICE = (  # most special first: a TracerBoolConversionError is a Concretizati
     ),
 )
 
+_SLIPS = (  # of shapes: words of JAX's, and what most likely led to them
+    ("annot stack arrays", "u and d are arrays, also of one entry: u[0] is the number"),
+    ("must have the same shape", "u and d are arrays, also of one entry: u[0] is the number"),
+    ("Too many indices", "x is one state, without an axis for a batch: x[0] is its first entry"),
+)
+
+
+def cure(error: Exception) -> str | None:
+    """What a function did that JAX cannot trace, and what to write instead; ``None`` for errors of another kind."""
+    return next((advice for kind, advice in _ADVICE if isinstance(error, kind)), None)
+
 
 def shapes(problem: Problem, grid: Grid, scheme: object) -> None:
     """Refuse functions that cannot be traced on one state or return something else than they should.
@@ -197,12 +208,12 @@ def _probe(problem: Problem, name: str, n: int) -> tuple[int, ...] | str:
         verdict, outside, *_ = _trace_once(function, names, tuple(lengths[letter] for letter in names))
     except Exception as error:
         fed = ", ".join(f"{letter} of shape {lengths[letter]}" for letter in names)
-        for kind, advice in _ADVICE:
-            if isinstance(error, kind):
-                raise ValueError(f"{said_call} {advice}.\nIt is traced once on one state, with {fed}") from error
+        if said := cure(error):
+            raise ValueError(f"{said_call} {said}.\nIt is traced once on one state, with {fed}") from error
         if isinstance(error, (TypeError, ValueError, IndexError)):
             said = (str(error).strip() or type(error).__name__).splitlines()[0]
-            raise ValueError(f"{said_call} failed on one state, with {fed}:\n{said[:400]}") from error
+            hint = next((f"\n{advice}" for words, advice in _SLIPS if words in said), "")
+            raise ValueError(f"{said_call} failed on one state, with {fed}:\n{said[:400]}{hint}") from error
         # an exception of the user's own making stays one, so that it can be caught by its type
         error.add_note(f"raised by {said_call}, traced on one state, with {fed}")
         raise

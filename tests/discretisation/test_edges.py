@@ -351,7 +351,7 @@ def test_growth_with_projected_ends_warns_and_says_where():
     with pytest.warns(hjb.SolveWarning, match=r"(?s)lower end of x1 \(1 of 1 nodes\).*edges='constrained'"):
         solution = hjb.solve(problem, hjb.Grid([1.5], [9.5], (201,)), tol=1e-6, scheme=hjb.Upwind())
     assert solution.cut.tolist() == [[1, 0]]
-    assert "1 of the lower end of x1" in str(solution)
+    assert "drift out of the box, nodes at the ends: x1 (1 lower" in str(solution)
 
 
 R, MU, SIGMA, GAMMA, RHO = 0.02, 0.06, 0.25, 3.0, 0.06

@@ -92,6 +92,7 @@ def test_discounted_cost_of_lq():
     p = (math.sqrt(5.0) - 1) / 2
     problem = Problem(integrator, quadratic, Box([-9.0], [9.0]), discount=1.0)
     path = simulate(problem, lambda x: -p * x, [2.0], 3.0, steps=50)
+    assert not path.held
     assert path.cost == pytest.approx(4 * p * (1 - math.exp(-(1 + 2 * p) * 3)), abs=1e-6)
 
 
@@ -99,6 +100,7 @@ def test_zero_order_hold_is_the_exact_discrete_system():
     hold, x = 0.3, np.array([1.0, -0.5])
     path = simulate(LQ, state_feedback, x, 1.0, hold=hold)
     np.testing.assert_allclose(path.times, [0.0, 0.3, 0.6, 0.9, 1.0], atol=1e-12)
+    assert path.held
     for k, dt in enumerate(np.diff(path.times)):
         u = -GAIN @ x
         np.testing.assert_allclose(path.controls[k], u, atol=1e-9)

@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 
 import pytest
+from matplotlib import pyplot
 
 from benchmarks.harness import quoted
 
@@ -16,7 +17,7 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 PAGES = {path.stem: path.read_text(encoding="utf-8") for path in [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]}
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 COMMANDS = ["pip install . && hjbjax solve pendulum", "pip install '.[test]' && pytest"]
-DRAWN = re.compile(r'savefig\("([\w.]+)"')
+DRAWN = re.compile(r'\.save\("(\w+\.png)"')
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -49,6 +50,7 @@ def blocks(page):
 @pytest.mark.parametrize("page", [page for page in PAGES if any(kind == "python" for kind, *_ in blocks(page))])
 def test_every_python_block_runs_and_prints_what_the_text_block_after_it_says(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    pyplot.close("all")  # or this page would draw on the axes of the one before
     names = {}
     for kind, code, after, wanted in blocks(page):
         if kind != "python":

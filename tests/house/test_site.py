@@ -9,12 +9,17 @@ import urllib.parse
 from pathlib import Path
 
 import jupytext
+import numpy as np
 import pytest
 from click.testing import CliRunner
+from docutils.utils.math.latex2mathml import tex2mathml
+from matplotlib import colormaps
+from PIL import Image
 
 import hjbjax as hjb
-from docs import notebooks
+from docs import mathml, notebooks
 from docs.docstrings import prepared
+from docs.pictures import shrink
 from hjbjax import zoo
 from hjbjax.cli.main import main
 
@@ -61,6 +66,38 @@ def test_docstrings_keep_their_bars_and_stars_and_equations():
 def test_the_page_of_a_notebook_has_its_cells(path):
     cells = [cell.source for cell in jupytext.read(path).cells if cell.cell_type == "code"]
     assert notebooks.cells((DOCS / "notebooks" / f"{path.stem}.md").read_text(encoding="utf-8")) == cells
+
+
+@pytest.mark.parametrize(
+    ("tex", "top", "bottom"),
+    [(r"\tfrac12 \mathrm{tr}(x)", "1", "2"), (r"\tfrac32P", "3", "2"), (r"\tfrac12\tau^2", "1", "2")],
+)
+def test_a_fraction_of_two_digits_is_one(tex, top, bottom):
+    """TeX takes one digit for each; docutils takes both for the numerator, and what follows for the denominator."""
+    shown = re.sub(r"\s", "", tex2mathml(mathml.plain(tex)))
+    assert f"<mn>{top}</mn><mn>{bottom}</mn></mfrac>" in shown
+
+
+def test_no_page_of_a_notebook_shows_the_text_of_an_object():
+    for page in (DOCS / "notebooks").glob("*.md"):
+        assert not re.search(r"<IPython|object at 0x", page.read_text(encoding="utf-8")), page.name
+
+
+def test_a_picture_made_small_keeps_its_paper_white_and_its_scale_even(tmp_path):
+    image = np.full((200, 400, 3), 255, np.uint8)
+    red, green = np.meshgrid(np.linspace(120, 255, 160), np.linspace(0, 120, 280), indexing="ij")
+    image[20:180, 20:300] = np.stack([red, green, np.full_like(red, 40)], axis=-1)  # thousands of colours on half of it
+    shades = (colormaps["viridis"](np.linspace(0, 1, 160))[:, :3] * 255).astype(np.uint8)
+    image[20:180, 340:350] = shades[:, None]  # the scale: one pixel in fifty
+    picture = tmp_path / "picture.png"
+    Image.fromarray(image).save(picture)
+    shrink(picture)
+    small = np.asarray(Image.open(picture).convert("RGB")).astype(int)
+    assert small.shape == (100, 200, 3)
+    assert small[0, 0].tolist() == [255, 255, 255]
+    scale = small[12:88, 172]
+    assert np.abs(scale - shades[5:157:2]).max() < 16  # by Pillow's own palette 31, in 9 steps
+    assert len(np.unique(scale, axis=0)) > 30
 
 
 def test_the_gallery_has_all_ready_problems():

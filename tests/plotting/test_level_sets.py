@@ -1,10 +1,12 @@
 """Zero level sets: where the curves run, projections, stacks, and pictures that move."""
 
+import sys
 from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib import pyplot
 from matplotlib.figure import Figure
 from pictures import covers
 from pictures import pictures as plotting
@@ -80,6 +82,42 @@ def test_a_surface_is_closed_at_a_periodic_seam_and_cut_along_a_fourth_axis(monk
     assert corners[:, 2].min() == 0.0
     assert corners[:, 2].max() == 1.0  # up to the seam
     np.testing.assert_allclose(np.linalg.norm(corners[:, :2], axis=1), 0.6, atol=0.04)
+
+
+def test_a_surface_that_can_be_turned_is_a_page_of_its_own(tmp_path):
+    pytest.importorskip("plotly")
+    grid = Grid([-1.0] * 3, [1.0] * 3, (15,) * 3, names=("x", "y", "z"), units=("m", "m", "s"))
+    turned = Grid([-1.0, -1.0, -np.pi], [1.0, 1.0, np.pi], (5, 5, 6), (False, False, True))
+    axis = plotting.turning_surface(solution(ball(0.6, turned), turned)).figure.layout.scene.zaxis
+    assert axis.ticktext == ("−π", "−π/2", "0", "π/2", "π")
+    scene = plotting.turning_surface(solution(ball(0.6, grid), grid), inside="below")
+    (mesh,) = scene.figure.data
+    vertices = np.stack([mesh.x, mesh.y, mesh.z], axis=-1)
+    # chords of cells cut off as much as (√3/7)²/(8 · 0.6) of the radius
+    np.testing.assert_allclose(np.linalg.norm(vertices, axis=-1), 0.6, atol=0.0128)
+    # a closed surface of triangles: Euler's V − E + F = 2, with 3F = 2E
+    assert len(vertices) - len(mesh.i) / 2 == 2
+    assert scene.figure.layout.scene.xaxis.title.text == "x [m]"
+    scene.save(tmp_path / "ball.html")
+    assert "x [m]" in (tmp_path / "ball.html").read_text(encoding="utf-8")
+    with pytest.raises(ValueError, match="2 axes are free, wanted three"):
+        plotting.turning_surface(solution(ball(0.6, grid), grid), fixed={"x": 0.0})
+
+
+def test_without_plotly_it_is_told_how_to_come_by_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "plotly", None)
+    with pytest.raises(ImportError, match=r"pip install 'hjbjax\[plot3d\]'"):
+        plotting.turning_surface(solution(ball(0.6)))
+
+
+def test_a_closed_loop_goes_on_an_empty_figure_of_pyplots():
+    plane = Grid([-1.0] * 2, [1.0] * 2, (5, 5))
+    answer = hjb.Solution(plane, np.sum(plane.nodes() ** 2, -1), -plane.nodes()[..., :1])
+    path = SimpleNamespace(times=np.array([0.0, 1.0]), states=np.full((2, 2), 0.5), controls=np.zeros((1, 1)))
+    pyplot.close("all")
+    empty = pyplot.figure(figsize=(12, 4))
+    assert hjb.plotting.closed_loop(answer, path).figure is empty
+    assert hjb.plotting.closed_loop(answer, path).figure is not empty
 
 
 def test_what_an_avoid_problem_is_about_is_shaded_without_being_told():

@@ -419,13 +419,31 @@ def test_a_path_on_a_torus_and_one_along_the_seam():
     np.testing.assert_allclose(curve.get_xydata(), wanted, atol=1e-12)
 
 
-def test_controls_are_steps():
+@pytest.mark.parametrize(("held", "style"), [(True, "steps-post"), (False, "default")])
+def test_controls_are_steps_where_they_were_held_and_lines_elsewhere(held, style):
     path = path_of(np.zeros((4, 1)), [[1.0], [-1.0], [0.5]], np.array([0.0, 1.0, 3.0, 4.0]))
-    steps = plotting.controls(path)[0]
-    np.testing.assert_array_equal(steps.get_data().values, [1.0, -1.0, 0.5])
-    np.testing.assert_array_equal(steps.get_data().edges, path.times)
-    assert steps.axes.get_ylabel() == "u"
-    *steps, legend = plotting.controls(path_of(np.zeros((2, 1)), [[1.0, 2.0]]))
+    path.held = held
+    (line,) = plotting.controls(path)
+    np.testing.assert_array_equal(line.get_xdata(), path.times)
+    np.testing.assert_array_equal(line.get_ydata(), [1.0, -1.0, 0.5, 0.5])
+    assert line.get_drawstyle() == style
+    assert line.axes.get_ylabel() == "u"
+
+
+def test_a_control_that_jumps_to_and_fro_is_pale_and_its_mean_is_drawn():
+    times = np.linspace(0.0, 4.0, 401)
+    flicker = np.where(np.arange(400) % 4 == 0, 1.0, -1.0)  # of which the mean is −½
+    flicker[:100] = 1.0
+    raw, mean, legend = plotting.controls(path_of(np.zeros((401, 1)), flicker[:, None], times))
+    assert raw.get_alpha() < 0.6
+    drawn = mean.get_ydata()
+    np.testing.assert_allclose(drawn[:90], 1.0, atol=1e-12)
+    np.testing.assert_allclose(drawn[110:], -0.5, atol=1e-9)  # the window holds four whole turns
+    assert [text.get_text() for text in legend.get_texts()] == ["u", "u, mean over 0.16"]
+
+
+def test_inputs_have_a_legend():
+    *_, legend = plotting.controls(path_of(np.zeros((2, 1)), [[1.0, 2.0]]))
     assert [text.get_text() for text in legend.get_texts()] == ["u1", "u2"]
 
 

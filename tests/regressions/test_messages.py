@@ -3,12 +3,18 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import hjbjax as hjb
+from hjbjax.feedback.path import Path
 from hjbjax.solution.status import Status
 
 U = hjb.Box([-1.0], [1.0])
 GRID = hjb.Grid([-1.0], [1.0], (21,))
+
+
+ANSWER = hjb.Solution(GRID, GRID.nodes()[:, 0] ** 2, -GRID.nodes())
+PATH = Path(np.zeros(2), np.zeros((2, 1)), np.zeros((1, 1)), None, 0.0, None, 0, 1)
 
 
 def cost(x, u):
@@ -112,6 +118,16 @@ def test_ordinary_grids_pass():
         (lambda: hjb.simulate(problem(), lambda x: -x, [0.5], durations=1.0), r"did you mean duration\?"),
         (lambda: hjb.pontryagin(problem(), [0.5], horizont=1.0), r"did you mean horizon\?"),
         (lambda: hjb.Box([-1.0], [1.0], xyzzy=1), r"Box\(\) got .* 'xyzzy': wanted one of hi, lo$"),
+        # as other packages say it
+        (lambda: hjb.Problem(dynamics=lambda x, u: u), r"'dynamics': did you mean drift\?"),
+        (lambda: hjb.solve(problem(), GRID, tolerance=1e-3), r"'tolerance': did you mean tol\?"),
+        (lambda: hjb.march(problem(), GRID, T=1.0), r"march\(\) got .* 'T': did you mean horizon\?"),
+        (lambda: hjb.Grid([-1.0], [1.0], num=(3,)), r"'num': did you mean shape\?"),
+        (lambda: hjb.reach(lambda x, u: u, U, goal=lambda x: x[0]), r"reach\(\) got .* 'goal': did you mean target\?"),
+        (lambda: hjb.filtering.zakai(problem(), None, grd=GRID), r"zakai\(\) got .* 'grd': did you mean grid\?"),
+        (lambda: hjb.plotting.value(None, axs=1), r"got solution = None"),
+        (lambda: hjb.plotting.value(ANSWER, axs=1), r"value\(\) got .* 'axs': did you mean ax\?"),
+        (lambda: hjb.plotting.closed_loop(ANSWER, PATH, fig=1), r"'fig': did you mean figure\?"),
     ],
 )
 def test_a_misspelt_keyword_is_told_from_the_right_one(ask, said):
@@ -134,6 +150,42 @@ def test_bounds_without_a_box_are_told_how_to_become_one():
     assert hjb.Box(-1.0, 1.0).dim == 1
     with pytest.raises(ValueError, match=r"got lo of shape \(\) and hi of shape \(1,\)"):
         hjb.Box(-1.0, [1.0])
+    with pytest.raises(TypeError, match=r"wanted both bounds, as in hjb.Box\(-2.0, 1.0\)$"):
+        hjb.Box((-2.0, 1.0))
+
+
+@pytest.mark.parametrize(
+    ("drift", "cure"),
+    [
+        (lambda x, u: jnp.stack([x[1], u]), r"u\[0\] is the number$"),
+        (lambda x, u: jnp.stack([x[:, 1], u[:, 0]], -1), r"x is one state, without an axis for a batch"),
+        (lambda x, u: np.stack([x[1], u[0]]), "use jnp in place of np"),
+    ],
+)
+def test_a_drift_of_the_wrong_shape_or_kind_is_told_what_to_change(drift, cure):
+    with pytest.raises(ValueError, match=rf"^drift\(x, u\) [\s\S]*{cure}") as caught:
+        hjb.solve(problem(drift), hjb.Grid([-1.0] * 2, [1.0] * 2, (11, 11)))
+    assert len(str(caught.value).splitlines()) <= 6
+
+
+def test_a_vector_field_in_numpy_is_told_what_to_change():
+    with pytest.raises(ValueError, match="hands a traced value to NumPy: use jnp in place of np"):
+        hjb.geometry.lie_bracket(lambda x: np.array([x[1], 0.0]), lambda x: x)(jnp.zeros(2))
+
+
+@pytest.mark.parametrize(
+    ("ask", "said"),
+    [
+        (lambda: hjb.plotting.value(problem()), "value: got solution = Problem.*wanted the Solution of solve or march"),
+        (lambda: hjb.plotting.trajectory(ANSWER), "trajectory: got path = Solution.*wanted the Path of simulate"),
+        (lambda: hjb.plotting.closed_loop(PATH, ANSWER), "closed_loop: got solution = Path"),
+        (lambda: hjb.plotting.value(ANSWER, ax=Figure()), r"a figure as ax, wanted axes on it: ax=figure.add_subplot"),
+        (lambda: hjb.plotting.policy(ANSWER, ax=Figure().subplots(1, 2)), r"got 2 axes as ax.*as in ax=ax\[0\]"),
+    ],
+)
+def test_what_cannot_be_drawn_is_told_from_what_can(ask, said):
+    with pytest.raises(TypeError, match=said):
+        ask()
 
 
 def test_a_path_is_one_line_and_a_missing_file_is_what_python_calls_it(tmp_path):

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 import hjbjax as hjb
 from hjbjax.cli import main as command
-from hjbjax.problem.grid import INDEXABLE
+from hjbjax.problem.arguments import INDEXABLE
 
 U = hjb.Box([-1.0], [1.0])
 GRIDS = [

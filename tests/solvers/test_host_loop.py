@@ -1,6 +1,8 @@
 """How a solve ends when it does not converge, and what the host does around it."""
 
 import _thread
+import os
+import select
 import signal
 import threading
 import time
@@ -13,6 +15,7 @@ import pytest
 import hjbjax as hjb
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.problem.pytree import pytree_dataclass
+from hjbjax.solution.clock import Clock
 from hjbjax.solvers import host_loop, stationary_run
 from hjbjax.solvers.setup import prepare_on_host
 
@@ -300,3 +303,20 @@ def test_what_stops_before_the_first_look_keeps_what_is_given():
     assert code is hjb.Status.NONFINITE
     assert np.all(np.isfinite(state.value))
     assert (state.value[0], state.value[10], state.value[-1]) == (3.0, 7.0, 3.0)
+
+
+def test_a_terminal_that_tells_no_width_is_told_the_phases(monkeypatch):
+    """As of `script`, and of some editors: tqdm by itself writes nothing there."""
+    pty = pytest.importorskip("pty")
+    reader, writer = pty.openpty()  # 0 columns
+    with open(writer, "w", buffering=1) as terminal:
+        monkeypatch.setattr("sys.stderr", terminal)
+        clock = Clock()
+        with host_loop.telling(clock):
+            clock.phase = "compiling for 81 nodes"
+        # a terminal passes on what is written when it comes to it
+        ready, _, _ = select.select([reader], [], [], 5.0)
+        seen = os.read(reader, 10_000).decode() if ready else ""
+    os.close(reader)
+    assert "the checks" in seen
+    assert "compiling for 81 nodes" in seen

@@ -1,0 +1,128 @@
+"""Pictures over time: the controls of a path; Pontryagin's λ, and DV of a solution on a grid along the same path."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hjbjax.plotting.scales import set_ticks
+from hjbjax.plotting.shading import around, is_level
+from hjbjax.plotting.slices import span_of
+from hjbjax.plotting.style import COLOURS, Picture, axes_of, drawing, label_axes, legend
+from hjbjax.problem.labels import Labels
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+
+    from hjbjax.extremals.necessary_conditions import Extremal
+    from hjbjax.feedback.path import Path
+    from hjbjax.solution.solution import Solution
+
+JUMPS = 60  # of one control to and fro: more of them fill a picture of ten centimetres
+WINDOW = 0.04  # of the duration, over which means of such a control are taken
+
+
+@drawing
+def costates(
+    extremal: Extremal, *, solution: Solution | None = None, ax: Axes | None = None, names: Sequence[str] | None = None
+) -> Picture:
+    """The costates of an extremal over time, and DV of a solution along its path: two roads to one curve.
+
+    Args:
+      extremal: the extremal of ``pontryagin``.
+
+    Keyword Args:
+      solution: of the same problem on a grid, or ``None``; its DV is drawn broken, where the path is inside the grid.
+      ax: matplotlib axes to draw on; ``None`` takes pyplot's current ones.
+      names: of the states, in place of the grid's.
+
+    Returns:
+      The picture: one line a state, then those of DV, then the legend.
+
+    Example:
+      >>> from types import SimpleNamespace
+      >>> extremal = SimpleNamespace(times=np.array([0.0, 1.0]), costates=np.array([[2.0], [0.0]]))
+      >>> costates(extremal)[0].get_ydata().tolist()
+      [2.0, 0.0]
+    """
+    times, costates = np.asarray(extremal.times), np.asarray(extremal.costates)
+    count = costates.shape[1]
+    names = tuple(names or (solution.grid.names if solution is not None else (f"x{i + 1}" for i in range(count))))
+    ax = axes_of(ax, wide=True)
+    colours = [COLOURS[i % len(COLOURS)] for i in range(count)]
+    artists: list[Artist] = [
+        ax.plot(times, costates[:, i], color=colours[i], linewidth=1.4, label=f"λ, {names[i]}")[0] for i in range(count)
+    ]
+    if solution is not None:
+        # a marched V has the time as its first argument; angles of an extremal run on, those of the grid do not
+        where = (times,) * (solution.times is not None) + (np.asarray(solution.grid.wrap(extremal.states)),)
+        with warnings.catch_warnings(action="ignore"):  # NaN outside the grid: there the line is interrupted
+            slopes = np.ma.masked_invalid(solution.costate_at(*where))
+        for i in range(count):
+            # broad and pale: the line λ stays to be seen where the two agree
+            style: dict[str, Any] = {"color": colours[i], "linewidth": 3.6, "alpha": 0.4, "linestyle": "--"}
+            artists += ax.plot(times, slopes[:, i], label=f"DV, {names[i]}", **style)
+    label_axes(ax, "t", "costate")
+    set_ticks(ax.xaxis, False)
+    set_ticks(ax.yaxis, False)
+    return Picture([*artists, legend(ax)], ax)
+
+
+@drawing
+def controls(
+    path: Path, *, ax: Axes | None = None, names: Sequence[str] | None = None, solution: Solution | None = None
+) -> Picture:
+    """The inputs of a path over time: lines, or steps where each was held through its interval.
+
+    ``path.controls`` has shape (k, m), the controls at the start of each interval; a line goes on level through the
+    last. One that jumps to and fro more often than a picture can show is drawn pale, with its running mean.
+
+    Args:
+      path: the path of ``simulate``.
+
+    Keyword Args:
+      ax: matplotlib axes to draw on; ``None`` takes pyplot's current ones.
+      names: of the inputs.
+      solution: gives the names, and the range beside which a variation counts as none.
+
+    Returns:
+      The picture: one line an input, then the means, then the legend.
+    """
+    times, inputs = np.asarray(path.times), np.asarray(path.controls)
+    count = inputs.shape[1]
+    words = getattr(solution, "labels", Labels())
+    names = tuple(names or (words.control(i, count) for i in range(count)))
+    ax = axes_of(ax, wide=True)
+    # the control at the end is not known; a path that ends at once has none at all
+    shown = np.concatenate([inputs, inputs[-1:]]) if len(inputs) else np.full((len(times), count), np.nan)
+    drawing = "steps-post" if getattr(path, "held", True) else "default"
+    lines: list[Artist] = []
+    means: list[Artist] = []
+    for i, name in enumerate(names[:count]):
+        restless = np.sum(np.abs(np.diff(inputs[:, i])) > np.ptp(inputs[:, i]) / 2) > JUMPS if len(inputs) else False
+        look: dict[str, Any] = {"linewidth": 0.6, "alpha": 0.5} if restless else {"linewidth": 1.4}
+        look["color"] = COLOURS[i % len(COLOURS)]
+        lines += ax.plot(times, shown[:, i], drawstyle=drawing, label=name, **look)
+        if restless:
+            width = (times[-1] - times[0]) * WINDOW
+            mean = _running_mean(times, inputs[:, i], width)
+            look = {"color": look["color"], "linewidth": 1.4}
+            means += ax.plot(times, mean, label=f"{name}, mean over {width:.2g}", **look)
+    label_axes(ax, "t", names[0] if count == 1 else "control")
+    set_ticks(ax.xaxis, False)
+    set_ticks(ax.yaxis, False)
+    span = max((span_of(solution, i) for i in range(count)), default=0.0) if solution is not None else 0.0
+    if inputs.size and is_level(inputs, span):  # or the axis would show its rounding
+        ax.set_ylim(*around(float(np.mean(inputs)), span))
+    return Picture([*lines, *means, *([legend(ax)] if count > 1 or means else [])], ax)
+
+
+def _running_mean(times: np.ndarray, held: np.ndarray, width: float) -> np.ndarray:
+    """Means, (k+1,), of a step function with values (k,) over a window around each time, whole at both ends."""
+    integral = np.concatenate([[0.0], np.cumsum(held * np.diff(times))])
+    begin = np.clip(times - width / 2, times[0], times[-1] - width)
+    return (np.interp(begin + width, times, integral) - np.interp(begin, times, integral)) / width

@@ -269,12 +269,8 @@ def _estimate(problem: "Problem", grid: "Grid", options: dict[str, Any], *, as_j
         found = hjb.estimate(problem, grid, **asked)
     click.echo(json.dumps(dataclasses.asdict(found)) if as_json else str(found))
     if not found.fits:
-        raise Failure(
-            "the solve does not fit: see nodes"
-            if not found.numbered
-            else "the solve does not fit into the memory that is free",
-            6,
-        )
+        what = "the memory that is free" if found.numbered else "32-bit indices"
+        raise Failure(f"the solve does not fit into {what}", 6)
 
 
 def _solve(problem: "Problem", grid: "Grid", options: dict[str, Any]) -> "Solution":

@@ -5,6 +5,7 @@ import dataclasses
 import json
 import math
 import re
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ from click.testing import CliRunner
 import hjbjax as hjb
 from benchmarks import cases
 from benchmarks.__main__ import NAMES
-from benchmarks.accuracy import mutants
+from benchmarks.accuracy import memory, mutants
 from benchmarks.harness import footprint, thresholds, timing
 from benchmarks.speed import batch, controls, devices, gradients, growth, information, peers, scaling, startup, sweep
 from hjbjax.discretisation.discretisation import Discretisation
@@ -38,7 +39,10 @@ def rows_of(benchmark, folder, *options):
 
 
 def test_every_name_leads_to_a_command():
-    for module in (sweep, peers, growth, scaling, controls, information, batch, startup, devices, gradients, mutants):
+    modules = (
+        sweep, peers, growth, scaling, controls, information, batch, startup, devices, gradients, memory, mutants,
+    )  # fmt: skip
+    for module in modules:
         _, folder, name = module.__name__.split(".")
         assert NAMES[name][0] == folder
         assert CliRunner().invoke(module.command, ["--help"]).exit_code == 0
@@ -332,3 +336,24 @@ def test_seeded_bugs_are_found(tmp_path):
     for row in rows_of(mutants, tmp_path):
         assert row["status"] == "OK"
         assert row["caught_by"].split("::")[0] in {each for m in mutants.MUTANTS for each in m.likely}
+
+
+# --- memory ---
+
+
+def test_what_is_told_of_the_memory_is_within_a_fifth_of_the_recorded_peaks():
+    rows = json.loads((mutants.ROOT / "benchmarks" / "results" / "memory.json").read_text())
+    assert {(row["question"], row["run"]) for row in rows} == {case[:2] for case in memory.CASES}
+    assert all(abs(row["told_over_peak"] - 1) <= 0.2 for row in rows)
+    six = next(row for row in rows if row["run"] == "march, value alone")
+    assert six["nodes"] >= 21**6
+    assert six["told_bytes_per_node"] <= 16
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="peaks are Linux's")
+def test_peaks_of_processes_of_their_own(tmp_path):
+    for row in rows_of(memory, tmp_path):
+        assert row["status"] == "OK"
+        assert row["peak"] > 0
+        assert math.prod(row["shape"]) == row["nodes"]

@@ -95,8 +95,13 @@ def pytree_dataclass(*, static: Iterable[str] = (), host: Iterable[str] = ()) ->
 
 
 def with_suggestions(function: Callable[P, T], name: str | None = None) -> Callable[P, T]:
-    """Decorator: a misspelt keyword is refused with the one that it is next to, or with all that there are."""
+    """Decorator: a misspelt keyword is refused with the one that it is next to, or with all that there are.
+
+    A function that hands further keywords on leaves that to whom it hands them.
+    """
     parameters = inspect.signature(function).parameters.values()
+    if any(each.kind is each.VAR_KEYWORD for each in parameters):
+        return function
     by_name = {each.name for each in parameters if each.kind in (each.POSITIONAL_OR_KEYWORD, each.KEYWORD_ONLY)}
 
     @functools.wraps(function)

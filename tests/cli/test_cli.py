@@ -729,9 +729,9 @@ def test_a_dry_run_says_what_a_solve_will_take_and_writes_nothing(folder):
     ]  # fmt: skip
     assert result.stdout.startswith("nodes     40 x 41 = 1,640\n")
     assert not list(folder.iterdir())
-    told = run("solve", "pendulum", "--shape", "40000x40001", "--scheme", "upwind", "--dry-run", "--json")
+    told = run("solve", "pendulum", "--shape", "46000x46001", "--scheme", "upwind", "--dry-run", "--json")
     assert told.exit_code == 6
-    assert json.loads(told.stdout)["shape"] == [40000, 40001]
+    assert json.loads(told.stdout)["shape"] == [46000, 46001]
     assert told.stderr == "hjbjax: the solve does not fit into the memory that is free\n"
 
 

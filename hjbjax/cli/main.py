@@ -12,6 +12,7 @@ import contextlib
 import dataclasses
 import json
 import signal
+import sys
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -317,9 +318,11 @@ def gallery(out: Path, only: tuple[str, ...], force: bool, no_cache: bool) -> No
         names = [name for name in zoo.catalogue if name in only or not only]
         try:
             for number, name in enumerate(names, 1):
-                click.echo(f"{number:>2}/{len(names)}  {name:<20}  ", nl=False)
+                line = f"{number:>2}/{len(names)}  {name:<20}  "
+                click.echo(line, nl=False)
                 cards.append(pages.card(zoo.catalogue[name]))
-                click.echo(cards[-1].status)
+                # on a terminal the phases of the solve have been written over the line
+                click.echo((f"\r{line}" if sys.stdout.isatty() else "") + cards[-1].status)
         finally:  # what is done is kept, after an interrupt, too
             if cards:
                 with _one_line_error(OSError, 5, "the page could not be written: "):

@@ -19,8 +19,8 @@ CHEAP = (
 )  # fmt: skip
 DEAR = (
     "value_iteration_to_a_target", "value_iteration_of_a_game", "value_iteration_with_correlated_noise",
-    "march_of_second_order", "march_of_fifth_order", "sweeps_of_flat_parts", "sweeps_to_a_target", "sweeps_of_a_game",
-    "krylov", "krylov_with_correlated_noise", "implicit_march", "open_ends", "without_a_choice",
+    "march_of_second_order", "march_of_fifth_order", "sweeps_of_flat_parts", "sweeps_in_slabs", "sweeps_to_a_target",
+    "sweeps_of_a_game", "krylov", "krylov_with_correlated_noise", "implicit_march", "open_ends", "without_a_choice",
 )  # fmt: skip
 EXACT = ("value_iteration", "march_of_first_order", *(name for name in DEAR if name.startswith(("value", "march"))))
 CERTIFIED = ("sweeps", *(name for name in DEAR if name.startswith(("sweeps", "krylov"))))
@@ -97,7 +97,8 @@ def test_certificates_hold_on_every_mesh(found, name):
         assert max(mesh["errors"]) <= 1e-6
         assert mesh["apart"] <= sum(mesh["errors"])
         one, many = mesh["steps"]
-        assert many <= 1.2 * one + 2
+        # slabs exchange twice an order in place of three times
+        assert many <= (1.5 if name == "sweeps_in_slabs" else 1.2) * one + 2
 
 
 def test_checkpoints(found):

@@ -20,6 +20,7 @@ from jax.sharding import Mesh
 import hjbjax as hjb
 from hjbjax.discretisation import slopes, stencil
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.iteration import gauss_seidel
 from hjbjax.problem.parts import Parts
 from hjbjax.problem.stretching import Sinh
 from hjbjax.solvers import setup, stationary_run
@@ -233,6 +234,19 @@ def sweeps():
 @case
 def sweeps_of_flat_parts():
     return within_certificates(PLAIN, ANGLE, hjb.PolicyIteration(hjb.Sweeps()), (8,), (1, 8))
+
+
+@case
+def sweeps_in_slabs():
+    """As on parts that outgrow a processor's cache."""
+    outgrows, slab = gauss_seidel._outgrows_the_cache, gauss_seidel.SLAB
+    gauss_seidel._outgrows_the_cache, gauss_seidel.SLAB = (lambda *_: True), 4
+    jax.clear_caches()
+    try:
+        return within_certificates(PLAIN, ANGLE, hjb.PolicyIteration(hjb.Sweeps()), (2, 2))
+    finally:
+        gauss_seidel._outgrows_the_cache, gauss_seidel.SLAB = outgrows, slab
+        jax.clear_caches()
 
 
 @case

@@ -75,8 +75,8 @@ MUTANTS = (
     Mutant(
         "ghost cell",
         "discretisation/stencil.py",
-        "last = grid.shape[axis] - 1 if step > 0 else 0\n    if (axis, step) not in",
-        "last = grid.shape[axis] - 2 if step > 0 else 0\n    if (axis, step) not in",
+        "        return slices(values, grid, axis, step)\n    nodes",
+        "        return slices(values, grid, axis, step, 1)\n    nodes",
         ("tests/discretisation/test_stencil.py",),
     ),
     Mutant(
@@ -96,8 +96,8 @@ MUTANTS = (
     Mutant(
         "periodic wrap",
         "discretisation/stencil.py",
-        "end = last if (step > 0) != bool(grid.periodic[axis]) else 0",
-        "end = last if step > 0 else 0",
+        "given = slices(values, grid, axis, -step, count",
+        "given = slices(values, grid, axis, step, count",
         ("tests/discretisation/test_stencil.py",),
     ),
     Mutant(
@@ -110,8 +110,8 @@ MUTANTS = (
     Mutant(
         "width of the ghost cells of Eno2",
         "discretisation/slopes.py",
-        "for k in range(3)))[3 - reach :]\n    last",
-        "for k in range(3)))[:reach]\n    last",
+        "3 * a - 3 * b + c][3 - reach :]",
+        "3 * a - 3 * b + c][:reach]",
         ("tests/discretisation/test_slopes.py",),
     ),
     Mutant(

@@ -227,7 +227,8 @@ class MarchRun:
     def store(self, *, feedback: bool = True) -> None:
         """Keep the value at the front, and its feedback, as the next slice."""
         # one program for all kept times: the time is an argument
-        answer = jax.device_get(self._greedy(self.task, self.front.value, self.front.t)) if feedback else None
+        asked = feedback and not self.task.bare
+        answer = jax.device_get(self._greedy(self.task, self.front.value, self.front.t)) if asked else None
         self.slices.keep(self.task, self.front.value, self.front.t, answer)
 
     def saved(self) -> list[Any]:
@@ -270,7 +271,7 @@ class MarchInParts(MarchRun):
     def store(self, *, feedback: bool = True) -> None:
         """Keep the value at the front, and its feedback, as the next slice."""
         front, answer = self.gathered(), None
-        if feedback:
+        if feedback and not self.task.bare:
             answer = _greedy_in_parts(self._divided, self.front.value, self.front.t, self.parts)
             answer = self.parts.gathered(answer, jax.tree.map(lambda _: True, answer))
         self.slices.keep(self.task, front.value, front.t, answer)

@@ -314,9 +314,10 @@ def test_a_terminal_that_tells_no_width_is_told_the_phases(monkeypatch):
         clock = Clock()
         with host_loop.telling(clock):
             clock.phase = "compiling for 81 nodes"
-        # a terminal passes on what is written when it comes to it
-        ready, _, _ = select.select([reader], [], [], 5.0)
-        seen = os.read(reader, 10_000).decode() if ready else ""
+        seen = ""
+        # a terminal passes on what is written when it comes to it, in parts
+        while "compiling" not in seen and select.select([reader], [], [], 5.0)[0]:
+            seen += os.read(reader, 10_000).decode()
     os.close(reader)
     assert "the checks" in seen
     assert "compiling for 81 nodes" in seen

@@ -138,8 +138,8 @@ MUTANTS = (
     Mutant(
         "spacing of a stretched axis",
         "discretisation/stencil.py",
-        "Links(jnp.append(gaps, gaps[-1:]).reshape(along), jnp.append(gaps[:1], gaps).reshape(along))",
-        "Links(jnp.append(gaps[:1], gaps).reshape(along), jnp.append(gaps, gaps[-1:]).reshape(along))",
+        "up, down = jnp.append(gaps, gaps[-1:]), jnp.append(gaps[:1], gaps)",
+        "down, up = jnp.append(gaps, gaps[-1:]), jnp.append(gaps[:1], gaps)",
         ("tests/discretisation/test_stencil.py",),
     ),
     Mutant(
@@ -159,8 +159,8 @@ MUTANTS = (
     Mutant(
         "half an error bound",
         "iteration/certificates.py",
-        "return jnp.min(policy.defect) / discount, jnp.max(policy.defect) / discount",
-        "return jnp.min(policy.defect) / (2 * discount), jnp.max(policy.defect) / (2 * discount)",
+        "return grid.least(policy.defect) / discount, grid.largest(policy.defect) / discount",
+        "return grid.least(policy.defect) / (2 * discount), grid.largest(policy.defect) / (2 * discount)",
         ("tests/iteration/test_certificates.py",),
     ),
 )

@@ -241,12 +241,7 @@ def test_two_inputs_against_the_oracle(kind):
 FOUR = np.array([[1.0, 0.3], [-1.0, 0.2], [0.1, 1.0], [0.2, -1.0], [-1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [1.0, -1.0]])
 
 
-OTHERS = [
-    pytest.param(each, marks=pytest.mark.slow) for each in (hjb.ValueIteration(), hjb.PolicyIteration(hjb.Direct()))
-]
-
-
-@pytest.mark.slow
+@pytest.mark.slow  # enumerated controls at constrained ends: see QUICK in tests/conftest.py
 @pytest.mark.parametrize("method", [None, hjb.ValueIteration(), hjb.PolicyIteration(hjb.Direct())])
 def test_enumerated_controls_against_the_oracle(method):
     """The same set, so the same value; bounds hold it, also at a coarse tolerance."""
@@ -508,6 +503,7 @@ def test_a_corner_may_leave_one_action_alone(power):
     assert solution.policy[0, 2, 0] >= 0.37
 
 
+@pytest.mark.slow  # enumerated controls at constrained ends: see QUICK in tests/conftest.py
 def test_exports_hold_admissible_pairs_and_policies_alone():
     problem = random_question(2, 2, quadratic, hjb.Finite(FOUR), sigma=0.2)
     costs, probabilities, states, actions, factor = chain.transition_arrays(problem, SQUARE, scheme=PLAIN)
@@ -537,6 +533,7 @@ def test_open_ends_have_no_chain(ask):
             probability(problem, hjb.Grid([-1.0], [1.0], (9,), edges="open"), lambda x: x[0] - 0.5)
 
 
+@pytest.mark.slow  # enumerated controls at constrained ends: see QUICK in tests/conftest.py
 def test_a_march_with_constrained_ends_against_the_oracle():
     problem = random_question(3, 2, quadratic, hjb.Finite(FOUR), sigma=0.2)
     problem = dataclasses.replace(problem, terminal_cost=lambda x: x[0] - x[1])

@@ -29,7 +29,9 @@ ULP = 8  # roundings of the largest value: XLA fuses the same operations otherwi
 
 def found_by(names):
     """What these cases found, by their names."""
-    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=8"
+    # the emitters of fusions, which round alike in arrays of any shape: see QUICK in tests/conftest.py
+    more = "--xla_force_host_platform_device_count=8 --xla_cpu_use_fusion_emitters=true"
+    flags = f"{os.environ.get('XLA_FLAGS', '')} {more}"
     path = f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
     environment = {**os.environ, "XLA_FLAGS": flags, "PYTHONPATH": path}
     command = [sys.executable, str(SCRIPT), *names]

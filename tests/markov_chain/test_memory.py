@@ -15,7 +15,7 @@ import hjbjax as hjb
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import fixed_point
 from hjbjax.markov_chain import memory
-from hjbjax.problem.grid import INDEXABLE
+from hjbjax.problem.arguments import INDEXABLE
 from hjbjax.problem.pytree import cast
 from hjbjax.solvers import stationary_run
 from hjbjax.solvers.setup import assumptions_of, prepare

@@ -55,10 +55,8 @@ class Worker:
         return json.loads(answer)
 
     def end(self) -> None:
-        """Let the process end."""
-        assert self.process.stdin is not None
-        self.process.stdin.close()
-        self.process.wait()
+        """Let the process end, and close both pipes."""
+        self.process.communicate()
 
 
 def work(nodes: int, mesh: Sequence[int]) -> None:

@@ -79,7 +79,8 @@ def of_march(on: Discretisation, kept: int, method: TimeMethod, *, policy: bool)
     steps = word * (3 + slopes + _searched(problem, n, on.dtype))
     filling = one + word  # and V itself
     if policy:
-        filling += word * (actions + (2 if scheme.monotone or scheme.even else 6)) + 2
+        wide = 1 if scheme.monotone and n > stencil.LONGER else 2 if scheme.monotone or scheme.even else 6
+        filling += word * (actions + wide) + 2
     return math.ceil(((kept - 1) * one + stored + max(steps, filling)) * grid.size)
 
 

@@ -35,11 +35,13 @@ COLOURS = (
 )  # Okabe and Ito: safe for all eyes
 NARROW, WIDE, SOLID = (5.4, 4.2), (5.4, 3.2), (5.4, 4.8)  # inches: of planes, of lines over time, of surfaces
 DPI = 200  # of saved pictures, unless given
-DRAWN = {  # what is drawn, by the name of the argument: the attributes that it must have, and what has them
+# what is drawn, by the name of the argument, maybe of one function: the attributes that it must have, and what has them
+DRAWN = {
     "solution": (("grid", "value"), "the Solution of solve or march"),
     "path": (("times", "states"), "the Path of simulate"),
     "extremal": (("times", "costates"), "the extremal of pontryagin"),
-    "study": (("errors", "fitted"), "the result of convergence_study"),
+    "convergence.study": (("errors", "fitted"), "the result of convergence_study"),
+    "perturbation.study": (("nominal", "noise"), "the result of perturbation_study"),
 }
 
 P = ParamSpec("P")
@@ -58,7 +60,7 @@ def drawing(function: Callable[P, T]) -> Callable[P, T]:
     @functools.wraps(function)
     def drawn(*arguments: P.args, **options: P.kwargs) -> T:
         for number, (name, thing) in enumerate((*zip(names, arguments, strict=False), *options.items())):
-            attributes, words = DRAWN.get(name, ((), ""))
+            attributes, words = DRAWN.get(name) or DRAWN.get(f"{function.__name__}.{name}", ((), ""))
             # an argument that may be left out is None then
             if not all(hasattr(thing, attribute) for attribute in attributes) and (thing is not None or number == 0):
                 raise TypeError(f"{function.__name__}: got {name} = {shown(thing)}, wanted {words}")

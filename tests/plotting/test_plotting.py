@@ -610,3 +610,16 @@ def test_rounding_about_zero_is_drawn_as_zero_where_the_range_of_the_control_is_
     problem = Problem(lambda x, u: u, lambda x, u: 1.0, Box([-3.0], [3.0]))
     solution = made(grid, lambda x: x[..., 0], lambda x: 1e-9 * np.sin(40 * x), problem=problem)
     assert plotting.policy(solution).ax.get_ylim() == pytest.approx((-3.0, 3.0), abs=1e-6)
+
+
+def test_pictures_ask_of_a_study_what_it_has():
+    """By the names of fields and properties: a study takes solves, and its picture is a slow test."""
+    from hjbjax.applications.convergence import Study
+    from hjbjax.applications.perturbations import Perturbation
+    from hjbjax.plotting.style import DRAWN
+
+    for name, kind in (("convergence.study", Study), ("perturbation.study", Perturbation)):
+        attributes, _ = DRAWN[name]
+        assert {*attributes} <= {*kind.__dataclass_fields__, *dir(kind)}
+    with pytest.raises(TypeError, match=r"perturbation: got study = 3, wanted the result of perturbation_study"):
+        hjb.plotting.perturbation(3)

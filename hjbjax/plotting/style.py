@@ -36,7 +36,7 @@ COLOURS = (
 NARROW, WIDE, SOLID = (5.4, 4.2), (5.4, 3.2), (5.4, 4.8)  # inches: of planes, of lines over time, of surfaces
 DPI = 200  # of saved pictures, unless given
 # what is drawn, by the name of the argument, maybe of one function: the attributes that it must have, and what has them
-DRAWN = {
+DRAWN: dict[str, tuple[tuple[str, ...], str]] = {
     "solution": (("grid", "value"), "the Solution of solve or march"),
     "path": (("times", "states"), "the Path of simulate"),
     "extremal": (("times", "costates"), "the extremal of pontryagin"),

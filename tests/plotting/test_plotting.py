@@ -622,4 +622,4 @@ def test_pictures_ask_of_a_study_what_it_has():
         attributes, _ = DRAWN[name]
         assert {*attributes} <= {*kind.__dataclass_fields__, *dir(kind)}
     with pytest.raises(TypeError, match=r"perturbation: got study = 3, wanted the result of perturbation_study"):
-        hjb.plotting.perturbation(3)
+        plotting.perturbation(3)

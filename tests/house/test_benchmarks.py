@@ -2,6 +2,7 @@
 
 import ast
 import dataclasses
+import importlib
 import json
 import math
 import re
@@ -18,7 +19,19 @@ from benchmarks import cases
 from benchmarks.__main__ import NAMES
 from benchmarks.accuracy import memory, mutants
 from benchmarks.harness import footprint, thresholds, timing
-from benchmarks.speed import batch, controls, devices, gradients, growth, information, peers, scaling, startup, sweep
+from benchmarks.speed import (
+    batch,
+    controls,
+    devices,
+    gradients,
+    growth,
+    information,
+    march,
+    peers,
+    scaling,
+    startup,
+    sweep,
+)  # fmt: skip
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.rates import fastest_rate
 from hjbjax.problem.pytree import cast
@@ -38,14 +51,10 @@ def rows_of(benchmark, folder, *options):
     return rows
 
 
-def test_every_name_leads_to_a_command():
-    modules = (
-        sweep, peers, growth, scaling, controls, information, batch, startup, devices, gradients, memory, mutants,
-    )  # fmt: skip
-    for module in modules:
-        _, folder, name = module.__name__.split(".")
-        assert NAMES[name][0] == folder
-        assert CliRunner().invoke(module.command, ["--help"]).exit_code == 0
+@pytest.mark.parametrize("name", NAMES)
+def test_every_name_leads_to_a_command(name):
+    module = importlib.import_module(f"benchmarks.{NAMES[name][0]}.{name}")
+    assert CliRunner().invoke(module.command, ["--help"]).exit_code == 0
 
 
 # --- timing and thresholds ---
@@ -336,6 +345,20 @@ def test_seeded_bugs_are_found(tmp_path):
     for row in rows_of(mutants, tmp_path):
         assert row["status"] == "OK"
         assert row["caught_by"].split("::")[0] in {each for m in mutants.MUTANTS for each in m.likely}
+
+
+# --- march ---
+
+
+@pytest.mark.slow
+def test_marches_of_both_problems_with_every_scheme(tmp_path):
+    rows = [row for row in rows_of(march, tmp_path) if row["who"] == "hjbjax"]
+    assert [(row["problem"], row["scheme"]) for row in rows] == [
+        (problem, scheme) for problem in ("Air3D", "4-D car") for scheme in ("Upwind", "Eno2", "Weno5")
+    ]
+    for row in rows:
+        assert row["ms_per_step"] > 0
+        assert row.get("differs", 0.0) < 0.01  # of the nodes, where the peer is installed
 
 
 # --- memory ---

@@ -53,8 +53,8 @@ def greedy(problem: Any, grid: Any, value: jax.Array) -> Any:
 
 
 def sweep(problem: Any, grid: Any, value: jax.Array, outflow: jax.Array) -> jax.Array:
-    """V + r/(max Q + β) with r = min H − β V."""
-    return value + greedy(problem, grid, value).defect / outflow
+    """V + r/(max Q + β) with r = min H − β V, as value iteration makes it: no action is kept."""
+    return value + bellman.relaxation(Discretisation(problem, grid, SCHEME, value.dtype), value, outflow)[0] / outflow
 
 
 @functools.partial(jax.jit, donate_argnums=0, keep_unused=True)

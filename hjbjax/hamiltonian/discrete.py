@@ -24,6 +24,7 @@ import jax.numpy as jnp
 
 from hjbjax.discretisation import correlated_noise, cut_cells, edges, schemes, stencil
 from hjbjax.discretisation.discretisation import Differences, Discretisation
+from hjbjax.hamiltonian import search
 from hjbjax.hamiltonian.piecewise import Kinked, inverse_root, kinked_ball, piecewise_input, piecewise_pair
 from hjbjax.hamiltonian.players import SAMPLES, Player, players_of, shared
 from hjbjax.hamiltonian.search import UNROLL, Action, best_of, enumerate_actions, refine
@@ -175,6 +176,16 @@ def optimise(hamiltonian: DiscreteHamiltonian, isaacs: str | None = None) -> tup
         return _nested(hamiltonian, players.control, players.disturbance, lambda u, d: (u, d))
     value, d, u = _nested(hamiltonian, players.disturbance, players.control, lambda d, u: (u, d))
     return value, u, d
+
+
+def optimum(hamiltonian: DiscreteHamiltonian) -> jax.Array:
+    """min max of H, or max min, where nobody asks for the actions: of finitely many none is kept in mind."""
+    players = players_of(hamiltonian.on)
+    player, admissible = players.control, players.control.admissible
+    if players.disturbance.admissible is not None or not isinstance(admissible, Finite):
+        return optimise(hamiltonian)[0]
+    points = jnp.asarray(admissible.points, hamiltonian.on.dtype)
+    return search.optimum(lambda u: hamiltonian.at(u, []), points, player.sign, weight=player.effort)
 
 
 def best_response(

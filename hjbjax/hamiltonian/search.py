@@ -68,6 +68,28 @@ def enumerate_actions(
     return jax.lax.scan(step, best, rows.reshape(padded // chunk, chunk, inputs))[0]
 
 
+def optimum(
+    function: Callable[[Action], jax.Array], points: jax.Array, sign: int, *, weight: int = 1, most: int = UNROLL
+) -> jax.Array:
+    """The best value over the rows of ``points`` alone, for half the work of a search that keeps the action.
+
+    Args:
+      function: the value at every node, of an action.
+      points: shape (K, m).
+      sign: +1 to minimise, −1 to maximise.
+      weight: how many evaluations one call of ``function`` stands for.
+      most: evaluations that may be written out.
+    """
+    count, inputs = np.shape(points)
+    if count * weight > most:
+        return enumerate_actions(lambda action: (function(action), []), points, sign, weight=weight, most=most)[0]
+    best, *others = (function([points[k, j] for j in range(inputs)]) for k in range(count))
+    total = best
+    for value in others:  # a comparison and a select are one instruction, and min, which hands on a NaN, is five
+        best, total = jnp.where(better(sign, value, best), value, best), total + value
+    return jnp.where(jnp.isnan(total), total, best)  # of a NaN among them the sum is one
+
+
 def best_of(objective: Objective, actions: Sequence[Action], sign: int, best: Best | None) -> Best:
     """The best of some actions and of ``best``, as ``enumerate_actions`` returns it; None where there is none yet."""
     for action in actions:

@@ -26,7 +26,7 @@ from hjbjax.discretisation.rates import Rates
 from hjbjax.iteration import certificates
 from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
 from hjbjax.iteration.certificates import Certificate, ErrorBound, Iterate
-from hjbjax.iteration.fixed_point import HISTORY, PATIENCE, ROUNDING
+from hjbjax.iteration.fixed_point import HISTORY
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import AtNodes, Field, Mask, Nodes, Number, Scalar
@@ -200,9 +200,9 @@ def _bound(task: ArcTask, value: Field, found: Look) -> ErrorBound:
 def _judge(task: ArcTask, value: Field, bound: ErrorBound, since: Scalar) -> Scalar:
     """The status after a step; each line overrules those before it."""
     size = jnp.max(jnp.where(task.counted, jnp.abs(value), 0))
-    rounding = ROUNDING * jnp.finfo(value.dtype).eps * size
+    rounding = certificates.ROUNDING * jnp.finfo(value.dtype).eps * size
     # a policy goes on by an arc a step, and a wave of better ones may cross the box four times
-    patience = jnp.where(bound.residual <= rounding, PATIENCE, 100 + 4 * sum(task.grid.shape))
+    patience = jnp.where(bound.residual <= rounding, certificates.PATIENCE, 100 + 4 * sum(task.grid.shape))
     code = jnp.where(since >= patience, Status.STALLED, Status.RUNNING)
     code = jnp.where(bound.error <= task.tol, Status.CONVERGED, code)
     return jnp.where(jnp.isfinite(bound.residual), code, Status.NONFINITE).astype(jnp.int32)

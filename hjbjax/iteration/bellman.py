@@ -129,19 +129,22 @@ def greedy(
     return _with_defect(on, value, held, *discrete.optimise(_around(on, value, incumbent, lost)))
 
 
-def relaxation(on: Discretisation, value: Field) -> tuple[Field, Field]:
+def relaxation(on: Discretisation, value: Field, outflow: Field | None = None) -> tuple[Field, Field]:
     """The defect r = min max H − β V before any obstacle, and Q + β of the fastest action, for s = r/(Q + β).
 
-    Actions are not kept, and rates made where they are used: at best all of it is one pass over V.
+    Actions are not kept. Without the ``outflow`` Q + β, (*grid), memory rules: rates are made where they are used, and
+    at best all of it is one pass over V.
     """
-    hamiltonian = dataclasses.replace(discrete.around(on, value), bare=True)
-    best, u, d = discrete.optimise(hamiltonian)
-    outflow, players = fastest_rate(on), players_of(on)
-    if not (players.control.fastest_at_ends and players.disturbance.fastest_at_ends):
-        outflow = jnp.maximum(outflow, jump_rates(on, u, d).total())  # a fast action between the samples
-    outflow = outflow + on.problem.discount
+    hamiltonian = dataclasses.replace(discrete.around(on, value), bare=outflow is None)
+    players, discount = players_of(on), on.problem.discount
+    outflow = fastest_rate(on) + discount if outflow is None else outflow
+    if players.control.fastest_at_ends and players.disturbance.fastest_at_ends:
+        best = discrete.optimum(hamiltonian)
+    else:
+        best, u, d = discrete.optimise(hamiltonian)
+        outflow = jnp.maximum(outflow, jump_rates(on, u, d).total() + discount)  # a fast action between the samples
     # it is divided by, also where nothing moves
-    return best - on.problem.discount * value, jnp.where(outflow > 0, outflow, 1)
+    return best - discount * value, jnp.where(outflow > 0, outflow, 1)
 
 
 def improvement(on: Discretisation, value: Field, fixed: jax.Array, new: Greedy, old: Greedy) -> Greedy:

@@ -16,7 +16,8 @@ A factor 1/(1 − ρ) beyond ε^{-1/2}, ε the unit of rounding, is no bound: it
 and it says nothing anyway. Both follow from the comparison principle of a monotone scheme; they bound the algebraic
 error and not the error of the grid, hold where the minimum over the actions is exact, and want float64.
 
-An iteration books its progress by them: the least error and residual so far, and the steps since either fell.
+An iteration books its progress by them, the least error and residual so far and the steps since either fell, and is
+judged by it.
 """
 
 import dataclasses
@@ -37,6 +38,9 @@ from hjbjax.solution.status import Status
 
 S = TypeVar("S", bound=Any)
 
+GROWTH = 1e6  # a residual that has grown by this factor over its smallest has diverged
+PATIENCE = 10  # steps without progress of a residual that is rounding
+ROUNDING = 64  # residuals below this many units in the last place of max|V| are rounding
 LOST = 4  # roundings of numbers of the size lift · max(factor, 1) in factor · V + shift
 
 
@@ -49,6 +53,9 @@ class Certificate(enum.Enum):
     RESIDUAL = "the high-order equation, whose residual this is, has no comparison principle"
     OPEN = "open ends continue the value from inside, and have no comparison principle"
     NONE = "without discount and positive running cost the residual bounds nothing"
+
+
+TO_THE_END = (Certificate.NONE, Certificate.BY_DISCOUNT)  # of tubes: V falls or climbs until nothing moves
 
 
 @pytree_dataclass()
@@ -223,6 +230,33 @@ def enclosure(kind: Certificate, bound: ErrorBound, discount: Number | None = No
 def steps_since_best(state: Any, bound: ErrorBound) -> Scalar:
     """The steps without progress, this one among them: neither error nor residual is less than ever before."""
     return jnp.where(jnp.any(_measures(bound) < state.best), 0, state.since_best + 1)
+
+
+def judged(task: Any, value: Field, bound: ErrorBound, best: jax.Array, since: Scalar) -> Scalar:
+    """The status of a ``fixed_point.Task`` after a step; each line overrules those before it."""
+    finite = jnp.isfinite(bound.residual)
+    matters = (since >= PATIENCE) | (bound.residual > GROWTH * best[1])  # else it changes no answer below
+    climbs = task.constrained or task.method.relaxes
+    to_the_end = climbs and task.certificate in (*TO_THE_END, Certificate.OPEN)
+    size = jax.lax.cond(
+        matters | to_the_end,
+        lambda: task.grid.largest(jnp.where(task.counted, jnp.abs(value), 0)),
+        lambda: jnp.zeros_like(best[1]),
+    )
+    rounding, tol = ROUNDING * jnp.finfo(value.dtype).eps * size, task.tol
+    longest = task.method.patience(task.grid.whole)
+    if to_the_end:  # a front moves V by a spacing times its slope a step, whatever the tolerance, past every node
+        tol = jnp.where(task.problem.discount > 0, tol, rounding)
+        longest = max(longest, 100 + 4 * task.grid.whole.size)
+    # a residual that is rounding has nowhere to go: ten steps tell, in place of the thousands of a slow climb
+    patience = jnp.where(bound.residual <= rounding, PATIENCE, longest)
+    code = jnp.where(since >= patience, Status.STALLED, Status.RUNNING)
+    grew = bound.residual > GROWTH * jnp.maximum(best[1], rounding)
+    bounded = jnp.isfinite(best[0]) & (bound.error <= GROWTH * best[0])
+    grew &= ~bounded  # a better policy may leave more than one that stops at once
+    code = jnp.where(grew, Status.DIVERGED, code)
+    code = jnp.where(bound.error <= tol, Status.CONVERGED, code)
+    return jnp.where(finite, code, Status.NONFINITE).astype(jnp.int32)
 
 
 def booked(state: S, start: Scalar, bound: ErrorBound, code: Scalar, since: Scalar, **found: Any) -> S:

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
-from hjbjax.discretisation.rates import jump_rates
+from hjbjax.discretisation.rates import Rates, jump_rates
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import bellman, certificates, methods
 from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
@@ -33,10 +33,6 @@ from hjbjax.solution.status import Status
 
 FULL_STEPS = 10  # corrections of a limited scheme before they are halved, which ends limit cycles of the limiter
 HISTORY = 256  # steps whose residuals one chunk can record
-GROWTH = 1e6  # a residual that has grown by this factor over its smallest has diverged
-TO_THE_END = (Certificate.NONE, Certificate.BY_DISCOUNT)  # of tubes: V falls or climbs until nothing moves
-PATIENCE = 10  # steps without progress of a residual that is rounding
-ROUNDING = 64  # residuals below this many units in the last place of max|V| are rounding
 
 
 @pytree_dataclass(static=("certificate", "has_lost", "bare"))
@@ -99,13 +95,28 @@ class Task:
         return ~self.counted if self.has_lost else None
 
     @property
+    def given(self) -> Obstacles:
+        """Target and constraints at the nodes, made where they are used if nothing but V is kept."""
+        return bellman.obstacles(self.on) if self.bare else self.obstacles
+
+    @property
+    def by_defect(self) -> bool:
+        """Whether neither a step nor its bound asks for actions: those at the last value are then found at the end."""
+        chosen = getattr(self.method, "by_defect", False)  # a method of the user's need not know of it
+        if not chosen or self.bare or self.certificate is not Certificate.ADDITIVE or self.on.plain is not None:
+            return False
+        players = players_of(self.on)
+        at_ends = players.control.fastest_at_ends and players.disturbance.fastest_at_ends
+        return at_ends and players.exact and self.scheme.monotone
+
+    @property
     def constrained(self) -> bool:
         """True if the problem has a stopping cost or a running maximum."""
         return self.problem.stopping_cost is not None or self.problem.running_max is not None
 
     def impose(self, value: Field) -> Field:
         """``value`` with the given values put in, and with nodes that are lost far above all others."""
-        value = (bellman.obstacles(self.on) if self.bare else self.obstacles).impose(value)
+        value = self.given.impose(value)
         if not self.has_lost:
             return value
         # 1/√eps above: no minimum chooses it, and a difference with it still has half of its digits
@@ -131,8 +142,7 @@ class Task:
         zero = jnp.zeros(self.grid.shape, self.tol.dtype)
         if not self.constrained or self.certificate is Certificate.ADDITIVE:
             return zero
-        given = bellman.obstacles(self.on) if self.bare else self.obstacles
-        limits = [limit for limit in (given.lower, given.upper) if limit is not None]
+        limits = [limit for limit in (self.given.lower, self.given.upper) if limit is not None]
         start = functools.reduce(jnp.maximum, limits)
         return jnp.asarray(jnp.broadcast_to(start, self.grid.shape), self.tol.dtype)
 
@@ -185,13 +195,18 @@ def run(task: Task, state: State, until: Number) -> State:
         here = dataclasses.replace(task, on=on)
         return advance(here, dataclasses.replace(state, step=count), start)
 
-    return jax.lax.while_loop(lambda at: (at.code == Status.RUNNING) & (at.step < until), step, state)
+    state = jax.lax.while_loop(lambda at: (at.code == Status.RUNNING) & (at.step < until), step, state)
+    if not task.by_defect:
+        return state
+    return dataclasses.replace(state, policy=bellman.greedy(task.on, state.value, task.obstacles.fixed))
 
 
 def advance(task: Task, state: State, start: Scalar) -> State:
     """One step; a step that ends in numbers that are not finite is taken back."""
     if task.bare:
         return _relaxed(task, state, start)
+    if task.by_defect:
+        return _relaxed_by_defect(task, state, start)
     delta = _correction(task, state)
     if not task.scheme.monotone:
         delta = jnp.where((state.step < FULL_STEPS) | task.plain, 1.0, 0.5).astype(delta.dtype) * delta
@@ -203,7 +218,7 @@ def advance(task: Task, state: State, start: Scalar) -> State:
     policy, fastest, bound = _look(task, value, state.policy, moved=moved, first=state.step < 0)
     bound = dataclasses.replace(bound, error=jnp.where(_lacks_measure(task, state), jnp.inf, bound.error))
     since = certificates.steps_since_best(state, bound)
-    code = _judge(task, value, bound, state.best, since)
+    code = certificates.judged(task, value, bound, state.best, since)
     return certificates.booked(state, start, bound, code, since, value=value, policy=policy, fastest=fastest)
 
 
@@ -212,9 +227,25 @@ def _relaxed(task: Task, state: State, start: Scalar) -> State:
     value = task.impose(state.value)  # a guess need not respect what is given
     step, bound = certificates.of_relaxation(task.certificate, task.on, value)
     since = certificates.steps_since_best(state, bound)
-    code = _judge(task, state.value, bound, state.best, since)  # of the next value it would want an array of its own
+    # of the next value it would want an array of its own
+    code = certificates.judged(task, state.value, bound, state.best, since)
     after = jnp.where(state.step < 0, value, task.impose(value + step))
     return certificates.booked(state, start, bound, code, since, value=after)
+
+
+def _relaxed_by_defect(task: Task, state: State, start: Scalar) -> State:
+    """One relaxation of every node by the defect before it, with the bound on the value after it; no action is kept."""
+    assert task.outflow is not None
+    value = task.impose(state.value + _correction(task, state))
+    defect = jnp.where(task.obstacles.fixed, 0, bellman.relaxation(task.on, value, task.outflow)[0])
+    policy = dataclasses.replace(state.policy, defect=defect)
+    left = PolicyEquation(task.obstacles.clipped(defect / task.outflow, value), Rates((), ()))
+    iterate = Iterate(task.grid, value, policy, left, task.obstacles, task.counted)
+    bound = certificates.error_bound(task.certificate, iterate, discount=task.problem.discount)
+    since = certificates.steps_since_best(state, bound)
+    code = certificates.judged(task, value, bound, state.best, since)
+    after = certificates.booked(state, start, bound, code, since, value=value)
+    return dataclasses.replace(after, policy=policy)  # of a step that is taken back, too: ``run`` makes it anew
 
 
 def broken(task: Task, state: State) -> jax.Array:
@@ -245,7 +276,7 @@ def _look(
     """The greedy policy at a value, its largest Q + β, and the bound on the value's error."""
     problem = task.problem
     policy = bellman.greedy(task.on, value, task.obstacles.fixed, incumbent=incumbent, lost=task.lost)
-    if problem.stopping_cost is not None and not problem.is_game and task.certificate in TO_THE_END:
+    if problem.stopping_cost is not None and not problem.is_game and task.certificate in certificates.TO_THE_END:
         fixed = task.obstacles.fixed | first  # nobody has chosen the actions before the first look
         policy = bellman.improvement(task.on, value, fixed, policy, incumbent)
     left = task.equation(value, policy)
@@ -260,33 +291,6 @@ def _look(
         leaks = bellman.leaks(task.on, policy, task.obstacles.fixed, ~task.counted)
         bound = dataclasses.replace(bound, error=jnp.where(leaks, jnp.inf, bound.error))
     return policy, left.fastest, bound
-
-
-def _judge(task: Task, value: Field, bound: ErrorBound, best: jax.Array, since: Scalar) -> Scalar:
-    """The status after a step; each line overrules those before it."""
-    finite = jnp.isfinite(bound.residual)
-    matters = (since >= PATIENCE) | (bound.residual > GROWTH * best[1])  # else it changes no answer below
-    climbs = task.constrained or task.method.relaxes
-    to_the_end = climbs and task.certificate in (*TO_THE_END, Certificate.OPEN)
-    size = jax.lax.cond(
-        matters | to_the_end,
-        lambda: task.grid.largest(jnp.where(task.counted, jnp.abs(value), 0)),
-        lambda: jnp.zeros_like(best[1]),
-    )
-    rounding, tol = ROUNDING * jnp.finfo(value.dtype).eps * size, task.tol
-    longest = task.method.patience(task.grid.whole)
-    if to_the_end:  # a front moves V by a spacing times its slope a step, whatever the tolerance, past every node
-        tol = jnp.where(task.problem.discount > 0, tol, rounding)
-        longest = max(longest, 100 + 4 * task.grid.whole.size)
-    # a residual that is rounding has nowhere to go: ten steps tell, in place of the thousands of a slow climb
-    patience = jnp.where(bound.residual <= rounding, PATIENCE, longest)
-    code = jnp.where(since >= patience, Status.STALLED, Status.RUNNING)
-    grew = bound.residual > GROWTH * jnp.maximum(best[1], rounding)
-    bounded = jnp.isfinite(best[0]) & (bound.error <= GROWTH * best[0])
-    grew &= ~bounded  # a better policy may leave more than one that stops at once
-    code = jnp.where(grew, Status.DIVERGED, code)
-    code = jnp.where(bound.error <= tol, Status.CONVERGED, code)
-    return jnp.where(finite, code, Status.NONFINITE).astype(jnp.int32)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -306,8 +310,13 @@ class Look:
         return self.task.equation(self.state.value, self.state.policy, self.state.fastest)
 
     def relaxed(self) -> Field:
-        """r/(Q + β): one relaxation of every node."""
-        return self.state.policy.defect / _outflow(self.task, self.state)
+        """r/(Q + β) of the fastest action, which the policy shows where it is not known beforehand."""
+        task, policy, players = self.task, self.state.policy, players_of(self.task.on)
+        assert task.outflow is not None
+        if players.control.fastest_at_ends and players.disturbance.fastest_at_ends:
+            return policy.defect / task.outflow
+        chosen = jump_rates(task.on, list(policy.controls), list(policy.disturbances)).total()
+        return policy.defect / jnp.maximum(task.outflow, chosen + task.problem.discount)
 
     def evaluated(self, evaluation: Evaluation, replies: int) -> Field:
         """The correction of policy iteration: by the linear equation of the policy, in a game by the inner problem."""
@@ -337,14 +346,3 @@ def _by_method(task: Task, state: State) -> Field:
     return jax.lax.cond(  # a tube whose discount is traced: without one its policies have no value of their own
         jnp.asarray(task.problem.discount > 0), lambda: task.method.correct(look), look.relaxed
     )
-
-
-def _outflow(task: Task, state: State) -> Field:
-    """Q + β for value iteration: of the fastest action, which the policy shows where it is not known beforehand."""
-    assert task.outflow is not None
-    players = players_of(task.on)
-    if players.control.fastest_at_ends and players.disturbance.fastest_at_ends:
-        return task.outflow
-    u, d = list(state.policy.controls), list(state.policy.disturbances)
-    chosen = jump_rates(task.on, u, d).total()  # a fast action between the samples
-    return jnp.maximum(task.outflow, chosen + task.problem.discount)

@@ -126,7 +126,8 @@ class ValueIteration:
     """
 
     policy: bool = True
-    relaxes, evaluation, coarsest, in_parts = True, None, None, True  # no fields: answers to the loop, no choices
+    # no fields: answers to the loop, no choices
+    relaxes, evaluation, coarsest, in_parts, by_defect = True, None, None, True, True
 
     def __post_init__(self):
         if not isinstance(self.policy, bool):

@@ -34,9 +34,11 @@ def estimate(problem: Problem, grid: Grid, method: Method, dtype: DType) -> int:
     precision; a Krylov method its vectors.
     """
     word, n, actions = np.dtype(dtype).itemsize, grid.ndim, _actions(problem)
+    searched = _searched(problem, n, dtype)
+    is_tube = problem.stopping_cost is not None or problem.running_max is not None
     if method.relaxes and not getattr(method, "policy", True):
         # where V began, V, the step, and V as a chunk begins; and on few axes the neighbours along the last one
-        return word * (4 + (n <= stencil.LONGER) + _searched(problem, n, dtype)) * grid.size
+        return word * (4 + (n <= stencil.LONGER) + searched) * grid.size
     conditions = (problem.target, problem.stopping_cost, problem.running_max, problem.disturbances)
     # V and its defect, the actions, what is given at the nodes or bounds V there, the least cost where that certifies;
     # and two masks of a byte: the nodes that are held, and those that count
@@ -48,12 +50,15 @@ def estimate(problem: Problem, grid: Grid, method: Method, dtype: DType) -> int:
         if problem.noise is None and method.evaluation.rough:
             weights = n  # one way an axis, since sweeps may keep the two as one
         correction = method.evaluation.bytes_per_node(weights, word)
+    elif is_discounted(problem) and not searched:
+        # the defect is all that a step asks for; at the end the actions, and the pace
+        look = word * (actions + 1 + (problem.noise is not None or is_tube))
     else:
         look = word * (4 * max(actions, 1) + 1)  # and the pace
         if problem.stopping_cost is not None and not problem.is_game and is_discounted(problem) is False:
             # a policy that stops is kept where another one is no better, which looks at every rate
             look = max(look, math.ceil(word * (2.5 * n + actions)))
-    return (kept + max(look, correction)) * grid.size
+    return (kept + max(look + word * searched, correction)) * grid.size
 
 
 def of_march(on: Discretisation, kept: int, method: TimeMethod, *, policy: bool) -> int:

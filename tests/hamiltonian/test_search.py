@@ -13,7 +13,7 @@ import hjbjax as hjb
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.hamiltonian import discrete
 from hjbjax.hamiltonian.players import find_players
-from hjbjax.hamiltonian.search import UNROLL, enumerate_actions, refine
+from hjbjax.hamiltonian.search import UNROLL, enumerate_actions, optimum, refine
 
 NODES = 6
 laws = settings(max_examples=30)
@@ -54,6 +54,8 @@ def test_every_way_of_enumerating_finds_the_same(count, weight, seed):
         assert np.allclose(value, np.take_along_axis(table, best[None], 0)[0], rtol=1e-12, atol=1e-12)
         assert np.array_equal(np.stack(action, axis=-1), points[best])
         assert np.allclose(extra[0], action[0] + 2 * action[1], rtol=1e-14)
+        alone = optimum(functools.partial(wavy, parameters), points, sign, weight=weight)
+        assert np.allclose(alone, value, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("count", [5, UNROLL + 6])
@@ -78,8 +80,18 @@ def test_a_nan_surfaces_where_it_is_and_nowhere_else(count):
 
     for sign, best in ((1, 0.0), (-1, count - 1.0)):
         value = enumerate_actions(objective, points, sign)[0]
-        assert value[0] == best
+        alone = optimum(lambda action: objective(action)[0], points, sign)
+        assert value[0] == alone[0] == best
         assert jnp.isnan(value[1])
+        assert jnp.isnan(alone[1])
+
+
+@pytest.mark.parametrize("worst", [jnp.inf, -jnp.inf])
+def test_an_action_that_may_not_be_taken_is_not_taken(worst):
+    points = jnp.arange(4.0)[:, None]
+    sign = 1 if worst > 0 else -1
+    found = optimum(lambda action: jnp.where(action[0] < 2, worst, action[0]) * jnp.ones(2), points, sign)
+    assert found.tolist() == [2.0 if sign > 0 else 3.0] * 2
 
 
 @given(seed=SEEDS)

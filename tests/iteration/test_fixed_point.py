@@ -9,14 +9,14 @@ import pytest
 
 import hjbjax as hjb
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.iteration import fixed_point
+from hjbjax.iteration import certificates
 from hjbjax.iteration.certificates import ErrorBound
 from hjbjax.solution.status import Status
 from hjbjax.solvers.setup import prepare_on_host
 
 GRID = hjb.Grid([-1.0], [1.0], (11,))
 LARGE = 1e6  # the size of the value, whose rounding is 64 eps of it
-ROUNDING = fixed_point.ROUNDING * np.finfo(np.float64).eps * LARGE
+ROUNDING = certificates.ROUNDING * np.finfo(np.float64).eps * LARGE
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -48,7 +48,7 @@ def test_every_rule_of_a_verdict():
     @jax.jit
     def assumptions_of(residual, error, best, nearest, since):
         measured = ErrorBound(-error, error, jnp.zeros(()), error, residual)
-        return fixed_point._judge(task, jnp.full(11, -LARGE), measured, jnp.stack([nearest, best]), since)
+        return certificates.judged(task, jnp.full(11, -LARGE), measured, jnp.stack([nearest, best]), since)
 
     residuals = (0.0, 0.9 * ROUNDING, 1.1 * ROUNDING, 1.0, 0.9e6 * ROUNDING, 1.1e6 * ROUNDING, 1e7, np.inf, np.nan)
     seen = set()

@@ -76,9 +76,9 @@ def test_not_a_number_is_not_lost(found):
 
 
 def test_compiled_program(found):
-    """Two permutes an axis that is divided, for the one look at V in a step, and nothing that collects an array."""
-    assert found["8"]["collective-permute"] == 2
-    assert found["4x2"]["collective-permute"] == 4
+    """Two permutes an axis that is divided, for the look at V in a step and the one at the end, and no collecting."""
+    assert found["8"]["collective-permute"] == 2 * 2
+    assert found["4x2"]["collective-permute"] == 2 * 4
     for counts in found.values():
         assert counts["all-gather"] == counts["all-to-all"] == 0
         assert counts["all-reduce"] > 0

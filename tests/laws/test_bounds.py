@@ -32,6 +32,11 @@ def test_what_is_certified_holds(name, seed):
 
 
 @pytest.mark.slow
+def test_what_is_certified_holds_on_a_ridge_along_which_the_oracle_is_slow():
+    holds("game, line", 959)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [family.name for family in FAMILIES if family.name not in EVERY_TIME])
 @given(seed=SEEDS)
 @settings(laws, max_examples=SOME)

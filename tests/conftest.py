@@ -21,17 +21,12 @@ settings.load_profile("hjbjax")
 MAPS = 20_000  # of the 65 530 that Linux allows a process; every compiled kernel takes a few, and XLA crashes beyond
 
 
-# Two thirds of the default run are XLA's: without its optimiser it takes half of the time, and without the emitters of
-# fusions a third. Those of old write a value anew in every block of a fusion: one that chooses among many actions at
-# many neighbours takes them time that doubles with every action. Such programs are tested with the slow tests, or ask
-# for the emitters themselves (``compiler_options``).
+# Two thirds of a run are XLA's: without its optimiser it takes half of the time, and without the emitters of fusions a
+# third. Those of old write a value anew in every block of a fusion: one that chooses among many actions at constrained
+# ends takes them time that doubles with every action, so tests of such have few. A program that wants the emitters asks
+# for them (``compiler_options``), and who wants all tests with what users run says ``XLA_FLAGS= pytest``.
 QUICK = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
-
-
-def pytest_configure(config):
-    """Tests of the default run compile quickly; long ones run what users run."""
-    if config.getoption("markexpr") == "not slow":
-        os.environ.setdefault("XLA_FLAGS", QUICK)  # read when JAX starts to compute
+os.environ.setdefault("XLA_FLAGS", QUICK)  # read when JAX starts to compute, here and in the processes that tests start
 
 
 @pytest.fixture(autouse=True, scope="module")

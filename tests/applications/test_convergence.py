@@ -41,6 +41,7 @@ def plain():
 # --- orders ---
 
 
+@pytest.mark.slow
 def test_the_chain_is_first_order_and_the_limited_scheme_second(plain):
     assert plain.nodes.tolist() == [21, 41, 81]  # sorted from coarse to fine
     np.testing.assert_allclose(plain.h, [0.2, 0.1, 0.05], rtol=1e-12)

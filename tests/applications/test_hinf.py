@@ -91,6 +91,7 @@ def test_the_oracle_agrees_with_scipy():
     assert INTEGRATOR.level() == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_the_level_of_an_oscillator(oscillator):
     """P stays finite at the level: above it V settles, below it V grows at the end of every march."""
     wanted = OSCILLATOR.level()
@@ -185,6 +186,7 @@ def test_an_unstable_mode_that_the_cost_does_not_see():
     assert "feasible, but the feedback does not stabilise" in str(level)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rate", "stable"), [(-1.0, True), (0.0, False), (0.5, False)])
 def test_the_undisturbed_loop_of_a_mode_without_control(rate, stable):
     """ẋ = a x comes back for a < 0 alone; resting is not coming back."""
@@ -436,6 +438,7 @@ def test_dissipation_refuses(top, changes, error, reason):
         hjb.dissipation(**arguments)
 
 
+@pytest.mark.slow
 def test_random_disturbances_stay_in_a_box_without_zero():
     """ẋ = −x and cost −½d²: what is supplied is ½∫d², with 1 ≤ d ≤ 2."""
     problem = hjb.Problem(
@@ -447,6 +450,7 @@ def test_random_disturbances_stay_in_a_box_without_zero():
     assert np.ptp(found.supplied) > 0.5
 
 
+@pytest.mark.slow
 def test_random_disturbances_of_a_finite_set_are_refused():
     problem = hjb.Problem(
         lambda x, u, d: -x + 0 * d,

@@ -72,6 +72,7 @@ class Edge:
 # --- for all times ---
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("central", "order"), [(True, 2), pytest.param(False, 1, marks=pytest.mark.slow)])
 def test_the_ruin_of_a_gambler(central, order):
     problem, errors = hjb.Problem(carried, noise=SIGMA), []
@@ -176,6 +177,7 @@ def test_the_exit_time_from_a_square():
     assert order_of(errors) == pytest.approx(2, abs=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the optimal drift leaves")
 @given(SEEDS)
 @settings(max_examples=10)
@@ -317,6 +319,7 @@ def test_a_disturbance_plays_against_a_feedback():
         np.testing.assert_allclose(found.value, ruin(np.asarray(found.grid.axis(0)), mu), rtol=0, atol=4e-4)
 
 
+@pytest.mark.slow
 def test_where_a_solution_has_no_action_the_state_stays():
     """A policy that ends at .5 never brings anyone to 1."""
     grid = interval(41)

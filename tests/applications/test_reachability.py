@@ -252,6 +252,7 @@ def steered(x, u, d):
     return jnp.stack([jnp.cos(x[1]) + d[0] + 0.5 * d[1], u[0]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("modes", "pose", "tube"), [(("min", "max"), hjb.reach, True), (("max", "min"), hjb.avoid, False)]
 )
@@ -293,6 +294,7 @@ def test_what_is_no_dynamics_is_refused(dynamics, reason):
         hjb.from_hj_reachability(dynamics, distance)
 
 
+@pytest.mark.slow
 def test_the_package_itself():
     """Its own march of its own dynamics, from the other side of the interface."""
     hj = pytest.importorskip("hj_reachability")

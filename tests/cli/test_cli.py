@@ -508,6 +508,7 @@ def test_help_and_version():
     assert "--shape" in run("solve", "--help").stdout
 
 
+@pytest.mark.slow
 def test_the_schemes_on_offer_solve_and_others_are_refused():
     result = run("solve", "bang-bang", "--scheme", "eno2")
     assert result.exit_code == 2
@@ -600,6 +601,7 @@ def test_a_reader_that_has_seen_enough():
     assert (result.stdout.count("\n"), result.stderr) == (1, "")
 
 
+@pytest.mark.slow
 def test_a_real_process(folder):
     command = [sys.executable, "-m", "hjbjax", "solve", "stochastic-lq", "--shape", "41", "--json"]
     first = subprocess.run(command, capture_output=True, text=True, env=environment(), timeout=300)
@@ -639,6 +641,7 @@ main()
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["keeps", "raises"])
 def test_sigterm_in_a_real_process(folder, way):
     """With or without a partial solution it ends at once and orderly, though JAX is at work; no hidden folder stays."""
@@ -721,6 +724,7 @@ def test_a_parameter_as_an_option_of_its_own_is_answered_with_the_cure():
 # --- long runs ---
 
 
+@pytest.mark.slow
 def test_a_dry_run_says_what_a_solve_will_take_and_writes_nothing(folder):
     result = run("solve", "pendulum", "--shape", "40x41", "--dry-run")
     assert result.exit_code == 0, result.output
@@ -735,6 +739,7 @@ def test_a_dry_run_says_what_a_solve_will_take_and_writes_nothing(folder):
     assert told.stderr == "hjbjax: the solve does not fit into the memory that is free\n"
 
 
+@pytest.mark.slow
 def test_a_checkpoint_is_gone_on_from(folder):
     first = run("solve", "stochastic-lq", "--shape", "41", "--checkpoint", "run", "--max-steps", "1", "--out", "a")
     assert first.exit_code == 3

@@ -144,6 +144,7 @@ def solved(value, code=Status.CONVERGED):
     return stand_in
 
 
+@pytest.mark.slow
 def test_a_card_says_how_far_the_value_is_from_the_exact_one(monkeypatch):
     monkeypatch.setattr(hjbjax, "solve", solved(lambda x: 1.01 * (1 - x[..., 0] ** 2)))
     found = card(zoo.catalogue["brownian-exit"])

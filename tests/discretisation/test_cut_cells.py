@@ -34,6 +34,7 @@ def minimum_time(radius, dim, discount=0.0, **more):
     return hjb.Problem(go, one, controls, discount=discount, target=Disc(radius).distance, **more)
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=20)
 @given(st.floats(0.11, 0.9))
 def test_on_a_line_the_distance_is_exact(radius):

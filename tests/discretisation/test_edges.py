@@ -238,23 +238,23 @@ def test_two_inputs_against_the_oracle(kind):
         assert_at_most_so_much_below(solution.value, value, 5e-3)
 
 
-FOUR = np.array([[1.0, 0.3], [-1.0, 0.2], [0.1, 1.0], [0.2, -1.0], [-1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [1.0, -1.0]])
+FIVE = np.array([[-1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [1.0, -1.0], [0.1, 0.3]])
 
 
-@pytest.mark.slow  # enumerated controls at constrained ends: see QUICK in tests/conftest.py
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [None, hjb.ValueIteration(), hjb.PolicyIteration(hjb.Direct())])
 def test_enumerated_controls_against_the_oracle(method):
     """The same set, so the same value; bounds hold it, also at a coarse tolerance."""
     for seed in range(3):
-        problem = random_question(seed, 2, quadratic, hjb.Finite(FOUR), sigma=0.2)
-        value, policy = solved(*oracle(problem, SQUARE, lambda x: FOUR), 0.5)
+        problem = random_question(seed, 2, quadratic, hjb.Finite(FIVE), sigma=0.2)
+        value, policy = solved(*oracle(problem, SQUARE, lambda x: FIVE), 0.5)
         for tol in (1e-2, 1e-9):
             solution = hjb.solve(problem, SQUARE, method=method, scheme=PLAIN, tol=tol)
             lower, upper = solution.bounds
             assert solution.error <= tol
             assert np.all(lower.ravel() <= value + 1e-11)
             assert np.all(upper.ravel() >= value - 1e-11)
-        np.testing.assert_array_equal(solution.policy.reshape(-1, 2), FOUR[policy])
+        np.testing.assert_array_equal(solution.policy.reshape(-1, 2), FIVE[policy])
 
 
 @pytest.mark.slow
@@ -288,6 +288,7 @@ def test_float32_leaves_by_a_rounding_of_float32_at_most():
         chain.generator(problem, LINE, single.policy - 0.01)
 
 
+@pytest.mark.slow
 def test_the_derivative_at_a_wall_is_that_of_differences():
     """What the control must do at a constrained end moves with the drift."""
 
@@ -364,6 +365,7 @@ def minus_power_utility(x, u):
     return -((u[1] * jnp.exp(x[0])) ** (1 - GAMMA)) / (1 - GAMMA)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("most", "sign"), [([2.0, 0.5], 1), pytest.param([1.0, 0.3], -1, marks=pytest.mark.slow)])
 def test_merton_with_open_ends(most, sign):
     """Share and rate at 0 without exact data at the ends; projected ones are 100 to 200 % off. Also mirrored."""
@@ -410,6 +412,7 @@ def test_units_change_nothing_else(edges):
         np.testing.assert_allclose(solution.policy, solutions[0].policy, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["constrained", pytest.param("open", marks=pytest.mark.slow)])
 def test_mirrored_problems_have_mirrored_answers(kind):
     values = []
@@ -434,6 +437,7 @@ def contested(x, u, d):
     return 3.0 * x[0] - 2.0 * u[0] * d[0] + u @ u - d @ d
 
 
+@pytest.mark.slow
 def test_a_game_is_kept_in_against_every_disturbance():
     """min_u max_d by enumeration: the control that lets the disturbance push out is not admissible."""
     us, ds = np.linspace(-1, 1, 9)[:, None], np.linspace(-0.5, 0.5, 3)[:, None]
@@ -503,11 +507,11 @@ def test_a_corner_may_leave_one_action_alone(power):
     assert solution.policy[0, 2, 0] >= 0.37
 
 
-@pytest.mark.slow  # enumerated controls at constrained ends: see QUICK in tests/conftest.py
+@pytest.mark.slow
 def test_exports_hold_admissible_pairs_and_policies_alone():
-    problem = random_question(2, 2, quadratic, hjb.Finite(FOUR), sigma=0.2)
+    problem = random_question(2, 2, quadratic, hjb.Finite(FIVE), sigma=0.2)
     costs, probabilities, states, actions, factor = chain.transition_arrays(problem, SQUARE, scheme=PLAIN)
-    *_, allowed = oracle(problem, SQUARE, lambda x: FOUR)
+    *_, allowed = oracle(problem, SQUARE, lambda x: FIVE)
     np.testing.assert_array_equal(np.stack([states, actions]), np.argwhere(allowed).T)
     value = np.zeros(SQUARE.size)
     for _ in range(4000):
@@ -518,7 +522,7 @@ def test_exports_hold_admissible_pairs_and_policies_alone():
     np.testing.assert_allclose(solution.value.ravel(), value, atol=1e-6)
     rows = chain.generator(problem, SQUARE, solution.policy, scheme=PLAIN)
     assert (rows - np.diag(rows.diagonal())).min() >= 0
-    outward = np.broadcast_to(FOUR[np.argmin(allowed.sum(axis=0))], (*SQUARE.shape, 2))
+    outward = np.broadcast_to(FIVE[np.argmin(allowed.sum(axis=0))], (*SQUARE.shape, 2))
     with pytest.raises(ValueError, match="the policy leaves the box across a constrained end"):
         chain.matrix(problem, SQUARE, outward)
 
@@ -533,12 +537,12 @@ def test_open_ends_have_no_chain(ask):
             probability(problem, hjb.Grid([-1.0], [1.0], (9,), edges="open"), lambda x: x[0] - 0.5)
 
 
-@pytest.mark.slow  # enumerated controls at constrained ends: see QUICK in tests/conftest.py
+@pytest.mark.slow
 def test_a_march_with_constrained_ends_against_the_oracle():
-    problem = random_question(3, 2, quadratic, hjb.Finite(FOUR), sigma=0.2)
+    problem = random_question(3, 2, quadratic, hjb.Finite(FIVE), sigma=0.2)
     problem = dataclasses.replace(problem, terminal_cost=lambda x: x[0] - x[1])
     solution = hjb.march(problem, SQUARE, 0.5, scheme=PLAIN, step=0.005, method=hjb.Explicit(1))
-    arrays = oracle(problem, SQUARE, lambda x: FOUR)
+    arrays = oracle(problem, SQUARE, lambda x: FIVE)
     value = (SQUARE.nodes()[..., 0] - SQUARE.nodes()[..., 1]).ravel()
     for _ in range(100):
         value = value + 0.005 * (hamiltonians(*arrays, value).min(axis=1) - 0.5 * value)
@@ -586,6 +590,7 @@ def test_a_wave_leaves_through_an_open_end(scheme, method, most):
     assert walled.cut.tolist() == [[[0, 1]]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", [hjb.Upwind(), pytest.param(hjb.Limited(), marks=pytest.mark.slow)])
 def test_a_line_in_the_whole_space(scheme):
     """dx = (.3 x + u) dt, cost x + ½u²: V = a x − ½a², a = 1/(1 − .3), is straight: open ends have it to the digits."""
@@ -690,6 +695,7 @@ def test_what_leaves_is_told_by_the_drift_there(bound, current, dtype):
     assert abs(solution.value[0] - 1) <= 1e-2  # standing still costs 1 a unit time
 
 
+@pytest.mark.slow
 def test_many_nodes_are_counted_in_blocks(monkeypatch):
     rng, grid = np.random.default_rng(0), hjb.Grid([-1.0] * 3, [1.0] * 3, (5, 6, 7), periodic=(False, True, False))
     problem = hjb.Problem(lambda x, u: jnp.stack([x[1] + u[0], x[2], x[0] * u[0]]), None, hjb.Box([-1.0], [1.0]))

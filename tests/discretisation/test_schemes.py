@@ -56,6 +56,7 @@ def test_another_scheme_is_of_its_order_in_a_stationary_problem():
     assert fine < 0.2 * largest_error(160, hjb.Upwind())
 
 
+@pytest.mark.slow
 def test_another_scheme_marches_and_goes_lane_by_lane():
     problem, grid = smooth(80)
     free = hjb.Problem(problem.drift, problem.cost, problem.controls)

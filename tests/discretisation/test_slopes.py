@@ -64,6 +64,7 @@ def smoother(v, h):
     return flatter.deriv()(0.0)
 
 
+@pytest.mark.slow
 @given(SEEDS)
 def test_slopes_are_those_of_fitted_polynomials(seed):
     rng = np.random.default_rng(seed)

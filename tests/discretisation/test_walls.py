@@ -45,6 +45,7 @@ def resolvent(problem, grid, source, discount=0.0, held=None, **how):
 # --- reflected hitting and exit times ---
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", [hjb.Upwind(), hjb.Limited()])
 def test_the_shortest_hitting_time_off_a_wall(scheme):
     """dx = u dt + ½ dw, |u| ≤ 1, to x = 0: u = −1 and T = x − (e^{−λ(1−x)} − e^{−λ})/λ with λ = 2/σ²."""

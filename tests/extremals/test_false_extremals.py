@@ -107,6 +107,7 @@ def test_past_a_conjugate_point(dim, horizon, ends, conjugate):
         assert told == pytest.approx(conjugate, abs=0.02)
 
 
+@pytest.mark.slow
 def test_a_target_that_is_only_touched():
     """Least time 3.05; the path that ends at (−.2, 0), along the edge of the disc, takes 4.1."""
     extremal = hjb.pontryagin(zoo.double_integrator(discount=0.0)[0], [1.5, 0.5], throw=False)

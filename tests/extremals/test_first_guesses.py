@@ -90,6 +90,7 @@ def test_a_cost_of_the_length_of_u_names_the_way_out():
     assert "a size times a direction" in failed.message
 
 
+@pytest.mark.slow
 def test_a_start_without_slopes_is_named():
     """The fall from rest in the height alone: √(2gy) has no slope at y = 0."""
     problem = hjb.Problem(lambda x, u: u * jnp.sqrt(x), lambda x, u: 1 + u @ u, hjb.Box([0.1], [3.0]))

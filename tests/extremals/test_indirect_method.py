@@ -39,6 +39,7 @@ def passes(extremal, tolerance=1e-6):
     return True
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parameters", [{}, {"mass": 1.5, "discount": 0.6, "control_weight": 2.0}], ids=str)
 def test_an_infinite_horizon_is_riccati(parameters):
     problem, _ = zoo.double_integrator_lq(**parameters)
@@ -181,6 +182,7 @@ def test_one_input_jumps_and_one_does_not():
     np.testing.assert_allclose(extremal.controls, [[-1.0, -0.5]] * len(extremal.controls), atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "start", [(1.0, 0.0, 1.0), *(pytest.param(x, marks=pytest.mark.slow) for x in ((1.0, -0.5, 1.0), (0.6, 0.4, 0.8)))]
 )

@@ -23,6 +23,7 @@ def exact_at_nodes(grid, exact, policy):
     return Solution(grid, value, policy)
 
 
+@pytest.mark.slow
 def test_at_a_switching_curve_it_is_nearer_to_the_least_time_than_the_mean_of_two_controls():
     """The double integrator with exact T at the nodes, sampled: what is lost between the nodes, and nothing else."""
     problem, grid = zoo.double_integrator(discount=0.0, shape=(61, 61))
@@ -45,6 +46,7 @@ def test_at_a_switching_curve_it_is_nearer_to_the_least_time_than_the_mean_of_tw
     assert 0 < lost["greedy"] < 0.35 * lost["means"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("source", ["exact", pytest.param("solved", marks=pytest.mark.slow)])
 def test_its_cost_is_nearer_to_the_value_of_the_eikonal_equation(source):
     problem, grid = zoo.eikonal(discount=0.0, shape=(21, 21))
@@ -93,6 +95,7 @@ def test_it_is_the_minimiser_of_a_game_also_where_the_control_drives_the_noise(n
     assert greedy.disturbance_at(x)[0] == pytest.approx(slopes[1] / 6, abs=accuracy)
 
 
+@pytest.mark.slow
 def test_enumerated_controls_are_members_and_marched_values_are_asked_at_the_time():
     grid, times = Grid([-1.0], [1.0], (21,), periodic=(True,)), np.array([0.0, 1.0])
     place = grid.nodes()[..., 0]
@@ -127,6 +130,7 @@ def test_it_is_blind_where_the_value_is_infinite_and_refuses_what_is_no_solution
         greedy_feedback(problem, Solution(grid, np.stack([value, value]), np.zeros((2, 11, 1))))
 
 
+@pytest.mark.slow
 def test_it_does_not_leave_across_a_constrained_end():
     """V falls towards both ends; only the upper one is constrained, and the nodes' control vanishes there."""
     grid = Grid([0.0], [1.0], (11,), edges=[("projected", "constrained")])

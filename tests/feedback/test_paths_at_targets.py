@@ -90,6 +90,7 @@ def test_a_path_into_states_without_a_control_ends_there_and_says_where():
     assert (path.status, path.states.tolist(), path.controls.shape) == (PathStatus.UNDEFINED, [[-1.0, 1.0]], (0, 2))
 
 
+@pytest.mark.slow
 def test_a_game_with_enumerated_controls_across_a_seam_on_a_stretched_axis_ends_at_its_target():
     grid = Grid([0.0, -1.0], [1.0, 1.0], (20, 21), periodic=(True, False), stretch=(None, Sinh(1.5)))
 
@@ -117,6 +118,7 @@ def test_a_game_with_enumerated_controls_across_a_seam_on_a_stretched_axis_ends_
         assert {tuple(u) for u in path.controls} <= {tuple(u) for u in admissible.points}
 
 
+@pytest.mark.slow
 def test_a_target_that_moves_is_met_by_a_marched_feedback_on_a_line():
     """From x = 1 at speed −1 towards |x| ≤ .2 + .1 t: met where 1 − t = .2 + .1 t."""
     grid, times = Grid([-1.0], [1.0], (21,)), np.linspace(0.0, 2.0, 21)

@@ -81,6 +81,7 @@ def test_lq_path_and_cost_are_exact_and_a_second_call_compiles_nothing():
     assert len(TRACES) == seen + 1, "the second call may probe the cost once; more means that it compiled again"
 
 
+@pytest.mark.slow
 def test_forward_derivative_of_the_cost_is_the_gradient_of_the_value():
     with jax.enable_x64(True):
         times = jnp.linspace(0.0, 25.0, 101)
@@ -168,6 +169,7 @@ def test_periodic_states_are_wrapped_before_cost_and_feedback_see_them():
     assert path.cost == pytest.approx(2 * 0.5 + (0.53**2 - 0.03**2) / 2, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_leaving_the_box_stops_at_the_edge_or_takes_the_nearest_point():
     grid = Grid([-1.0], [1.0], (5,))
     away = Answer(grid, np.linspace(0.0, 1.0, 5)[:, None] + 0.5)
@@ -188,6 +190,7 @@ def test_leaving_the_box_stops_at_the_edge_or_takes_the_nearest_point():
         simulate(problem, away, [1.5], 3.0)
 
 
+@pytest.mark.slow
 def test_worst_case_disturbance_of_a_solution_pays_the_value_of_the_game():
     gamma2, grid = 4.0, Grid([-2.0], [2.0], (9,))
     p = 1 / math.sqrt(1 - 1 / gamma2)
@@ -269,6 +272,7 @@ def test_a_key_is_one_brownian_path_whatever_the_steps():
     assert np.all(np.abs(other - ends[0]) > 1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [pytest.param("additive", marks=pytest.mark.slow), "multiplicative"])
 def test_variance_of_an_ornstein_uhlenbeck_path_over_4000_keys(kind):
     """dx = −θx dt + σ dw, or σx dw: eight states a path, so that 3 % are four standard deviations of the estimate."""
@@ -301,6 +305,7 @@ def within(times, mean, errors=3):
 BROWNIAN = Problem(lambda x, u: 0 * x, lambda x, u: jnp.ones(()), noise=1.0, target=lambda x: 1 - jnp.abs(x[0]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("steps", "count"),
     [(50, 1000), pytest.param(50, 4000, marks=pytest.mark.slow), pytest.param(200, 2000, marks=pytest.mark.slow)],
@@ -351,6 +356,7 @@ def test_a_brownian_motion_in_the_plane_leaves_the_disc_on_time_and_on_its_edge(
     np.testing.assert_allclose(np.linalg.norm(states[arrived], axis=-1), 1.0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_noise_that_does_not_act_across_the_edge_leaves_the_interpolant_to_say_when():
     """ẋ₁ = 1 with noise in x₂ alone: the target x₁ ≥ .77 is met at t = .77."""
     problem = Problem(

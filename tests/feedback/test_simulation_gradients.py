@@ -78,6 +78,7 @@ def test_the_feedback_of_a_solve_is_followed_through_its_path():
     assert found == pytest.approx(wanted, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_second_derivatives_of_a_path_are_refused():
     with pytest.raises(NotImplementedError, match="second derivatives of a path"):
         jax.eval_shape(jax.hessian(cost), jnp.asarray(AT))

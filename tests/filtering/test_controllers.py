@@ -75,6 +75,7 @@ def test_certainty_equivalence_is_the_feedback_at_the_estimate_in_and_out_of_a_p
 # --- the averaged Hamiltonian ---
 
 
+@pytest.mark.slow
 @settings(max_examples=6, deadline=None)
 @given(st.floats(-2, 2), st.floats(0.3, 0.8), st.floats(0.2, 3.0), st.floats(0.1, 4.0))
 def test_of_a_quadratic_the_average_is_certainty_equivalence(mean, deviation, slope, push):

@@ -72,6 +72,7 @@ def bucy(a, c, noise, mean, covariance, end, r=R):
 # --- linear plants ---
 
 
+@pytest.mark.slow
 def test_a_linear_plant_is_kalman_and_bucys_with_second_order():
     mean, covariance, likelihood = bucy(*(np.array([[k]]) for k in (-1.0, 1.0, 0.8)), [0.5], [[0.4]], 2.0)
     errors = []

@@ -67,6 +67,7 @@ def lag_errors(count, y, u, dt, exact, scheme):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scheme", "order", "finest"),
     [
@@ -232,6 +233,7 @@ def test_stretched_axes_and_other_schemes():
 # --- as an observer, in batches, in single precision ---
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*at an end of the box")
 def test_the_observer_is_the_filter_and_records_come_in_batches():
     rng = np.random.default_rng(3)

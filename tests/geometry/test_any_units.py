@@ -103,6 +103,7 @@ def test_brocketts_integrator_needs_one_bracket_in_any_units(units):
     assert ranks == [2, 3, 3]
 
 
+@pytest.mark.slow
 def test_ranks_in_float32_are_those_of_float64():
     plant = motor(1e-3)
     for depth, rank in ((1, 2), (2, 3), (4, 3)):
@@ -225,6 +226,7 @@ def test_an_equilibrium_must_be_one(region, equilibrium, words):
 # Brockett's condition
 
 
+@pytest.mark.slow
 def test_brocketts_condition_in_other_words_and_units():
     def drive(size):
         return [

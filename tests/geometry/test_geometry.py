@@ -133,6 +133,7 @@ def symbolic_bracket(f, g, x):
     return g.jacobian(x) * f - f.jacobian(x) * g
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_brackets_and_ranks_are_those_of_sympy(name):
     n, f, gs, h = SYSTEMS[name]
@@ -163,6 +164,7 @@ def test_brackets_and_ranks_are_those_of_sympy(name):
             assert observed.rank == seen.rank(), (point, depth)
 
 
+@pytest.mark.slow
 def test_linear_systems_have_kalmans_ranks():
     rng = np.random.default_rng(3)
     a, b, c = rng.normal(size=(4, 4)), rng.normal(size=4), rng.normal(size=4)
@@ -247,6 +249,7 @@ class Switching:
 # The verdicts of the literature
 
 
+@pytest.mark.slow
 def test_the_unicycle_reaches_everything_by_one_bracket_and_is_not_linearisable():
     f, gs = geometry.affine_fields(zoo.Unicycle().drift, 2)
     for theta in (0.0, 0.7, np.pi / 2):

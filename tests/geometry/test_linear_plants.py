@@ -93,6 +93,7 @@ def verdicts(plant):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "spread"), [(dense, 6), (stiff, 1.5)], ids=["dense", "stiff"])
 def test_verdicts_on_linear_plants_are_those_of_the_theory_in_any_units(kind, spread):
     """100 plants; every state, the time and the input in units up to 1e12 apart.

@@ -261,6 +261,7 @@ def test_no_continuous_feedback_of_the_state_stabilises_them(system, states):
     assert f"2 independent fields move {states} states" in verdict.message
 
 
+@pytest.mark.slow
 def test_brocketts_condition_is_met_or_left_open():
     f, gs = geometry.affine_fields(zoo.BallAndBeam().drift, 1)
     assert stability.brockett_check(f, gs, np.zeros(4)).satisfied is True

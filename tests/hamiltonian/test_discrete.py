@@ -333,6 +333,7 @@ def test_one_player_at_a_time():
     assert np.allclose(d[0], 0.5, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_reply_meets_the_others_action():
     problem = Problem(lambda x, u, d: 0 * x, lambda x, u, d: u[0] * d[0], UNIT, disturbances=UNIT, discount=1.0)
     grid = Grid([0.0], [1.0], (3,))

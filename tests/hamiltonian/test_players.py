@@ -143,6 +143,7 @@ def test_a_bounded_disturbance_is_no_blow_up(cost):
     assert hjb.march(problem, LINE, 0.5, scheme=hjb.Upwind(split=True)).status is hjb.Status.CONVERGED
 
 
+@pytest.mark.slow
 def test_a_disturbance_with_a_square_is_watched_whatever_the_control_costs():
     problem = hjb.Problem(
         shared, lambda x, u, d: 9 * x @ x + jnp.abs(u[0]) - 0.1 * d @ d, UNIT, disturbances=hjb.Box([-9.0], [9.0])
@@ -181,6 +182,7 @@ def test_a_march_tells_it_too():
     assert caught[0].filename == __file__
 
 
+@pytest.mark.slow
 def test_what_upwinding_leaves_is_no_failure():
     """f = u + d/2 and a kink of V at 0: a gap of first order, two hundredths of what the actions matter."""
     problem = hjb.Problem(

@@ -46,8 +46,13 @@ def blocks(page):
     return [(*this, *after) for this, after in zip(found, [*found, ("", "")][1:], strict=True)]
 
 
+WITH_CODE = [page for page in PAGES if any(kind == "python" for kind, *_ in blocks(page))]
+
+
 # one namespace a page: a reader who starts there has nothing from another one
-@pytest.mark.parametrize("page", [page for page in PAGES if any(kind == "python" for kind, *_ in blocks(page))])
+@pytest.mark.parametrize(
+    "page", ["README", *(pytest.param(page, marks=pytest.mark.slow) for page in WITH_CODE if page != "README")]
+)
 def test_every_python_block_runs_and_prints_what_the_text_block_after_it_says(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     pyplot.close("all")  # or this page would draw on the axes of the one before

@@ -65,6 +65,7 @@ def random_question(rng, kind, n=2):
     return random_problem(rng, grid, kind, UNIT), grid
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [*NOISES, "game"])
 @given(seed=SEEDS)
 @laws
@@ -160,6 +161,7 @@ def test_axes_may_be_permuted(n, seed):
     assert np.allclose(there, here.transpose(order), rtol=0, atol=1e-11 * (1 + np.max(np.abs(here))))
 
 
+@pytest.mark.slow
 @given(seed=SEEDS)
 @laws
 def test_axes_may_be_mirrored(seed):

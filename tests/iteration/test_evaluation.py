@@ -157,6 +157,7 @@ LINE, WALK = hjb.Grid([-1.0], [1.0], (31,)), hjb.Problem(controlled, costs, hjb.
 FOR_EVER = hjb.Problem(controlled, costs, hjb.Box([-1.0], [1.0]), noise=0.5, discount=0.3)
 
 
+@pytest.mark.slow
 def test_another_evaluation_solves_marches_and_goes_lane_by_lane():
     method, known = hjb.PolicyIteration(Gmres()), hjb.solve(FOR_EVER, LINE, tol=1e-8, scheme=hjb.Upwind())
     alone = hjb.solve(FOR_EVER, LINE, method=method, tol=1e-6, scheme=hjb.Upwind())
@@ -171,6 +172,7 @@ def test_another_evaluation_solves_marches_and_goes_lane_by_lane():
     np.testing.assert_allclose(*steps, rtol=0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_another_evaluation_inside_a_derivative():
     def value(weight, method):
         problem = hjb.Problem(
@@ -193,6 +195,7 @@ def test_an_evaluation_that_is_no_pytree_is_told_how_to_become_one():
         hjb.PolicyIteration(Unregistered())
 
 
+@pytest.mark.slow
 def test_policy_iteration_picks_its_evaluation_by_the_problem():
     noisy = hjb.Problem(lambda x, u: u, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), noise=0.5, discount=1.0)
     grid = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (31, 31))

@@ -38,6 +38,7 @@ QUESTIONS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.slow) if "ball" in name else name for name in QUESTIONS]
 )
@@ -128,6 +129,7 @@ def test_a_march_keeps_what_it_came_to_before_the_noise_turned():
     assert np.all(np.isfinite(stopped.value))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "ask",
     [

@@ -35,6 +35,7 @@ def fitted_order(errors):
 # --- errors of the first-order chain, evaluated independently ---
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("noise", "scheme", "known", "order"),
     [
@@ -145,6 +146,7 @@ def test_brownian_exit_from_a_ball_is_exact_in_any_dimension(dim):
     assert largest_error(question, zoo.brownian_ball_exact(dim=dim, noise=0.7), tol=1e-10) <= 1e-9
 
 
+@pytest.mark.slow
 def test_discounted_brownian_exit_is_second_order():
     exact = zoo.brownian_exit_exact(discount=2.0)
     errors = [largest_error(zoo.brownian_exit(discount=2.0, shape=(n,)), exact, tol=1e-10) for n in (21, 41, 81)]
@@ -207,6 +209,7 @@ def test_correlated_noise_is_exact_on_quadratics():
     assert largest_error((problem, hjb.Grid([-1.0, -1.0], [1.0, 1.0], (21, 23))), exact, tol=1e-10) <= 1e-9
 
 
+@pytest.mark.slow
 def test_stochastic_lq_is_exact_up_to_its_bound():
     exact = zoo.stochastic_lq_exact(noise=1.0)
     assert largest_error(zoo.stochastic_lq(noise=1.0, shape=(101,)), exact, tol=1e-10) <= 1e-9

@@ -246,6 +246,7 @@ def test_a_box_beats_its_samples(scheme):
 # --- what it says ---
 
 
+@pytest.mark.slow
 def test_status_message_and_statistics():
     problem, grid = zoo.bang_bang()
     solution = hjb.solve(problem, grid, scheme=hjb.Limited(), tol=1e-7)

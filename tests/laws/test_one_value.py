@@ -134,6 +134,7 @@ def agree(name, found, value, tolerance=1e-6):
     np.testing.assert_allclose(np.asarray(found)[finite], value[finite], atol=tolerance, err_msg=name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_one_value_however_it_is_asked_for(name):
     question = QUESTIONS[name]

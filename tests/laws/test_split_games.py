@@ -110,6 +110,7 @@ def test_the_exported_generator_is_that_of_both_players():
     np.testing.assert_allclose(np.diag(found, -1), down[2, 0, 1:], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_float32_batches_jit_and_derivatives():
     scheme, known = hjb.Upwind(split=True), hjb.solve(game(), GRID, scheme=hjb.Upwind(split=True), tol=1e-9).value
     single = hjb.solve(game(), GRID, scheme=scheme, dtype="float32", tol=1e-4).value
@@ -138,6 +139,7 @@ def test_players_who_cannot_be_told_apart_are_upwinded_by_their_sum():
     np.testing.assert_array_equal(split, whole)
 
 
+@pytest.mark.slow
 def test_a_march_of_long_duration_comes_to_the_stationary_value():
     """By explicit and by implicit steps: one Hamiltonian in solve and in march."""
     problem = game()
@@ -164,6 +166,7 @@ def test_two_axes_one_of_them_shared():
     assert solution.isaacs_gap == 0
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*cannot reach the target")
 def test_a_target_that_is_kept_off_is_reached_in_the_end_where_players_are_upwinded_apart():
     """f = u + d, |u| ≤ 1 towards the target, |d| ≤ 3/2 away from it; T_k − T_{k−1} = h + 3/2 (T_{k+1} − T_k)."""

@@ -112,6 +112,7 @@ def some(names, fast):
     return [name if name in fast else pytest.param(name, marks=pytest.mark.slow) for name in names]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", some(QUESTIONS, ["noisy", "minimum time", "rest", "tube", "pursuit"]))
 def test_a_solve_knows_no_units(name):
     known = hjb.solve(asked(name, Units()), GRID, tol=1e-6, scheme=hjb.Upwind())
@@ -136,6 +137,7 @@ def test_nor_does_a_second_order_solve_or_a_batch(name):
         same(lane.value, hjb.solve(problems[0], GRID, tol=1e-6, scheme=hjb.Upwind()).value, cost)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [hjb.Explicit(), hjb.Implicit()])
 @pytest.mark.parametrize(
     "name", some(["discounted", "noisy", "minimum time", "stopping", "kept off", "game"], ["noisy", "game"])

@@ -65,6 +65,7 @@ def brute(problem, grid, held, surely):
         inside = found
 
 
+@pytest.mark.slow
 @settings(max_examples=60)
 @given(
     st.lists(st.lists(st.sampled_from([-1.0, 0.0, 1.0]), min_size=3, max_size=3), min_size=8, max_size=8),
@@ -160,6 +161,7 @@ def thin(inputs, unit):
     return problem, grid, (x[..., 0] <= 0.6) & (x[..., 1] >= -0.6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("inputs", "unit"), [(2, 1e-6), (2, 1.0), (3, 1e3)])
 def test_a_part_of_a_ball_thinner_than_its_samples(inputs, unit):
     problem, grid, known = thin(inputs, unit)
@@ -167,6 +169,7 @@ def test_a_part_of_a_ball_thinner_than_its_samples(inputs, unit):
     np.testing.assert_array_equal(reached(problem, grid, held, surely=True), known)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*cannot reach the target")
 def test_the_long_way_through_a_thin_part_of_a_ball_is_found_in_a_batch_as_well():
     """From zero the iteration waits at rest, at a cost; the answers under a vanishing discount lead it on its way."""

@@ -324,6 +324,7 @@ SLOW = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n", "kind", "with_target"), [(1, "scalar", True), (2, "matrix", True), *SLOW])
 def test_quantecon_finds_our_value(n, kind, with_target):
     from quantecon.markov import DiscreteDP

@@ -56,6 +56,7 @@ def test_a_place_to_stay_and_earn(rate, speed, tol):
     assert solution.error is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tol", [1e-3, 0.8])
 def test_stopping_is_put_off_for_ever(tol):
     question = hjb.Problem(lambda x, u: jnp.stack([x[1], u[0]]), lambda x, u: -1.0, U, stopping_cost=lambda x: x @ x)
@@ -64,6 +65,7 @@ def test_stopping_is_put_off_for_ever(tol):
     assert caught.value.solution.value.shape == PLANE.shape
 
 
+@pytest.mark.slow
 def test_a_round_that_pays_on_the_average():
     """On a ring with a constant current: costs of both signs, and their mean decides."""
     ring = hjb.Grid([0.0], [2 * np.pi], (32,), periodic=(True,))

@@ -192,6 +192,7 @@ def test_chains_without_one_law_are_refused(changes, reason):
     assert len(str(caught.value).splitlines()) <= 6
 
 
+@pytest.mark.slow
 def test_where_everything_comes_to_rest_the_density_is_a_spike():
     """ẋ = −x: the node at zero holds all of it."""
     density = chain.stationary_density(Problem(ornstein_uhlenbeck), Grid([-1.0], [1.0], (21,)))

@@ -115,6 +115,7 @@ def test_the_axes_given_are_drawn_on_and_keep_their_figure():
     assert labels(ax) == ["switching curve", "path"]
 
 
+@pytest.mark.slow
 def test_on_axes_that_are_given_nothing_is_shown_and_no_global_state_changes():
     """In an interpreter of its own: pyplot is not even imported, and rcParams stay as they are."""
     code = """

@@ -37,6 +37,7 @@ def test_the_inverse_map(strength, center, fraction):
         assert float(stretching.fraction(stretching.place(fraction))) == pytest.approx(fraction, abs=1e-8)
 
 
+@pytest.mark.slow
 @settings(max_examples=50, deadline=None)
 @given(st.floats(0.3, 8), st.floats(0, 1), st.floats(-3, 0), st.floats(0.5, 6), st.sampled_from(["float64", "float32"]))
 def test_every_program_finds_the_nodes_where_they_are_to_a_few_roundings(strength, center, lo, length, dtype):

@@ -37,6 +37,7 @@ def test_nodes_on_the_boundary_are_held(half, dtype):
         assert np.array_equal(value == 0, np.abs(np.arange(-20, 21)) <= cells), cells
 
 
+@pytest.mark.slow
 def test_all_programs_hold_the_same_nodes():
     grid, problem = hjb.Grid([-2.0], [2.0], (41,)), timed(0.3)
     value = hjb.solve(problem, grid, tol=1e-9, scheme=hjb.Upwind()).value
@@ -80,6 +81,7 @@ def test_a_steep_target_does_not_grow():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stretch", [None, (hjb.Sinh(2.0),)])
 def test_the_corners_of_a_grid_have_derivatives(stretch):
     """Coordinates are data, and follow the corners all the same."""
@@ -101,6 +103,7 @@ def test_the_corners_of_a_grid_have_derivatives(stretch):
     assert np.isclose(by_leaf, slope, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_an_exit_cost_behind_the_seam_is_that_before_it():
     h = 2 * np.pi / 40
     grid = hjb.Grid([0.0], [2 * np.pi], (40,), periodic=(True,))

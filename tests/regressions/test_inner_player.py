@@ -26,6 +26,7 @@ def posed(numbers):
     return zoo.lq_game(gamma=gamma, rate=rate, discount=discount, shape=(NODES,))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("numbers", GAMES)
 @pytest.mark.parametrize("evaluation", [None, pytest.param(hjb.Krylov(), marks=pytest.mark.slow)])
 def test_a_game_near_its_limit_converges(numbers, evaluation):
@@ -40,6 +41,7 @@ def test_a_game_near_its_limit_converges(numbers, evaluation):
     np.testing.assert_allclose(sharp.value[inside], exact(problem, grid, numbers)[inside], rtol=0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_march_in_long_implicit_steps_through_such_a_game_is_exact():
     problem, grid = posed(GAMES[0])
     stationary = hjb.solve(problem, grid, scheme=hjb.Upwind(split=True), tol=1e-8)
@@ -49,6 +51,7 @@ def test_a_march_in_long_implicit_steps_through_such_a_game_is_exact():
     np.testing.assert_allclose(later.value[0], stationary.value, rtol=0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_disturbance_that_pays_to_keep_away_from_the_target_leaves_a_finite_value(monkeypatch):
     problem, grid = zoo.lq_game(rate=0.2, shape=(NODES,))
     wanted = exact(problem, grid, (2.0, 0.2, 0.0))

@@ -522,6 +522,7 @@ def test_lanes_side_by_side_end_with_their_last_steps(monkeypatch, act, status):
             np.testing.assert_array_equal(solution.value, part.value)
 
 
+@pytest.mark.slow
 def test_ctrl_c_after_the_last_look_of_a_batch_is_not_lost(rounds, monkeypatch):
     monkeypatch.setattr(LanesRun, "longest", 1)  # as many calls in both runs, whatever the machine's pace
     made = rounds(press, NEVER)
@@ -553,6 +554,7 @@ def level_of(make):
     return hjb.hinf_level(make, hjb.Grid([-1.0], [1.0], (21,)), 0.5, 1.0, horizon=16.0)
 
 
+@pytest.mark.slow
 def test_an_interrupted_search_for_a_level_keeps_its_bracket_and_its_trials():
     """Ctrl-C in the midst of a γ, seen by its march and by the search around it."""
     tried = []

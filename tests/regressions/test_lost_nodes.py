@@ -40,6 +40,7 @@ def test_no_action_steps_into_what_is_lost(cost, rate):
     assert solution.error <= 1e-6 * cost
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*cannot reach")
 def test_lanes_with_and_without_lost_nodes_and_traced_ones():
     lanes = hjb.solve_batch([drifting(1.0, 1.0), drifting(1e9, 1.0)], GRID, tol=1e-6 * 1e9, scheme=hjb.Upwind())
@@ -75,6 +76,7 @@ def narrow_gate(x):
     return jnp.max(jnp.abs(x) - jnp.array([0.05, 0.05, 0.05]))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*cannot reach")
 def test_a_corridor_that_one_action_alone_keeps_to():
     """No sample of the controls is that action; the minimiser knows where the drift changes its sign."""
@@ -106,6 +108,7 @@ def pursued(speed, x, u, d):
     return u + jnp.where(x > 2.05, speed, 0.5) * d
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*cannot reach")
 @pytest.mark.parametrize("isaacs", ["upper", "lower"])
 def test_a_game_says_from_where_its_target_cannot_be_forced(isaacs):

@@ -123,6 +123,7 @@ def damped(x, u):
     return x[0] + jnp.abs(u[0])
 
 
+@pytest.mark.slow
 def test_noise_that_the_control_switches_off_leaves_rest():
     problem = hjb.Problem(straight, square, U, noise=lambda x, u: jnp.stack([u[0]]) * jnp.ones((1, 1)))
     solution = hjb.solve(problem, LINE, tol=1e-4, scheme=hjb.Upwind())
@@ -184,6 +185,7 @@ def test_a_traced_solve_certifies_nothing_where_nothing_is_paid(cost):
     assert np.isinf(solution.error)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("exit_cost", [-1.0, 1.0])
 def test_a_game_that_may_go_on_at_no_cost(exit_cost):
     """With u = 0 nothing is paid while the disturbance moves the state, so that every constant is a solution."""

@@ -110,6 +110,7 @@ def test_a_tube_goes_to_its_end_whatever_the_units_and_the_spacing(scale, nodes,
     assert np.allclose(solution.value, scale * np.min(np.abs(grid.axis(0)) - half / 6), atol=1e-12 * scale)
 
 
+@pytest.mark.slow
 def test_a_tube_with_noise_and_in_single_precision_is_the_limit_of_marching():
     """Relatives: noise makes V fall for long by little, and float32 knows fewer numbers."""
     problem = hjb.reach(lambda x, u: 0.3 * u + 0.5, U, lambda x: jnp.abs(x[0] - 1.0) - 0.4, disturbances=None)
@@ -126,6 +127,7 @@ def winding(x, u):
     return jnp.stack([-x[1], x[0]]) + 0.02 * u
 
 
+@pytest.mark.slow
 def test_a_slow_spiral_is_followed_to_its_end():
     grid = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (21, 21))
     problem = hjb.reach(

@@ -65,6 +65,7 @@ def paths():
 LONGER = (first_order, least_time, single, levels, game, paths)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::hjbjax.SolveWarning")
 @pytest.mark.parametrize(
     "question",
@@ -96,6 +97,7 @@ class Chunks:
         return called
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::hjbjax.SolveWarning")
 def test_an_interrupt_in_any_part_is_resumed_to_the_same_bits(tmp_path, monkeypatch):
     """Vanishing discounts, the monotone solve, the one of second order, the coarser grid that tells the error."""

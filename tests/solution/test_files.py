@@ -289,6 +289,7 @@ def test_every_truncation_is_refused(tmp_path):
         refused(path, "truncated|no npz file|damaged")
 
 
+@pytest.mark.slow
 def test_every_flipped_bit_is_refused_or_without_consequence(tmp_path):
     path, random = tmp_path / "run.npz", np.random.default_rng(0)
     data, harmless = good(path), 0

@@ -71,6 +71,7 @@ def test_a_file_for_other_tools_is_whole_or_not_there(tmp_path, monkeypatch):
     assert io.BytesIO(path.read_bytes()).read(4) == b"\x89HDF"
 
 
+@pytest.mark.slow
 def test_a_batch_has_no_one_grid():
     import jax
 

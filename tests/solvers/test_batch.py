@@ -107,6 +107,7 @@ def test_a_lane_that_runs_out_of_steps_is_named_and_the_others_are_whole():
     assert same(caught.value.solution.value, unfinished.value)
 
 
+@pytest.mark.slow
 def test_one_lane_that_goes_nan_leaves_the_others_unchanged():
     systems = [Oscillator(1.0, w) for w in (1.0, -1.0, 2.0)]  # the logarithm of −1 is no number
     questions = [hjb.Problem(s.drift, s.spoilt_cost, hjb.Finite(MANY[:, None]), discount=1.0) for s in systems]
@@ -116,6 +117,7 @@ def test_one_lane_that_goes_nan_leaves_the_others_unchanged():
         assert same(solution.value, alone(question).value)
 
 
+@pytest.mark.slow
 def test_lanes_of_second_order_are_their_own_solves_and_claim_no_bound():
     questions = [problem(k, 1.0) for k in (0.0, 1.0)]
     for lane, question in zip(hjb.solve_batch(questions, GRID, scheme=hjb.Limited(), tol=1e-6), questions, strict=True):
@@ -172,6 +174,7 @@ def test_lanes_keep_single_precision():
     assert not jax.config.jax_enable_x64
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*the grid is coarse")
 def test_lanes_without_discount_take_the_way_that_a_solve_takes():
     """From zero they would be caught by policies that stay where they are, at a cost."""

@@ -23,6 +23,7 @@ def error_on_smooth(count, **options):
     return np.max(np.abs(solution.value - at_nodes_of(zoo.smooth_exact(), grid, inside))[inside])
 
 
+@pytest.mark.slow
 def test_a_smooth_value_is_met_at_fifth_order():
     errors = [error_on_smooth(count) for count in (21, 41, 81)]
     assert errors[1] <= 1e-7
@@ -51,6 +52,7 @@ def test_on_values_with_kinks_it_is_no_worse_than_second_order():
         assert fifth <= 1.5 * second
 
 
+@pytest.mark.slow
 def test_a_target_between_the_nodes_is_met():
     """Speed 1 + x²/2 towards |x| ≤ .3, at nodes that never fall on .3: T = √2 (arctan(x/√2) − arctan(.3/√2))."""
     problem = hjb.Problem(
@@ -67,6 +69,7 @@ def test_a_target_between_the_nodes_is_met():
     assert np.log2(errors[0] / errors[1]) > 1.8  # beside the target the slopes are those of Limited()
 
 
+@pytest.mark.slow
 def test_nodes_without_a_value_set_no_slopes():
     """A current of speed 1 from x = 1 on carries off what is there; the rest arrives at 0 as if it were not."""
 
@@ -92,6 +95,7 @@ def test_a_batch_is_its_single_solves():
         np.testing.assert_allclose(batch[lane].value, alone.value, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_game_in_both_precisions():
     game = hjb.Problem(
         lambda x, u, d: u + d, lambda x, u, d: x @ x + u @ u - 2 * d @ d, hjb.Box([-4.0], [4.0]),
@@ -106,6 +110,7 @@ def test_a_game_in_both_precisions():
         assert np.max(np.abs(solution.value - p * grid.nodes()[:, 0] ** 2)[inside]) < off
 
 
+@pytest.mark.slow
 def test_noise_is_seen_at_second_order():
     exact, errors = zoo.bang_bang_exact(noise=0.5**0.5), []
     for count in (41, 81):

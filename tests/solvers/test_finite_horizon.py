@@ -190,6 +190,7 @@ def test_the_game_of_finite_horizon():
     assert solution.isaacs_gap == 0
 
 
+@pytest.mark.slow
 def test_a_game_without_a_value_is_reported_as_blowing_up():
     """γ = .8: V = tan(kτ)/k x² blows up at τ = π/2k; before that it is returned, after that nothing is."""
     k = np.sqrt(0.8**-2 - 1)
@@ -306,6 +307,7 @@ def test_a_moving_target_by_hand():
     assert errors[-1] < 0.01
 
 
+@pytest.mark.slow
 def test_a_moving_obstacle_by_hand():
     """An obstacle ¼ − |x − 2t| passes a runner of speed 1: from x ≥ 0 it goes ¼ deep if T ≥ x, else ¼ − (x − T)."""
 
@@ -395,6 +397,7 @@ def with_waves(problem, k, extra=0.0, floor=None, cost=None):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the optimal drift leaves")  # of random systems some do
 @settings(max_examples=25)
 @given(SEEDS)
@@ -424,6 +427,7 @@ def test_a_higher_terminal_cost_gives_a_higher_value(seed):
     assert np.all(upper >= lower - 1e-12)
 
 
+@pytest.mark.slow
 def test_upwind_and_its_steps_agree_with_the_stationary_solution():
     problem = hjb.Problem(plane, quadratic, Box([-3.0], [3.0]), discount=1.0)
     grid = line(41)

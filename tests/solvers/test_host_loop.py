@@ -226,12 +226,14 @@ def test_ctrl_c_says_how_to_go_on():
     assert np.all(np.isfinite(caught.value.solution.value))
 
 
+@pytest.mark.slow
 def test_silent_where_there_is_no_terminal(capfd):
     hjb.solve(**endless(), time_limit=1.5, throw=False)
     out, err = capfd.readouterr()
     assert (out, err) == ("", "")
 
 
+@pytest.mark.slow
 def test_progress_when_asked_for_and_when_not(capfd):
     hjb.solve(**endless(), time_limit=2.0, throw=False, progress=True)
     said = capfd.readouterr().err

@@ -29,6 +29,7 @@ def value(numbers, name="chain", count=20):
     return marched.value_at(0.0, jnp.array([1.1, 0.7]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["chain", *(pytest.param(n, marks=pytest.mark.slow) for n in ("limited", "implicit"))])
 def test_both_modes_match_central_differences(name):
     run = functools.partial(value, name=name)
@@ -42,6 +43,7 @@ def test_both_modes_match_central_differences(name):
         assert float(ahead) == pytest.approx(float(jnp.sum(found)), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_memory_grows_like_the_square_root_of_the_steps():
     """Sixteen times the steps take less than four times the memory, and 64 times less than eight times."""
 

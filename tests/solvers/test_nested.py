@@ -89,6 +89,7 @@ def test_odd_intervals_are_prepared_anew_unless_nodes_are_lost():
     assert nested._on_coarser(dataclasses.replace(task, has_lost=True), coarse) is None
 
 
+@pytest.mark.slow
 def test_the_grid_that_tells_the_error_is_where_a_large_solve_begins(iterations):
     problem, grid = zoo.smooth(shape=(145, 145))
     solution = hjb.solve(problem, grid)
@@ -112,6 +113,7 @@ def test_levels_end_at_the_nodes_that_the_method_names():
     assert [level.grid.shape for level in told] == [(50, 51)]
 
 
+@pytest.mark.slow
 def test_nodes_that_are_lost_do_not_spoil_the_guess_of_their_neighbours():
     problem = hjb.Problem(
         lambda x, u: jnp.where(x[0] > 0.5, 1.0, u[0])[None],

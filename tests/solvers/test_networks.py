@@ -74,11 +74,13 @@ def answers():
     return layers, [by_numpy(each) for each in layers], found
 
 
+@pytest.mark.slow
 def test_a_batch_of_networks_is_value_iteration_in_numpy(answers):
     _, exact, found = answers
     np.testing.assert_allclose([each.value for each in found], exact, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_network_in_single_precision(answers):
     layers, exact, _ = answers
     found = hjb.solve(posed(layers[0]), GRID, dtype="float32", scheme=UPWIND["scheme"], tol=1e-4)
@@ -86,6 +88,7 @@ def test_a_network_in_single_precision(answers):
     np.testing.assert_allclose(found.value, exact[0], atol=3e-4)
 
 
+@pytest.mark.slow
 def test_derivatives_in_every_weight_are_those_of_the_oracle(answers):
     layers = answers[0][0]
 

@@ -74,6 +74,7 @@ def check(make, grid, step, atol, bound=0.8):
         return np.asarray(act(numbers)), forward
 
 
+@pytest.mark.slow
 def test_an_action_with_a_formula():
     act, jacobian = check(exact, LINE, 1e-5, 1e-7)
     held = np.abs(np.abs(act[:, 0]) - 0.8) < 1e-12
@@ -82,6 +83,7 @@ def test_an_action_with_a_formula():
     np.testing.assert_allclose(np.abs(jacobian[held, 0]), [[0.0, 0.0, 1.0, 0.0]] * np.sum(held), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_an_action_that_was_searched():
     check(
         searched, LINE, 1e-4, 2e-4, bound=0.45
@@ -94,6 +96,7 @@ def test_noise_games_and_balls(make, grid):
     check(make, grid, 1e-4, 5e-4, bound=0.45)
 
 
+@pytest.mark.slow
 def test_reverse_mode_agrees_and_finitely_many_actions_do_not_move():
     with jax.enable_x64(True):
         numbers = jnp.array([1.3, 0.6, 0.8, 0.7])
@@ -114,6 +117,7 @@ def test_reverse_mode_agrees_and_finitely_many_actions_do_not_move():
         assert not np.any(jax.jit(jax.grad(functools.partial(imitation, enumerated)))(numbers))
 
 
+@pytest.mark.slow
 def test_a_value_follows_the_kinks_that_hold_searched_actions():
     """Where a kink of the upwinding holds an action, the value moves with it: this derivative was 1 % off."""
 

@@ -28,6 +28,7 @@ def line(discount=1.0, **options):
     return hjb.Problem(steer, square, U, discount=discount, **options)
 
 
+@pytest.mark.slow
 def test_it_is_the_limited_answer_with_the_certificate_of_the_monotone_one():
     problem, grid = zoo.smooth(shape=(25, 25))
     solution, sharp, first = (
@@ -60,6 +61,7 @@ SLOW = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "count", "share", "parameters"), [*KNOWN, *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW)]
 )
@@ -95,6 +97,7 @@ def test_one_program_serves_the_chain_and_the_second_order(caplog):
     assert solution.stats["from_monotone"] == pytest.approx(np.max(np.abs(solution.value - chain.value)), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_where_noise_makes_central_differences_monotone_nothing_is_run_twice(iterations):
     solution = hjb.solve(line(noise=0.5), hjb.Grid([-1.0], [1.0], (41,)))
     assert iterations == [("Upwind", (41,)), ("Upwind", (21,))]
@@ -119,6 +122,7 @@ def test_value_iteration_and_tubes_stay_with_the_chain(problem, method):
     assert solution.monotone_error is None
 
 
+@pytest.mark.slow
 def test_transformations_give_the_answer_of_the_host():
     grid = hjb.Grid([-1.0], [1.0], (21,))
 
@@ -163,12 +167,14 @@ def test_a_limit_that_only_the_first_order_keeps_to():
     np.testing.assert_allclose(solution.value, first.value, rtol=1e-14, atol=1e-15)  # another program rounds otherwise
 
 
+@pytest.mark.slow
 def test_a_coarse_grid_warns():
     problem, grid = zoo.pendulum(shape=(24, 25))
     with pytest.warns(hjb.SolveWarning, match=r"the grid is coarse for this problem: its error is about \d"):
         hjb.solve(problem, grid)
 
 
+@pytest.mark.slow
 def test_without_a_coarser_grid_the_change_of_the_scheme_is_the_estimate():
     grid = hjb.Grid([-1.0], [1.0], (11,))  # half of its intervals are too few
     solution = hjb.solve(line(), grid)
@@ -200,6 +206,7 @@ def test_the_screen_says_both_errors_and_files_keep_them(tmp_path):
     assert str(again) == text
 
 
+@pytest.mark.slow
 def test_nodes_that_do_not_reach_the_target_have_no_estimate():
     problem = hjb.Problem(
         lambda x, u: jnp.where(x[0] > 0.5, 1.0, u[0])[None], lambda x, u: 1.0, U, target=lambda x: jnp.abs(x[0]) - 0.1
@@ -241,6 +248,7 @@ def test_marches(method, scheme):
     assert found.stats["scheme"] == repr(scheme)
 
 
+@pytest.mark.slow
 def test_a_path_says_what_the_value_promised():
     problem, grid = zoo.smooth(shape=(41, 41))
     solution = hjb.solve(problem, grid, tol=1e-6)

@@ -40,6 +40,7 @@ def compiled():
     return jax.jit(answers), jax.jit(jax.jacfwd(lambda mass: answers(mass)[:3]))
 
 
+@pytest.mark.slow
 def test_values_controls_and_costates_move_as_central_differences_do():
     with jax.enable_x64(True):
         answer, forward = compiled()
@@ -50,6 +51,7 @@ def test_values_controls_and_costates_move_as_central_differences_do():
             np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-6 * np.max(np.abs(wanted)))
 
 
+@pytest.mark.slow
 def test_reverse_mode_agrees_and_lanes_are_single_solves():
     with jax.enable_x64(True):
         answer, forward = compiled()
@@ -61,6 +63,7 @@ def test_reverse_mode_agrees_and_lanes_are_single_solves():
         assert values.dtype == found.dtype == jnp.float64
 
 
+@pytest.mark.slow
 def test_the_answer_is_that_of_the_host():
     host = hjb.solve(pendulum(1.2), GRID, tol=1e-12)
     with jax.enable_x64(True):

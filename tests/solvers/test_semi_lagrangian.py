@@ -160,6 +160,7 @@ def test_the_discrete_equation_is_that_of_an_independent_oracle(name):
         assert solution.error <= 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("discount", [0.0, 0.8])
 def test_certificates_hold_wherever_a_run_is_stopped(discount):
     problem, grid = zoo.double_integrator(discount=discount, shape=(31, 31))
@@ -196,6 +197,7 @@ def test_certificates_hold_where_nothing_is_held(sign):
             assert np.all(exact <= upper + 1e-9)
 
 
+@pytest.mark.slow
 def test_one_dimension_is_exact():
     """(|x| − r)/(1 − c sgn x): straight arcs, and the boundary between two nodes."""
     problem = hjb.Problem(slide, hold, ONE, target=lambda x: jnp.abs(x[0]) - 0.21)
@@ -230,6 +232,7 @@ def integrated(which, scheme):
     return hjb.solve(problem, grid, scheme=scheme, tol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", ["held", "disc"])
 def test_double_integrator_has_a_fifth_of_the_error_of_the_chain(which):
     """With exact values on {T ≤ ½} and on the edge, and on the zoo's larger box with a disc of radius .2."""

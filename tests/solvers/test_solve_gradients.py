@@ -104,6 +104,7 @@ PARAMETERS = {
 LONG = {"noise", "exit cost as a number", "mass, with a target"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [pytest.param(p, marks=[pytest.mark.slow] * (p in LONG)) for p in PARAMETERS])
 def test_gradients_match_central_differences(name):
     at, build = PARAMETERS[name]
@@ -234,6 +235,7 @@ def spun_value(numbers, tol=1e-9):
     return hjb.solve(problem, hjb.Grid([-2.0, -2.0], [2.0, 2.0], (9, 9)), tol=tol, scheme=hjb.Upwind()).value[5, 6]
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the optimal drift leaves")
 def test_the_gradient_is_right_where_sweeps_gain_little():
     """Without a stop that counts, and with one: rate, discount and stopping cost move the value."""
@@ -247,6 +249,7 @@ def test_the_gradient_is_right_where_sweeps_gain_little():
             assert slope == pytest.approx(rise / (2 * step[j]), rel=1e-4, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the optimal drift leaves")
 def test_a_derivative_that_is_not_found_is_nan_and_the_value_stays(monkeypatch):
     monkeypatch.setattr(adjoint, "STEPS", 1)
@@ -285,6 +288,7 @@ def test_second_derivatives_are_refused_and_not_made_up(scheme, read):
     assert value.shape == ()
 
 
+@pytest.mark.slow
 def test_second_derivatives_of_a_march_are_those_of_its_steps():
     def value(price):
         problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x + price * u @ u, hjb.Box([-4.0], [4.0]))

@@ -54,6 +54,7 @@ SLOW = ("sampled", "game")
 ASKED = [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in QUESTIONS]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ASKED)
 def test_the_value_is_that_of_a_solve_with_its_policy(name):
     problem, tol = QUESTIONS[name], 1e-6

@@ -284,6 +284,7 @@ DOORS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("door", DOORS)
 def test_a_changed_object_is_seen_by_every_front_door(door, monkeypatch):
     before = DOORS[door]()
@@ -362,6 +363,7 @@ def as_leaves(a):
     )
 
 
+@pytest.mark.slow
 def test_gradients_batches_and_compilation_see_what_is_closed_over():
     with jax.enable_x64(True):
         found, wanted = (np.array(jax.jit(jax.value_and_grad(ask))(1.3)) for ask in (curved, as_leaves))
@@ -373,6 +375,7 @@ def test_gradients_batches_and_compilation_see_what_is_closed_over():
     assert lanes[0] == pytest.approx(curved(0.7), abs=2e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", [jax.grad, jax.value_and_grad, lambda f: lambda a: jax.vmap(f)(jnp.stack([a, 2 * a]))])
 def test_a_transformation_without_jit_is_one_program_that_is_kept(way):
     """The functions are new ones at every call, and so are the numbers: a loop over gradients, as people write it."""
@@ -391,6 +394,7 @@ def test_a_transformation_without_jit_is_one_program_that_is_kept(way):
             jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), kept, wanted)
 
 
+@pytest.mark.slow
 def test_known_numbers_beside_traced_ones_belong_to_the_program():
     def total(a, discount):
         problem = hjb.Problem(lambda x, u: 0 * u, lambda x, u: a * x @ x, UNIT, discount=discount)
@@ -410,6 +414,7 @@ def test_a_closure_beside_a_leaf_and_inside_a_march():
     assert slope == pytest.approx((marched(1.001) - marched(0.999)) / 0.002, rel=1e-2)
 
 
+@pytest.mark.slow
 def test_known_problems_are_solved_at_once_inside_a_transformation():
     problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x, UNIT, discount=1.0)
     for ask in (
@@ -444,6 +449,7 @@ class OnHost:
         return jax.pure_callback(self.product, jax.ShapeDtypeStruct(u.shape, u.dtype), u, vmap_method="expand_dims")
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the primitive 'pure_callback'")
 def test_functions_of_the_host_are_told_apart():
     options = {"dtype": "float32", "scheme": hjb.Upwind(), "tol": 1e-4}
@@ -456,6 +462,7 @@ def test_functions_of_the_host_are_told_apart():
         np.testing.assert_allclose(solved(car.drift), solved(lambda x, u, gain=car.gain: gain * u), atol=1e-3)
 
 
+@pytest.mark.slow
 def test_rules_of_derivatives_that_a_jaxpr_does_not_tell():
     def ruled(slope):
         @jax.custom_jvp
@@ -477,6 +484,7 @@ def test_rules_of_derivatives_that_a_jaxpr_does_not_tell():
     np.testing.assert_allclose([of_weight(3.0), of_weight(5.0)], [3.0, 5.0], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_rules_of_jax_are_known():
     def fingerprint_of(function):
         closed = jax.make_jaxpr(function)(jnp.ones(2))

@@ -81,6 +81,7 @@ def test_so_does_a_batch():
     assert drift.calls <= TRACES + 1  # every lane is looked at
 
 
+@pytest.mark.slow
 def test_so_does_a_derivative():
     drift = Counted(pendulum)
     slope = jax.grad(
@@ -98,6 +99,7 @@ def test_a_second_solve_looks_once_whether_the_function_is_as_it_was():
     assert drift.calls == before + 1
 
 
+@pytest.mark.slow
 def test_a_function_that_changed_is_traced_anew():
     drift = Counted(pendulum)
     first = hjb.solve(question(drift), GRID, scheme=hjb.Upwind()).value

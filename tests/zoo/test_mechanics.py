@@ -253,6 +253,7 @@ def test_a_quadrotor_hovers_falls_and_leans():
         np.testing.assert_allclose(power, u[0] * (-vx * np.sin(angle) + vz * np.cos(angle)) + u[1] * w, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_quadrotor_has_its_mirror_image_and_six_dimensions_fit():
     """A tube on 8^6 nodes in single precision, the value alone: even under x, θ, ẋ, θ̇ → −x, −θ, −ẋ, −θ̇."""
     quadrotor = zoo.PlanarQuadrotor()

@@ -18,6 +18,7 @@ from the parts beside before every forward and backward pair.
 """
 
 import dataclasses
+import functools
 from typing import Any, TypeAlias
 
 import jax
@@ -168,12 +169,16 @@ def _in_turns(
 ) -> jax.Array:
     """All slices upwards and downwards, ``rounds`` times."""
 
+    def sweep(k: jax.Array, planes: jax.Array, source: jax.Array = source) -> jax.Array:
+        # one program for both ways
+        return _sweep(source, weights, _wrapped(planes, layout), 0, len(source), up=k % 2 == 0)
+
     def pair(_: Index, carried: Carried) -> Carried:
         planes, source = _exchanged(carried, layout, flips)
-        for up in (True, False):
-            planes = _sweep(source, weights, _wrapped(planes, layout), 0, len(source), up=up)
-        return planes, source
+        return jax.lax.fori_loop(0, 2, functools.partial(sweep, source=source), planes), source
 
+    if layout.grid.parts is None:
+        return jax.lax.fori_loop(0, 2 * rounds, sweep, planes)
     return jax.lax.fori_loop(0, rounds, pair, (planes, source))[0]
 
 
@@ -187,21 +192,23 @@ def _in_slabs(
     """
     count = len(source)
     slabs = -(-count // SLAB)  # the last one may be shorter
-    for up in (True, False):
-        planes, source = _exchanged((planes, source), layout, flips)
 
-        def slab(index: jax.Array, planes: jax.Array, up: bool = up, source: jax.Array = source) -> jax.Array:
-            first = SLAB * (index if up else slabs - 1 - index)
+    def way(k: jax.Array, carried: Carried) -> Carried:
+        upwards, (planes, source) = k == 0, _exchanged(carried, layout, flips)
+
+        def slab(index: jax.Array, planes: jax.Array) -> jax.Array:
+            first = SLAB * jnp.where(upwards, index, slabs - 1 - index)
             last = jnp.minimum(first + SLAB, count)
 
             def sweep(k: jax.Array, planes: jax.Array) -> jax.Array:
-                return _sweep(source, weights, planes, first, last, up=up == (k % 2 == 0))
+                return _sweep(source, weights, planes, first, last, up=upwards == (k % 2 == 0))
 
             return jax.lax.fori_loop(0, max(2 * rounds - 1, 3), sweep, planes)
 
         # margins once a way: filling them between slabs would read all planes
-        planes = jax.lax.fori_loop(0, slabs, slab, _wrapped(planes, layout))
-    return planes
+        return jax.lax.fori_loop(0, slabs, slab, _wrapped(planes, layout)), source
+
+    return jax.lax.fori_loop(0, 2, way, (planes, source))[0]
 
 
 def _towards(equation: PolicyEquation, layout: Layout, axis: int, flips: list[jax.Array]) -> tuple[jax.Array, ...]:
@@ -245,7 +252,7 @@ def _with_margins(planes: jax.Array, axis: int) -> jax.Array:
 
 
 def _sweep(
-    source: jax.Array, weights: Weights, planes: jax.Array, first: Index, last: Index, *, up: bool | jax.Array
+    source: jax.Array, weights: Weights, planes: jax.Array, first: Index, last: Index, *, up: jax.Array
 ) -> jax.Array:
     """One pass over the slices from ``first`` to ``last``; ``planes`` has a margin of one entry on every side."""
 

@@ -191,7 +191,8 @@ class Grid:
         table = computed if table is None else table
         # NumPy as long as nothing is traced, also inside ``jit``, where the table then is a constant
         if is_traced(computed, table):
-            return _from_table(*(jnp.asarray(each, dtype or jnp.result_type(float)) for each in (computed, table)))
+            given = (computed, table, jnp.maximum(jnp.abs(self.lo[axis]), jnp.abs(self.hi[axis])))
+            return _from_table(*(jnp.asarray(each, dtype or jnp.result_type(float)) for each in given))
         return np.asarray(table, dtype or np.float64)
 
     def _by_formula(self, axis: int) -> Array:
@@ -322,10 +323,10 @@ class Grid:
 
 
 @jax.custom_jvp
-def _from_table(computed: jax.Array, table: jax.Array) -> jax.Array:
+def _from_table(computed: jax.Array, table: jax.Array, farthest: jax.Array) -> jax.Array:
     """The table, with the derivative of the formula; the formula where the corners were changed alone."""
     # a corner that was swapped for a tracer, as ``grad`` does, comes with the table of the old one
-    slack = ROUNDINGS * jnp.finfo(table.dtype).eps * jnp.max(jnp.abs(computed))
+    slack = ROUNDINGS * jnp.finfo(table.dtype).eps * farthest
     return jnp.where(jnp.abs(computed - table) <= slack, table, computed)
 
 

@@ -23,10 +23,16 @@ MAPS = 20_000  # of the 65 530 that Linux allows a process; every compiled kerne
 
 # Two thirds of a run are XLA's: without its optimiser it takes half of the time, and without the emitters of fusions a
 # third. Those of old write a value anew in every block of a fusion: one that chooses among many actions at constrained
-# ends takes them time that doubles with every action, so tests of such have few. A program that wants the emitters asks
-# for them (``compiler_options``), and who wants all tests with what users run says ``XLA_FLAGS= pytest``.
+# ends takes them time that doubles with every action. Such tests are marked ``emitters``, or a program asks for them
+# itself (``compiler_options``); who wants all tests with what users run says ``XLA_FLAGS= pytest``.
 QUICK = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 os.environ.setdefault("XLA_FLAGS", QUICK)  # read when JAX starts to compute, here and in the processes that tests start
+
+
+def pytest_runtest_setup(item):
+    """Skip what the old emitters do not come to an end with."""
+    if item.get_closest_marker("emitters") and os.environ["XLA_FLAGS"] == QUICK:
+        pytest.skip("takes the old emitters too long: XLA_FLAGS= pytest -m emitters")
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -247,9 +247,14 @@ class Limited:
 
     def slopes(self, around: Differences) -> Slopes:
         """Limited slopes; central ones where noise keeps those monotone, a_ii ≥ h |f_i| for all actions."""
-        # limited slopes from the one-sided differences that are there: no further node is read
         grid, pairs = around.on.grid, list(zip(around.one_sided, around.links, strict=True))
-        found = [stencil.limited(*pair, grid, axis, link) for axis, (pair, link) in enumerate(pairs)]
+        found = [
+            # from V where that is all: the differences are then no arrays
+            slopes.of_second_order(around.value, grid, axis, stencil.van_albada)
+            if link.meets_up is link.meets_down is None and _is_plain(grid, axis)
+            else stencil.limited(*pair, grid, axis, link)
+            for axis, (pair, link) in enumerate(pairs)
+        ]
         if around.on.problem.noise is None:
             return found
         for axis, quiet in enumerate(calm(around.on, around.x, around.links)):
@@ -259,6 +264,11 @@ class Limited:
             middle = jnp.where(stencil.walls(grid, axis), up + down, middle)
             found[axis] = (jnp.where(quiet, middle, found[axis][0]), jnp.where(quiet, middle, found[axis][1]))
         return found
+
+
+def _is_plain(grid: Grid, axis: int) -> bool:
+    """True if an axis has equal spacings, three nodes, and all of them here."""
+    return grid.stretch[axis] is None and grid.shape[axis] > 2 and not grid.is_divided(axis)  # type: ignore[index]
 
 
 def calm(on: Discretisation, x: list, links: Sequence[Links]) -> list:

@@ -19,6 +19,7 @@ schemes for Hamilton–Jacobi equations, SIAM J. Sci. Comput. 21.
 """
 
 import itertools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -33,13 +34,18 @@ EPSILON = 1e-6  # of a squared slope over the typical one: what counts as equall
 
 def eno2(values: Field, grid: Grid) -> list[tuple[Field, Field]]:
     """The slopes from above and from below along every axis, each of shape (*grid); zero across a wall."""
-    result = []
-    for axis in range(grid.ndim):
-        far_down, down, up, far_up = _differences(values, grid, axis, 2, 1 / grid.spacing(axis))
-        bend = up - down  # h V'': half of it is h/2 V'', the leading error of a one-sided difference
-        above, below = up - _smaller(bend, far_up - up) / 2, down + _smaller(bend, down - far_down) / 2
-        result.append(stencil.stopped(above, below, grid, axis))
-    return result
+    return [of_second_order(values, grid, axis, _smaller) for axis in range(grid.ndim)]
+
+
+def of_second_order(values: Field, grid: Grid, axis: int, mean: Callable[[Field, Field], Field]) -> tuple[Field, Field]:
+    """D⁺ − (h/2) m(s_i, s_{i+1}) and D⁻ + (h/2) m(s_i, s_{i−1}) for a mean m of second differences; zero across a wall.
+
+    On equal spacings, with at least three nodes. Beyond an end the second difference is continued as a constant.
+    """
+    far_down, down, up, far_up = _differences(values, grid, axis, 2, 1 / grid.spacing(axis))
+    bend = up - down  # h V'': half of it is h/2 V'', the leading error of a one-sided difference
+    above, below = up - mean(bend, far_up - up) / 2, down + mean(bend, down - far_down) / 2
+    return stencil.stopped(above, below, grid, axis)
 
 
 def weno5(values: Field, grid: Grid, lost: Mask | None = None) -> list[tuple[Field, Field]]:

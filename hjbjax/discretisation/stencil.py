@@ -273,11 +273,11 @@ def limited(up: Field, down: Field, grid: Grid, axis: int, link: Links) -> tuple
     if link.meets_down is not None:
         below = jnp.where(link.meets_down[0], bend, below)
     # V(x ± h) = V ± h V' + h²/2 V'': half a gap times the bend is the leading error of a one-sided difference
-    up, down = up - link.up / 2 * _van_albada(bend, above), down + link.down / 2 * _van_albada(bend, below)
+    up, down = up - link.up / 2 * van_albada(bend, above), down + link.down / 2 * van_albada(bend, below)
     return stopped(up, down, grid, axis)
 
 
-def _van_albada(a: Field, b: Field) -> Field:
+def van_albada(a: Field, b: Field) -> Field:
     """The mean a b (a + b)/(a² + b²) of two bends, zero where their signs differ: G. D. van Albada's limiter."""
     agree = a * b > 0
     # the inner where keeps 0/0 out of the branch not taken, whose NaN a derivative would bring back

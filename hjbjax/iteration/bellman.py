@@ -219,7 +219,9 @@ def policy_equation(
         floored = ~obstacles.fixed & (obstacles.lower - value > source)
         source, free = jnp.where(floored, obstacles.lower - value, source), free & ~floored
     weights = rates.scaled(jnp.where(free, 1 / outflow, 0))
-    if on.scheme.subcell and on.problem.target is not None:  # what leads to a held node ends on the target's boundary, where nothing is to be corrected
+    if (
+        on.scheme.subcell and on.problem.target is not None
+    ):  # what leads to a held node ends on the target's boundary, where nothing is to be corrected
         loose = ~obstacles.fixed
         jumps = zip(weights.offsets, weights.values, strict=True)
         cut = tuple(jnp.where(stencil.neighbour(loose, on.grid, offset), w, 0) for offset, w in jumps)

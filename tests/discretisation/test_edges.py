@@ -226,6 +226,7 @@ def test_a_sampled_player_against_the_oracle():
 
 
 @pytest.mark.slow
+@pytest.mark.emitters
 @pytest.mark.parametrize("kind", ["pair", "apart", "ball"])
 def test_two_inputs_against_the_oracle(kind):
     for seed in range(2):

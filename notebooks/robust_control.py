@@ -33,7 +33,7 @@ from hjbjax import plotting
 warnings.simplefilter("ignore", hjb.SolveWarning)
 
 plant = hjb.Problem(lambda x, u: u - x, lambda x, u: 0.5 * (x @ x + u @ u), hjb.Box([-4.0], [4.0]))
-grid = hjb.Grid([-1.0], [1.0], (41,))
+grid = hjb.Grid([-1.5], [1.5], (61,))  # wider than what is shown: at its ends the drift is cut
 
 
 def game(gamma):
@@ -47,6 +47,8 @@ def game(gamma):
 # makes the value larger and the feedback stiffer, until at $\gamma = 1/\sqrt2$ no feedback keeps it.
 
 # %%
+shown = np.abs(grid.axis(0)) < 1 + 1e-9
+x = grid.axis(0)[shown]
 figure, ax = plt.subplots(figsize=(5.4, 3.4), layout="constrained")
 for gamma, colour in zip((0.75, 0.85, 2.0), plotting.COLOURS, strict=False):
     solution = hjb.march(game(gamma), grid, 12.0)
@@ -55,7 +57,8 @@ for gamma, colour in zip((0.75, 0.85, 2.0), plotting.COLOURS, strict=False):
     error = abs(float(solution.value_at(0.0, [0.5])) - 0.5 * p * 0.25)
     print(f"γ = {gamma}: V(½) off by {error:.1e}, feedback u(½) = {solution.control_at(0.0, [0.5])[0]:.3f}")
     assert error < 2e-3
-    ax.plot(grid.axis(0), solution.value[0], color=colour, label=f"γ = {gamma}")
+    ax.plot(x, solution.value[0][shown], color=colour, label=f"γ = {gamma}")
+    ax.plot(x, 0.5 * p * x**2, ":", color="black", linewidth=2.5, label="exact" if gamma == 2.0 else None)
 ax.set(xlabel="x", ylabel="V")
 ax.legend(frameon=False)
 plt.show()

@@ -51,6 +51,8 @@ def attenuation(
       >>> float(game.cost(jnp.ones(1), jnp.zeros(1), jnp.ones(1)))
       -1.5
     """
+    if not isinstance(problem, Problem):
+        raise TypeError(f"attenuation: got {type(problem).__name__}, wanted a Problem without disturbances")
     if problem.is_game:
         raise ValueError(f"attenuation: the problem already has disturbances, {problem.disturbances!r}; leave them out")
     if problem.cost is None:

@@ -6,6 +6,7 @@ writes it. One that dies takes the others along within the heartbeat: ``launch``
 """
 
 import contextlib
+import difflib
 import math
 import os
 import shlex
@@ -89,6 +90,9 @@ def start(words: Sequence[str], processes: int, heartbeat: int) -> int:
     Raises:
       Failure: another command, or a process that died.
     """
+    if words[0].startswith("-"):
+        near = difflib.get_close_matches(words[0], ("--processes", "--heartbeat"), 1)
+        raise Failure(f"launch: no such option {words[0]!r}{f'; did you mean {near[0]!r}?' if near else ''}")
     if words[0] != "solve":
         raise Failure(f"launch: got {words[0]!r}, wanted solve, which alone divides its nodes")
     common = {PROCESSES: str(processes), COORDINATOR: f"127.0.0.1:{_free_port()}", HEARTBEAT: str(heartbeat)}

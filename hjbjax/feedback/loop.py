@@ -15,7 +15,7 @@ the path has a slope, and the interpolant of the step says when it meets the tar
 """
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeAlias
 
 import jax
@@ -29,7 +29,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, pytree_dataclass
 from hjbjax.problem.types import Array, Control, Disturbance, Key, Number, State
-from hjbjax.tracing import closures
+from hjbjax.tracing import checks, closures
 
 Event: TypeAlias = tuple[Number, State]  # a point of the path: when, and where
 Actions: TypeAlias = tuple[Control, Disturbance | None]  # of both players; no disturbance where there is no opponent
@@ -170,22 +170,22 @@ def check_shapes(loop: Loop, x0: Array) -> None:
     opponents = 0 if problem.disturbances is None else problem.disturbances.dim
     # zeros, and a number of the state's type for the time: nothing is computed, only shapes and types are asked for
     u, d = np.zeros(m, x0.dtype), np.zeros(opponents, x0.dtype)
-    players, state = (x0[0], x0), problem.arguments(x0, u, d, x0[0])
-    for name, function, fed, wanted in (
-        ("feedback", loop.control, players, (m,)),
-        ("disturbance", loop.opponent, players, (opponents,)),
-        ("drift", problem.drift, state, (n,)),
-        ("cost", problem.cost, state, ()),
-        ("target", problem.target, problem.state_arguments(x0, x0[0]), ()),
+    fed = {"x": x0, "u": u, "d": d, "t": x0[0]}
+    action, place = problem.arguments("x", "u", "d", "t"), problem.state_arguments("x", "t")
+    for name, function, letters, wanted in (
+        ("feedback", loop.control, "tx", (m,)),
+        ("disturbance", loop.opponent, "tx", (opponents,)),
+        ("drift", problem.drift, action, (n,)),
+        ("cost", problem.cost, action, ()),
+        ("target", problem.target, place, ()),
     ):
         if function is None:
             continue
+        ask = functools.partial(_array, function, name, letters)
         try:
-            found = jax.eval_shape(functools.partial(_array, function, name), *fed)
-        except jax.errors.JAXTypeError as error:
-            raise ValueError(
-                f"simulate: {name} cannot be traced: use jnp.where instead of if, and jnp instead of numpy"
-            ) from error
+            found = jax.eval_shape(ask, *(fed[letter] for letter in letters))
+        except ValueError as error:  # anew, or JAX adds some lines on frames of its own
+            raise ValueError(str(error)) from error.__cause__
         if jnp.issubdtype(found.dtype, jnp.complexfloating):
             raise ValueError(f"simulate: {name} returned complex numbers, expected real ones, shape {wanted}")
         if found.shape != wanted:
@@ -194,13 +194,17 @@ def check_shapes(loop: Loop, x0: Array) -> None:
             )
 
 
-def _array(function: Callable, name: str, *arguments: Array) -> jax.Array:
-    """The function's result as an array; refuses what is none."""
-    result = function(*arguments)
+def _array(function: Callable, name: str, letters: Sequence[str], *arguments: Array) -> jax.Array:
+    """The function's result as an array; refuses what is none, and what fails or cannot be traced."""
+    try:
+        result = function(*arguments)
+    except Exception as error:
+        said = checks.refusal(error, name, dict(zip(letters, map(np.shape, arguments), strict=True)))
+        if said is None:  # an exception of the user's own
+            raise
+        raise ValueError(f"simulate: {said}") from error
     try:
         return jnp.asarray(result)
-    except jax.errors.JAXTypeError:  # a tracer where NumPy or Python wants a number
-        raise
     except (TypeError, ValueError):
         what = "None; is its return missing?" if result is None else f"a {type(result).__name__}"
         raise ValueError(f"simulate: {name} returned {what}, expected an array of numbers") from None

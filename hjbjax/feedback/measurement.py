@@ -67,13 +67,11 @@ def measurement(h: Callable, n: int, noise: Numbers | Sequence, name: str, *, pe
     try:
         with jax.enable_x64(True):
             closed, found = jax.make_jaxpr(function, return_shape=True)(jax.ShapeDtypeStruct((n,), np.float64))
-    except jax.errors.JAXTypeError as error:
-        raise ValueError(
-            f"{name}: h(x) cannot be traced: use jnp.where instead of if, and jnp instead of numpy"
-        ) from error
-    except (TypeError, ValueError, IndexError) as error:
-        said = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise ValueError(f"{name}: h(x) failed on one state, with x of shape ({n},):\n{said[:400]}") from error
+    except Exception as error:
+        said = checks.refusal(error, "h(x)", {"x": (n,)})
+        if said is None:  # an exception of the user's own
+            raise
+        raise ValueError(f"{name}: {said}") from error
     shape = getattr(found, "shape", None)
     if shape is None or len(shape) != 1 or shape[0] == 0 or not jnp.issubdtype(found.dtype, jnp.floating):
         got = f"a {type(found).__name__}" if shape is None else f"{found.dtype} numbers of shape {shape}"

@@ -100,6 +100,8 @@ def simulate(
             "simulate: duration and hold set the output times and must be known numbers, not traced ones; "
             "hjbjax.feedback.simulation.rollout takes traced times"
         )
+    if not isinstance(problem, Problem):
+        raise TypeError(f"simulate: got {type(problem).__name__}, wanted a Problem, and then its feedback")
     duration = float(arguments.positive(duration, "simulate: duration", "in units of time"))
     if _is_marched(feedback):
         problem = _within_horizon(problem, feedback, duration)

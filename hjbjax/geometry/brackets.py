@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem import arguments
-from hjbjax.problem.pytree import as_partial, cast, is_traced, pytree_dataclass
+from hjbjax.problem.pytree import as_partial, cast, is_traced, pytree_dataclass, with_suggestions
 from hjbjax.problem.types import Array, Control, DType, Number, State
 from hjbjax.tracing import checks
 
@@ -27,6 +27,7 @@ T = TypeVar("T")
 Field: TypeAlias = Callable[[State], State]
 
 
+@with_suggestions
 def lie_derivative(f: Field, h: Callable) -> Callable:
     """L_f h, the rate of h along f, as a function of one state.
 
@@ -42,11 +43,12 @@ def lie_derivative(f: Field, h: Callable) -> Callable:
 
     def derivative(x):
         # forward mode, one pass through h whatever its shape: its Jacobian is never formed
-        return jax.jvp(in_state_dtype(h), (as_state(x),), (in_state_dtype(f)(as_state(x)),))[1]
+        return jax.jvp(in_state_dtype(h), (as_state(x),), (velocity(f)(as_state(x)),))[1]
 
     return derivative
 
 
+@with_suggestions
 def lie_bracket(f: Field, g: Field) -> Field:
     """[f, g] = (∂g/∂x) f − (∂f/∂x) g, the sign of (4.4), as a function of one state.
 
@@ -62,12 +64,13 @@ def lie_bracket(f: Field, g: Field) -> Field:
 
     def bracket(x):
         # two directional derivatives in place of two n × n Jacobians
-        change = jax.jvp(in_state_dtype(g), (as_state(x),), (in_state_dtype(f)(as_state(x)),))[1]
-        return change - jax.jvp(in_state_dtype(f), (as_state(x),), (in_state_dtype(g)(as_state(x)),))[1]
+        change = jax.jvp(velocity(g), (as_state(x),), (velocity(f)(as_state(x)),))[1]
+        return change - jax.jvp(velocity(f), (as_state(x),), (velocity(g)(as_state(x)),))[1]
 
     return bracket
 
 
+@with_suggestions
 def ad(f: Field, g: Field, k: int) -> Field:
     """ad_f^k g, the k-fold bracket [f, [f, … [f, g]]], as a function of one state.
 
@@ -92,6 +95,7 @@ def ad(f: Field, g: Field, k: int) -> Field:
     return g
 
 
+@with_suggestions
 def affine_fields(drift: Callable, inputs: int) -> tuple[Field, Sequence[Field]]:
     """The fields f and g_1, …, g_m of a drift f(x) + Σ g_j(x) u_j, such as ``Problem.drift``.
 
@@ -135,20 +139,24 @@ def along(function: Callable[[State], T], x: State, directions: Array) -> tuple[
     return jax.vmap(lambda v: jax.jvp(function, (x,), (v,)), out_axes=(None, 0))(directions)
 
 
+def velocity(field: Field) -> Field:
+    """The field in the dtype of the state; another shape than that of the state is refused."""
+
+    def call(x):
+        rates = in_state_dtype(field)(x)
+        # a number or (n, 1) would broadcast to brackets of the right shape with the wrong entries
+        if rates.shape != x.shape:
+            raise ValueError(
+                f"a vector field returned shape {rates.shape}, expected {x.shape}: one rate a state, for one state"
+            )
+        return rates
+
+    return call
+
+
 def stack_fields(fields: Sequence[Field]) -> Callable[[State], jax.Array]:
     """Several fields as one function that returns shape (m, n)."""
-
-    def every(x):
-        rows = [in_state_dtype(field)(x) for field in fields]
-        for row in rows:
-            # a number or (n, 1) would broadcast to brackets of the right shape with the wrong entries
-            if row.shape != x.shape:
-                raise ValueError(
-                    f"a vector field returned shape {row.shape}, expected {x.shape}: one rate a state, for one state"
-                )
-        return jnp.stack(rows)
-
-    return every
+    return lambda x: jnp.stack([velocity(field)(x) for field in fields])
 
 
 def root_eps(dtype: DType) -> float:

@@ -21,7 +21,7 @@ import numpy as np
 from hjbjax.geometry.brackets import Field, along, as_fields, as_pytree, decide, stack_fields, stack_outputs
 from hjbjax.geometry.scaling import balance, with_terms, without_rounding
 from hjbjax.problem import arguments
-from hjbjax.problem.pytree import is_traced, pytree_dataclass
+from hjbjax.problem.pytree import is_traced, pytree_dataclass, with_suggestions
 from hjbjax.problem.types import Array, Number, State
 
 Generations: TypeAlias = tuple[Sequence[Array], Sequence[Array]]  # vectors of each, (members, n), and their terms
@@ -82,6 +82,7 @@ class Distribution:
         return ratio if is_traced(ratio) else float(ratio)
 
 
+@with_suggestions
 def reachability_distribution(
     f: Field | None,
     gs: Field | Sequence[Field],
@@ -122,6 +123,7 @@ def reachability_distribution(
     return decide(_reach, _span_of_generations, fields, x, tolerance, depth=int(depth))
 
 
+@with_suggestions
 def observability_codistribution(
     f: Field | None,
     gs: Field | Sequence[Field],

@@ -36,7 +36,7 @@ from hjbjax.geometry.brackets import (
 )
 from hjbjax.geometry.scaling import balance, with_terms
 from hjbjax.problem import arguments
-from hjbjax.problem.pytree import is_traced, pytree_dataclass
+from hjbjax.problem.pytree import is_traced, pytree_dataclass, with_suggestions
 from hjbjax.problem.types import Array, Control, DType, Number, State
 
 
@@ -181,6 +181,7 @@ class Linearisation:
             return _degrees_or_refuse(_deepen(rule, states), "the origin")
 
 
+@with_suggestions
 def relative_degree(
     f: Field,
     g: Field | Sequence[Field],
@@ -222,21 +223,14 @@ def relative_degree(
     functions = (as_fields(f, g), as_pytree(h), as_half_widths(radius, states, "relative_degree"))
 
     def rule(depth: int) -> RelativeDegree:
-        return decide(
-            _first_effects,
-            _relative_degree,
-            functions,
-            x,
-            tolerance,
-            rounding_of_terms,
-            samples=int(samples),
-            depth=depth,
-        )
+        options = {"samples": int(samples), "depth": depth}
+        return decide(_first_effects, _relative_degree, functions, x, tolerance, rounding_of_terms, **options)
 
     # under a tracer no verdict can be looked at, so that all n derivatives go into the program
     return rule(states) if is_traced(functions, x, tolerance) else _deepen(rule, states)
 
 
+@with_suggestions
 def linearising_feedback(
     f: Field, g: Field | Sequence[Field], h: Callable, x: State | Sequence[float] | None = None
 ) -> Linearisation:

@@ -31,7 +31,7 @@ from hjbjax.geometry.brackets import (
 from hjbjax.geometry.distributions import Distribution, span
 from hjbjax.geometry.scaling import ROUNDING, balance, with_terms, without_rounding
 from hjbjax.problem import arguments
-from hjbjax.problem.pytree import is_traced, pytree_dataclass
+from hjbjax.problem.pytree import is_traced, pytree_dataclass, with_suggestions
 from hjbjax.problem.types import Array, Number, State
 
 Ladders: TypeAlias = tuple[tuple[Array, Array], tuple[Array, Array]]  # members and slopes, and the terms of both
@@ -76,6 +76,7 @@ class Linearisability:
         )
 
 
+@with_suggestions
 def is_feedback_linearisable(
     f: Field,
     g: Field | Sequence[Field],

@@ -21,6 +21,7 @@ from hjbjax.problem.pytree import cast, pytree_dataclass, with_suggestions
 from hjbjax.problem.sets import Ball, Box
 from hjbjax.problem.types import Array, Number, State
 from hjbjax.solution.screen import encodable
+from hjbjax.tracing import checks
 from hjbjax.tracing.closures import settled_function
 
 Functions: TypeAlias = tuple[Callable, Callable]  # V and f, of (x) or of (t, x)
@@ -74,6 +75,7 @@ class LyapunovReport:
         return f"no violation found at {self.evaluations:,} points; the search proves nothing"
 
 
+@with_suggestions
 def lyapunov_derivative(V: Callable, f: Callable, *, time_varying: bool = False) -> Callable:
     """dV/dt along ẋ = f, a function of ``(x)``, or of ``(t, x)`` as V and f then are.
 
@@ -146,6 +148,9 @@ def lyapunov_check(
     rest = np.zeros(region.dim) if equilibrium is None else np.asarray(equilibrium, np.float64)
     if rest.shape != (region.dim,):
         raise ValueError(f"lyapunov_check: equilibrium has shape {rest.shape}, wanted ({region.dim},)")
+    fed = {"x": rest.shape} if times is None else {"t": (), "x": rest.shape}
+    checks.function_of(V, "V", (), **fed)
+    checks.function_of(f, "f", rest.shape, **fed)
     # float64 whatever the session has: the default tolerance of 1e-9 is below the rounding of float32
     with jax.enable_x64(True):
         place = cast((region, rest, span_of_times), np.float64)

@@ -78,8 +78,9 @@ def controls(
 ) -> Picture:
     """The inputs of a path over time: lines, or steps where each was held through its interval.
 
-    ``path.controls`` has shape (k, m), the controls at the start of each interval; a line goes on level through the
-    last. One that jumps to and fro more often than a picture can show is drawn pale, with its running mean.
+    ``path.controls`` has shape (k, m), the controls at the start of each interval: a line ends where the last begins,
+    and a step goes through it. One that jumps to and fro more often than a picture can show is drawn pale, with its
+    running mean.
 
     Args:
       path: the path of ``simulate``.
@@ -97,9 +98,12 @@ def controls(
     words = getattr(solution, "labels", Labels())
     names = tuple(names or (words.control(i, count) for i in range(count)))
     ax = axes_of(ax, wide=True)
-    # the control at the end is not known; a path that ends at once has none at all
-    shown = np.concatenate([inputs, inputs[-1:]]) if len(inputs) else np.full((len(times), count), np.nan)
-    drawing = "steps-post" if getattr(path, "held", True) else "default"
+    # the control at the end is not known: a step holds through the last interval, a line that went on level would bend
+    held = getattr(path, "held", True) or len(inputs) == 1
+    drawing = "steps-post" if held else "default"
+    # a path that ends at once has no control at all
+    shown = np.concatenate([inputs, inputs[-1:] if held else np.full((1, count), np.nan)])
+    shown = shown if len(inputs) else np.full((len(times), count), np.nan)
     lines: list[Artist] = []
     means: list[Artist] = []
     for i, name in enumerate(names[:count]):

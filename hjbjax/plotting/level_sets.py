@@ -31,6 +31,7 @@ from hjbjax.plotting.style import COLOURS, Picture, axes_of, drawing, legend, so
 from hjbjax.plotting.surfaces import level_surface, lit, thinned
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import SIDES, Labels
+from hjbjax.problem.pytree import keywords, refuse_misspelt
 
 if TYPE_CHECKING:
     from matplotlib.animation import FuncAnimation
@@ -319,6 +320,10 @@ def animation(
 
     if getattr(solution, "times", None) is None:
         raise ValueError("animation: the solution is stationary; march(..., times=np.linspace(0, horizon, 41)) moves")
+    if not callable(draw):
+        raise TypeError(f"animation: got draw = {draw!r}, wanted a function, as hjb.plotting.value")
+    # now: the frames are drawn later, and may be drawn by nobody
+    refuse_misspelt(options, {*(keywords(draw) or options), "interval"}, "animation")
     axes = _moving_axes(solution, draw, ax, options)
 
     def frame_at(time: float) -> list[Artist]:

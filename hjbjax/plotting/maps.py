@@ -15,6 +15,7 @@ from hjbjax.plotting.slices import (
     Cuts,
     Region,
     Section,
+    at_states,
     at_time,
     feedback,
     line_in_box,
@@ -131,7 +132,12 @@ def policy(
     span = span_of(solution, input)
     inner = (slice(1, -1),) if len(section.axes) == 1 else ()
     # the run ends at the two ends of a line: a hatch half a cell wide would tell nothing
-    hidden = "no control" if np.ma.getmaskarray(section.values)[inner].any() or len(section.axes) == 2 else ""
+    lost = np.ma.getmaskarray(section.values)[inner]
+    hidden = "no control" if lost.any() or len(section.axes) == 2 else ""
+    target = target_of(solution, time)
+    if hidden and len(section.axes) == 1 and target is not None:
+        within = at_states(target, section.states(section.coordinates))[inner] <= 0
+        hidden = "target" if within[lost].all() else hidden
     look = Look(label, hidden, colorbar, diverging=True, cells=cells, span=span)
     return Picture(draw(ax, section, look, regions), ax)
 

@@ -18,6 +18,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import Labels
 from hjbjax.problem.sets import Ball, Box
 from hjbjax.problem.types import Array, Number, State
+from hjbjax.tracing import checks
 
 if TYPE_CHECKING:
     from hjbjax.solution.solution import Solution
@@ -66,7 +67,12 @@ class Region(NamedTuple):
 
 
 def region_of(function: Callable[[State], Number], section: Section, label: str) -> Region:
-    """The set where a function of one state is ≤ 0, in the plane of a section over two axes."""
+    """The set where a function of one state is ≤ 0, in the plane of a section over two axes.
+
+    Raises:
+      ValueError: the function cannot be traced, or returns no number.
+    """
+    checks.function_of(function, label, (), x=(section.grid.ndim,))
     fine = tuple(np.linspace(line[0], line[-1], RASTER) for line in section.coordinates)
     level, nodes = (at_states(function, section.states(lines)) for lines in (fine, section.coordinates))
     return Region(label, fine, np.where(np.isfinite(level), level, 1.0), nodes <= 0)

@@ -19,7 +19,6 @@ from hjbjax.plotting.style import (
     logarithmic,
     pair_of_axes,
 )
-from hjbjax.problem.pytree import with_suggestions
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
     from hjbjax.solution.solution import Solution
 
 
-@with_suggestions
+@drawing
 def convergence(study: Study, *, ax: Axes | Sequence[Axes] | np.ndarray | None = None) -> Picture:
     """The errors of a convergence study over the spacing and over the seconds, with the fitted orders.
 
@@ -118,7 +117,7 @@ def perturbation(study: Perturbation, *, ax: Axes | None = None) -> Picture:
     return Picture(artists, ax)
 
 
-@with_suggestions
+@drawing
 def residuals(solution: Solution, *, ax: Axes | None = None, label: str | None = None) -> Picture:
     """The residual after each step on a logarithmic scale; steps where it is not finite are marked grey.
 

@@ -39,10 +39,14 @@ DPI = 200  # of saved pictures, unless given
 DRAWN: dict[str, tuple[tuple[str, ...], str]] = {
     "solution": (("grid", "value"), "the Solution of solve or march"),
     "path": (("times", "states"), "the Path of simulate"),
+    "estimates.path": (("times", "estimates"), "the OutputPath of simulate_output"),
     "extremal": (("times", "costates"), "the extremal of pontryagin"),
+    "grid": (("shape", "periodic"), "a Grid, such as solution.grid"),
+    "residuals.solution": (("residuals",), "the Solution of solve"),
     "convergence.study": (("errors", "fitted"), "the result of convergence_study"),
     "perturbation.study": (("nominal", "noise"), "the result of perturbation_study"),
 }
+PAIRS = ("convergence",)  # functions that draw on two axes, where these are given
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -60,14 +64,14 @@ def drawing(function: Callable[P, T]) -> Callable[P, T]:
     @functools.wraps(function)
     def drawn(*arguments: P.args, **options: P.kwargs) -> T:
         for number, (name, thing) in enumerate((*zip(names, arguments, strict=False), *options.items())):
-            attributes, words = DRAWN.get(name) or DRAWN.get(f"{function.__name__}.{name}", ((), ""))
+            attributes, words = DRAWN.get(f"{function.__name__}.{name}") or DRAWN.get(name, ((), ""))
             # an argument that may be left out is None then
             if not all(hasattr(thing, attribute) for attribute in attributes) and (thing is not None or number == 0):
                 raise TypeError(f"{function.__name__}: got {name} = {shown(thing)}, wanted {words}")
         ax = options.get("ax")
         if hasattr(ax, "add_subplot"):
             raise TypeError(f"{function.__name__}: got a figure as ax, wanted axes on it: ax=figure.add_subplot()")
-        if isinstance(ax, np.ndarray):
+        if isinstance(ax, np.ndarray) and function.__name__ not in PAIRS:
             raise TypeError(f"{function.__name__}: got {ax.size} axes as ax, wanted one of them, as in ax=ax[0]")
         return checked(*arguments, **options)
 

@@ -7,7 +7,7 @@ and what is wanted. Tracers pass: inside a JAX transformation no value can be lo
 import contextlib
 import difflib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, TypeVar
 
 import jax
@@ -131,6 +131,13 @@ def shown(value: object) -> str:
     """A value as a refusal quotes it: its ``repr`` in one line of at most ``SHOWN`` characters."""
     text = " ".join(repr(value).split())
     return text if len(text) <= SHOWN else text[: SHOWN - 4] + " ..."
+
+
+def stretchings(stretch: Any) -> tuple:
+    """The stretching of every axis as a tuple; one alone, or a word, is refused with what to write."""
+    if isinstance(stretch, str) or not isinstance(stretch, Iterable):
+        raise TypeError(f"Grid.stretch: got {stretch!r}, wanted one an axis, as in (hjb.Sinh(3.0), None)")
+    return tuple(stretch)
 
 
 def check_stretch(stretch: tuple, periodic: tuple[bool, ...]) -> None:

@@ -71,7 +71,7 @@ class Grid:
         shape = arguments.counts(self.shape)
         periodic = arguments.periodic_flags(self.periodic, len(shape))
         names = tuple(str(name) for name in self.names) or tuple(f"x{axis + 1}" for axis in range(len(shape)))
-        stretch = (None,) * len(shape) if self.stretch is None else tuple(self.stretch)
+        stretch = (None,) * len(shape) if self.stretch is None else arguments.stretchings(self.stretch)
         lengths = (len(lo), len(hi), len(shape), len(periodic), len(names), len(stretch))
         if len(set(lengths)) != 1:
             raise ValueError(

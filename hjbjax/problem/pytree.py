@@ -12,7 +12,7 @@ import difflib
 import functools
 import hashlib
 import inspect
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence, Set
 from typing import Any, ParamSpec, TypeVar, dataclass_transform
 
 import jax
@@ -36,6 +36,8 @@ ELSEWHERE = {  # words that other packages and books have for an argument, and o
     **dict.fromkeys(("max", "upper", "right"), ("hi",)),
     **dict.fromkeys(("n", "num", "size", "points", "nodes", "resolution"), ("shape", "points")),
     **dict.fromkeys(("dt", "time_step"), ("step", "max_step")),
+    **dict.fromkeys(("save_at", "saveat", "ts", "t_eval"), ("times",)),
+    **dict.fromkeys(("noise", "r"), ("measurement_noise", "radius")),
     **dict.fromkeys(("goal",), ("target",)),
     **dict.fromkeys(("slice", "cut", "at"), ("fixed",)),
     **dict.fromkeys(("accuracy", "order", "discretization"), ("scheme",)),
@@ -99,23 +101,37 @@ def with_suggestions(function: Callable[P, T], name: str | None = None) -> Calla
 
     A function that hands further keywords on leaves that to whom it hands them.
     """
-    parameters = inspect.signature(function).parameters.values()
-    if any(each.kind is each.VAR_KEYWORD for each in parameters):
+    by_name = keywords(function)
+    if by_name is None:
         return function
-    by_name = {each.name for each in parameters if each.kind in (each.POSITIONAL_OR_KEYWORD, each.KEYWORD_ONLY)}
 
     @functools.wraps(function)
     def called(*arguments: P.args, **options: P.kwargs) -> T:
-        for word in options.keys() - by_name:
-            # running_cost is the cost, though more like running_max
-            parts = [part for part in word.split("_")[::-1] if part in by_name]
-            elsewhere = [own for own in ELSEWHERE.get(word.lower(), ()) if own in by_name]
-            near = parts or elsewhere or difflib.get_close_matches(word, by_name)
-            cure = f"did you mean {near[0]}?" if near else f"wanted one of {', '.join(sorted(by_name - {'self'}))}"
-            raise TypeError(f"{name or function.__name__}() got an unexpected keyword argument {word!r}: {cure}")
+        refuse_misspelt(options, by_name, name or function.__name__)
         return function(*arguments, **options)
 
     return called
+
+
+def keywords(function: Callable) -> Set[str] | None:
+    """The keywords of a function; None where it hands further ones on."""
+    parameters = inspect.signature(function).parameters.values()
+    if any(each.kind is each.VAR_KEYWORD for each in parameters):
+        return None
+    return {each.name for each in parameters if each.kind in (each.POSITIONAL_OR_KEYWORD, each.KEYWORD_ONLY)}
+
+
+def refuse_misspelt(words: Iterable[str], by_name: Set[str], function: str) -> None:
+    """Refuse the first of the words that is no keyword of a function, with the one that it is next to."""
+    for word in words:
+        if word in by_name:
+            continue
+        # running_cost is the cost, though more like running_max
+        parts = [part for part in word.split("_")[::-1] if part in by_name]
+        elsewhere = [own for own in ELSEWHERE.get(word.lower(), ()) if own in by_name]
+        near = parts or elsewhere or difflib.get_close_matches(word, by_name)
+        cure = f"did you mean {near[0]}?" if near else f"wanted one of {', '.join(sorted(by_name - {'self'}))}"
+        raise TypeError(f"{function}() got an unexpected keyword argument {word!r}: {cure}")
 
 
 def _compare_by_value(cls: type, names: tuple[str, ...]) -> None:

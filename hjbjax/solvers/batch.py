@@ -15,7 +15,7 @@ lanes that still run, and those that have not begun.
 import contextlib
 import dataclasses
 import os
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from typing import Any
 
@@ -93,7 +93,9 @@ def solve_batch(
         raise TypeError(f"solve_batch: got {shown(problems)}; wanted a list of problems, as in [problem]")
     lanes = list(problems)
     check_limits(max_steps, time_limit)
-    for lane in lanes:
+    for number, lane in enumerate(lanes):
+        if not isinstance(lane, Problem):
+            raise TypeError(f"solve_batch: lane {number} is {shown(lane)}; wanted problems alone")
         check_arguments(lane, grid, method, scheme, tol)
     grid.check_indices()
     kind = arguments.as_dtype(dtype)
@@ -109,7 +111,8 @@ def solve_batch(
             # without nesting, whose levels the host drives one by one
             chosen = choose(first, grid, traced=False, method=method).inner
             on, sharpen = Discretisation(first, grid, scheme or Upwind(subcell=True), kind), scheme is None
-            check_on_one_state(first, grid, on.scheme)
+            with _naming(members[0]):
+                check_on_one_state(first, grid, on.scheme)
             needed = memory.require(first, grid, chosen, kind, max_memory)
             # one lane by itself has been held against the memory above, so that a round is never empty
             for some in _rounds(members, needed, max_memory):
@@ -128,6 +131,15 @@ def solve_batch(
         if throw and solution.status is not Status.CONVERGED:
             raise SolveError(f"lane {index}: {solution.status.name}: {solution.message}", solution, solutions)
     return solutions
+
+
+@contextlib.contextmanager
+def _naming(lane: int) -> Iterator[None]:
+    """A refusal with the lane that it is about."""
+    try:
+        yield
+    except ValueError as refusal:
+        raise ValueError(f"lane {lane}: {refusal}") from refusal
 
 
 def _same_program(problems: Sequence[Problem]) -> list[list[int]]:
@@ -196,11 +208,8 @@ def _solve_side_by_side(
     def one(name: int) -> tuple[Solution, list[str]]:
         own = clock.beside()
         own.journal = kept and kept.journal(f"lane{name}")
-        try:
-            with settings(), keeping_warnings() as said:
-                solution = solve_on_host(lanes[name], method, tol, None, own, sharpen=sharpen, free=False)
-        except ValueError as refusal:
-            raise ValueError(f"lane {name}: {refusal}") from refusal
+        with _naming(name), settings(), keeping_warnings() as said:
+            solution = solve_on_host(lanes[name], method, tol, None, own, sharpen=sharpen, free=False)
         solution.stats.setdefault("method", method.described(lanes[name].problem.is_game))
         solution.stats.update(seconds=own.stepping, lanes=len(lanes), tol=tol)
         return with_last_phase(solution, own) if solution.status in CUT else solution, said
@@ -244,13 +253,12 @@ def _solve_together(
     prepared: list[tuple[Task, Assumptions, Mask | None]] = []
     for i, on in enumerate(asked):
         try:
-            node_checks.values(on, clock)
-            admissibility.values(on.problem, on.grid, on.dtype)
-            if sharpen:
-                on = asked[i] = dataclasses.replace(on, scheme=choose_scheme(on, method))
-            prepared.append(prepare_on_host(on.chain, method=method, tol=tol, clock=clock))
-        except ValueError as refusal:
-            raise ValueError(f"lane {names[i]}: {refusal}") from refusal
+            with _naming(names[i]):
+                node_checks.values(on, clock)
+                admissibility.values(on.problem, on.grid, on.dtype)
+                if sharpen:
+                    on = asked[i] = dataclasses.replace(on, scheme=choose_scheme(on, method))
+                prepared.append(prepare_on_host(on.chain, method=method, tol=tol, clock=clock))
         except Stopped as stop:
             nothing = [solution_at_start(each, np.zeros(each.grid.shape), stop.status) for each in asked]
             return [with_last_phase(solution, clock) for solution in nothing]

@@ -4,7 +4,7 @@ Every function is traced once and nothing is allocated. What is refused is named
 """
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -16,7 +16,7 @@ from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.parts import check_mesh
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import remembered
+from hjbjax.problem.pytree import as_partial, remembered
 from hjbjax.tracing import indices
 from hjbjax.tracing.operations import Operations, operations
 
@@ -40,6 +40,7 @@ _SLIPS = (  # of shapes: words of JAX's, and what most likely led to them
     ("annot stack arrays", "u and d are arrays, also of one entry: u[0] is the number"),
     ("must have the same shape", "u and d are arrays, also of one entry: u[0] is the number"),
     ("Too many indices", "x is one state, without an axis for a batch: x[0] is its first entry"),
+    ("setting an array element", "nothing traced can be written into a NumPy array: use jnp.stack([...])"),
 )
 
 
@@ -200,26 +201,61 @@ def _verdict(result: Any) -> tuple[int, ...] | str:
 
 def _probe(problem: Problem, name: str, n: int) -> tuple[int, ...] | str:
     """The shape of a function's result on one state, found by tracing it, or a description of what it is instead."""
-    function, names, said_call = getattr(problem, name), _names(problem, name), call(problem, name)
-    lengths = _lengths(problem, n)
+    names, lengths = _names(problem, name), _lengths(problem, n)
     _check_arity(problem, name)
+    return _probed(getattr(problem, name), {letter: lengths[letter] for letter in names}, call(problem, name))
+
+
+def _probed(function: Callable, fed: Mapping[str, tuple[int, ...]], said_call: str) -> tuple[int, ...] | str:
+    """As ``_probe``, by the shapes of the arguments, and as refusals call it."""
     # any exception may come out of a function of the user's: those of JAX get advice, those of shapes their first line
     try:
-        verdict, outside, *_ = _trace_once(function, names, tuple(lengths[letter] for letter in names))
+        verdict, outside, *_ = _trace_once(function, tuple(fed), tuple(fed.values()))
     except Exception as error:
-        fed = ", ".join(f"{letter} of shape {lengths[letter]}" for letter in names)
-        if said := cure(error):
-            raise ValueError(f"{said_call} {said}.\nIt is traced once on one state, with {fed}") from error
-        if isinstance(error, (TypeError, ValueError, IndexError)):
-            said = (str(error).strip() or type(error).__name__).splitlines()[0]
-            hint = next((f"\n{advice}" for words, advice in _SLIPS if words in said), "")
-            raise ValueError(f"{said_call} failed on one state, with {fed}:\n{said[:400]}{hint}") from error
+        if said := refusal(error, said_call, fed):
+            raise ValueError(said) from error
         # an exception of the user's own making stays one, so that it can be caught by its type
-        error.add_note(f"raised by {said_call}, traced on one state, with {fed}")
+        error.add_note(f"raised by {said_call}, traced on one state, with {_in_words(fed)}")
         raise
     if outside is not None:  # no exception would ever come: see ``indices``
         raise ValueError(f"{said_call} asks for {outside}.\nJAX would take the nearest one, or none, without a word")
     return verdict
+
+
+def refusal(error: Exception, said_call: str, fed: Mapping[str, tuple[int, ...]]) -> str | None:
+    """What to say of a function, ``drift(x, u)``, that failed on one state; None for an exception of the user's own."""
+    if said := cure(error):
+        return f"{said_call} {said}.\nIt is traced once on one state, with {_in_words(fed)}"
+    if isinstance(error, (TypeError, ValueError, IndexError)):
+        said = (str(error).strip() or type(error).__name__).splitlines()[0]
+        hint = next((f"\n{advice}" for words, advice in _SLIPS if words in said), "")
+        return f"{said_call} failed on one state, with {_in_words(fed)}:\n{said[:400]}{hint}"
+    return None
+
+
+def _in_words(fed: Mapping[str, tuple[int, ...]]) -> str:
+    """Shapes of arguments, as in "x of shape (2,), u of shape (1,)"."""
+    return ", ".join(f"{letter} of shape {shape}" for letter, shape in fed.items())
+
+
+def function_of(function: Callable, name: str, wanted: tuple[int, ...], **fed: tuple[int, ...]) -> None:
+    """Refuse a function that is no part of a problem and cannot be traced, or returns another shape than it should.
+
+    Args:
+      function: what a picture or a search is given.
+      name: what it is called, for refusals.
+      wanted: the shape of its result.
+      **fed: the shapes of its arguments, by name.
+
+    Raises:
+      ValueError: with what was returned, or what cannot be traced.
+    """
+    said_call = f"{name}({', '.join(fed)})"
+    with jax.enable_x64(True):
+        verdict = _probed(as_partial(function, name) or function, fed, said_call)
+    if verdict != wanted:
+        returned = verdict if isinstance(verdict, str) else f"shape {verdict}"
+        raise ValueError(f"{said_call} returned {returned}, expected {wanted or 'one number'} for one state")
 
 
 def _lengths(problem: Problem, n: int) -> dict[str, tuple[int, ...]]:

@@ -128,6 +128,10 @@ def with_settled_functions(front_door: Callable) -> Callable:
         if len(arguments) > len(names) or positions.keys() & options.keys():
             return front_door(*arguments, **options)  # which Python refuses
         given = positions | options
+        if (first, second) == ("problem", "grid") and {first, second} <= given.keys():
+            kinds = [type(given[name]).__name__ for name in (first, second)]
+            if not isinstance(given[first], Problem) or not isinstance(given[second], Grid):
+                raise TypeError(f"{front_door.__name__}: got {', '.join(kinds)}; wanted a Problem and a Grid")
         if isinstance(given.get(second), Grid) and first in given:
             given[first] = _settle_all(given[first], given[second].ndim, given.get("dtype"))
         if is_traced(given):

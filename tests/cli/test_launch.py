@@ -39,6 +39,7 @@ def ended(process):
     ("words", "part"),
     [
         (("launch", "--", "list"), "launch: got 'list', wanted solve"),
+        (("launch", "--proceses", "2", "--", "solve", "pendulum"), "'--proceses'; did you mean '--processes'?"),
         (("launch", "--processes", "0", "--", "solve", "pendulum"), "wanted a whole number > 0"),
         (
             ("solve", "pendulum", "--devices", "1000x1000"),

@@ -302,7 +302,7 @@ REFUSED = [
     (lambda: ExtendedKalman(PROBLEM, lambda x: x[0], START, PRIOR), "of shape (), wanted"),
     (lambda: ExtendedKalman(PROBLEM, lambda x: x[:3] * x[5], START, PRIOR), "h(x) asks for"),
     (lambda: ExtendedKalman(PROBLEM, lambda x: x @ x[:1], START, PRIOR), "h(x) failed on one state"),
-    (lambda: ExtendedKalman(PROBLEM, lambda x: x if x[0] > 0 else -x, START, PRIOR), "cannot be traced"),
+    (lambda: ExtendedKalman(PROBLEM, lambda x: x if x[0] > 0 else -x, START, PRIOR), "h(x) decides by Python `if`"),
     (lambda: ExtendedKalman(PROBLEM, PLANT.h, START, [[1.0, 2.0], [2.0, 1.0]]), "without negative eigenvalues"),
     (lambda: ExtendedKalman(PROBLEM, PLANT.h, START, [[1.0, 0.2], [0.1, 1.0]]), "wanted a symmetric matrix"),
     (lambda: ExtendedKalman(PROBLEM, PLANT.h, START, np.eye(3)), "covariance has shape (3, 3), wanted (2, 2)"),

@@ -81,6 +81,17 @@ def test_the_files_it_names_exist(page):
         assert (ROOT / path).exists(), path
 
 
+@pytest.mark.parametrize("page", PAGES)
+def test_a_link_within_a_page_leads_to_one_of_its_headings(page):
+    """On the site `#benchmarks` leads to another page, where the file alone is read nowhere."""
+    headings = re.findall(r"^#+ (.*)$", PAGES[page], re.MULTILINE)
+    places = {re.sub(r"[^\w -]", "", heading).lower().replace(" ", "-") for heading in headings}
+    assert set(re.findall(r"\]\(#([^)]+)\)", PAGES[page])) <= places
+    for other, place in re.findall(r"\]\(([\w/]+)\.md#([^)]+)\)", PAGES[page]):
+        titles = re.findall(r"^#+ (.*)$", PAGES[other.split("/")[-1]], re.MULTILINE)
+        assert place in {title.lower().replace(" ", "-") for title in titles}, place
+
+
 def test_the_table_of_estimated_errors_is_what_the_benchmark_wrote():
     rows = json.loads((ROOT / "benchmarks/results/estimates.json").read_text(encoding="utf-8"))
     ratios = [row["ratio"] for row in rows if row["counts"]]

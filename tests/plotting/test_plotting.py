@@ -252,6 +252,13 @@ def test_bands_on_a_stretched_axis_end_half_way_to_the_next_node():
     np.testing.assert_allclose(found, wanted, atol=1e-12)
 
 
+def test_over_one_axis_a_target_is_called_one_and_not_a_place_without_a_control():
+    problem = Problem(lambda x, u: u, lambda x, u: 1.0, Box([-1.0], [1.0]), target=lambda x: jnp.abs(x[0]) - 0.1)
+    for asked, said in ((problem, "target"), (None, "no control")):
+        solution = made(line().grid, lambda x: x[..., 0] ** 2, lambda x: np.where(x == 0, np.nan, -x), problem=asked)
+        assert labels(plotting.policy(solution).ax) == [said]
+
+
 def test_enumerated_controls_are_cut_at_the_nearest_node():
     grid = volume().grid
     solution = made(grid, lambda x: x[..., 0], lambda x: np.sign(x[..., 2:] - 1.5), discrete=True)
@@ -420,13 +427,14 @@ def test_a_path_on_a_torus_and_one_along_the_seam():
     np.testing.assert_allclose(curve.get_xydata(), wanted, atol=1e-12)
 
 
-@pytest.mark.parametrize(("held", "style"), [(True, "steps-post"), (False, "default")])
-def test_controls_are_steps_where_they_were_held_and_lines_elsewhere(held, style):
+@pytest.mark.parametrize(("held", "style", "last"), [(True, "steps-post", 0.5), (False, "default", np.nan)])
+def test_controls_are_steps_where_they_were_held_and_lines_elsewhere(held, style, last):
+    """A line ends with the last control that is known: going on level it would bend where the feedback does not."""
     path = path_of(np.zeros((4, 1)), [[1.0], [-1.0], [0.5]], np.array([0.0, 1.0, 3.0, 4.0]))
     path.held = held
     (line,) = plotting.controls(path)
     np.testing.assert_array_equal(line.get_xdata(), path.times)
-    np.testing.assert_array_equal(line.get_ydata(), [1.0, -1.0, 0.5, 0.5])
+    np.testing.assert_array_equal(line.get_ydata(), [1.0, -1.0, 0.5, last])
     assert line.get_drawstyle() == style
     assert line.axes.get_ylabel() == "u"
 

@@ -1,5 +1,7 @@
 """What is said where something is wrong: the argument, the value, what is wanted, the place."""
 
+import math
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -15,6 +17,20 @@ GRID = hjb.Grid([-1.0], [1.0], (21,))
 
 ANSWER = hjb.Solution(GRID, GRID.nodes()[:, 0] ** 2, -GRID.nodes())
 PATH = Path(np.zeros(2), np.zeros((2, 1)), np.zeros((1, 1)), None, 0.0, None, 0, 1)
+
+
+PLANE = hjb.Solution(hjb.Grid([-1.0] * 2, [1.0] * 2, (3, 3)), np.zeros((3, 3)), None)
+MARCHED = hjb.Solution(GRID, np.zeros((2, 21)), None, times=np.array([0.0, 1.0]))
+
+
+def still(x):
+    return 0 * x
+
+
+def written(x, u):
+    rates = np.zeros(2)
+    rates[0], rates[1] = x[1], u[0]
+    return rates
 
 
 def cost(x, u):
@@ -128,6 +144,13 @@ def test_ordinary_grids_pass():
         (lambda: hjb.plotting.value(None, axs=1), r"got solution = None"),
         (lambda: hjb.plotting.value(ANSWER, axs=1), r"value\(\) got .* 'axs': did you mean ax\?"),
         (lambda: hjb.plotting.closed_loop(ANSWER, PATH, fig=1), r"'fig': did you mean figure\?"),
+        (lambda: hjb.geometry.affine_fields(lambda x, u: u, input=1), r"affine_fields\(\) .*did you mean inputs\?"),
+        (lambda: hjb.geometry.relative_degree(None, None, None, [0.0], sample=3), r"did you mean samples\?"),
+        (lambda: hjb.geometry.reachability_distribution(None, still, [0.0], dept=1), r"did you mean depth\?"),
+        (lambda: hjb.stability.brockett_check(None, still, [0.0], tolerence=1), r"did you mean tolerance\?"),
+        (lambda: hjb.march(problem(), GRID, 1.0, save_at=[0.0]), r"'save_at': did you mean times\?"),
+        (lambda: hjb.plotting.animation(MARCHED, intervall=9), r"animation\(\) .*did you mean interval\?"),
+        (lambda: hjb.plotting.animation(MARCHED, hjb.plotting.value, level=9), r"did you mean levels\?"),
     ],
 )
 def test_a_misspelt_keyword_is_told_from_the_right_one(ask, said):
@@ -160,12 +183,72 @@ def test_bounds_without_a_box_are_told_how_to_become_one():
         (lambda x, u: jnp.stack([x[1], u]), r"u\[0\] is the number$"),
         (lambda x, u: jnp.stack([x[:, 1], u[:, 0]], -1), r"x is one state, without an axis for a batch"),
         (lambda x, u: np.stack([x[1], u[0]]), "use jnp in place of np"),
+        (lambda x, u: written(x, u), r"setting an array element[\s\S]*use jnp.stack\(\[...\]\)$"),
     ],
 )
 def test_a_drift_of_the_wrong_shape_or_kind_is_told_what_to_change(drift, cure):
     with pytest.raises(ValueError, match=rf"^drift\(x, u\) [\s\S]*{cure}") as caught:
         hjb.solve(problem(drift), hjb.Grid([-1.0] * 2, [1.0] * 2, (11, 11)))
     assert len(str(caught.value).splitlines()) <= 6
+    with pytest.raises(ValueError, match=rf"^simulate: drift [\s\S]*{cure}"):
+        hjb.simulate(problem(drift), lambda x: -x[:1], [0.5, 0.5], 1.0)
+
+
+@pytest.mark.parametrize(
+    ("ask", "said"),
+    [
+        (lambda V: hjb.plotting.value(PLANE, ax=Figure().add_subplot(), target=V), r"^target\(x\) "),
+        (lambda V: hjb.lyapunov_check(V, lambda x: -x, hjb.Box([-1.0] * 2, [1.0] * 2)), r"^V\(x\) "),
+        (lambda V: hjb.simulate(problem(), lambda x: [V(x)], [0.5], 1.0), "^simulate: feedback "),
+        (lambda V: hjb.filtering.ExtendedKalman(problem(), lambda x: V(x)[None], [0.0], [1.0]), r"h\(x\) "),
+    ],
+    ids=["target", "Lyapunov", "feedback", "measurement"],
+)
+def test_other_functions_of_the_user_are_told_what_to_change_too(ask, said):
+    for function, cure in (
+        (lambda x: np.hypot(x[0], x[0]), "use jnp in place of np"),
+        (lambda x: math.exp(x[0]), "needs a traced value as a number: use jnp in place of np, math"),
+        (lambda x: x[0] if x[0] > 0 else -x[0], "use jnp.where"),
+    ):
+        with pytest.raises(ValueError, match=said + r"[\s\S]*" + cure) as caught:
+            ask(function)
+        assert len(str(caught.value).splitlines()) <= 6
+
+
+def test_functions_of_another_shape_are_refused_where_nothing_else_would_tell():
+    """A rate of one state beside two was broadcast, and a truth value ≤ 0 is outside where one means inside."""
+    square = hjb.Box([-1.0] * 2, [1.0] * 2)
+    with pytest.raises(ValueError, match=r"f\(x\) returned shape \(1,\), expected \(2,\) for one state"):
+        hjb.lyapunov_check(lambda x: x @ x, lambda x: -x[:1], square)
+    with pytest.raises(ValueError, match=r"V\(t, x\) returned shape \(2,\), expected one number"):
+        hjb.lyapunov_check(lambda t, x: x, lambda t, x: -x, square, times=[0.0, 1.0])
+    with pytest.raises(ValueError, match=r"a vector field returned shape \(1,\), expected \(2,\)"):
+        hjb.geometry.lie_bracket(lambda x: x, lambda x: x[:1])(jnp.zeros(2))
+    for target, returned in ((lambda x: x, r"shape \(2,\)"), (lambda x: x[0] < 0, "bool numbers")):
+        with pytest.raises(ValueError, match=rf"target\(x\) returned {returned}, expected one number"):
+            hjb.plotting.value(PLANE, ax=Figure().add_subplot(), target=target)
+
+
+@pytest.mark.parametrize(
+    ("ask", "said"),
+    [
+        (lambda: hjb.simulate(ANSWER, problem(), [0.5], 1.0), "simulate: got Solution, wanted a Problem, and then"),
+        (lambda: hjb.estimate(GRID, problem()), "estimate: got Grid, Problem; wanted a Problem and a Grid"),
+        (lambda: hjb.chain.generator(GRID, problem()), "generator: got Grid, Problem; wanted a Problem and a Grid"),
+        (lambda: hjb.attenuation(GRID, 1.0, U), "attenuation: got Grid, wanted a Problem"),
+        (lambda: hjb.solve_batch([problem(), 3], GRID), "solve_batch: lane 1 is 3; wanted problems alone"),
+        (lambda: hjb.Grid([0.0], [1.0], (3,), stretch="sinh"), "Grid.stretch: got 'sinh', wanted one an axis"),
+        (lambda: hjb.Grid([0.0], [1.0], (3,), stretch=hjb.Sinh(3.0)), r"wanted one an axis, as in \(hjb.Sinh\(3.0\)"),
+    ],
+)
+def test_arguments_that_changed_places_are_told(ask, said):
+    with pytest.raises(TypeError, match=said):
+        ask()
+
+
+def test_a_batch_names_the_lane_of_a_refusal():
+    with pytest.raises(ValueError, match=r"lane 1: drift\(x, u\) returned shape \(3,\), expected \(1,\)"):
+        hjb.solve_batch([problem(), problem(lambda x, u: jnp.zeros(3))], GRID, scheme=hjb.Upwind())
 
 
 def test_a_vector_field_in_numpy_is_told_what_to_change():
@@ -181,6 +264,12 @@ def test_a_vector_field_in_numpy_is_told_what_to_change():
         (lambda: hjb.plotting.closed_loop(PATH, ANSWER), "closed_loop: got solution = Path"),
         (lambda: hjb.plotting.value(ANSWER, ax=Figure()), r"a figure as ax, wanted axes on it: ax=figure.add_subplot"),
         (lambda: hjb.plotting.policy(ANSWER, ax=Figure().subplots(1, 2)), r"got 2 axes as ax.*as in ax=ax\[0\]"),
+        (lambda: hjb.plotting.residuals(PATH), "residuals: got solution = Path.*wanted the Solution of solve"),
+        (lambda: hjb.plotting.residuals(ANSWER, ax=Figure()), "residuals: got a figure as ax"),
+        (lambda: hjb.plotting.convergence(ANSWER), "convergence: got study = Solution.*result of convergence_study"),
+        (lambda: hjb.plotting.estimates(PATH), "estimates: got path = Path.*wanted the OutputPath of simulate_output"),
+        (lambda: hjb.plotting.trajectory(PATH, grid=ANSWER), "trajectory: got grid = Solution.*wanted a Grid"),
+        (lambda: hjb.plotting.animation(MARCHED, "value"), "got draw = 'value', wanted a function"),
     ],
 )
 def test_what_cannot_be_drawn_is_told_from_what_can(ask, said):

@@ -15,12 +15,13 @@ SCRIPT = Path(__file__).parents[1] / "support" / "over_devices.py"
 ROOT = Path(__file__).parents[2]
 CHEAP = (
     "stencils", "not_a_number_is_not_lost", "compiled_program", "value_iteration", "march_of_first_order", "sweeps",
-    "checkpoints", "faults", "refusals",
+    "two_integrators", "checkpoints", "faults", "refusals",
 )  # fmt: skip
 DEAR = (
-    "value_iteration_to_a_target", "value_iteration_of_a_game", "value_iteration_with_correlated_noise",
-    "march_of_second_order", "march_of_fifth_order", "sweeps_of_flat_parts", "sweeps_in_slabs", "sweeps_to_a_target",
-    "sweeps_of_a_game", "krylov", "krylov_with_correlated_noise", "implicit_march", "open_ends", "without_a_choice",
+    "value_alone", "value_iteration_to_a_target", "value_iteration_of_a_game", "value_iteration_with_correlated_noise",
+    "march_of_the_value_alone", "march_of_second_order", "march_of_fifth_order", "sweeps_of_flat_parts",
+    "sweeps_in_slabs", "sweeps_to_a_target", "sweeps_of_a_game", "krylov", "krylov_with_correlated_noise",
+    "implicit_march", "open_ends", "without_a_choice", "three_integrators",
 )  # fmt: skip
 EXACT = ("value_iteration", "march_of_first_order", *(name for name in DEAR if name.startswith(("value", "march"))))
 CERTIFIED = ("sweeps", *(name for name in DEAR if name.startswith(("sweeps", "krylov"))))
@@ -101,6 +102,15 @@ def test_certificates_hold_on_every_mesh(found, name):
         one, many = mesh["steps"]
         # slabs exchange twice an order in place of three times
         assert many <= (1.5 if name == "sweeps_in_slabs" else 1.2) * one + 2
+
+
+@pytest.mark.parametrize("name", slow_if_dear(["two_integrators", "three_integrators"]))
+def test_the_value_of_systems_side_by_side_is_the_sum_of_theirs(found, name):
+    """4096 nodes in four dimensions, 12^6 in six: at every node the sum of values in the plane (see ``decoupled``)."""
+    assert found["status"] == "CONVERGED"
+    assert found["apart"] <= sum(found["errors"])
+    assert max(found["errors"]) <= 1e-2
+    assert found["ulp"] <= ULP
 
 
 def test_checkpoints(found):

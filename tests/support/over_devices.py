@@ -5,6 +5,7 @@ object: what each case found, or how it failed. ``tests/solvers/test_mesh.py`` r
 """
 
 import dataclasses
+import functools
 import json
 import sys
 import tempfile
@@ -110,6 +111,24 @@ def march_of_first_order():
 
 
 @case
+def value_alone():
+    """Nothing but V is kept, and what is given at the nodes is made anew in every step."""
+    alone = {**STEPS, "method": hjb.ValueIteration(policy=False)}
+    tube = hjb.reach(swing, U, lambda x: jnp.hypot(x[0] - 0.4, x[1]) - 0.7)
+    return [
+        *beside(lambda mesh: hjb.solve(PLAIN, ANGLE, mesh=mesh, **alone), (4, 2)),
+        *beside(lambda mesh: hjb.solve(tube, FLAT, mesh=mesh, **alone), (8,)),
+    ]
+
+
+@case
+def march_of_the_value_alone():
+    tube = hjb.reach(swing, U, lambda x: jnp.hypot(x[0] - 0.4, x[1]) - 0.7)
+    options = {"scheme": hjb.Upwind(), "times": [0.0, 0.1], "step": 0.01, "policy": False}
+    return beside(lambda mesh: hjb.march(tube, ANGLE, 0.2, mesh=mesh, **options), (4, 2))
+
+
+@case
 def march_of_second_order():
     problem = hjb.reach(swing, U, lambda x: jnp.hypot(x[0] - 0.4, x[1]) - 0.7, disturbances=None)
     return beside(lambda mesh: hjb.march(problem, FLAT, 0.2, mesh=mesh), (4, 2))
@@ -207,6 +226,69 @@ def compiled_program():
                 for name in names
             }
     return found
+
+
+# gain of the input, weight of the position, half of the box of positions and of speeds: no two axes are alike
+PLANTS = ((1.0, 1.0, 1.0, 1.5), (2.0, 0.5, 1.2, 1.0), (0.5, 2.0, 0.8, 1.3))
+
+
+def integrators(plants, nodes):
+    """Double integrators side by side, each with its own input and its own cost, on so many nodes an axis."""
+    gain, weight, far, fast = map(np.array, zip(*plants, strict=True))
+
+    def drift(x, u):
+        return jnp.stack([x[1::2], gain * u], axis=1).ravel()
+
+    def cost(x, u):
+        return weight @ x[::2] ** 2 + x[1::2] @ x[1::2] + u @ u
+
+    def at_the_end(x):
+        return jnp.sum(jnp.abs(x[::2] - 0.1))
+
+    count, hi = len(plants), np.stack([far, fast], axis=1).ravel()
+    controls = hjb.Box([-1.0] * count, [1.0] * count)
+    problem = hjb.Problem(drift, cost, controls, discount=2.0)
+    return problem, dataclasses.replace(problem, terminal_cost=at_the_end), hjb.Grid(-hi, hi, (nodes,) * 2 * count)
+
+
+def decoupled(plants, nodes, mesh, steps):
+    """Integrators on the product of their grids over a mesh, beside the sum of their values in the plane.
+
+    On the product grid the generator is the sum of those of the factors, and so are the costs: min over all inputs is
+    the sum of the minima. If W_i solve β W_i = min {L_i + L^u W_i}, their sum solves the equation of the product, at
+    every node and not up to O(h), and the chain has no other solution. An explicit step adds dt times the right-hand
+    side, so that a march is the sum of marches of as many steps, too, up to rounding.
+    """
+    settled, moving, grid = integrators(plants, nodes)
+    step, chain = 0.02, {"scheme": hjb.Upwind()}
+    alone = {"method": hjb.ValueIteration(policy=False), "tol": 1e-2, **chain}
+    whole = hjb.solve(settled, grid, mesh=mesh, **alone)
+    marched = hjb.march(moving, grid, steps * step, step=step, policy=False, mesh=mesh, **chain)
+    planes = [integrators([plant], nodes) for plant in plants]
+    answers = [hjb.solve(plane, flat, tol=1e-6, **chain) for plane, _, flat in planes]
+    marches = [hjb.march(plane, flat, steps * step, step=step, policy=False, **chain) for _, plane, flat in planes]
+    apart, moved = (
+        np.max(
+            np.abs(one.value.reshape(grid.shape) - functools.reduce(np.add.outer, [w.value.squeeze() for w in many]))
+        )
+        for one, many in ((whole, answers), (marched, marches))
+    )
+    scale = np.finfo(float).eps * np.max(np.abs(marched.value))
+    return {
+        "nodes": grid.size, "status": whole.status.name, "steps": [whole.steps, marched.steps],
+        "apart": float(apart), "errors": [float(whole.error), *(float(each.error) for each in answers)],
+        "ulp": float(moved / scale),
+    }  # fmt: skip
+
+
+@case
+def two_integrators():
+    return decoupled(PLANTS[:2], 8, mesh_of(2, 2, 2), 10)
+
+
+@case
+def three_integrators():
+    return decoupled(PLANTS, 12, mesh_of(2, 2, 2), 10)
 
 
 def within_certificates(problem, grid, method, *meshes):

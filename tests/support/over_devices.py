@@ -23,6 +23,7 @@ from hjbjax.discretisation import slopes, stencil
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import gauss_seidel
 from hjbjax.problem.parts import Parts
+from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.stretching import Sinh
 from hjbjax.solvers import setup, stationary_run
 
@@ -64,6 +65,20 @@ CHASE = hjb.Problem(  # a game with a target, and noise along one axis
 SHAKEN = hjb.Problem(swing, effort, U, noise=0.6, discount=0.5)
 SKEW = hjb.Problem(swing, effort, U, noise=np.array([[0.5, 0.0], [0.2, 0.4]]), discount=0.5)
 STEPS = {"method": hjb.ValueIteration(), "scheme": hjb.Upwind(), "max_steps": 40, "throw": False}
+
+
+ROUGH = hjb.Grid([-np.pi, -3.0], [np.pi, 3.0], (14, 11), periodic=(True, False))
+TORQUES = np.linspace(-1.0, 1.0, 41)[:, None]  # more than the checks try: they pass over the fourth
+
+
+@pytree_dataclass()
+class Weighted:
+    """A cost with the logarithm of a weight for one torque, which the checks before a solve pass over."""
+
+    weight: object
+
+    def cost(self, x, u):
+        return effort(x, u) + jnp.where(jnp.abs(u[0] - TORQUES[3, 0]) < 1e-3, jnp.log(self.weight), 0.0)
 
 
 def beside(ask, *meshes):
@@ -383,6 +398,35 @@ def open_ends():
     return [other.status.name, one.steps, other.steps, float(np.max(np.abs(one.value - other.value)))]
 
 
+def batches(*meshes):
+    """Eleven lanes that take from a few steps to many, and one that fails, on meshes beside those without one."""
+    # discounts far apart, so that lanes are taken out on the way; the logarithm of −1 is no number
+    weights = [-1.0 if lane == 5 else 1.0 + lane for lane in range(11)]
+    lanes = [
+        hjb.Problem(swing, Weighted(w).cost, hjb.Finite(TORQUES), discount=b)
+        for w, b in zip(weights, np.geomspace(9.0, 0.05, 11), strict=True)
+    ]
+    options = {"scheme": hjb.Upwind(), "tol": 1e-6, "throw": False}
+    alone, found = hjb.solve_batch(lanes, ROUGH, **options), []
+    for mesh in meshes:
+        spread = hjb.solve_batch(lanes, ROUGH, mesh=mesh, **options)
+        found.append({
+            "status": [each.status.name for each in spread],
+            "steps": [[each.steps for each in answers] for answers in (alone, spread)],
+            "ulp": max(
+                float(np.max(np.abs(one.value - other.value)) / (np.finfo(float).eps * (1 + np.max(np.abs(one.value)))))
+                for one, other in zip(alone, spread, strict=True)
+            ),
+            "residuals": all(len(each.residuals) == each.steps + 1 for each in spread),
+        })  # fmt: skip
+    return found
+
+
+@case
+def batch():
+    return batches(mesh_of(4, 2))
+
+
 @case
 def checkpoints():
     """A run that is cut on eight devices and goes on on two, and on one."""
@@ -427,6 +471,10 @@ def refusals():
         "traced": lambda: jax.jit(lambda b: hjb.solve(discounted(b), FLAT, mesh=two).value)(0.5),
         "traced march": lambda: jax.jit(lambda b: hjb.march(discounted(b), FLAT, 1.0, step=0.01, mesh=two).value)(0.5),
         "host": lambda: hjb.solve(calling, FLAT, mesh=two),
+        "no mesh of lanes": lambda: hjb.solve_batch([PLAIN], FLAT, mesh=8),
+        "lanes to a file": lambda: hjb.solve_batch([PLAIN], FLAT, mesh=two, checkpoint="run.npz"),
+        "lanes by the host": lambda: hjb.solve_batch([PLAIN, calling], FLAT, mesh=two),
+        "direct lanes": lambda: hjb.solve_batch([PLAIN], FLAT, method=hjb.PolicyIteration(direct), mesh=two),
     }
     found = {}
     for name, question in ask.items():

@@ -55,6 +55,12 @@ def apart(dim: int, nodes: int) -> tuple[hjb.Problem, hjb.Grid]:
     return problem, hjb.Grid([-1.0] * dim, [1.0] * dim, (nodes,) * dim)
 
 
+def side_by_side(count: int, nodes: int) -> tuple[hjb.Problem, hjb.Grid]:
+    """``count`` double integrators, each with its own input; the value is the sum of theirs, also that of the chain."""
+    problem = hjb.Problem(_push_each, _effort, hjb.Box([-1.0] * count, [1.0] * count), discount=2.0)
+    return problem, hjb.Grid([-1.0] * 2 * count, [1.0] * 2 * count, (nodes,) * 2 * count)
+
+
 def inner(x: Any) -> Any:
     """Where the value of the zoo's "smooth" is free of the edge."""
     return (jnp.abs(x[0]) <= 0.5) & (jnp.abs(x[1]) <= 0.45)
@@ -74,6 +80,10 @@ def _within_half(x: Any) -> Any:
 
 def _push(x: Any, u: Any) -> Any:
     return jnp.concatenate([x[1:], u])
+
+
+def _push_each(x: Any, u: Any) -> Any:
+    return jnp.stack([x[1::2], u], axis=1).ravel()
 
 
 def _decay(x: Any, u: Any) -> Any:

@@ -4,6 +4,9 @@ The devices of a processor are made when JAX starts, so that every mesh is timed
 ``python -m benchmarks.speed.devices NODES MESH`` solves once a line that it reads, and prints a row for each. The
 processes take turns, and ratios are taken round by round. On eight devices, which two cores are not, steps are counted
 and not seconds.
+
+``python -m benchmarks.speed.devices NODES 2x2x2 planes`` solves three double integrators side by side, in six
+dimensions, beside one in the plane.
 """
 
 import json
@@ -75,6 +78,34 @@ def work(nodes: int, mesh: Sequence[int]) -> None:
         print(json.dumps(row | {"sample": np.asarray(answer.value)[every].tolist()}), flush=True)
 
 
+def planes(nodes: int, mesh: Sequence[int]) -> dict[str, Any]:
+    """The row of three double integrators on a mesh, by V alone, beside the sum of the values of one in the plane."""
+    import jax
+
+    axes = jax.make_mesh(tuple(mesh), ("a", "b", "c")[: len(mesh)])
+    one = hjb.solve(*cases.side_by_side(1, nodes), scheme=hjb.Upwind(), tol=TOL / 100, progress=False).value
+    began = time.perf_counter()
+    problem, grid = cases.side_by_side(3, nodes)
+    found = hjb.solve(problem, grid, method=hjb.ValueIteration(policy=False), tol=TOL, mesh=axes, progress=False)
+    seconds, truth = time.perf_counter() - began, np.add.outer(np.add.outer(one, one), one)
+    off = float(np.max(np.abs(found.value - truth)))
+    row = {"problem": "three double integrators", "shape": list(grid.shape), "nodes": grid.size, "mesh": list(mesh)}
+    row |= {"tol": TOL, "error": float(found.error), "difference": off, "steps": found.steps, "seconds": seconds}
+    # both values are those of one chain, up to what they are certified to
+    return row | {"status": "DISAGREES" if off > TOL * 1.03 else found.status.name}
+
+
+def apart(nodes: int, mesh: Sequence[int]) -> list[dict[str, Any]]:
+    """The row of ``planes``, found by a process with as many devices."""
+    flags = f"{os.environ.get('XLA_FLAGS', '')} {FLAG}={int(np.prod(mesh))}"
+    environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "benchmarks.speed.devices", str(nodes), "x".join(map(str, mesh)), "planes"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(done.stderr.strip().splitlines()[-1])
+    return [json.loads(done.stdout.splitlines()[-1])]
+
+
 def measure(nodes: int, meshes: Sequence[Sequence[int]], repeats: int, *, timed: bool) -> list[dict[str, Any]]:
     """A row a mesh, the first of which is one device; with ``repeats`` rounds after the first solves."""
     workers = [Worker(nodes, mesh) for mesh in meshes]
@@ -122,10 +153,15 @@ def command(quick: bool, nodes: Sequence[int], repeats: int | None, out: Path) -
         rows += found[1:]
         if all("steps_over_one" in row for row in found):
             figures["devices steps"] = max(row["steps_over_one"] for row in found)
+    rows += attempt(lambda: apart(6 if quick else 12, (2, 2, 2)), about)
     click.echo(table(rows, COLUMNS))
     rows += thresholds.announced(figures, "devices")
     publish(out, "devices", rows)
 
 
 if __name__ == "__main__":
-    work(int(sys.argv[1]), tuple(map(int, sys.argv[2].split("x"))))
+    asked = int(sys.argv[1]), tuple(map(int, sys.argv[2].split("x")))
+    if sys.argv[3:]:
+        print(json.dumps(planes(*asked)))
+    else:
+        work(*asked)

@@ -165,21 +165,21 @@ class State:
 def begin(task: Task, guess: Nodes) -> State:
     """The state before the first look at a guess; step −1 of ``run`` is that look, so that all is one program.
 
-    The guess is copied, since states are donated. At host level there is nothing to compile.
+    The guess is copied, since states are donated; that of parts by ``spread``. At host level nothing is compiled.
     """
     traced = is_traced(task, guess)
     xp: Any = jnp if traced else np
-    value = jnp.array(guess) if traced else jax.device_put(guess, may_alias=False)
+    copied: Any = jnp.array if traced else functools.partial(jax.device_put, may_alias=False)
+    value: Any = copied(guess) if task.on.parts is None else guess
     dtype, shape = guess.dtype, task.grid.shape
     players = (task.problem.controls, task.problem.disturbances)
     inputs = [0 if admissible is None else admissible.dim for admissible in players]
     policy = Greedy(xp.zeros(shape, dtype), *(tuple(xp.zeros(shape, dtype) for _ in range(m)) for m in inputs))
     if task.bare:
         policy = Greedy(xp.zeros((), dtype), (), ())
-    infinite = xp.asarray(xp.inf, dtype)
+    infinite, code = xp.asarray(xp.inf, dtype), xp.asarray(int(Status.RUNNING), xp.int32)
     bound = ErrorBound(xp.asarray(-infinite), infinite, xp.zeros((), dtype), infinite, infinite)
     counter, first = xp.zeros((), xp.int32), xp.full((), -1, xp.int32)
-    code = xp.asarray(int(Status.RUNNING), xp.int32)
     history = xp.full(HISTORY, -1, dtype)  # no NaN, which jax_debug_nans would take for a fault
     return State(value, policy, infinite, bound, first, xp.stack([infinite] * 2), counter, code, history)
 

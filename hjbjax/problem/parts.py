@@ -216,6 +216,61 @@ class Parts:
         return jnp.where(found == beyond, -1, found)
 
 
+@dataclasses.dataclass(frozen=True)
+class Lanes:
+    """Lanes of a batch over all devices of a mesh, as many on each: the leading axis of every array.
+
+    Args:
+      mesh: the devices; None for one.
+    """
+
+    mesh: Mesh | None = None
+
+    @property
+    def spec(self) -> PartitionSpec:
+        """How an array lies on the mesh: its lanes along all axes together."""
+        return PartitionSpec(() if self.mesh is None else self.mesh.axis_names)
+
+    @property
+    def on_processors(self) -> bool:
+        """True if the devices are cores of a processor, each of which one lane keeps busy."""
+        return self.mesh is not None and self.mesh.devices.flat[0].platform == "cpu"
+
+    @staticmethod
+    def in_turn(function: Callable) -> Callable:
+        """A function of one lane for lanes one after the other, each of which ends its loop by itself."""
+        # 48 pendulums on 100 x 101 took what they take in threads; by vmap 1.3 to 1.8 times as long
+        return lambda *rows: jax.lax.map(lambda row: function(*row), rows)
+
+    def filled(self, count: int) -> int:
+        """The least number of rows, at least ``count``, of which every device takes as many."""
+        size = 1 if self.mesh is None else self.mesh.size
+        return -(-count // size) * size
+
+    def spread(self, tree: T) -> T:
+        """Arrays of lanes, each on the device that runs it."""
+        if self.mesh is None:
+            return tree
+        sharding = NamedSharding(self.mesh, self.spec)
+
+        def put(leaf: Any) -> jax.Array:
+            host = np.asarray(leaf)
+            return jax.make_array_from_callback(host.shape, sharding, lambda index: host[index])
+
+        return jax.tree.map(put, tree)
+
+    def gathered(self, tree: Any) -> Any:
+        """The inverse of ``spread``: NumPy arrays of all lanes, in every process."""
+        far = spans_processes(self.mesh)
+        return multihost_utils.process_allgather(tree, tiled=True) if far else jax.device_get(tree)
+
+    def mapped(self, function: Callable) -> Callable:
+        """A function of arrays of lanes, on every device for its own, none of which waits for another."""
+        if self.mesh is None:
+            return function
+        return jax.shard_map(function, mesh=self.mesh, in_specs=self.spec, out_specs=self.spec, check_vma=False)
+
+
 def spans_processes(mesh: Mesh | None) -> bool:
     """True if some of the devices are those of other processes."""
     return mesh is not None and any(device.process_index != jax.process_index() for device in mesh.devices.flat)
@@ -228,9 +283,7 @@ def check_mesh(mesh: object, grid_shape: tuple[int, ...], caller: str, *choices:
       TypeError: no mesh.
       ValueError: more axes than the grid has, parts of too few nodes, or a choice that reads nodes in its own way.
     """
-    if not isinstance(mesh, Mesh):
-        wanted = 'a jax.sharding.Mesh, as from jax.make_mesh((2,), ("x",))'
-        raise TypeError(f"{caller}: mesh is {mesh!r}; wanted {wanted}")
+    mesh = as_mesh(mesh, caller)
     counts, n = mesh.devices.shape, len(grid_shape)
     if len(counts) > n:
         raise ValueError(
@@ -248,8 +301,16 @@ def check_mesh(mesh: object, grid_shape: tuple[int, ...], caller: str, *choices:
                 f"{caller}: {choice!r} runs on one device; leave out mesh. What reads other nodes by "
                 "hjbjax.discretisation.stencil alone, and reduces by grid.largest, may say in_parts = True"
             )
+    return mesh if mesh.size > 1 else None
+
+
+def as_mesh(mesh: object, caller: str) -> Mesh:
+    """The mesh with axes for ``shard_map``; a TypeError for anything else."""
+    if not isinstance(mesh, Mesh):
+        wanted = 'a jax.sharding.Mesh, as from jax.make_mesh((2,), ("x",))'
+        raise TypeError(f"{caller}: mesh is {mesh!r}; wanted {wanted}")
     # axes of other types than the manual ones of shard_map forbid slices
-    return Mesh(mesh.devices, mesh.axis_names) if mesh.size > 1 else None
+    return Mesh(mesh.devices, mesh.axis_names)
 
 
 def _largest(value: Scalar, names: tuple[str, ...]) -> Scalar:

@@ -8,6 +8,8 @@ most of its time. Two cores gave 1.8 times the solves a second on 100 x 101 node
 On an accelerator, which one lane does not fill, they are lanes of one ``vmap``ped loop. It runs until its slowest lane
 stops, so finished lanes are taken out between chunks.
 
+With ``mesh=`` each of many devices has such a loop, over lanes of its own, and none waits for another within a chunk.
+
 Each lane has its own status, and one that goes NaN changes no bit of the others. Ctrl-C and the time limit end the
 lanes that still run, and those that have not begun.
 """
@@ -15,12 +17,13 @@ lanes that still run, and those that have not begun.
 import contextlib
 import dataclasses
 import os
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from typing import Any
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.schemes import Upwind
@@ -30,6 +33,7 @@ from hjbjax.markov_chain import admissibility, memory, node_checks
 from hjbjax.problem import arguments
 from hjbjax.problem.arguments import shown
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.parts import Lanes, as_mesh, spans_processes
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.types import DType, Mask, Nodes
 from hjbjax.solution import checkpoints
@@ -44,6 +48,7 @@ from hjbjax.solvers.result import finish, solution_at_start, with_grid_error, wi
 from hjbjax.solvers.setup import Assumptions, check_on_one_state, choose, choose_scheme, prepare_on_host
 from hjbjax.solvers.stationary import check_arguments, check_limits, solve_on_host
 from hjbjax.solvers.stationary_run import LanesRun, stacked, with_obstacles
+from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
 
 
@@ -63,6 +68,7 @@ def solve_batch(
     max_memory: int | None = None,
     checkpoint: Path | Checkpoint | None = None,
     resume: bool = False,
+    mesh: Mesh | None = None,
 ) -> list[Solution]:
     """Solve many problems on one grid; each answer is that of ``solve`` by this method.
 
@@ -81,6 +87,7 @@ def solve_batch(
       checkpoint: as in ``solve``, like ``resume``: one file for all lanes. With it lanes run side by side, one a core,
         on an accelerator, too.
       resume: go on from that file if it is there, each lane to the same bits.
+      mesh: spread the lanes over all of its devices, each with lanes of its own; not with ``checkpoint``.
 
     Returns:
       One solution for each problem, in their order.
@@ -101,7 +108,8 @@ def solve_batch(
     kind = arguments.as_dtype(dtype)
     grid.check_spacings(kind)
     solutions: list[Any] = [None] * len(lanes)
-    clock = Clock(max_steps or 10**9, time_limit, progress)
+    over = Lanes(None if mesh is None else _over_lanes(mesh, lanes, grid, method, checkpoint))
+    clock = Clock(max_steps or 10**9, time_limit, progress, together=spans_processes(over.mesh))
     opened = checkpoints.opened(
         checkpoint, lanes, grid, resume=resume, what="solve_batch", method=method, scheme=scheme, tol=tol, dtype=kind
     )
@@ -109,7 +117,7 @@ def solve_batch(
         for members in _same_program(lanes):
             first = lanes[members[0]]
             # without nesting, whose levels the host drives one by one
-            chosen = choose(first, grid, traced=False, method=method).inner
+            chosen = choose(first, grid, traced=False, method=method, divided=mesh is not None).inner
             on, sharpen = Discretisation(first, grid, scheme or Upwind(subcell=True), kind), scheme is None
             with _naming(members[0]):
                 check_on_one_state(first, grid, on.scheme)
@@ -118,8 +126,8 @@ def solve_batch(
             for some in _rounds(members, needed, max_memory):
                 with host_loop.with_solution(clock, needed * len(some), lambda _: next(filter(None, solutions), None)):
                     members_of = {i: on.asking(lanes[i]) for i in some}
-                    if _fills_with_lanes() and kept is None:
-                        together = _solve_together(members_of, chosen, tol, clock, sharpen=sharpen)
+                    if mesh is not None or (_fills_with_lanes() and kept is None):
+                        together = _solve_together(members_of, chosen, tol, clock, over, sharpen=sharpen)
                     else:
                         together = _solve_side_by_side(members_of, chosen, tol, clock, kept, sharpen=sharpen)
                 for index, solution in zip(some, together, strict=True):
@@ -140,6 +148,22 @@ def _naming(lane: int) -> Iterator[None]:
         yield
     except ValueError as refusal:
         raise ValueError(f"lane {lane}: {refusal}") from refusal
+
+
+def _over_lanes(mesh: object, lanes: Sequence[Problem], grid: Grid, method: Method | None, checkpoint: object) -> Mesh:
+    """The mesh over which lanes are spread, if they can be.
+
+    Raises:
+      TypeError, ValueError: with what does not run on many devices.
+    """
+    known = as_mesh(mesh, "solve_batch")
+    if checkpoint is not None:
+        raise ValueError("solve_batch: lanes over the devices of a mesh have no checkpoint; leave out one of them")
+    calls_back = getattr(method and method.inner.evaluation, "calls_back", False)
+    if calls_back or any(checks.calls_back(problem, grid.ndim) for problem in lanes):
+        called = repr(method) if calls_back else "a function of the problem"
+        raise ValueError(f"solve_batch: {called} calls Python on the host; leave out mesh")
+    return known
 
 
 def _same_program(problems: Sequence[Problem]) -> list[list[int]]:
@@ -167,7 +191,7 @@ def _rounds(members: Sequence[int], bytes_each: int, limit: int | None) -> list[
 
 def _fills_with_lanes() -> bool:
     """True if lanes run as one ``vmap``ped loop: on a device that one of them does not keep busy."""
-    device = _read("jax_default_device") or jax.devices()[0]
+    device = host_loop.setting("jax_default_device") or jax.devices()[0]
     return getattr(device, "platform", device) != "cpu"
 
 
@@ -178,32 +202,11 @@ def _cores() -> int:
     return os.cpu_count() or 1
 
 
-def _settings() -> Callable[[], contextlib.ExitStack]:
-    """The context in which another thread has those settings of JAX that this one has by context managers."""
-    x64, nans, eager = _read("jax_enable_x64"), _read("jax_debug_nans"), _read("jax_disable_jit")
-    device, precision = _read("jax_default_device"), _read("jax_default_matmul_precision")
-
-    def entered() -> contextlib.ExitStack:
-        stack = contextlib.ExitStack()
-        for context in (jax.enable_x64(x64), jax.debug_nans(nans), jax.disable_jit(eager)):
-            stack.enter_context(context)
-        stack.enter_context(jax.default_device(device))
-        stack.enter_context(jax.default_matmul_precision(precision))
-        return stack
-
-    return entered
-
-
-def _read(setting: str) -> Any:
-    """A setting of JAX as this thread has it."""
-    return getattr(jax.config, setting)
-
-
 def _solve_side_by_side(
     lanes: dict[int, Discretisation], method: Method, tol: float, clock: Clock, kept: File | None, *, sharpen: bool
 ) -> list[Solution]:
     """The solutions of problems that share a program, by the numbers of their lanes, one thread a core."""
-    settings, names = _settings(), list(lanes)
+    settings, names = host_loop.settings(), list(lanes)
 
     def one(name: int) -> tuple[Solution, list[str]]:
         own = clock.beside()
@@ -246,7 +249,7 @@ def _told(name: int, solution: Solution, said: Sequence[str]) -> Solution:
 
 
 def _solve_together(
-    lanes: dict[int, Discretisation], method: Method, tol: float, clock: Clock, *, sharpen: bool
+    lanes: dict[int, Discretisation], method: Method, tol: float, clock: Clock, over: Lanes, *, sharpen: bool
 ) -> list[Solution]:
     """The solutions of problems that run as one loop, by the numbers of their lanes; ``sharpen`` as in ``solve``."""
     began, names, asked = clock.elapsed(), list(lanes), list(lanes.values())
@@ -265,7 +268,7 @@ def _solve_together(
     # a static flag, set for all lanes as soon as one has nodes out of reach, so that they share a program
     has_lost = any(task.has_lost for task, _, _ in prepared)
     tasks = [dataclasses.replace(task, has_lost=has_lost) for task, _, _ in prepared]
-    ended = _iterate(tasks, _starts(tasks, names, clock), names, clock)
+    ended = _iterate(tasks, _starts(tasks, names, clock, over), names, clock, over)
     settled = [
         _settled(Settled(task, assumptions, reached, *end), clock)
         for task, (_, assumptions, reached), end in zip(tasks, prepared, ended, strict=True)
@@ -276,9 +279,8 @@ def _solve_together(
         if not asked[i].scheme.monotone and each.code not in CUT and (each.code is Status.CONVERGED or not sharpen)
     ]
     raised = [nested.raised(settled[i].task, settled[i].assumptions, asked[i].scheme) for i in further]
-    better = _iterate(
-        [task for task, _ in raised], [settled[i].state.value for i in further], [names[i] for i in further], clock
-    )
+    guesses, further_names = [settled[i].state.value for i in further], [names[i] for i in further]
+    better = _iterate([task for task, _ in raised], guesses, further_names, clock, over)
     for i, (task, assumptions), end in zip(further, raised, better, strict=True):
         sharp = Settled(task, assumptions, settled[i].reached, *end, settled[i])
         settled[i] = nested.better_of(settled[i], sharp, sharpen=sharpen)
@@ -292,27 +294,28 @@ def _solve_together(
     return [with_last_phase(each, clock) if each.status in CUT else each for each in solutions]
 
 
-def _starts(tasks: Sequence[Task], names: Sequence[int], clock: Clock) -> list[Nodes]:
+def _starts(tasks: Sequence[Task], names: Sequence[int], clock: Clock, over: Lanes) -> list[Nodes]:
     """Where the lanes start: zero, the constraint of a tube, or the answer for a discount that vanishes."""
     starts: list[Nodes] = [task.start() for task in tasks]
     led = [i for i, task in enumerate(tasks) if nested.needs_a_way(task)]
     for discount in nested.VANISHING if led else ():
         on_the_way = [nested.under(tasks[i], discount) for i in led]
-        ended = _iterate(on_the_way, [starts[i] for i in led], [names[i] for i in led], clock, nested.WARM_STEPS)
+        most = nested.WARM_STEPS
+        ended = _iterate(on_the_way, [starts[i] for i in led], [names[i] for i in led], clock, over, most)
         for i, (state, _, _) in zip(led, ended, strict=True):
             starts[i] = state.value
     return starts
 
 
 def _iterate(
-    tasks: Sequence[Task], starts: Sequence[Nodes], names: Sequence[int], clock: Clock, most: int = 10**9
+    tasks: Sequence[Task], starts: Sequence[Nodes], names: Sequence[int], clock: Clock, over: Lanes, most: int = 10**9
 ) -> list[tuple[State, Status, np.ndarray]]:
     """The last state, the status and the residuals of each lane; lanes whose tasks share a structure run together."""
     found: list[Any] = [None] * len(tasks)
     # lanes whose certificates differ stop by different rules, which are part of the structure
     for members in _groups(jax.tree.structure(task) for task in tasks):
         limit = min(most, clock.max_steps)
-        run = LanesRun(stacked([tasks[i] for i in members]), stacked([starts[i] for i in members]), limit)
+        run = LanesRun(stacked([tasks[i] for i in members]), stacked([starts[i] for i in members]), limit, over)
         run.name = f"lanes {names[members[0]]} to {names[members[-1]]}, {tasks[0].grid.size} nodes each"
         run.between(host_loop.drive(run, clock), clock)  # once more, for lanes that were cut short
         for i, (state, code), residuals in zip(members, run.final, run.histories, strict=True):

@@ -210,3 +210,24 @@ def _memory_error(error: Exception, needed: int, where: str, solution: Solution 
     )
     report.solution = solution  # type: ignore[attr-defined]
     return report
+
+
+def settings() -> Callable[[], contextlib.ExitStack]:
+    """The context in which another thread has those settings of JAX that this one has by context managers."""
+    x64, nans, eager = setting("jax_enable_x64"), setting("jax_debug_nans"), setting("jax_disable_jit")
+    device, precision = setting("jax_default_device"), setting("jax_default_matmul_precision")
+
+    def entered() -> contextlib.ExitStack:
+        stack = contextlib.ExitStack()
+        for context in (jax.enable_x64(x64), jax.debug_nans(nans), jax.disable_jit(eager)):
+            stack.enter_context(context)
+        stack.enter_context(jax.default_device(device))
+        stack.enter_context(jax.default_matmul_precision(precision))
+        return stack
+
+    return entered
+
+
+def setting(name: str) -> Any:
+    """A setting of JAX as this thread has it."""
+    return getattr(jax.config, name)

@@ -15,7 +15,7 @@ import numpy as np
 from hjbjax.discretisation.discretisation import on_part, over_nodes
 from hjbjax.iteration import fixed_point
 from hjbjax.iteration.fixed_point import HISTORY, State, Task
-from hjbjax.problem.parts import Parts, spans_processes
+from hjbjax.problem.parts import Lanes, Parts, spans_processes
 from hjbjax.problem.pytree import altered
 from hjbjax.problem.types import Array, Nodes, Number
 from hjbjax.solution.clock import CHUNK_SECONDS, CUT, Clock
@@ -32,10 +32,16 @@ MANY_NODES = 2_000_000  # beyond which the look at the guess is a chunk of its o
 run = jax.jit(fixed_point.run, donate_argnames="state")
 # where Python is called on the way, and may raise, the state before must outlast it
 _run_kept = jax.jit(fixed_point.run)
-# under vmap a loop goes on until its last lane is done; lanes that are done keep their state by a select and pay
-# for the others' steps all the same, hence the short chunks
 _begin = jax.vmap(fixed_point.begin)
-_run_lanes = jax.jit(jax.vmap(fixed_point.run, in_axes=(0, 0, 0)))
+
+
+@functools.partial(jax.jit, static_argnames="over")
+def _run_lanes(tasks: Task, states: State, until: Array, over: Lanes) -> State:
+    """``fixed_point.run`` for lanes that run together, those of every device by themselves."""
+    # under vmap a loop goes on until its last lane is done; lanes that are done keep their state by a select and pay
+    # for the others' steps all the same, hence the short chunks
+    each = over.in_turn if over.on_processors else jax.vmap
+    return over.mapped(each(fixed_point.run))(tasks, states, until)
 
 
 @functools.partial(jax.jit, static_argnames="parts", donate_argnames="state")
@@ -234,9 +240,12 @@ class LanesRun:
 
     longest, bar = CHUNK, {"desc": "solve_batch", "unit": " steps"}
 
-    def __init__(self, tasks: Task, starts: Array, limit: int):
-        count, self.name = len(starts), f"{len(starts)} lanes"
-        self.rows = Rows(np.arange(count), tasks, _begin(tasks, starts), np.full(count, -1))
+    def __init__(self, tasks: Task, starts: Array, limit: int, over: Lanes):
+        count, self.name, self.over = len(starts), f"{len(starts)} lanes", over
+        states, lanes = _begin(tasks, starts), np.arange(over.filled(count))
+        if lanes.size > count:  # every device takes as many rows
+            (tasks, states), lanes = _take((tasks, states), lanes % count), np.where(lanes < count, lanes, -1)
+        self.rows = Rows(lanes, *over.spread((tasks, states)), np.full(lanes.size, -1))
         self.limit, self.steps = limit, -1
         self.final: list[Any] = [None] * count  # the last state and the status of each lane
         self.histories: list[list] = [[np.zeros(0)] for _ in range(count)]
@@ -246,10 +255,13 @@ class LanesRun:
         """The nodes of all rows: the loop runs over those that only fill up as well."""
         return self.rows.states.value.size
 
+    def _run(self, until: np.ndarray) -> State:
+        """The states when so many steps of each row are done, or it is."""
+        return _run_lanes(self.rows.tasks, self.rows.states, self.over.spread(until), self.over)
+
     def compile(self) -> None:
         """Run no step."""
-        rows = self.rows
-        self.rows = rows._replace(states=_run_lanes(rows.tasks, rows.states, rows.before))
+        self.rows = self.rows._replace(states=self._run(self.rows.before))
 
     def first_chunk(self, clock: Clock) -> int:
         """Steps of the first chunk: nothing has been timed yet."""
@@ -257,13 +269,11 @@ class LanesRun:
 
     def advance(self, count: int) -> Status:
         """Take ``count`` steps at most in every row; the loop runs as long as its slowest lane."""
-        rows, before = self.rows, np.asarray(self.rows.states.step)
+        before = self.over.gathered(self.rows.states.step)
         # an array: rows that are done stand where they stopped
         until = np.minimum(np.maximum(before, 0) + count, self.limit)
-        self.rows = rows._replace(
-            states=jax.block_until_ready(_run_lanes(rows.tasks, rows.states, until)), before=before
-        )
-        self.steps += max(int(np.max(np.asarray(self.rows.states.step) - before)), 1)
+        self.rows = self.rows._replace(states=jax.block_until_ready(self._run(until)), before=before)
+        self.steps += max(int(np.max(self.over.gathered(self.rows.states.step) - before)), 1)
         return Status.RUNNING
 
     def between(self, status: Status, clock: Clock) -> Status:
@@ -271,14 +281,14 @@ class LanesRun:
         rows = self.rows
         if not rows.lanes.size:
             return status
-        codes, steps, history = jax.device_get((rows.states.code, rows.states.step, rows.states.history))
+        codes, steps, history = self.over.gathered((rows.states.code, rows.states.step, rows.states.history))
         going = (codes == Status.RUNNING) & (steps < self.limit) & (status is Status.RUNNING)
         live = [row for row, lane in enumerate(rows.lanes) if lane >= 0 and self.final[lane] is None]
         for row in live:
             self._note(rows.lanes[row], history[row, : steps[row] - rows.before[row]], steps[row] + 1)
         ended = [row for row in live if not going[row]]
         if ended:
-            on_host = jax.device_get(rows.states)
+            on_host = self.over.gathered(rows.states)
             for row in ended:
                 # copied, or a view would keep the arrays of all lanes alive
                 last = jax.tree.map(lambda leaf, row=row: leaf[row].copy(), on_host)
@@ -295,13 +305,16 @@ class LanesRun:
 
     def _narrow(self, left: np.ndarray) -> None:
         """Go on with these rows alone, where that halves the work."""
-        rows, before = self.rows, np.asarray(self.rows.states.step)
+        rows, over, before = self.rows, self.over, self.over.gathered(self.rows.states.step)
         # powers of two, since every width is compiled for itself: a thousand lanes take eleven programs at most
-        width = 1 << (left.size - 1).bit_length() if left.size else 0
+        width = over.filled(1 << (left.size - 1).bit_length()) if left.size else 0
         if width < rows.lanes.size:
-            kept = np.resize(left, width)
+            kept, before = np.resize(left, width), before[np.resize(left, width)]
             lanes = np.where(np.arange(width) < left.size, rows.lanes[kept], -1)
-            rows, before = Rows(lanes, _take(rows.tasks, kept), _take(rows.states, kept), before[kept]), before[kept]
+            both = rows.tasks, rows.states
+            if over.mesh is not None:  # by way of the host: rows go to other devices
+                both = over.gathered(both)
+            rows = Rows(lanes, *over.spread(_take(both, kept)), before)
         self.rows = rows._replace(before=before)
 
     def show(self, bar: Any) -> None:

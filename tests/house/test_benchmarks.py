@@ -270,7 +270,9 @@ def test_a_batch_gives_the_values_of_its_members(tmp_path):
 
 @pytest.mark.slow
 def test_devices_take_turns_and_agree(tmp_path):
-    one, two = rows_of(devices, tmp_path)
+    one, two, six = rows_of(devices, tmp_path)
+    assert (six["shape"], six["mesh"], six["status"]) == ([6] * 6, [2, 2, 2], "CONVERGED")
+    assert six["difference"] <= 1.03 * six["tol"]
     assert (one["mesh"], two["mesh"]) == ([1], [2])
     assert one["over_one"] == one["steps_over_one"] == 1
     assert 0 < two["difference"] <= 2 * two["tol"]

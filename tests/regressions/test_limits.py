@@ -440,9 +440,9 @@ def rounds(monkeypatch):
     def rounds(act, at):
         made, clocks, first = [], [], LanesRun.first_chunk
 
-        def watched(tasks, states, until):
+        def watched(tasks, states, until, over):
             made.append(np.asarray(until))
-            states = run(tasks, states, until)
+            states = run(tasks, states, until, over)
             if len(made) == at + 1:
                 act(clocks[-1])
             return states

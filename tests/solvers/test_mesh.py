@@ -11,16 +11,19 @@ from pathlib import Path
 
 import pytest
 
+from hjbjax.cli import launch
+
 SCRIPT = Path(__file__).parents[1] / "support" / "over_devices.py"
 ROOT = Path(__file__).parents[2]
 CHEAP = (
     "stencils", "not_a_number_is_not_lost", "compiled_program", "value_iteration", "march_of_first_order", "sweeps",
-    "checkpoints", "faults", "refusals",
+    "two_integrators", "batch", "checkpoints", "faults", "refusals",
 )  # fmt: skip
 DEAR = (
-    "value_iteration_to_a_target", "value_iteration_of_a_game", "value_iteration_with_correlated_noise",
-    "march_of_second_order", "march_of_fifth_order", "sweeps_of_flat_parts", "sweeps_in_slabs", "sweeps_to_a_target",
-    "sweeps_of_a_game", "krylov", "krylov_with_correlated_noise", "implicit_march", "open_ends", "without_a_choice",
+    "value_alone", "value_iteration_to_a_target", "value_iteration_of_a_game", "value_iteration_with_correlated_noise",
+    "march_of_the_value_alone", "march_of_second_order", "march_of_fifth_order", "sweeps_of_flat_parts",
+    "sweeps_in_slabs", "sweeps_to_a_target", "sweeps_of_a_game", "krylov", "krylov_with_correlated_noise",
+    "implicit_march", "open_ends", "without_a_choice", "three_integrators",
 )  # fmt: skip
 EXACT = ("value_iteration", "march_of_first_order", *(name for name in DEAR if name.startswith(("value", "march"))))
 CERTIFIED = ("sweeps", *(name for name in DEAR if name.startswith(("sweeps", "krylov"))))
@@ -103,6 +106,60 @@ def test_certificates_hold_on_every_mesh(found, name):
         assert many <= (1.5 if name == "sweeps_in_slabs" else 1.2) * one + 2
 
 
+@pytest.mark.parametrize("name", slow_if_dear(["two_integrators", "three_integrators"]))
+def test_the_value_of_systems_side_by_side_is_the_sum_of_theirs(found, name):
+    """4096 nodes in four dimensions, 12^6 in six: at every node the sum of values in the plane (see ``decoupled``)."""
+    assert found["status"] == "CONVERGED"
+    assert found["apart"] <= sum(found["errors"])
+    assert max(found["errors"]) <= 1e-2
+    assert found["ulp"] <= ULP
+
+
+def test_batch(found):
+    """Eleven lanes on eight devices, one of which fails, as each by itself."""
+    for mesh in found:
+        assert [lane for lane, status in enumerate(mesh["status"]) if status != "CONVERGED"] == [5]
+        assert mesh["status"][5] == "NONFINITE"
+        alone, spread = mesh["steps"]
+        assert spread == alone
+        assert len(set(alone)) > 2
+        assert mesh["residuals"]
+        assert mesh["ulp"] <= ULP
+
+
+BATCH = """
+import sys
+import jax, numpy as np, hjbjax as hjb
+
+jax.config.update("jax_cpu_collectives_implementation", "gloo")
+jax.distributed.initialize(sys.argv[1], 2, int(sys.argv[2]), heartbeat_timeout_seconds=30)
+grid = hjb.Grid([-1.0], [1.0], (41,))
+lanes = [
+    hjb.Problem(lambda x, u: u, lambda x, u: x @ x + u @ u, hjb.Box([-1.0], [1.0]), discount=b) for b in (9.0, 1.0, 0.1)
+]
+options = {"scheme": hjb.Upwind(), "tol": 1e-6}
+alone = hjb.solve_batch(lanes, grid, **options)
+spread = hjb.solve_batch(lanes, grid, mesh=jax.make_mesh((2,), ("lanes",)), **options)
+assert [each.steps for each in alone] == [each.steps for each in spread]
+print(max(float(np.max(np.abs(a.value - b.value)) / np.max(b.value)) for a, b in zip(alone, spread)), flush=True)
+jax.distributed.shutdown()
+"""
+
+
+@pytest.mark.slow
+def test_a_batch_over_two_processes():
+    """Each process has lanes of its own, and the answers of all of them."""
+    place, running = f"127.0.0.1:{launch._free_port()}", []
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
+    for rank in range(2):
+        command = [sys.executable, "-c", BATCH, place, str(rank)]
+        running.append(subprocess.Popen(command, env=environment, stdout=-1, stderr=-1, text=True))
+    for process in running:
+        said, err = process.communicate(timeout=300)
+        assert process.returncode == 0, err
+        assert float(said.split()[-1]) <= ULP * 2.3e-16
+
+
 def test_checkpoints(found):
     """What eight devices began goes on on two, and on one."""
     for mesh in found:
@@ -128,6 +185,13 @@ def test_refusals(found):
         "traced": ("ValueError: solve: mesh divides the nodes at host level only", "jit"),
         "traced march": ("ValueError: march: mesh divides the nodes at host level only", "jit"),
         "host": ("ValueError: solve: a function of the problem calls Python on the host", "leave out mesh"),
+        "no mesh of lanes": ("TypeError: solve_batch: mesh is 8", "jax.make_mesh"),
+        "lanes to a file": (
+            "ValueError: solve_batch: lanes over the devices of a mesh have no checkpoint",
+            "leave out",
+        ),
+        "lanes by the host": ("ValueError: solve_batch: a function of the problem calls Python on", "leave out mesh"),
+        "direct lanes": ("ValueError: solve_batch: PolicyIteration(evaluation=Direct()", "leave out mesh"),
     }
     assert set(found) == set(wanted)
     for name, (start, way_out) in wanted.items():

@@ -5,6 +5,7 @@ object: what each case found, or how it failed. ``tests/solvers/test_mesh.py`` r
 """
 
 import dataclasses
+import functools
 import json
 import sys
 import tempfile
@@ -22,6 +23,7 @@ from hjbjax.discretisation import slopes, stencil
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import gauss_seidel
 from hjbjax.problem.parts import Parts
+from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.stretching import Sinh
 from hjbjax.solvers import setup, stationary_run
 
@@ -63,6 +65,20 @@ CHASE = hjb.Problem(  # a game with a target, and noise along one axis
 SHAKEN = hjb.Problem(swing, effort, U, noise=0.6, discount=0.5)
 SKEW = hjb.Problem(swing, effort, U, noise=np.array([[0.5, 0.0], [0.2, 0.4]]), discount=0.5)
 STEPS = {"method": hjb.ValueIteration(), "scheme": hjb.Upwind(), "max_steps": 40, "throw": False}
+
+
+ROUGH = hjb.Grid([-np.pi, -3.0], [np.pi, 3.0], (14, 11), periodic=(True, False))
+TORQUES = np.linspace(-1.0, 1.0, 41)[:, None]  # more than the checks try: they pass over the fourth
+
+
+@pytree_dataclass()
+class Weighted:
+    """A cost with the logarithm of a weight for one torque, which the checks before a solve pass over."""
+
+    weight: object
+
+    def cost(self, x, u):
+        return effort(x, u) + jnp.where(jnp.abs(u[0] - TORQUES[3, 0]) < 1e-3, jnp.log(self.weight), 0.0)
 
 
 def beside(ask, *meshes):
@@ -107,6 +123,24 @@ def march_of_first_order():
     )  # fmt: skip
     options = {"scheme": hjb.Upwind(), "times": [0.0, 0.1], "step": 0.01}
     return beside(lambda mesh: hjb.march(problem, ANGLE, 0.2, mesh=mesh, **options), (8,), (4, 2))
+
+
+@case
+def value_alone():
+    """Nothing but V is kept, and what is given at the nodes is made anew in every step."""
+    alone = {**STEPS, "method": hjb.ValueIteration(policy=False)}
+    tube = hjb.reach(swing, U, lambda x: jnp.hypot(x[0] - 0.4, x[1]) - 0.7)
+    return [
+        *beside(lambda mesh: hjb.solve(PLAIN, ANGLE, mesh=mesh, **alone), (4, 2)),
+        *beside(lambda mesh: hjb.solve(tube, FLAT, mesh=mesh, **alone), (8,)),
+    ]
+
+
+@case
+def march_of_the_value_alone():
+    tube = hjb.reach(swing, U, lambda x: jnp.hypot(x[0] - 0.4, x[1]) - 0.7)
+    options = {"scheme": hjb.Upwind(), "times": [0.0, 0.1], "step": 0.01, "policy": False}
+    return beside(lambda mesh: hjb.march(tube, ANGLE, 0.2, mesh=mesh, **options), (4, 2))
 
 
 @case
@@ -209,6 +243,69 @@ def compiled_program():
     return found
 
 
+# gain of the input, weight of the position, half of the box of positions and of speeds: no two axes are alike
+PLANTS = ((1.0, 1.0, 1.0, 1.5), (2.0, 0.5, 1.2, 1.0), (0.5, 2.0, 0.8, 1.3))
+
+
+def integrators(plants, nodes):
+    """Double integrators side by side, each with its own input and its own cost, on so many nodes an axis."""
+    gain, weight, far, fast = map(np.array, zip(*plants, strict=True))
+
+    def drift(x, u):
+        return jnp.stack([x[1::2], gain * u], axis=1).ravel()
+
+    def cost(x, u):
+        return weight @ x[::2] ** 2 + x[1::2] @ x[1::2] + u @ u
+
+    def at_the_end(x):
+        return jnp.sum(jnp.abs(x[::2] - 0.1))
+
+    count, hi = len(plants), np.stack([far, fast], axis=1).ravel()
+    controls = hjb.Box([-1.0] * count, [1.0] * count)
+    problem = hjb.Problem(drift, cost, controls, discount=2.0)
+    return problem, dataclasses.replace(problem, terminal_cost=at_the_end), hjb.Grid(-hi, hi, (nodes,) * 2 * count)
+
+
+def decoupled(plants, nodes, mesh, steps):
+    """Integrators on the product of their grids over a mesh, beside the sum of their values in the plane.
+
+    On the product grid the generator is the sum of those of the factors, and so are the costs: min over all inputs is
+    the sum of the minima. If W_i solve β W_i = min {L_i + L^u W_i}, their sum solves the equation of the product, at
+    every node and not up to O(h), and the chain has no other solution. An explicit step adds dt times the right-hand
+    side, so that a march is the sum of marches of as many steps, too, up to rounding.
+    """
+    settled, moving, grid = integrators(plants, nodes)
+    step, chain = 0.02, {"scheme": hjb.Upwind()}
+    alone = {"method": hjb.ValueIteration(policy=False), "tol": 1e-2, **chain}
+    whole = hjb.solve(settled, grid, mesh=mesh, **alone)
+    marched = hjb.march(moving, grid, steps * step, step=step, policy=False, mesh=mesh, **chain)
+    planes = [integrators([plant], nodes) for plant in plants]
+    answers = [hjb.solve(plane, flat, tol=1e-6, **chain) for plane, _, flat in planes]
+    marches = [hjb.march(plane, flat, steps * step, step=step, policy=False, **chain) for _, plane, flat in planes]
+    apart, moved = (
+        np.max(
+            np.abs(one.value.reshape(grid.shape) - functools.reduce(np.add.outer, [w.value.squeeze() for w in many]))
+        )
+        for one, many in ((whole, answers), (marched, marches))
+    )
+    scale = np.finfo(float).eps * np.max(np.abs(marched.value))
+    return {
+        "nodes": grid.size, "status": whole.status.name, "steps": [whole.steps, marched.steps],
+        "apart": float(apart), "errors": [float(whole.error), *(float(each.error) for each in answers)],
+        "ulp": float(moved / scale),
+    }  # fmt: skip
+
+
+@case
+def two_integrators():
+    return decoupled(PLANTS[:2], 8, mesh_of(2, 2, 2), 10)
+
+
+@case
+def three_integrators():
+    return decoupled(PLANTS, 12, mesh_of(2, 2, 2), 10)
+
+
 def within_certificates(problem, grid, method, *meshes):
     """Answers of policy iteration on meshes beside that on one device: how far apart, certified errors, steps."""
     options = {"method": method, "scheme": hjb.Upwind(), "tol": 1e-6, "throw": False}
@@ -301,6 +398,35 @@ def open_ends():
     return [other.status.name, one.steps, other.steps, float(np.max(np.abs(one.value - other.value)))]
 
 
+def batches(*meshes):
+    """Eleven lanes that take from a few steps to many, and one that fails, on meshes beside those without one."""
+    # discounts far apart, so that lanes are taken out on the way; the logarithm of −1 is no number
+    weights = [-1.0 if lane == 5 else 1.0 + lane for lane in range(11)]
+    lanes = [
+        hjb.Problem(swing, Weighted(w).cost, hjb.Finite(TORQUES), discount=b)
+        for w, b in zip(weights, np.geomspace(9.0, 0.05, 11), strict=True)
+    ]
+    options = {"scheme": hjb.Upwind(), "tol": 1e-6, "throw": False}
+    alone, found = hjb.solve_batch(lanes, ROUGH, **options), []
+    for mesh in meshes:
+        spread = hjb.solve_batch(lanes, ROUGH, mesh=mesh, **options)
+        found.append({
+            "status": [each.status.name for each in spread],
+            "steps": [[each.steps for each in answers] for answers in (alone, spread)],
+            "ulp": max(
+                float(np.max(np.abs(one.value - other.value)) / (np.finfo(float).eps * (1 + np.max(np.abs(one.value)))))
+                for one, other in zip(alone, spread, strict=True)
+            ),
+            "residuals": all(len(each.residuals) == each.steps + 1 for each in spread),
+        })  # fmt: skip
+    return found
+
+
+@case
+def batch():
+    return batches(mesh_of(4, 2))
+
+
 @case
 def checkpoints():
     """A run that is cut on eight devices and goes on on two, and on one."""
@@ -345,6 +471,10 @@ def refusals():
         "traced": lambda: jax.jit(lambda b: hjb.solve(discounted(b), FLAT, mesh=two).value)(0.5),
         "traced march": lambda: jax.jit(lambda b: hjb.march(discounted(b), FLAT, 1.0, step=0.01, mesh=two).value)(0.5),
         "host": lambda: hjb.solve(calling, FLAT, mesh=two),
+        "no mesh of lanes": lambda: hjb.solve_batch([PLAIN], FLAT, mesh=8),
+        "lanes to a file": lambda: hjb.solve_batch([PLAIN], FLAT, mesh=two, checkpoint="run.npz"),
+        "lanes by the host": lambda: hjb.solve_batch([PLAIN, calling], FLAT, mesh=two),
+        "direct lanes": lambda: hjb.solve_batch([PLAIN], FLAT, method=hjb.PolicyIteration(direct), mesh=two),
     }
     found = {}
     for name, question in ask.items():

@@ -226,9 +226,10 @@ class Limited:
 
         D⁺ − (h/2) φ(s_i, s_{i+1}),   D⁻ + (h/2) φ(s_i, s_{i−1}),   φ(a, b) = ab (a + b)/(a² + b²) if ab > 0 else 0
 
-    (van Albada), with quadratic ghost values at ends that are not periodic. The scheme is no chain: the residual
-    of the equation with these slopes is driven to zero by corrections with the matrix of the monotone one, from
-    its answer. There is no certificate; the tolerance bounds that residual and the last step, in cost units.
+    (van Albada), with quadratic ghost values at ends that are not periodic, and mirrored ones where noise reflects.
+    The scheme is no chain: the residual of the equation with these slopes is driven to zero by corrections with the
+    matrix of the monotone one, from its answer. There is no certificate; the tolerance bounds that residual and the
+    last step, in cost units.
 
     Args:
       subcell: as for ``Upwind``; on by default, since a target snapped to nodes is of first order.
@@ -249,7 +250,8 @@ class Limited:
         """Limited slopes; central ones where noise keeps those monotone, a_ii ≥ h |f_i| for all actions."""
         # limited slopes from the one-sided differences that are there: no further node is read
         grid, pairs = around.on.grid, list(zip(around.one_sided, around.links, strict=True))
-        found = [stencil.limited(*pair, grid, axis, link) for axis, (pair, link) in enumerate(pairs)]
+        noisy = around.on.noisy_walls(around.x)
+        found = [stencil.limited(*pair, grid, axis, link, noisy[axis]) for axis, (pair, link) in enumerate(pairs)]
         if around.on.problem.noise is None:
             return found
         for axis, quiet in enumerate(calm(around.on, around.x, around.links)):
@@ -293,7 +295,7 @@ class Eno2:
 
     def slopes(self, around: Differences) -> Slopes:
         """Those of the smoother of two stencils."""
-        return slopes.eno2(around.value, around.on.grid)
+        return slopes.eno2(around.value, around.on.grid, around.on.noisy_walls(around.x))
 
 
 @pytree_dataclass(static=("subcell", "split"))
@@ -322,9 +324,10 @@ class Weno5:
 
     def slopes(self, around: Differences) -> Slopes:
         """A mean of three stencils with weights that favour the smoothest; limited slopes beside what breaks them."""
-        grid, found = around.on.grid, slopes.weno5(around.value, around.on.grid, around.lost)
+        grid, noisy = around.on.grid, around.on.noisy_walls(around.x)
+        found = slopes.weno5(around.value, grid, around.lost, noisy)
         for axis, (pair, link) in enumerate(zip(around.one_sided, around.links, strict=True)):
             if (broken := slopes.broken(link, grid, axis, around.lost)) is not None:
-                near, (up, down) = stencil.limited(*pair, grid, axis, link), found[axis]
+                near, (up, down) = stencil.limited(*pair, grid, axis, link, noisy[axis]), found[axis]
                 found[axis] = jnp.where(broken, near[0], up), jnp.where(broken, near[1], down)
         return found

@@ -4,6 +4,7 @@ And what a scheme must offer, so that one of the user's own serves as well; ``sc
 """
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Sequence
 from typing import Any, Protocol, TypeVar, runtime_checkable
@@ -13,7 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
+from hjbjax.discretisation import stencil
 from hjbjax.discretisation.stencil import Links
+from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.parts import Parts
 from hjbjax.problem.problem import Problem
@@ -200,6 +203,26 @@ class Discretisation:
         # σ of shape (n, k): a_ij = Σ_l σ_il σ_jl, of which the half i ≤ j says all
         pairs = itertools.combinations_with_replacement(range(n), 2)
         return {(i, j): sum(p * q for p, q in zip(sigma[i], sigma[j], strict=True)) for i, j in pairs}
+
+    def noisy_walls(self, x: list) -> list[dict[int, jax.Array]]:
+        """Where noise reflects, for every axis and the steps −1 and 1 that lead across its walls: bool, one slice each.
+
+        There ∂V/∂n = 0, and slopes must see the mirror image. With the parabola through the last three nodes instead
+        the node beside a wall takes its slope from the node behind it, without a limit, while noise ties the value on
+        the wall to that node: under drift towards the wall with a < h f both grow like e^{.15 f t/h}.
+        """
+        found: list[dict[int, jax.Array]] = [{} for _ in range(self.grid.ndim)]
+        if self.problem.noise is None:
+            return found
+        pairs = list(itertools.product(sets.probes(self.problem.controls, self.dtype),
+                                       sets.probes(self.problem.disturbances, self.dtype)))  # fmt: skip
+        for axis, step in itertools.product(range(self.grid.ndim), (-1, 1)):
+            if self.grid.periodic[axis] or (axis, step) in self.grid.sides("open"):  # type: ignore[index]
+                continue
+            ends = [stencil.slices(c, self.grid, axis, step) if i == axis else c for i, c in enumerate(x)]
+            noise = [self.diffusion(u, d, ends).get((axis, axis), jnp.zeros((), self.dtype)) for u, d in pairs]
+            found[axis][step] = functools.reduce(jnp.logical_or, [a > 0 for a in noise])
+        return found
 
     def at_nodes(self, ingredient: Any) -> jax.Array:
         """A function of the state alone, or a number, at every node, shape (*grid); None is zero."""

@@ -226,9 +226,10 @@ class Limited:
 
         D⁺ − (h/2) φ(s_i, s_{i+1}),   D⁻ + (h/2) φ(s_i, s_{i−1}),   φ(a, b) = ab (a + b)/(a² + b²) if ab > 0 else 0
 
-    (van Albada), with quadratic ghost values at ends that are not periodic. The scheme is no chain: the residual
-    of the equation with these slopes is driven to zero by corrections with the matrix of the monotone one, from
-    its answer. There is no certificate; the tolerance bounds that residual and the last step, in cost units.
+    (van Albada), with quadratic ghost values at ends that are not periodic, and mirrored ones where noise reflects.
+    The scheme is no chain: the residual of the equation with these slopes is driven to zero by corrections with the
+    matrix of the monotone one, from its answer. There is no certificate; the tolerance bounds that residual and the
+    last step, in cost units.
 
     Args:
       subcell: as for ``Upwind``; on by default, since a target snapped to nodes is of first order.
@@ -248,11 +249,12 @@ class Limited:
     def slopes(self, around: Differences) -> Slopes:
         """Limited slopes; central ones where noise keeps those monotone, a_ii ≥ h |f_i| for all actions."""
         grid, pairs = around.on.grid, list(zip(around.one_sided, around.links, strict=True))
+        noisy = around.on.noisy_walls(around.x)
         found = [
             # from V where that is all: the differences are then no arrays
-            slopes.of_second_order(around.value, grid, axis, stencil.van_albada)
+            slopes.of_second_order(around.value, grid, axis, stencil.van_albada, noisy)
             if link.meets_up is link.meets_down is None and _is_plain(grid, axis)
-            else stencil.limited(*pair, grid, axis, link)
+            else stencil.limited(*pair, grid, axis, link, noisy[axis])
             for axis, (pair, link) in enumerate(pairs)
         ]
         if around.on.problem.noise is None:
@@ -303,7 +305,7 @@ class Eno2:
 
     def slopes(self, around: Differences) -> Slopes:
         """Those of the smoother of two stencils."""
-        return slopes.eno2(around.value, around.on.grid)
+        return slopes.eno2(around.value, around.on.grid, around.on.noisy_walls(around.x))
 
 
 @pytree_dataclass(static=("subcell", "split"))
@@ -332,9 +334,10 @@ class Weno5:
 
     def slopes(self, around: Differences) -> Slopes:
         """A mean of three stencils with weights that favour the smoothest; limited slopes beside what breaks them."""
-        grid, found = around.on.grid, slopes.weno5(around.value, around.on.grid, around.lost)
+        grid, noisy = around.on.grid, around.on.noisy_walls(around.x)
+        found = slopes.weno5(around.value, grid, around.lost, noisy)
         for axis, (pair, link) in enumerate(zip(around.one_sided, around.links, strict=True)):
             if (broken := slopes.broken(link, grid, axis, around.lost)) is not None:
-                near, (up, down) = stencil.limited(*pair, grid, axis, link), found[axis]
+                near, (up, down) = stencil.limited(*pair, grid, axis, link, noisy[axis]), found[axis]
                 found[axis] = jnp.where(broken, near[0], up), jnp.where(broken, near[1], down)
         return found

@@ -13,13 +13,14 @@ p, q, r, s, the slope from below is
 
 c = (.1, .6, .3); the slope from above is its mirror image. At a kink the order is that of the best of three stencils
 of order 3. These slopes are scaled by the range of V over the width of the box, so that ε = 10⁻⁶ has no unit. Beyond
-an end the value is continued quadratically; across a wall the slope is zero, as in every scheme here. The terms stand
-so that XLA makes one loop of them and keeps no array beside the result. Source: G.-S. Jiang and D. Peng, Weighted ENO
-schemes for Hamilton–Jacobi equations, SIAM J. Sci. Comput. 21.
+an end the value is continued quadratically, or by its mirror image where noise reflects; across a wall the slope is
+zero, as in every scheme here. The terms stand so that XLA makes one loop of them and keeps no array beside the result.
+Source: G.-S. Jiang and D. Peng, Weighted ENO schemes for Hamilton–Jacobi equations, SIAM J. Sci. Comput. 21.
 """
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -27,28 +28,32 @@ import jax.numpy as jnp
 from hjbjax.discretisation import stencil
 from hjbjax.discretisation.stencil import Links, PerNode
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.types import AtNodes, Field, Mask
+from hjbjax.problem.types import Array, AtNodes, Field, Mask
 
+Noisy: TypeAlias = Sequence[Mapping[int, Array]]  # an axis each: at which walls noise reflects, see ``Discretisation``
 EPSILON = 1e-6  # of a squared slope over the typical one: what counts as equally smooth
 
 
-def eno2(values: Field, grid: Grid) -> list[tuple[Field, Field]]:
+def eno2(values: Field, grid: Grid, noisy: Noisy | None = None) -> list[tuple[Field, Field]]:
     """The slopes from above and from below along every axis, each of shape (*grid); zero across a wall."""
-    return [of_second_order(values, grid, axis, _smaller) for axis in range(grid.ndim)]
+    return [of_second_order(values, grid, axis, _smaller, noisy) for axis in range(grid.ndim)]
 
 
-def of_second_order(values: Field, grid: Grid, axis: int, mean: Callable[[Field, Field], Field]) -> tuple[Field, Field]:
+def of_second_order(
+    values: Field, grid: Grid, axis: int, mean: Callable[[Field, Field], Field], noisy: Noisy | None = None
+) -> tuple[Field, Field]:
     """D⁺ − (h/2) m(s_i, s_{i+1}) and D⁻ + (h/2) m(s_i, s_{i−1}) for a mean m of second differences; zero across a wall.
 
-    On equal spacings, with at least three nodes. Beyond an end the second difference is continued as a constant.
+    On equal spacings, with at least three nodes. Beyond an end the second difference is continued as a constant, or by
+    its mirror image where noise reflects.
     """
-    far_down, down, up, far_up = _differences(values, grid, axis, 2, 1 / grid.spacing(axis))
+    far_down, down, up, far_up = _differences(values, grid, axis, 2, 1 / grid.spacing(axis), noisy)
     bend = up - down  # h V'': half of it is h/2 V'', the leading error of a one-sided difference
     above, below = up - mean(bend, far_up - up) / 2, down + mean(bend, down - far_down) / 2
     return stencil.stopped(above, below, grid, axis)
 
 
-def weno5(values: Field, grid: Grid, lost: Mask | None = None) -> list[tuple[Field, Field]]:
+def weno5(values: Field, grid: Grid, lost: Mask | None = None, noisy: Noisy | None = None) -> list[tuple[Field, Field]]:
     """The slopes from above and from below along every axis, each of shape (*grid); zero across a wall.
 
     Values at the nodes that are ``lost`` are no values and set no unit.
@@ -60,7 +65,7 @@ def weno5(values: Field, grid: Grid, lost: Mask | None = None) -> list[tuple[Fie
     result = []
     for axis in range(grid.ndim):
         typical = extent / (grid.hi[axis] - grid.lo[axis])
-        steps = _differences(values, grid, axis, 3, 1 / (grid.spacing(axis) * typical))
+        steps = _differences(values, grid, axis, 3, 1 / (grid.spacing(axis) * typical), noisy)
         # six differences: the last five from above are the mirror image of the first five from below
         above, below = typical * _weighted(*steps[:0:-1]), typical * _weighted(*steps[:-1])
         result.append(stencil.stopped(above, below, grid, axis))
@@ -89,22 +94,28 @@ def _smaller(a: Field, b: Field) -> Field:
     return jnp.where(jnp.abs(a) < jnp.abs(b), a, b)
 
 
-def _differences(values: Field, grid: Grid, axis: int, reach: int, scale: PerNode) -> list[Field]:
+def _differences(values: Field, grid: Grid, axis: int, reach: int, scale: PerNode, noisy: Noisy | None) -> list[Field]:
     """The differences between neighbours times ``scale``, from ``reach`` nodes below a node to ``reach`` above."""
     # kept apart: fused into the loop over the nodes, the ends would be branches in it
-    wide, count = jax.lax.optimization_barrier(_continued(values, grid, axis, reach)), grid.shape[axis]
+    wide, count = jax.lax.optimization_barrier(_continued(values, grid, axis, reach, noisy)), grid.shape[axis]
     nodes = [jax.lax.slice_in_dim(wide, k, k + count, axis=axis) for k in range(2 * reach + 1)]
     return [(right - left) * scale for left, right in itertools.pairwise(nodes)]
 
 
-def _continued(values: Field, grid: Grid, axis: int, reach: int) -> jax.Array:
+def _continued(values: Field, grid: Grid, axis: int, reach: int, noisy: Noisy | None) -> jax.Array:
     """``values`` with ``reach`` more entries at both ends of an axis."""
 
     def ended(step: int) -> jax.Array:
-        """The parabola through the last three entries of an end, at the nearest ``reach`` places beyond it."""
-        a, b, c = (stencil.slices(values, grid, axis, step, k) for k in range(3))
+        """The parabola through the last three entries of an end, at the nearest ``reach`` places beyond it.
+
+        Where noise reflects, the mirror image.
+        """
+        a, b, c, *far = (stencil.slices(values, grid, axis, step, k) for k in range(max(3, reach + 1)))
         # Lagrange's polynomials on the places 0, 1, 2, at −3, −2 and −1; at the upper end the mirror image
         found = [10 * a - 15 * b + 6 * c, 6 * a - 8 * b + 3 * c, 3 * a - 3 * b + c][3 - reach :]
+        if noisy is not None and step in noisy[axis]:
+            image = [*far, c, b]
+            found = [jnp.where(noisy[axis][step], even, odd) for even, odd in zip(image, found, strict=True)]
         return jnp.concatenate(found if step < 0 else found[::-1], axis)
 
     below, above = (stencil.beyond(values, grid, axis, step, ended(step)) for step in (-1, 1))

@@ -10,7 +10,7 @@ Where the nodes are divided over many devices, what stands beyond the last node 
 beside: see ``problem.parts``.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, TypeAlias
 
 import jax
@@ -256,16 +256,21 @@ def _neighbours(values: Field, grid: Grid, axis: int) -> tuple[Field, Field]:
     return jax.lax.slice_in_dim(wide, 2, count + 2, axis=axis), jax.lax.slice_in_dim(wide, 0, count, axis=axis)
 
 
-def limited(up: Field, down: Field, grid: Grid, axis: int, link: Links) -> tuple[Field, Field]:
+def limited(
+    up: Field, down: Field, grid: Grid, axis: int, link: Links, noisy: Mapping[int, Array] | None = None
+) -> tuple[Field, Field]:
     """Second-order one-sided slopes from the differences D⁺, D⁻ along one axis; zero across a wall as they are.
 
-    Next to an edge, and to the boundary of a target, the second difference is continued as a constant.
+    Next to an edge, and to the boundary of a target, the second difference is continued as a constant; at a wall on
+    which noise reflects, where ``noisy`` says so, it is that of the mirror image (see ``noisy_walls``).
     """
-    upper, lower = on_edge(grid, axis, 1), on_edge(grid, axis, -1)
     bend = 2 * (up - down) / (link.up + link.down)  # V'' on two gaps of any length
-    # D⁺ or D⁻ is missing on an edge, and with it the bend: that of the node before is taken
-    bend = jnp.where(upper, neighbour(bend, grid, unit(grid, axis, -1)), bend)
-    bend = jnp.where(lower, neighbour(bend, grid, unit(grid, axis, 1)), bend)
+    for step in (1, -1):
+        # D⁺ or D⁻ is missing on an edge, and with it the bend: that of the node before is taken
+        ended = neighbour(bend, grid, unit(grid, axis, -step))
+        if noisy and step in noisy:
+            ended = jnp.where(noisy[step], 2 * bend, ended)
+        bend = jnp.where(on_edge(grid, axis, step), ended, bend)
     above, below = (neighbour(bend, grid, unit(grid, axis, step)) for step in (1, -1))
     # nodes inside a target hold no smooth continuation of V: the bend of this side is taken for both
     if link.meets_up is not None:

@@ -1,5 +1,7 @@
 """Walls on the node: reflected processes with known answers, to second order, and what the chain does at a wall."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -163,6 +165,29 @@ def test_heat_between_two_walls(scheme):
 
 
 # --- the chain and the Hamiltonian at a wall ---
+
+
+@pytest.mark.filterwarnings("ignore::hjbjax.SolveWarning")
+@pytest.mark.parametrize("scheme", [hjb.Limited(), hjb.Eno2(), hjb.Weno5()])
+def test_a_sliver_between_a_target_and_a_wall_stays_in_the_range_of_its_data(scheme):
+    """Noise too weak for central differences ties the wall to the node before it, which once took its slope downwind.
+
+    With drift towards the wall both then grew like e^{.15 f t/h}: V = −7e13 for data in [−½, 1], and CONVERGED.
+    """
+    grid, drift = hjb.Grid([-1.0], [1.0], (31,)), 3.0
+    for nodes, share in ((2, 0.2), (2, 0.9), (3, 0.6), (4, 0.6)):  # between the target and the wall, and a/(h f)
+        edge = 1 - (nodes - 0.5) * grid.spacing(0)
+        problem = hjb.Problem(
+            lambda x, u: drift + 0 * x, noise=np.sqrt(share * drift * grid.spacing(0)), terminal_cost=-0.5,
+            target=lambda x, edge=edge: jnp.abs(x[0] - edge + 0.3) - 0.3, exit_cost=1.0,
+        )  # fmt: skip
+        value = hjb.march(problem, grid, 3.0, scheme=scheme).value
+        assert value.min() >= -0.501
+        assert value.max() <= 1.001
+    if scheme.stationary:  # of the last one, in [0, 1], −1.4 was CONVERGED
+        value = hjb.solve(dataclasses.replace(problem, terminal_cost=None, discount=0.3), grid, scheme=scheme).value
+        assert value.min() >= -0.001
+        assert value.max() <= 1.001
 
 
 @given(seed=SEEDS)

@@ -240,7 +240,7 @@ def judged(task: Any, value: Field, bound: ErrorBound, best: jax.Array, since: S
     to_the_end = climbs and task.certificate in (*TO_THE_END, Certificate.OPEN)
     size = jax.lax.cond(
         matters | to_the_end,
-        lambda: task.grid.largest(jnp.where(task.counted, jnp.abs(value), 0)),
+        lambda: _size(task.grid, value, task.counted),
         lambda: jnp.zeros_like(best[1]),
     )
     rounding, tol = ROUNDING * jnp.finfo(value.dtype).eps * size, task.tol
@@ -257,6 +257,13 @@ def judged(task: Any, value: Field, bound: ErrorBound, best: jax.Array, since: S
     code = jnp.where(grew, Status.DIVERGED, code)
     code = jnp.where(bound.error <= tol, Status.CONVERGED, code)
     return jnp.where(finite, code, Status.NONFINITE).astype(jnp.int32)
+
+
+def _size(grid: Grid, value: Field, counted: Mask) -> Scalar:
+    """max |V| over the nodes that count."""
+    if not jnp.ndim(counted):  # all of them: no array of |V|
+        return jnp.maximum(grid.largest(value), -grid.least(value))
+    return grid.largest(jnp.where(counted, jnp.abs(value), 0))
 
 
 def booked(state: S, start: Scalar, bound: ErrorBound, code: Scalar, since: Scalar, **found: Any) -> S:

@@ -64,8 +64,8 @@ def estimate(problem: Problem, grid: Grid, method: Method, dtype: DType) -> int:
 def of_march(on: Discretisation, kept: int, method: TimeMethod, *, policy: bool) -> int:
     """Bytes that a march keeps at its peak: ``kept`` slices, and what its steps or the policy of one slice take.
 
-    By XLA's own accounts of one to six axes: V before and after a chunk, and of a scheme of high order on a stencil of
-    its own each axis' neighbours, of one that limits slopes six arrays an axis.
+    By XLA's own accounts of one to six axes: V before and after a chunk, and of a scheme of high order each axis'
+    neighbours; where that limits slopes on unequal spacings, or beside a target between nodes, six arrays an axis.
     """
     problem, grid, scheme, word, n = on.problem, on.grid, on.scheme, on.dtype.itemsize, on.grid.ndim
     actions = _actions(problem) if policy else 0
@@ -73,10 +73,11 @@ def of_march(on: Discretisation, kept: int, method: TimeMethod, *, policy: bool)
     if not method.limited:
         inner = PolicyIteration(getattr(method, "evaluation", None) or Krylov())
         return kept * one * grid.size + estimate(problem, grid, inner, on.dtype)
+    plain = scheme.even or (not any(grid.stretch or ()) and not (scheme.subcell and problem.target is not None))
     if scheme.monotone:
         slopes = float(n <= stencil.LONGER)
-    elif scheme.even:
-        slopes = sum(1 + (scheme.points - 1) / count for count in grid.shape)
+    elif plain:
+        slopes = sum(1 + max(scheme.points - 1, 2) / count for count in grid.shape)
     else:
         slopes = 6.0 * n
     given = sum(each is not None for each in (problem.exit_cost, problem.stopping_cost, problem.running_max))
@@ -84,7 +85,7 @@ def of_march(on: Discretisation, kept: int, method: TimeMethod, *, policy: bool)
     steps = word * (3 + slopes + _searched(problem, n, on.dtype))
     filling = one + word  # and V itself
     if policy:
-        wide = 1 if scheme.monotone and n > stencil.LONGER else 2 if scheme.monotone or scheme.even else 6
+        wide = 1 if scheme.monotone and n > stencil.LONGER else 2 if scheme.monotone or plain else 6
         filling += word * (actions + wide) + 2
     return math.ceil(((kept - 1) * one + stored + max(steps, filling)) * grid.size)
 

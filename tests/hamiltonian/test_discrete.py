@@ -120,7 +120,7 @@ def test_a_box_is_minimised_exactly(cost, kind, scheme, seed):
 
 
 @pytest.mark.parametrize("scheme", SCHEMES, ids=["plain", "central"])
-@pytest.mark.parametrize("kind", ["none", pytest.param("diagonal", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kind", ["none", pytest.param("diagonal", marks=[pytest.mark.slow, pytest.mark.emitters])])
 @given(seed=SEEDS)
 @settings(max_examples=8)
 def test_a_ball_is_minimised_exactly(kind, scheme, seed):

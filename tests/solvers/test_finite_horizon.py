@@ -398,6 +398,7 @@ def with_waves(problem, k, extra=0.0, floor=None, cost=None):
 
 
 @pytest.mark.slow
+@pytest.mark.emitters
 @pytest.mark.filterwarnings("ignore:the optimal drift leaves")  # of random systems some do
 @settings(max_examples=25)
 @given(SEEDS)
@@ -414,6 +415,7 @@ def test_upwind_never_leaves_the_range_of_the_data(seed):
 
 @pytest.mark.filterwarnings("ignore:the optimal drift leaves")
 @pytest.mark.slow
+@pytest.mark.emitters
 @settings(max_examples=25)
 @given(SEEDS)
 def test_a_higher_terminal_cost_gives_a_higher_value(seed):

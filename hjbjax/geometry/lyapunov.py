@@ -31,6 +31,7 @@ CLIMBS = 32  # starts of the local search, for each of the three measures
 STEPS = 80  # its steps; a step that does not climb is halved
 NEAR = 0.01  # closer to the equilibrium than this part of the region's half widths, V is not compared with zero
 FLAT = 1e-9  # of the rise of V elsewhere at this distance: a rise below it may be that of a V that is 0 nearby
+ROUNDING = 64  # units of eps of the largest terms of dV/dt in the region, below which their sum has no sign
 AT_REST = 1e-8  # of the drift in the region; an equilibrium comes from a root finder or a rounded formula
 
 
@@ -240,8 +241,12 @@ def _search(functions: Functions, place: Place, starts: Array, tolerance: float)
     highest, nearest, lowest = (_best(f, starts) for f in (lambda z: rates(z)[0], relative, low))
     rate, terms = rates(highest)
     decreasing = rate <= tolerance * terms
-    # A violation may be small where dV/dt is largest in units of V: near the equilibrium everything is.
-    decreasing &= relative(nearest) <= tolerance
+    # A violation may be small where dV/dt is largest in units of V: near the equilibrium everything is. Where all terms
+    # vanish at once, as far as f's own rounding allows, their sum has no sign.
+    everywhere = jax.vmap(rates)(starts)
+    small = ROUNDING * jnp.finfo(starts.dtype).eps * jnp.max(everywhere[1])
+    close, its_terms = rates(nearest)
+    decreasing &= close <= tolerance * its_terms + small
     # the point in the report is the largest rate where that is a violation, and else the clearest one
     worst = jnp.where((rate > tolerance * terms), highest, nearest)
     above, rounding, around = _compare(functions[0], place, lowest, at(lowest)[1])
@@ -250,11 +255,11 @@ def _search(functions: Functions, place: Place, starts: Array, tolerance: float)
     hidden = (jnp.abs(above) <= rounding) & rises & (risen > FLAT * around)
     above, rounding = jnp.where(hidden, risen, above), jnp.where(hidden, 0, rounding)
     # a sum of both, to have NaN and infinity of either
-    everywhere = jax.vmap(lambda z: value(z) + rates(z)[0])(starts)
+    looked = jax.vmap(value)(starts) + everywhere[0]
     moved = _share_of_drift(functions[1], place, jax.vmap(at)(starts))
     (worst_time, worst_state), (lowest_time, lowest_state) = at(worst), at(lowest)
     return {
-        "finite": jnp.all(jnp.isfinite(everywhere)) & jnp.isfinite(moved), "moved": moved,
+        "finite": jnp.all(jnp.isfinite(looked)) & jnp.isfinite(moved), "moved": moved,
         "positive": above > rounding, "decreasing": decreasing,
         "worst_state": worst_state, "worst_time": worst_time, "rate": rates(worst)[0],
         "lowest_state": lowest_state, "lowest_time": lowest_time, "lowest": above,

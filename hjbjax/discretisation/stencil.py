@@ -124,10 +124,11 @@ def inward(
     return [offset for offset, _ in pairs], [value for _, value in pairs]
 
 
-def slices(values: AtNodes, grid: Grid, axis: int, step: int, inwards: int = 0, count: int = 1) -> jax.Array:
+def slices(values: jax.Array, grid: Grid, axis: int, step: int, inwards: int = 0, count: int = 1) -> jax.Array:
     """So many slices of the nodes next to the end of an axis in direction ``step``, ``inwards`` away from it.
 
-    In the order of the nodes. Where the axis is divided they are next to the end of this part.
+    Of an array at the nodes, or of one that varies along this axis and broadcasts. In the order of the nodes. Where
+    the axis is divided they are next to the end of this part.
     """
     first: int | Scalar = inwards
     if step > 0:

@@ -139,7 +139,7 @@ def slices(values: jax.Array, grid: Grid, axis: int, step: int, inwards: int = 0
     return jax.lax.dynamic_slice_in_dim(values, first, count, axis=axis)
 
 
-def joined(values: AtNodes, grid: Grid, axis: int, below: AtNodes, above: AtNodes) -> jax.Array:
+def joined(values: AtNodes, grid: Grid, axis: int, below: jax.Array, above: jax.Array) -> jax.Array:
     """The values with slices ``below`` and ``above`` them along an axis, these behind the last node that is here."""
     long = jnp.concatenate([below, values, above], axis=axis)
     if grid.parts is None or grid.parts.even(axis):
@@ -147,7 +147,7 @@ def joined(values: AtNodes, grid: Grid, axis: int, below: AtNodes, above: AtNode
     return jax.lax.dynamic_update_slice_in_dim(long, above, below.shape[axis] + grid.parts.count(axis), axis=axis)
 
 
-def beyond(values: AtNodes, grid: Grid, axis: int, step: int, ended: AtNodes) -> jax.Array:
+def beyond(values: AtNodes, grid: Grid, axis: int, step: int, ended: jax.Array) -> jax.Array:
     """The slices beyond the last node here: of the part beside, of the other end of a periodic axis, or ``ended``.
 
     ``ended`` is what stands beyond an end of the box, and says how many slices there are to be.

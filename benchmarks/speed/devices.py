@@ -41,9 +41,7 @@ class Worker:
     """A process with as many devices as a mesh has, which solves when it is told to."""
 
     def __init__(self, nodes: int, mesh: Sequence[int]):
-        flags = f"{os.environ.get('XLA_FLAGS', '')} {FLAG}={int(np.prod(mesh))}"
-        environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
-        command = [sys.executable, "-m", "benchmarks.speed.devices", str(nodes), "x".join(map(str, mesh))]
+        command, environment = _of_process(nodes, mesh)
         self.process = subprocess.Popen(command, env=environment, stdin=-1, stdout=-1, text=True)  # pipes
 
     def solve(self) -> dict[str, Any]:
@@ -60,6 +58,13 @@ class Worker:
     def end(self) -> None:
         """Let the process end, and close both pipes."""
         self.process.communicate()
+
+
+def _of_process(nodes: int, mesh: Sequence[int]) -> tuple[list[str], dict[str, str]]:
+    """The command and the environment of a process of this file with as many devices as a mesh has."""
+    flags = f"{os.environ.get('XLA_FLAGS', '')} {FLAG}={int(np.prod(mesh))}"
+    command = [sys.executable, "-m", "benchmarks.speed.devices", str(nodes), "x".join(map(str, mesh))]
+    return command, os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
 
 
 def work(nodes: int, mesh: Sequence[int]) -> None:
@@ -97,10 +102,8 @@ def planes(nodes: int, mesh: Sequence[int]) -> dict[str, Any]:
 
 def apart(nodes: int, mesh: Sequence[int]) -> list[dict[str, Any]]:
     """The row of ``planes``, found by a process with as many devices."""
-    flags = f"{os.environ.get('XLA_FLAGS', '')} {FLAG}={int(np.prod(mesh))}"
-    environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-m", "benchmarks.speed.devices", str(nodes), "x".join(map(str, mesh)), "planes"]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    command, environment = _of_process(nodes, mesh)
+    done = subprocess.run([*command, "planes"], env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
         raise RuntimeError(done.stderr.strip().splitlines()[-1])
     return [json.loads(done.stdout.splitlines()[-1])]

@@ -26,7 +26,7 @@ from hjbjax.iteration.certificates import Certificate, ErrorBound, Iterate
 from hjbjax.iteration.evaluation import Evaluation, evaluate
 from hjbjax.iteration.methods import Method
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.problem import Problem
+from hjbjax.problem.problem import Problem, is_constrained
 from hjbjax.problem.pytree import altered, is_traced, pytree_dataclass
 from hjbjax.problem.types import Field, Nodes, Number, Scalar
 from hjbjax.solution.status import Status
@@ -112,7 +112,7 @@ class Task:
     @property
     def constrained(self) -> bool:
         """True if the problem has a stopping cost or a running maximum."""
-        return self.problem.stopping_cost is not None or self.problem.running_max is not None
+        return is_constrained(self.problem)
 
     def impose(self, value: Field) -> Field:
         """``value`` with the given values put in, and with nodes that are lost far above all others."""

@@ -16,7 +16,7 @@ from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.markov_chain import stationary_law
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.problem import Problem
+from hjbjax.problem.problem import Problem, is_constrained
 from hjbjax.problem.pytree import is_traced
 from hjbjax.problem.sets import AdmissibleSet, Finite
 from hjbjax.problem.types import Mask
@@ -127,7 +127,7 @@ def actions(problem: Problem) -> np.ndarray:
             "transition_arrays: got discount = 0, wanted > 0: the factor would be 1, and stationary decision problems "
             "need one below (QuantEcon's methods refuse 1)"
         )
-    if problem.stopping_cost is not None or problem.running_max is not None:
+    if is_constrained(problem):
         raise ValueError("transition_arrays: got a stopping_cost or running_max, which a decision problem cannot hold")
     if problem.time_dependent:
         raise ValueError("transition_arrays: got time_dependent=True, wanted a stationary problem")

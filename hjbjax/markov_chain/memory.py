@@ -22,7 +22,7 @@ from hjbjax.iteration.time_methods import TimeMethod
 from hjbjax.problem import arguments
 from hjbjax.problem.arguments import NO_GRID
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.problem import Problem, is_discounted
+from hjbjax.problem.problem import Problem, is_constrained, is_discounted
 from hjbjax.problem.types import DType
 
 
@@ -35,7 +35,6 @@ def estimate(problem: Problem, grid: Grid, method: Method, dtype: DType) -> int:
     """
     word, n, actions = np.dtype(dtype).itemsize, grid.ndim, _actions(problem)
     searched = _searched(problem, n, dtype)
-    is_tube = problem.stopping_cost is not None or problem.running_max is not None
     if method.relaxes and not getattr(method, "policy", True):
         # where V began, V, the step, and V as a chunk begins; and on few axes the neighbours along the last one
         return word * (4 + (n <= stencil.LONGER) + searched) * grid.size
@@ -52,7 +51,7 @@ def estimate(problem: Problem, grid: Grid, method: Method, dtype: DType) -> int:
         correction = method.evaluation.bytes_per_node(weights, word)
     elif is_discounted(problem) and not searched:
         # the defect is all that a step asks for; at the end the actions, and the pace
-        look = word * (actions + 1 + (problem.noise is not None or is_tube))
+        look = word * (actions + 1 + (problem.noise is not None or is_constrained(problem)))
     else:
         look = word * (4 * max(actions, 1) + 1)  # and the pace
         if problem.stopping_cost is not None and not problem.is_game and is_discounted(problem) is False:

@@ -179,6 +179,11 @@ def is_discounted(problem: Problem) -> bool | None:
     return bool(np.all(np.asarray(problem.discount) > 0))  # of a batch, one a problem: all
 
 
+def is_constrained(problem: Problem) -> bool:
+    """True if the problem has a stopping cost or a running maximum."""
+    return problem.stopping_cost is not None or problem.running_max is not None
+
+
 def _is_nonzero(discount: Number) -> bool:
     """True if a discount is given: a traced one counts, as nobody traces a number that is to be left out."""
     return is_traced(discount) or bool(discount != 0)

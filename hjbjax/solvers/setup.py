@@ -19,7 +19,7 @@ from hjbjax.iteration.fixed_point import Task
 from hjbjax.iteration.methods import Method, Nested, PolicyIteration, ValueIteration
 from hjbjax.markov_chain import attainability, resting
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.problem import Problem, is_discounted
+from hjbjax.problem.problem import Problem, is_constrained, is_discounted
 from hjbjax.problem.pytree import cast, is_traced, known
 from hjbjax.problem.sets import Finite
 from hjbjax.problem.types import Mask, Number
@@ -54,11 +54,6 @@ def check_on_one_state(problem: Problem, grid: Grid, scheme: object) -> None:
             f"and over more than {OPERATIONS:,} the compiler takes minutes. Write sums as products with one matrix "
             "(W @ x with over 60 entries is one operation), and repetitions as jax.lax.fori_loop or scan"
         )
-
-
-def is_constrained(problem: Problem) -> bool:
-    """True if the problem has a stopping cost or a running maximum."""
-    return problem.stopping_cost is not None or problem.running_max is not None
 
 
 def choose(

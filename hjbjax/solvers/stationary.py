@@ -24,7 +24,7 @@ from hjbjax.markov_chain import admissibility, memory, node_checks, resting
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.parts import spans_processes
-from hjbjax.problem.problem import Problem, is_discounted
+from hjbjax.problem.problem import Problem, is_constrained, is_discounted
 from hjbjax.problem.pytree import altered, as_one_program, is_traced
 from hjbjax.problem.types import DType, Nodes, Number, Scalar
 from hjbjax.solution import checkpoints, nested_grids
@@ -42,7 +42,6 @@ from hjbjax.solvers.setup import (
     choose,
     choose_scheme,
     choose_traced_scheme,
-    is_constrained,
     prepare_on_host,
     prepare_traced,
 )

@@ -21,6 +21,7 @@ from hjbjax.solution.clock import CUT, Clock
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop
+from hjbjax.solvers.host_loop import WideJit
 from hjbjax.solvers.result import isaacs_gap, warn_of_cuts, warn_of_gap
 from hjbjax.solvers.setup import question
 
@@ -36,7 +37,7 @@ ADVICE = {
 }
 
 # not donated: a chunk that ends in NaN is done again from the front before it
-_run = jax.jit(time_stepping.run)
+_run = WideJit(time_stepping.run)
 _terminal = jax.jit(time_stepping.terminal)
 
 # the players' actions, the nodes on the target, and those at which actions matter
@@ -73,7 +74,7 @@ def _isaacs_gap(task: March, front: Front, code: Status) -> float | None:
     return gap
 
 
-@functools.partial(jax.jit, static_argnames="parts")
+@functools.partial(WideJit, static_argnames="parts")
 def _run_in_parts(march: March, front: Front, until: Number, most: Number, parts: Parts) -> Front:
     """``time_stepping.run`` on every device of a mesh at once, each with its own nodes."""
 

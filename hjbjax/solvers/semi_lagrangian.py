@@ -29,7 +29,7 @@ from hjbjax.solution.clock import CUT, Clock, Stopped
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop
-from hjbjax.solvers.host_loop import FIRST_NODES
+from hjbjax.solvers.host_loop import FIRST_NODES, WideJit
 from hjbjax.solvers.result import solution_at_start, warn_of_cuts, within_reach
 from hjbjax.solvers.setup import check_on_one_state, warn_unreached
 from hjbjax.solvers.stationary_run import StatesInChunks
@@ -141,7 +141,7 @@ def _traced(on: Discretisation, plan: Plan, *, running: bool) -> tuple[Arcs, bel
 _surely_arriving = jax.jit(arc_iteration.surely_arriving)
 _without = jax.jit(arc_iteration.without)
 _start = jax.jit(arc_iteration.start)
-_run = jax.jit(arc_iteration.run, donate_argnames="state")
+_run = WideJit(arc_iteration.run, donate_argnames="state")
 
 
 @jax.jit

@@ -21,7 +21,7 @@ from hjbjax.problem.types import Array, Nodes, Number
 from hjbjax.solution.clock import CHUNK_SECONDS, CUT, Clock
 from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop
-from hjbjax.solvers.host_loop import FIRST_NODES
+from hjbjax.solvers.host_loop import FIRST_NODES, WideJit
 from hjbjax.tracing import checks
 
 T = TypeVar("T")
@@ -29,13 +29,13 @@ CHUNK = 8  # steps between two looks at which lanes are done, at most
 MANY_NODES = 2_000_000  # beyond which the look at the guess is a chunk of its own: a step may take many times as long
 
 # a state is used once: the next one takes its place in memory
-run = jax.jit(fixed_point.run, donate_argnames="state")
+run = WideJit(fixed_point.run, donate_argnames="state")
 # where Python is called on the way, and may raise, the state before must outlast it
-_run_kept = jax.jit(fixed_point.run)
+_run_kept = WideJit(fixed_point.run)
 _begin = jax.vmap(fixed_point.begin)
 
 
-@functools.partial(jax.jit, static_argnames="over")
+@functools.partial(WideJit, static_argnames="over")
 def _run_lanes(tasks: Task, states: State, until: Array, over: Lanes) -> State:
     """``fixed_point.run`` for lanes that run together, those of every device by themselves."""
     # under vmap a loop goes on until its last lane is done; lanes that are done keep their state by a select and pay
@@ -44,7 +44,7 @@ def _run_lanes(tasks: Task, states: State, until: Array, over: Lanes) -> State:
     return over.mapped(each(fixed_point.run))(tasks, states, until)
 
 
-@functools.partial(jax.jit, static_argnames="parts", donate_argnames="state")
+@functools.partial(WideJit, static_argnames="parts", donate_argnames="state")
 def _run_in_parts(task: Task, state: State, until: Number, parts: Parts) -> State:
     """``fixed_point.run`` on every device of a mesh at once, each with its own nodes."""
 

@@ -323,3 +323,16 @@ def test_a_terminal_that_tells_no_width_is_told_the_phases(monkeypatch):
     os.close(reader)
     assert "the checks" in seen
     assert "compiling for 81 nodes" in seen
+
+
+@pytest.mark.parametrize("option", ["xla_cpu_prefer_vector_width", "xla_no_such_option"])
+def test_a_loop_is_compiled_with_and_without_the_option_for_wide_vectors(monkeypatch, option):
+    """A version of XLA that no longer knows the option compiles the same loop without it."""
+    monkeypatch.setattr(host_loop, "WIDTH", {option: 512})
+    host_loop._known_width.cache_clear()
+    known = option != "xla_no_such_option"
+    loop = host_loop.WideJit(lambda x, count: jax.lax.fori_loop(0, count, lambda _, y: 2 * y, x), static_argnames="count")
+    assert host_loop._known_width() == ({option: 512} if known else {})
+    assert float(loop(1.5, count=3)) == 12
+    assert "stablehlo.while" in loop.lower(1.5, count=3).as_text()
+    host_loop._known_width.cache_clear()

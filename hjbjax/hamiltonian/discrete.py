@@ -99,6 +99,14 @@ class DiscreteHamiltonian:
         upward, downward = schemes.weights(scheme.chain, f, a, link, self.on.grid, axis)
         return upward * self.up[axis] - downward * self.down[axis]
 
+    def kinks(self, axis: int, a: Any) -> tuple[Sequence[Any], Sequence[Any]]:
+        """The drifts along an axis at which the derivative of ``gain`` jumps, and its derivatives between them."""
+        scheme, slopes = self.on.scheme, (self.up[axis], self.down[axis])
+        if not scheme.monotone or (a is None and scheme.chain.one_way):  # f⁺ P⁺ + f⁻ P⁻ has its kink where f turns
+            return (0.0,), slopes[::-1]
+        width = 0 if a is None else jnp.maximum(a, 0)
+        return schemes.kinks(scheme.chain, width, slopes, self.links[axis], self.on.grid, axis)
+
     def at(self, u: Action, d: Action) -> Any:
         """H(u, d) at every node, in cost per unit time."""
         a, grid = self.on.diffusion(u, d, self.x), self.on.grid
@@ -338,13 +346,4 @@ def _kinked(
 ) -> Kinked:
     """The gain of one component as a function of an input: offset, slope, and where its derivative jumps."""
     left = correlated_noise.along_axis(noise, hamiltonian.on.grid, axis)
-    up, down = hamiltonian.up[axis], hamiltonian.down[axis]
-
-    def gain(f):
-        return hamiltonian.gain(axis, f, left)
-
-    scheme, link = hamiltonian.on.scheme, hamiltonian.links[axis]
-    if not scheme.monotone or (left is None and scheme.chain.one_way):  # f⁺ P⁺ + f⁻ P⁻ has its kink where f turns
-        return Kinked(gain, offset, slope, (0.0,), (down, up))
-    width = 0 if left is None else jnp.maximum(left, 0)
-    return Kinked(gain, offset, slope, *schemes.kinks(scheme.chain, width, (up, down), link, hamiltonian.on.grid, axis))
+    return Kinked(lambda f: hamiltonian.gain(axis, f, left), offset, slope, *hamiltonian.kinks(axis, left))

@@ -7,19 +7,20 @@ players meet, the inputs that are free at a node satisfy ∂H/∂z = 0, so that
     dz = −(∂²H/∂z²)⁻¹ d(∂H/∂z),
 
 for both players at once. An input is not free where an end of its box or a kink of H holds it: it moves with the end,
-and at a kink of the upwinding, f = 0, so that f stays zero; at the other kinks that central differences have it stays.
-On the rim of a ball, |z| = R, a multiplier λ joins, with ∂H/∂z + λ z = 0. Among finitely many actions nothing moves,
-nor where H does not depend on the action to second order.
+and at a kink of the upwinding, f = 0 or with central differences |f| = a/h, so that f stays there. On the rim of a
+ball, |z| = R, a multiplier λ joins, with ∂H/∂z + λ z = 0. Among finitely many actions nothing moves, nor where H does
+not depend on the action to second order.
 """
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 
+from hjbjax.discretisation import correlated_noise
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.hamiltonian import discrete
 from hjbjax.hamiltonian.discrete import DiscreteHamiltonian
@@ -201,50 +202,56 @@ def _rim(at: Optimum, inputs: Sequence[Input], slopes: Sequence[Field], mine: bo
 
 @dataclasses.dataclass(frozen=True)
 class Kinks:
-    """Kinks of the upwinding: drift components, their slopes in every input, and the nodes where one holds an input."""
+    """Kinks of the upwinding: how far beyond them drifts are, what that is in every input, and where one holds it."""
 
-    drift: Sequence[Any]  # with derivatives
-    slopes: Sequence[Sequence[Any]]  # ∂f/∂z, a row a component
-    holds: Sequence[Sequence[Any]]  # a row an input; a component holds one input of a node at most
+    passed: Sequence[Any]  # f, or f ∓ a/h, with derivatives
+    slopes: Sequence[Sequence[Any]]  # its ∂/∂z, a row a kink
+    holds: Sequence[Sequence[Any]]  # a row an input; a kink holds one input of a node at most
 
     def hold(self, a: int) -> Any:
         """The nodes where some kink holds an input, bool."""
         return functools.reduce(jnp.logical_or, self.holds[a], jnp.zeros((), bool))
 
     def followed(self, a: int, row: Row) -> Row:
-        """The row of an input, which moves so that f stays zero where a kink holds it."""
+        """The row of an input, which moves so that the drift stays at the kink where one holds it."""
         columns, side = row
-        for f, slopes, here in zip(self.drift, self.slopes, self.holds[a], strict=True):
+        for beyond, slopes, here in zip(self.passed, self.slopes, self.holds[a], strict=True):
             columns = {b: jnp.where(here, slopes[b] if b < len(slopes) else 0, value) for b, value in columns.items()}
-            side = jnp.where(here, -f, side)
+            side = jnp.where(here, -beyond, side)
         return columns, side
 
 
 def _kinks(at: Optimum, inputs: Sequence[Input], kinked: Sequence[Any]) -> Kinks:
-    """The drift components that an input drives, of each player by itself where they are upwinded apart."""
-    on, frozen = at.moving.on, at.frozen.on
-    count = on.grid.ndim
+    """The kinks of the components that an input drives, of each player by itself where they are upwinded apart."""
+    driven = {i for each in inputs for i in each.player.driven[each.index]}
+    if callable(at.moving.on.problem.noise):  # a may move with an input that does not drive f
+        driven = set(range(at.moving.on.grid.ndim))
+    kept = _passed(at.moving, driven, at.u, at.d)
 
-    def drift(on: Discretisation, u: Action, d: Action) -> list[Any]:
-        return [entry for part in on.drifts(u, d) for entry in part]
+    def kink(k: int, u: Action, d: Action) -> Any:
+        return _passed(at.frozen, driven, u, d)[k]
 
-    parts = drift(on, at.u, at.d)
-    driven = {i for each in inputs for j in each.player.driven[each.index] for i in range(j, len(parts), count)}
-    kept = [jnp.broadcast_to(jnp.asarray(parts[i], on.dtype), on.grid.shape) for i in sorted(driven)]
-
-    def component(i: int, u: Action, d: Action) -> Any:
-        return jnp.broadcast_to(drift(frozen, u, d)[i], on.grid.shape)
-
-    slopes = [[each.slope(functools.partial(component, i), at.u, at.d) for each in inputs] for i in sorted(driven)]
-    taken = [jnp.zeros(on.grid.shape, bool)] * len(kept)
+    slopes = [[each.slope(functools.partial(kink, k), at.u, at.d) for each in inputs] for k in range(len(kept))]
+    taken = [jnp.zeros(at.moving.on.grid.shape, bool)] * len(kept)
     holds: list[list[Any]] = []
     for a, (each, here) in enumerate(zip(inputs, kinked, strict=True)):
         holds.append([])
-        for i, (f, slope) in enumerate(zip(kept, slopes, strict=True)):
-            near = here & ~taken[i] & (jnp.abs(jax.lax.stop_gradient(f)) < each.close() * jnp.abs(slope[a]))
+        for k, (beyond, slope) in enumerate(zip(kept, slopes, strict=True)):
+            near = here & ~taken[k] & (jnp.abs(jax.lax.stop_gradient(beyond)) < each.close() * jnp.abs(slope[a]))
             holds[a].append(near)
-            taken[i], here = taken[i] | near, here & ~near
+            taken[k], here = taken[k] | near, here & ~near
     return Kinks(kept, slopes, holds)
+
+
+def _passed(hamiltonian: DiscreteHamiltonian, axes: Collection[int], u: Action, d: Action) -> list[Any]:
+    """By how much the drift along some axes is beyond each of the kinks of its gain, (*grid) each."""
+    on, found = hamiltonian.on, []
+    for number, part in enumerate(on.drifts(u, d)):
+        noise = {} if number else on.diffusion(u, d)  # where drifts are upwinded apart, it goes with the first
+        for axis in sorted(axes):
+            left = correlated_noise.along_axis(noise, on.grid, axis)
+            found += [part[axis] - kink for kink in hamiltonian.kinks(axis, left)[0]]
+    return [jnp.broadcast_to(jnp.asarray(beyond, on.dtype), on.grid.shape) for beyond in found]
 
 
 def _solved(rows: Sequence[Row]) -> list[Any]:

@@ -35,6 +35,7 @@ from hjbjax.problem.pytree import altered, is_traced, pytree_dataclass
 from hjbjax.problem.types import DType, Field, Number, Scalar
 
 ROUNDING = 16  # residuals below this many units in the last place of max|V| are rounding
+TOL = 1e-6  # cost units, for a value that spans one or more
 REPLIES = 20  # of the inner player to one policy of the outer one, at most
 
 
@@ -208,12 +209,13 @@ class Implicit:
 
     Args:
       evaluation: how a policy is evaluated; ``None`` is ``Krylov()`` with noise and ``Sweeps()`` without.
-      tol: bound on what the policy iterations leave over the whole march, in cost units.
+      tol: bound on what the policy iterations leave over the whole march, in cost units; ``None`` is 1e-6, or as much
+        of max V − min V where that is less than one.
       max_steps: policy improvements in one step, at most.
     """
 
     evaluation: Evaluation | None = None
-    tol: Number = 1e-6
+    tol: Number | None = None
     max_steps: int = 100
     limited, monotone_only, in_parts = False, True, True
     courant, tableau = math.inf, TABLEAUX[1]  # any length; the rates are looked at once
@@ -221,12 +223,14 @@ class Implicit:
     def __post_init__(self):
         if self.evaluation is not None:
             check_evaluation(self.evaluation, "Implicit: evaluation")
-        arguments.positive(self.tol, "Implicit: tol", "in the units of the cost")
+        if self.tol is not None:
+            arguments.positive(self.tol, "Implicit: tol", "in the units of the cost")
         arguments.count(self.max_steps, "Implicit: max_steps")
 
     def filled(self, on: Discretisation, evaluation: Evaluation | None = None) -> "Implicit":
         """The method with an evaluation, if none was asked for; its numbers in the type of the march."""
-        return Implicit(self.evaluation or evaluation, _as(self.tol, on.dtype), self.max_steps)
+        tol = None if self.tol is None else _as(self.tol, on.dtype)
+        return Implicit(self.evaluation or evaluation, tol, self.max_steps)
 
     def step(self, march: Marching, value: Field, t: Number, end: Number, dt: Number) -> tuple[Field, Scalar, Any]:
         """V at ``end`` from V at t, true if the policy iteration came to its end, and a look at its last policy."""
@@ -234,7 +238,7 @@ class Implicit:
         question = ImplicitStep.of(march.on.at(end), march.obstacles_at(end), value, dt)
         assert self.evaluation is not None
         # what a step leaves adds up over the march, so that each has its share of the tolerance
-        tol = self.tol * dt / march.horizon
+        tol = Tolerance((TOL if self.tol is None else self.tol) * dt / march.horizon, of_spread=self.tol is None)
         # the derivative is that of the solution and not of the steps to it
         known, start, tol = jax.lax.stop_gradient((question, value, tol))
         value, policy, ok = known.solve(start, self.evaluation, tol, self.max_steps)
@@ -244,12 +248,27 @@ class Implicit:
 
     def described(self) -> str:
         """The method as one would write it."""
-        return f"Implicit({self.evaluation!r}, tol={float(self.tol):g})"
+        tol = "" if self.tol is None else f", tol={float(self.tol):g}"
+        return f"Implicit({self.evaluation!r}{tol})"
 
 
 def _as(number: Number, dtype: DType) -> Number:
     """A number in the type of a march; one that is traced keeps its own."""
     return number if is_traced(number) else jnp.asarray(number, dtype)
+
+
+@pytree_dataclass(static=("of_spread",))
+class Tolerance:
+    """How much of W a step may leave: ``size`` cost units, or as much of max W − min W where that is less than one."""
+
+    size: Number
+    of_spread: bool
+
+    def at(self, value: Field, grid: Grid) -> Scalar:
+        """The bound at W, cost units."""
+        if not self.of_spread:
+            return jnp.asarray(self.size, value.dtype)
+        return jnp.asarray(self.size * jnp.minimum(1, grid.largest(value) - grid.least(value)), value.dtype)
 
 
 @pytree_dataclass()
@@ -295,14 +314,14 @@ class ImplicitStep:
         return self.grid.largest(jnp.abs(equation.source))
 
     def solve(
-        self, value: Field, evaluation: Evaluation, tol: Number, max_steps: int
+        self, value: Field, evaluation: Evaluation, tol: Tolerance, max_steps: int
     ) -> tuple[Field, Greedy, jax.Array]:
         """W, its policy, and true if W is known to ``tol`` or to rounding.
 
         Args:
           value: where to start.
           evaluation: how a policy is evaluated.
-          tol: bound on the algebraic error of the step, cost units.
+          tol: bound on the algebraic error of the step.
           max_steps: policy improvements, at most.
         """
 
@@ -313,7 +332,8 @@ class ImplicitStep:
             bound = certificates.error_bound(Certificate.ADDITIVE, iterate, discount=self.on.problem.discount)
             # a short step's share of the tolerance may be less than the rounding of V, and would never be reached
             rounding = ROUNDING * jnp.finfo(value.dtype).eps * self.grid.largest(jnp.abs(value))
-            return policy, bound.residual, (bound.error <= tol) | (bound.residual <= rounding)
+            enough = (bound.error <= tol.at(value, self.grid)) | (bound.residual <= rounding)
+            return policy, bound.residual, enough
 
         def unfinished(carry):
             _, _, residual, done, _, count = carry

@@ -331,7 +331,9 @@ def test_a_loop_is_compiled_with_and_without_the_option_for_wide_vectors(monkeyp
     monkeypatch.setattr(host_loop, "WIDTH", {option: 512})
     host_loop._known_width.cache_clear()
     known = option != "xla_no_such_option"
-    loop = host_loop.WideJit(lambda x, count: jax.lax.fori_loop(0, count, lambda _, y: 2 * y, x), static_argnames="count")
+    loop = host_loop.WideJit(
+        lambda x, count: jax.lax.fori_loop(0, count, lambda _, y: 2 * y, x), static_argnames="count"
+    )
     assert host_loop._known_width() == ({option: 512} if known else {})
     assert float(loop(1.5, count=3)) == 12
     assert "stablehlo.while" in loop.lower(1.5, count=3).as_text()

@@ -117,17 +117,34 @@ def test_reverse_mode_agrees_and_finitely_many_actions_do_not_move():
         assert not np.any(jax.jit(jax.grad(functools.partial(imitation, enumerated)))(numbers))
 
 
+def noisy_by_choice(gain, weight, bound, discount):
+    """Noise that grows with the action: a kink of central differences, |f| = a/h, holds it at the outer nodes."""
+    return hjb.Problem(
+        lambda x, u: u - 0.35 * gain * x, lambda x, u: x @ x + 0.6 * weight * u @ u, hjb.Box(-bound[None], bound[None]),
+        noise=lambda x, u: 0.1 * gain + 0.2 * u * u, discount=discount,
+    )  # fmt: skip
+
+
+def noise_alone(gain, weight, bound, discount):
+    """An action that drives nothing but the noise: a kink holds it at every other node."""
+    return hjb.Problem(
+        lambda x, u: -0.7 * gain * x, lambda x, u: 2 * weight * x @ x + 0.001 * jnp.sin(3 * u[0]) - 0.01 * u[0],
+        hjb.Box(-bound[None], bound[None]), noise=lambda x, u: 0.1 + 0.08 * u, discount=discount,
+    )  # fmt: skip
+
+
 @pytest.mark.slow
-def test_a_value_follows_the_kinks_that_hold_searched_actions():
-    """Where a kink of the upwinding holds an action, the value moves with it: this derivative was 1 % off."""
+@pytest.mark.parametrize("make", [searched, noisy_by_choice, noise_alone])
+def test_a_value_follows_the_kinks_that_hold_searched_actions(make):
+    """Where a kink of the upwinding holds an action, the value moves with it: derivatives were 1 % and .2 % off."""
 
     def value(make, numbers):
         return hjb.solve(make(*numbers), LINE, scheme=hjb.Upwind(), tol=1e-11).value_at(PLACES[1])
 
     with jax.enable_x64(True):
         numbers, step = jnp.array([1.3, 0.6, 0.8, 0.7]), 1e-4
-        solve = jax.jit(functools.partial(value, searched))
-        forward = np.asarray(jax.jit(jax.jacfwd(functools.partial(value, searched)))(numbers))
+        solve = jax.jit(functools.partial(value, make))
+        forward = np.asarray(jax.jit(jax.jacfwd(functools.partial(value, make)))(numbers))
         found = np.stack([(solve(numbers + e) - solve(numbers - e)) / (2 * step) for e in step * np.eye(4)], axis=-1)
         np.testing.assert_allclose(forward, found, rtol=0, atol=1e-7)
 

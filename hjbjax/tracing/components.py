@@ -43,7 +43,12 @@ def components(function: Callable, *arguments: Any, dtype: DType) -> np.ndarray:
     """
     closed, packed = trace(function, *arguments, dtype=dtype)
     (result,) = evaluate(closed, packed, ARRAYS)
-    return lift(result, ARRAYS)
+    entries = lift(result, ARRAYS)
+    (kind,) = (each.dtype for each in closed.out_avals)
+    if not jnp.issubdtype(kind, jnp.floating) or kind == dtype:
+        return entries
+    # tracers of another type in a closure, inside jit: they are no leaves, which ``cast`` would find
+    return np.vectorize(lambda entry: jnp.asarray(entry, dtype), otypes=[object])(entries)
 
 
 def scalar(function: Callable | Numbers, *arguments: Any, dtype: DType) -> jax.Array:

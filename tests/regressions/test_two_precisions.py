@@ -47,3 +47,18 @@ def test_a_function_is_asked_in_both_by_turns(name, wide):
             assert compiled.dtype == (np.float64 if bits else np.float32)
             np.testing.assert_allclose(compiled, wanted, rtol=1e-12 if bits else 2e-4)
             np.testing.assert_allclose(plain, wanted, rtol=1e-12 if bits else 2e-4)
+
+
+@pytest.mark.parametrize("transformed", [jax.jit, jax.grad], ids=["jit", "grad"])
+def test_numbers_of_64_bits_in_a_closure_may_be_traced_in_a_solve_of_32(transformed):
+    """They are no leaves of the problem that could be cast: this left from the loop as a TypeError of JAX."""
+
+    def cost_of(weight, dtype):
+        problem = hjb.Problem(lambda x, u: weight * u, lambda x, u: x @ x + u @ u, hjb.Box([-1.0], [1.0]), discount=1.0)
+        return hjb.solve(problem, hjb.Grid([-1.0], [1.0], (21,)), scheme=hjb.Upwind(), dtype=dtype).value_at([0.5])
+
+    with jax.enable_x64(True):
+        short, long = (
+            float(transformed(lambda w, d=d: cost_of(w, d))(jnp.asarray(0.9))) for d in ("float32", "float64")
+        )
+    assert short == pytest.approx(long, rel=1e-4)

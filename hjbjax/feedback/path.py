@@ -1,18 +1,23 @@
-"""The answer of a simulation: a path, why it ends, and the line that says so."""
+"""The answer of a simulation: a path, where V says that it ends, why it ends, and the line that says so."""
 
 import enum
 import math
 import warnings
+from collections.abc import Callable
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.pytree import is_traced, pytree_dataclass
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import altered, as_partial, is_traced, pytree_dataclass
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, holds
-from hjbjax.problem.types import Array
+from hjbjax.problem.types import Array, Numbers, State
 from hjbjax.solution.screen import encodable
 from hjbjax.solution.solution import Solution
+from hjbjax.tracing.components import of_state
 
 MANY = 1000  # internal steps, beside an eighth of those allowed: more of them tell of a feedback that jumps
 
@@ -102,12 +107,51 @@ class Path:
 
 def promise(feedback: object, start: Array) -> float | None:
     """V at the start of a path, by the solution of its feedback; None where there is none."""
-    solution = feedback if isinstance(feedback, Solution) else getattr(feedback, "solution", None)
-    if not isinstance(solution, Solution):
+    solution = _solution_of(feedback)
+    if solution is None:
         return None
     where = (start,) if solution.times is None else (0.0, start)
     value = float(solution.value_at(*where, clamp=True))
     return value if math.isfinite(value) else None
+
+
+def _solution_of(feedback: object) -> Solution | None:
+    """The solution that is a feedback, or from which one comes."""
+    solution = feedback if isinstance(feedback, Solution) else getattr(feedback, "solution", None)
+    return solution if isinstance(solution, Solution) else None
+
+
+def with_stops(problem: Problem, feedback: object) -> Problem:
+    """The problem whose paths end, and pay ψ, where the Solution behind a feedback says that one had better stop.
+
+    That is where V = ψ at every node around. Problems whose value is no cost of a path, as of tubes, stay as they are,
+    and those with noise: between the steps of a noisy path a target is met by distances, which ψ − V is not.
+    """
+    solution = _solution_of(feedback)
+    no_path = problem.cost is None or problem.running_max is not None or problem.is_game or problem.time_dependent
+    no_path |= problem.noise is not None
+    if problem.stopping_cost is None or no_path or solution is None or solution.times is not None:
+        return problem
+    value, grid = jnp.asarray(solution.value), solution.grid
+    surplus = of_state(problem, problem.stopping_cost, grid.components(value.dtype), 0.0, value.dtype) - value
+    rounding = 16 * jnp.finfo(value.dtype).eps * jnp.max(jnp.where(jnp.isfinite(value), jnp.abs(value), 0))
+    beyond = jax.tree_util.Partial(_beyond, grid, surplus - rounding, as_partial(problem.target))
+    pay = jax.tree_util.Partial(_pay, as_partial(problem.target), problem.exit_cost, problem.stopping_cost)
+    return altered(problem, target=beyond, exit_cost=pay)
+
+
+def _beyond(grid: Grid, surplus: Array, target: Callable | None, x: State) -> Array:
+    """ψ − V between the nodes, or the target's function where that is less: ≤ 0 where the path ends."""
+    least = jnp.asarray(grid.interpolate(surplus, x, clamp=True), x.dtype)
+    return least if target is None else jnp.minimum(least, target(x))
+
+
+def _pay(target: Callable | None, exit_cost: Numbers | Callable | None, stopping_cost: Callable, x: State) -> Array:
+    """What is paid at the end: on the target the exit cost, elsewhere ψ."""
+    if target is None:
+        return stopping_cost(x)
+    on_target = exit_cost(x) if callable(exit_cost) else 0.0 if exit_cost is None else exit_cost
+    return jnp.where(target(x) <= 0, on_target, stopping_cost(x))
 
 
 def joined(first: Path, then: Path, discount: float) -> Path:

@@ -13,7 +13,7 @@ import numpy as np
 from hjbjax.feedback.closed_loop import InitialValueProblem, Stepping, blank_record, integrate, integrate_part
 from hjbjax.feedback.feedback import GridFeedback, check_kept, is_grid_feedback, lookups
 from hjbjax.feedback.loop import Loop, check_shapes, random_key, settled_loop, timeless
-from hjbjax.feedback.path import Interrupted, Path, PathStatus, promise, truncate
+from hjbjax.feedback.path import Interrupted, Path, PathStatus, promise, truncate, with_stops
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
@@ -59,6 +59,8 @@ def simulate(
       problem: the system and its costs.
       feedback: a Solution, a ``greedy_feedback``, or a function that returns the control, shape (m,). ``None`` if
         there is no control.
+        Where a Solution of a problem with a stopping cost and without noise says that one had better stop, V = ψ at
+        all nodes around, the path ends as in a target and pays ψ.
         A marched Solution must have been kept at enough times: at least ten over the duration. Its terminal cost,
         and that of any problem, is paid at the end of a path that lasts as long as the horizon.
       x0: the state at time 0, shape (n,).
@@ -284,7 +286,7 @@ def _close(
             for player, given in ((control, feedback), (opponent, disturbance))
         )
     control = None if problem.controls is None else as_partial(control)
-    return Loop(problem, control, as_partial(opponent), grid, bool(clamp))
+    return Loop(with_stops(problem, feedback), control, as_partial(opponent), grid, bool(clamp))
 
 
 def _is_marched(feedback: object) -> TypeGuard[GridFeedback]:

@@ -41,6 +41,7 @@ S = TypeVar("S", bound=Any)
 GROWTH = 1e6  # a residual that has grown by this factor over its smallest has diverged
 PATIENCE = 10  # steps without progress of a residual that is rounding
 ROUNDING = 64  # residuals below this many units in the last place of max|V| are rounding
+FEW = 4  # such units: steps by the fastest rate of all, as V alone takes them, are small at a slow node long before
 LOST = 4  # roundings of numbers of the size lift · max(factor, 1) in factor · V + shift
 
 
@@ -246,17 +247,31 @@ def judged(task: Any, value: Field, bound: ErrorBound, best: jax.Array, since: S
     rounding, tol = ROUNDING * jnp.finfo(value.dtype).eps * size, task.tol
     longest = task.method.patience(task.grid.whole)
     if to_the_end:  # a front moves V by a spacing times its slope a step, whatever the tolerance, past every node
-        tol = jnp.where(task.problem.discount > 0, tol, rounding)
+        tol = jnp.where(task.problem.discount > 0, tol, FEW / ROUNDING * rounding if task.bare else rounding)
         longest = max(longest, 100 + 4 * task.grid.whole.size)
     # a residual that is rounding has nowhere to go: ten steps tell, in place of the thousands of a slow climb
     patience = jnp.where(bound.residual <= rounding, PATIENCE, longest)
-    code = jnp.where(since >= patience, Status.STALLED, Status.RUNNING)
+    halted: Any = Status.STALLED
+    if to_the_end and task.bare:  # of many terms more than a few units may remain
+        halted = jnp.where((bound.residual <= rounding) & ~(task.problem.discount > 0), Status.CONVERGED, halted)
+    code = jnp.where(since >= patience, halted, Status.RUNNING)
     grew = bound.residual > GROWTH * jnp.maximum(best[1], rounding)
     bounded = jnp.isfinite(best[0]) & (bound.error <= GROWTH * best[0])
     grew &= ~bounded  # a better policy may leave more than one that stops at once
     code = jnp.where(grew, Status.DIVERGED, code)
     code = jnp.where(bound.error <= tol, Status.CONVERGED, code)
     return jnp.where(finite, code, Status.NONFINITE).astype(jnp.int32)
+
+
+def at_rest(task: Any, state: Any, moved: Scalar, code: Scalar) -> Scalar:
+    """The status after a step; a tube that moved nowhere is at its end, whatever a slow node's residual is.
+
+    That residual is over the node's own rate, and the step over the fastest one: less than the last place of V.
+    """
+    if not (task.constrained and task.method.relaxes and task.certificate in TO_THE_END):
+        return code
+    ends = (moved == 0) & (state.step >= 0) & (code != Status.NONFINITE) & ~(task.problem.discount > 0)
+    return jnp.where(ends, int(Status.CONVERGED), code).astype(code.dtype)
 
 
 def _size(grid: Grid, value: Field, counted: Mask) -> Scalar:

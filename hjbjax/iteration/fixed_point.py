@@ -218,7 +218,7 @@ def advance(task: Task, state: State, start: Scalar) -> State:
     policy, fastest, bound = _look(task, value, state.policy, moved=moved, first=state.step < 0)
     bound = dataclasses.replace(bound, error=jnp.where(_lacks_measure(task, state), jnp.inf, bound.error))
     since = certificates.steps_since_best(state, bound)
-    code = certificates.judged(task, value, bound, state.best, since)
+    code = certificates.at_rest(task, state, moved, certificates.judged(task, value, bound, state.best, since))
     return certificates.booked(state, start, bound, code, since, value=value, policy=policy, fastest=fastest)
 
 
@@ -230,6 +230,7 @@ def _relaxed(task: Task, state: State, start: Scalar) -> State:
     # of the next value it would want an array of its own
     code = certificates.judged(task, state.value, bound, state.best, since)
     after = jnp.where(state.step < 0, value, task.impose(value + step))
+    code = certificates.at_rest(task, state, task.grid.largest(jnp.abs(after - state.value)), code)
     return certificates.booked(state, start, bound, code, since, value=after)
 
 

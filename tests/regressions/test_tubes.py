@@ -158,3 +158,23 @@ def test_coarser_grids_lead_to_no_other_fixed_point(inner):
     grid = hjb.Grid([-1.0], [1.0], (40,))
     nested, alone = (hjb.solve(reach, grid, method=each) for each in (hjb.Nested(inner, coarsest=5), None))
     np.testing.assert_allclose(nested.value, alone.value, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("method", [None, hjb.ValueIteration(policy=False)])
+@pytest.mark.parametrize(("dtype", "close"), [("float64", 1e-9), ("float32", 2e-3)])
+def test_a_tube_ends_where_nothing_moves_and_not_before(method, dtype, close):
+    """At a node of slow drift a step is less than the last place of V: STALLED was said of the right value.
+
+    V alone knows the step by the fastest rate, not the residual of the slow node, and ended .03 too early in float32.
+    """
+
+    def drift(x, u, d):
+        return 0.7095693481 * jnp.sin(2 * x) + 0.8158293698 * u + 0.2286814718 * d
+
+    problem = hjb.reach(
+        drift, hjb.Finite([[-1.0], [0.0], [1.0]]), lambda x: jnp.abs(x[0] + 0.2900834182) - 0.3,
+        disturbances=hjb.Finite([[-1.0], [1.0]]),
+    )  # fmt: skip
+    found = hjb.solve(problem, hjb.Grid([-1.0], [1.2], (61,)), scheme=hjb.Upwind(), method=method, dtype=dtype)
+    assert found.status.name == "CONVERGED"
+    assert found.value[14] == pytest.approx(-0.286750085349, abs=close)  # by value iteration in NumPy

@@ -111,6 +111,8 @@ def with_grid_error(solution: Solution, settled: Settled, coarser: tuple[Grid, n
             gain = nested_grids.apart(value, np.asarray(origin.state.value))
             order = nested_grids.order_of_slopes(solution.grid, coarse, change, gain, solution.policy)
         found = nested_grids.estimated_error(solution.grid, coarse, change, order)
+        if origin is not None and nested_grids.is_a_point(np.asarray(settled.task.obstacles.ended)):
+            found = np.maximum(nested_grids.estimated_error(solution.grid, coarse, change, nested_grids.BROKEN), gain)
     elif origin is not None and settled.task.problem.noise is None:
         with np.errstate(invalid="ignore"):
             found = np.abs(value - np.asarray(origin.state.value))

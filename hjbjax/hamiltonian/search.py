@@ -22,6 +22,7 @@ Best: TypeAlias = tuple[jax.Array, Action, list]  # the best value so far, the a
 
 UNROLL = 80  # evaluations written out in one fused kernel; beyond that XLA's compile time grows and its speed falls
 CHUNK = 20  # evaluations in one step of the scan that takes over
+TURNED = 2  # rounds of each length in turned directions
 REFINEMENTS = 24  # halvings of the sample spacing: 2⁻²⁴ of it is below the rounding of float32
 
 
@@ -113,7 +114,7 @@ def refine(
     *,
     weight: int = 1,
 ) -> Best:
-    """Pattern search around the best sample: one input at a time, up and down, halving the step.
+    """Pattern search around the best sample: one input at a time and in turned directions, halving the step.
 
     Args:
       objective: see the module.
@@ -129,25 +130,32 @@ def refine(
     # the carry of a loop has fixed shapes: actions that are one number for all nodes become arrays first
     best = jax.tree.map(lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, dtype), shape), (value, action, extra))
 
-    def one_round(k, best):
-        scale = jnp.asarray(0.5, dtype) ** (k + 1)  # from half the distance between two samples downwards
-        for j, width in enumerate(spacing):
-            for direction in (1, -1):
-                moved = list(best[1])
-                moved[j] = moved[j] + direction * scale * width
-                best = best_of(objective, [project(moved)], sign, best)
-        return best
+    table = jnp.asarray(_moves(len(action)), dtype)
 
-    def one_move(k, best):
-        turn = k // moves  # k counts inputs and directions within a round: 2j upwards, 2j + 1 downwards
-        length = (1 - 2 * (k % 2)) * jnp.asarray(0.5, dtype) ** (turn + 1)
-        moved = [
-            entry + jnp.where(k % moves // 2 == j, length * width, 0)
-            for j, (entry, width) in enumerate(zip(best[1], spacing, strict=True))
-        ]
+    def one_move(move, best):
+        moved = [entry + part * width for entry, part, width in zip(best[1], move, spacing, strict=True)]
         return best_of(objective, [project(moved)], sign, best)
 
-    moves = 2 * len(action)
+    def one_round(k, best):
+        for place in range(table.shape[1]):
+            best = one_move(table[k, place], best)
+        return best
+
+    rounds, moves, inputs = table.shape
     if weight * moves <= CHUNK:
-        return jax.lax.fori_loop(0, REFINEMENTS, one_round, best)
-    return jax.lax.fori_loop(0, REFINEMENTS * moves, one_move, best)
+        return jax.lax.fori_loop(0, rounds, one_round, best)
+    return jax.lax.fori_loop(0, rounds * moves, lambda k, best: one_move(table.reshape(-1, inputs)[k], best), best)
+
+
+def _moves(inputs: int) -> np.ndarray:
+    """The moves of every round, (rounds, moves, inputs), in distances between two samples, from half of one downwards.
+
+    One input at a time stops where a kink runs across several of them: turned directions find the way along it.
+    """
+    turns = np.random.default_rng(0).normal(size=(REFINEMENTS * TURNED, inputs, inputs))
+    directions = [np.eye(inputs)[None].repeat(REFINEMENTS, 0)[:, None]]
+    if inputs > 1:
+        directions.append(np.linalg.qr(turns)[0].reshape(REFINEMENTS, TURNED, inputs, inputs))
+    lengths = 0.5 ** np.arange(1, REFINEMENTS + 1)
+    ways = (lengths[:, None, None, None] * np.concatenate(directions, axis=1)).reshape(-1, inputs, inputs)
+    return np.stack([ways, -ways], axis=2).reshape(len(ways), 2 * inputs, inputs)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import settings
 
 os.environ["MPLBACKEND"] = "Agg"  # for this process and for the commands and notebooks that tests start
-os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"  # or the command finds in a user's folder what others compiled
+os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"  # or commands find in a user's folder what others compiled
 
 # Traced programs are millions of objects that stay: looking through them again and again finds nothing.
 gc.set_threshold(100_000, 20, 20)
@@ -24,15 +24,46 @@ MAPS = 20_000  # of the 65 530 that Linux allows a process; every compiled kerne
 # Two thirds of a run are XLA's: without its optimiser it takes half of the time, and without the emitters of fusions a
 # third. Those of old write a value anew in every block of a fusion: one that chooses among many actions at constrained
 # ends takes them time that doubles with every action. Such tests are marked ``emitters``, or a program asks for them
-# itself (``compiler_options``); who wants all tests with what users run says ``XLA_FLAGS= pytest``.
-QUICK = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
-os.environ.setdefault("XLA_FLAGS", QUICK)  # read when JAX starts to compute, here and in the processes that tests start
+# itself (``compiler_options``). Without the optimiser what computes for long takes up to seventy times as long: such
+# tests are marked ``optimised``. Who wants all tests with what users run says ``XLA_FLAGS= pytest``.
+QUICK = "--xla_cpu_use_fusion_emitters=false"
+HASTE = "jax_disable_most_optimizations"  # its variable is for the processes that tests start
+if os.environ.setdefault("XLA_FLAGS", QUICK) == QUICK:  # read when JAX starts to compute, here and in those processes
+    os.environ[HASTE.upper()] = "1"
+    jax.config.update(HASTE, True)
+
+
+def pytest_configure(config):
+    """Keep compiled programs, by what they are compiled from, beside pytest's own notes; ``--cache-clear`` drops them.
+
+    Workers find what the other one compiled, and the next run what this one did, which takes half of the time.
+    """
+    if not hasattr(config, "cache"):
+        return
+    config.addinivalue_line("filterwarnings", "ignore:Error (reading|writing) persistent compilation cache:UserWarning")
+    jax.config.update("jax_compilation_cache_dir", str(config.cache.mkdir("compiled")))
+    jax.config.update("jax_enable_compilation_cache", True)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
 def pytest_runtest_setup(item):
     """Skip what the old emitters do not come to an end with."""
     if item.get_closest_marker("emitters") and os.environ["XLA_FLAGS"] == QUICK:
         pytest.skip("takes the old emitters too long: XLA_FLAGS= pytest -m emitters")
+
+
+@pytest.fixture(autouse=True)
+def _optimised(request, monkeypatch):
+    """XLA's optimiser for the tests marked ``optimised`` and for the processes that they start."""
+    if request.node.get_closest_marker("optimised") is None:
+        yield
+        return
+    monkeypatch.delenv(HASTE.upper(), raising=False)
+    before = jax.config.read(HASTE)
+    jax.config.update(HASTE, False)
+    yield
+    jax.config.update(HASTE, before)
 
 
 @pytest.fixture(autouse=True, scope="module")

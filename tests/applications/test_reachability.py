@@ -153,6 +153,7 @@ def air3d_grid(shape):
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 def test_air3d_never_leaves_the_range_of_the_distance():
     grid = air3d_grid((27, 21, 24))
     solution = hjb.march(AIR3D, grid, 1.0, times=[0.0, 1.0], scheme=hjb.Upwind(split=True))
@@ -162,6 +163,7 @@ def test_air3d_never_leaves_the_range_of_the_distance():
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 def test_air3d_has_the_published_fraction():
     """hj_reachability 0.7.0 "very_high" finds .25941 of the nodes unsafe."""
     value = hjb.march(AIR3D, air3d_grid((51, 40, 50)), 2.8, scheme=hjb.Weno5()).value[0]
@@ -180,6 +182,7 @@ def cylinder(x):
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 def test_the_tube_of_the_dubins_car():
     """hj_reachability finds .1298 at "very_high"; straight ahead the value is exactly −1."""
     grid = hjb.Grid([-5.0, -5.0, -np.pi], [5.0, 5.0, np.pi], (41, 41, 41), (False, False, True))
@@ -210,6 +213,7 @@ def halves(x):
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 def test_two_integrators_apart_are_two_integrators():
     """The set of two decoupled systems at one time is the product of theirs: V₄ = max(V₂, V₂)."""
     lo, hi = [-4.0, -3.0], [4.0, 3.0]

@@ -274,6 +274,7 @@ def test_a_key_is_one_brownian_path_whatever_the_steps():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [pytest.param("additive", marks=pytest.mark.slow), "multiplicative"])
+@pytest.mark.optimised
 def test_variance_of_an_ornstein_uhlenbeck_path_over_4000_keys(kind):
     """dx = −θx dt + σ dw, or σx dw: eight states a path, so that 3 % are four standard deviations of the estimate."""
     theta, sigma = 0.25, 0.5
@@ -310,6 +311,7 @@ BROWNIAN = Problem(lambda x, u: 0 * x, lambda x, u: jnp.ones(()), noise=1.0, tar
     ("steps", "count"),
     [(50, 1000), pytest.param(50, 4000, marks=pytest.mark.slow), pytest.param(200, 2000, marks=pytest.mark.slow)],
 )
+@pytest.mark.optimised
 def test_a_brownian_motion_meets_its_target_on_time(steps, count):
     """E τ = 1 and E τ² = 5/3 from 0 to |x| = 1; seen at the ends of steps alone E τ is 1.14 and 1.07.
 
@@ -326,6 +328,7 @@ def test_a_brownian_motion_meets_its_target_on_time(steps, count):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["additive", "function"])
+@pytest.mark.optimised
 def test_an_ornstein_uhlenbeck_process_leaves_its_interval_on_time(kind):
     """dx = −θx dt + σ dw from 0 to |x| = 1: E τ = (2/σ²)∫₀¹ e^{θy²/σ²} ∫₀^y e^{−θz²/σ²} dz dy."""
     theta, sigma = 1.0, 1.0
@@ -343,6 +346,7 @@ def test_an_ornstein_uhlenbeck_process_leaves_its_interval_on_time(kind):
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 def test_a_brownian_motion_in_the_plane_leaves_the_disc_on_time_and_on_its_edge():
     """E τ = (1 − |x|²)/2 in the disc; E of the exit cost x₁² + x₁ is harmonic: ½ + x₁ + ½(x₁² − x₂²) at the start."""
     start = [0.3, -0.4]

@@ -1,5 +1,6 @@
 """Wonham's filter and closed loops of hidden chains: Bayes by enumeration, laws, what control of a belief is worth."""
 
+import functools
 import itertools
 
 import jax
@@ -199,15 +200,22 @@ def worn_price(u):
     return jnp.array([0.0, 0.4, 1.5]) + u[0] * jnp.array([1.0, 1.0, 0.2])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("prior", [[0.8, 0.1, 0.1], [0.2, 0.3, 0.5]])
-def test_three_states_cost_in_simulation_what_the_value_in_logarithms_promises(prior):
-    """Ito's terms and all: paths of the chain and of its filter know nothing of the coordinates."""
+@functools.cache
+def worn_machine():
+    """The problem of the beliefs about it, and its solution."""
     question = belief_problem(
         worn, [1.0, 0.4, 0.0], worn_price, controls=hjb.Finite([[0.0], [2.0]]), discount=0.5, measurement_noise=0.7,
         nodes=161,
     )  # fmt: skip
-    solution = hjb.solve(question.problem, question.grid, tol=1e-5, scheme=hjb.Upwind())
+    return question, hjb.solve(question.problem, question.grid, tol=1e-5, scheme=hjb.Upwind())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("prior", [[0.8, 0.1, 0.1], [0.2, 0.3, 0.5]])
+@pytest.mark.optimised
+def test_three_states_cost_in_simulation_what_the_value_in_logarithms_promises(prior):
+    """Ito's terms and all: paths of the chain and of its filter know nothing of the coordinates."""
+    question, solution = worn_machine()
 
     def of_belief(belief):
         return solution.control_at(question.coordinates.from_belief(belief), clamp=True)

@@ -73,6 +73,7 @@ def distance(x):
 @pytest.mark.filterwarnings("ignore:the optimal drift leaves")
 @pytest.mark.parametrize("speed", [1.0, -1.0])
 @pytest.mark.slow
+@pytest.mark.optimised
 def test_the_tubes_of_example_41(speed):
     """The least distance to the origin on the way, forwards and backwards in time.
 

@@ -41,7 +41,12 @@ def test_each_figure_of_the_chapter_has_its_heading():
     assert sorted(headings) == list(range(3, 17))
 
 
+HEAVY = {"reachability": pytest.mark.optimised}  # Air3D: ten times as long without XLA's optimiser
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", [pytest.param(path, id=path.stem, marks=HEAVY.get(path.stem, ())) for path in NOTEBOOKS]
+)
 def test_a_notebook_runs(path, tmp_path, monkeypatch):
     check(run(path, tmp_path, monkeypatch))

@@ -121,6 +121,7 @@ def test_manufactured_problem_on_a_line_is_second_order():
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 def test_manufactured_problem_in_space_is_second_order():
     """On the inner half. From 21 to 41 nodes the limiter still shows: the order is 1.55 there, 1.86 from 61 to 81."""
     counts = (41, 61, 81)

@@ -5,6 +5,7 @@ solves the Hamiltonian system from many first guesses, which aim at the upright 
 """
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -62,6 +63,7 @@ class Hamiltonian:
             if np.max(np.abs(path[:, -1])) < 0.5:
                 yield times, np.vstack([path, matrix @ path, np.zeros_like(times)])
 
+    @functools.cache  # noqa: B019, of two oracles which stay
     def extremals(self, state):
         """(value, fastest |ω|) of the local extremals from a state, cheapest first."""
         from scipy.integrate import solve_bvp
@@ -92,11 +94,12 @@ def test_the_oracle_agrees_with_riccati_near_upright(name):
     as_printed, oracle = PENDULUMS[name]
     near = zoo.pendulum_near_upright(as_printed=as_printed)
     state = np.array([0.04, -0.02])
-    assert oracle.extremals(state)[0][0] == pytest.approx(float(near.value(state)), rel=2e-3)
+    assert oracle.extremals(tuple(state))[0][0] == pytest.approx(float(near.value(state)), rel=2e-3)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PENDULUMS)
+@pytest.mark.optimised
 def test_value_of_the_best_extremal(name):
     as_printed, oracle = PENDULUMS[name]
     problem, grid = zoo.pendulum(as_printed=as_printed, shape=(400, 401))
@@ -109,6 +112,7 @@ def test_value_of_the_best_extremal(name):
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 def test_going_round_is_cheaper():
     """From 45° at rest to let the pendulum fall costs less than to lift it: the value is not that of the direct way."""
     ways = PENDULUMS["gain 1/m"][1].extremals((np.pi / 4, 0.0))
@@ -123,6 +127,7 @@ def test_going_round_is_cheaper():
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 def test_the_main_job_is_near_the_truth_and_says_how_near():
     problem, grid = zoo.pendulum()
     solution, oracle = hjb.solve(problem, grid), PENDULUMS["gain 1/m"][1]

@@ -254,6 +254,7 @@ def test_a_quadrotor_hovers_falls_and_leans():
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 def test_a_quadrotor_has_its_mirror_image_and_six_dimensions_fit():
     """A tube on 8^6 nodes in single precision, the value alone: even under x, θ, ẋ, θ̇ → −x, −θ, −ẋ, −θ̇."""
     quadrotor = zoo.PlanarQuadrotor()

@@ -33,20 +33,6 @@ if os.environ.setdefault("XLA_FLAGS", QUICK) == QUICK:  # read when JAX starts t
     jax.config.update(HASTE, True)
 
 
-def pytest_configure(config):
-    """Keep compiled programs, by what they are compiled from, beside pytest's own notes; ``--cache-clear`` drops them.
-
-    Workers find what the other one compiled, and the next run what this one did, which takes half of the time.
-    """
-    if not hasattr(config, "cache"):
-        return
-    config.addinivalue_line("filterwarnings", "ignore:Error (reading|writing) persistent compilation cache:UserWarning")
-    jax.config.update("jax_compilation_cache_dir", str(config.cache.mkdir("compiled")))
-    jax.config.update("jax_enable_compilation_cache", True)
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-
-
 def pytest_runtest_setup(item):
     """Skip what the old emitters do not come to an end with."""
     if item.get_closest_marker("emitters") and os.environ["XLA_FLAGS"] == QUICK:

@@ -9,7 +9,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import kept_programs
 import pytest
 
 from hjbjax.cli import launch
@@ -37,7 +36,7 @@ def found_by(names):
     more = "--xla_force_host_platform_device_count=8 --xla_cpu_use_fusion_emitters=true"
     flags = f"{os.environ.get('XLA_FLAGS', '')} {more}"
     path = f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
-    environment = {**os.environ, **kept_programs.variables(), "XLA_FLAGS": flags, "PYTHONPATH": path}
+    environment = {**os.environ, "XLA_FLAGS": flags, "PYTHONPATH": path}
     command = [sys.executable, str(SCRIPT), *names]
     answer = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     assert answer.returncode == 0, answer.stderr

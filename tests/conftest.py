@@ -2,6 +2,7 @@
 
 import gc
 import os
+import sys
 from pathlib import Path
 
 import jax
@@ -31,6 +32,21 @@ HASTE = "jax_disable_most_optimizations"  # its variable is for the processes th
 if os.environ.setdefault("XLA_FLAGS", QUICK) == QUICK:  # read when JAX starts to compute, here and in those processes
     os.environ[HASTE.upper()] = "1"
     jax.config.update(HASTE, True)
+
+
+class Figures:
+    """No test and no doctest finds the axes of another one, be it on a logarithmic scale."""
+
+    @staticmethod
+    def pytest_runtest_teardown():
+        """Close what was drawn."""
+        if (pyplot := sys.modules.get("matplotlib.pyplot")) is not None:
+            pyplot.close("all")
+
+
+def pytest_configure(config):
+    """Doctests lie outside of this folder, whose own hooks they do not see."""
+    config.pluginmanager.register(Figures())
 
 
 def pytest_runtest_setup(item):

@@ -53,6 +53,7 @@ def test_the_chain_is_first_order_and_the_limited_scheme_second(plain):
     assert np.all(limited.errors < 0.1 * plain.errors)
 
 
+@pytest.mark.slow
 def test_what_a_study_says_of_its_solutions(plain):
     off = np.abs(plain.solutions[-1].value - [float(EXACT(x)) for x in plain.grids[-1].nodes()])
     assert plain.errors[-1] == pytest.approx(off.max(), rel=1e-4)  # EXACT is float32 outside of enable_x64

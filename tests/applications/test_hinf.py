@@ -420,6 +420,7 @@ def test_the_energies_are_those_of_simulate(top, energies):
     np.testing.assert_allclose(energies.ends[0], path.states[-1], atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "error", "reason"),
     [

@@ -483,6 +483,7 @@ def test_no_file_for_a_control_that_is_not_there(solver, folder):
     assert sorted(os.listdir("brownian-exit")) == ["solution.npz", "trajectory.png", "value.png"]
 
 
+@pytest.mark.slow
 def test_two_inputs_are_drawn_side_by_side(solver, folder):
     from matplotlib.image import imread
 

@@ -167,6 +167,7 @@ def test_heat_between_two_walls(scheme):
 # --- the chain and the Hamiltonian at a wall ---
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::hjbjax.SolveWarning")
 @pytest.mark.parametrize("scheme", [hjb.Limited(), hjb.Eno2(), hjb.Weno5()])
 def test_a_sliver_between_a_target_and_a_wall_stays_in_the_range_of_its_data(scheme):

@@ -24,6 +24,7 @@ def without_target(problem):
     return dataclasses.replace(problem, target=None, exit_cost=None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ends", [{"horizon": 1.0}, {"horizon": 1.0, "terminal": [1.0, 0.0]}], ids=["cost", "state"])
 def test_a_path_through_the_target_is_no_answer(ends):
     """The target costs 100, and a path through it would have paid them."""
@@ -151,6 +152,7 @@ def test_an_infinite_horizon_in_a_small_unit():
     assert hjb.pontryagin(problem, [1e-9, 0.0]).cost == pytest.approx(np.sqrt(3) * 1e-18, rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "units", [(1.0, 1.0, 1.0, 1.0), (1e6, 1e-6, 1.0, 1.0), (1e-6, 1e6, 1e3, 1e6), (1.0, 1.0, 1e-6, 1e-9)], ids=str
 )

@@ -31,6 +31,7 @@ def test_to_a_target_without_a_guess_of_the_costate(start, unit):
     assert abs(extremal.states[-1, 0]) < 1e-6 * unit
 
 
+@pytest.mark.slow
 def test_to_a_target_that_no_input_reaches_directly():
     """Over a length of 1 from rest with 1 + u²: u falls linearly to 0, p₁ = ν, T⁴ = 9, at the cost 4T/3."""
     problem = hjb.Problem(integrator, lambda x, u: 1 + u @ u, hjb.Box([-9.0], [9.0]), target=lambda x: x[0])

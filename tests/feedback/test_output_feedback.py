@@ -363,6 +363,7 @@ def test_the_observer_sees_the_record_and_nothing_else():
     np.testing.assert_allclose(path.information.density, told.density[-1], rtol=1e-7, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_solution_is_asked_at_the_estimate():
     """Certainty equivalence by a Solution and by hand; an estimate in the target keeps the control before."""
     problem = Problem(lambda x, u: u, lambda x, u: 1.0, Box([-1.0], [1.0]), target=lambda x: jnp.abs(x[0]) - 0.2)

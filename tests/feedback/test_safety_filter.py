@@ -240,6 +240,7 @@ def test_traced_use_wants_a_margin(tube):
         jax.jit(lambda tube: hjb.least_restrictive(tube, full_throttle)(jnp.zeros(2)))(tube)
 
 
+@pytest.mark.slow
 def test_a_marched_filter_wants_the_time(tube):
     marched = hjb.march(AVOID, GRID, 0.1, times=[0.0, 0.1], scheme=hjb.Upwind(split=True))
     guarded = hjb.least_restrictive(marched, full_throttle)

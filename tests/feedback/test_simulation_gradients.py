@@ -27,6 +27,7 @@ def differences(function, at, step=1e-4):
     return np.array([(function(at + e) - function(at - e)) / (2 * step) for e in step * np.eye(len(at))])
 
 
+@pytest.mark.slow
 def test_plant_start_and_feedback_in_both_modes():
     with jax.enable_x64(True):
         backward, forward = (np.asarray(jax.jit(mode(cost))(jnp.asarray(AT))) for mode in (jax.grad, jax.jacfwd))

@@ -18,6 +18,7 @@ def stopped(**parts):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("greedy", [False, True])
 def test_a_path_stops_where_v_is_the_price(greedy):
     """At once in a valley, on a slope after the way to where going on no longer pays: it ran on, and paid for that."""
@@ -32,6 +33,7 @@ def test_a_path_stops_where_v_is_the_price(greedy):
     assert later.cost == pytest.approx(later.promised, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_a_target_keeps_its_own_price():
     """A target at the right end is free; from there on V is the way to it or the price of stopping."""
     problem = stopped(target=lambda x: 1.0 - x[0], exit_cost=-0.4)
@@ -42,6 +44,7 @@ def test_a_target_keeps_its_own_price():
         assert path.cost == pytest.approx(path.promised, abs=5e-3)
 
 
+@pytest.mark.slow
 def test_a_rollout_stops_as_well():
     problem = stopped()
     solution = hjb.solve(problem, GRID)

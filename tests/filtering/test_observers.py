@@ -221,6 +221,7 @@ def test_correlated_sensors_count_by_their_matrix():
 GAIN = np.array([[4.0], [3.0]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dt", [0.02, 0.5])
 def test_the_error_of_a_luenberger_observer_falls_as_its_matrix_says(dt):
     """The record of a plant at rest, y = C x* with A x* + B u = 0: x̂ − x* = e^{(A − GC)t}(x̂₀ − x*), at any dt."""

@@ -119,6 +119,7 @@ def test_controls_of_every_kind_of_set_are_judged_in_the_units_of_the_set():
         assert holds(finite, u).tolist() == [True, True, False]
 
 
+@pytest.mark.slow
 def test_absurd_steps_end():
     with pytest.raises(ValueError, match="dt = 1e\\+30 asks for over 100000 inner steps"):
         worst(dt=1e30)
@@ -141,6 +142,7 @@ def test_p_that_is_no_number_has_no_worst_state():
         F.sup_pairing(np.zeros(21) + 1j, 0.0, GRID)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", ["zakai", "robust_filter"])
 def test_reverse_derivatives_are_those_of_finite_differences(which):
     record = np.array([[0.1], [-0.05], [0.2]])

@@ -209,6 +209,7 @@ def test_a_flat_function_is_told_from_one_that_is_zero(level, positive):
     assert report.positive == positive
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("region", "equilibrium", "words"),
     [

@@ -128,6 +128,7 @@ def shared(x, u, d):
     return u + d
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the optimal drift leaves")  # where it is cheap to go left
 @pytest.mark.parametrize(
     "cost",

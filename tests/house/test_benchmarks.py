@@ -366,6 +366,7 @@ def test_marches_of_both_problems_with_every_scheme(tmp_path):
 # --- memory ---
 
 
+@pytest.mark.slow
 def test_what_is_told_of_the_memory_is_within_a_fifth_of_the_recorded_peaks():
     rows = json.loads((mutants.ROOT / "benchmarks" / "results" / "memory.json").read_text())
     assert {(row["question"], row["run"]) for row in rows} == {case[:2] for case in memory.CASES}

@@ -312,6 +312,7 @@ def _fastest(problem, grid):
     return fastest_rate(upwind(problem, grid))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("isaacs", ["upper", "lower"])
 @given(seed=SEEDS)
 @settings(max_examples=5)

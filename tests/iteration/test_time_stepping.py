@@ -74,6 +74,7 @@ def test_a_drift_that_switches_on_within_a_step_is_not_outrun(scheme, stages):
     assert np.max(np.abs(found)) <= 1 + (0 if isinstance(scheme, hjb.Upwind) else 0.02)
 
 
+@pytest.mark.slow
 def test_value_iteration_does_not_outrun_a_fast_action_between_the_samples():
     problem = hjb.Problem(pulled, square, UNIT, discount=1.0)
     by_policy = hjb.solve(problem, LINE, tol=1e-6, scheme=hjb.Upwind())

@@ -55,6 +55,7 @@ def value_iteration(split, isaacs="upper", noise=0.0):
     return value
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("isaacs", ["upper", "lower"])
 @pytest.mark.parametrize("split", [False, True])
 @pytest.mark.parametrize("method", [hjb.ValueIteration(), hjb.PolicyIteration(), hjb.PolicyIteration(hjb.Direct())])

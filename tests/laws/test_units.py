@@ -125,6 +125,7 @@ def test_a_solve_knows_no_units(name):
             assert found.error <= 1e-6 * cost or known.error > 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", some(["discounted", "minimum time", "rest", "tube", "game"], ["minimum time"]))
 def test_nor_does_a_second_order_solve_or_a_batch(name):
     problems = [asked(name, Units(*units)) for units in [(1.0, 1.0), UNITS[0]]]

@@ -295,6 +295,7 @@ def test_states_that_cannot_reach_the_target():
     assert np.isfinite(solution.error)
 
 
+@pytest.mark.slow
 def test_discounted_states_that_never_arrive_keep_their_value():
     problem = hjb.Problem(drifting_right, pay_time, hjb.Box([-1.0], [1.0]), target=in_the_middle, discount=0.5)
     grid = hjb.Grid([-1.0], [1.0], (21,))

@@ -581,6 +581,7 @@ def test_an_interrupted_search_for_a_level_keeps_its_bracket_and_its_trials():
     assert "interrupted" in str(level)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("last", ["_bisect", "comes_back"])
 def test_ctrl_c_after_the_last_trial_is_not_lost(monkeypatch, last):
     usual = getattr(hinf, last)
@@ -850,6 +851,7 @@ def test_times_that_are_one_number_in_single_precision():
         hjb.march(question(discount=0.0), GRID, 1.0, times=[0.0, 0.5, 0.5 + 1e-9], dtype="float32")
 
 
+@pytest.mark.slow
 def test_an_interrupt_while_lanes_are_taken_out_keeps_them_all(monkeypatch):
     problems = [question(discount=beta) for beta in (0.02, 3.0, 0.5, 20.0, 1.0)]
     options = {"method": hjb.PolicyIteration(hjb.Sweeps(1)), "tol": 1e-9, "throw": False}

@@ -71,6 +71,7 @@ def traced(make, which):
         return np.asarray(jax.vmap(value)(jnp.array([0.4, 0.5]))[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_every_path_to_a_tube_starts_from_its_constraint(name):
     make, exact = CASES[name]
@@ -160,6 +161,7 @@ def test_coarser_grids_lead_to_no_other_fixed_point(inner):
     np.testing.assert_allclose(nested.value, alone.value, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [None, hjb.ValueIteration(policy=False)])
 @pytest.mark.parametrize(("dtype", "close"), [("float64", 1e-9), ("float32", 2e-3)])
 def test_a_tube_ends_where_nothing_moves_and_not_before(method, dtype, close):

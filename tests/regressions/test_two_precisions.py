@@ -35,6 +35,7 @@ def asked():
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wide", [True, False])
 @pytest.mark.parametrize("name", asked())
 def test_a_function_is_asked_in_both_by_turns(name, wide):
@@ -49,6 +50,7 @@ def test_a_function_is_asked_in_both_by_turns(name, wide):
             np.testing.assert_allclose(plain, wanted, rtol=1e-12 if bits else 2e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("transformed", [jax.jit, jax.grad], ids=["jit", "grad"])
 def test_numbers_of_64_bits_in_a_closure_may_be_traced_in_a_solve_of_32(transformed):
     """They are no leaves of the problem that could be cast: this left from the loop as a TypeError of JAX."""

@@ -141,6 +141,7 @@ def test_a_march_is_resumed_to_the_same_bits(method, tmp_path, monkeypatch):
         hjb.march(problem, grid, 2.0, checkpoint=path, resume=True, **options | {"times": times})
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::hjbjax.SolveWarning")
 def test_a_batch_is_resumed_lane_by_lane_to_the_same_bits(tmp_path, monkeypatch):
     grid = hjb.Grid([-3.0, -3.0], [3.0, 3.0], (21, 21))

@@ -68,6 +68,7 @@ def test_away_from_a_kink_and_beside_infinity():
     assert np.isnan(walled.costate_at([0.8])[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
 @pytest.mark.parametrize("grid", [PLAIN, STRETCHED], ids=["plain", "stretched"])
 def test_on_a_node_the_second_derivative_is_that_beside_it(grid, derivative):

@@ -53,6 +53,7 @@ def race(folder, number, barrier, answers):
     answers.put((number, won))
 
 
+@pytest.mark.slow
 def test_of_two_writers_without_force_one_succeeds(tmp_path):
     context = multiprocessing.get_context("spawn")
     barrier, answers = context.Barrier(2), context.Queue()

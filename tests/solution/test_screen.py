@@ -65,6 +65,7 @@ def test_an_encoding_that_nobody_knows(monkeypatch):
     assert "β" in str(solution(stats=WORDS))
 
 
+@pytest.mark.slow
 def test_other_results_on_a_terminal_without_greek(terminal):
     path = hjb.simulate(hjb.Problem(lambda x, u: u - x, controls=hjb.Box([-1.0], [1.0])), lambda x: 0 * x, [1.0], 1.0)
     object.__setattr__(path, "message", "x − 1 ≤ 2")

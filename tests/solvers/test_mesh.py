@@ -68,6 +68,7 @@ def slow_if_dear(names):
     return [pytest.param(name, marks=pytest.mark.slow) if name in DEAR else name for name in names]
 
 
+@pytest.mark.slow
 def test_stencils(found):
     """All that is read of other nodes is read alike across the seams between parts, and all reductions are exact."""
     assert len(found) == 36

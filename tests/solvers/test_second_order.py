@@ -156,6 +156,7 @@ def test_where_the_second_order_does_not_converge_the_monotone_answer_stands(fai
         hjb.solve(problem, grid, scheme=hjb.Limited())
 
 
+@pytest.mark.slow
 def test_a_limit_that_only_the_first_order_keeps_to():
     problem, grid = zoo.smooth(shape=(25, 25))
     first = hjb.solve(problem, grid, scheme=hjb.Upwind(subcell=True), tol=1e-9)
@@ -228,6 +229,7 @@ def test_lanes_are_solves():
         np.testing.assert_allclose(found.grid_error, alone.grid_error, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_lanes_with_enough_noise_keep_their_certificates():
     grid = hjb.Grid([-1.0], [1.0], (41,))
     loud, quiet = hjb.solve_batch([line(noise=0.5), line(noise=0.05)], grid)

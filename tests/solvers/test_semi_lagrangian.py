@@ -243,6 +243,7 @@ def test_double_integrator_has_a_fifth_of_the_error_of_the_chain(which):
     assert solution.error <= 1e-4
 
 
+@pytest.mark.slow
 def test_double_integrator_switches_within_two_cells():
     assert furthest_miss(integrated("held", hjb.SemiLagrangian())) <= 2
     assert furthest_miss(integrated("held", PLAIN)) > 5
@@ -349,6 +350,7 @@ def test_memory_is_told_before_anything_is_compiled():
         hjb.solve(*zoo.eikonal(shape=(101, 101)), scheme=hjb.SemiLagrangian(), max_memory=10_000_000)
 
 
+@pytest.mark.slow
 def test_a_solution_says_what_it_is_and_goes_through_files(tmp_path):
     solution = hjb.solve(rest(), LINE, scheme=hjb.SemiLagrangian(cells=3))
     assert "SemiLagrangian(cells=3" in str(solution)

@@ -77,6 +77,7 @@ def test_the_value_is_that_of_a_solve_with_its_policy(name):
         assert found.bounds is None
 
 
+@pytest.mark.slow
 def test_every_bound_on_the_way_holds():
     problem = QUESTIONS["stopping"]
     exact = hjb.solve(problem, PLANE, scheme=hjb.Upwind(), tol=1e-10).value
@@ -88,6 +89,7 @@ def test_every_bound_on_the_way_holds():
         np.testing.assert_allclose(found.value, known.value, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["reach", "exit", "noise"])
 @pytest.mark.parametrize("scheme", [hjb.Upwind(split=True), hjb.Limited(split=True)], ids=lambda s: type(s).__name__)
 def test_a_march_without_policies_comes_to_the_same_values(name, scheme):
@@ -99,6 +101,7 @@ def test_a_march_without_policies_comes_to_the_same_values(name, scheme):
     assert found.steps == known.steps
 
 
+@pytest.mark.slow
 def test_what_comes_of_it_is_saved_loaded_printed_and_controls(tmp_path):
     problem = QUESTIONS["discounted"]
     found = hjb.solve(problem, PLANE, method=BARE, tol=1e-6)

@@ -128,6 +128,7 @@ def asked(gain, weight, offset):
     return hjb.Problem(lambda x, u: gain * u - offset[0] * x, lambda x, u: weight * (x @ x + u @ u), UNIT, discount=1.0)
 
 
+@pytest.mark.slow
 def test_a_lambda_of_other_numbers_compiles_nothing_again():
     def ask(gain, weight, offset):
         problem = asked(gain, weight, np.array([offset, 9.0]))
@@ -205,6 +206,7 @@ def test_a_change_of_one_ulp_is_seen():
     assert closures.settled(hjb.Problem(car.drift, square, UNIT), 1).drift.func == first.drift.func
 
 
+@pytest.mark.slow
 def test_a_changed_object_is_seen_in_batches_marches_and_tubes():
     car = Car()
 
@@ -405,6 +407,7 @@ def test_known_numbers_beside_traced_ones_belong_to_the_program():
         assert jax.grad(total)(1.3, discount) == pytest.approx(0.36 / discount, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_a_closure_beside_a_leaf_and_inside_a_march():
     def marched(a):
         problem = hjb.Problem(jax.tree_util.Partial(lambda b, x, u: b * u, a), lambda x, u: a * (x @ x), UNIT)

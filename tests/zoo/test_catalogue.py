@@ -152,6 +152,7 @@ def test_the_drift_is_differentiable_in_a_parameter():
     assert np.all(np.isfinite(lengths))
 
 
+@pytest.mark.slow
 def test_importing_the_zoo_loads_nothing_heavy():
     code = "import sys, hjbjax.zoo; print([m for m in ('scipy.linalg', 'matplotlib', 'diffrax') if m in sys.modules])"
     # JAX itself may load parts of SciPy; the zoo must not add any.

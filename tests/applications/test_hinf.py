@@ -465,6 +465,7 @@ def test_random_disturbances_of_a_finite_set_are_refused():
     assert hjb.dissipation(problem, solution, [0.5], 2.0, random=0).supplied == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_dissipation_refuses_a_marched_solution(top):
     marched = dataclasses.replace(top.solution, times=np.array([0.0]))
     with pytest.raises(ValueError, match=r"wanted a stationary problem and solution"):

@@ -479,6 +479,7 @@ def test_a_grid_that_does_not_fit_is_refused_before_any_node_is_looked_at(ask, m
         ask(hjb.Problem(pushed, controls=UNIT), interval(41), above_one, max_memory=100, **options)
 
 
+@pytest.mark.slow
 def test_a_partial_answer_is_a_probability_too():
     problem = hjb.Problem(pushed, controls=UNIT, noise=SIGMA)
     with pytest.raises(hjb.SolveError, match=r"MAX_STEPS") as caught:

@@ -147,6 +147,7 @@ def test_lengths_in_any_unit(unit):
     assert quick.switches == pytest.approx([1], abs=1e-6)
 
 
+@pytest.mark.slow
 def test_an_infinite_horizon_in_a_small_unit():
     problem, _ = zoo.double_integrator_lq(bound=1e-8)
     assert hjb.pontryagin(problem, [1e-9, 0.0]).cost == pytest.approx(np.sqrt(3) * 1e-18, rel=1e-6)

@@ -139,6 +139,7 @@ def test_a_target_that_moves(speed):
     np.testing.assert_allclose(extremal.optimality_check.hamiltonian, -2 * best * speed, atol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("discount", [0.0, 1.0])
 @pytest.mark.parametrize("start", [(1.0, 0.0), (0.0, 1.0), (1.0, 1.0), (-0.7, -1.3)])
 def test_least_time_of_the_double_integrator(start, discount):

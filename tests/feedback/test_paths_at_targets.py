@@ -47,6 +47,7 @@ def to_disc(radius, side=1.0):
     return Problem(velocity, one, Ball(1.0, 2), target=disc.level), Solution(GRID, 0 * distance[..., 0], policy)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radius", [0.3, 0.25])
 def test_a_path_ends_on_the_boundary_of_a_disc_wherever_the_output_times_fall(radius):
     """Radius .3 on spacing .1: the boundary goes through nodes, and along an axis only they count."""

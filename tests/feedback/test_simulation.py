@@ -138,6 +138,7 @@ def exact_minimum_time_policy(grid):
     return -np.where(side == 0, np.sign(x[..., 1]), np.sign(side))[..., None]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{}, {"hold": 0.01}])
 def test_interpolated_bang_bang_feedback_takes_the_minimum_time(options):
     grid = Grid([-2.0, -2.0], [2.0, 2.0], (101, 101))

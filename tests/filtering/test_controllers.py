@@ -209,6 +209,7 @@ def test_where_both_together_do_not_hold_the_level_the_worst_case_runs_to_an_end
         assert abs(control.worst_case(jnp.asarray(-0.5 * (X - 0.1) ** 2))[0]) == 6.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("paths", [None, 2])
 def test_a_simulation_tells_that_the_worst_case_ran_to_an_end(paths):
     plant = hjb.Problem(lag, quadratic, WIDE)

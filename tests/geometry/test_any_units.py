@@ -28,6 +28,7 @@ def motor(inductance):
 # Ranks
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("inductance", [1e-3, 1e-6, 1e-9])
 def test_a_stiff_motor_is_controllable_at_every_depth(inductance):
     plant = motor(inductance)
@@ -173,6 +174,7 @@ def test_near_may_be_another_distance_for_every_state():
 # Lyapunov functions
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("widths", [[1.0, 1.0], [1e-5, 1.0], [1e6, 1e-6]])
 def test_a_definite_function_is_not_violated_by_its_units(widths):
     """V = Σ (x_i / w_i)²; and a small one that is positive, though by 1e-11 of V beside it."""

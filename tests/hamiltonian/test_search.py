@@ -40,6 +40,7 @@ def enumerated(parameters, points, sign, weight):
     return enumerate_actions(objective, points, sign, weight=weight)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [UNROLL, UNROLL + 21])
 @pytest.mark.parametrize("weight", [1, 7])
 @given(seed=SEEDS)

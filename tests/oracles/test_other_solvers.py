@@ -280,6 +280,7 @@ def in_the_middle(x):
     return jnp.abs(x[0]) - 0.05
 
 
+@pytest.mark.slow
 def test_states_that_cannot_reach_the_target():
     problem = hjb.Problem(drifting_right, pay_time, hjb.Box([-1.0], [1.0]), target=in_the_middle)
     grid = hjb.Grid([-1.0], [1.0], (21,))

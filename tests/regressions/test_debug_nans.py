@@ -61,6 +61,7 @@ def test_simulate_past_the_target():
     assert path.status.name == "TARGET"
 
 
+@pytest.mark.slow
 def test_a_nan_of_the_users_own_is_found():
     with pytest.raises(ValueError, match="cost.* is NaN or infinite at 10 of 21 nodes"):
         hjb.solve(hjb.Problem(drift, lambda x, u: jnp.sqrt(x[0]), U, discount=1.0), GRID, scheme=hjb.Upwind())

@@ -762,6 +762,7 @@ def test_an_interrupted_simulation_brings_the_path_so_far(monkeypatch):
     assert path.cost == pytest.approx(0.5 + (1 - np.exp(-1)) / 2, rel=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", [None, lambda x: x[0] - 0.3])
 def test_how_long_a_chunk_of_a_simulation_is_changes_no_bit(monkeypatch, target):
     problem = hjb.Problem(drift, None, hjb.Box([-9.0], [9.0]), target=target, running_max=lambda x: x[0] ** 2)

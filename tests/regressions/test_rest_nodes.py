@@ -171,6 +171,7 @@ def test_the_derivative_of_a_failed_solve_is_no_number():
         assert np.isnan(jax.grad(value)(10.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cost", [-1.0, 0.0])
 def test_a_traced_solve_certifies_nothing_where_nothing_is_paid(cost):
     """Without discount and a positive running cost there is no bound, and an error of zero least of all."""

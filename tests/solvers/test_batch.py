@@ -95,6 +95,7 @@ def test_rounds_that_fit_into_memory_change_nothing():
         assert same(left.value, right.value)
 
 
+@pytest.mark.slow
 def test_a_lane_that_runs_out_of_steps_is_named_and_the_others_are_whole():
     questions = [problem(1.0, 9.0), problem(1.0, 0.01)]
     steps = alone(questions[0]).steps

@@ -185,6 +185,7 @@ def test_without_a_coarser_grid_the_change_of_the_scheme_is_the_estimate():
     assert hjb.solve(line(noise=0.3), grid).grid_error is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parameters", [{}, {"noise": 0.5**0.5}])
 def test_an_odd_number_of_intervals_has_no_half(parameters):
     entry = zoo.catalogue["bang-bang"]

@@ -148,6 +148,7 @@ QUESTIONS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", QUESTIONS)
 def test_the_discrete_equation_is_that_of_an_independent_oracle(name):
     question, numbers, stop = QUESTIONS[name]

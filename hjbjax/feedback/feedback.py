@@ -19,7 +19,8 @@ import numpy as np
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Limited
 from hjbjax.discretisation.stencil import Links
-from hjbjax.hamiltonian.discrete import DiscreteHamiltonian, optimise
+from hjbjax.hamiltonian.discrete import DiscreteHamiltonian
+from hjbjax.hamiltonian.optimum import optimise
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_jax, as_partial, cast, is_traced, pytree_dataclass, with_suggestions

@@ -1,4 +1,4 @@
-"""The discrete Hamiltonian and its optimum over the admissible sets.
+"""The discrete Hamiltonian around one value function.
 
 At a node, for one action of each player,
 
@@ -6,17 +6,12 @@ At a node, for one action of each player,
 
 written with one-sided differences, so that nothing but the value is read from memory: with D⁺, D⁻ along an
 axis the gain of a drift component f is [(e + h⁻ f) D⁺ − (e − h⁺ f) D⁻]/(h⁺ + h⁻). As a function of u it has
-kinks where f changes sign (and at |f| = a/h under central differences): minimising it is piecewise.
-
-Exact where the drift is affine in u, the cost separable and quadratic, the noise free of u, and the inputs fall into
-groups of one or two that drive components of their own, not too many (read from the jaxpr, see ``players``): all
-ends, kinks and stationary points are tried. Otherwise samples and a pattern search, and certificates hold for the
-refined sample.
+kinks where f changes sign (and at |f| = a/h under central differences): minimising it is piecewise (see ``optimum``).
 """
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -24,17 +19,8 @@ import jax.numpy as jnp
 
 from hjbjax.discretisation import correlated_noise, cut_cells, edges, schemes, stencil
 from hjbjax.discretisation.discretisation import Differences, Discretisation
-from hjbjax.hamiltonian import search
-from hjbjax.hamiltonian.piecewise import Kinked, inverse_root, kinked_ball, piecewise_input, piecewise_pair
-from hjbjax.hamiltonian.players import SAMPLES, Player, players_of, shared
-from hjbjax.hamiltonian.search import UNROLL, Action, best_of, enumerate_actions, refine
-from hjbjax.problem import sets
+from hjbjax.hamiltonian.search import Action
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import altered
-from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite
-from hjbjax.tracing import components
-
-INNER = 8  # evaluations written out of a search inside a search: with all 33 XLA gets up to five times the lines
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,183 +153,3 @@ def around(on: Discretisation, value: jax.Array, lost: jax.Array | None = None) 
     slack = tuple(edges.slack(on)) if careful else None
     beside = None if lost is None else edges.beside(lost, grid)
     return DiscreteHamiltonian(on, x, value, up, down, bends, links, slack=slack, lost=beside)
-
-
-def optimise(hamiltonian: DiscreteHamiltonian, isaacs: str | None = None) -> tuple[jax.Array, Action, Action]:
-    """min max of H, or max min, as the problem or ``isaacs`` says: the value, the control and the disturbance."""
-    players = players_of(hamiltonian.on)
-    if players.disturbance.admissible is None:
-        value, u = best_response(hamiltonian, players.control, lambda u: (u, []))
-        return value, u, []
-    if players.decoupled:  # H is a sum: each optimum is the same whatever the other does, and so any action serves
-        start = _any_action(players.disturbance.admissible)
-        _, u = best_response(hamiltonian, players.control, lambda u: (u, start))
-        value, d = best_response(hamiltonian, players.disturbance, lambda d: (u, d))
-        return value, u, d
-    if (isaacs or hamiltonian.on.problem.isaacs) == "upper":
-        return _nested(hamiltonian, players.control, players.disturbance, lambda u, d: (u, d))
-    value, d, u = _nested(hamiltonian, players.disturbance, players.control, lambda d, u: (u, d))
-    return value, u, d
-
-
-def optimum(hamiltonian: DiscreteHamiltonian) -> jax.Array:
-    """min max of H, or max min, where nobody asks for the actions: of finitely many none is kept in mind."""
-    players = players_of(hamiltonian.on)
-    player, admissible = players.control, players.control.admissible
-    if players.disturbance.admissible is not None or not isinstance(admissible, Finite):
-        return optimise(hamiltonian)[0]
-    points = jnp.asarray(admissible.points, hamiltonian.on.dtype)
-    return search.optimum(lambda u: hamiltonian.at(u, []), points, player.sign, weight=player.effort)
-
-
-def best_response(
-    hamiltonian: DiscreteHamiltonian, player: Player, join: Callable, most: int = UNROLL
-) -> tuple[jax.Array, Action]:
-    """One player's optimum against a given action of the other; ``join(mine)`` makes the pair (u, d).
-
-    ``most`` is how many evaluations may be written out, where it samples.
-    """
-    if player.admissible is None:
-        return hamiltonian.at(*join([])), []
-    if player.exact:
-        action = _exact(hamiltonian, player, join)
-    else:
-        start = _admissible(hamiltonian, player, join)
-        _, action, _ = _sampled(
-            hamiltonian, player, lambda action: (hamiltonian.at(*join(action)), []),
-            weight=player.effort, most=most, start=start,
-        )  # fmt: skip
-    if not hamiltonian.bare:
-        action = jax.lax.optimization_barrier(action)  # or the search is done twice, for the action and for the value
-    return hamiltonian.at(*join(action)), action
-
-
-def _nested(
-    hamiltonian: DiscreteHamiltonian, outer: Player, inner: Player, join: Callable
-) -> tuple[jax.Array, Action, Action]:
-    """The outer player's optimum, who moves first and knows that the inner one answers."""
-
-    def objective(action):
-        return best_response(hamiltonian, inner, lambda reply: join(action, reply), most=INNER)
-
-    if outer.admissible is None:  # a lower game without controls, say: nobody moves first
-        value, answer = objective([])
-        return value, [], answer
-    return _sampled(hamiltonian, outer, objective, weight=inner.weight)
-
-
-def _admissible(hamiltonian: DiscreteHamiltonian, player: Player, join: Callable) -> Action | None:
-    """At constrained ends an action of a sampled control that does not leave, where that can be found exactly."""
-    if hamiltonian.slack is None or player.sign < 0:
-        return None
-    # without the cost H is the gain alone, infinite outside: the least of it is exact where the drift is affine
-    free = altered(hamiltonian.on.problem, cost=None)
-    alone = players_of(hamiltonian.asking(free).on).control
-    return _exact(hamiltonian.asking(free), alone, join) if alone.exact else None
-
-
-def _sampled(
-    hamiltonian: DiscreteHamiltonian,
-    player: Player,
-    objective: Callable,
-    weight: int,
-    most: int = UNROLL,
-    start: Action | None = None,
-) -> Any:
-    """The best of samples, refined by a pattern search between them; of finitely many actions the best of all."""
-    assert player.admissible is not None
-    points = jnp.asarray(sets.samples(player.admissible, SAMPLES), hamiltonian.on.dtype)
-    best = enumerate_actions(objective, points, player.sign, weight=weight, most=most)
-    if isinstance(player.admissible, Finite):
-        return best
-    project = _projection(player.admissible)
-    # samples may miss a part of the set in which the drift stays inside, or the action of the last step
-    if start is not None:
-        best = best_of(objective, [start], player.sign, best)
-    if hamiltonian.tried is not None:
-        best = best_of(objective, [project(hamiltonian.tried[0 if player.sign > 0 else 1])], player.sign, best)
-    return refine(objective, best, sets.spacing(player.admissible, SAMPLES), project, player.sign, weight=weight)
-
-
-def _projection(admissible: Box | Ball) -> Callable[[Action], Action]:
-    """The map of an action onto its set: a step of the search may leave it."""
-    if isinstance(admissible, Box):
-        return lambda action: [jnp.clip(u, admissible.lo[j], admissible.hi[j]) for j, u in enumerate(action)]
-
-    def onto_ball(action):
-        shrink = jnp.minimum(1, admissible.radius * inverse_root(sum(u * u for u in action)))
-        return [shrink * u for u in action]
-
-    return onto_ball
-
-
-def _any_action(admissible: AdmissibleSet) -> Action:
-    """Some action of the set; zero need not be one."""
-    if isinstance(admissible, Ball):
-        return [jnp.zeros(())] * admissible.dim
-    first = admissible.lo if isinstance(admissible, Box) else admissible.points[0]
-    return [first[j] for j in range(admissible.dim)]
-
-
-def _exact(hamiltonian: DiscreteHamiltonian, player: Player, join: Callable) -> Action:
-    """The exact optimum over a box or a ball; see ``piecewise`` for why the candidates suffice."""
-    admissible = player.admissible
-    assert isinstance(admissible, (Box, Ball))
-    problem, dtype = hamiltonian.on.problem, hamiltonian.on.dtype
-    # at zero even if that is not admissible: an affine drift is known by its offset and its slopes there
-    zero = [jnp.zeros((), dtype)] * admissible.dim
-    u, d = join(zero)
-    arguments = problem.arguments(hamiltonian.x, u, d, hamiltonian.on.t)
-    parts = hamiltonian.on.drifts(u, d, hamiltonian.x)
-    # where drifts are upwinded apart, the noise goes with the control's
-    part = 0 if player.sign > 0 else len(parts) - 1
-    noise = hamiltonian.on.diffusion(u, d, hamiltonian.x) if part == 0 else {}
-    slopes = [
-        components.components(player.derivative(problem, problem.drift, j), *arguments, dtype=dtype)
-        for j in range(admissible.dim)
-    ]
-    linear, square = zip(
-        *(_cost_coefficients(hamiltonian, player, arguments, j) for j in range(admissible.dim)), strict=True
-    )
-
-    def piece(i: int, group: Sequence[int]) -> Kinked:
-        slope = [slopes[j][i] for j in group]
-        return _kinked(hamiltonian, noise, i, parts[part][i], slope[0] if len(group) == 1 else slope)
-
-    if isinstance(admissible, Ball):
-        single = [[piece(i, [j]) for i in player.driven[j]] for j in range(admissible.dim)]
-        return kinked_ball(player.sign, admissible.radius, linear, [p[0] if p else None for p in single])
-    action = list(zero)
-    for group in player.groups:
-        pieces = [piece(i, group) for i in shared(player.driven, group)]
-        lo, hi, slope, bend = ([each[j] for j in group] for each in (admissible.lo, admissible.hi, linear, square))
-        curved = any(player.curved[j] for j in group)
-        if len(group) == 1:
-            found = [piecewise_input(player.sign, lo[0], hi[0], slope[0], bend[0], pieces, curved=curved)]
-        else:
-            found = piecewise_pair(player.sign, lo, hi, slope, bend, pieces, curved=curved)
-        for j, u in zip(group, found, strict=True):
-            action[j] = u
-    return action
-
-
-def _cost_coefficients(hamiltonian: DiscreteHamiltonian, player: Player, arguments: tuple, j: int) -> tuple[Any, Any]:
-    """l_j and q_j of a cost l_j u + q_j u² + ... by differentiation at zero."""
-    cost, none = hamiltonian.on.problem.cost, jnp.zeros((), hamiltonian.on.dtype)
-    if cost is None:
-        return none, none
-    slope = player.derivative(hamiltonian.on.problem, cost, j)
-    linear = components.scalar(slope, *arguments, dtype=hamiltonian.on.dtype)
-    if not player.curved[j]:  # known to be linear: the second derivative would be traced to find a zero
-        return linear, none
-    return linear, components.scalar(
-        player.derivative(hamiltonian.on.problem, slope, j), *arguments, dtype=hamiltonian.on.dtype
-    ) / 2
-
-
-def _kinked(
-    hamiltonian: DiscreteHamiltonian, noise: dict[tuple[int, int], Any], axis: int, offset: Any, slope: Any
-) -> Kinked:
-    """The gain of one component as a function of an input: offset, slope, and where its derivative jumps."""
-    left = correlated_noise.along_axis(noise, hamiltonian.on.grid, axis)
-    return Kinked(lambda f: hamiltonian.gain(axis, f, left), offset, slope, *hamiltonian.kinks(axis, left))

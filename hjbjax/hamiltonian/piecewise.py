@@ -1,4 +1,4 @@
-"""Exact minima of a convex or concave cost plus piecewise linear gains, over one input, two, or a ball.
+"""Exact minima of a convex or concave cost plus piecewise linear gains, over one input or two; see ``ball`` for balls.
 
 Under upwinding the Hamiltonian is such a function of the control wherever the drift is affine in it and the cost
 separable and quadratic: each drift component contributes a gain with a kink where it changes sign. ``sign`` is +1 to
@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from hjbjax.discretisation.stencil import PerNode
-from hjbjax.hamiltonian.search import Action, better, pick
+from hjbjax.hamiltonian.search import better
 
 Pair: TypeAlias = Sequence[PerNode]  # one number a node for each of two inputs
 Slope = TypeVar("Slope")
@@ -195,48 +195,3 @@ def _within(point: Pair, direction: Pair, lo: Pair, hi: Pair) -> tuple[jax.Array
     # no direction at all, where G = 0, leaves both ends infinite: t = 0 then
     first = jnp.where(jnp.isfinite(first), first, 0)
     return first, jnp.maximum(first, jnp.where(jnp.isfinite(last), last, 0))
-
-
-def ball_directions(gradients: Sequence[PerNode], radius: PerNode, sign: int) -> Action:
-    """The optimum of g·u over |u| ≤ radius: −sign · radius · g/|g|; the centre where g = 0."""
-    scale = -sign * radius * inverse_root(sum(g * g for g in gradients))
-    return [scale * g for g in gradients]
-
-
-def kinked_ball(
-    sign: int, radius: PerNode, linear: Sequence[PerNode], pieces: Sequence[Kinked[PerNode] | None]
-) -> Action:
-    """The exact optimum over |u| ≤ radius of Σ_j (l_j u_j + gain_j(b_j + G_j u_j)), one gain an input at most.
-
-    On each combination of pieces the objective is linear, so its optimum lies on the sphere, or where some
-    inputs sit at kinks and the others on the sphere that is left; all combinations are tried.
-    """
-
-    def total(action: Action) -> PerNode:
-        terms = [g * u for g, u in zip(linear, action, strict=True)]
-        terms += [p.gain(p.offset + p.slope * u) for p, u in zip(pieces, action, strict=True) if p is not None]
-        return sum(terms[1:], start=terms[0])
-
-    best = None
-    for choice in itertools.product(*(_branches(g, piece) for g, piece in zip(linear, pieces, strict=True))):
-        fixed = {j: u for j, (kind, u) in enumerate(choice) if kind == "kink"}
-        # the kinks alone may lie outside of the ball: then their point on the sphere stands for them
-        spent = sum((u * u for u in fixed.values()), start=jnp.zeros(()))
-        shrink = jnp.minimum(1, radius / jnp.sqrt(jnp.where(spent == 0, 1, spent))) if fixed else 1
-        left = jnp.sqrt(jnp.maximum(radius * radius - spent, 0))
-        # without a gradient left the inputs at kinks are all: one zero, so that there is something to sum
-        free = ball_directions([g for kind, g in choice if kind == "slope"] or [jnp.zeros(())], left, sign)
-        moving = iter(free)
-        action = [shrink * fixed[j] if j in fixed else next(moving) for j in range(len(choice))]
-        challenger = (total(action), action)
-        best = challenger if best is None else pick(better(sign, challenger[0], best[0]), challenger, best)
-    assert best is not None
-    return best[1]
-
-
-def _branches(linear: PerNode, piece: Kinked[PerNode] | None) -> list[tuple[str, PerNode]]:
-    """The choices of one input: to follow the gradient of a piece, or to sit at a kink."""
-    if piece is None:
-        return [("slope", linear)]
-    kinks = [(k - piece.offset) * inverse(piece.slope) for k in piece.kinks]
-    return [("slope", linear + piece.slope * d) for d in piece.derivatives] + [("kink", u) for u in kinks]

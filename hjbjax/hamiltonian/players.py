@@ -2,7 +2,8 @@
 
 The optimum over a player's actions is exact where the drift is affine in them, the cost separable and quadratic, the
 noise free of them, and the inputs of a box fall into groups of one or two that drive components of their own, few
-enough that all their pieces can be tried; in a ball each input drives one component of its own. See ``piecewise``.
+enough that all their pieces can be tried; in a ball each input drives one component of its own. See ``piecewise``
+and ``ball``.
 In a game whose players meet in a component, in a cost or in the noise, that holds of the player who answers; the one
 who moves first faces a function with ridges, which is searched.
 """
@@ -16,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.hamiltonian.ball import combinations
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite
 from hjbjax.tracing import dependence
@@ -28,6 +30,7 @@ SHORT = 200  # operations on components up to which evaluations of H are written
 # run as fast as written out.
 ALONE = 80
 CELLS = {1: 64, 2: 16}  # by the inputs of a group: combinations of pieces that are tried at most
+QUADRATICS = 50  # in a ball: three inputs without noise make 27, two with noise 49; a search is at no more than this
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,12 +115,17 @@ class Players:
     isaacs: str
 
     @property
+    def both(self) -> tuple[Player, Player]:
+        """The control and the disturbance."""
+        return self.control, self.disturbance
+
+    @property
     def exact(self) -> bool:
         """Whether min (max) over the sets is exact, which certificates need."""
         first, second = (self.control, self.disturbance) if self.isaacs == "upper" else (self.disturbance, self.control)
         if second.admissible is not None and not self.decoupled:  # the reply is no polynomial of what it replies to
             return first.enumerated and (second.exact or second.enumerated)
-        return all(player.exact or player.enumerated for player in (first, second))
+        return all(player.exact or player.enumerated for player in self.both)
 
 
 def players_of(on: Discretisation) -> Players:
@@ -153,7 +161,8 @@ def _player(admissible: AdmissibleSet | None, sign: int, found: dependence.Influ
         suits &= all(count <= CELLS.get(len(group), 0) for group, count in zip(groups, cells, strict=True))
     elif isinstance(admissible, Ball):
         apart = all(len(group) == 1 for group in groups) and all(len(components) <= 1 for components in driven)
-        suits &= admissible.dim <= 3 and not any(curved) and apart
+        few = not any(curved) or combinations(cells) <= QUADRATICS
+        suits &= admissible.dim <= 3 and apart and few
     return Player(
         admissible, sign, suits and isinstance(admissible, (Box, Ball)), driven, groups, cells, curved, at_ends,
         _effort(found.operations),

@@ -23,6 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hjbjax.hamiltonian.ball import least_in_ball
 from hjbjax.hamiltonian.search import enumerate_actions, refine
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite, samples, spacing
@@ -30,7 +31,6 @@ from hjbjax.problem.types import Control, Costate, DType, Number, Scalar, State
 from hjbjax.tracing import dependence
 
 BUDGET = 64  # samples that start a search
-NEWTON = 24  # steps for the multiplier of a ball, monotone and at last quadratic; an affine H needs none
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,7 +150,7 @@ def least(
     slope, square = jax.grad(energy)(zero), jnp.diagonal(jax.hessian(energy)(zero)) / 2
     if isinstance(admissible, Box):
         return _in_box(jnp.asarray(admissible.lo, dtype), jnp.asarray(admissible.hi, dtype), slope, square)
-    return _in_ball(jnp.asarray(admissible.radius, dtype), slope, square)
+    return jnp.stack(least_in_ball(jnp.asarray(admissible.radius, dtype), list(slope), list(square)))
 
 
 def _in_box(lo: Control, hi: Control, slope: Control, square: Control) -> jax.Array:
@@ -160,44 +160,6 @@ def _in_box(lo: Control, hi: Control, slope: Control, square: Control) -> jax.Ar
     # affine or concave: the better end, and the lower one where both are worth as much
     end = jnp.where(slope * lo + square * lo * lo <= slope * hi + square * hi * hi, lo, hi)
     return jnp.where(convex, inner, end)
-
-
-def _in_ball(radius: Scalar, slope: Control, square: Control) -> jax.Array:
-    """The minimum of b·u + Σ c_j u_j² over |u| ≤ r: u = −b/(2c + μ); the centre where b = 0 and c ≥ 0.
-
-    1/|u| − 1/r is concave and increasing in μ, so Newton's method from the left rises to the root. Where c is one
-    number it is linear, and the first μ is the root. Some c < 0 leave the sphere alone, where |u|² is a constant:
-    with the least c taken off all of them it is the same minimum, and nothing is concave.
-    """
-    concave = jnp.min(square) < 0
-    curvature = 2 * (square - jnp.minimum(jnp.min(square), 0))
-    inner = -slope / jnp.where(curvature > 0, curvature, 1)
-    # the free minimum counts only where it exists: an input without curvature but with a slope runs to the sphere
-    inside = jnp.all((curvature > 0) | (slope == 0)) & (inner @ inner <= radius * radius) & ~concave
-    # b = 0 is no rare case, and on the sphere nothing has a derivative there
-    nothing = slope @ slope <= jnp.finfo(slope.dtype).tiny
-    slope = jnp.where(nothing, 1, slope)
-    size = jnp.sqrt(slope @ slope)
-    # |u| ≥ |b|/(max 2c + μ) and |u| ≥ |b_j|/(2c_j + μ): at this μ the norm is at least r, so that Newton's method
-    # starts left of the root; without the second a tiny b_j where c_j is least would take more steps than there are
-    mu = jnp.maximum(size / radius - jnp.max(curvature), jnp.max(jnp.abs(slope) / radius - curvature))
-    mu = jnp.maximum(mu, 0)
-
-    def newton(_, mu):
-        parts = jnp.where(curvature + mu > 0, curvature + mu, 1)
-        u = slope / parts
-        norm = jnp.sqrt(jnp.maximum(u @ u, jnp.finfo(slope.dtype).tiny))
-        rise = jnp.maximum((u / parts) @ u, jnp.finfo(slope.dtype).tiny)  # −½ d|u|²/dμ
-        return jnp.maximum(mu + (norm / radius - 1) * norm * norm / rise, 0)
-
-    mu = jax.lax.fori_loop(0, NEWTON, newton, mu)
-    bound = jnp.where(nothing, 0, -slope / jnp.where(curvature + mu > 0, curvature + mu, 1))
-    # without a slope along the most concave input both ways to the sphere are as good: up
-    room = jnp.maximum(radius * radius - bound @ bound, 0)
-    aside = concave & (room > 1e-6 * radius * radius)
-    rest = jnp.sqrt(jnp.where(aside, room, 1))
-    bound += jnp.where(aside, rest, 0) * (jnp.arange(len(square)) == jnp.argmin(square))
-    return jnp.where(inside, inner, bound)
 
 
 def _searched(admissible: AdmissibleSet | None, energy: Callable[[jax.Array], jax.Array], dtype: DType) -> jax.Array:

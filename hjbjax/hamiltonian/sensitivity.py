@@ -22,7 +22,7 @@ import jax.numpy as jnp
 
 from hjbjax.discretisation import correlated_noise
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.hamiltonian import discrete
+from hjbjax.hamiltonian import discrete, optimum
 from hjbjax.hamiltonian.discrete import DiscreteHamiltonian
 from hjbjax.hamiltonian.players import SAMPLES, Player, players_of
 from hjbjax.hamiltonian.search import Action
@@ -107,7 +107,7 @@ def actions(on: Discretisation, value: Field, lost: jax.Array | None, u: Action,
 def _alone(at: Optimum, player: Player, join: Callable) -> tuple[Action, Action]:
     """Both actions with the derivatives of a player's who need not know the other's."""
     if player.exact:
-        return join(discrete.best_response(at.moving, player, join)[1])
+        return join(optimum.best_response(at.moving, player, join)[1])
     return _implicit(at, _inputs(player))
 
 

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from hjbjax.discretisation import cut_cells, edges, stencil
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.rates import Rates, fastest_rate, jump_rates
-from hjbjax.hamiltonian import discrete
+from hjbjax.hamiltonian import discrete, optimum
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.hamiltonian.search import Action
 from hjbjax.problem.pytree import pytree_dataclass
@@ -126,7 +126,7 @@ def greedy(
 
     To the nodes that are ``lost``, bool (*grid), no drift leads that is only rounding.
     """
-    return _with_defect(on, value, held, *discrete.optimise(_around(on, value, incumbent, lost)))
+    return _with_defect(on, value, held, *optimum.optimise(_around(on, value, incumbent, lost)))
 
 
 def relaxation(on: Discretisation, value: Field, outflow: Field | None = None) -> tuple[Field, Field]:
@@ -139,9 +139,9 @@ def relaxation(on: Discretisation, value: Field, outflow: Field | None = None) -
     players, discount = players_of(on), on.problem.discount
     outflow = fastest_rate(on) + discount if outflow is None else outflow
     if players.control.fastest_at_ends and players.disturbance.fastest_at_ends:
-        best = discrete.optimum(hamiltonian)
+        best = optimum.optimal_value(hamiltonian)
     else:
-        best, u, d = discrete.optimise(hamiltonian)
+        best, u, d = optimum.optimise(hamiltonian)
         outflow = jnp.maximum(outflow, jump_rates(on, u, d).total() + discount)  # a fast action between the samples
     # it is divided by, also where nothing moves
     return best - discount * value, jnp.where(outflow > 0, outflow, 1)
@@ -172,9 +172,9 @@ def respond(
     hamiltonian = _around(on, value, current, lost)
     u, d = list(current.controls), list(current.disturbances)
     if on.problem.isaacs == "upper":  # min max: the control moves first, and the disturbance knows it
-        best, d = discrete.best_response(hamiltonian, players.disturbance, lambda d: (u, d))
+        best, d = optimum.best_response(hamiltonian, players.disturbance, lambda d: (u, d))
     else:
-        best, u = discrete.best_response(hamiltonian, players.control, lambda u: (u, d))
+        best, u = optimum.best_response(hamiltonian, players.control, lambda u: (u, d))
     return _with_defect(on, value, held, best, u, d)
 
 

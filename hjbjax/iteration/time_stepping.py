@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from hjbjax.discretisation import correlated_noise
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.rates import jump_rates, largest_rate
-from hjbjax.hamiltonian import discrete
+from hjbjax.hamiltonian import discrete, optimum
 from hjbjax.hamiltonian.search import Action
 from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import Obstacles
@@ -83,7 +83,7 @@ class March:
 
     def rate(self, value: Field, t: Number) -> tuple[Field, "Seen"]:
         """F = min max H − β V, cost per unit time, and the rates and the noise under the optimal actions."""
-        best, u, d = discrete.optimise(dataclasses.replace(discrete.around(self.on.at(t), value), bare=self.bare))
+        best, u, d = optimum.optimise(dataclasses.replace(discrete.around(self.on.at(t), value), bare=self.bare))
         return best - self.problem.discount * value, self.look(u, d, t)
 
     def look(self, u: Action, d: Action, t: Number) -> "Seen":
@@ -278,7 +278,7 @@ def repeat(march: March, value: Field, start: float, end: float, count: int) -> 
 def greedy(march: March, value: Field, t: Number) -> tuple[tuple[Field, ...], tuple[Field, ...]]:
     """The control and the disturbance at the time t, each component of shape (*grid), of the H that steps solve."""
     on = march.on.at(t)
-    _, u, d = discrete.optimise(discrete.around(on, value))
+    _, u, d = optimum.optimise(discrete.around(on, value))
 
     def full(action):
         return tuple(jnp.broadcast_to(jnp.asarray(entry, value.dtype), march.grid.shape) for entry in action)

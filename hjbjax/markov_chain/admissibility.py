@@ -9,7 +9,7 @@ import numpy as np
 
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.hamiltonian import discrete
+from hjbjax.hamiltonian import discrete, optimum
 from hjbjax.hamiltonian.players import find_players
 from hjbjax.iteration import bellman
 from hjbjax.problem.grid import Grid
@@ -61,6 +61,6 @@ def _without_action(on: Discretisation) -> Mask:
     # V = 0 and L = 0 leave the infinite price of leaving as the only term of H
     free = altered(on.problem, cost=None)
     hamiltonian = discrete.around(on.asking(free), jnp.zeros(on.grid.shape, on.dtype))
-    least = discrete.optimise(hamiltonian)[0]
+    least = optimum.optimise(hamiltonian)[0]
     # on the target the run is over and needs no action
     return ~jnp.isfinite(least) & ~bellman.obstacles(on).fixed

@@ -97,7 +97,7 @@ def _actions(problem: Problem) -> int:
 def _searched(problem: Problem, n: int, dtype: DType) -> int:
     """Words a node of a search between samples: the best so far, what is tried, and both players' actions of either."""
     players = find_players(problem, n, dtype)
-    alone = [each for each in (players.control, players.disturbance) if not (each.exact or each.enumerated)]
+    alone = [each for each in players.both if not (each.exact or each.enumerated)]
     if problem.is_game and not players.decoupled:
         return 10 + 2 * _actions(problem)
     return max((5 + 2 * each.admissible.dim for each in alone if each.admissible is not None), default=0)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.rates import jump_rates
-from hjbjax.hamiltonian import discrete
+from hjbjax.hamiltonian import discrete, optimum
 from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import Obstacles
 from hjbjax.problem import sets
@@ -47,7 +47,7 @@ def standstill(on: Discretisation) -> Standstill:
     """
     grid, dtype = on.grid, on.dtype
     # at V = 0 the Hamiltonian is L alone, and its minimum the least running cost
-    least = discrete.optimise(discrete.around(on, jnp.zeros(grid.shape, dtype)))[0]
+    least = optimum.optimise(discrete.around(on, jnp.zeros(grid.shape, dtype)))[0]
     speeds, dearest = _scales(on)
     cost = jnp.max(jnp.where(jnp.isfinite(least), jnp.abs(least), 0))  # infinite where a constrained end leaves none
     # the least cost may be zero everywhere: then the dearest action sets the scale, and without any cost one does
@@ -55,7 +55,7 @@ def standstill(on: Discretisation) -> Standstill:
     # an axis along which nothing moves puts no condition on rest
     speeds = jnp.where(speeds > 0, speeds, 1)
     # s_i = max L/max|f_i| puts costs and all speeds into one unit, so that none drowns in the rounding of another
-    effort, u, d = discrete.optimise(discrete.at_rest(on, cost / speeds))
+    effort, u, d = optimum.optimise(discrete.at_rest(on, cost / speeds))
     small = ROUNDINGS * jnp.finfo(dtype).eps
     # of the action that was found, not of all: the minimum is at rest where any action is
     rests = (jnp.abs(effort) <= small * cost) & (jnp.abs(least) <= small * cost)

@@ -9,7 +9,7 @@ import numpy as np
 
 from hjbjax.discretisation import correlated_noise, edges
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.hamiltonian import discrete
+from hjbjax.hamiltonian import discrete, optimum
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import certificates, fixed_point
 from hjbjax.iteration.certificates import Certificate
@@ -235,7 +235,7 @@ def isaacs_gap(hamiltonian: discrete.DiscreteHamiltonian, free: Mask) -> tuple[S
     How much they matter is the largest difference of H between two pairs of them, of nine representatives a player.
     """
     problem, dtype = hamiltonian.on.problem, hamiltonian.on.dtype
-    upper, lower = (discrete.optimise(hamiltonian, isaacs=which)[0] for which in ("upper", "lower"))
+    upper, lower = (optimum.optimise(hamiltonian, isaacs=which)[0] for which in ("upper", "lower"))
     sets_of = (problem.controls, problem.disturbances)
     mine, theirs = (jnp.asarray(_representatives(admissible), dtype) for admissible in sets_of)
 

@@ -13,7 +13,7 @@ from systems import SEEDS
 import hjbjax as hjb
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.rates import jump_rates
-from hjbjax.hamiltonian import discrete
+from hjbjax.hamiltonian import discrete, optimum
 from hjbjax.markov_chain import chain
 from hjbjax.problem.stretching import Sinh
 
@@ -239,7 +239,7 @@ def test_the_optimum_at_a_wall_is_exact(noise):
         on = Discretisation(problem, grid, scheme, np.float64)
         for _ in range(5):
             hamiltonian = discrete.around(on, jnp.asarray(rng.normal(size=6)))
-            best, _, _ = discrete.optimise(hamiltonian)
+            best, _, _ = optimum.optimise(hamiltonian)
             scan = jax.vmap(lambda c, h=hamiltonian: h.at([jnp.full(6, c)], []))(jnp.linspace(-1, 1, 4001))
             np.testing.assert_array_less(best, jnp.min(scan, axis=0) + 1e-12)
             np.testing.assert_allclose(best, jnp.min(scan, axis=0), atol=1e-5)

@@ -12,7 +12,7 @@ from systems import SEEDS, random_game, random_grid, random_problem, random_sigm
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.rates import jump_rates
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.hamiltonian import discrete
+from hjbjax.hamiltonian import discrete, optimum
 from hjbjax.hamiltonian.players import SAMPLES, find_players
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
@@ -86,7 +86,7 @@ def best_and_scan(problem, grid, value, scan, scheme):
     players = find_players(problem, grid.ndim, value.dtype)
     assert players.exact
     hamiltonian = discrete.around(Discretisation(problem, grid, scheme, value.dtype), value)
-    best, u, _ = discrete.optimise(hamiltonian)
+    best, u, _ = optimum.optimise(hamiltonian)
     table = jax.lax.map(lambda point: hamiltonian.at([point[j] for j in range(scan.shape[1])], []), scan)
     full = [jnp.broadcast_to(component, grid.shape) for component in u]
     return best, jnp.stack(full), jnp.min(table, axis=0), hamiltonian.at(full, [])
@@ -141,7 +141,8 @@ def test_a_ball_is_minimised_exactly(kind, scheme, seed):
     [
         (lambda x, u: x + u, lambda x, u: u @ u, Box([-1.0] * 2, [1.0] * 2), True),
         (lambda x, u: x + u, None, Ball(1.0, 2), True),
-        (lambda x, u: x + u, lambda x, u: u @ u, Ball(1.0, 2), False),
+        (lambda x, u: x + u, lambda x, u: u @ u, Ball(1.0, 2), True),
+        (lambda x, u: x + u[:2] * u[2], lambda x, u: u @ u, Ball(1.0, 3), False),
         (lambda x, u: x * u[0] + u[1], None, Box([-1.0] * 2, [1.0] * 2), True),  # both inputs drive both components
         (lambda x, u: x * u[0] + u[1] - u[2], None, Box([-1.0] * 3, [1.0] * 3), False),  # three do
         (lambda x, u: x * u[0] + u[1], None, Ball(1.0, 2), False),
@@ -181,7 +182,7 @@ def test_samples_and_search_come_close_where_the_minimum_is_not_exact(scheme, se
 @functools.partial(jax.jit, static_argnames="scheme")
 def sampled_and_scan(problem, grid, value, scheme):
     hamiltonian = discrete.around(Discretisation(problem, grid, scheme, value.dtype), value)
-    best = discrete.optimise(hamiltonian)[0]
+    best = optimum.optimise(hamiltonian)[0]
 
     def lowest(points):
         return jnp.min(jax.lax.map(lambda point: hamiltonian.at(list(point), []), points), axis=0)
@@ -193,9 +194,9 @@ def sampled_and_scan(problem, grid, value, scheme):
 
 
 @functools.partial(jax.jit, static_argnames=("scheme", "isaacs"))
-def optimum(problem, grid, value, scheme, isaacs=None):
+def optimal(problem, grid, value, scheme, isaacs=None):
     hamiltonian = discrete.around(Discretisation(problem, grid, scheme, value.dtype), value)
-    return discrete.optimise(hamiltonian, isaacs=isaacs)
+    return optimum.optimise(hamiltonian, isaacs=isaacs)
 
 
 @functools.partial(jax.jit, static_argnames="scheme")
@@ -217,7 +218,7 @@ def test_a_finite_set_is_enumerated(count, seed):
     grid = random_grid(rng, 2)
     problem = random_problem(rng, grid, "matrix", Finite(rng.uniform(-1, 1, (count, 2))))
     value = rng.normal(size=grid.shape)
-    best, u, _ = jax.device_get(optimum(problem, grid, value, Upwind()))
+    best, u, _ = jax.device_get(optimal(problem, grid, value, Upwind()))
     table = np.asarray(table_of(problem, grid, value, problem.controls.points, np.zeros((1, 0)), Upwind()))[:, 0]
     assert np.allclose(best, np.min(table, axis=0), rtol=1e-12, atol=1e-12)
     assert np.array_equal(np.stack(u, axis=-1), problem.controls.points[np.argmin(table, axis=0)])
@@ -233,7 +234,7 @@ def test_min_max_against_all_pairs(isaacs, mine, theirs, seed):
     sets = Finite(rng.uniform(-1, 1, (mine, 1))), Finite(rng.uniform(-1, 1, (theirs, 2)))
     problem = random_game(rng, grid, "diagonal", *sets, isaacs=isaacs)
     value = rng.normal(size=grid.shape)
-    best, u, d = jax.device_get(optimum(problem, grid, value, Upwind()))
+    best, u, d = jax.device_get(optimal(problem, grid, value, Upwind()))
     table = np.asarray(table_of(problem, grid, value, sets[0].points, sets[1].points, Upwind()))
     expected = table.max(axis=1).min(axis=0) if isaacs == "upper" else table.min(axis=0).max(axis=0)
     assert np.allclose(best, expected, rtol=1e-12, atol=1e-12)
@@ -249,7 +250,7 @@ def test_lower_is_at_most_upper(seed):
     grid = random_grid(rng, 2)
     problem = random_game(rng, grid, "diagonal", UNIT, Box([-0.5], [1.0]))
     value = rng.normal(size=grid.shape)
-    (upper, u, _), (lower, _, d) = (optimum(problem, grid, value, Upwind(), isaacs) for isaacs in ("upper", "lower"))
+    (upper, u, _), (lower, _, d) = (optimal(problem, grid, value, Upwind(), isaacs) for isaacs in ("upper", "lower"))
     slack = 1e-12 * (1 + float(jnp.max(jnp.abs(upper))))
     assert jnp.all(lower <= upper + slack)
     highest, lowest = replies(problem, grid, value, u, d)
@@ -271,8 +272,8 @@ def test_upwinding_opens_a_gap_at_a_kink():
     problem = Problem(lambda x, u, d: u + d, None, UNIT, disturbances=UNIT, discount=1.0)
     grid = Grid([-1.0], [1.0], (3,))
     value = jnp.abs(jnp.linspace(-1.0, 1.0, 3))
-    assert np.isclose(optimum(problem, grid, value, Upwind(), "upper")[0][1], 1)
-    assert np.isclose(optimum(problem, grid, value, Upwind(), "lower")[0][1], 0)
+    assert np.isclose(optimal(problem, grid, value, Upwind(), "upper")[0][1], 1)
+    assert np.isclose(optimal(problem, grid, value, Upwind(), "lower")[0][1], 0)
 
 
 @pytest.mark.parametrize("slope", [2.0, -0.5])
@@ -281,7 +282,7 @@ def test_a_squared_difference_has_a_gap_everywhere(slope):
     problem = Problem(lambda x, u, d: (u - d) ** 2, None, UNIT, disturbances=UNIT, discount=1.0)
     grid = Grid([0.0], [1.0], (5,))
     value = slope * jnp.linspace(0.0, 1.0, 5)
-    upper, lower = (optimum(problem, grid, value, Upwind(), isaacs)[0][:-1] for isaacs in ("upper", "lower"))
+    upper, lower = (optimal(problem, grid, value, Upwind(), isaacs)[0][:-1] for isaacs in ("upper", "lower"))
     assert np.allclose(upper, max(slope, 0), atol=1e-9)
     assert np.allclose(lower, min(slope, 0), atol=1e-9)
 
@@ -315,7 +316,7 @@ def test_decoupled_players_reach_the_saddle(isaacs):
     )
     grid = Grid([-1.0, -1.0], [1.0, 1.0], (6, 5))
     value = np.random.default_rng(3).normal(size=grid.shape)
-    best, u, d = optimum(game, grid, value, Upwind())
+    best, u, d = optimal(game, grid, value, Upwind())
     highest, lowest = replies(game, grid, value, u, d)
     assert jnp.all(highest <= best + 1e-12)
     assert jnp.all(lowest >= best - 1e-12)
@@ -325,9 +326,9 @@ def test_one_player_at_a_time():
     """A problem in which only the disturbance acts: it maximises, exactly."""
     problem = Problem(lambda x, d: 0 * x, lambda x, d: d[0], UNIT, discount=1.0)
     grid = Grid([0.0], [1.0], (3,))
-    assert optimum(problem, grid, jnp.zeros(3), Upwind())[0].tolist() == [-1.0] * 3
+    assert optimal(problem, grid, jnp.zeros(3), Upwind())[0].tolist() == [-1.0] * 3
     alone = Problem(lambda x, u, d: 0 * x, lambda x, u, d: d[0] - d[0] ** 2, disturbances=UNIT, discount=1.0)
-    best, u, d = optimum(alone, grid, jnp.zeros(3), Upwind())
+    best, u, d = optimal(alone, grid, jnp.zeros(3), Upwind())
     assert np.allclose(best, 0.25, rtol=1e-14)
     assert u == []
     assert np.allclose(d[0], 0.5, rtol=1e-12)
@@ -340,6 +341,6 @@ def test_a_reply_meets_the_others_action():
     players = find_players(problem, 1, np.float64)
     hamiltonian = discrete.around(Discretisation(problem, grid, Upwind(), jnp.zeros(3).dtype), jnp.zeros(3))
     fixed = [jnp.array([-1.0, 0.5, 1.0])]
-    value, action = discrete.best_response(hamiltonian, players.disturbance, lambda d: (fixed, d))
+    value, action = optimum.best_response(hamiltonian, players.disturbance, lambda d: (fixed, d))
     assert np.allclose(value, [1.0, 0.5, 1.0], rtol=1e-14)
     assert np.allclose(action[0], [-1.0, 1.0, 1.0], rtol=1e-14)

@@ -7,33 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from pieces import NODES, gain, random_pieces
 from systems import SEEDS
 
-from hjbjax.hamiltonian.piecewise import Kinked, kinked_ball, piecewise_input, piecewise_pair
-
-NODES = 6
+from hjbjax.hamiltonian.piecewise import Kinked, piecewise_input, piecewise_pair
 
 
 @pytest.fixture(autouse=True, scope="module")
 def _float64():
     with jax.enable_x64(True):
         yield
-
-
-def random_pieces(rng, count, kinks):
-    """For each piece: offset, slope, sorted kinks and the slopes between them; some slopes are zero."""
-    offset = rng.normal(size=(count, NODES))
-    slope = rng.normal(size=(count, NODES)) * rng.choice([0.0, 1.0], (count, NODES), p=[0.2, 0.8])
-    at = np.sort(rng.uniform(-1.5, 1.5, (count, kinks, NODES)), axis=1)
-    return offset, slope, at, rng.normal(size=(count, kinks + 1, NODES))
-
-
-def gain(at, derivatives, f):
-    """The continuous piecewise linear function that is zero at zero kinks' origin and has these slopes."""
-    total = derivatives[0] * f
-    for kink, below, above in zip(at, derivatives[:-1], derivatives[1:], strict=True):
-        total = total + (above - below) * jnp.maximum(f - kink, 0)
-    return total
 
 
 def pieces_of(offset, slope, at, derivatives):
@@ -125,32 +108,3 @@ def test_kinks_that_coincide_hide_no_stationary_point(count, seed):
     twice = np.stack([linear, -linear]), np.stack([square, square])
     _, value, scan = map(np.asarray, best_pair(1, pieces, slopes, *twice, -np.ones(2), np.ones(2), True))
     assert np.all(value <= np.min(scan, axis=(0, 1)) + 1e-11)
-
-
-@functools.partial(jax.jit, static_argnames="sign")
-def best_in_ball(sign, pieces, linear, radius, directions):
-    made = [Kinked(functools.partial(gain, k, d), b, s, list(k), list(d)) for b, s, k, d in zip(*pieces, strict=True)]
-    made[-1] = None  # an input that drives nothing
-
-    def value(action):
-        result = sum(slope * u for slope, u in zip(linear, action, strict=True))
-        return result + sum(p.gain(p.offset + p.slope * u) for p, u in zip(made[:-1], action[:-1], strict=True))
-
-    action = kinked_ball(sign, radius, list(linear), made)
-    around = [radius * directions[:, j, None] for j in range(len(linear))]
-    return jnp.stack(action), value(action), value(around)
-
-
-@pytest.mark.parametrize(("dim", "kinks"), [(1, 1), (2, 1), (3, 1), (2, 3)])
-@given(seed=SEEDS)
-@settings(max_examples=15)
-def test_a_ball_is_optimal_over_a_scan(dim, kinks, seed):
-    rng = np.random.default_rng(seed)
-    pieces, linear, radius = random_pieces(rng, dim, kinks), rng.normal(size=(dim, NODES)), rng.uniform(0, 2)
-    sphere = rng.normal(size=(2000, dim))
-    sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
-    directions = np.concatenate([sphere, sphere * rng.uniform(0, 1, (2000, 1)) ** (1 / dim), np.zeros((1, dim))])
-    for sign in (1, -1):
-        action, value, scan = map(np.asarray, best_in_ball(sign, pieces, linear, radius, directions))
-        assert np.all(np.linalg.norm(action, axis=0) <= radius * (1 + 1e-12))
-        assert np.all(sign * value <= np.min(sign * scan, axis=0) + 1e-9)

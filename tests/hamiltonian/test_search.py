@@ -12,6 +12,7 @@ from systems import SEEDS
 import hjbjax as hjb
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.hamiltonian import discrete
+from hjbjax.hamiltonian.optimum import optimise
 from hjbjax.hamiltonian.players import find_players
 from hjbjax.hamiltonian.search import UNROLL, enumerate_actions, optimum, refine
 
@@ -156,7 +157,7 @@ def test_a_search_inside_a_search_is_compiled_in_few_places():
     assert not players.disturbance.exact
 
     def best(value):
-        return discrete.optimise(discrete.around(Discretisation(problem, grid, hjb.Upwind(), value.dtype), value))
+        return optimise(discrete.around(Discretisation(problem, grid, hjb.Upwind(), value.dtype), value))
 
     assert len(jax.jit(best).lower(jnp.zeros(11)).as_text().splitlines()) < 1500
 

@@ -199,13 +199,13 @@ def test_a_march_takes_what_is_told_beforehand(n, count, policy, scheme):
 
 
 def test_a_bare_hamiltonian_has_the_same_optimum():
-    from hjbjax.hamiltonian import discrete
+    from hjbjax.hamiltonian import discrete, optimum
 
     problem, kind = QUESTIONS["discounted"], np.dtype(np.float32)
     on = Discretisation(*cast((problem, PLANE), kind), hjb.Upwind(), kind)
     value = jnp.asarray(np.random.default_rng(0).normal(size=PLANE.shape), kind)
     around = discrete.around(on, value)
     for one, other in zip(
-        discrete.optimise(around)[:2], discrete.optimise(dataclasses.replace(around, bare=True))[:2], strict=True
+        optimum.optimise(around)[:2], optimum.optimise(dataclasses.replace(around, bare=True))[:2], strict=True
     ):
         np.testing.assert_array_equal(one, other)

@@ -1,0 +1,141 @@
+"""The optimum of the discrete Hamiltonian over the admissible sets: min, max, min max and max min, node by node.
+
+Exact where the drift is affine in u, the cost separable and quadratic, the noise free of u, and the inputs fall into
+groups of one or two that drive components of their own, not too many (read from the jaxpr, see ``players``): all
+ends, kinks and stationary points are tried, by ``exact``. Of finitely many actions the best of all. Otherwise samples
+and a pattern search, and certificates hold for the refined sample.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from hjbjax.hamiltonian import search
+from hjbjax.hamiltonian.discrete import DiscreteHamiltonian
+from hjbjax.hamiltonian.exact import exact_optimum
+from hjbjax.hamiltonian.piecewise import inverse_root
+from hjbjax.hamiltonian.players import SAMPLES, Player, players_of
+from hjbjax.hamiltonian.search import UNROLL, Action, best_of, enumerate_actions, refine
+from hjbjax.problem import sets
+from hjbjax.problem.pytree import altered
+from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite
+
+INNER = 8  # evaluations written out of a search inside a search: with all 33 XLA gets up to five times the lines
+
+
+def optimise(hamiltonian: DiscreteHamiltonian, isaacs: str | None = None) -> tuple[jax.Array, Action, Action]:
+    """min max of H, or max min, as the problem or ``isaacs`` says: the value, the control and the disturbance."""
+    players = players_of(hamiltonian.on)
+    if players.disturbance.admissible is None:
+        value, u = best_response(hamiltonian, players.control, lambda u: (u, []))
+        return value, u, []
+    if players.decoupled:  # H is a sum: each optimum is the same whatever the other does, and so any action serves
+        start = _any_action(players.disturbance.admissible)
+        _, u = best_response(hamiltonian, players.control, lambda u: (u, start))
+        value, d = best_response(hamiltonian, players.disturbance, lambda d: (u, d))
+        return value, u, d
+    if (isaacs or hamiltonian.on.problem.isaacs) == "upper":
+        return _nested(hamiltonian, players.control, players.disturbance, lambda u, d: (u, d))
+    value, d, u = _nested(hamiltonian, players.disturbance, players.control, lambda d, u: (u, d))
+    return value, u, d
+
+
+def optimal_value(hamiltonian: DiscreteHamiltonian) -> jax.Array:
+    """min max of H, or max min, where nobody asks for the actions: of finitely many none is kept in mind."""
+    players = players_of(hamiltonian.on)
+    player, admissible = players.control, players.control.admissible
+    if players.disturbance.admissible is not None or not isinstance(admissible, Finite):
+        return optimise(hamiltonian)[0]
+    points = jnp.asarray(admissible.points, hamiltonian.on.dtype)
+    return search.optimum(lambda u: hamiltonian.at(u, []), points, player.sign, weight=player.effort)
+
+
+def best_response(
+    hamiltonian: DiscreteHamiltonian, player: Player, join: Callable, most: int = UNROLL
+) -> tuple[jax.Array, Action]:
+    """One player's optimum against a given action of the other; ``join(mine)`` makes the pair (u, d).
+
+    ``most`` is how many evaluations may be written out, where it samples.
+    """
+    if player.admissible is None:
+        return hamiltonian.at(*join([])), []
+    if player.exact:
+        action = exact_optimum(hamiltonian, player, join)
+    else:
+        start = _admissible(hamiltonian, player, join)
+        _, action, _ = _sampled(
+            hamiltonian, player, lambda action: (hamiltonian.at(*join(action)), []),
+            weight=player.effort, most=most, start=start,
+        )  # fmt: skip
+    if not hamiltonian.bare:
+        action = jax.lax.optimization_barrier(action)  # or the search is done twice, for the action and for the value
+    return hamiltonian.at(*join(action)), action
+
+
+def _nested(
+    hamiltonian: DiscreteHamiltonian, outer: Player, inner: Player, join: Callable
+) -> tuple[jax.Array, Action, Action]:
+    """The outer player's optimum, who moves first and knows that the inner one answers."""
+
+    def objective(action):
+        return best_response(hamiltonian, inner, lambda reply: join(action, reply), most=INNER)
+
+    if outer.admissible is None:  # a lower game without controls, say: nobody moves first
+        value, answer = objective([])
+        return value, [], answer
+    return _sampled(hamiltonian, outer, objective, weight=inner.weight)
+
+
+def _admissible(hamiltonian: DiscreteHamiltonian, player: Player, join: Callable) -> Action | None:
+    """At constrained ends an action of a sampled control that does not leave, where that can be found exactly."""
+    if hamiltonian.slack is None or player.sign < 0:
+        return None
+    # without the cost H is the gain alone, infinite outside: the least of it is exact where the drift is affine
+    free = altered(hamiltonian.on.problem, cost=None)
+    alone = players_of(hamiltonian.asking(free).on).control
+    return exact_optimum(hamiltonian.asking(free), alone, join) if alone.exact else None
+
+
+def _sampled(
+    hamiltonian: DiscreteHamiltonian,
+    player: Player,
+    objective: Callable,
+    weight: int,
+    most: int = UNROLL,
+    start: Action | None = None,
+) -> Any:
+    """The best of samples, refined by a pattern search between them; of finitely many actions the best of all."""
+    assert player.admissible is not None
+    points = jnp.asarray(sets.samples(player.admissible, SAMPLES), hamiltonian.on.dtype)
+    best = enumerate_actions(objective, points, player.sign, weight=weight, most=most)
+    if isinstance(player.admissible, Finite):
+        return best
+    project = _projection(player.admissible)
+    # samples may miss a part of the set in which the drift stays inside, or the action of the last step
+    if start is not None:
+        best = best_of(objective, [start], player.sign, best)
+    if hamiltonian.tried is not None:
+        best = best_of(objective, [project(hamiltonian.tried[0 if player.sign > 0 else 1])], player.sign, best)
+    return refine(objective, best, sets.spacing(player.admissible, SAMPLES), project, player.sign, weight=weight)
+
+
+def _projection(admissible: Box | Ball) -> Callable[[Action], Action]:
+    """The map of an action onto its set: a step of the search may leave it."""
+    if isinstance(admissible, Box):
+        return lambda action: [jnp.clip(u, admissible.lo[j], admissible.hi[j]) for j, u in enumerate(action)]
+
+    def onto_ball(action):
+        shrink = jnp.minimum(1, admissible.radius * inverse_root(sum(u * u for u in action)))
+        return [shrink * u for u in action]
+
+    return onto_ball
+
+
+def _any_action(admissible: AdmissibleSet) -> Action:
+    """Some action of the set; zero need not be one."""
+    if isinstance(admissible, Ball):
+        return [jnp.zeros(())] * admissible.dim
+    first = admissible.lo if isinstance(admissible, Box) else admissible.points[0]
+    return [first[j] for j in range(admissible.dim)]

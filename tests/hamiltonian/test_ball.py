@@ -1,0 +1,116 @@
+"""Exact minima over a ball of quadratics plus piecewise linear gains, against scans of the ball."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from pieces import NODES, gain, random_pieces
+from scipy.optimize import minimize
+from systems import SEEDS
+
+import hjbjax as hjb
+from hjbjax.hamiltonian.ball import combinations, kinked_ball, least_in_ball
+from hjbjax.hamiltonian.piecewise import Kinked
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _float64():
+    with jax.enable_x64(True):
+        yield
+
+
+@functools.partial(jax.jit, static_argnames=("sign", "curved"))
+def best_in_ball(sign, pieces, linear, square, radius, directions, curved):
+    made = [Kinked(functools.partial(gain, k, d), b, s, list(k), list(d)) for b, s, k, d in zip(*pieces, strict=True)]
+    made[-1] = None  # an input that drives nothing
+
+    def value(action):
+        result = sum(b * u + c * u * u for b, c, u in zip(linear, square, action, strict=True))
+        return result + sum(p.gain(p.offset + p.slope * u) for p, u in zip(made[:-1], action[:-1], strict=True))
+
+    action = kinked_ball(sign, radius, list(linear), list(square), made, curved=curved)
+    around = [radius * directions[:, j, None] for j in range(len(linear))]
+    return jnp.stack(action), value(action), value(around)
+
+
+@pytest.mark.parametrize("curved", [False, True])
+@pytest.mark.parametrize(("dim", "kinks"), [(1, 1), (2, 1), (3, 1), (2, 3)])
+@given(seed=SEEDS)
+@settings(max_examples=15)
+def test_a_ball_is_optimal_over_a_scan(dim, kinks, curved, seed):
+    """Gains convex and concave, squares of very different size, some of them zero, and balls of one point."""
+    rng = np.random.default_rng(seed)
+    pieces, linear = random_pieces(rng, dim, kinks), rng.normal(size=(dim, NODES))
+    radius = rng.uniform(0, 2) * rng.choice([0.0, 1.0], p=[0.1, 0.9])
+    square = np.zeros((dim, NODES))
+    if curved:
+        square = 10.0 ** rng.uniform(-3, 2, (dim, NODES)) * rng.choice([0.0, 1.0], (dim, NODES), p=[0.2, 0.8])
+        linear *= rng.choice([0.0, 1.0], (dim, NODES), p=[0.2, 0.8])
+    sphere = rng.normal(size=(2000, dim))
+    sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
+    directions = np.concatenate([sphere, sphere * rng.uniform(0, 1, (2000, 1)) ** (1 / dim), np.zeros((1, dim))])
+    for sign in (1, -1):
+        action, value, scan = map(
+            np.asarray, best_in_ball(sign, pieces, linear, sign * square, radius, directions, curved)
+        )
+        assert np.all(np.linalg.norm(action, axis=0) <= radius * (1 + 1e-12))
+        assert np.all(sign * value <= np.min(sign * scan, axis=0) + 1e-9)
+
+
+@pytest.mark.parametrize("units", [1.0, 1e-7, 1e6])
+def test_the_least_quadratic_in_a_ball_against_scipy(units):
+    """Of one cell the optimum to rounding, also where the quadratic is concave, where b = 0, and of any size."""
+    rng = np.random.default_rng(5)
+    for dim in (1, 2, 3, 4):
+        slope, square = rng.normal(size=(2, dim, 40))
+        slope[:, :5], slope[0, 5:10], square[:, 10:20] = 0, 0, np.abs(square[:, 10:20])
+        found = np.stack(least_in_ball(0.7, list(slope * units), list(square * units)))
+
+        def value(u, at, slope=slope, square=square):
+            u = u * min(1, 0.7 / max(np.linalg.norm(u), 1e-12))
+            return slope[:, at] @ u + square[:, at] @ u**2
+
+        assert np.all(np.linalg.norm(found, axis=0) <= 0.7 * (1 + 1e-12))
+        for at in range(slope.shape[1]):
+            # a local search from many starts: the global optimum is among what it finds
+            starts = rng.normal(size=(12, dim))
+            best = min(minimize(value, start, args=(at,), method="Nelder-Mead").fun for start in starts)
+            assert value(found[:, at], at) <= best + 1e-7
+
+
+def test_the_optimum_in_a_ball_has_two_derivatives():
+    """min (b·u + Σ c u²) has the gradient u and a Hessian, inside the ball and on its sphere, against differences."""
+
+    def least(b):
+        u = jnp.stack(least_in_ball(0.5, list(b), [0.3, 1.0, 2.0]))
+        return b @ u + jnp.array([0.3, 1.0, 2.0]) @ u**2
+
+    for b in (np.array([0.1, -0.2, 0.3]), np.array([1.0, -2.0, 3.0]), np.array([0.02, 4.0, 1.0])):
+        gradient, bend = jax.grad(least)(b), jax.hessian(least)(b)
+        h = 1e-4 * np.eye(3)
+        np.testing.assert_allclose(gradient, [(least(b + e) - least(b - e)) / 2e-4 for e in h], atol=1e-8)
+        differences = [(jax.grad(least)(b + e) - jax.grad(least)(b - e)) / 2e-4 for e in h]
+        np.testing.assert_allclose(bend, differences, atol=1e-7)
+
+
+def pushed(x, u):
+    return 0.3 * jnp.sin(x) + u
+
+
+def question(weight):
+    return hjb.Problem(pushed, lambda x, u: jnp.sum(jnp.cos(x)) + weight * jnp.sum(u * u), hjb.Ball(1.0, 2), discount=1)
+
+
+def test_a_certificate_says_where_the_optimum_may_be_missed():
+    """Effort that costs: exact; that is earned: a quadratic on the sphere may have a second optimum."""
+    grid = hjb.Grid([-np.pi] * 2, [np.pi] * 2, (9, 9), periodic=[True, True])
+    for weight, sampled in ((0.5, False), (-0.1, True)):
+        solution = hjb.solve(question(weight), grid, scheme=hjb.Upwind())
+        assert ("refined sample" in solution.stats["certificate"]) == sampled
+
+
+def test_how_many_combinations_are_tried():
+    assert (combinations([2, 2, 2]), combinations([4, 4]), combinations([1, 2])) == (27, 49, 3)

@@ -157,7 +157,8 @@ def _intervals(ivp: InitialValueProblem, stepping: Stepping, reverse: bool = Fal
         u, d = loop.players(t, y[:-1])
         code = jnp.where((code == PathStatus.DURATION) & ~are_finite((u, d)), PathStatus.UNDEFINED, code)
         active = code == PathStatus.DURATION  # while all is well the code is that of a path which lasts to its end
-        later, moved, result, made = _advance(loop, stepping, solve, (t, jnp.where(active, end, t)), y, u)
+        times = (t, jnp.where(active, end, t), ivp.times[-1])
+        later, moved, result, made = _advance(loop, stepping, solve, times, y, u)
         count = count + made
         code = jnp.where(active, result, code)
         code = jnp.where((code == PathStatus.DURATION) & (count >= stepping.max_steps), PathStatus.MAX_STEPS, code)
@@ -193,13 +194,14 @@ def _path(ivp: InitialValueProblem, stepping: Stepping, last: Progress, shown: R
 
 
 def _advance(
-    loop: Loop, stepping: Stepping, solve: Callable, interval: tuple[jax.Array, jax.Array], y: jax.Array, u: Control
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    loop: Loop, stepping: Stepping, solve: Callable, times: tuple[jax.Array, ...], y: jax.Array, u: Control
+) -> Progress:
     """The path at the end of an interval, or at the target or the edge if they come first: (time, y, code, steps)."""
     import diffrax
 
-    t, end = interval
-    width = jnp.where(end > t, end - t, 1)  # of an ended path: any positive number
+    t, end, last = times  # of the interval, and the last of all
+    # under vmap a step of a path that is over is worked out, too, and may not go beyond the Brownian path
+    width = jnp.where(end > t, end - t, jnp.where(last > t, last - t, 1))
     if loop.problem.noise is None:
         step = jnp.minimum(width, stepping.max_step)
     else:
@@ -266,9 +268,8 @@ def _solver(ivp: InitialValueProblem, stepping: Stepping, reverse: bool) -> Call
         kind, controller = diffrax.SRA1 if additive else diffrax.Euler, diffrax.ConstantStepSize()
         solver = bridging(kind)(flag=_flag_of_steps(ivp, stepping)) if bridged else kind()
     event = None
-    if (
-        loop.guarded or loop.problem.target is not None or (loop.grid is not None and not loop.clamp)
-    ):  # it doubles the compile time
+    ends = loop.guarded or loop.problem.target is not None or (loop.grid is not None and not loop.clamp)
+    if ends:  # it doubles the compile time
         close = BRACKET * jnp.finfo(x0.dtype).eps
         # flip=True: the function falls through zero. "detect" would put a host callback into the compiled run.
         event = diffrax.Event(margin, _bisection()(close, close, flip=True), direction=False)
@@ -334,7 +335,6 @@ def _bisection() -> type:
     """The class of optimistix's bisection, stopped by the width of its bracket alone.
 
     A target function may be steep, or jump: a test of its value would never be met, or met too early.
-
     The answer is the late end of the bracket, where the function has fallen to zero or below.
     """
     import optimistix

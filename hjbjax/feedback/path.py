@@ -124,24 +124,26 @@ def _solution_of(feedback: object) -> Solution | None:
 def with_stops(problem: Problem, feedback: object) -> Problem:
     """The problem whose paths end, and pay ψ, where the Solution behind a feedback says that one had better stop.
 
-    That is where V = ψ at every node around. Problems whose value is no cost of a path, as of tubes, stay as they are,
-    and those with noise: between the steps of a noisy path a target is met by distances, which ψ − V is not.
+    That is where V = ψ at every node around. Problems whose value is no cost of a path, as of tubes, stay as they are.
     """
     solution = _solution_of(feedback)
     no_path = problem.cost is None or problem.running_max is not None or problem.is_game or problem.time_dependent
-    no_path |= problem.noise is not None
     if problem.stopping_cost is None or no_path or solution is None or solution.times is not None:
         return problem
     value, grid = jnp.asarray(solution.value), solution.grid
     surplus = of_state(problem, problem.stopping_cost, grid.components(value.dtype), 0.0, value.dtype) - value
     rounding = 16 * jnp.finfo(value.dtype).eps * jnp.max(jnp.where(jnp.isfinite(value), jnp.abs(value), 0))
-    beyond = jax.tree_util.Partial(_beyond, grid, surplus - rounding, as_partial(problem.target))
+    surplus -= rounding
+    if problem.noise is not None:
+        # V fits ψ smoothly, so that ψ − V grows as the square of the distance, of which a bridge between two steps asks
+        surplus = jnp.sqrt(jnp.maximum(surplus, 0))
+    beyond = jax.tree_util.Partial(_beyond, grid, surplus, as_partial(problem.target))
     pay = jax.tree_util.Partial(_pay, as_partial(problem.target), problem.exit_cost, problem.stopping_cost)
     return altered(problem, target=beyond, exit_cost=pay)
 
 
 def _beyond(grid: Grid, surplus: Array, target: Callable | None, x: State) -> Array:
-    """ψ − V between the nodes, or the target's function where that is less: ≤ 0 where the path ends."""
+    """ψ − V, or its root, between the nodes, or the target's function where that is less: ≤ 0 where the path ends."""
     least = jnp.asarray(grid.interpolate(surplus, x, clamp=True), x.dtype)
     return least if target is None else jnp.minimum(least, target(x))
 

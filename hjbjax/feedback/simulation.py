@@ -59,8 +59,8 @@ def simulate(
       problem: the system and its costs.
       feedback: a Solution, a ``greedy_feedback``, or a function that returns the control, shape (m,). ``None`` if
         there is no control.
-        Where a Solution of a problem with a stopping cost and without noise says that one had better stop, V = ψ at
-        all nodes around, the path ends as in a target and pays ψ.
+        Where a Solution of a problem with a stopping cost says that one had better stop, V = ψ at all nodes around,
+        the path ends as in a target and pays ψ.
         A marched Solution must have been kept at enough times: at least ten over the duration. Its terminal cost,
         and that of any problem, is paid at the end of a path that lasts as long as the horizon.
       x0: the state at time 0, shape (n,).

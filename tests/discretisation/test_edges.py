@@ -105,7 +105,7 @@ def test_beyond_open_ends_stands_the_parabola(stretch):
 
 
 def affine(matrix, gain, shift, x, u):
-    return matrix @ x + gain @ u + shift
+    return matrix @ x + (gain @ u if gain.ndim == 2 else gain * u) + shift
 
 
 def quadratic(weights, x, u):
@@ -121,11 +121,14 @@ def nodes_of(grid):
 
 
 def random_question(seed, n, cost, controls, *, diagonal=False, sigma=0.0):
-    """An affine drift that the controls can turn round at every end, and a cost with terms of all kinds."""
+    """An affine drift that the controls can turn round at every end, and a cost with terms of all kinds.
+
+    ``diagonal``: each input drives a component of its own, as the functions themselves show.
+    """
     rng = np.random.default_rng(seed)
-    gain = np.diag(rng.uniform(1.5, 2.5, n) * rng.choice([-1, 1], n))
+    gain = rng.uniform(1.5, 2.5, n) * rng.choice([-1, 1], n)
     if not diagonal:
-        gain = gain + rng.uniform(-0.3, 0.3, (n, n)) * (1 - np.eye(n))
+        gain = np.diag(gain) + rng.uniform(-0.3, 0.3, (n, n)) * (1 - np.eye(n))
     leaves = rng.uniform(-0.2, 0.2, (n, n)), gain, rng.uniform(-0.3, 0.3, n)
     weights = np.array([*rng.normal(size=2), rng.uniform(0.1, 1), 3 * rng.normal()])
     noise = np.full(n, sigma)
@@ -142,7 +145,7 @@ def oracle(problem, grid, actions):
 
 
 def _plain_affine(matrix, gain, shift, x, u):
-    return matrix @ x + gain @ u + shift
+    return matrix @ x + (gain @ u if gain.ndim == 2 else gain * u) + shift
 
 
 def _plain_quadratic(weights, fourth, x, u):
@@ -153,12 +156,15 @@ def _plain_quadratic(weights, fourth, x, u):
 def sampled(box, count, problem, ball=False):
     """Samples of a box or a ball, with all points on which a component of the drift vanishes: the walls of the set."""
     matrix, gain, shift = map(np.asarray, problem.drift.args)
+    gain = gain if gain.ndim == 2 else np.diag(gain)
     lines = [np.linspace(low, high, count) for low, high in zip(*box, strict=True)]
     base = np.stack(np.meshgrid(*lines, indexing="ij"), -1).reshape(-1, len(lines))
     radius = np.max(box)
     if ball:
-        angles = np.linspace(0, 2 * np.pi, 721)
-        base = np.concatenate([r * np.stack([np.cos(angles), np.sin(angles)], -1) for r in (0.5 * radius, radius)])
+        angles = np.linspace(0, 2 * np.pi, 361)
+        base = np.concatenate(
+            [r * np.stack([np.cos(angles), np.sin(angles)], -1) for r in radius * np.linspace(0, 1, 6)]
+        )
 
     def at(x):
         u = [base]

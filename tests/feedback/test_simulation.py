@@ -328,6 +328,20 @@ def test_a_brownian_motion_meets_its_target_on_time(steps, count):
 
 
 @pytest.mark.slow
+def test_paths_side_by_side_may_be_over_in_any_unit_of_time():
+    """A path that is over must ask for no w beyond the last time: it asked for that of a tenth of a unit later."""
+    keys = jax.random.split(jax.random.key(1), 20)
+    for unit in (1.0, 1e-4):
+        problem = Problem(lambda x, u: 0 * x, noise=unit**-0.5, target=lambda x: 1 - x[0] ** 2)
+        times = unit * np.linspace(0, 1.5, 11)
+        with jax.enable_x64(True):
+            run = jax.vmap(lambda key, p=problem, t=times: rollout(p, None, jnp.zeros(1), t, key=key).reached)
+            reached = np.asarray(jax.jit(run)(keys)) / unit
+        assert 5 < np.sum(reached <= 1.5) < 20
+        assert np.all((reached > 0.05) | np.isinf(reached))
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["additive", "function"])
 @pytest.mark.optimised
 def test_an_ornstein_uhlenbeck_process_leaves_its_interval_on_time(kind):

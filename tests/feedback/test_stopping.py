@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
+from hjbjax.feedback.simulation import rollout
 
 GRID = hjb.Grid([-1.5], [1.5], (151,))
 
@@ -50,5 +51,21 @@ def test_a_rollout_stops_as_well():
     solution = hjb.solve(problem, GRID)
     with jax.enable_x64(True):
         times = jnp.linspace(0.0, 3.0, 31)
-        path = jax.jit(lambda x: hjb.feedback.simulation.rollout(problem, solution, x, times))(jnp.array([0.6]))
+        path = jax.jit(lambda x: rollout(problem, solution, x, times))(jnp.array([0.6]))
     assert float(path.cost) == pytest.approx(float(solution.value_at([0.6])), abs=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.optimised
+def test_noisy_paths_stop_and_cost_what_v_promises_in_the_mean():
+    """Those that ran on, as if nothing could be stopped, cost twice as much."""
+    problem = stopped(noise=0.4)
+    solution = hjb.solve(problem, hjb.Grid([-2.0], [2.0], (101,)))
+    keys, times = jax.random.split(jax.random.key(2), 400), np.linspace(0.0, 8.0, 41)
+    with jax.enable_x64(True):
+        run = jax.vmap(lambda key: rollout(problem, solution, jnp.array([0.55]), times, key=key))
+        paths = jax.jit(run)(keys)
+    assert np.all(np.asarray(paths.code) == 1)  # TARGET
+    cost = np.asarray(paths.cost)
+    mean, deviation = cost.mean(), cost.std() / np.sqrt(len(cost))
+    assert abs(mean - float(solution.value_at([0.55]))) < 4 * deviation < 0.04

@@ -11,7 +11,6 @@ Exit codes: 0 done, 1 a check of ``doctor`` failed, 2 usage, 3 not converged, 4 
 import contextlib
 import dataclasses
 import json
-import signal
 import sys
 import warnings
 from collections.abc import Iterator
@@ -34,6 +33,7 @@ from hjbjax.cli.command_line import (
     say,
     systems,
 )  # fmt: skip
+from hjbjax.solution.clock import interruptible
 
 if TYPE_CHECKING:  # for annotations alone: what is heavy is imported by the command that needs it
     from hjbjax.problem.grid import Grid
@@ -108,7 +108,7 @@ def solve(
         return
     options["mesh"] = processes_of.mesh_of(devices)
     if processes_of.rank() > 0:  # the first process of a launch writes, and speaks for all
-        with _interruptible():
+        with interruptible():
             _raise_unless_converged(_solve(*_build(entry, parameters, shape), options))
         return
     out = Path(name) if out is None else out
@@ -121,7 +121,7 @@ def solve(
         with _one_line_error(OSError, 2, "--out: "):
             staging = stack.enter_context(run_folder.staging(out))
         stack.enter_context(_one_line_warnings())
-        stack.enter_context(_interruptible())
+        stack.enter_context(interruptible())
         if not no_cache:
             compile_cache.keep_for_the_command()
         solution = _solve(problem, grid, options)
@@ -205,24 +205,6 @@ def _build(entry: "Entry", parameters: dict[str, Any], shape: tuple[int, ...] | 
         raise Failure(error) from error
     except MemoryError as error:
         raise Failure(error, 6) from error
-
-
-@contextlib.contextmanager
-def _interruptible() -> Iterator[None]:
-    """Ctrl-C and SIGTERM alike: the solver keeps what it has for either.
-
-    A shell starts background jobs with SIGINT ignored, so SIGTERM must not go by way of SIGINT. While it runs the
-    solver notes what has the usual handler of Ctrl-C, and takes either for one.
-    """
-    try:
-        old = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    except ValueError:  # not the main thread: signals are another's business
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, old)
 
 
 @contextlib.contextmanager
@@ -312,7 +294,7 @@ def gallery(out: Path, only: tuple[str, ...], force: bool, no_cache: bool) -> No
         with _one_line_error(OSError, 2, "--out: "):
             staging = stack.enter_context(run_folder.staging(out))
         stack.enter_context(_one_line_warnings())
-        stack.enter_context(_interruptible())
+        stack.enter_context(interruptible())
         if not no_cache:
             compile_cache.keep_for_the_command()
         names = [name for name in zoo.catalogue if name in only or not only]

@@ -156,11 +156,9 @@ def least_in_ball(radius: PerNode, slope: Sequence[PerNode], square: Sequence[Pe
     # the free minimum counts only where it exists: an input without curvature but with a slope runs to the sphere
     exists = functools.reduce(jnp.logical_and, ((k > 0) | (b == 0) for b, k in zip(slope, curvature, strict=True)))
     inside = exists & (_dot(inner, inner) <= radius * radius) & ~concave
-    # b = 0 is no rare case, and on the sphere nothing has a derivative there
-    tiny = jnp.finfo(jnp.result_type(*slope)).tiny
-    nothing = _dot(slope, slope) <= tiny
-    slope = [jnp.where(nothing, 1, b) for b in slope]
-    found = _on_sphere(radius, slope, curvature)
+    # b = 0 is no rare case, and on the sphere nothing has a derivative there: other numbers take its place
+    nothing = _dot(slope, slope) <= jnp.finfo(jnp.result_type(*slope)).tiny
+    found = _on_sphere(radius, *([jnp.where(nothing, 1, e) for e in each] for each in (slope, curvature)))
     bound = [jnp.where(nothing, 0, u) for u in found]
     # without a slope along the most concave input both ways to the sphere are as good: up
     room = jnp.maximum(radius * radius - _dot(bound, bound), 0)

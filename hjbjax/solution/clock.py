@@ -144,6 +144,34 @@ class _Beside(Clock):
 
 
 _running: list[Clock] = []  # of the main thread, the outermost run first
+_raised: list[int] = []  # signals for which ``_interrupt`` raised
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """What the command does on a signal: Ctrl-C's exception, and a note that there was one."""
+    _raised.append(number)
+    raise KeyboardInterrupt
+
+
+@contextlib.contextmanager
+def interruptible() -> Iterator[None]:
+    """Context of a command that Ctrl-C and SIGTERM end alike: a run in it keeps what it has for either.
+
+    Python drops an exception in a callback of its garbage collector, and JAX has such; the next run notes the signal.
+    A shell starts background jobs with SIGINT ignored, which stays so, and SIGTERM must not go by way of it.
+    """
+    if threading.current_thread() is not threading.main_thread():  # signals are another's business
+        yield
+        return
+    ignored = signal.getsignal(signal.SIGINT) is not signal.default_int_handler
+    usual = {number: signal.signal(number, _interrupt) for number in (SIGNALS[1:] if ignored else SIGNALS)}
+    _raised.clear()
+    try:
+        yield
+    finally:
+        for number, handler in usual.items():
+            signal.signal(number, handler)
+        _raised.clear()
 
 
 @contextlib.contextmanager
@@ -157,11 +185,11 @@ def noting_interrupts(clock: Clock) -> Iterator[None]:
         yield
         return
     # A run inside another one finds the handler of the outer already there.
-    usual = signal.default_int_handler
-    noted = [] if _running else [number for number in SIGNALS if signal.getsignal(number) is usual]
+    handlers = {} if _running else {number: signal.getsignal(number) for number in SIGNALS}
+    noted = {n: usual for n, usual in handlers.items() if usual in (signal.default_int_handler, _interrupt)}
 
     def give_back() -> None:
-        for number in noted:
+        for number, usual in noted.items():
             signal.signal(number, usual)
 
     def note(number: int, frame: FrameType | None) -> None:
@@ -170,7 +198,7 @@ def noting_interrupts(clock: Clock) -> Iterator[None]:
         give_back()  # a second Ctrl-C is the usual KeyboardInterrupt
 
     # a Ctrl-C that fell between two inner runs was noted on the outer clock
-    clock.interrupted |= any(each.interrupted for each in _running)
+    clock.interrupted |= any(each.interrupted for each in _running) or bool(_raised)
     _running.append(clock)
     try:
         for number in noted:

@@ -29,6 +29,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, as_partial, is_traced, with_suggestions
 from hjbjax.problem.types import DType, Numbers
+from hjbjax.tracing import jaxprs
 from hjbjax.tracing.outside import (
     ADDRESS,
     FLOATS,
@@ -201,7 +202,7 @@ class Marked:
         except Exception:
             self._jaxprs[key] = None
             return None
-        found = closed, jax.tree.structure(results)
+        found = jaxprs.in_use(closed), jax.tree.structure(results)
         if not is_traced(closed.consts):  # else it belongs to one transformation, which ends
             self._jaxprs[key] = found
         return found

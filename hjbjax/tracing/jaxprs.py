@@ -146,3 +146,17 @@ def closed(jaxpr: jex.Jaxpr) -> jex.ClosedJaxpr:
     from jax.extend.core import ClosedJaxpr
 
     return ClosedJaxpr(jaxpr, ())
+
+
+def in_use(found: jex.ClosedJaxpr) -> jex.ClosedJaxpr:
+    """A jaxpr with its constants in the types that numbers have: without x64 a trace keeps NumPy's float64."""
+    from jax.extend.core import ClosedJaxpr
+
+    return ClosedJaxpr(found.jaxpr, [_in_use(constant) for constant in found.consts])
+
+
+def _in_use(constant: Any) -> Any:
+    if jax.dtypes.issubdtype(constant.dtype, jax.dtypes.extended):  # a random key
+        return constant
+    dtype = jax.dtypes.canonicalize_dtype(constant.dtype)
+    return constant if constant.dtype == dtype else np.asarray(constant, dtype)

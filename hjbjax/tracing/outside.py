@@ -41,6 +41,7 @@ LIBRARIES = frozenset({"builtins", "functools", "hjbjax", "itertools", "jax", "j
 # what a number may do to a state or a control without a say in how the result depends on these
 ARITHMETIC = frozenset({"add", "add_any", "sub", "mul", "div", "max", "min", "atan2", "dot_general", "concatenate"})
 CALLED = frozenset({"jit", "pjit"})  # JAX renamed the one to the other
+INSIDE = "."  # between the name of a function and that of what it reads
 FLOATS = (float, np.floating)
 NUMBERS = (int, float, np.integer, np.floating)
 
@@ -223,29 +224,57 @@ class OfNumbers:
 
     def __call__(self, numbers: tuple, *arguments: Any, **options: Any) -> Any:
         """What the function returns where it reads ``numbers``."""
-        values = dict(zip(self.names, numbers, strict=True))
-        inner = self.function.__code__.co_freevars
-        cells = self.function.__closure__ or ()
-        changed = types.FunctionType(
-            self.function.__code__,
-            self.function.__globals__ | {name: values[name] for name in self.names if name not in inner},
-            self.function.__name__,
-            self.function.__defaults__,
-            tuple(types.CellType(values[n]) if n in values else c for n, c in zip(inner, cells, strict=True)),
-        )
-        changed.__kwdefaults__ = self.function.__kwdefaults__
-        return changed(*arguments, **options)
+        return _reading(self.function, dict(zip(self.names, numbers, strict=True)))(*arguments, **options)
 
 
-def numbers_read(function: Callable, kinds: tuple[type, ...]) -> dict[str, np.ndarray]:
-    """Numbers of these kinds and real arrays in the cells and globals that a function's own code names."""
-    if not isinstance(function, types.FunctionType) or _writes(function.__code__):
+def _reading(function: types.FunctionType, numbers: dict[str, Any]) -> types.FunctionType:
+    """A function written again that reads ``numbers`` by their names; ``helper.name`` in a function that it names."""
+    values: dict[str, Any] = {}
+    for name, number in numbers.items():
+        helper, _, inner = name.partition(INSIDE)
+        if inner:
+            values.setdefault(helper, {})[inner] = number
+        else:
+            values[name] = number
+    read = _read(function)
+    values = {n: _reading(read[n], each) if isinstance(each, dict) else each for n, each in values.items()}
+    inner_names, cells = function.__code__.co_freevars, function.__closure__ or ()
+    changed = types.FunctionType(
+        function.__code__,
+        function.__globals__ | {name: each for name, each in values.items() if name not in inner_names},
+        function.__name__,
+        function.__defaults__,
+        tuple(types.CellType(values[n]) if n in values else c for n, c in zip(inner_names, cells, strict=True)),
+    )
+    changed.__kwdefaults__ = function.__kwdefaults__
+    return changed
+
+
+def numbers_read(function: Callable, kinds: tuple[type, ...], depth: int = 3) -> dict[str, np.ndarray]:
+    """Numbers of these kinds and real arrays in the cells and globals that a function's own code names.
+
+    And those of functions in its cells, as ``helper.name``: a drift that calls one made a line above.
+    """
+    if depth == 0 or not isinstance(function, types.FunctionType) or _writes(function.__code__):
         return {}
-    # a global whose name is an attribute's in the code is found as well, and then not read: no harm
+    read = _read(function)
+    found = {name: np.asarray(each, float) for name, each in read.items() if _is_number(each, kinds)}
+    for name in function.__code__.co_freevars:
+        inside = numbers_read(read[name], kinds, depth - 1) if isinstance(read[name], types.FunctionType) else {}
+        found |= {f"{name}{INSIDE}{each}": number for each, number in inside.items()}
+    return dict(sorted(found.items()))
+
+
+def _read(function: types.FunctionType) -> dict[str, Any]:
+    """What the globals and the cells hold that a function's own code names.
+
+    A global whose name is an attribute's in the code is found as well, and then not read: no harm.
+    """
     found = {name: function.__globals__.get(name) for name in names_read(function.__code__)}
-    for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
-        found[name] = content(cell)
-    return {name: np.asarray(each, float) for name, each in sorted(found.items()) if _is_number(each, kinds)}
+    return found | {
+        name: content(cell)
+        for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
+    }
 
 
 def _writes(code: types.CodeType) -> bool:

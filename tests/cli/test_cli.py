@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import warnings
+import weakref
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from click.testing import CliRunner
 
 import hjbjax
 from hjbjax import zoo
-from hjbjax.cli import run_folder
+from hjbjax.cli import compile_cache, run_folder
 from hjbjax.cli.main import main
 from hjbjax.feedback.path import Path, PathStatus
 from hjbjax.solution.solution import Solution, Status, load
@@ -370,6 +371,28 @@ def test_sigterm_is_an_interrupt_and_the_handler_goes_back(solver, monkeypatch):
     assert (result.exit_code, result.stderr.strip()) == (130, "hjbjax: interrupted")
     assert signal.getsignal(signal.SIGTERM) is before
     assert not os.listdir(".")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_that_python_drops_is_noted(monkeypatch, number):
+    """An exception in a callback of the garbage collector, of which JAX has one, goes nowhere: three of eight did."""
+
+    class Thing:
+        pass
+
+    def dropped():
+        thing = Thing()
+        weakref.finalize(thing, signal.raise_signal, number)
+        monkeypatch.setattr(sys, "unraisablehook", lambda found: seen.append(found.exc_type))
+        monkeypatch.setattr(sys, "excepthook", lambda kind, *_: seen.append(kind))  # where finalizers report
+        del thing
+
+    seen, before = [], signal.signal(signal.SIGINT, signal.default_int_handler)
+    monkeypatch.setattr(compile_cache, "keep_for_the_command", dropped)
+    result = run("solve", "bang-bang")
+    signal.signal(signal.SIGINT, before)
+    assert seen == [KeyboardInterrupt]
+    assert result.exit_code == 130
 
 
 def test_a_warning_is_one_line_and_a_path_that_cannot_be_is_left_out(solver, monkeypatch):

@@ -96,6 +96,23 @@ def test_the_optimum_in_a_ball_has_two_derivatives():
         np.testing.assert_allclose(bend, differences, atol=1e-7)
 
 
+@pytest.mark.parametrize("curved", [False, True])
+def test_the_slopes_of_an_optimum_are_its_actions(curved):
+    """∂/∂b of min (b·u + ...) is u, by the formulas' own derivatives: finite also where inputs sit at kinks."""
+    rng = np.random.default_rng(3)
+    pieces, linear = random_pieces(rng, 3, 1), rng.normal(size=(3, NODES))
+    square = 10.0 ** rng.uniform(-2, 1, (3, NODES)) if curved else np.zeros((3, NODES))
+    linear[:, 0] = 0  # a node at which nothing pulls but the gains
+
+    def total(linear, radius):
+        return jnp.sum(best_in_ball(1, pieces, linear, square, radius, np.zeros((1, 3)), curved)[1])
+
+    action = best_in_ball(1, pieces, linear, square, 0.8, np.zeros((1, 3)), curved)[0]
+    slope, room = jax.grad(total, argnums=(0, 1))(linear, 0.8)
+    np.testing.assert_allclose(slope, action, atol=1e-9)
+    assert room == pytest.approx((total(linear, 0.8 + 1e-6) - total(linear, 0.8 - 1e-6)) / 2e-6, abs=1e-7)
+
+
 def pushed(x, u):
     return 0.3 * jnp.sin(x) + u
 

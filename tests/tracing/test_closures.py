@@ -153,6 +153,47 @@ def test_a_lambda_of_other_numbers_compiles_nothing_again():
         assert cost == pytest.approx(wanted, rel=1e-5)
 
 
+@pytest.mark.slow
+def test_numbers_of_a_helper_are_numbers_too():
+    """A drift that calls a function made a line above it, as in a factory of models."""
+
+    def pushed(gain):
+        return lambda x, u: gain * u
+
+    def ask(gain, offset):
+        push = pushed(gain)
+        return hjb.Problem(lambda x, u: push(x, u) - offset * x, square, UNIT, discount=1.0)
+
+    def value(gain, offset):
+        return hjb.solve(ask(gain, offset), LINE, tol=1e-9, scheme=hjb.Upwind()).value[2]
+
+    first = value(1.0, 0.5)
+    programs, found = compiled(lambda: value(1.5, 0.25))
+    assert programs == 0
+    plain = hjb.Problem(lambda x, u: 1.5 * u - 0.25 * x, square, UNIT, discount=1.0)
+    assert found == pytest.approx(hjb.solve(plain, LINE, tol=1e-9, scheme=hjb.Upwind()).value[2], rel=1e-8)
+    assert abs(found - first) > 1e-3
+    # what calls itself reads no numbers without end, and a helper that counts is left as it is
+
+    def halved(x, u, depth=3):
+        return 1.25 * u if depth == 0 else halved(x, u, depth - 1) / 2
+
+    jitted = closures.settled(hjb.Problem(lambda x, u: halved(x, u), square, UNIT), 1).drift
+    assert jax.jit(jitted)(np.ones(1), np.ones(1)) == pytest.approx(1.25 / 8)
+
+
+def test_an_array_of_a_helper_in_float32():
+    """Without x64 a trace keeps an array of NumPy's in float64, which then met the float32 of the states."""
+    gain = np.ones(1)
+
+    def push(x, u):
+        return gain * u
+
+    problem = hjb.Problem(lambda x, u: push(x, u), square, UNIT, discount=1.0)
+    assert hjb.solve(problem, LINE, scheme=hjb.Upwind(), dtype="float32").status.name == "CONVERGED"
+    assert hjb.march(problem, LINE, 0.1, dtype="float32").value.dtype == np.float32
+
+
 def test_numbers_that_decide_stay_in_the_code():
     """Exponents, shapes, indices, branches and comparisons: seen anew each time, and as good as written down."""
 

@@ -110,7 +110,8 @@ def test_the_slopes_of_an_optimum_are_its_actions(curved):
     action = best_in_ball(1, pieces, linear, square, 0.8, np.zeros((1, 3)), curved)[0]
     slope, room = jax.grad(total, argnums=(0, 1))(linear, 0.8)
     np.testing.assert_allclose(slope, action, atol=1e-9)
-    assert room == pytest.approx((total(linear, 0.8 + 1e-6) - total(linear, 0.8 - 1e-6)) / 2e-6, abs=1e-7)
+    differences = (total(linear, 0.8 + 1e-6) - total(linear, 0.8 - 1e-6)) / 2e-6
+    assert float(room) == pytest.approx(float(differences), abs=1e-7)
 
 
 def pushed(x, u):

@@ -75,10 +75,14 @@ def links(on: Discretisation) -> list[Links]:
     return result
 
 
+def keeps(on: Discretisation) -> bool:
+    """Whether the cut links are kept at hand: where there are such, and they take little room."""
+    return on.scheme.subcell and on.problem.target is not None and on.grid.size <= KEPT
+
+
 def kept(on: Discretisation) -> Discretisation:
     """The discretisation with its cut links at hand, on grids where they take little room."""
-    wanted = on.scheme.subcell and on.problem.target is not None and on.grid.size <= KEPT
-    return dataclasses.replace(on, cut=tuple(links(on))) if wanted else on
+    return dataclasses.replace(on, cut=tuple(links(on))) if keeps(on) else on
 
 
 def _across_seam(coordinate: jax.Array, grid: Grid, axis: int) -> jax.Array:

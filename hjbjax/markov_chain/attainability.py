@@ -23,6 +23,7 @@ from hjbjax.problem.types import Array, Mask, Number, Scalar
 from hjbjax.solution.clock import Clock
 
 FEW = 9  # of each player in a game, where all pairs are
+SMALL = 20_000  # nodes up to which NumPy follows paths in less time than SciPy's graphs take to import
 LARGE = 200_000  # nodes beyond which paths are first followed on the device, all at once
 LONG = 4  # times the nodes of all axes together: jumps of a path that are followed there
 SEARCHABLE = 5 * 10**7  # jumps that a search on the host can list: some 60 bytes each
@@ -38,37 +39,40 @@ def _open_jumps(
     which a component of the drift vanishes, are tried as well.
     """
     points = tried_actions.control_samples(on.problem)
-    known: Rates | None = None
+    known = _no_jumps(on, points)
     count, some = len(points), max(1, LOOK // on.grid.size)
     for first in range(0, count, some):
         clock.enter(f"the jumps of the chain, {first} of {count} actions")
         last = min(first + some, count)
         # always as many actions, the last lot overlapping the one before: another number would be another program
-        known = _more_open_jumps(on, inside, known, points[max(last - some, 0) : last], least=least, kinks=kinks)
-    assert known is not None
+        lot = points[max(last - some, 0) : last]
+        # the actions between the samples of a ball do not depend on these: once, with the first lot
+        known = _more_open_jumps(on, inside, known, lot, least=least, kinks=kinks, outmost=kinks and first == 0)
     return known
 
 
-@functools.partial(jax.jit, static_argnames="kinks")
+def _no_jumps(on: Discretisation, points: Array) -> Rates:
+    """The jumps that the chain may make, none of them open."""
+    # the offsets are those of every action, since they follow from the noise and not from what is done
+    offsets = jax.eval_shape(lambda: jump_rates(on, list(jnp.asarray(points[0], on.dtype)))).offsets
+    return Rates(offsets, tuple(np.zeros(on.grid.shape, bool) for _ in offsets))
+
+
+@functools.partial(jax.jit, static_argnames=("kinks", "outmost"))
 def _more_open_jumps(
     on: Discretisation,
     inside: jax.Array | None,
-    known: Rates | None,
+    known: Rates,
     points: Array,
     *,
     least: Number = 0.0,
     kinks: bool = False,
+    outmost: bool = False,
 ) -> Rates:
     """The jumps that are known to be open and those of the actions ``points``, shape (count, m)."""
     # a jump is open once any action makes it, so that the order of the actions, and one tried twice, change nothing
     grid, points = on.grid, jnp.asarray(points, on.dtype)
     mine = players_of(on).control
-    # once, with the first lot: they do not depend on the samples
-    outmost = tried_actions.of_a_ball(on, mine) if kinks and known is None else []
-    if known is None:
-        # the offsets are those of every action, since they follow from the noise and not from what is done
-        start = jump_rates(on, list(points[0]))
-        known = Rates(start.offsets, tuple(jnp.zeros(grid.shape, bool) for _ in start.offsets))
 
     def tried(actions, opened):
         for each in actions:
@@ -84,7 +88,9 @@ def _more_open_jumps(
         action = list(points[k])
         return tried(tried_actions.with_kinks(on, mine, action) if kinks else [action], opened)
 
-    return Rates(known.offsets, jax.lax.fori_loop(0, len(points), also, tried(outmost, known.values)))
+    first = tried_actions.of_a_ball(on, mine) if outmost else []
+    opened = tried(first, tuple(map(jnp.asarray, known.values)))
+    return Rates(known.offsets, jax.lax.fori_loop(0, len(points), also, opened))
 
 
 def _stays(rates: Rates, grid: Grid, inside: jax.Array, least: Number) -> jax.Array:
@@ -145,7 +151,8 @@ def surely_reached(on: Discretisation, held: Mask, *, least: Number = 0.0) -> ja
     def shrink(carry):
         inside, _ = carry
         # all in one program: no clock, no search on the host, and as many jumps as there are nodes if need be
-        jumps = _more_open_jumps(on, inside, None, points, least=least, kinks=True)
+        none = _no_jumps(on, points)
+        jumps = _more_open_jumps(on, inside, none, points, least=least, kinks=True, outmost=True)
         found = inside & _predecessors(held, jumps, grid, grid.size)[0]
         return found, jnp.any(found != inside)
 
@@ -263,7 +270,8 @@ def _backward_reach(held: np.ndarray, jumps: Rates, grid: Grid, clock: Clock) ->
         if found is not None:
             return found
     clock.enter("the search for nodes that reach the target")
-    return _reach_on_host(held, jumps, grid)
+    found = _reach_in_passes(held, jumps, LONG * sum(grid.shape)) if grid.size <= SMALL else None
+    return _reach_on_host(held, jumps, grid) if found is None else found
 
 
 def _reach_on_device(held: np.ndarray, jumps: Rates, grid: Grid, clock: Clock, most: int) -> np.ndarray | None:
@@ -294,6 +302,19 @@ def _predecessors(found: jax.Array, jumps: Rates, grid: Grid, most: int | Scalar
 
     found, more, _ = jax.lax.while_loop(goes_on, step, (found, jnp.ones((), bool), 0))
     return found, more
+
+
+def _reach_in_passes(held: np.ndarray, jumps: Rates, most: int) -> np.ndarray | None:
+    """Nodes that lead to a held one, all at once in NumPy; None if their paths have more than ``most`` jumps."""
+    found, axes = held, tuple(range(held.ndim))
+    for _ in range(most):
+        more = found
+        for offset, jump in zip(jumps.offsets, map(np.asarray, jumps.values), strict=True):
+            more = more | (jump & np.roll(more, [-step for step in offset], axes))  # no jump leads out of the box
+        if np.array_equal(more, found):
+            return found
+        found = more
+    return None
 
 
 def _reach_on_host(held: np.ndarray, jumps: Rates, grid: Grid) -> np.ndarray:

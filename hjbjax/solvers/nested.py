@@ -286,7 +286,8 @@ def _on_coarser(task: Task, coarse: Grid) -> Task | None:
         # without those of the problem and the grid, which may have the shape of the nodes by chance
         bare: Any = dataclasses.replace(task, on=None)  # type: ignore[arg-type]
         known = jax.tree.map(lambda leaf: np.asarray(leaf)[every] if np.shape(leaf) == fine.shape else leaf, bare)
-        made = dataclasses.replace(known, on=_kept(task.on.on_grid(coarse)))
+        on = task.on.on_grid(coarse)
+        made = dataclasses.replace(known, on=_kept(on) if cut_cells.keeps(on) else on)
     elif task.has_lost:  # which nodes cannot reach the target is not known of other ones
         return None
     else:

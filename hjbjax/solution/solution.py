@@ -285,11 +285,14 @@ class Solution:
     def to_netcdf(self, path: Path, *, force: bool = False) -> None:
         """Write ``to_xarray()`` as netCDF, whole or not at all, for other tools; what ``load`` reads is of ``save``.
 
+        A slash in a name, which is a path of groups there, is written as the fraction slash, ⁄.
+
         Raises:
           FileExistsError: the file exists; another name or ``force=True`` helps.
           FileError: it cannot be written.
         """
         found = self.to_xarray()
+        found = found.rename({name: name.replace("/", "⁄") for name in map(str, found.variables) if "/" in name})
         files.write_whole(path, lambda file: found.to_netcdf(file, engine="h5netcdf"), force=force)
 
     def __repr__(self) -> str:

@@ -71,6 +71,15 @@ def test_a_file_for_other_tools_is_whole_or_not_there(tmp_path, monkeypatch):
     assert io.BytesIO(path.read_bytes()).read(4) == b"\x89HDF"
 
 
+def test_a_slash_in_a_name_makes_no_group(tmp_path):
+    pytest.importorskip("h5netcdf")
+    problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), discount=1.0)
+    solution = hjb.solve(problem, hjb.Grid([-1.0], [1.0], (9,), names=("v/ω",)), scheme=hjb.Upwind())
+    solution.to_netcdf(tmp_path / "run.nc")
+    with xarray.open_dataset(tmp_path / "run.nc", engine="h5netcdf") as found:
+        assert found["value"].dims == ("v⁄ω",)
+
+
 @pytest.mark.slow
 def test_a_batch_has_no_one_grid():
     import jax

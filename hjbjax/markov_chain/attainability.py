@@ -54,7 +54,9 @@ def _open_jumps(
 def _no_jumps(on: Discretisation, points: Array) -> Rates:
     """The jumps that the chain may make, none of them open."""
     # the offsets are those of every action, since they follow from the noise and not from what is done
-    offsets = jax.eval_shape(lambda: jump_rates(on, list(jnp.asarray(points[0], on.dtype)))).offsets
+    offsets = jax.eval_shape(
+        lambda on, action: jump_rates(on, list(action)), on, np.asarray(points[0], on.dtype)
+    ).offsets
     return Rates(offsets, tuple(np.zeros(on.grid.shape, bool) for _ in offsets))
 
 

@@ -51,12 +51,16 @@ def _open_jumps(
     return known
 
 
+@jax.jit  # never run: its trace is kept
+def _jumps_of(on: Discretisation, action: Array) -> Rates:
+    """The jumps under one action at every node, shape (m,)."""
+    return jump_rates(on, list(action))
+
+
 def _no_jumps(on: Discretisation, points: Array) -> Rates:
     """The jumps that the chain may make, none of them open."""
     # the offsets are those of every action, since they follow from the noise and not from what is done
-    offsets = jax.eval_shape(
-        lambda on, action: jump_rates(on, list(action)), on, np.asarray(points[0], on.dtype)
-    ).offsets
+    offsets = _jumps_of.eval_shape(on, np.asarray(points[0], on.dtype)).offsets
     return Rates(offsets, tuple(np.zeros(on.grid.shape, bool) for _ in offsets))
 
 

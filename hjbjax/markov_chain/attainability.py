@@ -60,7 +60,7 @@ def _jumps_of(on: Discretisation, action: Array) -> Rates:
 def _no_jumps(on: Discretisation, points: Array) -> Rates:
     """The jumps that the chain may make, none of them open."""
     # the offsets are those of every action, since they follow from the noise and not from what is done
-    offsets = _jumps_of.eval_shape(on, np.asarray(points[0], on.dtype)).offsets
+    offsets = _jumps_of.eval_shape(on, jax.ShapeDtypeStruct(np.shape(points)[1:], on.dtype)).offsets
     return Rates(offsets, tuple(np.zeros(on.grid.shape, bool) for _ in offsets))
 
 

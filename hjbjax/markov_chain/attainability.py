@@ -152,12 +152,11 @@ def _reached_by_samples(
 def surely_reached(on: Discretisation, held: Mask, *, least: Number = 0.0) -> jax.Array:
     """The nodes from which the held ones are reached with probability one, bool (*grid); inside a transformation."""
     points, on = tried_actions.control_samples(on.problem), on.on_grid(on.grid.walled)
-    grid = on.grid
+    grid, none = on.grid, _no_jumps(on, points)
 
     def shrink(carry):
         inside, _ = carry
         # all in one program: no clock, no search on the host, and as many jumps as there are nodes if need be
-        none = _no_jumps(on, points)
         jumps = _more_open_jumps(on, inside, none, points, least=least, kinks=True, outmost=True)
         found = inside & _predecessors(held, jumps, grid, grid.size)[0]
         return found, jnp.any(found != inside)
@@ -313,9 +312,10 @@ def _predecessors(found: jax.Array, jumps: Rates, grid: Grid, most: int | Scalar
 def _reach_in_passes(held: np.ndarray, jumps: Rates, most: int) -> np.ndarray | None:
     """Nodes that lead to a held one, all at once in NumPy; None if their paths have more than ``most`` jumps."""
     found, axes = held, tuple(range(held.ndim))
+    opened = [(offset, np.asarray(jump)) for offset, jump in zip(jumps.offsets, jumps.values, strict=True)]
     for _ in range(most):
         more = found
-        for offset, jump in zip(jumps.offsets, map(np.asarray, jumps.values), strict=True):
+        for offset, jump in opened:
             more = more | (jump & np.roll(more, [-step for step in offset], axes))  # no jump leads out of the box
         if np.array_equal(more, found):
             return found

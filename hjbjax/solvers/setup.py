@@ -43,7 +43,7 @@ OPERATIONS = 10_000  # of one evaluation: XLA takes minutes over a program in wh
 DIRECT = 50_000  # nodes up to which a plane with open ends is solved by sparse LU: about a second a step
 # A sweep hears of the part beside at the next exchange alone: 1600 x 1601 nodes on two devices took 19 steps of three
 # sweeps and 1.4 s, 14 steps of five and 1.2 s; 800 x 801 nodes take .23 s and .27 s.
-BETWEEN_PARTS, MILLION = 5, 10**6
+BETWEEN_PARTS, MANY = 5, 10**6  # sweeps, and the nodes beyond which there are so many
 NEST = 100_000  # nodes beyond which compiling coarser grids pays
 COARSEST = 20_000  # nodes up to which none is worth it: a step takes under a millisecond, and its program a second
 
@@ -91,7 +91,7 @@ def choose_evaluation(problem: Problem, grid: Grid, *, traced: bool, divided: bo
         small = grid.ndim < 3 and grid.size <= DIRECT and not divided
         return Direct() if small else Krylov()
     if problem.noise is None:
-        return Sweeps(BETWEEN_PARTS) if divided and grid.size > MILLION else Sweeps()
+        return Sweeps(BETWEEN_PARTS) if divided and grid.size > MANY else Sweeps()
     return Krylov() if traced or divided else linear_solve(grid)
 
 

@@ -18,6 +18,7 @@ from hjbjax.discretisation import stencil
 from hjbjax.discretisation.stencil import Links
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.padding import Padding
 from hjbjax.problem.parts import Parts
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, pytree_dataclass
@@ -89,7 +90,7 @@ class Chain(Scheme, Protocol):
         """
 
 
-@pytree_dataclass(static=("scheme", "dtype", "mesh"))
+@pytree_dataclass(static=("scheme", "dtype", "mesh", "room"))
 class Discretisation:
     """A problem on a grid by a scheme, in one floating-point type and at one time.
 
@@ -107,6 +108,7 @@ class Discretisation:
       cut: the links that end on the boundary of a target, kept by ``cut_cells``; None: made anew wherever they are
         wanted.
       mesh: the devices over which the nodes are divided while steps are made; None: one.
+      room: the shape of the arrays in which the nodes stand while steps are made; None: that of the grid.
     """
 
     problem: Problem
@@ -117,6 +119,7 @@ class Discretisation:
     plain: Any = None
     cut: tuple[Links, ...] | None = None
     mesh: Mesh | None = None
+    room: tuple[int, ...] | None = None
 
     def __post_init__(self):
         # jnp.float32 and "float32" are other keys than np.dtype: one program would be compiled for each
@@ -145,6 +148,13 @@ class Discretisation:
         """The parts of the grid over the mesh; None for one device, and for grids too small for it, as coarser ones."""
         parts = None if self.mesh is None else Parts(self.mesh, self.grid.shape)
         return parts if parts is not None and parts.fits else None
+
+    @property
+    def padding(self) -> Padding | None:
+        """How the nodes stand in larger arrays; None where they have their own."""
+        if self.room is None:
+            return None
+        return Padding(np.array(self.grid.shape, np.int32), self.room, self.grid.periodic or ())
 
     def coordinates(self) -> list:
         """The n coordinates of all nodes, each of a shape that broadcasts to (*grid)."""
@@ -245,8 +255,8 @@ def over_nodes(task: T, shape: tuple[int, ...]) -> T:
     return altered(jax.tree.map(mark, altered(task, on=None)), on=altered(nothing, cut=cut))
 
 
-def on_part(task: T, parts: Parts) -> T:
-    """A task, or a march, as one of the devices sees it, inside ``shard_map``."""
+def on_part(task: T, parts: Parts | Padding) -> T:
+    """A task, or a march, as one of the devices sees it, inside ``shard_map``; or, at host level, in larger arrays."""
     on: Discretisation = task.on  # type: ignore[attr-defined]
     return altered(task, on=altered(on, grid=on.grid.divided(parts)))
 

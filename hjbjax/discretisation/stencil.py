@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.parts import Parts
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import Array, AtNodes, Field, Number, Scalar
 
@@ -32,10 +33,10 @@ LONGER = 4  # axes up to which neighbours along the last one are slices of a lon
 def on_edge(grid: Grid, axis: int, step: int) -> Array:
     """The nodes without a neighbour in direction ``step`` along ``axis``, bool; broadcasts against the node axes."""
     along = [-1 if i == axis else 1 for i in range(grid.ndim)]
-    if grid.is_divided(axis):  # which nodes are here, only the running program knows
-        end = grid.whole.shape[axis] - 1 if step > 0 else 0
+    # which nodes are here, only the running program knows
+    if grid.parts is not None and (grid.is_divided(axis) or not grid.parts.even(axis)):
         ended = jnp.asarray(not grid.periodic[axis])  # type: ignore[index]
-        return ((grid.parts.nodes(axis) == end) & ended).reshape(along)  # type: ignore[union-attr]
+        return (grid.parts.last(axis, step) & ended).reshape(along)
     # (1, …, N, …, 1) and on the host: as a constant of the size of the grid it would stand in every program
     mask = np.zeros(grid.shape[axis], dtype=bool)
     mask[-1 if step > 0 else 0] = not grid.periodic[axis]  # type: ignore[index]
@@ -157,7 +158,7 @@ def beyond(values: AtNodes, grid: Grid, axis: int, step: int, ended: jax.Array) 
         return ended
     # what the other side has at the end that faces this one
     given = slices(values, grid, axis, -step, count=ended.shape[axis])
-    if grid.parts is None or not grid.is_divided(axis):
+    if not (isinstance(grid.parts, Parts) and grid.is_divided(axis)):
         return given
     found = grid.parts.fetched(given, axis, step, cyclic=cyclic)
     return found if cyclic else jnp.where(grid.parts.at_end(axis, step), ended, found)

@@ -31,7 +31,7 @@ import numpy as np
 
 from hjbjax.feedback.loop import Actions, BridgeDraw, Loop, are_finite, bridging, meeting_flag, onto_edge
 from hjbjax.feedback.path import Path, PathStatus
-from hjbjax.problem.derivatives import with_both_modes
+from hjbjax.hamiltonian.derivatives import with_both_modes
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import Array, Control, Key, Number, State
 

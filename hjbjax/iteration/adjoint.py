@@ -26,11 +26,11 @@ import jax.numpy as jnp
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.rates import Rates, jump_rates
 from hjbjax.hamiltonian import discrete, sensitivity
+from hjbjax.hamiltonian.derivatives import once
 from hjbjax.hamiltonian.search import Action
 from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
 from hjbjax.iteration.evaluation import Evaluation, Krylov, direct, evaluate, left_over, relaxed
 from hjbjax.iteration.fixed_point import State, Task
-from hjbjax.problem.derivatives import once
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import Field, Number, Scalar

@@ -28,6 +28,7 @@ import numpy as np
 from hjbjax.discretisation import stencil
 from hjbjax.iteration.bellman import PolicyEquation
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.parts import Parts
 from hjbjax.problem.types import Field, Scalar
 
 Index: TypeAlias = int | Scalar  # of a slice; traced inside a loop
@@ -49,7 +50,7 @@ def sweep(equation: PolicyEquation, grid: Grid, rounds: int) -> Field:
     layout = _layout(grid)
     equation = _laid_out(equation, layout)
     # news cross one part a sweep
-    rounds += 0 if grid.parts is None else max(grid.parts.sizes) // FURTHER
+    rounds += 0 if layout.parts is None else max(layout.parts.sizes) // FURTHER
 
     def order(index: jax.Array, delta: jax.Array) -> jax.Array:
         # one bit an axis beyond the first; forward and backward sweeps are the two ways along the first
@@ -88,6 +89,11 @@ class Layout:
     grid: Grid
     axes: tuple[int, ...]
 
+    @property
+    def parts(self) -> Parts | None:
+        """The parts of the nodes over many devices; None where all are here."""
+        return self.grid.parts if isinstance(self.grid.parts, Parts) else None
+
     def is_divided(self, axis: int) -> bool:
         """True if an axis of the arrays has a layer on both sides, for the nodes on other devices."""
         return self.grid.is_divided(self.axes[axis])
@@ -100,14 +106,14 @@ class Layout:
 def _layout(grid: Grid) -> Layout:
     """The axes in their order; where a part is so flat that hyperplanes would be folded often, the longest first."""
     axes = list(range(grid.ndim))
-    if grid.parts is not None and _folds(grid.shape) > FOLDS:
+    if isinstance(grid.parts, Parts) and _folds(grid.shape) > FOLDS:
         axes.sort(key=lambda axis: axis != int(np.argmax(grid.shape)))
     return Layout(grid, tuple(axes))
 
 
 def _laid_out(equation: PolicyEquation, layout: Layout) -> PolicyEquation:
     """The equation with a layer of zeros on both sides of every divided axis; in fillers zeros as well."""
-    parts = layout.grid.parts
+    parts = layout.parts
     if parts is None:
         return equation
     widths = [(1, 1) if layout.is_divided(axis) else (0, 0) for axis in range(layout.grid.ndim)]
@@ -124,7 +130,7 @@ Carried = tuple[jax.Array, jax.Array]  # planes, and the source, whose layers ch
 def _exchanged(carried: Carried, layout: Layout, flips: list[jax.Array]) -> Carried:
     """Planes and source with the δ of the nodes beyond this part in the layers around it."""
     planes, source = carried
-    parts = layout.grid.parts
+    parts = layout.parts
     for axis in range(source.ndim) if parts is not None else ():
         if not layout.is_divided(axis):
             continue
@@ -177,7 +183,7 @@ def _in_turns(
         planes, source = _exchanged(carried, layout, flips)
         return jax.lax.fori_loop(0, 2, functools.partial(sweep, source=source), planes), source
 
-    if layout.grid.parts is None:
+    if layout.parts is None:
         return jax.lax.fori_loop(0, 2 * rounds, sweep, planes)
     return jax.lax.fori_loop(0, rounds, pair, (planes, source))[0]
 

@@ -13,7 +13,9 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
+from hjbjax.problem.parts import FEWEST
 from hjbjax.problem.pytree import is_traced, numbers
 from hjbjax.problem.stretching import Sinh
 from hjbjax.problem.types import Array, DType, Key
@@ -244,3 +246,40 @@ def check_count(shape: tuple[int, ...]) -> None:
             f"{' x '.join(map(str, shape))} = {size:,} nodes; 32-bit indices number fewer than {INDEXABLE:,}.\n"
             f"At most N = {math.floor((INDEXABLE - 1) ** (1 / n))} points an axis in {n}-D; {NO_GRID}."
         )
+
+
+def check_mesh(mesh: object, grid_shape: tuple[int, ...], caller: str, *choices: object) -> Mesh | None:
+    """The mesh, unless the nodes cannot be divided over it, or not by these ``choices``; None where it is one device.
+
+    Raises:
+      TypeError: no mesh.
+      ValueError: more axes than the grid has, parts of too few nodes, or a choice that reads nodes in its own way.
+    """
+    mesh = as_mesh(mesh, caller)
+    counts, n = mesh.devices.shape, len(grid_shape)
+    if len(counts) > n:
+        raise ValueError(
+            f"{caller}: mesh has {len(counts)} axes, {counts}, the grid {n}; its i-th divides the grid's i-th"
+        )
+    for axis, (size, count) in enumerate(zip(counts, grid_shape, strict=False)):
+        if size > 1 and count // size < FEWEST:
+            raise ValueError(
+                f"{caller}: mesh divides the {count} points of axis {axis} into {size} parts; wanted {FEWEST} points a "
+                f"part at least, and so at most {count // FEWEST} parts"
+            )
+    for choice in choices:
+        if not getattr(choice, "in_parts", False):
+            raise ValueError(
+                f"{caller}: {choice!r} runs on one device; leave out mesh. What reads other nodes by "
+                "hjbjax.discretisation.stencil alone, and reduces by grid.largest, may say in_parts = True"
+            )
+    return mesh if mesh.size > 1 else None
+
+
+def as_mesh(mesh: object, caller: str) -> Mesh:
+    """The mesh with axes for ``shard_map``; a TypeError for anything else."""
+    if not isinstance(mesh, Mesh):
+        wanted = 'a jax.sharding.Mesh, as from jax.make_mesh((2,), ("x",))'
+        raise TypeError(f"{caller}: mesh is {mesh!r}; wanted {wanted}")
+    # axes of other types than the manual ones of shard_map forbid slices
+    return Mesh(mesh.devices, mesh.axis_names)

@@ -17,6 +17,7 @@ import numpy as np
 
 from hjbjax.problem import arguments
 from hjbjax.problem.labels import with_unit, words
+from hjbjax.problem.padding import Padding
 from hjbjax.problem.parts import Parts
 from hjbjax.problem.pytree import altered, is_traced, known, pytree_dataclass
 from hjbjax.problem.stretching import Stretching
@@ -26,7 +27,7 @@ ROUNDINGS = 16  # units of eps of the largest coordinate by which the formula ma
 TABLED = 2**24  # points of an axis whose coordinates are kept, 128 MiB; a grid too large must not allocate them before
 
 
-@pytree_dataclass(static=("shape", "periodic", "names", "edges", "units", "parts"))
+@pytree_dataclass(static=("shape", "periodic", "names", "edges", "units"))
 class Grid:
     """A grid of nodes on a box in R^n, uniform along every axis that is not stretched.
 
@@ -64,7 +65,7 @@ class Grid:
     edges: Any = "projected"
     units: tuple[str, ...] = ()
     coordinates: tuple[Any, ...] = dataclasses.field(init=False, repr=False)
-    parts: Parts | None = dataclasses.field(init=False, repr=False, default=None)  # inside ``shard_map``: its own nodes
+    parts: Parts | Padding | None = dataclasses.field(init=False, repr=False, default=None)  # how its arrays hold nodes
 
     def __post_init__(self):
         lo, hi = arguments.corner(self.lo, "lo"), arguments.corner(self.hi, "hi")
@@ -139,13 +140,15 @@ class Grid:
         pairs = (pair and tuple("projected" if name == "open" else name for name in pair) for pair in self.edges)
         return altered(self, edges=tuple(pairs))
 
-    def divided(self, parts: Parts) -> "Grid":
-        """The grid as one of the devices sees it, inside ``shard_map``: its shape is that of the arrays of one part."""
-        return altered(self, shape=parts.shape, parts=parts)
+    def divided(self, parts: Parts | Padding) -> "Grid":
+        """The grid of the arrays of one part, or of larger ones, whose shape is its own; for one part traced."""
+        known = self.coordinates  # of all nodes; the larger arrays' at host level
+        tables = known if isinstance(parts, Parts) else tuple(parts.own(self.axis(i), i) for i in range(self.ndim))
+        return altered(self, shape=parts.shape, coordinates=tables, parts=parts)
 
     @property
     def whole(self) -> "Grid":
-        """The grid of all parts; itself where it is none."""
+        """The grid of all parts, or one that fills the larger arrays; itself where it is neither."""
         return self if self.parts is None else altered(self, shape=self.parts.whole, parts=None)
 
     def is_divided(self, axis: int) -> bool:
@@ -175,8 +178,8 @@ class Grid:
         return self.parts.first(mask)
 
     def intervals(self, axis: int) -> int:
-        """The number M of intervals between ``lo`` and ``hi``."""
-        count = self.whole.shape[axis]
+        """The number M of intervals between ``lo`` and ``hi``; in larger arrays traced."""
+        count = self.parts.counts[axis] if isinstance(self.parts, Padding) else self.whole.shape[axis]
         return count if self.periodic[axis] else count - 1  # type: ignore[index]
 
     def spacing(self, axis: int) -> Number:
@@ -185,6 +188,8 @@ class Grid:
 
     def axis(self, axis: int, dtype: DType | None = None) -> Array:
         """The coordinates of the nodes along one axis, shape (N,); the same numbers in every program."""
+        if isinstance(self.parts, Padding):
+            return jnp.asarray(self.coordinates[axis], dtype or jnp.result_type(float))
         if self.parts is not None:
             return self.parts.own(self.whole.axis(axis, dtype), axis)
         computed, table = self._by_formula(axis), self.coordinates[axis]

@@ -24,6 +24,7 @@ T = TypeVar("T")
 FEWEST = 3  # nodes of a part along a divided axis: what Weno5, and a parabola beyond an end, read at once
 
 
+@jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Parts:
     """The nodes of a grid over the devices of a mesh. What is traced here has a meaning inside ``shard_map`` alone.
@@ -154,6 +155,10 @@ class Parts:
         start = jnp.asarray(self._starts(axis)[:-1], jnp.int32)[self.index(axis)]
         return start + jnp.arange(self.shape[axis], dtype=jnp.int32)
 
+    def last(self, axis: int, step: int) -> jax.Array:
+        """The entries that hold the last node of a divided axis in the direction of ``step``, bool."""
+        return self.nodes(axis) == (self.whole[axis] - 1 if step > 0 else 0)
+
     def own(self, table: Any, axis: int) -> Any:
         """The entries of this part of a table of all nodes along an axis."""
         if self.names[axis] is None:
@@ -274,43 +279,6 @@ class Lanes:
 def spans_processes(mesh: Mesh | None) -> bool:
     """True if some of the devices are those of other processes."""
     return mesh is not None and any(device.process_index != jax.process_index() for device in mesh.devices.flat)
-
-
-def check_mesh(mesh: object, grid_shape: tuple[int, ...], caller: str, *choices: object) -> Mesh | None:
-    """The mesh, unless the nodes cannot be divided over it, or not by these ``choices``; None where it is one device.
-
-    Raises:
-      TypeError: no mesh.
-      ValueError: more axes than the grid has, parts of too few nodes, or a choice that reads nodes in its own way.
-    """
-    mesh = as_mesh(mesh, caller)
-    counts, n = mesh.devices.shape, len(grid_shape)
-    if len(counts) > n:
-        raise ValueError(
-            f"{caller}: mesh has {len(counts)} axes, {counts}, the grid {n}; its i-th divides the grid's i-th"
-        )
-    for axis, (size, count) in enumerate(zip(counts, grid_shape, strict=False)):
-        if size > 1 and count // size < FEWEST:
-            raise ValueError(
-                f"{caller}: mesh divides the {count} points of axis {axis} into {size} parts; wanted {FEWEST} points a "
-                f"part at least, and so at most {count // FEWEST} parts"
-            )
-    for choice in choices:
-        if not getattr(choice, "in_parts", False):
-            raise ValueError(
-                f"{caller}: {choice!r} runs on one device; leave out mesh. What reads other nodes by "
-                "hjbjax.discretisation.stencil alone, and reduces by grid.largest, may say in_parts = True"
-            )
-    return mesh if mesh.size > 1 else None
-
-
-def as_mesh(mesh: object, caller: str) -> Mesh:
-    """The mesh with axes for ``shard_map``; a TypeError for anything else."""
-    if not isinstance(mesh, Mesh):
-        wanted = 'a jax.sharding.Mesh, as from jax.make_mesh((2,), ("x",))'
-        raise TypeError(f"{caller}: mesh is {mesh!r}; wanted {wanted}")
-    # axes of other types than the manual ones of shard_map forbid slices
-    return Mesh(mesh.devices, mesh.axis_names)
 
 
 def _largest(value: Scalar, names: tuple[str, ...]) -> Scalar:

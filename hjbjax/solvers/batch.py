@@ -31,9 +31,9 @@ from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import Method
 from hjbjax.markov_chain import admissibility, memory, node_checks
 from hjbjax.problem import arguments
-from hjbjax.problem.arguments import shown
+from hjbjax.problem.arguments import as_mesh, shown
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.parts import Lanes, as_mesh, spans_processes
+from hjbjax.problem.parts import Lanes, spans_processes
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.types import DType, Mask, Nodes
 from hjbjax.solution import checkpoints

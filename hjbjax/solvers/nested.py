@@ -19,6 +19,7 @@ from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import Method, PolicyIteration
 from hjbjax.markov_chain import resting
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.padding import Padding
 from hjbjax.problem.pytree import altered, known
 from hjbjax.problem.types import Mask, Nodes
 from hjbjax.solution import nested_grids
@@ -33,6 +34,9 @@ FAILED = (Status.STALLED, Status.DIVERGED, Status.NONFINITE)
 # the last of the answers is a guess, and need not be exact
 WARM_STEPS = 60  # improvements for each of them
 FEWEST = 6  # intervals that an axis keeps on the coarser grid that tells the error of the finer one
+# Nodes up to which that one runs in arrays of the finer one's shape. On 200 x 201 its steps take three times as long, a
+# warm solve .05 s more, and the first one .8 s less, since no program is compiled for it.
+ROOM = 50_000
 
 
 def start(
@@ -266,6 +270,17 @@ def coarser_answer(settled: Settled, clock: Clock) -> tuple[Grid, np.ndarray] | 
     if code is not Status.CONVERGED:
         return None
     return coarse, np.where(np.asarray(level.counted), np.asarray(state.value), np.inf)
+
+
+def room(grid: Grid, method: Method) -> tuple[int, ...] | None:
+    """The shape of arrays in which the grid and the one that tells its error both stand, by one program.
+
+    None where the coarser one is worth a program of its own, or the arrays of the finer one do not suit it.
+    """
+    coarse, apart = _telling(grid), method.coarsest is not None or not getattr(method, "in_parts", False)
+    if coarse is None or apart or grid.size > ROOM or grid.sides("open") or any(grid.stretch or ()):
+        return None
+    return grid.shape if Padding.fits(coarse.shape, grid.shape, grid.periodic or ()) else None
 
 
 def _telling(fine: Grid) -> Grid | None:

@@ -5,6 +5,7 @@ One problem, or lanes of one ``vmap``ped loop.
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
@@ -15,6 +16,7 @@ import numpy as np
 from hjbjax.discretisation.discretisation import on_part, over_nodes
 from hjbjax.iteration import fixed_point
 from hjbjax.iteration.fixed_point import HISTORY, State, Task
+from hjbjax.problem.padding import Padding
 from hjbjax.problem.parts import Lanes, Parts, spans_processes
 from hjbjax.problem.pytree import altered
 from hjbjax.problem.types import Array, Nodes, Number
@@ -75,7 +77,7 @@ def iterate(task: Task, guess: Nodes, clock: Clock, most: int | None = None) -> 
       The last state, how it ended, and the residuals of all steps, that of the guess first.
     """
     limit = clock.max_steps if most is None else min(most, clock.max_steps)
-    parts = task.on.parts
+    parts = task.on.padding or task.on.parts
     iteration = StationaryRun(task, guess, limit) if parts is None else RunInParts(task, guess, limit, parts)
     if most is not None:
         iteration.name += ", on the way to a guess"
@@ -194,14 +196,17 @@ class StationaryRun(StatesInChunks):
 
 
 class RunInParts(StationaryRun):
-    """The iteration of a task whose nodes are divided over many devices."""
+    """The iteration of a task whose nodes are divided over many devices, or stand in arrays with room for more."""
 
-    def __init__(self, task: Task, guess: Nodes, limit: int, parts: Parts):
+    def __init__(self, task: Task, guess: Nodes, limit: int, parts: Parts | Padding):
         super().__init__(task, guess, limit)
-        self.parts, self._over = parts, state_over_nodes(self.state)
+        self.grid, self.parts, self._over = task.grid, parts, state_over_nodes(self.state)
         self.task = parts.spread(task, over_nodes(task, task.grid.shape))
         self.before = self.state = parts.spread(self.state, self._over)
-        self._run = functools.partial(_run_in_parts, parts=parts)
+        if isinstance(parts, Parts):
+            self._run = functools.partial(_run_in_parts, parts=parts)
+        else:  # the program of one device, where a step takes as long as the arrays have entries
+            self.task, self.nodes = on_part(self.task, parts), math.prod(parts.shape)
 
     def gathered(self) -> State:
         """The last state, with the values of all parts."""
@@ -217,7 +222,7 @@ class RunInParts(StationaryRun):
         # what other processes hold is out of reach: they may not have come to this exception
         states = () if spans_processes(self.parts.mesh) else (self.state, self.before)
         values = (lambda s=s: self.parts.gathered(s, self._over).value for s in states)
-        host_loop.keep(error, self.task.grid, *values, lambda: self.guess)
+        host_loop.keep(error, self.grid, *values, lambda: self.guess)
 
 
 def _calls_back(task: Task) -> bool:

@@ -13,8 +13,8 @@ import numpy as np
 from jax.sharding import Mesh
 
 from hjbjax.problem import sets
+from hjbjax.problem.arguments import check_mesh
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.parts import check_mesh
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, remembered
 from hjbjax.tracing import indices

@@ -10,6 +10,7 @@ import pytest
 import hjbjax as hjb
 from hjbjax.tracing import closures
 from hjbjax.tracing.outside import fingerprint
+from tests.support.compilation import compiling
 
 UNIT = hjb.Box([-1.0], [1.0])
 LINE = hjb.Grid([-1.0], [1.0], (11,))
@@ -108,18 +109,9 @@ def test_an_object_of_a_library_may_hold_anything(monkeypatch):
 
 
 def compiled(ask):
-    """The programs that a call compiles, and its result."""
-    programs = []
-
-    def note(event, seconds, **_):
-        if event == "/jax/core/compile/backend_compile_duration":
-            programs.append(seconds)
-
-    jax.monitoring.register_event_duration_secs_listener(note)
-    try:
+    """The number of programs that a call compiles, and its result."""
+    with compiling() as programs:
         result = ask()
-    finally:
-        jax.monitoring.unregister_event_duration_listener(note)
     return len(programs), result
 
 

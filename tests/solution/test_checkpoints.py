@@ -133,9 +133,10 @@ def test_a_march_is_resumed_to_the_same_bits(method, tmp_path, monkeypatch):
     for chunks in (1, 3, 6):
         path = tmp_path / f"{chunks}.npz"
         with monkeypatch.context() as patched:
-            patched.setattr(MarchRun, "advance", Chunks(MarchRun.advance, chunks))
+            pressed = Chunks(MarchRun.advance, chunks)
+            patched.setattr(MarchRun, "advance", pressed)
             cut = hjb.march(problem, grid, 1.0, checkpoint=path, throw=False, **options)
-        assert cut.status is hjb.Status.INTERRUPTED
+        assert cut.status is hjb.Status.INTERRUPTED, f"Ctrl-C at chunk {chunks} of {pressed.count}"
         alike(hjb.march(problem, grid, 1.0, checkpoint=path, resume=True, **options), wanted)
     with pytest.raises(hjb.FileError, match="made for another horizon"):
         hjb.march(problem, grid, 2.0, checkpoint=path, resume=True, **options | {"times": times})

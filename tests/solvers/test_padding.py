@@ -68,10 +68,13 @@ PROBLEMS = {
         hjb.Grid([-1.0], [1.0], (42,)),
     ),
 }  # fmt: skip
+FEW = ("a target between nodes", "noise")
 
 
 @pytest.mark.filterwarnings("ignore::hjbjax.SolveWarning")
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize(
+    "name", [name if name in FEW else pytest.param(name, marks=pytest.mark.slow) for name in PROBLEMS]
+)
 def test_an_answer_does_not_know_of_the_room_around_it(name, monkeypatch):
     tol = 1e-7
     problem, grid = PROBLEMS[name]()

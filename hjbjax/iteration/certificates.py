@@ -111,8 +111,6 @@ def error_bound(
       least_cost: L at every node, for the multiplicative bound.
       moved: the size of the last correction, the fallback measure.
     """
-    residual = iterate.grid.largest(jnp.where(iterate.counted, jnp.abs(iterate.equation.source), 0))
-    zero = jnp.zeros_like(residual)
     if kind is Certificate.BY_DISCOUNT:
         other = Certificate.NONE if least_cost is None else Certificate.MULTIPLICATIVE
         # β is traced, so that both bounds are made and one is chosen; r/1 in place of r/0 where it is not
@@ -122,14 +120,23 @@ def error_bound(
             for each in (Certificate.ADDITIVE, other)
         )
         if other is Certificate.NONE:  # bounds that say nothing
-            without = ErrorBound(zero, zero + jnp.inf, zero + jnp.inf, without.error, residual)
+            endless = jnp.full_like(without.residual, jnp.inf)
+            without = dataclasses.replace(without, above=endless, lift=endless)
         return jax.tree.map(lambda mine, theirs: jnp.where(discount > 0, mine, theirs), with_it, without)
+    residual = iterate.grid.largest(jnp.where(iterate.counted, jnp.abs(iterate.equation.source), 0))
     if kind is Certificate.ADDITIVE:
         below, above = _additive(iterate, discount)
-        return ErrorBound(below, above, zero, jnp.maximum(jnp.abs(below), jnp.abs(above)), residual)
+        error = jnp.maximum(jnp.abs(below), jnp.abs(above))
+        return ErrorBound(below, above, jnp.zeros_like(residual), error, residual)
     if kind is Certificate.MULTIPLICATIVE:
         assert least_cost is not None
         return _multiplicative(iterate, least_cost, residual)
+    return measured(residual, moved)
+
+
+def measured(residual: Scalar, moved: Number) -> ErrorBound:
+    """The error by what is at hand without a bound: the residual, and the size of the last correction."""
+    zero = jnp.zeros_like(residual)
     return ErrorBound(zero, zero, zero, jnp.maximum(residual, moved), residual)
 
 
@@ -169,24 +176,25 @@ def _additive(iterate: Iterate, discount: Number) -> tuple[Scalar, Scalar]:
 def _multiplicative(iterate: Iterate, least_cost: Field, residual: Scalar) -> ErrorBound:
     """V/(1 + η) ≤ V_h ≤ V/(1 − ρ), of a V lifted until no exit cost is negative."""
     value, policy, obstacles, counted = iterate.value, iterate.policy, iterate.obstacles, iterate.counted
-    grid = iterate.grid
+    grid, costs = iterate.grid, least_cost > 0
     free = counted & ~obstacles.fixed
-    safe = jnp.where(free & (least_cost > 0), least_cost, 1)
     # where nothing is paid any rate that is left is infinitely much next to the cost; r = 0 makes a NaN of sign · ∞,
     # and ``priced`` says no there anyway
-    relative = jnp.where(free, jnp.where(least_cost > 0, policy.defect / safe, jnp.sign(policy.defect) * jnp.inf), 0)
+    rate = jnp.where(costs, policy.defect / jnp.where(costs, least_cost, 1), jnp.sign(policy.defect) * jnp.inf)
+    relative = jnp.where(free, rate, 0)
     # where V = ψ nothing bounds V_h from above but ψ, which is imposed
     rising = relative if obstacles.upper is None else jnp.where(value < obstacles.upper, relative, 0)
     rho, eta = jnp.maximum(grid.largest(rising), 0), jnp.maximum(grid.largest(-relative), 0)
-    priced = ~grid.some(free & ~(least_cost > 0))
+    # as numbers: of truth values XLA would make two passes
+    priced = grid.largest((free & ~costs).astype(value.dtype)) == 0
     sound = priced & (1 - rho > jnp.sqrt(jnp.finfo(rho.dtype).eps))  # a V flat somewhere has r = L up to rounding
     below, above = 1 / (1 + eta), jnp.where(sound, 1 / jnp.where(sound, 1 - rho, 1), jnp.inf)
     lift = jnp.maximum(-lowest_end(obstacles, counted, grid), 0)
-    lifted = jnp.where(counted, value + lift, 0)
     apart = jnp.where(jnp.isinf(above), 0, jnp.maximum(above - 1, 1 - below))  # no 0 · inf
-    error = jnp.where(jnp.isinf(above), jnp.inf, grid.largest(lifted) * apart)
+    least, most = (grid.least(jnp.where(counted, value, jnp.inf)), grid.largest(jnp.where(counted, value, -jnp.inf)))
     # the scaling argument wants V ≥ 0; without that there is no bound
-    error = jnp.where(grid.some(~(lifted >= 0)), jnp.inf, error) + 0 * residual  # a NaN stays one
+    bounded = jnp.isfinite(above) & (least + lift >= 0)
+    error = jnp.where(bounded, jnp.maximum(most + lift, 0) * apart, jnp.inf) + 0 * residual  # a NaN stays one
     return ErrorBound(below, above, jnp.where(priced, lift, jnp.inf), error, residual)
 
 
@@ -235,32 +243,36 @@ def steps_since_best(state: Any, bound: ErrorBound) -> Scalar:
 
 def judged(task: Any, value: Field, bound: ErrorBound, best: jax.Array, since: Scalar) -> Scalar:
     """The status of a ``fixed_point.Task`` after a step; each line overrules those before it."""
-    finite = jnp.isfinite(bound.residual)
-    matters = (since >= PATIENCE) | (bound.residual > GROWTH * best[1])  # else it changes no answer below
+    longest = task.method.patience(task.grid.whole)
     climbs = task.constrained or task.method.relaxes
     to_the_end = climbs and task.certificate in (*TO_THE_END, Certificate.OPEN)
-    size = jax.lax.cond(
-        matters | to_the_end,
-        lambda: _size(task.grid, value, task.counted),
-        lambda: jnp.zeros_like(best[1]),
-    )
-    rounding, tol = ROUNDING * jnp.finfo(value.dtype).eps * size, task.tol
-    longest = task.method.patience(task.grid.whole)
-    if to_the_end:  # a front moves V by a spacing times its slope a step, whatever the tolerance, past every node
-        tol = jnp.where(task.problem.discount > 0, tol, FEW / ROUNDING * rounding if task.bare else rounding)
+    if to_the_end:  # a front moves V by a spacing times its slope a step past every node
         longest = max(longest, 100 + 4 * task.grid.whole.size)
-    # a residual that is rounding has nowhere to go: ten steps tell, in place of the thousands of a slow climb
-    patience = jnp.where(bound.residual <= rounding, PATIENCE, longest)
-    halted: Any = Status.STALLED
-    if to_the_end and task.bare:  # of many terms more than a few units may remain
-        halted = jnp.where((bound.residual <= rounding) & ~(task.problem.discount > 0), Status.CONVERGED, halted)
-    code = jnp.where(since >= patience, halted, Status.RUNNING)
-    grew = bound.residual > GROWTH * jnp.maximum(best[1], rounding)
-    bounded = jnp.isfinite(best[0]) & (bound.error <= GROWTH * best[0])
-    grew &= ~bounded  # a better policy may leave more than one that stops at once
-    code = jnp.where(grew, Status.DIVERGED, code)
-    code = jnp.where(bound.error <= tol, Status.CONVERGED, code)
-    return jnp.where(finite, code, Status.NONFINITE).astype(jnp.int32)
+
+    def converged(code: Any, tol: Scalar) -> Scalar:
+        code = jnp.where(bound.error <= tol, Status.CONVERGED, code)
+        return jnp.where(jnp.isfinite(bound.residual), code, Status.NONFINITE).astype(jnp.int32)
+
+    def by_size() -> Scalar:
+        rounding, tol = ROUNDING * jnp.finfo(value.dtype).eps * _size(task.grid, value, task.counted), task.tol
+        if to_the_end:  # whatever the tolerance
+            tol = jnp.where(task.problem.discount > 0, tol, FEW / ROUNDING * rounding if task.bare else rounding)
+        # a residual that is rounding has nowhere to go: ten steps tell, in place of the thousands of a slow climb
+        patience = jnp.where(bound.residual <= rounding, PATIENCE, longest)
+        halted: Any = Status.STALLED
+        if to_the_end and task.bare:  # of many terms more than a few units may remain
+            halted = jnp.where((bound.residual <= rounding) & ~(task.problem.discount > 0), Status.CONVERGED, halted)
+        code = jnp.where(since >= patience, halted, Status.RUNNING)
+        grew = bound.residual > GROWTH * jnp.maximum(best[1], rounding)
+        bounded = jnp.isfinite(best[0]) & (bound.error <= GROWTH * best[0])
+        grew &= ~bounded  # a better policy may leave more than one that stops at once
+        return converged(jnp.where(grew, Status.DIVERGED, code), tol)
+
+    if to_the_end:
+        return by_size()
+    # else the size of V changes no answer; a choice of programs, whose answer the selects that follow do not find anew
+    matters = (since >= min(PATIENCE, longest)) | (bound.residual > GROWTH * best[1])
+    return jax.lax.cond(matters, by_size, lambda: converged(Status.RUNNING, task.tol))
 
 
 def at_rest(task: Any, state: Any, moved: Scalar, code: Scalar) -> Scalar:

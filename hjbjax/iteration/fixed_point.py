@@ -286,7 +286,7 @@ def _look(
     known = {"discount": problem.discount, "least_cost": task.least_cost, "moved": moved}
     bound = certificates.error_bound(task.certificate, iterate, **known)
     if task.on.plain is not None:  # the chain's certificate is no other scheme's
-        measured = certificates.error_bound(Certificate.RESIDUAL, iterate, **known)
+        measured = certificates.measured(bound.residual, moved)
         bound = jax.tree.map(functools.partial(jnp.where, task.plain), bound, measured)
     if task.has_lost:
         leaks = bellman.leaks(task.on, policy, task.obstacles.fixed, ~task.counted)

@@ -240,6 +240,7 @@ class Limited:
     split: bool = False
     monotone, stationary, even, in_parts = False, True, False, True
     stages, points = 2, 2
+    blends = True  # makes the one-sided differences itself, where ``Discretisation.plain`` says so
 
     @property
     def chain(self) -> Upwind:
@@ -249,12 +250,17 @@ class Limited:
     def slopes(self, around: Differences) -> Slopes:
         """Limited slopes; central ones where noise keeps those monotone, a_ii ≥ h |f_i| for all actions."""
         grid, pairs = around.on.grid, list(zip(around.one_sided, around.links, strict=True))
-        noisy = around.on.noisy_walls(around.x)
+        noisy, plain = around.on.noisy_walls(around.x), around.on.plain
+
+        def mean(a: jax.Array, b: jax.Array) -> jax.Array:
+            found = stencil.van_albada(a, b)
+            return found if plain is None else jnp.where(plain, 0, found)
+
         found = [
             # from V where that is all: the differences are then no arrays
-            slopes.of_second_order(around.value, grid, axis, stencil.van_albada, noisy)
+            slopes.of_second_order(around.value, grid, axis, mean, noisy)
             if link.meets_up is link.meets_down is None and _is_plain(grid, axis)
-            else stencil.limited(*pair, grid, axis, link, noisy[axis])
+            else stencil.limited(*pair, grid, axis, link, noisy[axis], mean)
             for axis, (pair, link) in enumerate(pairs)
         ]
         if around.on.problem.noise is None:

@@ -24,6 +24,7 @@ from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from hjbjax.discretisation import stencil
 from hjbjax.discretisation.stencil import Links, PerNode
@@ -111,12 +112,15 @@ def _continued(values: Field, grid: Grid, axis: int, reach: int, noisy: Noisy | 
         Where noise reflects, the mirror image.
         """
         a, b, c, *far = (stencil.slices(values, grid, axis, step, k) for k in range(max(3, reach + 1)))
+        along = [-1 if i == axis else 1 for i in range(grid.ndim)]
         # Lagrange's polynomials on the places 0, 1, 2, at −3, −2 and −1; at the upper end the mirror image
-        found = [10 * a - 15 * b + 6 * c, 6 * a - 8 * b + 3 * c, 3 * a - 3 * b + c][3 - reach :]
-        if noisy is not None and step in noisy[axis]:
-            image = [*far, c, b]
-            found = [jnp.where(noisy[axis][step], even, odd) for even, odd in zip(image, found, strict=True)]
-        return jnp.concatenate(found if step < 0 else found[::-1], axis)
+        weights = np.array([[10, -15, 6], [6, -8, 3], [3, -3, 1]])[3 - reach :][::-step].T.astype(values.dtype)
+        first, second, third = (w.reshape(along) * node for w, node in zip(weights, (a, b, c), strict=True))
+        found = first + second + third
+        if noisy is None or step not in noisy[axis]:
+            return found
+        image = [*far, c, b]
+        return jnp.where(noisy[axis][step], jnp.concatenate(image if step < 0 else image[::-1], axis), found)
 
     below, above = (stencil.beyond(values, grid, axis, step, ended(step)) for step in (-1, 1))
     return stencil.joined(values, grid, axis, below, above)

@@ -10,7 +10,7 @@ Where the nodes are divided over many devices, what stands beyond the last node 
 beside: see ``problem.parts``.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, TypeAlias
 
 import jax
@@ -258,8 +258,21 @@ def _neighbours(values: Field, grid: Grid, axis: int) -> tuple[Field, Field]:
     return jax.lax.slice_in_dim(wide, 2, count + 2, axis=axis), jax.lax.slice_in_dim(wide, 0, count, axis=axis)
 
 
+def van_albada(a: Field, b: Field) -> Field:
+    """The mean a b (a + b)/(a² + b²) of two bends, zero where their signs differ: G. D. van Albada's limiter."""
+    agree = a * b > 0
+    # the inner where keeps 0/0 out of the branch not taken, whose NaN a derivative would bring back
+    return jnp.where(agree, a * b * (a + b) / jnp.where(agree, a * a + b * b, 1), 0)
+
+
 def limited(
-    up: Field, down: Field, grid: Grid, axis: int, link: Links, noisy: Mapping[int, Array] | None = None
+    up: Field,
+    down: Field,
+    grid: Grid,
+    axis: int,
+    link: Links,
+    noisy: Mapping[int, Array] | None = None,
+    mean: Callable[[Field, Field], Field] = van_albada,
 ) -> tuple[Field, Field]:
     """Second-order one-sided slopes from the differences D⁺, D⁻ along one axis; zero across a wall as they are.
 
@@ -280,15 +293,8 @@ def limited(
     if link.meets_down is not None:
         below = jnp.where(link.meets_down[0], bend, below)
     # V(x ± h) = V ± h V' + h²/2 V'': half a gap times the bend is the leading error of a one-sided difference
-    up, down = up - link.up / 2 * van_albada(bend, above), down + link.down / 2 * van_albada(bend, below)
+    up, down = up - link.up / 2 * mean(bend, above), down + link.down / 2 * mean(bend, below)
     return stopped(up, down, grid, axis)
-
-
-def van_albada(a: Field, b: Field) -> Field:
-    """The mean a b (a + b)/(a² + b²) of two bends, zero where their signs differ: G. D. van Albada's limiter."""
-    agree = a * b > 0
-    # the inner where keeps 0/0 out of the branch not taken, whose NaN a derivative would bring back
-    return jnp.where(agree, a * b * (a + b) / jnp.where(agree, a * a + b * b, 1), 0)
 
 
 def numbers(grid: Grid, offset: Sequence[int]) -> np.ndarray:

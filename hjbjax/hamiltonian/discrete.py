@@ -145,7 +145,7 @@ def around(on: Discretisation, value: jax.Array, lost: jax.Array | None = None) 
     differences = tuple(stencil.one_sided(value, grid, axis, link) for axis, link in enumerate(links))
     bends = tuple(stencil.bends(*pair, grid, axis) for axis, pair in enumerate(differences))
     slopes = on.scheme.slopes(Differences(on, x, value, links, differences, lost))
-    if on.plain is not None:
+    if on.plain is not None and not getattr(on.scheme, "blends", False):
         slopes = jax.tree.map(lambda first, better: jnp.where(on.plain, first, better), list(differences), list(slopes))
     up, down = zip(*slopes, strict=True)
     # only constrained ends and lost nodes ask what of a drift is rounding, which costs a look at its terms

@@ -95,6 +95,11 @@ class Task:
         return ~self.counted if self.has_lost else None
 
     @property
+    def counting(self) -> jax.Array | bool:
+        """The nodes whose value is judged; a known truth where all are, which takes no pass over them."""
+        return self.counted if self.has_lost else True
+
+    @property
     def given(self) -> Obstacles:
         """Target and constraints at the nodes, made where they are used if nothing but V is kept."""
         return bellman.obstacles(self.on) if self.bare else self.obstacles
@@ -135,7 +140,7 @@ class Task:
 
     def residual(self, equation: PolicyEquation) -> Scalar:
         """The largest |source| at the nodes that count, in cost units."""
-        return self.grid.largest(jnp.where(self.counted, jnp.abs(equation.source), 0))
+        return self.grid.largest(jnp.where(self.counting, jnp.abs(equation.source), 0))
 
     def start(self) -> Field:
         """The value without a guess: zero, or without discount ψ, above all fixed points, or g, below them."""
@@ -178,7 +183,7 @@ def begin(task: Task, guess: Nodes) -> State:
     if task.bare:
         policy = Greedy(xp.zeros((), dtype), (), ())
     infinite, code = xp.asarray(xp.inf, dtype), xp.asarray(int(Status.RUNNING), xp.int32)
-    bound = ErrorBound(xp.asarray(-infinite), infinite, xp.zeros((), dtype), infinite, infinite)
+    bound = jax.tree.map(xp.asarray, ErrorBound.unknown(dtype))
     counter, first = xp.zeros((), xp.int32), xp.full((), -1, xp.int32)
     history = xp.full(HISTORY, -1, dtype)  # no NaN, which jax_debug_nans would take for a fault
     return State(value, policy, infinite, bound, first, xp.stack([infinite] * 2), counter, code, history)
@@ -212,11 +217,11 @@ def advance(task: Task, state: State, start: Scalar) -> State:
         delta = jnp.where((state.step < FULL_STEPS) | task.plain, 1.0, 0.5).astype(delta.dtype) * delta
     value = task.impose(state.value + delta)
     # a node that does not count may move for ever
-    moved = task.grid.largest(jnp.abs(jnp.where(task.counted, value - state.value, 0)))
+    moved = task.grid.largest(jnp.abs(jnp.where(task.counting, value - state.value, 0)))
     if task.certificate is Certificate.OPEN and not task.method.relaxes:
         moved = moved * methods.shift_factor(_shift(task, state), task.problem.discount)
     policy, fastest, bound = _look(task, value, state.policy, moved=moved, first=state.step < 0)
-    bound = dataclasses.replace(bound, error=jnp.where(_lacks_measure(task, state), jnp.inf, bound.error))
+    bound = bound.having(error=jnp.where(_lacks_measure(task, state), jnp.inf, bound.error))
     since = certificates.steps_since_best(state, bound)
     code = certificates.at_rest(task, state, moved, certificates.judged(task, value, bound, state.best, since))
     return certificates.booked(state, start, bound, code, since, value=value, policy=policy, fastest=fastest)
@@ -241,7 +246,7 @@ def _relaxed_by_defect(task: Task, state: State, start: Scalar) -> State:
     defect = jnp.where(task.obstacles.fixed, 0, bellman.relaxation(task.on, value, task.outflow)[0])
     policy = dataclasses.replace(state.policy, defect=defect)
     left = PolicyEquation(task.obstacles.clipped(defect / task.outflow, value), Rates((), ()))
-    iterate = Iterate(task.grid, value, policy, left, task.obstacles, task.counted)
+    iterate = Iterate(task.grid, value, policy, left, task.obstacles, task.counting)
     bound = certificates.error_bound(task.certificate, iterate, discount=task.problem.discount)
     since = certificates.steps_since_best(state, bound)
     code = certificates.judged(task, value, bound, state.best, since)
@@ -282,7 +287,7 @@ def _look(
         policy = bellman.improvement(task.on, value, fixed, policy, incumbent)
     left = task.equation(value, policy)
     assert left.fastest is not None
-    iterate = Iterate(task.grid, value, policy, left, task.obstacles, task.counted)
+    iterate = Iterate(task.grid, value, policy, left, task.obstacles, task.counting)
     known = {"discount": problem.discount, "least_cost": task.least_cost, "moved": moved}
     bound = certificates.error_bound(task.certificate, iterate, **known)
     if task.on.plain is not None:  # the chain's certificate is no other scheme's
@@ -290,7 +295,7 @@ def _look(
         bound = jax.tree.map(functools.partial(jnp.where, task.plain), bound, measured)
     if task.has_lost:
         leaks = bellman.leaks(task.on, policy, task.obstacles.fixed, ~task.counted)
-        bound = dataclasses.replace(bound, error=jnp.where(leaks, jnp.inf, bound.error))
+        bound = bound.having(error=jnp.where(leaks, jnp.inf, bound.error))
     return policy, left.fastest, bound
 
 

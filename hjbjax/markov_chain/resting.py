@@ -19,6 +19,7 @@ from hjbjax.hamiltonian import discrete, optimum
 from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import Obstacles
 from hjbjax.problem import sets
+from hjbjax.problem.pytree import altered
 from hjbjax.problem.sets import AdmissibleSet
 from hjbjax.problem.types import Field, Mask, Numbers, Scalar
 
@@ -46,8 +47,7 @@ def standstill(on: Discretisation) -> Standstill:
     With slopes ±s, s_i = max L/max|f_i|, the Hamiltonian is L + Σ s_i |f_i|: its minimum vanishes at rest alone.
     """
     grid, dtype = on.grid, on.dtype
-    # at V = 0 the Hamiltonian is L alone, and its minimum the least running cost
-    least = optimum.optimise(discrete.around(on, jnp.zeros(grid.shape, dtype)))[0]
+    least = _least_cost(on)
     speeds, dearest = _scales(on)
     cost = jnp.max(jnp.where(jnp.isfinite(least), jnp.abs(least), 0))  # infinite where a constrained end leaves none
     # the least cost may be zero everywhere: then the dearest action sets the scale, and without any cost one does
@@ -64,6 +64,19 @@ def standstill(on: Discretisation) -> Standstill:
     # axes one after another: an upper bound, whichever way the motion turns
     extents = jnp.stack([jnp.asarray(grid.hi[axis] - grid.lo[axis], dtype) for axis in range(grid.ndim)])
     return Standstill(rests, least, jnp.sum(extents / speeds))
+
+
+def _least_cost(on: Discretisation) -> Field:
+    """The least running cost at every node, in a game that of both players' best actions, (*grid)."""
+    if not on.grid.sides("constrained"):  # else the drift tells which actions there are
+        on = on.asking(altered(on.problem, drift=_nowhere, noise=None))
+    # at V = 0 the Hamiltonian is L alone
+    return optimum.optimise(discrete.around(on, jnp.zeros(on.grid.shape, on.dtype)))[0]
+
+
+def _nowhere(x: jax.Array, *actions: jax.Array) -> jax.Array:
+    """No drift."""
+    return jnp.zeros_like(x)
 
 
 def _noise_speeds(on: Discretisation, u: list, d: list) -> list[jax.Array]:

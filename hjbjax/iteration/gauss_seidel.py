@@ -7,8 +7,8 @@ sheared cyclically along the first axis,
 
 so that such a hyperplane is one slice S[d] (several, folded); its neighbours stand in S[d − 1] and S[d + 1], one
 entry to the side for the axes beyond the first. A forward sweep goes through the slices upwards, a backward one
-downwards, and flipping axes beyond the first before shearing gives all 2ⁿ orders. What comes across the fold, or
-across the seam of a periodic axis, is as old as the last sweep.
+downwards, and flipping axes beyond the first before shearing gives all 2ⁿ orders. What comes across the seam of a
+periodic axis beyond the first is as old as the last sweep.
 
 Where the arrays outgrow a processor's cache, slabs of slices take the place of single sweeps through all of them.
 
@@ -19,6 +19,7 @@ from the parts beside before every forward and backward pair.
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 import jax
@@ -64,8 +65,8 @@ def sweep(equation: PolicyEquation, grid: Grid, rounds: int) -> Field:
         def in_slabs(planes: jax.Array) -> jax.Array:
             return _in_slabs(source, weights, planes, layout, rounds, flips)
 
-        # a margin of one entry on every side, so that neighbours are slices without a branch at the ends
-        planes = jnp.pad(_sheared(delta, flips), 1)
+        # a margin of one entry beside the axes beyond the first, so that neighbours are slices without a branch
+        planes = jnp.pad(_sheared(delta, flips), _margins(grid.ndim))
         if _outgrows_the_cache(source, weights):
             planes = jax.lax.platform_dependent(planes, cpu=in_slabs, default=whole)
         else:
@@ -139,17 +140,25 @@ def _exchanged(carried: Carried, layout: Layout, flips: list[jax.Array]) -> Carr
         count, cyclic = parts.count(along), bool(layout.grid.periodic[along])  # type: ignore[index]
         for step, first, layer in ((1, 1, count + 1), (-1, count, 0)):
             # what the part beside needs of this one is its node at that end; places count the layer
-            given = planes.at[_places(source.shape, axis, first, flips, margin=1)].get(**KNOWN)
-            found = parts.fetched(given, along, step, cyclic=cyclic)
-            planes = planes.at[_places(source.shape, axis, layer, flips, margin=1)].set(found, **KNOWN)
-            source = source.at[_places(source.shape, axis, layer, flips, margin=0)].set(found, **KNOWN)
+            given = planes.at[_within(_places(source.shape, axis, first, flips))].get(**KNOWN)
+            found, there = parts.fetched(given, along, step, cyclic=cyclic), _places(source.shape, axis, layer, flips)
+            planes = planes.at[_within(there)].set(found, **KNOWN)
+            source = source.at[there].set(found, **KNOWN)
     return planes, source
 
 
-def _places(
-    shape: tuple[int, ...], axis: int, number: Index, flips: list[jax.Array], *, margin: int
-) -> tuple[jax.Array, ...]:
-    """Where the nodes with one ``number`` along an axis stand in sheared arrays with a ``margin`` on every side."""
+def _margins(ndim: int) -> list[tuple[int, int]]:
+    """The entries before and behind the nodes of planes along every axis."""
+    return [(0, 0), *[(1, 1)] * (ndim - 1)]
+
+
+def _within(places: Sequence[Any]) -> tuple[Any, ...]:
+    """Places in sheared arrays as those in planes, which have margins."""
+    return tuple(place + (axis > 0) for axis, place in enumerate(places))
+
+
+def _places(shape: tuple[int, ...], axis: int, number: Index, flips: list[jax.Array]) -> tuple[jax.Array, ...]:
+    """Where the nodes with one ``number`` along an axis stand in sheared arrays."""
     sizes = [1 if k == axis else size for k, size in enumerate(shape)]
     row, *columns = (
         jax.lax.broadcasted_iota(jnp.int32, sizes, k) + (number if k == axis else 0) for k in range(len(shape))
@@ -158,8 +167,7 @@ def _places(
         jnp.where(flip == 1, size - 1 - column, column)
         for column, size, flip in zip(columns, shape[1:], flips, strict=True)
     ]
-    slices = (row + sum(columns)) % shape[0]
-    return tuple(place + margin for place in (slices, *columns))
+    return (row + sum(columns)) % shape[0], *columns
 
 
 def _outgrows_the_cache(source: jax.Array, weights: Weights) -> bool:
@@ -229,11 +237,11 @@ def _towards(equation: PolicyEquation, layout: Layout, axis: int, flips: list[ja
 
 
 def _wrapped(planes: jax.Array, layout: Layout) -> jax.Array:
-    """The planes with a margin of values from across the fold of the shear and the seams of periodic axes."""
-    for axis in range(1, planes.ndim):  # before the first axis, whose margins hold the corners of the others as well
+    """The planes with a margin of values from across the seams of periodic axes beyond the first."""
+    for axis in range(1, planes.ndim):
         if layout.closes(axis):
             planes = _with_margins(planes, axis)
-    return _with_margins(planes, 0)
+    return planes
 
 
 def _with_margins(planes: jax.Array, axis: int) -> jax.Array:
@@ -247,10 +255,8 @@ def _with_margins(planes: jax.Array, axis: int) -> jax.Array:
         above = side == 0
         inner = jax.lax.dynamic_slice_in_dim(planes, jnp.where(above, 1, count), 1, axis)
         start: list[Index] = [0] * planes.ndim
-        if axis > 0:
-            # S[d, j] with d − Σ j: a step of a whole axis to the side is as many slices further
-            inner = jnp.roll(inner[1:-1], jnp.where(above, count, -count), axis=0)
-            start[0] = 1
+        # S[d, j] with d − Σ j: a step of a whole axis to the side is as many slices further
+        inner = jnp.roll(inner, jnp.where(above, count, -count), axis=0)
         start[axis] = jnp.where(above, count + 1, 0)
         return jax.lax.dynamic_update_slice(planes, inner, start)
 
@@ -260,7 +266,8 @@ def _with_margins(planes: jax.Array, axis: int) -> jax.Array:
 def _sweep(
     source: jax.Array, weights: Weights, planes: jax.Array, first: Index, last: Index, *, up: jax.Array
 ) -> jax.Array:
-    """One pass over the slices from ``first`` to ``last``; ``planes`` has a margin of one entry on every side."""
+    """One pass over the slices from ``first`` to ``last``; ``planes`` has margins beside the axes beyond the first."""
+    count = len(source)
 
     def row(values: jax.Array, d: Index) -> jax.Array:
         # d is never negative: JAX would add a comparison and a select to every start
@@ -274,8 +281,9 @@ def _sweep(
 
     def relax(k: jax.Array, planes: jax.Array) -> jax.Array:
         d = jnp.where(up, k, first + last - 1 - k)
-        # with the margin slice d stands at d + 1: its neighbours at d and d + 2
-        below, above, new = row(planes, d), row(planes, d + 2), row(source, d)
+        # round: behind the last slice comes the first one, across the fold of the shear
+        below, above = row(planes, jnp.where(d == 0, count, d) - 1), row(planes, jnp.where(d == count - 1, 0, d + 1))
+        new = row(source, d)
         for axis, pair in enumerate(weights):
             rows, up_there, down_there = [row(w, d) for w in pair], core(above, axis, 1), core(below, axis, -1)
             if len(rows) == 2:
@@ -283,7 +291,7 @@ def _sweep(
             else:
                 # up − down: positive goes up; a negative one goes down by its size
                 new = new + rows[0] * jnp.where(rows[0] > 0, up_there, -down_there)
-        start: tuple[Index, ...] = (d + 1, *(1 for _ in source.shape[1:]))
+        start: tuple[Index, ...] = (d, *(1 for _ in source.shape[1:]))
         return jax.lax.dynamic_update_slice(planes, new, start, allow_negative_indices=False)
 
     return jax.lax.fori_loop(first, last, relax, planes)
@@ -302,15 +310,15 @@ def _sheared(values: jax.Array, flips: list[jax.Array]) -> jax.Array:
 
 
 def _from_planes(planes: jax.Array, flips: list[jax.Array]) -> jax.Array:
-    """X of its planes, which have a margin of one entry on every side.
+    """X of its planes, which have margins.
 
     The margin is skipped by the places: of its slice without it, fused into the gather, every entry would be looked for
     by divisions, six times the time.
     """
-    shape = tuple(size - 2 for size in planes.shape)
+    shape = tuple(size - sum(margin) for size, margin in zip(planes.shape, _margins(planes.ndim), strict=True))
     row, _, flipped = _entries(shape, flips)
     first = _folded(row + sum(flipped), shape, back=True)
-    return _gathered(planes, [place + 1 for place in (first, *flipped)])
+    return _gathered(planes, list(_within((first, *flipped))))
 
 
 def _entries(shape: tuple[int, ...], flips: list[jax.Array]) -> tuple[jax.Array, list[jax.Array], list[jax.Array]]:

@@ -110,8 +110,8 @@ MUTANTS = (
     Mutant(
         "width of the ghost cells of Eno2",
         "discretisation/slopes.py",
-        "3 * a - 3 * b + c][3 - reach :]",
-        "3 * a - 3 * b + c][:reach]",
+        "[3, -3, 1]])[3 - reach :]",
+        "[3, -3, 1]])[:reach]",
         ("tests/discretisation/test_slopes.py",),
     ),
     Mutant(

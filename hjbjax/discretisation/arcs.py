@@ -22,8 +22,9 @@ import numpy as np
 
 from hjbjax.discretisation import cut_cells
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.problem.grid import Grid, into_period
+from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import pytree_dataclass
+from hjbjax.problem.stretching import into_period
 from hjbjax.problem.types import Array, AtNodes, Mask, Number, Scalar
 from hjbjax.tracing import components
 

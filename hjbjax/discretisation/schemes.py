@@ -76,6 +76,7 @@ takes (e(n⁺) − h n)/h², with e for as much of the drift as leaves: never ne
 zero for n > 0, which is cut off.
 """
 
+import functools
 import itertools
 from collections.abc import Sequence
 from typing import Any
@@ -239,8 +240,7 @@ class Limited:
     subcell: bool = True
     split: bool = False
     monotone, stationary, even, in_parts = False, True, False, True
-    stages, points = 2, 2
-    blends = True  # makes the one-sided differences itself, where ``Discretisation.plain`` says so
+    stages, points, blends = 2, 2, True  # it makes the one-sided differences itself, where they are asked for
 
     @property
     def chain(self) -> Upwind:
@@ -252,17 +252,18 @@ class Limited:
         grid, pairs = around.on.grid, list(zip(around.one_sided, around.links, strict=True))
         noisy, plain = around.on.noisy_walls(around.x), around.on.plain
 
-        def mean(a: jax.Array, b: jax.Array) -> jax.Array:
-            found = stencil.van_albada(a, b)
-            return found if plain is None else jnp.where(plain, 0, found)
+        def mean(*bends: jax.Array) -> jax.Array:
+            return stencil.van_albada(*bends) if plain is None else jnp.where(plain, 0, stencil.van_albada(*bends))
 
-        found = [
-            # from V where that is all: the differences are then no arrays
-            slopes.of_second_order(around.value, grid, axis, mean, noisy)
-            if link.meets_up is link.meets_down is None and _is_plain(grid, axis)
-            else stencil.limited(*pair, grid, axis, link, noisy[axis], mean)
-            for axis, (pair, link) in enumerate(pairs)
-        ]
+        found = []
+        for axis, (pair, link) in enumerate(pairs):
+            if link.meets_up is link.meets_down is None and _is_plain(grid, axis):
+                # from V where that is all: the differences are then no arrays
+                sharp = slopes.of_second_order(around.value, grid, axis, mean, noisy)
+            else:
+                sharp = stencil.limited(*pair, grid, axis, link, noisy[axis])
+                sharp = sharp if plain is None else jax.tree.map(functools.partial(jnp.where, plain), pair, sharp)
+            found.append(sharp)
         if around.on.problem.noise is None:
             return found
         for axis, quiet in enumerate(calm(around.on, around.x, around.links)):

@@ -10,7 +10,7 @@ Where the nodes are divided over many devices, what stands beyond the last node 
 beside: see ``problem.parts``.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, TypeAlias
 
 import jax
@@ -266,13 +266,7 @@ def van_albada(a: Field, b: Field) -> Field:
 
 
 def limited(
-    up: Field,
-    down: Field,
-    grid: Grid,
-    axis: int,
-    link: Links,
-    noisy: Mapping[int, Array] | None = None,
-    mean: Callable[[Field, Field], Field] = van_albada,
+    up: Field, down: Field, grid: Grid, axis: int, link: Links, noisy: Mapping[int, Array] | None = None
 ) -> tuple[Field, Field]:
     """Second-order one-sided slopes from the differences D⁺, D⁻ along one axis; zero across a wall as they are.
 
@@ -293,7 +287,7 @@ def limited(
     if link.meets_down is not None:
         below = jnp.where(link.meets_down[0], bend, below)
     # V(x ± h) = V ± h V' + h²/2 V'': half a gap times the bend is the leading error of a one-sided difference
-    up, down = up - link.up / 2 * mean(bend, above), down + link.down / 2 * mean(bend, below)
+    up, down = up - link.up / 2 * van_albada(bend, above), down + link.down / 2 * van_albada(bend, below)
     return stopped(up, down, grid, axis)
 
 

@@ -20,10 +20,9 @@ from hjbjax.problem.labels import with_unit, words
 from hjbjax.problem.padding import Padding
 from hjbjax.problem.parts import Parts
 from hjbjax.problem.pytree import altered, is_traced, known, pytree_dataclass
-from hjbjax.problem.stretching import Stretching
+from hjbjax.problem.stretching import Stretching, from_table, into_period
 from hjbjax.problem.types import Array, AtNodes, DType, Mask, Number, Numbers, Scalar, States, Verdict
 
-ROUNDINGS = 16  # units of eps of the largest coordinate by which the formula may miss its table
 TABLED = 2**24  # points of an axis whose coordinates are kept, 128 MiB; a grid too large must not allocate them before
 
 
@@ -65,6 +64,7 @@ class Grid:
     edges: Any = "projected"
     units: tuple[str, ...] = ()
     coordinates: tuple[Any, ...] = dataclasses.field(init=False, repr=False)
+    spacings: tuple[Any, ...] | None = dataclasses.field(init=False, repr=False, default=None)  # see ``settled``
     parts: Parts | Padding | None = dataclasses.field(init=False, repr=False, default=None)  # how its arrays hold nodes
 
     def __post_init__(self):
@@ -141,10 +141,23 @@ class Grid:
         return altered(self, edges=tuple(pairs))
 
     def divided(self, parts: Parts | Padding) -> "Grid":
-        """The grid of the arrays of one part, or of larger ones, whose shape is its own; for one part traced."""
-        known = self.coordinates  # of all nodes; the larger arrays' at host level
-        tables = known if isinstance(parts, Parts) else tuple(parts.own(self.axis(i), i) for i in range(self.ndim))
-        return altered(self, shape=parts.shape, coordinates=tables, parts=parts)
+        """The grid of the arrays of one part, whose shape is its own; or, at host level, of larger ones."""
+        if isinstance(parts, Parts):
+            return altered(self, shape=parts.shape, parts=parts)
+        grid = self.settled()
+        tables = tuple(parts.own(table, axis) for axis, table in enumerate(grid.coordinates))
+        return altered(grid, shape=parts.shape, coordinates=tables, parts=parts)
+
+    def settled(self) -> "Grid":
+        """The grid for a program in which neither corners nor tables change: all that is made of them is made here.
+
+        Host level. A derivative by a corner would not see the nodes move.
+        """
+        if any(table is None for table in self.coordinates):
+            return self
+        lo, hi = (tuple(np.asarray(corner)) for corner in (self.lo, self.hi))
+        spacings = tuple((b - a) / self.intervals(axis) for axis, (a, b) in enumerate(zip(lo, hi, strict=True)))
+        return altered(self, lo=lo, hi=hi, spacings=spacings)
 
     @property
     def whole(self) -> "Grid":
@@ -178,26 +191,28 @@ class Grid:
         return self.parts.first(mask)
 
     def intervals(self, axis: int) -> int:
-        """The number M of intervals between ``lo`` and ``hi``; in larger arrays traced."""
-        count = self.parts.counts[axis] if isinstance(self.parts, Padding) else self.whole.shape[axis]
+        """The number M of intervals between ``lo`` and ``hi``."""
+        count = self.whole.shape[axis]
         return count if self.periodic[axis] else count - 1  # type: ignore[index]
 
     def spacing(self, axis: int) -> Number:
         """The distance h between neighbours along ``axis``; their mean on a stretched one."""
+        if self.spacings is not None:
+            return self.spacings[axis]
         return (self.hi[axis] - self.lo[axis]) / self.intervals(axis)
 
     def axis(self, axis: int, dtype: DType | None = None) -> Array:
         """The coordinates of the nodes along one axis, shape (N,); the same numbers in every program."""
-        if isinstance(self.parts, Padding):
-            return jnp.asarray(self.coordinates[axis], dtype or jnp.result_type(float))
-        if self.parts is not None:
+        if isinstance(self.parts, Parts):
             return self.parts.own(self.whole.axis(axis, dtype), axis)
+        if self.spacings is not None:
+            return jnp.asarray(self.coordinates[axis], dtype or jnp.result_type(float))
         computed, table = self._by_formula(axis), self.coordinates[axis]
         table = computed if table is None else table
         # NumPy as long as nothing is traced, also inside ``jit``, where the table then is a constant
         if is_traced(computed, table):
             given = (computed, table, jnp.maximum(jnp.abs(self.lo[axis]), jnp.abs(self.hi[axis])))
-            return _from_table(*(jnp.asarray(each, dtype or jnp.result_type(float)) for each in given))
+            return from_table(*(jnp.asarray(each, dtype or jnp.result_type(float)) for each in given))
         return np.asarray(table, dtype or np.float64)
 
     def _by_formula(self, axis: int) -> Array:
@@ -325,28 +340,6 @@ class Grid:
         fraction = (x - nodes[cell]) / (nodes[cell + 1] - nodes[cell])
         fraction = jnp.nan_to_num(fraction)  # a clip would halve the derivative on a node, where it is 0 or 1
         return cell, jnp.where((fraction >= 0) & (fraction <= 1), fraction, jnp.clip(fraction, 0, 1)), inside
-
-
-@jax.custom_jvp
-def _from_table(computed: jax.Array, table: jax.Array, farthest: jax.Array) -> jax.Array:
-    """The table, with the derivative of the formula; the formula where the corners were changed alone."""
-    # a corner that was swapped for a tracer, as ``grad`` does, comes with the table of the old one
-    slack = ROUNDINGS * jnp.finfo(table.dtype).eps * farthest
-    return jnp.where(jnp.abs(computed - table) <= slack, table, computed)
-
-
-@_from_table.defjvp
-def _derivative_of_the_formula(primals: tuple, tangents: tuple) -> tuple:
-    """Value and tangent: nodes move with the corners as the formula says; the table is constant."""
-    return _from_table(*primals), tangents[0]
-
-
-def into_period(x: Array, lo: Array, hi: Array) -> jax.Array:
-    """Places along periodic axes, brought into [lo, hi)."""
-    moved = lo + jnp.mod(x - lo, hi - lo)
-    moved = jnp.where(moved >= hi, lo, moved)  # just below lo, the remainder rounds up to a whole period
-    # a place in [lo, hi) keeps its bits: the remainder of a small difference would be rounded
-    return jnp.where((x >= lo) & (x < hi), x, moved)
 
 
 def _states(x: Numbers) -> jax.Array:

@@ -1,13 +1,16 @@
-"""Where the nodes of an axis stand: maps of [0, 1] onto itself."""
+"""Where the nodes of an axis stand: maps of [0, 1] onto itself, tables of coordinates, and periods."""
 
 from types import ModuleType
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
 from hjbjax.problem.types import Array, Number, Numbers
+
+ROUNDINGS = 16  # units of eps of the largest coordinate by which the formula may miss its table
 
 
 @pytree_dataclass()
@@ -64,3 +67,25 @@ class Sinh:
 
 
 Stretching = Sinh
+
+
+@jax.custom_jvp
+def from_table(computed: jax.Array, table: jax.Array, farthest: jax.Array) -> jax.Array:
+    """The table, with the derivative of the formula; the formula where the corners were changed alone."""
+    # a corner that was swapped for a tracer, as ``grad`` does, comes with the table of the old one
+    slack = ROUNDINGS * jnp.finfo(table.dtype).eps * farthest
+    return jnp.where(jnp.abs(computed - table) <= slack, table, computed)
+
+
+@from_table.defjvp
+def _derivative_of_the_formula(primals: tuple, tangents: tuple) -> tuple:
+    """Value and tangent: nodes move with the corners as the formula says; the table is constant."""
+    return from_table(*primals), tangents[0]
+
+
+def into_period(x: Array, lo: Array, hi: Array) -> jax.Array:
+    """Places along periodic axes, brought into [lo, hi)."""
+    moved = lo + jnp.mod(x - lo, hi - lo)
+    moved = jnp.where(moved >= hi, lo, moved)  # just below lo, the remainder rounds up to a whole period
+    # a place in [lo, hi) keeps its bits: the remainder of a small difference would be rounded
+    return jnp.where((x >= lo) & (x < hi), x, moved)

@@ -172,6 +172,7 @@ class StationaryRun(StatesInChunks):
     """The iteration of a task of the chain, or of one with slopes of high order behind it."""
 
     def __init__(self, task: Task, guess: Nodes, limit: int):
+        task = altered(task, on=altered(task.on, grid=task.grid.settled()))
         super().__init__(task, fixed_point.begin(task, guess), _run_kept if _calls_back(task) else run, guess, limit)
 
     def first_chunk(self, clock: Clock) -> int:
@@ -201,7 +202,7 @@ class RunInParts(StationaryRun):
     def __init__(self, task: Task, guess: Nodes, limit: int, parts: Parts | Padding):
         super().__init__(task, guess, limit)
         self.grid, self.parts, self._over = task.grid, parts, state_over_nodes(self.state)
-        self.task = parts.spread(task, over_nodes(task, task.grid.shape))
+        self.task = parts.spread(self.task, over_nodes(self.task, task.grid.shape))
         self.before = self.state = parts.spread(self.state, self._over)
         if isinstance(parts, Parts):
             self._run = functools.partial(_run_in_parts, parts=parts)

@@ -43,7 +43,8 @@ def values(on: Discretisation, clock: Clock | None = None) -> None:
     clock, problem, grid, scheme = clock or Clock(), on.problem, on.grid, on.scheme
     actions = _actions(problem)
     # one program for all schemes whose chain is right by construction
-    on = dataclasses.replace(on, scheme=Upwind() if isinstance(scheme.chain, Upwind) else scheme.chain)
+    chain = Upwind() if isinstance(scheme.chain, Upwind) else scheme.chain
+    on = dataclasses.replace(on, scheme=chain, grid=grid.settled())
     # for counts of 64 bits; the functions are evaluated in ``dtype`` all the same
     with jax.enable_x64(True):
         # nearly every problem passes, and is spared counts and first nodes, which are slow on a CPU
@@ -120,7 +121,8 @@ def _actions_pass(on: Discretisation, actions: tuple[Array, Array], first: int |
     def look(k, amiss):
         here, (u, d) = jax.lax.optimization_barrier((x, jax.tree.map(lambda rows: rows[k], tried)))  # see _survey
         bad = _faults(on, here, list(u), list(d)).values()
-        return amiss | jnp.any(functools.reduce(jnp.logical_or, bad))
+        # as numbers: of truth values XLA would make two passes
+        return amiss | (jnp.max(functools.reduce(jnp.logical_or, bad).astype(jnp.int32)) > 0)
 
     return ~jax.lax.fori_loop(first, last, look, amiss)
 

@@ -144,6 +144,11 @@ class Discretisation:
         return dataclasses.replace(self, grid=grid, cut=None)
 
     @property
+    def settled(self) -> "Discretisation":
+        """The discretisation for a program in which the grid does not change: see ``Grid.settled``."""
+        return altered(self, grid=self.grid.settled())
+
+    @property
     def parts(self) -> Parts | None:
         """The parts of the grid over the mesh; None for one device, and for grids too small for it, as coarser ones."""
         parts = None if self.mesh is None else Parts(self.mesh, self.grid.shape)

@@ -85,12 +85,13 @@ class Look(NamedTuple):
 def begin(task: ArcTask, guess: Nodes) -> ArcState:
     """The state before the first look at a guess, which is step −1 of ``run``; NumPy, so that nothing is compiled."""
     dtype, infinite = guess.dtype, np.asarray(np.inf, guess.dtype)
+    numbers: Any = (-infinite, infinite, np.zeros((), dtype), infinite, infinite)
     number: Any = np.zeros(task.grid.shape, np.int32)
     counter = np.zeros((), np.int32)
     first, code = np.full((), -1, np.int32), np.asarray(int(Status.RUNNING), np.int32)
     value = jax.device_put(guess, may_alias=False)  # states are donated
     books: Any = (first, np.full(2, infinite), counter, code, np.full(HISTORY, -1, dtype))
-    return ArcState(value, number, ErrorBound.unknown(dtype), *books)
+    return ArcState(value, number, ErrorBound(*numbers), *books)
 
 
 def start(task: ArcTask) -> Field:
@@ -193,7 +194,7 @@ def _bound(task: ArcTask, value: Field, found: Look) -> ErrorBound:
     if task.certificate is not Certificate.ADDITIVE:
         return bound
     # that the best arcs all lead upwards says nothing of how far the others do
-    return bound.having(below=jnp.minimum(bound.below, 0))
+    return dataclasses.replace(bound, below=jnp.minimum(bound.below, 0))
 
 
 def _judge(task: ArcTask, value: Field, bound: ErrorBound, since: Scalar) -> Scalar:

@@ -33,7 +33,7 @@ from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
-from hjbjax.problem.types import Array, DType, Field, Mask, Number, Scalar
+from hjbjax.problem.types import Array, Field, Mask, Number, Scalar
 from hjbjax.solution.status import Status
 
 S = TypeVar("S", bound=Any)
@@ -42,7 +42,6 @@ GROWTH = 1e6  # a residual that has grown by this factor over its smallest has d
 PATIENCE = 10  # steps without progress of a residual that is rounding
 ROUNDING = 64  # residuals below this many units in the last place of max|V| are rounding
 FEW = 4  # such units: steps by the fastest rate of all, as V alone takes them, are small at a slow node long before
-NUMBERS = ("below", "above", "lift", "error", "residual")  # of an ``ErrorBound``
 LOST = 4  # roundings of numbers of the size lift · max(factor, 1) in factor · V + shift
 
 
@@ -62,62 +61,21 @@ TO_THE_END = (Certificate.NONE, Certificate.BY_DISCOUNT)  # of tubes: V falls or
 
 @pytree_dataclass()
 class ErrorBound:
-    """Bounds on V_h − V, and how far they are from V: one array, of which a compiled step makes one and not five.
+    """Bounds on V_h − V, and how far they are from V.
 
     Args:
-      numbers: the five of ``of``, in that order, (..., 5).
+      below, above: the bounds on V_h: V + shift where additive, (V + lift) · factor − lift where multiplicative.
+      lift: the constant that makes every exit cost non-negative.
+      error: the largest |bound − V| over the nodes that count, cost units; without a certificate the size of the
+        last correction or of the residual.
+      residual: the largest |residual| in cost units.
     """
 
-    numbers: Any
-
-    @classmethod
-    def of(cls, below: Number, above: Number, lift: Number, error: Number, residual: Number) -> "ErrorBound":
-        """The bounds of these numbers.
-
-        Args:
-          below, above: the bounds on V_h: V + shift where additive, (V + lift) · factor − lift where multiplicative.
-          lift: the constant that makes every exit cost non-negative.
-          error: the largest |bound − V| over the nodes that count, cost units; without a certificate the size of the
-            last correction or of the residual.
-          residual: the largest |residual| in cost units.
-        """
-        numbers: Any = (below, above, lift, error, residual)
-        xp: Any = jnp if is_traced(numbers) else np
-        return cls(xp.stack(numbers, -1))
-
-    @classmethod
-    def unknown(cls, dtype: DType) -> "ErrorBound":
-        """Those of a value at which nobody has looked; NumPy."""
-        return cls(np.array([-np.inf, np.inf, 0, np.inf, np.inf], dtype))
-
-    def having(self, **changed: Scalar) -> "ErrorBound":
-        """The bounds with other numbers, by their names."""
-        return self.of(**{name: changed.get(name, getattr(self, name)) for name in NUMBERS})
-
-    @property
-    def below(self) -> Scalar:
-        """The lower bound, see ``of``."""
-        return self.numbers[..., 0]
-
-    @property
-    def above(self) -> Scalar:
-        """The upper bound."""
-        return self.numbers[..., 1]
-
-    @property
-    def lift(self) -> Scalar:
-        """What is added to V for them."""
-        return self.numbers[..., 2]
-
-    @property
-    def error(self) -> Scalar:
-        """How far they are from V, cost units."""
-        return self.numbers[..., 3]
-
-    @property
-    def residual(self) -> Scalar:
-        """The largest |residual|, cost units."""
-        return self.numbers[..., 4]
+    below: Scalar
+    above: Scalar
+    lift: Scalar
+    error: Scalar
+    residual: Scalar
 
 
 @dataclasses.dataclass(frozen=True)
@@ -163,13 +121,13 @@ def error_bound(
         )
         if other is Certificate.NONE:  # bounds that say nothing
             endless = jnp.full_like(without.residual, jnp.inf)
-            without = without.having(above=endless, lift=endless)
+            without = dataclasses.replace(without, above=endless, lift=endless)
         return jax.tree.map(lambda mine, theirs: jnp.where(discount > 0, mine, theirs), with_it, without)
     residual = iterate.grid.largest(jnp.where(iterate.counted, jnp.abs(iterate.equation.source), 0))
     if kind is Certificate.ADDITIVE:
         below, above = _additive(iterate, discount)
         error = jnp.maximum(jnp.abs(below), jnp.abs(above))
-        return ErrorBound.of(below, above, jnp.zeros_like(residual), error, residual)
+        return ErrorBound(below, above, jnp.zeros_like(residual), error, residual)
     if kind is Certificate.MULTIPLICATIVE:
         assert least_cost is not None
         return _multiplicative(iterate, least_cost, residual)
@@ -179,7 +137,7 @@ def error_bound(
 def measured(residual: Scalar, moved: Number) -> ErrorBound:
     """The error by what is at hand without a bound: the residual, and the size of the last correction."""
     zero = jnp.zeros_like(residual)
-    return ErrorBound.of(zero, zero, zero, jnp.maximum(residual, moved), residual)
+    return ErrorBound(zero, zero, zero, jnp.maximum(residual, moved), residual)
 
 
 def of_relaxation(kind: Certificate, on: Discretisation, value: Field) -> tuple[Field, ErrorBound]:
@@ -194,10 +152,10 @@ def of_relaxation(kind: Certificate, on: Discretisation, value: Field) -> tuple[
     if kind is Certificate.ADDITIVE:
         defect = jax.lax.optimization_barrier(defect)
         error = on.grid.largest(jnp.abs(given.clipped(defect / on.problem.discount, value)))
-        return given.clipped(defect / outflow, value), ErrorBound.of(-error, error, zero, error, error)
+        return given.clipped(defect / outflow, value), ErrorBound(-error, error, zero, error, error)
     step = given.clipped(jax.lax.optimization_barrier(defect / outflow), value)
     residual = on.grid.largest(jnp.abs(step))
-    return step, ErrorBound.of(zero, zero, zero, residual, residual)
+    return step, ErrorBound(zero, zero, zero, residual, residual)
 
 
 def _additive(iterate: Iterate, discount: Number) -> tuple[Scalar, Scalar]:
@@ -237,7 +195,7 @@ def _multiplicative(iterate: Iterate, least_cost: Field, residual: Scalar) -> Er
     # the scaling argument wants V ≥ 0; without that there is no bound
     bounded = jnp.isfinite(above) & (least + lift >= 0)
     error = jnp.where(bounded, jnp.maximum(most + lift, 0) * apart, jnp.inf) + 0 * residual  # a NaN stays one
-    return ErrorBound.of(below, above, jnp.where(priced, lift, jnp.inf), error, residual)
+    return ErrorBound(below, above, jnp.where(priced, lift, jnp.inf), error, residual)
 
 
 def lowest_end(obstacles: Obstacles, counted: Mask | bool, grid: Grid) -> Scalar:

@@ -5,8 +5,7 @@ policy gives a correction δ; V + δ is the next value. What differs is how well
 iteration takes its diagonal with the largest rate (monotone, a contraction), modified policy iteration a few
 Gauss–Seidel sweeps, policy iteration (Howard; semismooth Newton) solves it. In a game see ``methods``.
 
-The loop stops by the certificate of the value it returns, not by the size of a step, and tests finiteness: a
-NaN residual is never taken for convergence.
+The loop stops by the certificate of the value it returns, not by the size of a step; a NaN is never convergence.
 """
 
 import dataclasses
@@ -96,7 +95,7 @@ class Task:
 
     @property
     def counting(self) -> jax.Array | bool:
-        """The nodes whose value is judged; a known truth where all are, which takes no pass over them."""
+        """The nodes whose value is judged; a known truth where all are, which costs no pass over them."""
         return self.counted if self.has_lost else True
 
     @property
@@ -172,21 +171,19 @@ def begin(task: Task, guess: Nodes) -> State:
 
     The guess is copied, since states are donated; that of parts by ``spread``. At host level nothing is compiled.
     """
-    traced = is_traced(task, guess)
+    traced, dtype = is_traced(task, guess), guess.dtype
     xp: Any = jnp if traced else np
     copied: Any = jnp.array if traced else functools.partial(jax.device_put, may_alias=False)
     value: Any = copied(guess) if task.on.parts is None else guess
-    dtype, shape = guess.dtype, task.grid.shape
-    players = (task.problem.controls, task.problem.disturbances)
+    shape = () if task.bare else task.grid.shape  # of the policy
+    players = (None if task.bare else admissible for admissible in (task.problem.controls, task.problem.disturbances))
     inputs = [0 if admissible is None else admissible.dim for admissible in players]
     policy = Greedy(xp.zeros(shape, dtype), *(tuple(xp.zeros(shape, dtype) for _ in range(m)) for m in inputs))
-    if task.bare:
-        policy = Greedy(xp.zeros((), dtype), (), ())
     infinite, code = xp.asarray(xp.inf, dtype), xp.asarray(int(Status.RUNNING), xp.int32)
-    bound = jax.tree.map(xp.asarray, ErrorBound.unknown(dtype))
+    bound = ErrorBound(xp.asarray(-infinite), infinite, xp.zeros((), dtype), infinite, infinite)
     counter, first = xp.zeros((), xp.int32), xp.full((), -1, xp.int32)
-    history = xp.full(HISTORY, -1, dtype)  # no NaN, which jax_debug_nans would take for a fault
-    return State(value, policy, infinite, bound, first, xp.stack([infinite] * 2), counter, code, history)
+    history, best = xp.full(HISTORY, -1, dtype), xp.stack([infinite] * 2)  # no NaN, a fault to jax_debug_nans
+    return State(value, policy, infinite, bound, first, best, counter, code, history)
 
 
 def run(task: Task, state: State, until: Number) -> State:
@@ -197,8 +194,7 @@ def run(task: Task, state: State, until: Number) -> State:
         # loop variant, or XLA compiles a kernel for every scalar of every action that it can hoist
         controls, grid, count = jax.lax.optimization_barrier((task.problem.controls, task.grid, state.step))
         on = dataclasses.replace(task.on, problem=altered(task.problem, controls=controls), grid=grid)
-        here = dataclasses.replace(task, on=on)
-        return advance(here, dataclasses.replace(state, step=count), start)
+        return advance(dataclasses.replace(task, on=on), dataclasses.replace(state, step=count), start)
 
     state = jax.lax.while_loop(lambda at: (at.code == Status.RUNNING) & (at.step < until), step, state)
     if not task.by_defect:
@@ -221,7 +217,7 @@ def advance(task: Task, state: State, start: Scalar) -> State:
     if task.certificate is Certificate.OPEN and not task.method.relaxes:
         moved = moved * methods.shift_factor(_shift(task, state), task.problem.discount)
     policy, fastest, bound = _look(task, value, state.policy, moved=moved, first=state.step < 0)
-    bound = bound.having(error=jnp.where(_lacks_measure(task, state), jnp.inf, bound.error))
+    bound = dataclasses.replace(bound, error=jnp.where(_lacks_measure(task, state), jnp.inf, bound.error))
     since = certificates.steps_since_best(state, bound)
     code = certificates.at_rest(task, state, moved, certificates.judged(task, value, bound, state.best, since))
     return certificates.booked(state, start, bound, code, since, value=value, policy=policy, fastest=fastest)
@@ -295,7 +291,7 @@ def _look(
         bound = jax.tree.map(functools.partial(jnp.where, task.plain), bound, measured)
     if task.has_lost:
         leaks = bellman.leaks(task.on, policy, task.obstacles.fixed, ~task.counted)
-        bound = bound.having(error=jnp.where(leaks, jnp.inf, bound.error))
+        bound = dataclasses.replace(bound, error=jnp.where(leaks, jnp.inf, bound.error))
     return policy, left.fastest, bound
 
 

@@ -12,9 +12,8 @@ periodic axis beyond the first is as old as the last sweep.
 
 Where the arrays outgrow a processor's cache, slabs of slices take the place of single sweeps through all of them.
 
-Over many devices each sweeps its own nodes, all at once: block Jacobi between the parts. The arrays of a part have one
-more layer on either side of a divided axis, rows without weights whose source is the δ of the nodes beyond, fetched
-from the parts beside before every forward and backward pair.
+Over many devices each sweeps its own nodes: block Jacobi between the parts. The arrays of a part have one more layer
+beside a divided axis, rows without weights whose source is the δ beyond, fetched before every forward and backward pair.
 """
 
 import dataclasses
@@ -51,7 +50,7 @@ def sweep(equation: PolicyEquation, grid: Grid, rounds: int) -> Field:
     layout = _layout(grid)
     equation = _laid_out(equation, layout)
     # news cross one part a sweep
-    rounds += 0 if layout.parts is None else max(layout.parts.sizes) // FURTHER
+    rounds += max(layout.parts.sizes) // FURTHER if layout.parts else 0
 
     def order(index: jax.Array, delta: jax.Array) -> jax.Array:
         # one bit an axis beyond the first; forward and backward sweeps are the two ways along the first
@@ -117,7 +116,7 @@ def _laid_out(equation: PolicyEquation, layout: Layout) -> PolicyEquation:
     parts = layout.parts
     if parts is None:
         return equation
-    widths = [(1, 1) if layout.is_divided(axis) else (0, 0) for axis in range(layout.grid.ndim)]
+    widths = [(int(layout.is_divided(axis)),) * 2 for axis in range(layout.grid.ndim)]
 
     def lay(leaf: jax.Array) -> jax.Array:
         return jnp.pad(jnp.moveaxis(parts.cleared(leaf), layout.axes[0], 0), widths) if leaf.ndim else leaf
@@ -130,8 +129,7 @@ Carried = tuple[jax.Array, jax.Array]  # planes, and the source, whose layers ch
 
 def _exchanged(carried: Carried, layout: Layout, flips: list[jax.Array]) -> Carried:
     """Planes and source with the δ of the nodes beyond this part in the layers around it."""
-    planes, source = carried
-    parts = layout.parts
+    (planes, source), parts = carried, layout.parts
     for axis in range(source.ndim) if parts is not None else ():
         if not layout.is_divided(axis):
             continue

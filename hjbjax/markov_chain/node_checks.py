@@ -44,7 +44,7 @@ def values(on: Discretisation, clock: Clock | None = None) -> None:
     actions = _actions(problem)
     # one program for all schemes whose chain is right by construction
     chain = Upwind() if isinstance(scheme.chain, Upwind) else scheme.chain
-    on = dataclasses.replace(on, scheme=chain, grid=grid.settled())
+    on = dataclasses.replace(on, scheme=chain).settled
     # for counts of 64 bits; the functions are evaluated in ``dtype`` all the same
     with jax.enable_x64(True):
         # nearly every problem passes, and is spared counts and first nodes, which are slow on a CPU

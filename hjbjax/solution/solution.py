@@ -20,6 +20,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import Labels
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
+from hjbjax.problem.sets import Finite
 from hjbjax.problem.types import Array, Numbers
 from hjbjax.solution import archive, files, screen
 from hjbjax.solution.files import FileError
@@ -321,3 +322,13 @@ def load(path: Path) -> Solution:
       FileError: the file is missing, truncated, damaged, foreign, of a newer format, or contradicts itself.
     """
     return Solution(**files.read(path, archive.FORMAT, archive.VERSION, archive.plan, archive.fields))
+
+
+def question(problem: Problem) -> dict[str, Any]:
+    """The fields of a ``Solution`` that follow from the problem alone: its words, and which sets are enumerated."""
+    return {
+        "discrete": isinstance(problem.controls, Finite),
+        "discrete_disturbance": isinstance(problem.disturbances, Finite),
+        "labels": problem.labels,
+        "problem": None if is_traced(problem) else problem,
+    }

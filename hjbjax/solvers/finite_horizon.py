@@ -33,11 +33,11 @@ from hjbjax.solution import checkpoints
 from hjbjax.solution.checkpoints import Checkpoint
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solution.placement import Path
-from hjbjax.solution.solution import Solution, SolveError
+from hjbjax.solution.solution import Solution, SolveError, question
 from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop, march_run
 from hjbjax.solvers.result import solution_at_start, with_last_phase
-from hjbjax.solvers.setup import check_on_one_state, choose_evaluation, question
+from hjbjax.solvers.setup import check_on_one_state, choose_evaluation
 from hjbjax.solvers.stationary import check_node_values
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions

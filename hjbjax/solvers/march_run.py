@@ -18,12 +18,11 @@ from hjbjax.problem.parts import Parts, spans_processes
 from hjbjax.problem.pytree import altered
 from hjbjax.problem.types import Field, Nodes, Number, Scalar
 from hjbjax.solution.clock import CUT, Clock
-from hjbjax.solution.solution import Solution
+from hjbjax.solution.solution import Solution, question
 from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop
 from hjbjax.solvers.host_loop import WideJit
 from hjbjax.solvers.result import isaacs_gap, warn_of_cuts, warn_of_gap
-from hjbjax.solvers.setup import question
 
 CERTIFICATE = "of a march there is none; halve the spacings and the step to see its error"
 ADVICE = {

@@ -25,7 +25,7 @@ from hjbjax.problem.types import Mask, Nodes
 from hjbjax.solution import nested_grids
 from hjbjax.solution.clock import Clock, Stopped
 from hjbjax.solution.status import Status
-from hjbjax.solvers.setup import Assumptions, assumptions_of, forced_only, linear_solve, prepare_jit
+from hjbjax.solvers.setup import Assumptions, assumptions_of, forced_only, linear_solve, prepared
 from hjbjax.solvers.stationary_run import iterate
 
 VANISHING = (2.0, 0.2, 0.02)  # discounts on the way to none, over one by the time that crossing the box takes
@@ -307,7 +307,7 @@ def _on_coarser(task: Task, coarse: Grid) -> Task | None:
         return None
     else:
         level = task.on.chain.on_grid(coarse)
-        made = prepare_jit(level, method=task.method, tol=task.tol, assumptions=assumptions_of(level))
+        made = prepared(level, method=task.method, tol=task.tol, assumptions=assumptions_of(level))
         on = dataclasses.replace(task.on.on_grid(coarse), cut=made.on.cut)
         made = dataclasses.replace(made, on=on, certificate=task.certificate)
     held, kept = (bool(np.any(np.asarray(each.obstacles.fixed))) for each in (task, made))

@@ -22,10 +22,10 @@ from hjbjax.problem.sets import AdmissibleSet
 from hjbjax.problem.types import Array, Field, Mask, Nodes, Scalar
 from hjbjax.solution import nested_grids
 from hjbjax.solution.clock import CUT, Clock
-from hjbjax.solution.solution import Solution
+from hjbjax.solution.solution import Solution, question
 from hjbjax.solution.status import Status, warn
 from hjbjax.solvers.nested import Settled
-from hjbjax.solvers.setup import Assumptions, question
+from hjbjax.solvers.setup import Assumptions
 
 GAP = 0.05  # of what the actions matter; where Isaacs' condition holds, upwinding left up to .019 on 21 nodes
 FIRST, CENTRAL = 1.0, 2.0  # orders of upwinding and of central differences

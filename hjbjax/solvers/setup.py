@@ -1,7 +1,6 @@
 """From a problem on a grid to a task: what is held, what counts, which certificate applies, which method runs."""
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,23 +20,11 @@ from hjbjax.iteration.methods import Method, Nested, PolicyIteration, ValueItera
 from hjbjax.markov_chain import attainability, resting
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_constrained, is_discounted
-from hjbjax.problem.pytree import cast, is_traced, known
-from hjbjax.problem.sets import Finite
+from hjbjax.problem.pytree import altered, cast, known
 from hjbjax.problem.types import Mask, Number
 from hjbjax.solution.clock import Clock
 from hjbjax.solution.status import warn
 from hjbjax.tracing import checks
-
-
-def question(problem: Problem) -> dict[str, Any]:
-    """The fields of a ``Solution`` that follow from the problem alone: its words, and which sets are enumerated."""
-    return {
-        "discrete": isinstance(problem.controls, Finite),
-        "discrete_disturbance": isinstance(problem.disturbances, Finite),
-        "labels": problem.labels,
-        "problem": None if is_traced(problem) else problem,
-    }
-
 
 OPERATIONS = 10_000  # of one evaluation: XLA takes minutes over a program in which there are a dozen such
 DIRECT = 50_000  # nodes up to which a plane with open ends is solved by sparse LU: about a second a step
@@ -206,7 +193,13 @@ def assumptions_of(on: Discretisation) -> Assumptions:
     return Assumptions(Certificate.BY_DISCOUNT if discounted is None else kind, players.exact, may_rest, fits)
 
 
-prepare_jit = jax.jit(prepare, static_argnames="assumptions")
+_prepare_jit = jax.jit(prepare, static_argnames="assumptions")
+
+
+def prepared(on: Discretisation, *, method: Method, tol: Number, assumptions: Assumptions) -> Task:
+    """The task of ``prepare`` at host level, by a program that takes spacings and coordinates as they are."""
+    made = _prepare_jit(on.settled, method=method, tol=tol, assumptions=assumptions)
+    return altered(made, on=altered(made.on, grid=jax.tree.map(lambda leaf: np.asarray(leaf, on.dtype), on.grid)))
 
 
 def prepare_on_host(
@@ -229,7 +222,7 @@ def prepare_on_host(
         assumptions = dataclasses.replace(assumptions, exact=False)
     if is_bare(method):
         return *_bare(on, method, tol, assumptions), None
-    task = prepare_jit(on, method=method, tol=tol, assumptions=assumptions)
+    task = prepared(on, method=method, tol=tol, assumptions=assumptions)
     priced = assumptions.certificate is Certificate.MULTIPLICATIVE
     # where L = 0 the bound by the running cost fails, and a run may go round for ever at no cost as well as rest
     if (priced and not _costs_positive(task)) or problem.cost is None:
@@ -239,7 +232,7 @@ def prepare_on_host(
         )
     if priced and problem.is_game and not _costs_positive(task) and not method.relaxes:
         # policies that go on for ever at no cost have any value: the one sought is the limit of those of long horizons
-        task = prepare_jit(on, method=ValueIteration(), tol=tol, assumptions=assumptions)
+        task = prepared(on, method=ValueIteration(), tol=tol, assumptions=assumptions)
     if priced and not _costs_positive(task):
         assumptions = dataclasses.replace(assumptions, certificate=Certificate.NONE)
         task = dataclasses.replace(task, certificate=Certificate.NONE, least_cost=None)

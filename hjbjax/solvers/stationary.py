@@ -282,10 +282,10 @@ def _without_rests_to_leave(task: Task, state: State) -> tuple[State, Scalar]:
     # under a discount, which may be traced, no node was held for being at rest
     wrong = jnp.any(pays) & (state.code == Status.CONVERGED) & (task.problem.discount == 0)
     gap, infinite = state.bound, jnp.asarray(jnp.inf, state.value.dtype)
-    gap = gap.having(
-        below=jnp.where(wrong, 0, gap.below),
-        **{name: jnp.where(wrong, infinite, getattr(gap, name)) for name in ("above", "lift", "error")},
-    )
+    gap = dataclasses.replace(
+        gap, below=jnp.where(wrong, 0, gap.below), above=jnp.where(wrong, infinite, gap.above),
+        lift=jnp.where(wrong, infinite, gap.lift), error=jnp.where(wrong, infinite, gap.error),
+    )  # fmt: skip
     code = jnp.where(wrong, Status.STALLED, state.code).astype(state.code.dtype)
     return dataclasses.replace(state, bound=gap, code=code), wrong
 

@@ -200,7 +200,7 @@ def _toll(slope, lo, x, u):
 
 
 def test_before_the_first_look_nothing_is_known():
-    unlooked = certificates.ErrorBound.unknown(float)
+    unlooked = certificates.ErrorBound(-np.inf, np.inf, 0.0, np.inf, np.inf)
     for kind in (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE):
         value = np.array([0.0, 2.0, np.inf])
         solution = Solution(Grid([0.0], [1.0], (3,)), value, None, enclosure=certificates.enclosure(kind, unlooked))
@@ -263,7 +263,7 @@ def test_lifted_bounds_are_rounded_outwards(seed):
     lift = float(10.0 ** rng.uniform(-9, 9) * rng.choice([0.0, 1.0], p=[0.1, 0.9]))
     below, above = float(rng.choice([1.0, rng.uniform(0, 1)])), float(10.0 ** rng.choice([0.0, rng.uniform(0, 7.8)]))
     value = np.append(-lift, -lift * (1 - 10.0 ** rng.uniform(-16, 0, 20)))
-    gap = certificates.ErrorBound.of(*(np.asarray(number) for number in (below, above, lift, 0.0, 0.0)))
+    gap = certificates.ErrorBound(*(np.asarray(number) for number in (below, above, lift, 0.0, 0.0)))
     enclosure = certificates.enclosure(Certificate.MULTIPLICATIVE, gap)
     lower, upper = Solution(Grid([0.0], [1.0], (21,)), value, None, enclosure=enclosure).bounds
     for v, low, high in zip(value, lower, upper, strict=True):

@@ -47,7 +47,7 @@ def test_every_rule_of_a_verdict():
 
     @jax.jit
     def assumptions_of(residual, error, best, nearest, since):
-        measured = ErrorBound.of(-error, error, jnp.zeros(()), error, residual)
+        measured = ErrorBound(-error, error, jnp.zeros(()), error, residual)
         return certificates.judged(task, jnp.full(11, -LARGE), measured, jnp.stack([nearest, best]), since)
 
     residuals = (0.0, 0.9 * ROUNDING, 1.1 * ROUNDING, 1.0, 0.9e6 * ROUNDING, 1.1e6 * ROUNDING, 1e7, np.inf, np.nan)

@@ -13,7 +13,7 @@ periodic axis beyond the first is as old as the last sweep.
 Where the arrays outgrow a processor's cache, slabs of slices take the place of single sweeps through all of them.
 
 Over many devices each sweeps its own nodes: block Jacobi between the parts. The arrays of a part have one more layer
-beside a divided axis, rows without weights whose source is the δ beyond, fetched before every forward and backward pair.
+beside a divided axis, rows without weights whose source is the δ beyond, fetched before every pair of sweeps.
 """
 
 import dataclasses

@@ -67,18 +67,26 @@ def test_the_least_quadratic_in_a_ball_against_scipy(units):
     for dim in (1, 2, 3, 4):
         slope, square = rng.normal(size=(2, dim, 40))
         slope[:, :5], slope[0, 5:10], square[:, 10:20] = 0, 0, np.abs(square[:, 10:20])
-        found = np.stack(least_in_ball(0.7, list(slope * units), list(square * units)))
-
-        def value(u, at, slope=slope, square=square):
-            u = u * min(1, 0.7 / max(np.linalg.norm(u), 1e-12))
-            return slope[:, at] @ u + square[:, at] @ u**2
+        found = np.stack(jax.jit(least_in_ball)(0.7, list(slope * units), list(square * units)))
 
         assert np.all(np.linalg.norm(found, axis=0) <= 0.7 * (1 + 1e-12))
-        for at in range(slope.shape[1]):
+        inside = {"type": "ineq", "fun": lambda u: 0.49 - u @ u, "jac": lambda u: -2 * u}
+        for b, c, mine in zip(slope.T, square.T, found.T, strict=True):
+
+            def value(u, b=b, c=c):
+                return b @ u + c @ u**2
+
             # a local search from many starts: the global optimum is among what it finds
             starts = rng.normal(size=(12, dim))
-            best = min(minimize(value, start, args=(at,), method="Nelder-Mead").fun for start in starts)
-            assert value(found[:, at], at) <= best + 1e-7
+            starts *= 0.6 / np.linalg.norm(starts, axis=1, keepdims=True)
+            ends = (
+                minimize(
+                    value, start, jac=lambda u, b=b, c=c: b + 2 * c * u, constraints=inside, options={"ftol": 1e-12}
+                ).x
+                for start in starts
+            )
+            best = min(value(u * min(1, 0.7 / max(np.linalg.norm(u), 1e-12))) for u in ends)
+            assert value(mine) <= best + 1e-7
 
 
 def test_the_optimum_in_a_ball_has_two_derivatives():
@@ -88,12 +96,12 @@ def test_the_optimum_in_a_ball_has_two_derivatives():
         u = jnp.stack(least_in_ball(0.5, list(b), [0.3, 1.0, 2.0]))
         return b @ u + jnp.array([0.3, 1.0, 2.0]) @ u**2
 
+    value, gradient, bend = jax.jit(least), jax.jit(jax.grad(least)), jax.jit(jax.hessian(least))
     for b in (np.array([0.1, -0.2, 0.3]), np.array([1.0, -2.0, 3.0]), np.array([0.02, 4.0, 1.0])):
-        gradient, bend = jax.grad(least)(b), jax.hessian(least)(b)
         h = 1e-4 * np.eye(3)
-        np.testing.assert_allclose(gradient, [(least(b + e) - least(b - e)) / 2e-4 for e in h], atol=1e-8)
-        differences = [(jax.grad(least)(b + e) - jax.grad(least)(b - e)) / 2e-4 for e in h]
-        np.testing.assert_allclose(bend, differences, atol=1e-7)
+        np.testing.assert_allclose(gradient(b), [(value(b + e) - value(b - e)) / 2e-4 for e in h], atol=1e-8)
+        differences = [(gradient(b + e) - gradient(b - e)) / 2e-4 for e in h]
+        np.testing.assert_allclose(bend(b), differences, atol=1e-7)
 
 
 @pytest.mark.parametrize("curved", [False, True])

@@ -16,10 +16,10 @@ from hjbjax.cli import launch
 SCRIPT = Path(__file__).parents[1] / "support" / "over_devices.py"
 ROOT = Path(__file__).parents[2]
 CHEAP = (
-    "stencils", "not_a_number_is_not_lost", "compiled_program", "value_iteration", "march_of_first_order", "sweeps",
-    "two_integrators", "batch", "checkpoints", "faults", "refusals",
+    "not_a_number_is_not_lost", "compiled_program", "value_iteration", "sweeps", "checkpoints", "faults", "refusals"
 )  # fmt: skip
 DEAR = (
+    "stencils", "batch", "two_integrators", "march_of_first_order",
     "value_alone", "value_iteration_to_a_target", "value_iteration_of_a_game", "value_iteration_with_correlated_noise",
     "march_of_the_value_alone", "march_of_second_order", "march_of_fifth_order", "sweeps_of_flat_parts",
     "sweeps_in_slabs", "sweeps_to_a_target", "sweeps_of_a_game", "krylov", "krylov_with_correlated_noise",
@@ -116,6 +116,7 @@ def test_the_value_of_systems_side_by_side_is_the_sum_of_theirs(found, name):
     assert found["ulp"] <= ULP
 
 
+@pytest.mark.slow
 def test_batch(found):
     """Eleven lanes on eight devices, one of which fails, as each by itself."""
     for mesh in found:

@@ -68,7 +68,7 @@ PROBLEMS = {
         hjb.Grid([-1.0], [1.0], (42,)),
     ),
 }  # fmt: skip
-FEW = ("a target between nodes", "noise")
+FEW = ("a target between nodes",)
 
 
 @pytest.mark.filterwarnings("ignore::hjbjax.SolveWarning")

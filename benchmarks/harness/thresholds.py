@@ -37,6 +37,8 @@ class Threshold:
 
 CHAIN = "pendulum 200 x 201, 21 controls, to 1e-3, against the faster of QuantEcon's two methods"
 FIRST = "first answer of the pendulum at its default on {} over one compilation of its loop"
+DEFAULT = "its default with the error of the grid over the monotone answer alone"
+COLD = f"pendulum {{}}, first answers, {DEFAULT}"
 HAND = "pendulum {} to 1e-3, 21 controls, against the numba solver"
 DEVICES = "pendulum {} to 1e-3, seconds on two devices of one processor over those on one"
 THRESHOLDS = {
@@ -57,6 +59,9 @@ THRESHOLDS = {
     "first pendulum 101": Threshold(FIRST.format("100 x 101"), 2.2, 1.4, most=True),
     "first pendulum 401": Threshold(FIRST.format("400 x 401"), 3, 1.8, most=True),
     "first pendulum 801": Threshold(FIRST.format("800 x 801"), 4.2, 2.2, most=True),
+    "cold default 201": Threshold(COLD.format("200 x 201"), 1.3, most=True),
+    "cold default 401": Threshold(COLD.format("400 x 401"), 1.3, most=True),
+    "warm default 401": Threshold(f"pendulum 400 x 401, warm, {DEFAULT}", 3, 2, most=True),
     "programs": Threshold("pendulum by default, the most programs compiled", 14, unit="", most=True),
     "quantecon cold 160": Threshold("pendulum 160 x 161, 31 controls, our first answer against QuantEcon's", 1.8, 2.5),
     "quantecon cold 200": Threshold("pendulum 200 x 201, 21 controls, our first answer against QuantEcon's", 3, 4),

@@ -20,7 +20,7 @@ from hjbjax.problem.labels import with_unit, words
 from hjbjax.problem.padding import Padding
 from hjbjax.problem.parts import Parts
 from hjbjax.problem.pytree import altered, is_traced, known, pytree_dataclass
-from hjbjax.problem.stretching import Stretching, from_table, into_period
+from hjbjax.problem.stretching import Stretching, checked_table, from_table, into_period
 from hjbjax.problem.types import Array, AtNodes, DType, Mask, Number, Numbers, Scalar, States, Verdict
 
 TABLED = 2**24  # points of an axis whose coordinates are kept, 128 MiB; a grid too large must not allocate them before
@@ -149,15 +149,15 @@ class Grid:
         return altered(grid, shape=parts.shape, coordinates=tables, parts=parts)
 
     def settled(self) -> "Grid":
-        """The grid for a program in which neither corners nor tables change: all that is made of them is made here.
-
-        Host level. A derivative by a corner would not see the nodes move.
-        """
+        """The grid for a program in which it does not change: what is made of its corners is made here, by NumPy."""
         if any(table is None for table in self.coordinates):
             return self
         lo, hi = (tuple(np.asarray(corner)) for corner in (self.lo, self.hi))
-        spacings = tuple((b - a) / self.intervals(axis) for axis, (a, b) in enumerate(zip(lo, hi, strict=True)))
-        return altered(self, lo=lo, hi=hi, spacings=spacings)
+        tables, spacings = [], []
+        for axis, (low, high, table) in enumerate(zip(lo, hi, self.coordinates, strict=True)):
+            tables.append(checked_table(self._by_formula(axis), np.asarray(table), max(abs(low), abs(high))))
+            spacings.append((high - low) / self.intervals(axis))
+        return altered(self, lo=lo, hi=hi, coordinates=tuple(tables), spacings=tuple(spacings))
 
     @property
     def whole(self) -> "Grid":

@@ -69,12 +69,17 @@ class Sinh:
 Stretching = Sinh
 
 
-@jax.custom_jvp
-def from_table(computed: jax.Array, table: jax.Array, farthest: jax.Array) -> jax.Array:
-    """The table, with the derivative of the formula; the formula where the corners were changed alone."""
-    # a corner that was swapped for a tracer, as ``grad`` does, comes with the table of the old one
-    slack = ROUNDINGS * jnp.finfo(table.dtype).eps * farthest
-    return jnp.where(jnp.abs(computed - table) <= slack, table, computed)
+def checked_table(computed: Array, table: Array, farthest: Array) -> Array:
+    """The table of an axis whose largest coordinate is ``farthest``; the formula where the corners were changed alone.
+
+    A corner that was swapped for a tracer, as ``grad`` does, comes with the table of the old one.
+    """
+    xp: Any = jnp if is_traced(computed, table, farthest) else np
+    slack = ROUNDINGS * np.finfo(table.dtype).eps * farthest
+    return xp.where(xp.abs(computed - table) <= slack, table, computed)
+
+
+from_table = jax.custom_jvp(checked_table)  # with the derivative of the formula
 
 
 @from_table.defjvp

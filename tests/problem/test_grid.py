@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hjbjax import Grid
+from hjbjax import Grid, Sinh
+from hjbjax.problem.pytree import altered
 
 finite = st.floats(-1e3, 1e3, allow_subnormal=False)  # XLA flushes subnormal numbers to zero
 PLANE = Grid(lo=[-1.0, 0.0], hi=[2.0, 4.0], shape=(5, 4))
@@ -242,3 +243,13 @@ def test_the_inner_share_of_a_box():
     assert np.flatnonzero(np.any(inside, axis=(0, 2))).tolist() == [2, 3, 4, 5, 6]
     assert np.all(inside[2, 4])  # a periodic axis has no edge to keep away from
     assert grid.inner(1.0).all()
+
+
+def test_a_settled_grid_has_the_nodes_and_spacings_of_its_corners():
+    """Also where the corners were changed alone, by whoever rebuilds the tree: then the tables are those of the old."""
+    grid = Grid([-1.0, 0.0], [1.0, 2.0], (5, 7), stretch=(Sinh(2.0), None))
+    for each in (grid, altered(grid, lo=np.array([-3.0, 0.5])), grid.settled()):
+        settled, wanted = each.settled(), Grid(each.lo, each.hi, each.shape, stretch=each.stretch)
+        assert settled.spacings == tuple(wanted.spacing(axis) for axis in range(2))
+        for axis in range(2):
+            np.testing.assert_allclose(settled.coordinates[axis], wanted.axis(axis), rtol=0, atol=1e-15)

@@ -120,7 +120,7 @@ class Task:
 
     def impose(self, value: Field) -> Field:
         """``value`` with the given values put in, and with nodes that are lost far above all others."""
-        value = self.given.impose(value)
+        value = self.grid.repeated(self.given.impose(value))
         if not self.has_lost:
             return value
         # 1/√eps above: no minimum chooses it, and a difference with it still has half of its digits

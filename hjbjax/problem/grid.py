@@ -21,7 +21,7 @@ from hjbjax.problem.padding import Padding
 from hjbjax.problem.parts import Parts
 from hjbjax.problem.pytree import altered, is_traced, known, pytree_dataclass
 from hjbjax.problem.stretching import Stretching, checked_table, from_table, into_period
-from hjbjax.problem.types import Array, AtNodes, DType, Mask, Number, Numbers, Scalar, States, Verdict
+from hjbjax.problem.types import Array, AtNodes, DType, Field, Mask, Number, Numbers, Scalar, States, Verdict
 
 TABLED = 2**24  # points of an axis whose coordinates are kept, 128 MiB; a grid too large must not allocate them before
 
@@ -172,6 +172,10 @@ class Grid:
         """The largest of node values, on all devices."""
         return jnp.max(values) if self.parts is None else self.parts.largest(values)
 
+    def repeated(self, values: Field) -> Field:
+        """What each node holds, in all of its copies, where larger arrays have such."""
+        return self.parts.repeated(values) if isinstance(self.parts, Padding) else values
+
     def least(self, values: AtNodes) -> Scalar:
         """The least of node values, on all devices."""
         return jnp.min(values) if self.parts is None else -self.parts.largest(-values)
@@ -197,9 +201,7 @@ class Grid:
 
     def spacing(self, axis: int) -> Number:
         """The distance h between neighbours along ``axis``; their mean on a stretched one."""
-        if self.spacings is not None:
-            return self.spacings[axis]
-        return (self.hi[axis] - self.lo[axis]) / self.intervals(axis)
+        return self.spacings[axis] if self.spacings else (self.hi[axis] - self.lo[axis]) / self.intervals(axis)
 
     def axis(self, axis: int, dtype: DType | None = None) -> Array:
         """The coordinates of the nodes along one axis, shape (N,); the same numbers in every program."""

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.pytree import pytree_dataclass
-from hjbjax.problem.types import AtNodes, Mask, Scalar
+from hjbjax.problem.types import AtNodes, Field, Mask, Scalar
 
 T = TypeVar("T")
 
@@ -22,8 +22,9 @@ T = TypeVar("T")
 class Padding:
     """The nodes of a grid in the first entries of larger arrays, so that one program serves grids of several sizes.
 
-    Along a periodic axis they are there several times, so that what is beside a node stands beside it everywhere. Along
-    the others copies of the last node follow it. No node reads what becomes of them, and no reduction counts them.
+    Along a periodic axis they are there several times, so that what is beside a node stands beside it everywhere; after
+    every step the copies are made alike. Along the others copies of the last node follow it. No node reads what becomes
+    of them, and no reduction counts them.
 
     Args:
       counts: the nodes along every axis, n integers, which may be traced.
@@ -71,6 +72,18 @@ class Padding:
         """The number of the node, one of so many, that each entry holds along an axis."""
         entry = np.arange(self.shape[axis])
         return entry % count if self.periodic[axis] else np.minimum(entry, count - 1)
+
+    def repeated(self, values: Field) -> Field:
+        """What each node holds, in all of its copies.
+
+        Left alone they need not stay alike: what no certificate bounds may have solutions on a ring of several turns
+        that are none on a ring of one.
+        """
+        for axis in range(len(self.shape)):
+            if self.periodic[axis]:
+                entry = jnp.arange(self.shape[axis]) % self.counts[axis]
+                values = jnp.take(values, entry, axis, mode="clip")
+        return values
 
     def spread(self, tree: T, over_nodes: Any) -> T:
         """Arrays of the grid as those of the entries, on the device; others as they are. Host level."""

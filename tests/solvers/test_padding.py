@@ -31,6 +31,14 @@ def chase(x, u, d):
 
 PROBLEMS = {
     "periodic": lambda: (hjb.Problem(swing, effort, U, discount=0.5), ANGLE),
+    # where the coarser grid is so coarse that its slopes grow without end: copies on the ring would part
+    "a ring of few nodes": lambda: (
+        hjb.Problem(
+            lambda x, u: jnp.stack([x[1], 2 * jnp.sin(x[0]) + u[0]]),
+            lambda x, u: 1 - jnp.cos(x[0]) + 0.2 * x[1] ** 2 + 0.1 * u @ u, hjb.Box([-1.5], [1.5]), discount=0.1,
+        ),
+        hjb.Grid([-np.pi, -2.0], [np.pi, 2.0], (28, 27), periodic=(True, False)),
+    ),
     "undiscounted, at rest": lambda: zoo.pendulum(shape=(40, 41)),
     "a target between nodes": lambda: (
         hjb.Problem(
@@ -68,7 +76,7 @@ PROBLEMS = {
         hjb.Grid([-1.0], [1.0], (42,)),
     ),
 }  # fmt: skip
-FEW = ("a target between nodes",)
+FEW = ("a target between nodes", "a ring of few nodes")
 
 
 @pytest.mark.filterwarnings("ignore::hjbjax.SolveWarning")

@@ -32,6 +32,7 @@ from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.padding import Padding
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
 from hjbjax.problem.types import Array, Field, Mask, Number, Scalar
 from hjbjax.solution.status import Status
@@ -243,11 +244,12 @@ def steps_since_best(state: Any, bound: ErrorBound) -> Scalar:
 
 def judged(task: Any, value: Field, bound: ErrorBound, best: jax.Array, since: Scalar) -> Scalar:
     """The status of a ``fixed_point.Task`` after a step; each line overrules those before it."""
-    longest = task.method.patience(task.grid.whole)
+    here = task.grid.parts
+    longest = here.patience if isinstance(here, Padding) else task.method.patience(task.grid.whole)
     climbs = task.constrained or task.method.relaxes
     to_the_end = climbs and task.certificate in (*TO_THE_END, Certificate.OPEN)
     if to_the_end:  # a front moves V by a spacing times its slope a step past every node
-        longest = max(longest, 100 + 4 * task.grid.whole.size)
+        longest = jnp.maximum(longest, 100 + 4 * task.grid.whole.size)
 
     def converged(code: Any, tol: Scalar) -> Scalar:
         code = jnp.where(bound.error <= tol, Status.CONVERGED, code)
@@ -271,7 +273,7 @@ def judged(task: Any, value: Field, bound: ErrorBound, best: jax.Array, since: S
     if to_the_end:
         return by_size()
     # else the size of V changes no answer; a choice of programs, whose answer the selects that follow do not find anew
-    matters = (since >= min(PATIENCE, longest)) | (bound.residual > GROWTH * best[1])
+    matters = (since >= jnp.minimum(PATIENCE, longest)) | (bound.residual > GROWTH * best[1])
     return jax.lax.cond(matters, by_size, lambda: converged(Status.RUNNING, task.tol))
 
 

@@ -30,11 +30,13 @@ class Padding:
       counts: the nodes along every axis, n integers, which may be traced.
       shape: the entries of the arrays along every axis.
       periodic: whether an axis is.
+      patience: the steps without progress after which a solve on this grid has stalled, a number as well.
     """
 
     counts: Any
     shape: tuple[int, ...]
     periodic: tuple[bool, ...]
+    patience: Any = 0
     mesh, axes = None, ()  # of the one device
 
     @staticmethod

@@ -1,7 +1,4 @@
-"""A solve in chunks of steps: the jitted iteration from a guess to its end, with the residuals of all steps.
-
-One problem, or lanes of one ``vmap``ped loop.
-"""
+"""A solve in chunks of steps, of one problem or of lanes of one ``vmap``ped loop, with the residuals of all steps."""
 
 import dataclasses
 import functools
@@ -207,7 +204,8 @@ class RunInParts(StationaryRun):
         if isinstance(parts, Parts):
             self._run = functools.partial(_run_in_parts, parts=parts)
         else:  # the program of one device, where a step takes as long as the arrays have entries
-            self.task, self.nodes = on_part(self.task, parts), math.prod(parts.shape)
+            here = dataclasses.replace(parts, patience=np.int32(task.method.patience(task.grid)))
+            self.task, self.nodes = on_part(self.task, here), math.prod(parts.shape)
 
     def gathered(self) -> State:
         """The last state, with the values of all parts."""

@@ -7,8 +7,11 @@ import pytest
 
 import hjbjax as hjb
 from hjbjax import zoo
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.problem.padding import Padding
 from hjbjax.solvers import nested
+from hjbjax.solvers.setup import prepare_on_host
+from hjbjax.solvers.stationary_run import RunInParts
 from tests.support.compilation import compiling
 from tests.support.over_devices import read_of_others
 
@@ -157,3 +160,14 @@ def test_a_checkpoint_of_a_coarser_grid_goes_on_in_larger_arrays(tmp_path):
     resumed = hjb.solve(problem, grid, checkpoint=file, resume=True)
     np.testing.assert_array_equal(resumed.value, whole.value)
     np.testing.assert_array_equal(resumed.grid_error, whole.grid_error)
+
+
+def test_patience_is_that_of_the_grid_and_not_of_the_arrays():
+    problem, grid = PROBLEMS["periodic"]()
+    method = hjb.PolicyIteration(hjb.Sweeps())
+    with jax.enable_x64(True):
+        on = Discretisation(problem, grid, hjb.Upwind(), np.dtype(float), room=(72, 50))
+        task = prepare_on_host(on, method=method, tol=1e-3)[0]
+        run = RunInParts(task, np.zeros(grid.shape), 10, on.padding)
+    assert run.task.grid.shape == (72, 50)
+    assert run.task.grid.parts.patience == method.patience(grid)

@@ -34,9 +34,11 @@ def test_it_is_the_limited_answer_with_the_certificate_of_the_monotone_one():
     solution, sharp, first = (
         hjb.solve(problem, grid, scheme=scheme, tol=1e-5) for scheme in (None, hjb.Limited(), hjb.Upwind(subcell=True))
     )
-    np.testing.assert_array_equal(solution.value, sharp.value)
+    # to rounding: its program has room for the coarser grid that tells the error
+    np.testing.assert_allclose(solution.value, sharp.value, rtol=0, atol=1e-12)
     assert solution.error is None  # nothing certifies the second order
-    assert solution.monotone_error == sharp.monotone_error <= 1e-5
+    assert solution.monotone_error == pytest.approx(sharp.monotone_error, rel=1e-6)
+    assert sharp.monotone_error <= 1e-5
     # another program: its sweeps in single precision may be rounded otherwise
     assert first.error == pytest.approx(sharp.monotone_error, rel=1e-6)
     assert first.monotone_error is None

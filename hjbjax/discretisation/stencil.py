@@ -258,13 +258,6 @@ def _neighbours(values: Field, grid: Grid, axis: int) -> tuple[Field, Field]:
     return jax.lax.slice_in_dim(wide, 2, count + 2, axis=axis), jax.lax.slice_in_dim(wide, 0, count, axis=axis)
 
 
-def van_albada(a: Field, b: Field) -> Field:
-    """The mean a b (a + b)/(a² + b²) of two bends, zero where their signs differ: G. D. van Albada's limiter."""
-    agree = a * b > 0
-    # the inner where keeps 0/0 out of the branch not taken, whose NaN a derivative would bring back
-    return jnp.where(agree, a * b * (a + b) / jnp.where(agree, a * a + b * b, 1), 0)
-
-
 def limited(
     up: Field, down: Field, grid: Grid, axis: int, link: Links, noisy: Mapping[int, Array] | None = None
 ) -> tuple[Field, Field]:
@@ -289,6 +282,13 @@ def limited(
     # V(x ± h) = V ± h V' + h²/2 V'': half a gap times the bend is the leading error of a one-sided difference
     up, down = up - link.up / 2 * van_albada(bend, above), down + link.down / 2 * van_albada(bend, below)
     return stopped(up, down, grid, axis)
+
+
+def van_albada(a: Field, b: Field) -> Field:
+    """The mean a b (a + b)/(a² + b²) of two bends, zero where their signs differ: G. D. van Albada's limiter."""
+    agree = a * b > 0
+    # the inner where keeps 0/0 out of the branch not taken, whose NaN a derivative would bring back
+    return jnp.where(agree, a * b * (a + b) / jnp.where(agree, a * a + b * b, 1), 0)
 
 
 def numbers(grid: Grid, offset: Sequence[int]) -> np.ndarray:

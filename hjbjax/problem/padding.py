@@ -49,11 +49,6 @@ class Padding:
         """The entries of all arrays."""
         return self.shape
 
-    @property
-    def entries(self) -> tuple[int, ...]:
-        """The same: there is one part."""
-        return self.shape
-
     def even(self, axis: int) -> bool:
         """True if the last entry along an axis is read by others, as a node is."""
         return self.periodic[axis]

@@ -20,7 +20,7 @@ from hjbjax.problem.types import DType
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import keeping_warnings
 from hjbjax.solvers import semi_lagrangian
-from hjbjax.solvers.nested import below, room
+from hjbjax.solvers.nested import below
 from hjbjax.solvers.setup import check_on_one_state, choose
 from hjbjax.solvers.stationary import check_arguments, solve
 
@@ -165,11 +165,11 @@ def _largest(needed: int, free: int | None, grid: Grid) -> int | None:
 
 
 def _programs(grid: Grid, method: Method, scheme: Scheme | None) -> int:
-    """Loops to compile: one a grid, and without a scheme one for the coarser grid where that finds no room."""
+    """Loops to compile: one per grid, and without a scheme one for the coarser grid that tells the error."""
     count, smaller = 1, below(grid, method)
     while smaller is not None:
         count, smaller = count + 1, below(smaller, method)
-    return count + (scheme is None and count == 1 and room(grid, method) is None)
+    return count + (scheme is None and count == 1)
 
 
 def _tried(grid: Grid) -> tuple[Grid, Grid]:

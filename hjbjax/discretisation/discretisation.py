@@ -18,7 +18,6 @@ from hjbjax.discretisation import stencil
 from hjbjax.discretisation.stencil import Links
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.padding import Padding
 from hjbjax.problem.parts import Parts
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, pytree_dataclass
@@ -90,7 +89,7 @@ class Chain(Scheme, Protocol):
         """
 
 
-@pytree_dataclass(static=("scheme", "dtype", "mesh", "room"))
+@pytree_dataclass(static=("scheme", "dtype", "mesh"))
 class Discretisation:
     """A problem on a grid by a scheme, in one floating-point type and at one time.
 
@@ -103,12 +102,9 @@ class Discretisation:
       scheme: how derivatives are made.
       dtype: the floating-point type of all node values.
       t: the time, which matters if the problem's functions depend on it.
-      plain: whether the one-sided differences take the place of the scheme's slopes, as a number, so that one program
-        serves the scheme and, without noise, its chain; None: never.
       cut: the links that end on the boundary of a target, kept by ``cut_cells``; None: made anew wherever they are
         wanted.
       mesh: the devices over which the nodes are divided while steps are made; None: one.
-      room: the shape of the arrays in which the nodes stand while steps are made; None: that of the grid.
     """
 
     problem: Problem
@@ -116,10 +112,8 @@ class Discretisation:
     scheme: Scheme
     dtype: Any
     t: Any = 0.0
-    plain: Any = None
     cut: tuple[Links, ...] | None = None
     mesh: Mesh | None = None
-    room: tuple[int, ...] | None = None
 
     def __post_init__(self):
         # jnp.float32 and "float32" are other keys than np.dtype: one program would be compiled for each
@@ -128,7 +122,7 @@ class Discretisation:
     @property
     def chain(self) -> "Discretisation":
         """The monotone chain that goes with the scheme."""
-        return dataclasses.replace(self, scheme=self.scheme.chain, plain=None)
+        return dataclasses.replace(self, scheme=self.scheme.chain)
 
     def at(self, t: Any) -> "Discretisation":
         """The discretisation at another time."""
@@ -153,13 +147,6 @@ class Discretisation:
         """The parts of the grid over the mesh; None for one device, and for grids too small for it, as coarser ones."""
         parts = None if self.mesh is None else Parts(self.mesh, self.grid.shape)
         return parts if parts is not None and parts.fits else None
-
-    @property
-    def padding(self) -> Padding | None:
-        """How the nodes stand in larger arrays; None where they have their own."""
-        if self.room is None:
-            return None
-        return Padding(np.array(self.grid.shape, np.int32), self.room, self.grid.periodic or ())
 
     def coordinates(self) -> list:
         """The n coordinates of all nodes, each of a shape that broadcasts to (*grid)."""
@@ -260,8 +247,8 @@ def over_nodes(task: T, shape: tuple[int, ...]) -> T:
     return altered(jax.tree.map(mark, altered(task, on=None)), on=altered(nothing, cut=cut))
 
 
-def on_part(task: T, parts: Parts | Padding) -> T:
-    """A task, or a march, as one of the devices sees it, inside ``shard_map``; or, at host level, in larger arrays."""
+def on_part(task: T, parts: Parts) -> T:
+    """A task, or a march, as one of the devices sees it, inside ``shard_map``."""
     on: Discretisation = task.on  # type: ignore[attr-defined]
     return altered(task, on=altered(on, grid=on.grid.divided(parts)))
 
@@ -277,6 +264,8 @@ class Differences:
       links: the distances to the neighbours along every axis.
       one_sided: D⁺ and D⁻ along every axis, each (*grid); zero across a wall.
       lost: the nodes without a finite value, far above all others, bool (*grid); None where there is none.
+      first_order: true where the one-sided differences themselves are the slopes, a truth value that may be traced;
+        None: nowhere. Only schemes with ``blends`` read it, which saves them an array per slope.
     """
 
     on: Discretisation
@@ -285,3 +274,4 @@ class Differences:
     links: tuple[Links, ...]
     one_sided: tuple[tuple[jax.Array, jax.Array], ...]
     lost: jax.Array | None = None
+    first_order: jax.Array | None = None

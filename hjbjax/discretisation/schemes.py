@@ -250,10 +250,10 @@ class Limited:
     def slopes(self, around: Differences) -> Slopes:
         """Limited slopes; central ones where noise keeps those monotone, a_ii ≥ h |f_i| for all actions."""
         grid, pairs = around.on.grid, list(zip(around.one_sided, around.links, strict=True))
-        noisy, plain = around.on.noisy_walls(around.x), around.on.plain
+        noisy, first = around.on.noisy_walls(around.x), around.first_order
 
         def mean(*bends: jax.Array) -> jax.Array:
-            return stencil.van_albada(*bends) if plain is None else jnp.where(plain, 0, stencil.van_albada(*bends))
+            return stencil.van_albada(*bends) if first is None else jnp.where(first, 0, stencil.van_albada(*bends))
 
         found = []
         for axis, (pair, link) in enumerate(pairs):
@@ -262,7 +262,7 @@ class Limited:
                 sharp = slopes.of_second_order(around.value, grid, axis, mean, noisy)
             else:
                 sharp = stencil.limited(*pair, grid, axis, link, noisy[axis])
-                sharp = sharp if plain is None else jax.tree.map(functools.partial(jnp.where, plain), pair, sharp)
+                sharp = sharp if first is None else jax.tree.map(functools.partial(jnp.where, first), pair, sharp)
             found.append(sharp)
         if around.on.problem.noise is None:
             return found

@@ -18,7 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.parts import Parts
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import Array, AtNodes, Field, Number, Scalar
 
@@ -158,7 +157,7 @@ def beyond(values: AtNodes, grid: Grid, axis: int, step: int, ended: jax.Array) 
         return ended
     # what the other side has at the end that faces this one
     given = slices(values, grid, axis, -step, count=ended.shape[axis])
-    if not (isinstance(grid.parts, Parts) and grid.is_divided(axis)):
+    if grid.parts is None or not grid.is_divided(axis):
         return given
     found = grid.parts.fetched(given, axis, step, cyclic=cyclic)
     return found if cyclic else jnp.where(grid.parts.at_end(axis, step), ended, found)

@@ -10,6 +10,7 @@ kinks where f changes sign (and at |f| = a/h under central differences): minimis
 """
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Sequence
 from typing import Any
@@ -136,17 +137,23 @@ def at_rest(on: Discretisation, slopes: jax.Array) -> DiscreteHamiltonian:
     return dataclasses.replace(hamiltonian, up=ups, down=downs, bends=bends)
 
 
-def around(on: Discretisation, value: jax.Array, lost: jax.Array | None = None) -> DiscreteHamiltonian:
-    """Coordinates and differences around ``value``, tied together so that no loop hoists tables out of itself."""
+def around(
+    on: Discretisation, value: jax.Array, lost: jax.Array | None = None, first_order: jax.Array | None = None
+) -> DiscreteHamiltonian:
+    """Coordinates and differences around ``value``, tied together so that no loop hoists tables out of itself.
+
+    ``lost`` and ``first_order`` as in ``Differences``.
+    """
     grid = on.grid
     # without it XLA hoists products of coordinates out of the loop, as arrays of all nodes, one an action
     x, value = jax.lax.optimization_barrier((on.coordinates(), value))
     links = tuple(cut_cells.links(on))
     differences = tuple(stencil.one_sided(value, grid, axis, link) for axis, link in enumerate(links))
     bends = tuple(stencil.bends(*pair, grid, axis) for axis, pair in enumerate(differences))
-    slopes = on.scheme.slopes(Differences(on, x, value, links, differences, lost))
-    if on.plain is not None and not getattr(on.scheme, "blends", False):
-        slopes = jax.tree.map(lambda first, better: jnp.where(on.plain, first, better), list(differences), list(slopes))
+    slopes = on.scheme.slopes(Differences(on, x, value, links, differences, lost, first_order))
+    if first_order is not None and not getattr(on.scheme, "blends", False):
+        choose = functools.partial(jnp.where, first_order)
+        slopes = jax.tree.map(choose, list(differences), list(slopes))
     up, down = zip(*slopes, strict=True)
     # only constrained ends and lost nodes ask what of a drift is rounding, which costs a look at its terms
     careful = lost is not None or grid.sides("constrained")

@@ -121,12 +121,14 @@ def greedy(
     *,
     incumbent: Greedy | None = None,
     lost: jax.Array | None = None,
+    first_order: jax.Array | None = None,
 ) -> Greedy:
     """The optimal actions at ``value`` and the rate r that is left; an incumbent policy is among the candidates.
 
-    To the nodes that are ``lost``, bool (*grid), no drift leads that is only rounding.
+    To the nodes that are ``lost``, bool (*grid), no drift leads that is only rounding; where ``first_order`` holds the
+    slopes are those of the chain.
     """
-    return _with_defect(on, value, held, *optimum.optimise(_around(on, value, incumbent, lost)))
+    return _with_defect(on, value, held, *optimum.optimise(_around(on, value, incumbent, lost, first_order)))
 
 
 def relaxation(on: Discretisation, value: Field, outflow: Field | None = None) -> tuple[Field, Field]:
@@ -164,12 +166,18 @@ def improvement(on: Discretisation, value: Field, fixed: jax.Array, new: Greedy,
 
 
 def respond(
-    on: Discretisation, value: Field, held: jax.Array, current: Greedy, *, lost: jax.Array | None = None
+    on: Discretisation,
+    value: Field,
+    held: jax.Array,
+    current: Greedy,
+    *,
+    lost: jax.Array | None = None,
+    first_order: jax.Array | None = None,
 ) -> Greedy:
-    """The inner player's best answer to the outer player's current policy, in a game."""
+    """The inner player's best answer to the outer player's current policy, in a game; masks as in ``greedy``."""
     players = players_of(on)
     # the current answer among the candidates: a sampled player then never answers worse than before
-    hamiltonian = _around(on, value, current, lost)
+    hamiltonian = _around(on, value, current, lost, first_order)
     u, d = list(current.controls), list(current.disturbances)
     if on.problem.isaacs == "upper":  # min max: the control moves first, and the disturbance knows it
         best, d = optimum.best_response(hamiltonian, players.disturbance, lambda d: (u, d))
@@ -179,10 +187,14 @@ def respond(
 
 
 def _around(
-    on: Discretisation, value: Field, policy: Greedy | None, lost: jax.Array | None = None
+    on: Discretisation,
+    value: Field,
+    policy: Greedy | None,
+    lost: jax.Array | None = None,
+    first_order: jax.Array | None = None,
 ) -> discrete.DiscreteHamiltonian:
     """The Hamiltonian around V, with the actions of a policy among the candidates of a search."""
-    hamiltonian = discrete.around(on, value, lost)
+    hamiltonian = discrete.around(on, value, lost, first_order)
     if policy is None:
         return hamiltonian
     return dataclasses.replace(hamiltonian, tried=(list(policy.controls), list(policy.disturbances)))

@@ -32,7 +32,6 @@ from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.padding import Padding
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
 from hjbjax.problem.types import Array, Field, Mask, Number, Scalar
 from hjbjax.solution.status import Status
@@ -244,8 +243,7 @@ def steps_since_best(state: Any, bound: ErrorBound) -> Scalar:
 
 def judged(task: Any, value: Field, bound: ErrorBound, best: jax.Array, since: Scalar) -> Scalar:
     """The status of a ``fixed_point.Task`` after a step; each line overrules those before it."""
-    here = task.grid.parts
-    longest = here.patience if isinstance(here, Padding) else task.method.patience(task.grid.whole)
+    longest = task.method.patience(task.grid.whole)
     climbs = task.constrained or task.method.relaxes
     to_the_end = climbs and task.certificate in (*TO_THE_END, Certificate.OPEN)
     if to_the_end:  # a front moves V by a spacing times its slope a step past every node

@@ -50,6 +50,8 @@ class Task:
       crossing: the time that it takes to cross the box at the largest speeds, where that was asked for; else None.
       has_lost: true if nodes that do not count may lie beside others, so that no action may lead there.
       bare: true if nothing but V is kept; then ``obstacles`` hold nothing and are made anew in every step.
+      first_order: a truth value, which may be traced: with a scheme of high order its chain is solved, so that one
+        program serves both; None: always the scheme itself. Without noise only.
     """
 
     on: Discretisation
@@ -63,6 +65,7 @@ class Task:
     crossing: Any = None
     has_lost: bool = False
     bare: bool = False
+    first_order: Any = None
 
     @property
     def problem(self) -> Problem:
@@ -84,9 +87,14 @@ class Task:
         return dataclasses.replace(self, on=self.on.asking(problem))
 
     @property
-    def plain(self) -> Any:
-        """Whether this is the chain, to which the certificate belongs; traced where one program serves both."""
-        return self.scheme.monotone if self.on.plain is None else self.on.plain
+    def is_chain(self) -> Any:
+        """True if the chain is solved, to which the certificate belongs; traced where one program serves both."""
+        return self.scheme.monotone if self.first_order is None else self.first_order
+
+    @property
+    def of_chain(self) -> "Task":
+        """The task of the chain, in a program of its own."""
+        return dataclasses.replace(self, on=self.on.chain, first_order=None)
 
     @property
     def lost(self) -> jax.Array | None:
@@ -107,7 +115,7 @@ class Task:
     def by_defect(self) -> bool:
         """Whether neither a step nor its bound asks for actions: those at the last value are then found at the end."""
         chosen = getattr(self.method, "by_defect", False)  # a method of the user's need not know of it
-        if not chosen or self.bare or self.certificate is not Certificate.ADDITIVE or self.on.plain is not None:
+        if not chosen or self.bare or self.certificate is not Certificate.ADDITIVE or self.first_order is not None:
             return False
         players = players_of(self.on)
         at_ends = players.control.fastest_at_ends and players.disturbance.fastest_at_ends
@@ -120,7 +128,7 @@ class Task:
 
     def impose(self, value: Field) -> Field:
         """``value`` with the given values put in, and with nodes that are lost far above all others."""
-        value = self.grid.repeated(self.given.impose(value))
+        value = self.given.impose(value)
         if not self.has_lost:
             return value
         # 1/√eps above: no minimum chooses it, and a difference with it still has half of its digits
@@ -135,7 +143,9 @@ class Task:
 
     def reply(self, value: Field, policy: Greedy) -> Greedy:
         """The inner player's best answer to the outer player's policy."""
-        return bellman.respond(self.on, value, self.obstacles.fixed, policy, lost=self.lost)
+        return bellman.respond(
+            self.on, value, self.obstacles.fixed, policy, lost=self.lost, first_order=self.first_order
+        )
 
     def residual(self, equation: PolicyEquation) -> Scalar:
         """The largest |source| at the nodes that count, in cost units."""
@@ -210,7 +220,7 @@ def advance(task: Task, state: State, start: Scalar) -> State:
         return _relaxed_by_defect(task, state, start)
     delta = _correction(task, state)
     if not task.scheme.monotone:
-        delta = jnp.where((state.step < FULL_STEPS) | task.plain, 1.0, 0.5).astype(delta.dtype) * delta
+        delta = jnp.where((state.step < FULL_STEPS) | task.is_chain, 1.0, 0.5).astype(delta.dtype) * delta
     value = task.impose(state.value + delta)
     # a node that does not count may move for ever
     moved = task.grid.largest(jnp.abs(jnp.where(task.counting, value - state.value, 0)))
@@ -256,14 +266,14 @@ def broken(task: Task, state: State) -> jax.Array:
         return ~jnp.isfinite(bellman.relaxation(task.on, task.impose(state.value))[0])
     state = dataclasses.replace(state, step=state.step - 1)
     value = task.impose(state.value + _correction(task, state))
-    rate = bellman.greedy(task.on, value, task.obstacles.fixed, lost=task.lost).defect
+    rate = bellman.greedy(task.on, value, task.obstacles.fixed, lost=task.lost, first_order=task.first_order).defect
     return task.counted & ~(jnp.isfinite(value) & jnp.isfinite(rate))
 
 
 def _lacks_measure(task: Task, state: State) -> jax.Array:
     """True before the first step where the error is measured by the size of a step, without a certificate."""
     certified = task.certificate in (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE)
-    return (state.step < 0) & ~(certified & jnp.asarray(task.plain))
+    return (state.step < 0) & ~(certified & jnp.asarray(task.is_chain))
 
 
 def _shift(task: Task, state: State) -> Scalar:
@@ -277,7 +287,9 @@ def _look(
 ) -> tuple[Greedy, Scalar, ErrorBound]:
     """The greedy policy at a value, its largest Q + β, and the bound on the value's error."""
     problem = task.problem
-    policy = bellman.greedy(task.on, value, task.obstacles.fixed, incumbent=incumbent, lost=task.lost)
+    policy = bellman.greedy(
+        task.on, value, task.obstacles.fixed, incumbent=incumbent, lost=task.lost, first_order=task.first_order
+    )
     if problem.stopping_cost is not None and not problem.is_game and task.certificate in certificates.TO_THE_END:
         fixed = task.obstacles.fixed | first  # nobody has chosen the actions before the first look
         policy = bellman.improvement(task.on, value, fixed, policy, incumbent)
@@ -286,9 +298,9 @@ def _look(
     iterate = Iterate(task.grid, value, policy, left, task.obstacles, task.counting)
     known = {"discount": problem.discount, "least_cost": task.least_cost, "moved": moved}
     bound = certificates.error_bound(task.certificate, iterate, **known)
-    if task.on.plain is not None:  # the chain's certificate is no other scheme's
+    if task.first_order is not None:  # the chain's certificate is no other scheme's
         measured = certificates.measured(bound.residual, moved)
-        bound = jax.tree.map(functools.partial(jnp.where, task.plain), bound, measured)
+        bound = jax.tree.map(functools.partial(jnp.where, task.first_order), bound, measured)
     if task.has_lost:
         leaks = bellman.leaks(task.on, policy, task.obstacles.fixed, ~task.counted)
         bound = dataclasses.replace(bound, error=jnp.where(leaks, jnp.inf, bound.error))

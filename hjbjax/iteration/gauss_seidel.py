@@ -92,7 +92,7 @@ class Layout:
     @property
     def parts(self) -> Parts | None:
         """The parts of the nodes over many devices; None where all are here."""
-        return self.grid.parts if isinstance(self.grid.parts, Parts) else None
+        return self.grid.parts
 
     def is_divided(self, axis: int) -> bool:
         """True if an axis of the arrays has a layer on both sides, for the nodes on other devices."""
@@ -106,7 +106,7 @@ class Layout:
 def _layout(grid: Grid) -> Layout:
     """The axes in their order; where a part is so flat that hyperplanes would be folded often, the longest first."""
     axes = list(range(grid.ndim))
-    if isinstance(grid.parts, Parts) and _folds(grid.shape) > FOLDS:
+    if grid.parts is not None and _folds(grid.shape) > FOLDS:
         axes.sort(key=lambda axis: axis != int(np.argmax(grid.shape)))
     return Layout(grid, tuple(axes))
 

@@ -17,11 +17,10 @@ import numpy as np
 
 from hjbjax.problem import arguments
 from hjbjax.problem.labels import with_unit, words
-from hjbjax.problem.padding import Padding
 from hjbjax.problem.parts import Parts
 from hjbjax.problem.pytree import altered, is_traced, known, pytree_dataclass
 from hjbjax.problem.stretching import Stretching, checked_table, from_table, into_period
-from hjbjax.problem.types import Array, AtNodes, DType, Field, Mask, Number, Numbers, Scalar, States, Verdict
+from hjbjax.problem.types import Array, AtNodes, DType, Mask, Number, Numbers, Scalar, States, Verdict
 
 TABLED = 2**24  # points of an axis whose coordinates are kept, 128 MiB; a grid too large must not allocate them before
 
@@ -65,7 +64,7 @@ class Grid:
     units: tuple[str, ...] = ()
     coordinates: tuple[Any, ...] = dataclasses.field(init=False, repr=False)
     spacings: tuple[Any, ...] | None = dataclasses.field(init=False, repr=False, default=None)  # see ``settled``
-    parts: Parts | Padding | None = dataclasses.field(init=False, repr=False, default=None)  # how its arrays hold nodes
+    parts: Parts | None = dataclasses.field(init=False, repr=False, default=None)  # over which devices; None: one
 
     def __post_init__(self):
         lo, hi = arguments.corner(self.lo, "lo"), arguments.corner(self.hi, "hi")
@@ -140,13 +139,9 @@ class Grid:
         pairs = (pair and tuple("projected" if name == "open" else name for name in pair) for pair in self.edges)
         return altered(self, edges=tuple(pairs))
 
-    def divided(self, parts: Parts | Padding) -> "Grid":
-        """The grid of the arrays of one part, whose shape is its own; or, at host level, of larger ones."""
-        if isinstance(parts, Parts):
-            return altered(self, shape=parts.shape, parts=parts)
-        grid = self.settled()
-        tables = tuple(parts.own(table, axis) for axis, table in enumerate(grid.coordinates))
-        return altered(grid, shape=parts.shape, coordinates=tables, parts=parts)
+    def divided(self, parts: Parts) -> "Grid":
+        """The grid of one part, with the shape of its arrays."""
+        return altered(self, shape=parts.shape, parts=parts)
 
     def settled(self) -> "Grid":
         """The grid for a program in which it does not change: what is made of its corners is made here, by NumPy."""
@@ -161,7 +156,7 @@ class Grid:
 
     @property
     def whole(self) -> "Grid":
-        """The grid of all parts, or one that fills the larger arrays; itself where it is neither."""
+        """The grid of all parts; the grid itself on one device."""
         return self if self.parts is None else altered(self, shape=self.parts.whole, parts=None)
 
     def is_divided(self, axis: int) -> bool:
@@ -171,10 +166,6 @@ class Grid:
     def largest(self, values: AtNodes) -> Scalar:
         """The largest of node values, on all devices."""
         return jnp.max(values) if self.parts is None else self.parts.largest(values)
-
-    def repeated(self, values: Field) -> Field:
-        """What each node holds, in all of its copies, where larger arrays have such."""
-        return self.parts.repeated(values) if isinstance(self.parts, Padding) else values
 
     def least(self, values: AtNodes) -> Scalar:
         """The least of node values, on all devices."""
@@ -205,7 +196,7 @@ class Grid:
 
     def axis(self, axis: int, dtype: DType | None = None) -> Array:
         """The coordinates of the nodes along one axis, shape (N,); the same numbers in every program."""
-        if isinstance(self.parts, Parts):
+        if self.parts is not None:
             return self.parts.own(self.whole.axis(axis, dtype), axis)
         if self.spacings is not None:
             return jnp.asarray(self.coordinates[axis], dtype or jnp.result_type(float))

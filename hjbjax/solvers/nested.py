@@ -19,7 +19,6 @@ from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import Method, PolicyIteration
 from hjbjax.markov_chain import resting
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.padding import Padding
 from hjbjax.problem.pytree import altered, known
 from hjbjax.problem.types import Mask, Nodes
 from hjbjax.solution import nested_grids
@@ -34,9 +33,6 @@ FAILED = (Status.STALLED, Status.DIVERGED, Status.NONFINITE)
 # the last of the answers is a guess, and need not be exact
 WARM_STEPS = 60  # improvements for each of them
 FEWEST = 6  # intervals that an axis keeps on the coarser grid that tells the error of the finer one
-# Nodes up to which that one runs in arrays of the finer one's shape. On 200 x 201 its steps take three times as long, a
-# warm solve .05 s more, and the first one .8 s less, since no program is compiled for it.
-ROOM = 50_000
 
 
 def start(
@@ -84,7 +80,7 @@ def staged(task: Task, scheme: Scheme) -> Task:
     certified = task.certificate in (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE)
     if scheme.monotone or not (fits and certified):
         return task
-    return dataclasses.replace(task, on=dataclasses.replace(task.on, scheme=scheme, plain=np.asarray(True)))
+    return dataclasses.replace(task, on=dataclasses.replace(task.on, scheme=scheme), first_order=np.asarray(True))
 
 
 def levels(task: Task, method: Method, clock: Clock, *, asked_again: bool) -> list[Task]:
@@ -211,17 +207,16 @@ def settle(task: Task, assumptions: Assumptions, reached: Mask | None, guess: No
 def raised(task: Task, assumptions: Assumptions, scheme: Scheme) -> tuple[Task, Assumptions]:
     """The task and the assumptions of a scheme of high order behind a monotone one, whose certificates it has not."""
     # the matrix stays that of the chain, the residual is of the better slopes: defect correction
-    on = dataclasses.replace(task.on, scheme=scheme, plain=None)
-    task = dataclasses.replace(task, certificate=Certificate.RESIDUAL, on=on)
+    on = dataclasses.replace(task.on, scheme=scheme)
+    task = dataclasses.replace(task, certificate=Certificate.RESIDUAL, on=on, first_order=None)
     return task, dataclasses.replace(assumptions, certificate=Certificate.RESIDUAL)
 
 
 def running(settled: Settled) -> Task:
     """The task of an answer of high order as its program has it: that of the monotone answer, where both share one."""
-    if settled.origin is None or settled.origin.task.on.plain is None:
+    if settled.origin is None or settled.origin.task.first_order is None:
         return settled.task
-    task = settled.origin.task
-    return dataclasses.replace(task, on=dataclasses.replace(task.on, plain=np.asarray(False)))
+    return dataclasses.replace(settled.origin.task, first_order=np.asarray(False))
 
 
 def second_order(settled: Settled, scheme: Scheme, clock: Clock) -> Settled:
@@ -253,7 +248,7 @@ def better_of(settled: Settled, sharp: Settled, *, sharpen: bool) -> Settled:
 def plainly(settled: Settled) -> Settled:
     """An answer of the chain, told as such, whatever program it comes from."""
     task = settled.task
-    return settled if task.on.plain is None else settled._replace(task=dataclasses.replace(task, on=task.on.chain))
+    return settled if task.first_order is None else settled._replace(task=task.of_chain)
 
 
 def coarser_answer(settled: Settled, clock: Clock) -> tuple[Grid, np.ndarray] | None:
@@ -270,17 +265,6 @@ def coarser_answer(settled: Settled, clock: Clock) -> tuple[Grid, np.ndarray] | 
     if code is not Status.CONVERGED:
         return None
     return coarse, np.where(np.asarray(level.counted), np.asarray(state.value), np.inf)
-
-
-def room(grid: Grid, method: Method) -> tuple[int, ...] | None:
-    """The shape of arrays in which the grid and the one that tells its error both stand, by one program.
-
-    None where the coarser one is worth a program of its own, or the arrays of the finer one do not suit it.
-    """
-    coarse, apart = _telling(grid), method.coarsest is not None or not getattr(method, "in_parts", False)
-    if coarse is None or apart or grid.size > ROOM or grid.sides("open") or any(grid.stretch or ()):
-        return None
-    return grid.shape if Padding.fits(coarse.shape, grid.shape, grid.periodic or ()) else None
 
 
 def _telling(fine: Grid) -> Grid | None:

@@ -199,7 +199,6 @@ def solve_on_host(
         if sharpen:
             on = dataclasses.replace(on, scheme=choose_scheme(on, method))
             sharpen = on.scheme.subcell  # value iteration and tubes start from nowhere else, on a coarser grid neither
-            on = dataclasses.replace(on, room=nested.room(grid, method) if sharpen and on.mesh is None else None)
         task, assumptions, reached = prepare_on_host(on.chain, method=method.inner, tol=tol, clock=clock)
     except Stopped as stop:
         return solution_at_start(on, np.zeros(grid.shape) if start is None else np.array(start), stop.status)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
@@ -13,7 +12,6 @@ import numpy as np
 from hjbjax.discretisation.discretisation import on_part, over_nodes
 from hjbjax.iteration import fixed_point
 from hjbjax.iteration.fixed_point import HISTORY, State, Task
-from hjbjax.problem.padding import Padding
 from hjbjax.problem.parts import Lanes, Parts, spans_processes
 from hjbjax.problem.pytree import altered
 from hjbjax.problem.types import Array, Nodes, Number
@@ -74,7 +72,7 @@ def iterate(task: Task, guess: Nodes, clock: Clock, most: int | None = None) -> 
       The last state, how it ended, and the residuals of all steps, that of the guess first.
     """
     limit = clock.max_steps if most is None else min(most, clock.max_steps)
-    parts = task.on.padding or task.on.parts
+    parts = task.on.parts
     iteration = StationaryRun(task, guess, limit) if parts is None else RunInParts(task, guess, limit, parts)
     if most is not None:
         iteration.name += ", on the way to a guess"
@@ -194,18 +192,14 @@ class StationaryRun(StatesInChunks):
 
 
 class RunInParts(StationaryRun):
-    """The iteration of a task whose nodes are divided over many devices, or stand in arrays with room for more."""
+    """The iteration of a task whose nodes are divided over many devices."""
 
-    def __init__(self, task: Task, guess: Nodes, limit: int, parts: Parts | Padding):
+    def __init__(self, task: Task, guess: Nodes, limit: int, parts: Parts):
         super().__init__(task, guess, limit)
         self.grid, self.parts, self._over = task.grid, parts, state_over_nodes(self.state)
         self.task = parts.spread(self.task, over_nodes(self.task, task.grid.shape))
         self.before = self.state = parts.spread(self.state, self._over)
-        if isinstance(parts, Parts):
-            self._run = functools.partial(_run_in_parts, parts=parts)
-        else:  # the program of one device, where a step takes as long as the arrays have entries
-            here = dataclasses.replace(parts, patience=np.int32(task.method.patience(task.grid)))
-            self.task, self.nodes = on_part(self.task, here), math.prod(parts.shape)
+        self._run = functools.partial(_run_in_parts, parts=parts)
 
     def gathered(self) -> State:
         """The last state, with the values of all parts."""

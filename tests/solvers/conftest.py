@@ -11,7 +11,7 @@ def iterations(monkeypatch):
     seen, run = [], stationary_run.StationaryRun.__init__
 
     def noted(self, task, *rest):
-        scheme = task.scheme.chain if task.plain else task.scheme
+        scheme = task.scheme.chain if task.is_chain else task.scheme
         seen.append((type(scheme).__name__, task.grid.shape))
         run(self, task, *rest)
 

@@ -15,8 +15,8 @@ from hjbjax.extremals.collocation import on_mesh, pad_mesh
 from hjbjax.hamiltonian import pointwise
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Ball, samples
+from hjbjax.problem.streams import encodable
 from hjbjax.problem.types import Array, Number
-from hjbjax.solution.screen import encodable
 from hjbjax.solution.status import Status
 
 EMPTY = 1e-9  # share of the time below which an arc is left out of the path

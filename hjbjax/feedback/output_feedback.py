@@ -1,6 +1,5 @@
 """Output feedback: the plant is steered by what an observer makes of the measurements."""
 
-import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -21,7 +20,7 @@ from hjbjax.feedback.output_loop import (
     output_path,
 )
 from hjbjax.feedback.path import PathStatus
-from hjbjax.problem import arguments
+from hjbjax.problem import arguments, streams
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, as_partial, cast, is_traced, numbers, with_suggestions
@@ -287,7 +286,7 @@ def _report(path: OutputPath) -> None:
             ends = np.atleast_2d(path.times)[codes == code, -1]
             many = f"{ends.size} of {codes.size} paths" if codes.size > 1 else "the path"
             message = ADVICE[status]
-            warnings.warn(f"simulate_output: {many} {message}; the first at t = {ends.min():.6g}", stacklevel=3)
+            streams.warn(f"simulate_output: {many} {message}; the first at t = {ends.min():.6g}", stacklevel=3)
 
 
 ADVICE = {

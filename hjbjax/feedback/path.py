@@ -2,7 +2,6 @@
 
 import enum
 import math
-import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -10,12 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hjbjax.problem import streams
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, as_partial, is_traced, pytree_dataclass
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, holds
+from hjbjax.problem.streams import encodable
 from hjbjax.problem.types import Array, Numbers, State
-from hjbjax.solution.screen import encodable
 from hjbjax.solution.solution import Solution
 from hjbjax.tracing.components import of_state
 
@@ -225,7 +225,7 @@ def truncate(
     if _are_inadmissible(controls, applied):
         said.append("controls outside the problem's admissible set were applied as they are")
     if status not in (PathStatus.DURATION, PathStatus.TARGET, PathStatus.INTERRUPTED):  # that is raised
-        warnings.warn(f"simulate: the path {said[0]}", UserWarning, stacklevel=3)  # at the line that calls simulate
+        streams.warn(f"simulate: the path {said[0]}", UserWarning, stacklevel=3)  # at the line that calls simulate
     return Path(
         times=times,
         states=states,

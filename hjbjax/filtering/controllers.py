@@ -14,7 +14,6 @@ Source: M. R. James, Nonlinear Control Systems, section 12.
 """
 
 import dataclasses
-import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -30,6 +29,7 @@ from hjbjax.filtering.grid_filter import Density, GridFilter, at_ends, check_box
 from hjbjax.filtering.max_plus import refined_maximum
 from hjbjax.filtering.robust_filter import RobustGridFilter
 from hjbjax.hamiltonian import pointwise
+from hjbjax.problem import streams
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, cast, is_traced, pytree_dataclass
@@ -131,7 +131,7 @@ class MinimumStress:
             find = jax.vmap(self.worst_case) if np.ndim(path.code) else self.worst_case
             states = np.atleast_2d(find(jnp.asarray(path.information)))
         if np.any(ends := np.any(at_ends(self.grid, states), axis=-1)):
-            warnings.warn(
+            streams.warn(
                 f"minimum_stress: the worst case is at an end of the box on {np.sum(ends)} of {len(ends)} paths, the "
                 f"first at {np.array2string(states[np.argmax(ends)], separator=', ')}: p + V has no maximum inside; γ "
                 "is too small for filter and feedback together, or V that of another γ, or the box too small",

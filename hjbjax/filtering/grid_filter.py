@@ -12,7 +12,6 @@ largest product taken out, so that nothing overflows or vanishes; what is taken 
 mass.
 """
 
-import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -28,7 +27,7 @@ from hjbjax.feedback.measurement import Measurement, check_step, measurement, pl
 from hjbjax.filtering import forward_equation
 from hjbjax.filtering.forward_equation import advanced, cells
 from hjbjax.markov_chain.decision_process import refuse
-from hjbjax.problem import sets
+from hjbjax.problem import sets, streams
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import cast, is_traced, numbers, pytree_dataclass
@@ -193,7 +192,7 @@ def warn_at_ends(name: str, grid: Grid, places: Array, dt: float, what: str) -> 
     if not np.any(off := at_ends(grid, places)):
         return
     *_, step, axis = np.argwhere(off)[np.argmin(np.argwhere(off)[:, -2])]
-    warnings.warn(
+    streams.warn(
         f"{name}: {what} lies at an end of the box of axis {axis} after {np.sum(np.any(off, axis=-1))} of "
         f"{off[..., 0].size} measurements, the first at t = {(step + 1) * dt:.6g}: beyond it nothing is known; if the "
         "state can leave the box take a larger one, else there is none to heed",

@@ -19,8 +19,8 @@ import numpy as np
 from hjbjax.geometry.unit_cube import half_widths, nearest_inside, state_of, time_of
 from hjbjax.problem.pytree import cast, pytree_dataclass, with_suggestions
 from hjbjax.problem.sets import Ball, Box
+from hjbjax.problem.streams import encodable
 from hjbjax.problem.types import Array, Number, State
-from hjbjax.solution.screen import encodable
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import settled_function
 

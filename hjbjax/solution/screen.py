@@ -1,14 +1,13 @@
-"""Text for a terminal: the printed screen of a solution, one line of any text, and what an old encoding cannot show.
+"""Text for a terminal: the printed screen of a solution, and one line of any text.
 
-What is printed may come from a file of somebody else's. So long texts are cut before anything looks at them, control
-characters are shown as Python would write them, and a statistic of another kind than expected is named, not formatted.
+The text may come from somebody else's file. So long texts are cut first, control characters are shown as Python writes
+them, and a statistic of an unexpected type is replaced by the name of its type.
 """
 
 import base64
 import html
 import io
 import math
-import sys
 import textwrap
 from typing import Any, Protocol
 
@@ -16,19 +15,13 @@ import numpy as np
 
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.streams import encodable, plain
 from hjbjax.problem.types import Array, Number
 from hjbjax.solution.status import Status
 
 WIDTH = 100  # columns of the printed screen
 THUMBNAIL = 160  # pixels, and the largest number of nodes an axis that it shows
-LONGEST = 2000  # characters of a text that are looked at; wrapping a million takes a second
 UNITS = ("bytes", "kB", "MB", "GB", "TB")
-SPELLED = {  # where the terminal has no such letter
-    **{"−": "-", "–": "-", "—": "-", "≤": "<=", "≥": ">=", "∞": "inf", "·": "*", "×": "x", "→": "->", "±": "+-"},
-    **{"²": "^2", "½": "1/2", "Δ": "d", "∂": "d", "Σ": "sum ", "“": '"', "”": '"', "‘": "'", "’": "'", "…": "..."},
-    **{"α": "alpha", "β": "beta", "γ": "gamma", "δ": "delta", "ε": "eps", "η": "eta", "θ": "theta", "κ": "kappa"},
-    **{"λ": "lambda", "μ": "mu", "π": "pi", "ρ": "rho", "σ": "sigma", "τ": "tau", "φ": "phi", "ψ": "psi", "ω": "omega"},
-}
 
 
 class _Answer(Protocol):
@@ -167,33 +160,6 @@ def one_line(text: str, width: int = WIDTH) -> str:
     """A text in one line of at most ``width`` characters."""
     text = plain(text)
     return text if len(text) <= width else text[: width - 4] + " ..."
-
-
-def plain(text: str) -> str:
-    """A text without line breaks and control characters, cut where it is endless."""
-    cut = " ".join(text[:LONGEST].split()) + (" ..." if len(text) > LONGEST else "")
-    return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in cut)
-
-
-def encodable(text: str) -> str:
-    """A text in letters that standard output has: Greek and mathematical ones are spelled out where it lacks them."""
-    encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
-    try:
-        text.encode(encoding)  # a Windows console may know 256 letters, and print would raise in the middle of a screen
-    except UnicodeEncodeError:
-        return "".join(_spell(letter, encoding) for letter in text)
-    except LookupError:  # an encoding that Python does not know
-        pass
-    return text
-
-
-def _spell(letter: str, encoding: str) -> str:
-    """A letter as it is if the encoding has it, else by its name, else by its code point."""
-    try:
-        letter.encode(encoding)
-    except UnicodeEncodeError:
-        return SPELLED.get(letter) or ascii(letter)[1:-1]
-    return letter
 
 
 def number(value: Any) -> str:

@@ -8,7 +8,6 @@ max(upper − V, V − lower).
 
 import dataclasses
 import html
-import warnings
 from collections.abc import Sequence
 from types import ModuleType
 from typing import Any
@@ -16,6 +15,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from hjbjax.problem import streams
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import Labels
 from hjbjax.problem.problem import Problem
@@ -232,7 +232,7 @@ class Solution:
         samples = Samples(self.grid, values, self.times)
         found = query(look, samples, x, t, clamp=clamp, name=f"Solution.{name}")
         if not clamp and not is_traced(found, x, self.grid) and np.any(outside := self.grid.beyond(x)):
-            warnings.warn(
+            streams.warn(
                 f"Solution.{name}: {np.sum(outside)} of {np.size(outside)} states lie outside the grid, where the "
                 "answer is NaN; clamp=True takes the nearest point in it",
                 stacklevel=3,

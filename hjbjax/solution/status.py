@@ -3,9 +3,10 @@
 import contextlib
 import enum
 import sys
-import warnings
 from collections.abc import Iterator
 from contextvars import ContextVar
+
+from hjbjax.problem import streams
 
 
 class Status(enum.IntEnum):
@@ -74,4 +75,4 @@ def warn(message: str) -> None:
     package, frame, level = __name__.split(".")[0], sys._getframe(1), 2
     while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] == package:
         frame, level = frame.f_back, level + 1
-    warnings.warn(message, SolveWarning, stacklevel=level)
+    streams.warn(message, SolveWarning, stacklevel=level)

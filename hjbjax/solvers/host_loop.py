@@ -20,6 +20,7 @@ import jax
 import numpy as np
 
 from hjbjax.markov_chain import memory
+from hjbjax.problem import streams
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.types import Nodes
 from hjbjax.solution.checkpoints import Part
@@ -185,15 +186,19 @@ def telling(clock: Clock) -> Iterator[None]:
 
 @contextlib.contextmanager
 def progress_bar(progress: bool | None, options: dict[str, Any]) -> Iterator[Any]:
-    """A progress bar on a terminal, after one second if ``options`` name no other delay; None elsewhere."""
-    if progress is False or (progress is None and not sys.stderr.isatty()):
+    """A progress bar on a terminal, after one second if ``options`` name no other delay; None elsewhere.
+
+    Standard error may be missing, closed or full: then the bar is not shown, and the run does not notice.
+    """
+    if not (progress or (progress is None and streams.is_terminal(sys.stderr))):
         yield None
         return
     from tqdm import tqdm
 
-    # a terminal that tells no size, as of `script` and of some editors, would get nothing from tqdm
+    # tqdm writes nothing to a terminal that does not report its size, such as that of `script` and of some editors
     size = shutil.get_terminal_size()
-    with tqdm(**{"delay": 1, "leave": False, "ncols": size.columns, "nrows": size.lines, **options}) as bar:
+    shown = {"file": streams.Expendable(sys.stderr), "ncols": size.columns, "nrows": size.lines}
+    with tqdm(**{"delay": 1, "leave": False, **shown, **options}) as bar:
         yield bar
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-import warnings
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
@@ -17,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hjbjax.problem import streams
 from hjbjax.problem.types import Numbers
 from hjbjax.tracing import jaxprs
 from hjbjax.tracing.jaxprs import (
@@ -280,7 +280,7 @@ def _contract(eqn: jex.JaxprEqn, left: np.ndarray, right: np.ndarray, algebra: A
 @functools.cache  # a solve evaluates its functions many times, and every one of them would warn
 def _warn_once(name: str) -> None:
     """Warn of a primitive without a rule, once in a process."""
-    warnings.warn(
+    streams.warn(
         f"the primitive {name!r} has no component rule: the function that uses it is evaluated node by node, "
         "which is correct and slower; entry-by-entry arithmetic on x[0], x[1], ... avoids it",
         FallbackWarning,

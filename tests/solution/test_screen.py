@@ -10,8 +10,8 @@ import pytest
 
 import hjbjax as hjb
 from hjbjax.feedback.path import Path
+from hjbjax.problem import streams
 from hjbjax.problem.grid import Grid
-from hjbjax.solution import screen
 from hjbjax.solution.solution import Solution, Status
 
 GRID = Grid([0.0], [1.0], (3,))
@@ -52,7 +52,7 @@ def test_a_terminal_without_greek(terminal, encoding):
 
 
 def test_every_letter_is_spelled_in_ascii():
-    assert all(spelled.isascii() and len(letter) == 1 for letter, spelled in screen.SPELLED.items())
+    assert all(spelled.isascii() and len(letter) == 1 for letter, spelled in streams.SPELLED.items())
 
 
 def test_an_encoding_that_nobody_knows(monkeypatch):

@@ -1,119 +1,40 @@
 """hjbjax: Hamilton–Jacobi–Bellman and Isaacs equations on grids, with JAX."""
 
-import importlib
 import sys
-from typing import TYPE_CHECKING, Any
 
-from hjbjax import geometry
-from hjbjax._version import __version__
-from hjbjax.applications.convergence import convergence_study
-from hjbjax.applications.hinf import hinf_level
-from hjbjax.applications.l2_gain import attenuation, saturation
-from hjbjax.applications.perturbations import perturbation_study
-from hjbjax.applications.probabilities import expected_exit_time, reach_probability, stay_probability
-from hjbjax.applications.reachability import avoid, from_hj_reachability, reach, reach_avoid
-from hjbjax.applications.resources import estimate
-from hjbjax.cli.compile_cache import keep_compiled
-from hjbjax.discretisation.schemes import Eno2, Limited, Upwind, Weno5
-from hjbjax.discretisation.semi_lagrangian import SemiLagrangian
-from hjbjax.extremals.indirect_method import FreeTime, pontryagin
-from hjbjax.feedback.dissipation import dissipation
-from hjbjax.feedback.feedback import greedy_feedback
-from hjbjax.feedback.safety_filter import least_restrictive
-from hjbjax.feedback.simulation import simulate
-from hjbjax.geometry import stability
-from hjbjax.geometry.lyapunov import lyapunov_check
-from hjbjax.iteration.evaluation import Direct, Krylov, Sweeps
-from hjbjax.iteration.methods import Nested, PolicyIteration, ValueIteration
-from hjbjax.iteration.time_methods import Explicit, Implicit, Tableau
-from hjbjax.markov_chain import chain
-from hjbjax.problem.grid import Grid
-from hjbjax.problem.problem import Problem
-from hjbjax.problem.sets import Ball, Box, Finite
-from hjbjax.problem.stretching import Sinh
-from hjbjax.solution.checkpoints import Checkpoint
-from hjbjax.solution.files import FileError
-from hjbjax.solution.solution import Solution, SolveError, load
-from hjbjax.solution.status import SolveWarning, Status
-from hjbjax.solvers.batch import solve_batch
-from hjbjax.solvers.finite_horizon import march
-from hjbjax.solvers.stationary import solve
-from hjbjax.tracing.interpreter import FallbackWarning
+from hjbjax._version import __version__ as __version__
+
+TYPE_CHECKING = False  # True for type checkers, as in typing, which takes 10 ms to import
 
 if TYPE_CHECKING:
-    from hjbjax import filtering, plotting, zoo
+    from typing import Any
 
-__all__ = [
-    "Ball",
-    "Box",
-    "Checkpoint",
-    "Direct",
-    "Eno2",
-    "Explicit",
-    "FallbackWarning",
-    "FileError",
-    "Finite",
-    "FreeTime",
-    "Grid",
-    "Implicit",
-    "Krylov",
-    "Limited",
-    "Nested",
-    "PolicyIteration",
-    "Problem",
-    "SemiLagrangian",
-    "Sinh",
-    "Solution",
-    "SolveError",
-    "SolveWarning",
-    "Status",
-    "Sweeps",
-    "Tableau",
-    "Upwind",
-    "ValueIteration",
-    "Weno5",
-    "__version__",
-    "attenuation",
-    "avoid",
-    "chain",
-    "convergence_study",
-    "dissipation",
-    "estimate",
-    "expected_exit_time",
-    "filtering",
-    "from_hj_reachability",
-    "geometry",
-    "greedy_feedback",
-    "hinf_level",
-    "keep_compiled",
-    "least_restrictive",
-    "load",
-    "lyapunov_check",
-    "march",
-    "perturbation_study",
-    "plotting",
-    "pontryagin",
-    "reach",
-    "reach_avoid",
-    "reach_probability",
-    "saturation",
-    "simulate",
-    "solve",
-    "solve_batch",
-    "stability",
-    "stay_probability",
-    "zoo",
-]
+    from hjbjax._names import *  # noqa: F403
+    from hjbjax._names import __all__ as __all__
 
-LATER = ("filtering", "plotting", "zoo")  # imported when first asked for: a third of the seconds that the package takes
+LATER = ("filtering", "plotting", "zoo")  # imported on first use: a third of the seconds that the package takes
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> "Any":
+    """A public name, imported on first use.
+
+    Importing JAX and the package takes more than a second. The command parses its words, prints its help and handles
+    Ctrl-C before that, and ``hjbjax doctor`` reports a broken installation of JAX instead of ending with a traceback.
+    """
+    import importlib
+
     if name in LATER:
         return importlib.import_module(f"hjbjax.{name}")
-    # with the name, from which Python tells what was meant
+    if name == "__all__" or not name.startswith("__"):  # inspect and doctest look for special names that no module has
+        public = importlib.import_module("hjbjax._names")
+        if name == "__all__" or name in public.__all__:
+            globals()[name] = found = getattr(public, name)
+            return found
+        if name in globals():  # a folder of the package, by now imported
+            return globals()[name]
+    # with the name, from which Python derives its suggestion
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}", name=name, obj=sys.modules[__name__])
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return sorted(__getattr__("__all__"))

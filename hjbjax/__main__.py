@@ -1,6 +1,24 @@
-"""``python -m hjbjax``: the command without its script."""
+"""The command ``hjbjax``, also as ``python -m hjbjax``: all that has to be done before anything is imported."""
 
-from hjbjax.cli.main import main
+import os
+
+
+def start() -> None:
+    """Run the command and end the process with its exit code."""
+    try:
+        from hjbjax.cli import interrupts
+
+        interrupts.end_at_once()
+    except KeyboardInterrupt:  # in these few milliseconds
+        os._exit(130)
+    # 2>&- leaves descriptor 2 free, and the next file that is opened would receive what XLA writes to standard error
+    while (handle := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(handle)
+    from hjbjax.cli.main import main
+
+    main(prog_name="hjbjax")
+
 
 if __name__ == "__main__":
-    main(prog_name="hjbjax")
+    start()

@@ -5,27 +5,42 @@ import difflib
 import math
 import os
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast, overload
 
 import click
 
+from hjbjax.cli import interrupts
+from hjbjax.problem import streams
+
 if TYPE_CHECKING:
     from hjbjax.zoo.entry import Entry
+
+
+UNREAD = 141  # 128 + SIGPIPE, the exit code that shells report for a program whose reader has gone
 
 
 class Failure(click.ClickException):
     """A refusal or a fault: one line and an exit code."""
 
     def __init__(self, message: str | Exception, exit_code: int = 2):
-        # an exception's text may have several lines; a script that reads stderr is promised one
-        super().__init__(" ".join(str(message).split()))
+        super().__init__(str(message))
         self.exit_code = exit_code  # type: ignore[misc]
 
 
 class OneLineGroup(click.Group):
     """A group whose errors are one line on stderr, without the usage block."""
+
+    def make_context(self, *arguments: Any, **options: Any) -> click.Context:
+        """Parse the words of the group, which may print its help."""
+        with _own_endings():
+            return super().make_context(*arguments, **options)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run a command of the group."""
+        with _own_endings():
+            return super().invoke(ctx)
 
     def main(
         self,
@@ -39,25 +54,42 @@ class OneLineGroup(click.Group):
         if not standalone_mode:
             return super().main(args, prog_name, complete_var, False, **extra)
         try:
-            # not standalone, click raises in place of printing a usage block and ending the process itself
+            # not standalone, click raises instead of printing a usage block and ending the process itself
             code = super().main(args, prog_name, complete_var, False, **extra)
+        except _Unread:
+            code = UNREAD
+            streams.let_go(sys.stdout)
         except click.ClickException as error:
-            say(" ".join((_for_a_parameter(error) or error.format_message()).split()))
+            say(_for_a_parameter(error) or error.format_message())
             code = error.exit_code
         except (click.Abort, KeyboardInterrupt):
-            say("interrupted")
-            code = 130  # 128 + SIGINT, as shells have it
-        except OSError as error:  # what is not a file of ours is standard output: a full disk, a closed pipe
+            say("interrupted", after="\n" * streams.is_terminal(sys.stderr))  # which shows ^C on the line
+            code = interrupts.CODE
+        except OSError as error:  # the commands handle errors of their files: this is standard output on a full disk
             code = 5
-            _let_go_of_output()
+            streams.let_go(sys.stdout)
             say(f"the output could not be written: {error.strerror or error}")
-        if code == 130 and sys.stdout is sys.__stdout__:  # a process of our own
-            # os._exit loses what is in a buffer; a stream is None where the process has none
-            for stream in filter(None, (sys.stdout, sys.stderr)):
-                with contextlib.suppress(OSError):
-                    stream.flush()
+        if code == interrupts.CODE and sys.stdout is sys.__stdout__:  # a process of our own
+            # os._exit loses what is in a buffer
+            for stream in (sys.stdout, sys.stderr):
+                streams.Expendable(stream).flush()
             os._exit(code)  # JAX may still be at work, which the usual exit waits for, or crashes on
         sys.exit(code if isinstance(code, int) else 0)  # a command that ends well returns None
+
+
+class _Unread(click.ClickException):
+    """The reader of standard output has closed the pipe, as ``head`` does when it has enough."""
+
+
+@contextlib.contextmanager
+def _own_endings() -> Iterator[None]:
+    """Turn two exceptions into others before click sees them: it would print an empty line, or exit with code 1."""
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        raise click.Abort from error
+    except BrokenPipeError as error:
+        raise _Unread("") from error
 
 
 def _for_a_parameter(error: click.ClickException) -> str | None:
@@ -74,20 +106,27 @@ def _for_a_parameter(error: click.ClickException) -> str | None:
     )
 
 
-def say(line: str) -> None:
-    """Write one line on standard error; the exit code stands even if nobody can read it."""
-    with contextlib.suppress(OSError):
-        click.echo(f"hjbjax: {line}", err=True)
+def say(line: str, *, after: str = "") -> None:
+    """Write one line on standard error, if anybody can read it."""
+    stream = streams.Expendable(sys.stderr)
+    # an exception's text may have several lines; a script that reads stderr is promised one
+    stream.write(f"{after}{streams.encodable(streams.plain(f'hjbjax: {line}'), sys.stderr)}\n")
+    stream.flush()
 
 
-def _let_go_of_output() -> None:
-    """Send what is left in a buffer of standard output nowhere, or the interpreter fails on it again at its end."""
-    with contextlib.suppress(OSError, ValueError, AttributeError):
-        # the descriptor is replaced below Python: closing the stream would flush it and fail once more; a test's
-        # stand-in for stdout has no descriptor, hence the other two errors
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, sys.stdout.fileno())
-        os.close(nowhere)
+def show(text: str, *, newline: bool = True) -> None:
+    """Write a text on standard output, if there is one, in the letters that it has.
+
+    Raises:
+      OSError: the disk is full, or the reader has gone.
+    """
+    if streams.is_open(sys.stdout):
+        click.echo(streams.encodable(text), nl=newline)
+
+
+def text_of(path: str | os.PathLike[str]) -> str:
+    """A path as text of one line, whatever is in it."""
+    return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in os.fspath(path))
 
 
 class Place(click.Path):

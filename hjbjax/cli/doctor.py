@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from hjbjax._version import __version__
+from hjbjax.cli.command_line import text_of
 from hjbjax.solution import placement
 
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "diffrax", "optax", "matplotlib", "tqdm", "click")
@@ -83,9 +84,10 @@ def _pictures() -> str:
 
 
 def _folder() -> str:
-    placement.sweep(".")  # what a killed command left here
-    # made and taken away again, as a solve does: permission bits say nothing of a full or read-only disk
-    folder = Path(placement.hidden_name("doctor"))
+    here = Path(placement.current_folder())
+    placement.sweep(here)  # what a killed command left here
+    # made and removed again, as by a solve: permission bits do not show a full or read-only disk
+    folder = here / placement.hidden_name("doctor")
     folder.mkdir()
     folder.rmdir()
-    return f"{Path.cwd()} can be written"
+    return f"{text_of(here)} can be written"

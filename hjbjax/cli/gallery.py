@@ -23,6 +23,7 @@ import numpy as np
 from hjbjax import plotting
 from hjbjax._version import __version__
 from hjbjax.cli import run_folder
+from hjbjax.cli.command_line import text_of
 from hjbjax.feedback.path import Path as Trajectory
 from hjbjax.solution import placement
 from hjbjax.solution.solution import Solution, SolveError, Status
@@ -65,14 +66,16 @@ def check_folder(out: Path, force: bool = False) -> None:
     Raises:
       OSError: with a line on the way out.
     """
+    placement.current_folder()  # without one JAX raises FileNotFoundError where it filters a traceback
     if os.path.lexists(out) and not out.is_dir():
         raise NotADirectoryError(f"{out} is there and is no folder; give another name")
     placement.check_place(out / PAGE, force=True)  # a folder of that name is refused even by force
-    found = sorted(entry.name for entry in out.iterdir()) if out.is_dir() else []
+    # a hidden folder of a command, maybe of this one, is not a result
+    found = sorted(name for name in os.listdir(out) if not placement.OWN.fullmatch(name)) if out.is_dir() else []
     if not force and PAGE in found:
         raise FileExistsError(f"{out} holds {PAGE} already; give another --out, or --force to replace it")
     if not force and found:
-        shown = ", ".join(found[:3]) + (", ..." if len(found) > 3 else "")
+        shown = ", ".join(map(text_of, found[:3])) + (", ..." if len(found) > 3 else "")
         raise FileExistsError(f"{out} is not empty: {shown}; give another --out, or --force to put {PAGE} beside them")
 
 
@@ -250,9 +253,15 @@ def publish(cards: Sequence[Card], staging: Path, out: Path, force: bool = False
     Raises:
       OSError: ``out`` cannot be written, or holds something by now.
     """
-    made = staging / PAGE
-    made.write_text(page(cards), encoding="utf-8")
+    made = write(cards, staging)
     out.mkdir(parents=True, exist_ok=True)
     check_folder(out, force)  # again: the solves may have taken long
     placement.place(made, out / PAGE, force)
     return out / PAGE
+
+
+def write(cards: Sequence[Card], folder: Path) -> Path:
+    """Write the page of the cards into a folder; the file."""
+    made = folder / PAGE
+    made.write_text(page(cards), encoding="utf-8")
+    return made

@@ -1,11 +1,12 @@
 """The command ``hjbjax``: solve a ready problem, list them, show all of them on a page, look at the machine.
 
 ``solve`` writes ``solution.npz``, ``value.png``, ``policy.png`` and ``trajectory.png`` into a folder and prints
-one screen. What can be refused is refused in one line before anything is compiled. Files are made in a hidden
-folder beside the old ones and moved over them when they are whole.
+one screen. What can be refused is refused in one line before anything is compiled. Files are made in a hidden folder
+next to the old ones and moved over them when they are whole. If the folder cannot take them after the solve, they go
+into a new one, which the last line names.
 
 Exit codes: 0 done, 1 a check of ``doctor`` failed, 2 usage, 3 not converged, 4 diverged or not finite, 5 file,
-6 memory, 7 a process of ``launch`` died, 130 interrupted (Ctrl-C or SIGTERM).
+6 memory, 7 a process of ``launch`` died, 130 interrupted (Ctrl-C or SIGTERM), 141 the reader of a pipe had enough.
 """
 
 import contextlib
@@ -20,6 +21,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 import click
 
 from hjbjax._version import __version__
+from hjbjax.cli import interrupts
 from hjbjax.cli import launch as processes_of
 from hjbjax.cli.command_line import (
     Failure,
@@ -31,11 +33,16 @@ from hjbjax.cli.command_line import (
     names_of,
     parameters_of,
     say,
+    show,
     systems,
+    text_of,
 )  # fmt: skip
+from hjbjax.problem import streams
 from hjbjax.solution.clock import interruptible
 
 if TYPE_CHECKING:  # for annotations alone: what is heavy is imported by the command that needs it
+    from hjbjax.cli.gallery import Card
+    from hjbjax.feedback.path import Path as Trajectory
     from hjbjax.problem.grid import Grid
     from hjbjax.problem.problem import Problem
     from hjbjax.solution.solution import Solution
@@ -65,7 +72,7 @@ def list_problems(name: str | None) -> None:
     from hjbjax.cli import listing
 
     for line in listing.overview() if name is None else listing.details(zoo.catalogue[name]):
-        click.echo(line)
+        show(line)
 
 
 @main.command(short_help="Solve a problem, draw the answer.")
@@ -108,7 +115,7 @@ def solve(
         return
     options["mesh"] = processes_of.mesh_of(devices)
     if processes_of.rank() > 0:  # the first process of a launch writes, and speaks for all
-        with interruptible():
+        with interrupts.raised(), interruptible():
             _raise_unless_converged(_solve(*_build(entry, parameters, shape), options))
         return
     out = Path(name) if out is None else out
@@ -116,8 +123,8 @@ def solve(
     with _one_line_error(OSError, 2, "--out: "):
         run_folder.check_folder(out, force)
     problem, grid = _build(entry, parameters, shape)
-    path, made = None, []
-    with contextlib.ExitStack() as stack:  # the hidden folder goes last: after an interrupt, too
+    with contextlib.ExitStack() as stack:  # the hidden folder is removed late: after an interrupt, too
+        stack.enter_context(interrupts.raised())
         with _one_line_error(OSError, 2, "--out: "):
             staging = stack.enter_context(run_folder.staging(out))
         stack.enter_context(_one_line_warnings())
@@ -125,33 +132,21 @@ def solve(
         if not no_cache:
             compile_cache.keep_for_the_command()
         solution = _solve(problem, grid, options)
-        with _one_line_error(OSError, 5, "the results could not be written: "):
-            try:
-                start = entry.initial_state(grid.ndim)
-                finish = None if entry.finish is None else entry.finish(**parameters)
-                pictures = run_folder.make(
-                    problem, solution, staging, start=start, duration=entry.duration, finish=finish
-                )
-                for file, drawn in pictures:  # a generator: each file is whole before the next one is begun
-                    made.append(file)
-                    path = drawn
-            finally:  # what is whole is kept
-                run_folder.publish(staging, out, made, force)
-    files = [out / file for file in made]
+        files, path = _write(entry, parameters, problem, solution, staging, out, force)
     off = None
     with contextlib.suppress(ValueError), _one_line_warnings():  # no answer is known for these parameters
         off = None if entry.exact is None else run_folder.difference(entry.exact(**parameters), solution)
     if as_json:
         about = {"problem": name, "parameters": parameters, "exact_difference": off}
-        click.echo(json.dumps(run_folder.report(solution, path, files, **about)))
+        show(json.dumps(run_folder.report(solution, path, files, **about)))
     else:
-        click.echo(str(solution))
+        show(str(solution))
         if off is not None:
-            click.echo(f"off the exact answer by at most {off:.3g} on the inner half of the box")
+            show(f"off the exact answer by at most {off:.3g} on the inner half of the box")
         if path is not None:
-            click.echo(f"path: {path}")
+            show(f"path: {path}")
         without = "" if problem.controls is not None else "; no policy.png, as there are no controls"
-        click.echo(f"wrote {', '.join(map(str, files))}{without}")
+        show(f"wrote {', '.join(map(text_of, files))}{without}")
     if (failure := solution.stats.get("checkpoint", "written")) != "written":
         raise Failure(failure, 5)
     _raise_unless_converged(solution)
@@ -170,7 +165,9 @@ def _raise_unless_converged(solution: "Solution") -> None:
 @click.argument("words", nargs=-1, required=True, metavar="-- COMMAND")
 def launch(processes: int, heartbeat: int, words: tuple[str, ...]) -> None:
     """Run a command, as in "hjbjax launch --processes 2 -- solve pendulum", by many processes that share its nodes."""
-    if code := processes_of.start(words, processes, heartbeat):
+    with interrupts.raised():
+        code = processes_of.start(words, processes, heartbeat)
+    if code:
         raise SystemExit(code)
 
 
@@ -250,7 +247,7 @@ def _estimate(problem: "Problem", grid: "Grid", options: dict[str, Any], *, as_j
     asked = {key: value for key, value in _given(options).items() if key in ("method", "scheme", "tol")}
     with _one_line_error((ValueError, TypeError), 2), _one_line_warnings():
         found = hjb.estimate(problem, grid, **asked)
-    click.echo(json.dumps(dataclasses.asdict(found)) if as_json else str(found))
+    show(json.dumps(dataclasses.asdict(found)) if as_json else str(found))
     if not found.fits:
         what = "the memory that is free" if found.numbered else "32-bit indices"
         raise Failure(f"the solve does not fit into {what}", 6)
@@ -276,6 +273,46 @@ def _solve(problem: "Problem", grid: "Grid", options: dict[str, Any]) -> "Soluti
         raise Failure(error, 6 if "RESOURCE_EXHAUSTED" in str(error) else 4) from error
 
 
+def _write(
+    entry: "Entry",
+    parameters: dict[str, Any],
+    problem: "Problem",
+    solution: "Solution",
+    staging: Path,
+    out: Path,
+    force: bool,
+) -> tuple[list[Path], "Trajectory | None"]:
+    """Draw a solution and write all files into a folder, or into a new one if that folder no longer takes them.
+
+    Returns:
+      The files, and the trajectory in the last of them, if there is one.
+
+    Raises:
+      Failure: a file could not be written.
+    """
+    from hjbjax.cli import run_folder
+
+    made: list[str] = []
+    path, published = None, False
+    start = entry.initial_state(solution.grid.ndim)
+    finish = None if entry.finish is None else entry.finish(**parameters)
+    try:
+        try:
+            pictures = run_folder.make(problem, solution, staging, start=start, duration=entry.duration, finish=finish)
+            for file, drawn in pictures:  # a generator: each file is whole before the next one is begun
+                made.append(file)
+                path = drawn
+        finally:  # what is whole is kept
+            run_folder.publish(staging, out, made, force)
+            published = bool(made)
+    except OSError as error:
+        message = f"the results could not be written: {error}"
+        if not published:
+            message += "; " + run_folder.rescue(out, lambda folder: run_folder.copy(solution, staging, folder))
+        raise Failure(message, 5) from error
+    return [out / file for file in made], path
+
+
 @main.command(short_help="All ready problems on a page.")
 @click.option("--out", type=Place(), required=True, help="Folder of the page, index.html.")
 @click.option("--only", multiple=True, type=Name("problem", systems), help="One problem; may be given several times.")
@@ -291,6 +328,7 @@ def gallery(out: Path, only: tuple[str, ...], force: bool, no_cache: bool) -> No
         pages.check_folder(out, force)
     cards: list[pages.Card] = []
     with contextlib.ExitStack() as stack:
+        stack.enter_context(interrupts.raised())
         with _one_line_error(OSError, 2, "--out: "):
             staging = stack.enter_context(run_folder.staging(out))
         stack.enter_context(_one_line_warnings())
@@ -301,17 +339,28 @@ def gallery(out: Path, only: tuple[str, ...], force: bool, no_cache: bool) -> No
         try:
             for number, name in enumerate(names, 1):
                 line = f"{number:>2}/{len(names)}  {name:<20}  "
-                click.echo(line, nl=False)
+                show(line, newline=False)
                 cards.append(pages.card(zoo.catalogue[name]))
                 # on a terminal the phases of the solve have been written over the line
-                click.echo((f"\r{line}" if sys.stdout.isatty() else "") + cards[-1].status)
+                show((f"\r{line}" if streams.is_terminal(sys.stdout) else "") + cards[-1].status)
         finally:  # what is done is kept, after an interrupt, too
             if cards:
-                with _one_line_error(OSError, 5, "the page could not be written: "):
-                    pages.publish(cards, staging, out, force)
-    click.echo(f"wrote {out / pages.PAGE}")
+                _publish_page(cards, staging, out, force)
+    show(f"wrote {text_of(out / pages.PAGE)}")
     if failed := [card.name for card in cards if card.status != "CONVERGED"]:
         raise Failure(f"not converged: {', '.join(failed)}", 3)
+
+
+def _publish_page(cards: "list[Card]", staging: Path, out: Path, force: bool) -> None:
+    """Write the page of the cards into a folder, or into a new one if that folder no longer takes it."""
+    from hjbjax.cli import gallery as pages
+    from hjbjax.cli import run_folder
+
+    try:
+        pages.publish(cards, staging, out, force)
+    except OSError as error:
+        kept = run_folder.rescue(out, lambda folder: pages.write(cards, folder))
+        raise Failure(f"the page could not be written: {error}; {kept}", 5) from error
 
 
 @main.command(short_help="Look at versions and devices.")
@@ -321,7 +370,7 @@ def doctor() -> None:
 
     failed = 0
     for name, well, found in examine():
-        click.echo(f"{'ok  ' if well else 'FAIL'}  {name:<10}  {found}")
+        show(f"{'ok  ' if well else 'FAIL'}  {name:<10}  {found}")
         failed += not well
     if failed:
         raise Failure(f"{failed} of the checks failed", 1)

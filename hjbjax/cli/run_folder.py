@@ -14,8 +14,8 @@ import dataclasses
 import math
 import os
 import shutil
-import warnings
-from collections.abc import Iterator, Sequence
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
@@ -30,6 +30,7 @@ from hjbjax.feedback.simulation import simulate
 from hjbjax.plotting.maps import closed_loop_size
 from hjbjax.plotting.slices import at_states
 from hjbjax.plotting.style import NARROW
+from hjbjax.problem import streams
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import Ball
 from hjbjax.solution import placement
@@ -44,6 +45,7 @@ FILES = ("solution.npz", "value.png", "policy.png", "trajectory.png")
 Plain: TypeAlias = "dict[str, Plain] | list[Plain] | str | float | bool | None"  # what JSON has
 SAMPLES = 400  # of a bang-bang feedback along its trajectory
 DPI = 160
+NAME = 40  # characters of a folder's name that a folder next to it repeats
 
 
 def check_folder(out: Path, force: bool = False) -> None:
@@ -52,6 +54,7 @@ def check_folder(out: Path, force: bool = False) -> None:
     Raises:
       OSError: with a line on what to do.
     """
+    placement.current_folder()  # without one JAX raises FileNotFoundError where it filters a traceback
     # lexists: a link that leads nowhere is there as well, and writing would go through it
     if os.path.lexists(out) and not out.is_dir():
         raise NotADirectoryError(f"{out} is there and is no folder; give another name")
@@ -64,26 +67,27 @@ def check_folder(out: Path, force: bool = False) -> None:
 
 @contextlib.contextmanager
 def staging(out: Path) -> Iterator[Path]:
-    """A hidden folder on the file system of ``out``, gone at the end; that it can be made shows that one can write.
+    """A hidden folder on the file system of ``out``, gone at the end; making it shows that one can write there.
 
-    A killed command leaves it behind, for the next one to take away.
+    A killed command leaves the folder behind, and the next command removes it.
 
     Raises:
       OSError: ``out`` cannot be written.
     """
-    # beside the nearest folder that exists: moving files is atomic on one file system only, /tmp may be another
-    place = out.absolute()
-    while not place.is_dir():
-        if os.path.lexists(place):
-            raise NotADirectoryError(f"{out} cannot be written: {place} is no folder; give another name")
-        place = place.parent
+    whole = Path(placement.absolute(os.fspath(out)))
+    # in the nearest folder that exists: moving files is atomic only on one file system, and /tmp may be another
+    place = next(folder for folder in (whole, *whole.parents) if os.path.lexists(folder))
     placement.sweep(place)
     folder = place / placement.hidden_name(out.name)
     try:
-        folder.mkdir(mode=0o700)  # nobody else looks into it before it is whole
-    except OSError as error:
-        raise OSError(f"{out} cannot be written: {error.strerror}; give another folder") from error
-    try:
+        try:
+            folder.mkdir(mode=0o700)  # nobody else looks into it before it is whole
+            missing = whole.relative_to(place).parts
+            folder.joinpath(*missing).mkdir(parents=True, exist_ok=True)  # or a name that is too long shows at the end
+        except OSError as error:
+            raise OSError(f"{out} cannot be written: {error.strerror}; give another folder") from error
+        if missing:
+            shutil.rmtree(folder / missing[0])
         with placement.claimed(folder):
             yield folder
     finally:
@@ -105,6 +109,33 @@ def publish(folder: Path, out: Path, made: Sequence[str], force: bool = False) -
             placement.place(folder / file, out / file, force)
         else:
             (out / file).unlink(missing_ok=True)
+
+
+def copy(solution: Solution, staging: Path, folder: Path) -> None:
+    """Write a solution into a folder, and what had been drawn of it."""
+    solution.save(folder / FILES[0])
+    for file in FILES[1:]:
+        with contextlib.suppress(OSError):
+            shutil.copyfile(staging / file, folder / file)
+
+
+def rescue(out: Path, fill: Callable[[Path], object]) -> str:
+    """Put results that ``out`` does not take into a new folder next to it, else among temporary files; where, in words.
+
+    Args:
+      out: the folder that was to hold them.
+      fill: writes them into a folder.
+    """
+    for parent in (lambda: placement.absolute(os.fspath(out.parent)), tempfile.gettempdir):
+        with contextlib.suppress(OSError):
+            folder = Path(tempfile.mkdtemp(prefix=f"{out.name[:NAME]}-", dir=parent()))
+            try:
+                fill(folder)
+            except OSError:
+                shutil.rmtree(folder, ignore_errors=True)
+                raise
+            return f"they are in {folder}"
+    return "no other folder could be written either"
 
 
 def make(
@@ -213,7 +244,7 @@ def closed_path(
         rest = simulate(rest_problem, rest_feedback, path.states[-1], duration)
         return joined(path, rest, float(np.asarray(problem.discount)))
     except ValueError as error:  # a start outside the box that parameters made smaller: no reason to lose the rest
-        warnings.warn(f"no trajectory.png: {error}", UserWarning, stacklevel=2)
+        streams.warn(f"no trajectory.png: {error}", UserWarning, stacklevel=2)
         return None
 
 

@@ -26,6 +26,7 @@ from hjbjax.solution.placement import (
     FileError,
     MissingFileError,
     Path,
+    absolute,
     check_place,
     claimed,
     hidden_name,
@@ -97,7 +98,7 @@ def write(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray
 def write_whole(path: Path, fill: Callable[[IO[bytes]], object], *, force: bool = False) -> None:
     """Write a file whole or not at all: ``fill`` gets it open; refusals as for ``write``."""
     # through links: the file behind one is replaced, not the link
-    path = os.path.realpath(path_of(path, "written"))
+    path = absolute(path_of(path, "written"))
     check_place(path, force)  # before the arrays are written, and once more when the file is moved
     folder, name = os.path.split(path)
     sweep(folder)

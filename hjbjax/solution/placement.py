@@ -52,6 +52,30 @@ def path_of(path: Path, done: str) -> str:
     return text
 
 
+def current_folder() -> str:
+    """The current folder.
+
+    Raises:
+      FileError: it has been removed.
+    """
+    try:
+        return os.getcwd()
+    except FileNotFoundError as error:
+        raise FileError("the current folder has been removed; change to another one") from error
+
+
+def absolute(path: str) -> str:
+    """The path of a file to be written, from the root of the file system and through links.
+
+    Raises:
+      FileError: the path is relative, and the current folder has been removed.
+    """
+    try:
+        return os.path.realpath(path if os.path.isabs(path) else os.path.join(current_folder(), path))
+    except FileError as error:
+        raise FileError(f"{path}: cannot be written: {error}, or give an absolute path") from error
+
+
 def check_place(path: str | os.PathLike[str], force: bool) -> None:
     """Refuse a path at which no file can be put.
 

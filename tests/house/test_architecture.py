@@ -22,7 +22,7 @@ ROWS = [[re.findall(r"`(\w+)`", cell) for cell in row.split("|")[1:3]] for row i
 FOLDERS = {folder[0]: files for folder, files in (row for row in ROWS if len(row) == 2) if folder}
 ORDER = [f"{folder}.{file}" for folder, files in FOLDERS.items() for file in files if file != "zoo"]
 SOURCES = sorted(path for path in PACKAGE.rglob("*.py") if path.parent != PACKAGE)
-LOOSE = {"__init__.py", "__main__.py", "_version.py", "py.typed"}
+LOOSE = {"__init__.py", "__main__.py", "_names.py", "_version.py", "py.typed"}
 
 
 def name_of(path):
@@ -73,9 +73,26 @@ def test_a_file_imports_only_from_above(path):
     assert imports_of(path) <= allowed
 
 
+def uses_of_streams(path):
+    """The lines of a file that call a method of ``sys.stdout`` or ``sys.stderr``, or ``warnings.warn``."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Attribute):
+            owner = ast.unparse(node.value)
+            if owner in ("sys.stdout", "sys.stderr") or (owner, node.attr) == ("warnings", "warn"):
+                yield node.lineno
+
+
+def test_only_one_file_uses_the_standard_streams():
+    """They may be missing, closed or full, and a solve must not end with them."""
+    others = [path for path in SOURCES if path != PACKAGE / "problem" / "streams.py"]
+    assert [(path.name, line) for path in others for line in uses_of_streams(path)] == []
+
+
 def test_importing_brings_nothing_heavy():
     heavy = {"matplotlib", "scipy", "diffrax", "equinox", "optax", "tqdm", "click", "plotly", "xarray"}
-    code = "import jax, sys; before = set(sys.modules); import hjbjax; print(*(set(sys.modules) - before))"
+    code = (
+        "import jax, sys; before = set(sys.modules); import hjbjax as h; h.solve; print(*(set(sys.modules) - before))"
+    )
     answer = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     loaded = {name.split(".")[0] for name in answer.stdout.split()}
     assert "hjbjax" in loaded

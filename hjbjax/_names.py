@@ -1,0 +1,104 @@
+"""The public names, imported together when the first of them is used; see ``hjbjax.__getattr__``."""
+
+from typing import TYPE_CHECKING
+
+from hjbjax import geometry
+from hjbjax._version import __version__
+from hjbjax.applications.convergence import convergence_study
+from hjbjax.applications.hinf import hinf_level
+from hjbjax.applications.l2_gain import attenuation, saturation
+from hjbjax.applications.perturbations import perturbation_study
+from hjbjax.applications.probabilities import expected_exit_time, reach_probability, stay_probability
+from hjbjax.applications.reachability import avoid, from_hj_reachability, reach, reach_avoid
+from hjbjax.applications.resources import estimate
+from hjbjax.cli.compile_cache import keep_compiled
+from hjbjax.discretisation.schemes import Eno2, Limited, Upwind, Weno5
+from hjbjax.discretisation.semi_lagrangian import SemiLagrangian
+from hjbjax.extremals.indirect_method import FreeTime, pontryagin
+from hjbjax.feedback.dissipation import dissipation
+from hjbjax.feedback.feedback import greedy_feedback
+from hjbjax.feedback.safety_filter import least_restrictive
+from hjbjax.feedback.simulation import simulate
+from hjbjax.geometry import stability
+from hjbjax.geometry.lyapunov import lyapunov_check
+from hjbjax.iteration.evaluation import Direct, Krylov, Sweeps
+from hjbjax.iteration.methods import Nested, PolicyIteration, ValueIteration
+from hjbjax.iteration.time_methods import Explicit, Implicit, Tableau
+from hjbjax.markov_chain import chain
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.sets import Ball, Box, Finite
+from hjbjax.problem.stretching import Sinh
+from hjbjax.solution.checkpoints import Checkpoint
+from hjbjax.solution.files import FileError
+from hjbjax.solution.solution import Solution, SolveError, load
+from hjbjax.solution.status import SolveWarning, Status
+from hjbjax.solvers.batch import solve_batch
+from hjbjax.solvers.finite_horizon import march
+from hjbjax.solvers.stationary import solve
+from hjbjax.tracing.interpreter import FallbackWarning
+
+if TYPE_CHECKING:
+    from hjbjax import filtering, plotting, zoo
+
+__all__ = [
+    "Ball",
+    "Box",
+    "Checkpoint",
+    "Direct",
+    "Eno2",
+    "Explicit",
+    "FallbackWarning",
+    "FileError",
+    "Finite",
+    "FreeTime",
+    "Grid",
+    "Implicit",
+    "Krylov",
+    "Limited",
+    "Nested",
+    "PolicyIteration",
+    "Problem",
+    "SemiLagrangian",
+    "Sinh",
+    "Solution",
+    "SolveError",
+    "SolveWarning",
+    "Status",
+    "Sweeps",
+    "Tableau",
+    "Upwind",
+    "ValueIteration",
+    "Weno5",
+    "__version__",
+    "attenuation",
+    "avoid",
+    "chain",
+    "convergence_study",
+    "dissipation",
+    "estimate",
+    "expected_exit_time",
+    "filtering",
+    "from_hj_reachability",
+    "geometry",
+    "greedy_feedback",
+    "hinf_level",
+    "keep_compiled",
+    "least_restrictive",
+    "load",
+    "lyapunov_check",
+    "march",
+    "perturbation_study",
+    "plotting",
+    "pontryagin",
+    "reach",
+    "reach_avoid",
+    "reach_probability",
+    "saturation",
+    "simulate",
+    "solve",
+    "solve_batch",
+    "stability",
+    "stay_probability",
+    "zoo",
+]

@@ -11,6 +11,11 @@ from pathlib import Path
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 
 
+def names() -> list[str]:
+    """The names of all notebooks."""
+    return sorted(path.stem for path in NOTEBOOKS.glob("*.py"))
+
+
 def render(folder: Path, names: Sequence[str] = ()) -> None:
     """One page a notebook in a folder, the pictures beside it; of all notebooks, or of those that are named."""
     import jupytext
@@ -25,13 +30,13 @@ def render(folder: Path, names: Sequence[str] = ()) -> None:
         if names and path.stem not in names:
             continue
         print(path.stem, flush=True)
-        for picture in folder.glob(f"{path.stem}-*.*"):
-            picture.unlink()
         notebook = jupytext.read(path)
         # twice as many pixels, of which ``shrink`` makes one: a surface of small triangles shows no grain
         notebook.cells.insert(0, nbformat.v4.new_code_cell("%config InlineBackend.figure_format = 'retina'"))
         # lines printed one after the other are one block
         NotebookClient(notebook, timeout=1200, kernel_name="python3", coalesce_streams=True).execute()
+        for picture in folder.glob(f"{path.stem}-*.*"):  # of the last time, now that there are new ones
+            picture.unlink()
         lines: list[str] = []
         for cell in notebook.cells[1:]:
             lines += [cell.source, ""] if cell.cell_type == "markdown" else ["```py", cell.source, "```", ""]

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hjbjax import zoo
-from hjbjax.cli import gallery
+from hjbjax.cli import gallery, run_folder
 
 COLOURS = 256  # of a palette: a quarter of the bytes of full colours
 ALIKE = 16  # of the 256 shades of red, of green and of blue count as one when colours are counted
@@ -22,20 +22,30 @@ PAGES = ("README.md", "docs/getting_started.md")
 
 def draw(docs: Path, names: Sequence[str] = ()) -> None:
     """The pictures of the pages, and the gallery; or those of the ready problems that are named, and no page."""
-    if names:
-        gallery_page([gallery.card(zoo.catalogue[name]) for name in names], docs / "pictures" / "gallery")
-        return
-    for old in (docs / "pictures").glob("*.png"):
-        old.unlink()
-    for page in PAGES:
-        run(docs.parent / page, docs / "pictures")
-    for picture in sorted((docs / "pictures").glob("*.png")):
-        shrink(picture)
+    folder = docs / "pictures"
+    if not names:
+        pictures_of_pages(docs, folder)
     cards = []
-    for entry in zoo.catalogue.values():
+    for entry in (zoo.catalogue[name] for name in names or zoo.catalogue):
         print(entry.name, flush=True)
         cards.append(gallery.card(entry))
-    (docs / "gallery.md").write_text(gallery_page(cards, docs / "pictures" / "gallery"), encoding="utf-8")
+        write_pictures(cards[-1], folder / "gallery")  # at once: what was computed stays after an interrupt
+    if not names:
+        (docs / "gallery.md").write_text(gallery_page(cards), encoding="utf-8")
+
+
+def pictures_of_pages(docs: Path, folder: Path) -> None:
+    """Run the pages, and replace the pictures of the last time when all new ones are there."""
+    with run_folder.staging(folder) as new:
+        for page in PAGES:
+            run(docs.parent / page, new)
+        made = sorted(new.glob("*.png"))
+        for picture in made:
+            shrink(picture)
+        for old in folder.glob("*.png"):
+            old.unlink()
+        for picture in made:
+            os.replace(picture, folder / picture.name)
 
 
 def run(page: Path, folder: Path) -> None:
@@ -82,9 +92,15 @@ def shrink(picture: Path) -> None:
     small.save(picture, optimize=True)
 
 
-def gallery_page(cards: list[gallery.Card], folder: Path) -> str:
-    """The page of the gallery, with its pictures put into a folder."""
+def write_pictures(card: gallery.Card, folder: Path) -> None:
+    """Write the pictures of a ready problem into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
+    for number, (_, data) in enumerate(card.pictures, 1):
+        (folder / f"{card.name}-{number}.webp").write_bytes(data)
+
+
+def gallery_page(cards: list[gallery.Card]) -> str:
+    """The page of the gallery, whose pictures ``write_pictures`` writes."""
     lines = [
         "# Gallery",
         "",
@@ -95,9 +111,7 @@ def gallery_page(cards: list[gallery.Card], folder: Path) -> str:
     ]
     for card in cards:
         lines += [f"## {card.name}", "", f"{card.summary[0].upper()}{card.summary[1:]}: {card.status}.", ""]
-        for number, (caption, data) in enumerate(card.pictures, 1):
-            picture = folder / f"{card.name}-{number}.webp"
-            picture.write_bytes(data)
-            lines += [f"![{card.name}: {caption}](pictures/gallery/{picture.name})", ""]
+        for number, (caption, _) in enumerate(card.pictures, 1):
+            lines += [f"![{card.name}: {caption}](pictures/gallery/{card.name}-{number}.webp)", ""]
         lines += ["| | |", "|---|---|", *(f"| {word} | {figure} |" for word, figure in card.facts), ""]
     return "\n".join(lines)

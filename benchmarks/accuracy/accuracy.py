@@ -13,7 +13,7 @@ import numpy as np
 
 import hjbjax as hjb
 from benchmarks.cases import inner
-from benchmarks.harness.report import RESULTS, attempt, publish, table
+from benchmarks.harness.report import RESULTS, Folder, attempt, publish, table
 from benchmarks.peers import stationary_march
 from hjbjax.applications.convergence import fitted_order
 from hjbjax.applications.reference import at_nodes_of, distance, mask_of, mean_spacing
@@ -123,7 +123,7 @@ def _words(region: Any) -> str:
 @click.option("--quick", is_flag=True, help="The two coarsest grids of every problem.")
 @click.option("--problem", "names", multiple=True, metavar="NAME", help="Only this problem of the zoo; repeatable.")
 @click.option("--tol", type=click.FloatRange(0, 1, min_open=True), default=1e-7, show_default=True)
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Folder of the files.")
+@click.option("--out", type=Folder(), default=RESULTS, help="Folder of the files.")
 def command(quick: bool, names: tuple[str, ...], tol: float, out: Path) -> None:
     """Errors, orders and seconds over the zoo's problems with known answers."""
     known = sorted({case.entry for case in CASES})

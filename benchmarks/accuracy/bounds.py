@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "oracles"))
 import agreement
 import random_problems
 
-from benchmarks.harness.report import RESULTS, publish, table
+from benchmarks.harness.report import RESULTS, Folder, publish, table
 
 COLUMNS = ("problem", "count", "certified", "refused", "held", "unfinished", "tightest", "seconds")
 
@@ -27,7 +27,7 @@ COLUMNS = ("problem", "count", "certified", "refused", "held", "unfinished", "ti
 @click.option("--problems", default=2000, show_default=True, help="How many, spread evenly over the families.")
 @click.option("--family", "names", multiple=True, help="Only these families.")
 @click.option("--quick", is_flag=True, help="Two of each family.")
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Folder of the files.")
+@click.option("--out", type=Folder(), default=RESULTS, help="Folder of the files.")
 def command(problems, names, quick, out):
     """Draw random problems, solve each twice, and print how many bounds held and how tight they were."""
     families = [random_problems.BY_NAME[name] for name in names] or random_problems.FAMILIES

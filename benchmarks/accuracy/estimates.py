@@ -14,7 +14,7 @@ import numpy as np
 
 import hjbjax as hjb
 from benchmarks.accuracy.accuracy import CASES, Case
-from benchmarks.harness.report import RESULTS, attempt, publish, table
+from benchmarks.harness.report import RESULTS, Folder, attempt, publish, table
 from hjbjax.applications.reference import at_nodes_of, mask_of
 
 COLUMNS = ("problem", "shape", "scheme", "error", "estimate", "ratio", "mean_ratio", "status")
@@ -49,7 +49,7 @@ def verdict(rows: Sequence[dict[str, Any]]) -> str:
 
 @click.command()
 @click.option("--quick", is_flag=True, help="The second coarsest grid of every problem on a line.")
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Folder of the files.")
+@click.option("--out", type=Folder(), default=RESULTS, help="Folder of the files.")
 def command(quick: bool, out: Path) -> None:
     """The estimated error of the grid beside the true one, over the zoo's problems with known answers."""
     rows: list[dict[str, Any]] = []

@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from benchmarks.harness.report import RESULTS, attempt, publish, table
+from benchmarks.harness.report import RESULTS, Folder, attempt, publish, table
 
 COLUMNS = ("question", "run", "shape", "told", "peak", "told_over_peak", "seconds", "steps", "status")
 # what is asked, how it is run, the nodes an axis, and the steps or the horizon; all in single precision
@@ -32,7 +32,7 @@ SMALL = 6
 
 @click.command()
 @click.option("--quick", is_flag=True, help="Small grids, of which compiling is most: no verdict.")
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Folder of the files.")
+@click.option("--out", type=Folder(), default=RESULTS, help="Folder of the files.")
 def command(quick: bool, out: Path) -> None:
     """Run large grids each in a process of its own, and print what was told and what was taken."""
     rows = []

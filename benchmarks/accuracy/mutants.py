@@ -17,7 +17,7 @@ from pathlib import Path
 
 import click
 
-from benchmarks.harness.report import RESULTS, publish, table
+from benchmarks.harness.report import RESULTS, Folder, publish, table
 
 ROOT = Path(__file__).parents[2]
 LEFT_OUT = (".git", ".venv", "__pycache__", "site", "build", "dist", "*.egg-info", ".*_cache", ".hypothesis")
@@ -170,7 +170,7 @@ QUICK = ("ghost cell", "seam of an interpolation")
 @click.command()
 @click.option("--mutant", "names", multiple=True, help="Only those whose names hold this text.")
 @click.option("--quick", is_flag=True, help="Two of them, without the whole suite.")
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Folder of the rows.")
+@click.option("--out", type=Folder(), default=RESULTS, help="Folder of the rows.")
 def command(names: Sequence[str], quick: bool, out: Path) -> None:
     """Seed one bug after the other in a copy of the checkout, and print which test found it."""
     chosen = [each for each in MUTANTS if any(name in each.name for name in (names or ("",)))]

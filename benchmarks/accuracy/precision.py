@@ -23,7 +23,7 @@ import numpy as np
 import hjbjax as hjb
 from benchmarks import cases
 from benchmarks.accuracy import accuracy
-from benchmarks.harness.report import RESULTS, attempt, publish, table
+from benchmarks.harness.report import RESULTS, Folder, attempt, publish, table
 from benchmarks.harness.timing import interleaved
 
 COLUMNS = ("problem", "scheme", "shape", "error", "seconds", "compile_seconds", "status")
@@ -179,7 +179,7 @@ def verdicts(rows: Sequence[dict[str, Any]]) -> list[str]:
 
 @click.command()
 @click.option("--quick", is_flag=True, help="Coarse grids only.")
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Folder of the files.")
+@click.option("--out", type=Folder(), default=RESULTS, help="Folder of the files.")
 def command(quick: bool, out: Path) -> None:
     """Error against seconds, plain and second order, on the pendulum and the double integrator."""
     about = {"benchmark": "precision", "dtype": "float64"}

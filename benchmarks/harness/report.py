@@ -16,6 +16,9 @@ from typing import Any
 
 import click
 
+from hjbjax.cli import run_folder
+from hjbjax.cli.command_line import Failure
+
 RESULTS = Path(__file__).parents[1] / "results"
 PACKAGES = ("jax", "numpy", "scipy", "hj-reachability", "quantecon", "numba", "mdpsolver", "scikit-fmm")
 
@@ -79,12 +82,44 @@ def write_json(path: Path, rows: Sequence[dict[str, Any]]) -> None:
         temporary.unlink(missing_ok=True)
 
 
+class Folder(click.Path):
+    """A folder that can be written, as is checked before anything is measured."""
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path, file_okay=False)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The path."""
+        path = super().convert(value, param, ctx)
+        try:
+            run_folder.check_writable(path)
+        except OSError as error:
+            self.fail(str(error), param, ctx)
+        return path
+
+
+def put(out: Path, write: Callable[[Path], None]) -> None:
+    """Let ``write`` write its files into a folder, or into a new one if that folder no longer takes them.
+
+    Raises:
+      Failure: the folder no longer takes them; it says where they are.
+    """
+    try:
+        write(out)
+    except OSError as error:
+        raise Failure(f"{error}; {run_folder.rescue(out, write)}", 5) from error
+
+
 def publish(out: Path, name: str, rows: Sequence[dict[str, Any]], **drawing: Any) -> None:
     """The rows, stamped, in ``name``.json; what ``drawing`` says of them (see ``picture``) in ``name``.png."""
     rows = stamped(rows)
-    write_json(out / f"{name}.json", rows)
-    if drawing:
-        picture(out / f"{name}.png", rows, **drawing)
+
+    def write(folder: Path) -> None:
+        write_json(folder / f"{name}.json", rows)
+        if drawing:
+            picture(folder / f"{name}.png", rows, **drawing)
+
+    put(out, write)
     click.echo(f"{len(rows)} rows in {out / name}.json{', the picture beside it' if drawing else ''}")
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import hjbjax as hjb
 from benchmarks import cases
 from benchmarks.harness import thresholds
-from benchmarks.harness.report import RESULTS, attempt, publish, table
+from benchmarks.harness.report import RESULTS, Folder, attempt, publish, table
 from benchmarks.harness.timing import interleaved
 
 COLUMNS = (
@@ -55,7 +55,7 @@ def measure(nodes: int, lanes: int, repeats: int) -> list[dict[str, Any]]:
 @click.option("--lanes", type=click.IntRange(1), default=None, help="Problems; 64 if not given, quick 4.")
 @click.option("--nodes", type=click.IntRange(8), default=None, help="N of N x (N + 1); 100 if not given, quick 16.")
 @click.option("--repeats", type=click.IntRange(1), default=None, help="Rounds; 3 if not given, quick 1.")
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Folder of the files.")
+@click.option("--out", type=Folder(), default=RESULTS, help="Folder of the files.")
 def command(quick: bool, lanes: int | None, nodes: int | None, repeats: int | None, out: Path) -> None:
     """solve_batch of pendulums of different mass, against one solve after the other."""
     lanes, nodes, again = lanes or (4 if quick else 64), nodes or (16 if quick else 100), repeats or (1 if quick else 3)

@@ -19,7 +19,7 @@ import numpy as np
 
 import hjbjax as hjb
 from benchmarks import cases
-from benchmarks.harness.report import RESULTS, attempt, picture, stamped, table, write_json
+from benchmarks.harness.report import RESULTS, Folder, attempt, picture, put, stamped, table, write_json
 from benchmarks.harness.timing import interleaved
 from hjbjax.applications.convergence import fitted_order
 from hjbjax.applications.reference import at_nodes_of, mask_of
@@ -90,7 +90,7 @@ def _with_exponent(rows: list[dict[str, Any]], key: str, bound: float) -> list[d
 @click.option("--quick", is_flag=True, help="Small grids, one round.")
 @click.option("--repeats", type=click.IntRange(1), default=None, help="Rounds; 3 if not given, quick 1.")
 @click.option("--nodes", type=click.IntRange(8), default=None, help="N of N x (N + 1), for the part by number.")
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Folder of the files.")
+@click.option("--out", type=Folder(), default=RESULTS, help="Folder of the files.")
 def command(quick: bool, repeats: int | None, nodes: int | None, out: Path) -> None:
     """Seconds against the number of controls, and against the error."""
     again = repeats or (1 if quick else 3)
@@ -101,8 +101,12 @@ def command(quick: bool, repeats: int | None, nodes: int | None, out: Path) -> N
     rows += attempt(lambda: by_error(sizes, again), about | {"problem": "smooth, finer grids"})
     click.echo(table(rows, COLUMNS))
     rows = stamped(rows)
-    write_json(out / "controls.json", rows)
     number, error = ([row for row in rows if row.get("part") == part] for part in ("number", "error"))
-    picture(out / "controls.png", number, panel="problem", line="minimum", x=("controls", "error"), y="seconds")
-    picture(out / "controls_error.png", error, panel="problem", line="minimum", x=("error",), y="seconds")
+
+    def write(folder: Path) -> None:
+        write_json(folder / "controls.json", rows)
+        picture(folder / "controls.png", number, panel="problem", line="minimum", x=("controls", "error"), y="seconds")
+        picture(folder / "controls_error.png", error, panel="problem", line="minimum", x=("error",), y="seconds")
+
+    put(out, write)
     click.echo(f"{len(rows)} rows in {out / 'controls.json'}, pictures in {out}/controls*.png")

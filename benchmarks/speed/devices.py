@@ -25,7 +25,7 @@ import numpy as np
 import hjbjax as hjb
 from benchmarks import cases
 from benchmarks.harness import thresholds
-from benchmarks.harness.report import RESULTS, attempt, publish, table
+from benchmarks.harness.report import RESULTS, Folder, attempt, publish, table
 
 ROOT = Path(__file__).parents[2]
 COLUMNS = (
@@ -140,7 +140,7 @@ def measure(nodes: int, meshes: Sequence[Sequence[int]], repeats: int, *, timed:
 @click.option("--quick", is_flag=True, help="A small grid, one round, two devices alone.")
 @click.option("--nodes", type=click.IntRange(16), multiple=True, help="N of N x (N + 1); 800 and 1600 if not given.")
 @click.option("--repeats", type=click.IntRange(1), default=None, help="Rounds; 7 if not given, quick 1.")
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Folder of the files.")
+@click.option("--out", type=Folder(), default=RESULTS, help="Folder of the files.")
 def command(quick: bool, nodes: Sequence[int], repeats: int | None, out: Path) -> None:
     """The pendulum to 1e-3 on two devices of one processor beside one, and its outer steps on eight."""
     sizes, again = nodes or ((48,) if quick else SIZES), repeats or (1 if quick else 7)

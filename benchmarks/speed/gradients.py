@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import hjbjax as hjb
-from benchmarks.harness.report import RESULTS, attempt, publish, table
+from benchmarks.harness.report import RESULTS, Folder, attempt, publish, table
 from benchmarks.harness.thresholds import announced
 from benchmarks.harness.timing import interleaved
 
@@ -148,7 +148,7 @@ def measure(name: str, nodes: int | None, repeats: int) -> dict[str, Any]:
 @click.option("--nodes", type=click.IntRange(8), default=None, help="N of N x (N + 1); 100 if not given, quick 16.")
 @click.option("--repeats", type=click.IntRange(1), default=None, help="Rounds; 5 if not given, quick 1.")
 @click.option("--only", type=click.Choice(list(CASES)), multiple=True, help="These cases alone.")
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Folder of the file.")
+@click.option("--out", type=Folder(), default=RESULTS, help="Folder of the file.")
 def command(quick: bool, nodes: int | None, repeats: int | None, only: tuple[str, ...], out: Path) -> None:
     """Value and gradient of a solve beside the value alone."""
     nodes, repeats = nodes or (16 if quick else None), repeats or (1 if quick else 5)

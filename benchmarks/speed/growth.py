@@ -22,7 +22,7 @@ import numpy as np
 import hjbjax as hjb
 from benchmarks import cases
 from benchmarks.harness import footprint, thresholds
-from benchmarks.harness.report import RESULTS, attempt, publish, table
+from benchmarks.harness.report import RESULTS, Folder, attempt, publish, table
 from benchmarks.harness.timing import interleaved, timed
 from hjbjax.applications.convergence import fitted_order
 
@@ -117,7 +117,7 @@ def judged(rows: list[dict[str, Any]]) -> dict[str, float]:
 @click.option(
     "--time-limit", type=click.FloatRange(0, min_open=True), default=600, show_default=True, help="Of a solve."
 )
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Folder of the files.")
+@click.option("--out", type=Folder(), default=RESULTS, help="Folder of the files.")
 def command(
     quick: bool,
     names: tuple[str, ...],

@@ -25,7 +25,7 @@ import numpy as np
 
 import hjbjax as hjb
 from benchmarks.harness import footprint
-from benchmarks.harness.report import RESULTS, attempt, publish, table
+from benchmarks.harness.report import RESULTS, Folder, attempt, publish, table
 from benchmarks.harness.timing import interleaved
 from hjbjax.applications.convergence import fitted_order
 from hjbjax.filtering import BeliefProblem, belief_problem
@@ -125,7 +125,7 @@ def _with_exponents(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 @click.command()
 @click.option("--quick", is_flag=True, help="Small grids, one round.")
 @click.option("--repeats", type=click.IntRange(1), default=None, help="Rounds; 3 if not given, quick 1.")
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Folder of the files.")
+@click.option("--out", type=Folder(), default=RESULTS, help="Folder of the files.")
 def command(quick: bool, repeats: int | None, out: Path) -> None:
     """Nodes, bytes, seconds and errors of beliefs on grids, beside the counts of section 13.2."""
     again = repeats or (1 if quick else 3)

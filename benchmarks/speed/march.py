@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import hjbjax as hjb
-from benchmarks.harness.report import RESULTS, attempt, publish, table, threads, without
+from benchmarks.harness.report import RESULTS, Folder, attempt, publish, table, threads, without
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import time_stepping
 from hjbjax.solvers import finite_horizon, march_run
@@ -189,7 +189,7 @@ def measure(problem: Any, grid: Any, accuracy: str, steps: int, runs: int) -> li
 @click.option("--steps", default=6, help="Our time steps in one run.")
 @click.option("--runs", default=5, help="Runs of each, in turn.")
 @click.option("--problem", "wanted", default=None, help="Air3D or 4-D car; both without.")
-@click.option("--out", type=click.Path(path_type=Path), default=RESULTS, help="Folder for march.json.")
+@click.option("--out", type=Folder(), default=RESULTS, help="Folder for march.json.")
 def command(quick: bool, scale: float, steps: int, runs: int, wanted: str | None, out: Path) -> None:
     if quick:
         scale, steps, runs = 0.1, 2, 1

@@ -25,7 +25,7 @@ import numpy as np
 import hjbjax as hjb
 from benchmarks import cases
 from benchmarks.harness import thresholds
-from benchmarks.harness.report import RESULTS, attempt, publish, table, threads, without
+from benchmarks.harness.report import RESULTS, Folder, attempt, publish, table, threads, without
 from benchmarks.harness.timing import interleaved, timed
 from benchmarks.peers import decision
 
@@ -159,7 +159,7 @@ def judged(rows: list[dict[str, Any]]) -> dict[str, float]:
 @click.option("--repeats", type=click.IntRange(1), default=None, help="Rounds; 5 if not given, quick 1.")
 @click.option("--controls", type=click.IntRange(2), default=21, show_default=True)
 @click.option("--tol", type=click.FloatRange(0, min_open=True), default=1e-3, show_default=True)
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Folder of the files.")
+@click.option("--out", type=Folder(), default=RESULTS, help="Folder of the files.")
 def command(quick: bool, nodes: tuple[int, ...], repeats: int | None, controls: int, tol: float, out: Path) -> None:
     """A certified solve beside QuantEcon, mdpsolver and a hand-written numba solver, on one chain."""
     sizes = nodes or ((26, 52) if quick else (200, 400, 800, 1600))

@@ -15,7 +15,7 @@ import numpy as np
 import hjbjax as hjb
 from benchmarks import cases
 from benchmarks.harness import footprint
-from benchmarks.harness.report import RESULTS, attempt, publish, table
+from benchmarks.harness.report import RESULTS, Folder, attempt, publish, table
 from benchmarks.harness.timing import interleaved
 from benchmarks.speed import growth
 
@@ -54,7 +54,7 @@ def measure(dimension: int, nodes: int, repeats: int) -> list[dict[str, Any]]:
 @click.option("--dimension", "dimensions", multiple=True, type=click.IntRange(1, 6), help="Only this one; repeatable.")
 @click.option("--repeats", type=click.IntRange(1), default=None, help="Warm solves; 3 if not given, quick 1.")
 @click.option("--times", type=click.IntRange(1), default=1, help="So many times the nodes in all, for a GPU.")
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Folder of the files.")
+@click.option("--out", type=Folder(), default=RESULTS, help="Folder of the files.")
 def command(quick: bool, dimensions: tuple[int, ...], repeats: int | None, times: int, out: Path) -> None:
     """The N^n law: seconds, steps and bytes a node in one to six dimensions."""
     rows: list[dict[str, Any]] = []

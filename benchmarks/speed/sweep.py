@@ -24,7 +24,7 @@ import hjbjax as hjb
 from benchmarks import cases
 from benchmarks.harness import thresholds
 from benchmarks.harness.footprint import bytes_of
-from benchmarks.harness.report import RESULTS, attempt, publish, table, threads, without
+from benchmarks.harness.report import RESULTS, Folder, attempt, publish, table, threads, without
 from benchmarks.harness.timing import interleaved
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.rates import fastest_rate
@@ -277,7 +277,7 @@ def judged(rows: list[dict[str, Any]]) -> dict[str, float]:
 @click.option("--repeats", type=click.IntRange(1), default=None, help="Rounds; 9 if not given, quick 2.")
 @click.option("--controls", type=click.IntRange(2), default=21, show_default=True, help="Of the pendulum.")
 @click.option("--few", type=click.IntRange(2), default=3, show_default=True, help="Controls in the other dimensions.")
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Folder of the files.")
+@click.option("--out", type=Folder(), default=RESULTS, help="Folder of the files.")
 def command(quick: bool, repeats: int | None, controls: int, few: int, out: Path) -> None:
     """Node-controls per second of one sweep, against numba and against the copy bandwidth."""
     repeats = repeats or (2 if quick else 9)

@@ -94,6 +94,16 @@ def staging(out: Path) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)  # the next command's sweep takes what could not be removed
 
 
+def check_writable(out: Path) -> None:
+    """Check that files can be written into a folder, which need not exist yet.
+
+    Raises:
+      OSError: they cannot.
+    """
+    with staging(out):
+        pass
+
+
 def publish(folder: Path, out: Path, made: Sequence[str], force: bool = False) -> None:
     """Move whole files into ``out``; an older file that has no successor goes with the result it belonged to.
 

@@ -60,7 +60,13 @@ class Expendable:
         self._stream, self.encoding = stream, encoding_of(stream)
 
     def write(self, text: str) -> int:
-        """Write a text if the stream accepts it; the number of its characters."""
+        """Write a text if the stream accepts it; the number of its characters.
+
+        Raises:
+          TypeError: bytes, by which some libraries find out whether a stream is one of text.
+        """
+        if not isinstance(text, str):
+            raise TypeError(f"write() argument must be str, not {type(text).__name__}")
         with contextlib.suppress(Exception):
             self._stream.write(text)
         return len(text)

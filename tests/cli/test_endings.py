@@ -348,3 +348,16 @@ def test_the_commands_that_have_something_to_keep(quick, monkeypatch, words):
         signal.signal(signal.SIGINT, before)
     assert (result.exit_code, result.stderr) == (130, "hjbjax: interrupted\n")
     assert os.listdir() == []
+
+
+# --- a broken installation ---
+
+
+def test_doctor_reports_a_jax_that_cannot_be_imported(folder):
+    (folder / "jax").mkdir()
+    (folder / "jax" / "__init__.py").write_text("raise ImportError('libcudart.so: cannot open shared object file')")
+    done = process("doctor", code=f"import sys; sys.path.insert(0, {str(folder)!r})")
+    assert done.returncode == 1
+    lines = {line.split()[1]: line for line in done.stdout.splitlines()}
+    assert "FAIL  devices     ImportError: libcudart.so: cannot open" in lines["devices"]
+    assert lines["folder"].startswith("ok")

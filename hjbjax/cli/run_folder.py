@@ -84,7 +84,7 @@ def staging(out: Path) -> Iterator[Path]:
     except OSError as error:
         raise OSError(f"{out} cannot be written: {error.strerror}; give another folder") from error
     try:
-        with placement.claimed(folder):
+        with placement.claim(folder):
             yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)  # the next command's sweep takes what could not be removed

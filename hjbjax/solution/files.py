@@ -110,12 +110,17 @@ def write_archive(stream: IO[bytes], header: Mapping[str, Any], arrays: Mapping[
     text = json.dumps({**header, "arrays": sorted(arrays)}, default=_plain).encode()
     if len(text) > MAX_HEADER - 1000:  # the entry's own header takes some of it
         raise OSError(f"message and statistics take {len(text):,} bytes of {MAX_HEADER:,}")
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED) as archive:
+    archive = zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED)
+    try:
         for name, array in {"header": np.frombuffer(text, np.uint8), **arrays}.items():
             info = zipfile.ZipInfo(name + ".npy")  # dated 1980: equal solutions make equal files
             # zip64, as an entry that is written piece by piece may pass 2 GiB after its header is written
             with archive.open(info, "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, np.asarray(array, order="C"), allow_pickle=False)
+        archive.close()
+    except BaseException:
+        archive.fp = None  # what closing it would raise then hides Ctrl-C, and the reason of a failure
+        raise
 
 
 def with_suffix(path: str) -> str:

@@ -122,14 +122,17 @@ def finish(stream: IO[bytes]) -> None:
 
 
 def try_place(path: str) -> None:
-    """Write a small file next to ``path`` and remove it again.
+    """Write a small file next to the file at ``path``, which a run will replace, and remove it again.
 
     Raises:
-      FileError: no file can be written there.
+      FileError: no file can be written there, or that file belongs to another user, in a folder like /tmp.
     """
     with new_file(path) as (_, stream):
         stream.write(bytes(BLOCK))
         finish(stream)
+        folder, old = os.stat(os.path.dirname(path)), os.stat(path)
+        if folder.st_mode & stat.S_ISVTX and os.geteuid() not in (0, folder.st_uid, old.st_uid):
+            raise FileError(f"{path}: cannot be written: in this folder only the owner of a file may replace it")
 
 
 def place(source: str | os.PathLike[str], path: str | os.PathLike[str], force: bool) -> None:

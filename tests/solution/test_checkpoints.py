@@ -501,7 +501,8 @@ def test_a_state_of_another_size_is_refused(tmp_path, door, monkeypatch):
     if door == "march":  # more slices than there are times
         more = {f"run_0_{i}": lambda array: np.resize(array, (9, *array.shape[1:])) for i in range(1, 7)}
         forgeries += [{**more, "run_0_0": lambda count: count - count + 9}]
-        forgeries += [{"run_0_0": lambda count: count - 9}]
+        none = {f"run_0_{i}": lambda array: array[:0] for i in range(1, 7)}
+        forgeries += [{**none, "run_0_0": lambda count: count - count - 1}]
     for forgery in forgeries:
         forge(sound, path, forgery)
         with pytest.raises(hjb.FileError, match=f"^{door}: .*run.npz: cannot be read: it holds a state that this run"):

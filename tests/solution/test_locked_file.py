@@ -220,13 +220,24 @@ def test_where_there_are_no_locks_no_handle_is_kept(path, monkeypatch):
 
 
 def test_a_trial_leaves_nothing(path, monkeypatch):
-    placement.try_place(path)
-    assert os.listdir(os.path.dirname(path)) == []
-
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(FileError, match=r"run\.npz: cannot be written: No space left"):
+    files.write_whole(path, text("one"))
+    placement.try_place(path)
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        with pytest.raises(FileError, match=r"run\.npz: cannot be written: No space left"):
+            placement.try_place(path)
+    assert os.listdir(os.path.dirname(path)) == ["run.npz"]
+
+
+def test_in_a_shared_folder_a_trial_finds_the_file_of_another_user(path, monkeypatch):
+    files.write_whole(path, text("one"))
+    folder, user = os.path.dirname(path), os.geteuid()
+    os.chmod(folder, 0o1777)
+    placement.try_place(path)
+    monkeypatch.setattr(os, "geteuid", lambda: user + 1)
+    with pytest.raises(FileError, match="in this folder only the owner of a file may replace it"):
         placement.try_place(path)
-    assert os.listdir(os.path.dirname(path)) == []
+    assert os.listdir(folder) == ["run.npz"]

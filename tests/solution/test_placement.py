@@ -211,6 +211,16 @@ def test_a_file_that_is_replaced_keeps_its_mode_and_its_owner(tmp_path, kept):
 
 
 @posix
+def test_a_file_that_is_moved_over_another_takes_its_mode(tmp_path):
+    """As the files of a command, which are made in a folder of their own."""
+    for name, text in (("made", "new"), ("old", "old")):
+        (tmp_path / name).write_text(text)
+    os.chmod(tmp_path / "old", 0o600)
+    placement.place(tmp_path / "made", tmp_path / "old", force=True)
+    assert (mode(tmp_path / "old"), (tmp_path / "old").read_text()) == (0o600, "new")
+
+
+@posix
 @pytest.mark.parametrize(("mask", "wanted"), [(0o022, 0o644), (0o077, 0o600), (0o002, 0o664)])
 @pytest.mark.parametrize("force", [False, True])
 def test_the_mode_of_a_new_file_follows_the_umask(tmp_path, mask, wanted, force):

@@ -88,7 +88,7 @@ def staging(out: Path) -> Iterator[Path]:
             raise OSError(f"{out} cannot be written: {error.strerror}; give another folder") from error
         if missing:
             shutil.rmtree(folder / missing[0])
-        with placement.claimed(folder):
+        with placement.claim(folder):
             yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)  # the next command's sweep takes what could not be removed

@@ -1,4 +1,4 @@
-"""A solution as a header and arrays, and back: what of it a file holds; and as arrays with names, for other tools."""
+"""A solution as a header and arrays, and back, for result files; and as arrays with names, for other tools."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +11,7 @@ from hjbjax.problem.stretching import Sinh
 from hjbjax.solution.files import Expected, FileError
 from hjbjax.solution.status import Status
 
-if TYPE_CHECKING:  # an extra: it is imported by whoever asks for it
+if TYPE_CHECKING:  # an extra, imported when it is needed
     import xarray
 
 FORMAT, VERSION = "hjbjax.Solution", 1  # the version goes up when an older hjbjax would read a file wrongly
@@ -136,6 +136,31 @@ def dataset(solution: Any) -> "xarray.Dataset":
     kept = {key: str(value) for key, value in solution.stats.items() if isinstance(value, (str, int, float))}
     said = {"status": solution.status.name, "steps": int(solution.steps), "message": solution.message, **kept}
     return xarray.Dataset(found, {**axes, **times}, said)
+
+
+def netcdf(found: "xarray.Dataset") -> bytes:
+    """A dataset as the bytes of a netCDF file.
+
+    A slash in a name, which means a path of groups in netCDF, is written as the fraction slash, ⁄.
+
+    Raises:
+      ImportError: h5netcdf is not installed.
+    """
+    try:
+        import h5netcdf
+        import h5py
+        from xarray.backends import H5NetCDFStore
+    except ImportError:
+        raise ImportError("Solution.to_netcdf needs h5netcdf: pip install 'hjbjax[io]'") from None
+    found = found.rename({name: name.replace("/", "⁄") for name in map(str, found.variables) if "/" in name})
+    # HDF5 ends the process if it cannot close a file, as on a full disk: so it writes into memory, where it always can.
+    # netCDF's own library wants the order of attributes tracked.
+    with h5py.File("memory", "w", driver="core", backing_store=False, track_order=True) as image:
+        with h5netcdf.File(image, "w") as file:
+            # without xarray's lock, which Ctrl-C may leave locked for good: nobody else knows this file
+            found.dump_to_store(H5NetCDFStore(file, lock=False))
+        image.flush()
+        return image.id.get_file_image()
 
 
 def _input(labels: Labels, kind: str, j: int, count: int) -> tuple[str, str]:

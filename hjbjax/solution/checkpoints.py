@@ -1,20 +1,21 @@
-"""Checkpoints: what a run had done when it was cut, in a file, and going on from there with the same bits.
+"""Checkpoints: the state of a run in a file, from which a later run goes on to the same bits.
 
-A run is a sequence of parts, each a computation in steps whose state holds all there is: coarser grids, the way to a
-guess, the monotone solve, the one of second order. What lies between two parts is computed again and comes to the same,
-on the same machine with the same versions; so the states of the parts that are done, and of the one under way, are all
-that a file has to hold. Files are written whole or not at all: whenever a run is killed there is the old one or the
+A run is a sequence of parts, each a computation in steps whose state holds everything it needs: coarser grids, the path
+to a guess, the monotone solve, the one of second order. Whatever happens between two parts is computed again, with the
+same result on the same machine with the same versions; so a file holds only the states of the parts that are done and
+of the one under way. Files are written whole or not at all: whenever a run is killed, its file is the old one or the
 new one.
+
+A run makes its file before it computes anything, which tries the place, and holds it locked until its end.
 """
 
 import contextlib
 import dataclasses
 import hashlib
-import os
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Protocol
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import IO, Any, Protocol
 
 import jax
 import numpy as np
@@ -23,10 +24,11 @@ from hjbjax._version import __version__
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.solution import files
+from hjbjax.solution import files, placement
 from hjbjax.solution.clock import agreed
 from hjbjax.solution.files import Expected, FileError
-from hjbjax.solution.placement import Path, check_place, path_of
+from hjbjax.solution.locked_file import LockedFile
+from hjbjax.solution.placement import Path
 from hjbjax.solution.status import Status, warn
 from hjbjax.tracing import closures
 from hjbjax.tracing.outside import ADDRESS
@@ -34,20 +36,20 @@ from hjbjax.tracing.outside import ADDRESS
 FORMAT, VERSION = "hjbjax.Checkpoint", 1
 SECONDS = 60.0  # between two writes
 KINDS = tuple(map(np.dtype, ("f8", "f4", "i8", "i4", "u4", "u1", "?")))  # of the arrays in a state
-# how a part ends that is not done: from there it goes on
+# the ends of a part that is not done: a later run goes on from there
 CUT_SHORT = (Status.INTERRUPTED, Status.TIME_LIMIT, Status.MAX_STEPS, Status.RUNNING)
 
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """Where a run keeps what it has done, and how often.
+    """The file that keeps the state of a run, and how often it is written.
 
     Args:
-      path: the file; ``.npz`` is put behind a name without a suffix.
-      every: seconds between two writes; what is cut by hand or by a limit is written in any case.
+      path: the file; ``.npz`` is added to a name without a suffix.
+      every: seconds between two writes; a run that ends for any reason also writes at its end.
 
     Raises:
-      ValueError: a time that is not positive; infinity writes at the end alone.
+      ValueError: a time that is not positive; infinity writes at the end only.
 
     Example:
       >>> Checkpoint("run.npz", every=600.0)
@@ -66,34 +68,43 @@ class Part(Protocol):
 
     @property
     def passing(self) -> bool:
-        """Whether its end is a guess for the part that follows, and nothing else."""
+        """True if its result is only a guess for the next part."""
 
     def saved(self) -> list[Any]:
-        """Its state, as arrays in an order of its own."""
+        """Its state, as a list of arrays."""
 
     def restore(self, arrays: list[np.ndarray]) -> None:
-        """Go on from the arrays of ``saved``."""
+        """Go on from the arrays of ``saved``.
+
+        Raises:
+          ValueError: the arrays are not a state of this part.
+        """
 
 
 @dataclasses.dataclass(frozen=True)
 class Record:
-    """What is known of a part: its arrays, how it stands, and whether it is done.
+    """The state of a part, and how it ended.
 
-    A part that only led to a guess has no arrays any more when the next one has begun.
+    A part that only led to a guess keeps no arrays once the next part has begun.
     """
 
     arrays: Sequence[np.ndarray]
     status: Status
-    done: bool
     passing: bool
+
+    @property
+    def done(self) -> bool:
+        """True if no step is left to be taken."""
+        # the path to a guess is given a number of steps, and ends with them
+        return self.status not in CUT_SHORT or (self.passing and self.status is Status.MAX_STEPS)
 
 
 class Journal:
     """The parts of a run: those that are done, and the one under way.
 
     Args:
-      file: what holds them, maybe beside those of other runs.
-      records: those of an earlier process.
+      file: the file that holds them, maybe with those of other lanes.
+      records: those of an earlier run.
     """
 
     def __init__(self, file: "File", records: Sequence[Record] = ()):
@@ -102,38 +113,44 @@ class Journal:
         self._closed = False
 
     def enter(self, part: Part) -> Status | None:
-        """Put a part to where it stood: how it ended if it is done, else None."""
+        """Bring a part to its recorded state; its status if it is done, otherwise None.
+
+        Raises:
+          FileError: the record is not one of this part.
+        """
         if self._closed or self._at >= len(self.records):
             return None
         record = self.records[self._at]
-        if record.arrays:
-            self.file.check(part.saved(), record.arrays)
-            part.restore(list(record.arrays))
+        forgotten = record.passing and not record.arrays and self._at + 1 < len(self.records)
+        if not forgotten:
+            try:
+                part.restore(list(record.arrays))
+            except ValueError as error:
+                raise self.file.refusal(f"it holds a state that this run cannot have: {error}") from error
         self._at += record.done
         return record.status if record.done else None
 
     def keep(self, part: Part) -> None:
         """Write the state of the part under way, if it is time for that."""
         if not self._closed and self.file.is_due():
-            self._note(part, Status.RUNNING, done=False)
+            self._note(part, Status.RUNNING)
             self.file.write()
 
     def leave(self, part: Part, status: Status) -> None:
-        """Note the end of a part, or how far it came; after a cut nothing counts that follows."""
+        """Record the end of a part, or how far it came; after a cut nothing else is recorded."""
         if self._closed:
             return
-        # no more steps than these were to be taken on the way to a guess
-        done = status not in CUT_SHORT or (part.passing and status is Status.MAX_STEPS)
-        self._note(part, status, done=done)
+        self._note(part, status)
+        done = self.records[-1].done
         self._at, self._closed = self._at + done, not done
 
-    def _note(self, part: Part, status: Status, *, done: bool) -> None:
-        """Record the state of the part under way, and forget those that led to where it began."""
+    def _note(self, part: Part, status: Status) -> None:
+        """Record the state of the part under way, and forget the states that led to where it began."""
         before = [dataclasses.replace(each, arrays=()) if each.passing else each for each in self.records[: self._at]]
-        # on a CPU these are views of JAX's arrays, which a step may take for its own
+        # copied before a next step: a view of JAX's array keeps that step from reusing the array's memory
         keep = np.array if status is Status.RUNNING else np.asarray
         arrays = [keep(array) for array in jax.device_get(part.saved())]
-        self.records = [*before, Record(arrays, status, done, part.passing)]
+        self.records = [*before, Record(arrays, status, part.passing)]
         self.file.changed = True
 
 
@@ -141,21 +158,26 @@ class File:
     """The journals of one run, or of the lanes of a batch, in one file.
 
     Args:
-      checkpoint: where it is, and how often it is written.
-      asked: what was asked, as digests and words; a file that was made for anything else is refused.
-      known: the records of an earlier process, by the names of their journals.
-      together: whether many processes solve one problem, of which the first one writes.
+      checkpoint: the path and the seconds between two writes.
+      question: the question as digests and words; see ``describe_question``.
+      known: the records of an earlier run, by the names of their journals.
+      target: the file; None in a process that leaves the writing to another one.
+      caller: the function that was called, for messages.
+      together: True if many processes solve one problem.
     """
 
     def __init__(
         self,
         checkpoint: Checkpoint,
-        asked: Mapping[str, str],
+        question: Mapping[str, str],
         known: Mapping[str, Sequence[Record]],
+        target: LockedFile | None,
         *,
+        caller: str = "solve",
         together: bool = False,
     ):
-        self.checkpoint, self.asked, self.known, self.together = checkpoint, dict(asked), dict(known), together
+        self.checkpoint, self.question, self.known = checkpoint, dict(question), dict(known)
+        self.target, self.caller, self.together = target, caller, together
         self.journals: dict[str, Journal] = {}
         self.changed = False
         self.failure: str | None = None  # why it could not be written
@@ -163,57 +185,72 @@ class File:
 
     @property
     def outcome(self) -> str:
-        """What to say of it at the end: written, or why not."""
+        """The word for the end of the run: "written", or why not."""
         return self.failure or "written"
 
     def journal(self, name: str = "run") -> Journal:
-        """The journal of a run, with what is known of it."""
+        """The journal of a run, with the records of an earlier one."""
         return self.journals.setdefault(name, Journal(self, self.known.get(name, ())))
 
     def is_due(self) -> bool:
-        """Whether it is time to write."""
+        """True if it is time to write."""
         due = time.monotonic() - self._written >= self.checkpoint.every
-        # what is written is gathered from all processes, and all of them have to ask
+        # the state is gathered from all processes, so all of them have to agree
         return bool(agreed(int(due))) if self.together else due
 
+    def records(self) -> dict[str, Sequence[Record]]:
+        """All records by the names of their journals, with those of lanes that have not begun yet."""
+        begun = {name: each.records for name, each in dict(self.journals).items()}  # copied: lanes begin meanwhile
+        return {**self.known, **begun}
+
     def write(self) -> None:
-        """Write what has changed; where that fails the run goes on, with one warning."""
+        """Write what has changed; if that fails the run goes on, with one warning."""
         with self._lock:
-            if not self.changed or (self.together and jax.process_index() > 0):
+            if not self.changed or self.target is None:
                 return
             self.changed = False
-            # copied: lanes begin meanwhile; and with those of lanes that have not begun yet
-            begun = {name: each.records for name, each in dict(self.journals).items()}
-            records: dict[str, Sequence[Record]] = {**self.known, **begun}
             try:
-                files.write(self.checkpoint.path, self._header(records), dict(_arrays(records)), force=True)
-            except (FileError, OSError) as error:
+                self.target.write(_archive(self.question, self.records()))
+            except OSError as error:
                 if self.failure is None:
-                    warn(f"the run goes on without a checkpoint: {error}")
+                    warn(f"{self.caller}: the run goes on without a checkpoint: {error}")
                 self.failure, self.changed = str(error), True
             else:
                 self.failure = None
             self._written = time.monotonic()
 
-    def _header(self, records: Mapping[str, Sequence[Record]]) -> dict[str, Any]:
-        """What stands beside the arrays."""
-        journals = {
-            name: [
-                [int(each.status), each.done, each.passing, [[list(a.shape), a.dtype.str] for a in each.arrays]]
-                for each in some
-            ]
-            for name, some in records.items()
-        }
-        return {
-            "format": FORMAT, "version": VERSION, "asked": self.asked, "versions": versions(), "journals": journals,
-        }  # fmt: skip
+    def refusal(self, reason: str) -> FileError:
+        """The refusal of what the file holds."""
+        return FileError(f"{self.caller}: {self.checkpoint.path!s}: cannot be read: {reason}")
 
-    def check(self, state: Sequence[Any], arrays: Sequence[np.ndarray]) -> None:
-        """Refuse arrays that are not those of a part's state."""
-        wanted, found = ([(np.shape(a)[1:], np.asarray(a).dtype) for a in each] for each in (state, arrays))
-        # a leading axis may be of residuals, or of slices: of these there are as many as the run had come to
-        if wanted != found:
-            raise FileError(f"{self.checkpoint.path!s}: it holds another state than the run it is to go on with has")
+
+def check_alike(arrays: Sequence[np.ndarray], wanted: Sequence[Any]) -> None:
+    """Compare number, shapes and dtypes of arrays with those of others.
+
+    Raises:
+      ValueError: they differ.
+    """
+    found, own = ([f"{np.asarray(each).dtype}{list(np.shape(each))}" for each in some] for some in (arrays, wanted))
+    if len(found) != len(own):
+        raise ValueError(f"it has {len(found)} arrays, wanted {len(own)}")
+    for one, other in zip(found, own, strict=True):
+        if one != other:
+            raise ValueError(f"one of its arrays is {one}, wanted {other}")
+
+
+def _archive(question: Mapping[str, str], records: Mapping[str, Sequence[Record]]) -> Callable[[IO[bytes]], None]:
+    """A function that writes all records to a stream."""
+    journals = {
+        name: [
+            [int(each.status), each.done, each.passing, [[list(a.shape), a.dtype.str] for a in each.arrays]]
+            for each in some
+        ]
+        for name, some in records.items()
+    }
+    header = {
+        "format": FORMAT, "version": VERSION, "asked": dict(question), "versions": versions(), "journals": journals,
+    }  # fmt: skip
+    return lambda stream: files.write_archive(stream, header, dict(_arrays(records)))
 
 
 def _arrays(records: Mapping[str, Sequence[Record]]) -> Iterator[tuple[str, np.ndarray]]:
@@ -230,57 +267,121 @@ def _name(journal: str, part: int, array: int) -> str:
 
 
 def versions() -> dict[str, str]:
-    """What the bits of an answer depend on beside the question."""
+    """The versions and the device on which the last bits of an answer depend."""
     return {"hjbjax": __version__, "jax": jax.__version__, "device": str(jax.devices()[0].device_kind)}
 
 
 @contextlib.contextmanager
-def opened(
+def open_checkpoint(
     checkpoint: Path | Checkpoint | None,
     problems: Sequence[Problem],
     grid: Grid,
     *,
     resume: bool,
-    what: str,
+    caller: str,
     together: bool = False,
     **others: Any,
 ) -> Iterator[File | None]:
-    """Context with the file of a run, which is written at its end; None where there is to be none.
+    """Context with the file of a run, which is written at its end; None without a checkpoint.
+
+    The file is locked for the whole run. A new one is made at once; if the run ends with an exception before it has
+    anything to keep, the file is removed again.
 
     Args:
-      checkpoint: the file, or that and how often it is written.
-      problems: one, or those of all lanes.
+      checkpoint: the file, or a ``Checkpoint``.
+      problems: one problem, or those of all lanes.
       grid: the nodes.
-      resume: whether to go on from the file, if it is there.
-      what: the function that was called, for messages.
-      together: whether many processes solve the problem.
-      others: what else decides the answer.
+      resume: go on from the file, if there is one.
+      caller: the function that was called, for messages.
+      together: True if many processes solve the problem.
+      others: the other arguments that decide the answer.
 
     Raises:
       ValueError: ``resume`` without a checkpoint.
-      FileExistsError: the file is there, and ``resume`` is false.
-      FileError: the file cannot be read, or is that of another question.
+      FileExistsError: the file exists, and ``resume`` is false.
+      FileError: the file cannot be read or written, belongs to another question, or another run is using it.
     """
     if checkpoint is None:
         if resume:
-            raise ValueError(f"{what}: resume=True goes on from a checkpoint; give checkpoint=, the file")
+            raise ValueError(f"{caller}: resume=True goes on from a checkpoint; give checkpoint=, the file")
         yield None
         return
-    kept = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(checkpoint)
-    kept = dataclasses.replace(kept, path=_place_of(kept.path))
-    there = os.path.lexists(kept.path)
-    if there and not resume:
-        raise FileExistsError(f"{kept.path!s}: there is a checkpoint already; resume=True goes on from it")
-    question = asked(problems, grid, **others)
-    file = File(kept, question, _read(kept.path, question) if there else {}, together=together)
+    with _named_after(caller):
+        kept = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(checkpoint)
+        path = placement.absolute(files.with_suffix(placement.path_of(kept.path, "written")))
+        kept, target = dataclasses.replace(kept, path=path), LockedFile(path)
+    question = describe_question(problems, grid, **others)
+    with contextlib.closing(target):
+        with _named_after(caller):
+            known = (_begin_together if together else _begin)(target, question, resume=resume)
+        writes = not together or jax.process_index() == 0
+        file = File(kept, question, known, target if writes else None, caller=caller, together=together)
+        try:
+            yield file
+        except BaseException:
+            if not any(file.records().values()):
+                target.remove()
+            raise
+        finally:
+            file.write()
+
+
+@contextlib.contextmanager
+def _named_after(caller: str) -> Iterator[None]:
+    """Context in which refusals of files begin with the function that was called."""
     try:
-        yield file
-    finally:
-        file.write()
+        yield
+    except (FileError, FileExistsError) as error:
+        raise type(error)(f"{caller}: {error}") from error.__cause__
 
 
-def asked(problems: Sequence[Problem], grid: Grid, **others: Any) -> dict[str, str]:
-    """What a run is asked, by digests and words: settled problems, their grid and what else decides the answer."""
+def _begin(target: LockedFile, question: Mapping[str, str], *, resume: bool) -> dict[str, list[Record]]:
+    """The records of an earlier run, from the file that is locked from now on; a new one holds none.
+
+    Raises:
+      FileExistsError: the file exists, and ``resume`` is false.
+      FileError: it is in use, or made for another question, or no file can be written there.
+    """
+    empty = _archive(question, {})
+    if not resume:
+        try:
+            target.write(empty)
+        except FileExistsError:
+            raise FileExistsError(
+                f"{target.path}: there is a checkpoint already; resume=True goes on from it"
+            ) from None
+        return {}
+    while not target.take():
+        with contextlib.suppress(FileExistsError):  # another run was faster, and ``take`` reports that
+            target.write(empty)
+            return {}
+    placement.try_place(target.path)
+    return _read(target.path, question)
+
+
+def _begin_together(target: LockedFile, question: Mapping[str, str], *, resume: bool) -> dict[str, list[Record]]:
+    """The same in each of many processes that solve one problem: the first one locks the file, the others read it."""
+    first, known = jax.process_index() == 0, {}
+    with _in_all_processes(target.path):
+        known = _begin(target, question, resume=resume) if first else {}
+    with _in_all_processes(target.path):
+        return known if first or not resume else _read(target.path, question)
+
+
+@contextlib.contextmanager
+def _in_all_processes(path: str) -> Iterator[None]:
+    """Context that all processes leave together; an exception in one of them is one in all, and nobody waits."""
+    try:
+        yield
+    except Exception:
+        agreed(0)
+        raise
+    if not agreed(1):
+        raise FileError(f"{path}: another process of this run could not open it")
+
+
+def describe_question(problems: Sequence[Problem], grid: Grid, **others: Any) -> dict[str, str]:
+    """The question of a run in digests and words: problems with settled functions, the grid, and other arguments."""
     about = (
         grid.shape,
         grid.periodic,
@@ -300,31 +401,19 @@ def asked(problems: Sequence[Problem], grid: Grid, **others: Any) -> dict[str, s
     return found
 
 
-def _place_of(path: Path) -> str:
-    """The file of a checkpoint, in a folder where it can be written; that is known before anything is computed."""
-    place = files.with_suffix(path_of(path, "written"))
-    folder = os.path.dirname(os.path.abspath(place))
-    if not os.path.isdir(folder) or not os.access(folder, os.W_OK):
-        raise FileError(f"{place}: cannot be written: {folder} is no folder in which one may write")
-    check_place(place, force=True)
-    return place
-
-
-def _read(path: Path, asked: Mapping[str, str]) -> dict[str, list[Record]]:
-    """The records in a file by the names of their journals; it must be of the same question."""
+def _read(path: str, question: Mapping[str, str]) -> dict[str, list[Record]]:
+    """The records in a file by the names of their journals; the file must have been made for the same question."""
 
     def rebuild(header: dict, arrays: dict[str, np.ndarray]) -> dict[str, list[Record]]:
         made_for = header["asked"]
-        if other := sorted(key for key in asked.keys() | made_for.keys() if asked.get(key) != made_for.get(key)):
-            raise FileError(f"it was made for another {' and '.join(other)}; give another path, or take the file away")
+        if other := sorted(key for key in question.keys() | made_for.keys() if question.get(key) != made_for.get(key)):
+            raise FileError(f"it was made for another {' and '.join(other)}; give another path, or remove the file")
         if header["versions"] != versions():
-            warn(f"{path!s}: the checkpoint was made with {header['versions']}; the last bits of the answer may differ")
+            warn(f"{path}: the checkpoint was made with {header['versions']}; the last bits of the answer may differ")
         return {
             name: [
-                Record(
-                    [arrays[_name(name, i, j)] for j in range(len(shapes))], Status(status), bool(done), bool(passing)
-                )
-                for i, (status, done, passing, shapes) in enumerate(parts)
+                Record([arrays[_name(name, i, j)] for j in range(len(shapes))], Status(status), bool(passing))
+                for i, (status, _, passing, shapes) in enumerate(parts)
             ]
             for name, parts in header["journals"].items()
         }

@@ -1,10 +1,9 @@
 """Result files: npz archives written whole or not at all, and read with suspicion.
 
-A file is an uncompressed zip of npy arrays, one of which, ``header``, is JSON in UTF-8. Writing goes to a
-temporary file in the same folder, then flush, fsync and ``os.replace``: after a crash at any time the file is
-the old one or the new one. Without leave to replace it ends in ``os.link``, which fails where another writer was
-faster. What a killed writer left behind is taken away by the next one in that folder. Reading never unpickles,
-and believes no declared size that the file's own size does not bear out, so that a claim of 8 TB costs nothing.
+A file is an uncompressed zip of npy arrays, one of which, ``header``, is JSON in UTF-8. Writing goes to a temporary
+file in the same folder, then flush, fsync and the move of ``placement``: after a crash at any time the file is the old
+one or the new one. What a killed writer left behind is removed by the next writer in that folder. Reading never
+unpickles, and believes no declared size that exceeds the file's own size, so that a claim of 8 TB costs nothing.
 Every failure is one ``FileError``.
 """
 
@@ -28,11 +27,10 @@ from hjbjax.solution.placement import (
     Path,
     absolute,
     check_place,
-    claimed,
-    hidden_name,
+    finish,
+    new_file,
     path_of,
     place,
-    sweep,
 )
 
 T = TypeVar("T")
@@ -76,10 +74,10 @@ def write(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray
     """Write a header and arrays atomically.
 
     Args:
-      path: where to; ``.npz`` is put behind a name without a suffix, unless that very name is there.
+      path: the file; ``.npz`` is added to a name without a suffix, unless a file of that very name exists.
       header: JSON values; NumPy scalars and arrays in it become numbers and lists, anything else its text.
       arrays: numbers or booleans by name.
-      force: whether an existing file may be replaced.
+      force: replace an existing file, whose permissions are kept.
 
     Raises:
       FileExistsError: the file exists and ``force`` is false; or another process made it meanwhile.
@@ -87,54 +85,47 @@ def write(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray
         name; no half file is left.
     """
     path = with_suffix(path_of(path, "written"))
-    # A damaged table of contents may hide whole entries, and no checksum covers it: so the header has the list.
-    text = json.dumps({**header, "arrays": sorted(arrays)}, default=_plain).encode()
-    if len(text) > MAX_HEADER - 1000:  # of which the entry's own header takes some
-        raise FileError(f"{path}: cannot be written: message and statistics take {len(text):,} bytes of {MAX_HEADER:,}")
-    members = {"header": np.frombuffer(text, np.uint8), **arrays}
-    write_whole(path, lambda file: _write_members(file, members), force=force)
+    write_whole(path, lambda stream: write_archive(stream, header, arrays), force=force)
 
 
 def write_whole(path: Path, fill: Callable[[IO[bytes]], object], *, force: bool = False) -> None:
-    """Write a file whole or not at all: ``fill`` gets it open; refusals as for ``write``."""
+    """Write a file whole or not at all: ``fill`` writes its bytes to a stream; refusals as for ``write``."""
     # through links: the file behind one is replaced, not the link
     path = absolute(path_of(path, "written"))
-    check_place(path, force)  # before the arrays are written, and once more when the file is moved
-    folder, name = os.path.split(path)
-    sweep(folder)
-    temporary = os.path.join(folder, hidden_name(name))
+    check_place(path, force)  # before the bytes are written, and again when the file is moved
+    with new_file(path) as (temporary, stream):
+        fill(stream)
+        finish(stream)
+        place(temporary, path, force)
+    _sync_folder(os.path.dirname(path))
+
+
+def write_archive(stream: IO[bytes], header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
+    """Write a header and arrays as a zip archive.
+
+    Raises:
+      OSError: a header that is too long to be read again.
+    """
+    # A damaged table of contents may hide whole entries, and no checksum covers it: so the header has the list.
+    text = json.dumps({**header, "arrays": sorted(arrays)}, default=_plain).encode()
+    if len(text) > MAX_HEADER - 1000:  # the entry's own header takes some of it
+        raise OSError(f"message and statistics take {len(text):,} bytes of {MAX_HEADER:,}")
+    archive = zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED)
     try:
-        open(temporary, "xb").close()  # first the file, then its lock: the pid in the name guards the moment between
-        with claimed(temporary):
-            with open(temporary, "r+b") as file:
-                fill(file)
-                # before the move: else a power cut may leave the new name with nothing behind it
-                file.flush()
-                os.fsync(file.fileno())
-            place(temporary, path, force)
-    except FileExistsError:  # an OSError too, and the one that ``force`` helps against
+        for name, array in {"header": np.frombuffer(text, np.uint8), **arrays}.items():
+            info = zipfile.ZipInfo(name + ".npy")  # dated 1980: equal solutions make equal files
+            # zip64, as an entry that is written piece by piece may pass 2 GiB after its header is written
+            with archive.open(info, "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.asarray(array, order="C"), allow_pickle=False)
+        archive.close()
+    except BaseException:
+        archive.fp = None  # what closing it would raise then hides Ctrl-C, and the reason of a failure
         raise
-    except OSError as error:
-        raise FileError(f"{path}: cannot be written: {error.strerror or error}") from error
-    finally:
-        if os.path.lexists(temporary):
-            os.unlink(temporary)
-    _sync_folder(folder)
 
 
 def with_suffix(path: str) -> str:
-    """The name with ``.npz``, as NumPy writes it, if it has no suffix and nothing has this name as it stands."""
+    """The name with ``.npz``, as NumPy writes it, unless it has a suffix or a file of that very name exists."""
     return path if os.path.splitext(path)[1] or os.path.lexists(path) or not path else path + ".npz"
-
-
-def _write_members(file: IO[bytes], members: Mapping[str, np.ndarray]) -> None:
-    """Write arrays as the entries of a zip archive."""
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-        for name, array in members.items():
-            info = zipfile.ZipInfo(name + ".npy")  # dated 1980: equal solutions make equal files
-            # zip64, as an entry that is written piece by piece may pass 2 GiB when its header stands already
-            with archive.open(info, "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, np.asarray(array, order="C"), allow_pickle=False)
 
 
 def _sync_folder(folder: str) -> None:

@@ -1,7 +1,8 @@
 """Files put in their place in one step, and what killed writers left on the way taken away.
 
-A file is made under a hidden name in its folder and moved when it is whole: by ``os.replace`` where an older one may
-go, else by ``os.link``, which fails if somebody else's is there by then.
+A file is made under a hidden name in its folder and moved when it is whole: by ``os.replace`` if an older file may be
+replaced, otherwise by ``os.link``, which fails if another writer's file is there by then. The new file has the mode
+of the one it replaces.
 """
 
 import contextlib
@@ -11,11 +12,11 @@ import secrets
 import shutil
 import stat
 from collections.abc import Iterator
-from typing import TypeAlias
+from typing import IO, TypeAlias
 
 try:
     import fcntl
-except ImportError:  # Windows, where nothing of a dead process is taken away
+except ImportError:  # Windows: no locks, and nothing that a dead process left is taken away
     fcntl = None  # type: ignore[assignment]
 
 Path: TypeAlias = str | bytes | os.PathLike  # what the system takes for the name of a file
@@ -23,6 +24,7 @@ NAME = 64  # bytes of a file's name that its temporary one repeats; file systems
 OWN = re.compile(
     r"\..*\.hjbjax\.tmp-(\d+)-[0-9a-f]{8}", re.DOTALL
 )  # names of what is on its way, with the writer's pid
+BLOCK = 4096  # bytes that a trial writes: what a file system allocates at least for a file
 
 
 class FileError(OSError):
@@ -30,7 +32,7 @@ class FileError(OSError):
 
 
 class MissingFileError(FileError, FileNotFoundError):
-    """A file that is not there, for whoever catches what ``open`` raises."""
+    """A file that does not exist, for callers that catch what ``open`` raises."""
 
 
 def path_of(path: Path, done: str) -> str:
@@ -41,7 +43,7 @@ def path_of(path: Path, done: str) -> str:
       done: what was to be done with the file, as in "read".
 
     Raises:
-      FileError: no path at all, or one with a null byte, which no system takes.
+      FileError: not a path, or one with a null byte, which no system takes.
     """
     try:
         text = os.fsdecode(path)
@@ -81,11 +83,11 @@ def check_place(path: str | os.PathLike[str], force: bool) -> None:
 
     Raises:
       FileExistsError: a file is there and ``force`` is false.
-      FileError: what is there is no ordinary file: to replace a device would take it from the whole machine.
+      FileError: a folder is there, or a device: to replace a device would take it from the whole machine.
     """
     try:
         mode = os.stat(path).st_mode
-    except OSError:  # nothing is there, or writing will tell
+    except OSError:  # nothing is there, or writing reports the reason
         return
     if stat.S_ISDIR(mode):
         raise FileError(f"{path}: cannot be written: it is a folder; give a file in it, as in 'run.npz'")
@@ -95,18 +97,71 @@ def check_place(path: str | os.PathLike[str], force: bool) -> None:
         raise FileExistsError(f"{path}: exists already; give another name, or force=True to replace it")
 
 
+@contextlib.contextmanager
+def new_file(path: str) -> Iterator[tuple[str, IO[bytes]]]:
+    """Context with the hidden name and the open stream of a file that ``place`` will move to ``path``.
+
+    The file is locked, and it is gone at the end unless it was moved.
+
+    Raises:
+      FileError: whatever the system refuses on the way.
+    """
+    folder, name = os.path.split(path)
+    sweep(folder)
+    temporary = os.path.join(folder, hidden_name(name))
+    try:
+        with open(temporary, "xb") as stream:
+            lock(stream.fileno())  # the pid in the name protects the file until here
+            keep_owner_and_mode(temporary, path)  # before anything is in it that others may not read
+            yield temporary, stream
+    except (FileError, FileExistsError):
+        raise
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise FileError(f"{path}: cannot be written: there is no folder {folder}") from error
+    except OSError as error:
+        raise FileError(f"{path}: cannot be written: {error.strerror or error}") from error
+    finally:
+        if os.path.lexists(temporary):
+            os.unlink(temporary)
+
+
+def finish(stream: IO[bytes]) -> None:
+    """Bring all bytes to the disk: otherwise a power cut may leave the new name with nothing behind it."""
+    stream.flush()
+    os.fsync(stream.fileno())
+    if fcntl is None:  # Windows moves no open file; elsewhere it is open, and so locked, until it is in its place
+        stream.close()
+
+
+def try_place(path: str) -> None:
+    """Write a small file next to the file at ``path``, which a run will replace, and remove it again.
+
+    Raises:
+      FileError: no file can be written there, or that file belongs to another user, in a folder like /tmp.
+    """
+    with new_file(path) as (_, stream):
+        stream.write(bytes(BLOCK))
+        finish(stream)
+        folder, old = os.stat(os.path.dirname(path)), os.stat(path)
+        if folder.st_mode & stat.S_ISVTX and os.geteuid() not in (0, folder.st_uid, old.st_uid):
+            raise FileError(f"{path}: cannot be written: in this folder only the owner of a file may replace it")
+
+
 def place(source: str | os.PathLike[str], path: str | os.PathLike[str], force: bool) -> None:
     """Move a whole file to its name in one step; without ``force`` only if that name is free at that moment.
 
+    A file that replaces another one takes over its mode and, where permitted, its owner.
+
     Raises:
-      FileExistsError: it is not.
-      OSError: whatever the system says.
+      FileExistsError: the name is taken and ``force`` is false.
+      OSError: whatever the system refuses.
     """
     check_place(path, force)
     if force:
+        keep_owner_and_mode(source, path)
         os.replace(source, path)
         return
-    # ``os.replace`` would take the place of a file that came after the check; a link fails where there is one
+    # ``os.replace`` would replace a file that came after the check; a link fails if there is one
     try:
         try:
             os.link(source, path)
@@ -117,49 +172,82 @@ def place(source: str | os.PathLike[str], path: str | os.PathLike[str], force: b
         else:
             os.unlink(source)
     except FileExistsError:
-        check_place(path, force)  # who refuses in the user's words, unless the file has gone again
+        check_place(path, force)  # refuses in the user's words, unless the file is gone again
         raise
 
 
 def _move_over_reservation(source: str | os.PathLike[str], path: str | os.PathLike[str]) -> None:
-    """Move a file to a name that an empty file takes first: of two who try, one fails."""
+    """Move a file to a name that an empty file takes first: of two writers one fails."""
     os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
     try:
         os.replace(source, path)
-    except OSError:
+    except BaseException:  # Ctrl-C among them
         os.unlink(path)
         raise
 
 
-# --- what is on its way ---
+def keep_owner_and_mode(source: str | os.PathLike[str], path: str | os.PathLike[str]) -> None:
+    """Give a file the permissions of the one at ``path``, if there is one, and its owner where permitted."""
+    try:
+        old, new = os.stat(path), os.stat(source)
+    except OSError:  # a new file: its mode follows the umask
+        return
+    mode = stat.S_IMODE(old.st_mode) & 0o777
+    if hasattr(os, "chown"):
+        for owner, group in ((old.st_uid, -1), (-1, old.st_gid)):
+            with contextlib.suppress(OSError):  # only root gives files away, and groups go to their members
+                os.chown(source, owner, group)
+        if os.stat(source).st_gid != old.st_gid:  # the members of another group may do what everybody may
+            mode = mode & ~0o070 | (mode & 0o007) << 3
+    if mode != stat.S_IMODE(new.st_mode):
+        with contextlib.suppress(OSError):  # a file system without modes
+            os.chmod(source, mode)
+
+
+# --- files on their way ---
 
 
 def hidden_name(name: str) -> str:
-    """A name for what will be called ``name``, hidden, with the writer's pid."""
-    start = os.fsdecode(os.fsencode(name)[:NAME])  # the limit of file systems is in bytes, a cut letter is no harm
+    """A hidden name, with the writer's pid, for what will be called ``name``."""
+    start = os.fsdecode(os.fsencode(name)[:NAME])  # the limit of file systems is in bytes; half a letter does no harm
     return f".{start}.hjbjax.tmp-{os.getpid()}-{secrets.token_hex(4)}"
 
 
+def lock(handle: int) -> bool:
+    """Lock an open file or folder until it is closed, also by the end of the process; False if another lock is on it.
+
+    True as well on a file system without locks.
+    """
+    if fcntl is None:
+        return True
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system without locks
+        return True
+    return True
+
+
 @contextlib.contextmanager
-def claimed(path: Path) -> Iterator[None]:
-    """Context with a lock on a file or a folder on its way; it ends with the process, however that ends."""
+def claim(path: Path) -> Iterator[None]:
+    """Context with a lock on a folder on its way; it ends with the process, however that ends."""
     if fcntl is None:
         yield
         return
     handle = os.open(path, os.O_RDONLY)
     try:
-        with contextlib.suppress(OSError):  # a file system without locks
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        lock(handle)
         yield
     finally:
         os.close(handle)
 
 
 def sweep(folder: str | os.PathLike[str]) -> None:
-    """Take away what killed writers left in a folder: what bears a dead pid and is locked by nobody.
+    """Remove what killed writers left in a folder: files whose names hold a dead pid and that nobody has locked.
 
-    Of the two signs one alone would not do: a pid says nothing about another machine that writes into the folder, and
-    a lock comes a moment after the file.
+    Neither sign is enough without the other: a pid says nothing about another machine that writes into the folder, and
+    the lock comes a moment after the file.
     """
     if fcntl is None:
         return
@@ -174,10 +262,10 @@ def sweep(folder: str | os.PathLike[str]) -> None:
 def _is_alive(pid: int) -> bool:
     """True if a process with this number runs on this machine."""
     try:
-        os.kill(pid, 0)  # signal 0 is none: only its delivery is checked
+        os.kill(pid, 0)  # signal 0 sends nothing, and only checks that it could be sent
     except (ProcessLookupError, OverflowError):
         return False
-    except OSError:  # another user's
+    except OSError:  # PermissionError: the process of another user
         return True
     return True
 
@@ -189,7 +277,7 @@ def _remove_unclaimed(entry: os.DirEntry) -> None:
         return
     handle = os.open(entry.path, os.O_RDONLY | os.O_NOFOLLOW)  # a link that came meanwhile may point anywhere
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises where a writer holds it
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises if a writer holds it
         shutil.rmtree(entry.path, ignore_errors=True) if is_folder else os.unlink(entry.path)
     finally:
         os.close(handle)

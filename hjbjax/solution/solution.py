@@ -261,7 +261,8 @@ class Solution:
     def save(self, path: Path, *, force: bool = False) -> None:
         """Write the solution to ``path``, whole or not at all; ``load`` gives back the same bits.
 
-        Statistics come back as JSON has them: tuples as lists, objects as their text.
+        Statistics come back as JSON has them: tuples as lists, objects as their text. A file that is replaced keeps its
+        permissions; those of a new one follow the umask.
 
         Raises:
           FileExistsError: the file exists; another name or ``force=True`` helps.
@@ -284,17 +285,18 @@ class Solution:
         return archive.dataset(self)
 
     def to_netcdf(self, path: Path, *, force: bool = False) -> None:
-        """Write ``to_xarray()`` as netCDF, whole or not at all, for other tools; what ``load`` reads is of ``save``.
+        """Write ``to_xarray()`` as netCDF for other tools, whole or not at all; ``load`` reads only files of ``save``.
 
-        A slash in a name, which is a path of groups there, is written as the fraction slash, ⁄.
+        The file is made in memory first. A slash in a name, which means a path of groups in netCDF, is written as the
+        fraction slash, ⁄.
 
         Raises:
           FileExistsError: the file exists; another name or ``force=True`` helps.
-          FileError: it cannot be written.
+          FileError: it cannot be written; nothing is left behind.
+          ImportError: ``hjbjax[io]`` is not installed.
         """
         found = self.to_xarray()
-        found = found.rename({name: name.replace("/", "⁄") for name in map(str, found.variables) if "/" in name})
-        files.write_whole(path, lambda file: found.to_netcdf(file, engine="h5netcdf"), force=force)
+        files.write_whole(path, lambda stream: stream.write(archive.netcdf(found)), force=force)
 
     def __repr__(self) -> str:
         status = self.status

@@ -110,8 +110,8 @@ def solve_batch(
     solutions: list[Any] = [None] * len(lanes)
     over = Lanes(None if mesh is None else _over_lanes(mesh, lanes, grid, method, checkpoint))
     clock = Clock(max_steps or 10**9, time_limit, progress, together=spans_processes(over.mesh))
-    opened = checkpoints.opened(
-        checkpoint, lanes, grid, resume=resume, what="solve_batch", method=method, scheme=scheme, tol=tol, dtype=kind
+    opened = checkpoints.open_checkpoint(
+        checkpoint, lanes, grid, resume=resume, caller="solve_batch", method=method, scheme=scheme, tol=tol, dtype=kind
     )
     with noting_interrupts(clock), host_loop.telling(clock), jax.enable_x64(kind == np.float64), opened as kept:
         for members in _same_program(lanes):

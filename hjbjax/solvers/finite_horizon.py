@@ -143,9 +143,9 @@ def march(
     check_node_values(start, grid, "march: start")
     grid.check_spacings(kind)
     clock = Clock(seconds=time_limit, progress=progress, together=spans_processes(mesh))
-    opened = checkpoints.opened(
-        checkpoint, [problem], grid, resume=resume, what="march", together=clock.together, horizon=horizon, times=kept,
-        start=start, method=method, scheme=scheme, step=step, inner=inner, policy=policy, dtype=kind,
+    opened = checkpoints.open_checkpoint(
+        checkpoint, [problem], grid, resume=resume, caller="march", together=clock.together, horizon=horizon,
+        times=kept, start=start, method=method, scheme=scheme, step=step, inner=inner, policy=policy, dtype=kind,
     )  # fmt: skip
     # float64 for this call alone: the caller's own programs, and other threads, keep the type they have
     with noting_interrupts(clock), host_loop.telling(clock), jax.enable_x64(kind == np.float64), opened as file:

@@ -17,6 +17,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.parts import Parts, spans_processes
 from hjbjax.problem.pytree import altered
 from hjbjax.problem.types import Field, Nodes, Number, Scalar
+from hjbjax.solution.checkpoints import check_alike
 from hjbjax.solution.clock import CUT, Clock
 from hjbjax.solution.solution import Solution, question
 from hjbjax.solution.status import Status
@@ -136,10 +137,18 @@ class Slices:
         return [np.array(len(self.times) - self.first), *(array[filled].copy() for array in arrays)]
 
     def restore(self, arrays: list[np.ndarray]) -> None:
-        """Take slices that were saved."""
+        """Take slices that were saved.
+
+        Raises:
+          ValueError: the arrays are not those of as many slices as they say.
+        """
         filled, *own = arrays
+        check_alike([filled], [np.array(0)])
+        if not 0 <= filled <= len(self.times):
+            raise ValueError(f"it counts {filled} slices of {len(self.times)}")
         self.first = len(self.times) - int(filled)
         whole = (self.times, self.value, self.policy, self.disturbance, self.cut, self.ends)
+        check_alike(own, [array[self.first :] for array in whole])
         for array, entries in zip(whole, own, strict=True):
             array[self.first :] = entries
 
@@ -210,15 +219,13 @@ class MarchRun:
     def between(self, status: Status, clock: Clock) -> Status:
         """Keep the slices at the times that the front has reached; CONVERGED after the last of them."""
         slices, front = self.slices, self.front
-        while status is Status.RUNNING and float(front.t) <= float(self.until):
+        while status is Status.RUNNING and slices.first > 0 and float(front.t) <= float(self.until):
             cut = clock.over()
             # at the last kept time nothing is missing any more, and a time limit that passes now takes nothing away
             if cut is not None and not (slices.first == 1 and cut is Status.TIME_LIMIT):
                 return cut
             self.store()
-            if slices.first == 0:
-                return Status.CONVERGED
-        return status
+        return Status.CONVERGED if status is Status.RUNNING and slices.first == 0 else status
 
     def gathered(self) -> Front:
         """The front, with values at all nodes."""
@@ -236,10 +243,19 @@ class MarchRun:
         return [*self.slices.saved(), *jax.tree.leaves(self.gathered())]
 
     def restore(self, arrays: list[np.ndarray]) -> None:
-        """Go on from a front that was saved."""
+        """Go on from a front that was saved.
+
+        Raises:
+          ValueError: the arrays are not a front of this march and its slices.
+        """
         count = len(self.slices.saved())
+        check_alike(arrays[count:], jax.tree.leaves(self.gathered()))
+        front = jax.tree.unflatten(jax.tree.structure(self.front), map(jnp.asarray, arrays[count:]))
+        if not 0 <= front.t <= self.task.horizon:
+            raise ValueError(f"its time is {front.t}, outside [0, {self.task.horizon}]")
+        Status(int(front.code))
         self.slices.restore(arrays[:count])
-        self.front = jax.tree.unflatten(jax.tree.structure(self.front), map(jnp.asarray, arrays[count:]))
+        self.front = front
 
     def show(self, bar: Any) -> None:
         """Move the progress bar, which runs over the problem's own time."""

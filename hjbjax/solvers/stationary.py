@@ -137,9 +137,9 @@ def solve(
     check_node_values(guess, grid, "solve: the guess")
     grid.check_spacings(kind)
     clock = Clock(max_steps or 10**9, time_limit, progress, together=spans_processes(mesh))
-    opened = checkpoints.opened(
-        checkpoint, [problem], grid, resume=resume, what="solve", together=clock.together, method=method, scheme=scheme,
-        tol=tol, guess=guess, dtype=kind,
+    opened = checkpoints.open_checkpoint(
+        checkpoint, [problem], grid, resume=resume, caller="solve", together=clock.together, method=method,
+        scheme=scheme, tol=tol, guess=guess, dtype=kind,
     )  # fmt: skip
     if isinstance(scheme, PathScheme):
         with noting_interrupts(clock), host_loop.telling(clock), jax.enable_x64(kind == np.float64), opened as kept:

@@ -15,6 +15,7 @@ from hjbjax.iteration.fixed_point import HISTORY, State, Task
 from hjbjax.problem.parts import Lanes, Parts, spans_processes
 from hjbjax.problem.pytree import altered
 from hjbjax.problem.types import Array, Nodes, Number
+from hjbjax.solution.checkpoints import check_alike
 from hjbjax.solution.clock import CHUNK_SECONDS, CUT, Clock
 from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop
@@ -145,12 +146,20 @@ class StatesInChunks:
         return [np.concatenate(self.residuals), *jax.tree.leaves(self.gathered())]
 
     def restore(self, arrays: list[np.ndarray]) -> None:
-        """Go on from a state that was saved."""
+        """Go on from a state that was saved.
+
+        Raises:
+          ValueError: the arrays are not a state of this run, with one residual per step and one before the first.
+        """
         residuals, *leaves = arrays
+        check_alike(leaves, jax.tree.leaves(self.gathered()))
         # copied to the device: a state is donated
         on_device = [jax.device_put(leaf, may_alias=False) for leaf in leaves]
-        self.before = self.state = jax.tree.unflatten(jax.tree.structure(self.state), on_device)
-        self.residuals, self.steps = [residuals], int(self.state.step)
+        state = jax.tree.unflatten(jax.tree.structure(self.state), on_device)
+        check_alike([residuals], [np.broadcast_to(0.0, int(state.step) + 1)])
+        Status(int(state.code))
+        self.before = self.state = state
+        self.residuals, self.steps = [residuals], int(state.step)
 
     def show(self, bar: Any) -> None:
         """Move the progress bar; the look is no step."""

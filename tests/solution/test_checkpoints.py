@@ -1,10 +1,13 @@
 """Checkpoints: cut anywhere and resumed, a run comes to the bits of one that was never cut."""
 
+import errno
+import json
 import os
 import random
 import signal
 import subprocess
 import sys
+import threading
 import time
 import warnings
 
@@ -204,13 +207,13 @@ def test_the_file_of_another_question_is_refused(tmp_path):
 def test_what_stands_in_the_way_is_said_before_anything_is_computed(tmp_path):
     path = tmp_path / "run.npz"
     path.write_bytes(b"")
-    with pytest.raises(FileExistsError, match=r"there is a checkpoint already; resume=True goes on from it"):
+    with pytest.raises(FileExistsError, match=r"^solve: .*there is a checkpoint already; resume=True goes on from it"):
         hjb.solve(posed(), LINE, checkpoint=path)
-    with pytest.raises(hjb.FileError, match="it is empty"):
+    with pytest.raises(hjb.FileError, match="^solve: .*run.npz: cannot be read: it is empty"):
         hjb.solve(posed(), LINE, checkpoint=path, resume=True)
     with pytest.raises(ValueError, match="resume=True goes on from a checkpoint; give checkpoint="):
         hjb.solve(posed(), LINE, resume=True)
-    with pytest.raises(hjb.FileError, match="is no folder in which one may write"):
+    with pytest.raises(hjb.FileError, match=r"^solve: .*run.npz: cannot be written: there is no folder .*missing$"):
         hjb.solve(posed(), LINE, checkpoint=tmp_path / "missing" / "run")
     with pytest.raises(hjb.FileError, match="it is a folder"):
         hjb.solve(posed(), LINE, checkpoint=tmp_path, resume=True)
@@ -221,18 +224,302 @@ def test_what_stands_in_the_way_is_said_before_anything_is_computed(tmp_path):
         hjb.load(tmp_path / "other.npz")
 
 
-def test_a_full_disk_takes_the_checkpoint_and_not_the_answer(tmp_path, monkeypatch):
-    def full(*arguments, **options):
-        raise files.FileError("run.npz: cannot be written: No space left on device")
+def full(*_):
+    raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(files, "write", full)
+
+@pytest.mark.parametrize("resume", [False, True])
+def test_a_place_where_nothing_can_be_written_is_found_before_the_solve(tmp_path, monkeypatch, resume):
+    monkeypatch.setattr(StatesInChunks, "advance", None)
+    (tmp_path / "file").write_bytes(b"")
+    for name, reason in (("x" * 256, "File name too long"), ("file/run.npz", "there is no folder .*file$")):
+        with pytest.raises(hjb.FileError, match=f"^solve: .*cannot be written: {reason}"):
+            hjb.solve(posed(), LINE, checkpoint=tmp_path / name, resume=resume)
+    with opened(tmp_path / "old.npz"):
+        pass
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        with pytest.raises(hjb.FileError, match=r"^solve: .*new\.npz: cannot be written: No space left on device"):
+            hjb.solve(posed(), LINE, checkpoint=tmp_path / "new.npz", resume=resume)
+        with pytest.raises(
+            OSError, match=r"old\.npz: (there is a checkpoint already|cannot be written: No space left)"
+        ):
+            hjb.solve(posed(), LINE, checkpoint=tmp_path / "old.npz", resume=resume)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    with pytest.raises(hjb.FileError, match="run.npz: cannot be written: the working folder is gone; give an absolute"):
+        hjb.solve(posed(), LINE, checkpoint="run.npz", resume=resume)
+    assert sorted(os.listdir(tmp_path)) == ["file", "old.npz"]
+
+
+def test_a_full_disk_takes_the_checkpoint_and_not_the_answer(tmp_path, monkeypatch):
+    write, writes = files.write_archive, []
+
+    def full_after_the_first(*arguments):
+        writes.append(None)
+        return write(*arguments) if len(writes) == 1 else full()
+
+    monkeypatch.setattr(files, "write_archive", full_after_the_first)
     kept = hjb.Checkpoint(tmp_path / "run", every=OFTEN)
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         solution = hjb.solve(posed(), LINE, checkpoint=kept)
     assert solution.status is hjb.Status.CONVERGED
-    assert ["without a checkpoint" in str(each.message) for each in said] == [True]
+    assert ["solve: the run goes on without a checkpoint" in str(each.message) for each in said] == [True]
     assert "No space left" in solution.stats["checkpoint"]
+    assert len(writes) > 2
+
+
+# --- one run, one file ---
+
+
+def opened(path, *, resume=False, every=OFTEN, caller="solve", **others):
+    """The file of a run that has been asked a question of its own."""
+    kept = hjb.Checkpoint(path, every=every)
+    return checkpoints.open_checkpoint(kept, [posed()], LINE, resume=resume, caller=caller, **others)
+
+
+class Counter:
+    """A part that counts, in an array of JAX's that every step takes for the next one."""
+
+    passing = False
+    _add = staticmethod(jax.jit(lambda x: x + 1, donate_argnums=0))
+
+    def __init__(self, start=0.0):
+        self.state = jnp.full(1000, start)
+
+    def step(self):
+        before, self.state = self.state, self._add(self.state)
+        return before
+
+    def saved(self):
+        return [self.state]
+
+    def restore(self, arrays):
+        checkpoints.check_alike(arrays, [self.state])
+        self.state = jnp.asarray(arrays[0])
+
+
+def counts(path, **others):
+    """What the counters of a file have come to, by the names of their journals."""
+    with opened(path, resume=True, **others) as file:
+        return {name: [float(each.arrays[0][0]) for each in records] for name, records in file.known.items()}
+
+
+DOORS = {
+    "solve": lambda **options: hjb.solve(posed(), LINE, **options),
+    "solve_batch": lambda **options: hjb.solve_batch([posed()], LINE, **options),
+    "march": lambda **options: hjb.march(posed(), LINE, 1.0, **options),
+}
+
+
+@pytest.mark.parametrize("door", DOORS)
+def test_a_file_that_another_run_is_using_is_refused(tmp_path, door):
+    path = tmp_path / "run.npz"
+    (tmp_path / "link.npz").symlink_to("run.npz")
+    with opened(path) as file:
+        file.journal().leave(Counter(), hjb.Status.INTERRUPTED)
+        file.write()
+        for name in ("run", "run.npz", "link.npz"):
+            with pytest.raises(hjb.FileError, match=rf"^{door}: .*run\.npz: another run is using it; wait for its end"):
+                DOORS[door](checkpoint=tmp_path / name, resume=True)
+            with pytest.raises(FileExistsError, match=f"^{door}: .*there is a checkpoint already"):
+                DOORS[door](checkpoint=tmp_path / name)
+    with pytest.raises(hjb.FileError, match=f"^{door}: .*made for another"):
+        DOORS[door](checkpoint=path, resume=True)
+    assert counts(path) == {"run": [0.0]}
+
+
+def test_of_many_runs_with_one_new_file_one_begins(tmp_path):
+    for resume in (False, True):
+        path, barrier, ends = tmp_path / f"{resume}.npz", threading.Barrier(4), []
+
+        def run(path=path, barrier=barrier, ends=ends, resume=resume):
+            barrier.wait()
+            try:
+                with opened(path, resume=resume) as file:
+                    file.journal().leave(Counter(), hjb.Status.CONVERGED)
+                    barrier.wait()  # until the others have been refused
+            except (FileExistsError, hjb.FileError) as error:
+                ends.append(str(error))
+                barrier.wait()
+            else:
+                ends.append(file.outcome)
+
+        threads = [threading.Thread(target=run) for _ in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert sorted("written" in each for each in ends) == [False, False, False, True]
+        assert counts(path) == {"run": [0.0]}
+
+
+def test_another_folder_meanwhile_sends_the_file_nowhere_else(tmp_path, monkeypatch):
+    (tmp_path / "first").mkdir()
+    (tmp_path / "second").mkdir()
+    monkeypatch.chdir(tmp_path / "first")
+    with opened("run") as file:
+        monkeypatch.chdir(tmp_path / "second")
+        file.journal().leave(Counter(), hjb.Status.INTERRUPTED)
+    assert os.listdir(tmp_path / "second") == []
+    assert counts(tmp_path / "first" / "run.npz") == {"run": [0.0]}
+
+
+def test_a_run_that_is_refused_leaves_no_file_and_takes_none(tmp_path):
+    path = tmp_path / "run.npz"
+    broken = hjb.Problem(lambda x, u: u * jnp.nan, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), discount=1.0)
+    for resume in (False, True):
+        with pytest.raises(ValueError, match="NaN"):
+            hjb.solve(broken, LINE, checkpoint=path, resume=resume)
+    assert os.listdir(tmp_path) == []
+    with opened(path) as file:
+        file.journal().leave(Counter(), hjb.Status.INTERRUPTED)
+    with pytest.raises(KeyboardInterrupt), opened(path, resume=True):
+        raise KeyboardInterrupt
+    assert counts(path) == {"run": [0.0]}
+
+
+def test_a_file_that_appears_during_the_run_is_not_replaced(tmp_path):
+    path = tmp_path / "run.npz"
+    with opened(path) as file:
+        path.unlink()
+        path.write_bytes(b"another's")
+        file.journal().leave(Counter(), hjb.Status.CONVERGED)
+        with pytest.warns(hjb.SolveWarning, match="^solve: the run goes on without a checkpoint: .*its own file there"):
+            file.write()
+    assert path.read_bytes() == b"another's"
+    assert "its own file there" in file.outcome
+
+
+# --- what is written, and when ---
+
+
+def test_a_state_that_is_written_is_a_copy_that_the_next_step_does_not_touch(tmp_path):
+    path, part, other = tmp_path / "run.npz", Counter(), Counter(10.0)
+    with opened(path) as file:
+        part.step()
+        file.journal("one").keep(part)
+        (kept,) = file.journal("one").records
+        # a view would keep the step from using the memory of the state again
+        assert not np.shares_memory(kept.arrays[0], np.asarray(part.state))
+        part.state = jnp.full(1000, 5.0)
+        file.journal("one").keep(part)
+        assert part.step().is_deleted()
+        file.journal("two").keep(other)
+    assert counts(path) == {"one": [5.0], "two": [10.0]}
+
+
+def test_nothing_is_written_before_it_is_time(tmp_path, monkeypatch):
+    now, path, part = [0.0], tmp_path / "run.npz", Counter()
+    monkeypatch.setattr(checkpoints.time, "monotonic", lambda: now[0])
+    stamps = []
+    with opened(path, every=60.0) as file:
+        for now[0] in (1.0, 59.0, 60.0, 61.0, 119.0, 121.0):
+            part.step()
+            file.journal().keep(part)
+            stamps.append(os.stat(path).st_ino)
+    assert [stamps[i] != stamps[i - 1] for i in range(1, 6)] == [False, True, False, False, True]
+    assert counts(path) == {"run": [6.0]}
+
+
+@pytest.mark.parametrize("every", [3600.0, OFTEN])
+def test_a_solve_writes_as_often_as_it_is_told(tmp_path, monkeypatch, every):
+    write, writes = files.write_archive, []
+    monkeypatch.setattr(files, "write_archive", lambda *arguments: (writes.append(None), write(*arguments)))
+    hjb.solve(posed(), LINE, checkpoint=hjb.Checkpoint(tmp_path / "run", every=every))
+    assert len(writes) == 2 if every > 1 else len(writes) > 4  # the first, before the solve, and the last
+
+
+def test_lanes_that_have_not_begun_stay_in_the_file(tmp_path):
+    path = tmp_path / "run.npz"
+    with opened(path) as file:
+        for lane in range(3):
+            file.journal(f"lane{lane}").leave(Counter(float(lane)), hjb.Status.MAX_STEPS)
+    with opened(path, resume=True) as file:
+        part = Counter()
+        assert file.journal("lane1").enter(part) is None
+        part.step()
+        file.journal("lane1").keep(part)
+        assert counts_in(path) == [0.0, 2.0, 2.0]
+    assert counts(path) == {"lane0": [0.0], "lane1": [2.0], "lane2": [2.0]}
+
+
+def counts_in(path):
+    """What the counters of a file have come to, read by someone who takes no lock."""
+    with np.load(path) as found:
+        return [float(found[name][0]) for name in sorted(found) if name != "header"]
+
+
+# --- files that someone made up ---
+
+
+def forge(sound, path, changes):
+    """A checkpoint with other arrays, of whose shapes and dtypes its header knows."""
+    with np.load(sound) as found:
+        arrays = {name: changes.get(name, np.asarray)(found[name]) for name in found if name != "header"}
+        header = json.loads(found["header"].tobytes())
+    for name in changes:
+        journal, part, array = name.split("_")
+        header["journals"][journal][int(part)][3][int(array)] = [list(arrays[name].shape), arrays[name].dtype.str]
+    files.write(path, header, arrays, force=True)
+
+
+def longer(array):
+    return np.concatenate([array, array[-1:]]) if array.ndim else array[None]
+
+
+def shorter(array):
+    return array[:-1]
+
+
+def cut_short(door, path, monkeypatch):
+    """The checkpoint of a run that ended after some steps, and the options with which to go on."""
+    with monkeypatch.context() as patched:
+        if door == "march":
+            options = {"times": np.linspace(0, 1, 4)}
+            patched.setattr(MarchRun, "advance", Chunks(MarchRun.advance, 2))
+            cut = DOORS[door](checkpoint=path, throw=False, **options)
+        else:
+            options = {}
+            cut = DOORS[door](checkpoint=path, throw=False, max_steps=1)
+    assert cut.status is not hjb.Status.CONVERGED
+    return options
+
+
+@pytest.mark.parametrize("door", ["solve", "march"])
+def test_a_state_of_another_size_is_refused(tmp_path, door, monkeypatch):
+    sound, path = tmp_path / "sound.npz", tmp_path / "run.npz"
+    options = cut_short(door, sound, monkeypatch)
+    with np.load(sound) as found:
+        sizes = {name: found[name].shape for name in found if name != "header"}
+    forgeries = [{name: longer} for name in sizes]
+    forgeries += [{name: shorter} for name, shape in sizes.items() if shape and shape[0]]
+    forgeries += [{"run_0_1": lambda array: array.astype("u4")}]
+    if door == "march":  # more slices than there are times
+        more = {f"run_0_{i}": lambda array: np.resize(array, (9, *array.shape[1:])) for i in range(1, 7)}
+        forgeries += [{**more, "run_0_0": lambda count: count - count + 9}]
+        none = {f"run_0_{i}": lambda array: array[:0] for i in range(1, 7)}
+        forgeries += [{**none, "run_0_0": lambda count: count - count - 1}]
+    for forgery in forgeries:
+        forge(sound, path, forgery)
+        with pytest.raises(hjb.FileError, match=f"^{door}: .*run.npz: cannot be read: it holds a state that this run"):
+            DOORS[door](checkpoint=path, resume=True, **options)
+    alike(DOORS[door](checkpoint=sound, resume=True, **options), DOORS[door](**options))
+
+
+def test_a_part_that_is_done_has_its_state(tmp_path):
+    path = tmp_path / "run.npz"
+    with opened(path) as file:
+        file.journal().leave(Counter(), hjb.Status.CONVERGED)
+    with np.load(path) as found:
+        header = json.loads(found["header"].tobytes())
+    header["journals"]["run"][0][3] = []
+    files.write(path, header, {}, force=True)
+    with opened(path, resume=True) as file, pytest.raises(hjb.FileError, match="^solve: .*has 0 arrays, wanted 1"):
+        file.journal().enter(Counter())
 
 
 @pytest.mark.slow

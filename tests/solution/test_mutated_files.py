@@ -14,6 +14,7 @@ from counted_reads import counted_reads
 
 import hjbjax as hjb
 from hjbjax.solution import checkpoints
+from hjbjax.solution.locked_file import LockedFile
 
 COUNT = 1000  # files that must be refused
 SPARED = 400  # files at most that may say the same as before: a date or a flag of a zip entry says nothing
@@ -42,15 +43,16 @@ def solution(path):
 
 
 def checkpoint(path):
-    kept = checkpoints.Checkpoint(str(path))
-    asked = {"problem": "a digest", "grid": "another", "tol": "0.1"}
-    file = checkpoints.File(kept, asked, {})
+    kept, target = checkpoints.Checkpoint(str(path)), LockedFile(str(path))
+    question = {"problem": "a digest", "grid": "another", "tol": "0.1"}
+    file = checkpoints.File(kept, question, {}, target)
     arrays = [np.random.default_rng(0).normal(size=(7, 5)), np.arange(4, dtype=np.int32), np.ones(3, bool)]
-    done = checkpoints.Record(arrays, hjb.Status.CONVERGED, True, False)
-    file.journal().records = [done, checkpoints.Record(arrays[:1], hjb.Status.RUNNING, False, True)]
+    done = checkpoints.Record(arrays, hjb.Status.CONVERGED, False)
+    file.journal().records = [done, checkpoints.Record(arrays[:1], hjb.Status.RUNNING, True)]
     file.changed = True
     file.write()
-    return lambda: checkpoints._read(str(path), asked)
+    target.close()
+    return lambda: checkpoints._read(str(path), question)
 
 
 def said(answer):

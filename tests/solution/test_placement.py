@@ -186,6 +186,82 @@ def test_a_name_that_is_too_long(tmp_path):
     assert os.listdir(tmp_path) == []
 
 
+# --- permissions ---
+
+
+def mode(path):
+    return stat.S_IMODE(os.stat(path).st_mode)
+
+
+@posix
+@pytest.mark.parametrize("kept", [0o600, 0o640, 0o444, 0o777])
+def test_a_file_that_is_replaced_keeps_its_mode_and_its_owner(tmp_path, kept):
+    path, other = tmp_path / "run.npz", tmp_path / "link.npz"
+    write(path)
+    os.chmod(path, kept)
+    os.symlink(path, other)
+    if os.geteuid() == 0:
+        os.chown(path, 1234, 1235)
+    before = os.stat(path)
+    for number, name in ((0.0, path), (1.0, other)):
+        write(name, number, force=True)
+        after = os.stat(path)
+        assert (mode(path), after.st_uid, after.st_gid) == (kept, before.st_uid, before.st_gid)
+    assert read(path).tolist() == [1.0] * 3
+
+
+@posix
+def test_a_file_that_is_moved_over_another_takes_its_mode(tmp_path):
+    """As the files of a command, which are made in a folder of their own."""
+    for name, text in (("made", "new"), ("old", "old")):
+        (tmp_path / name).write_text(text)
+    os.chmod(tmp_path / "old", 0o600)
+    placement.place(tmp_path / "made", tmp_path / "old", force=True)
+    assert (mode(tmp_path / "old"), (tmp_path / "old").read_text()) == (0o600, "new")
+
+
+@posix
+@pytest.mark.parametrize(("mask", "wanted"), [(0o022, 0o644), (0o077, 0o600), (0o002, 0o664)])
+@pytest.mark.parametrize("force", [False, True])
+def test_the_mode_of_a_new_file_follows_the_umask(tmp_path, mask, wanted, force):
+    usual = os.umask(mask)
+    try:
+        write(tmp_path / "run.npz", force=force)
+    finally:
+        os.umask(usual)
+    assert mode(tmp_path / "run.npz") == wanted
+
+
+@posix
+def test_a_private_file_is_private_from_its_first_byte(tmp_path):
+    path, seen = tmp_path / "run.npz", []
+    write(path)
+    os.chmod(path, 0o600)
+    files.write_whole(path, lambda stream: seen.append(stat.S_IMODE(os.fstat(stream.fileno()).st_mode)), force=True)
+    assert seen == [0o600]
+
+
+@posix
+def test_where_the_group_cannot_be_kept_it_may_do_what_everybody_may(tmp_path, monkeypatch):
+    path = tmp_path / "run.npz"
+    write(path)
+    os.chmod(path, 0o664)
+    stat_of, there = os.stat, os.stat(path).st_ino
+
+    def of_another_group(name, **options):
+        found = stat_of(name, **options)
+        return os.stat_result([*found[:5], 4321, *found[6:]]) if found.st_ino == there else found
+
+    def refused(*_):
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "chown", refused)
+    monkeypatch.setattr(os, "stat", of_another_group)
+    write(path, force=True)
+    monkeypatch.undo()
+    assert mode(path) == 0o644
+
+
 # --- what killed writers leave ---
 
 
@@ -217,13 +293,29 @@ def test_the_next_writer_takes_away_what_the_dead_left(tmp_path):
 
 
 @posix
+def test_what_the_process_of_another_user_is_writing_stays(tmp_path, monkeypatch):
+    path = tmp_path / left_by(dead())
+    path.write_bytes(b"half")
+
+    def not_permitted(pid, number):
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "kill", not_permitted)
+        write(tmp_path / "run.npz")
+    assert path.exists()
+    write(tmp_path / "run.npz", force=True)
+    assert not path.exists()
+
+
+@posix
 def test_what_another_machine_is_writing_stays(tmp_path):
     path = tmp_path / left_by(dead())  # a pid of theirs that is free here
     path.write_bytes(b"half")
     program = f"""
 import time
 from hjbjax.solution import placement
-with placement.claimed({str(path)!r}):
+with placement.claim({str(path)!r}):
     print("claimed", flush=True)
     time.sleep(60)
 """

@@ -1,6 +1,9 @@
 """Solutions as arrays with names, for other tools."""
 
 import io
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -57,18 +60,50 @@ def test_a_file_for_other_tools_is_whole_or_not_there(tmp_path, monkeypatch):
     with pytest.raises(FileExistsError, match="force=True"):
         solution.to_netcdf(path)
 
-    def full(self, file, **options):
-        file.write(b"half")
+    def full(*_):
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patched:
-        patched.setattr(xarray.Dataset, "to_netcdf", full)
+        patched.setattr(os, "fsync", full)
         with pytest.raises(hjb.FileError, match="No space left"):
             solution.to_netcdf(path, force=True)
     assert path.read_bytes() == before
     assert [each.name for each in tmp_path.iterdir()] == ["run.nc"]
     solution.to_netcdf(path, force=True)
     assert io.BytesIO(path.read_bytes()).read(4) == b"\x89HDF"
+
+
+LIMITED = """
+import gc, resource, sys
+import numpy as np
+import hjbjax as hjb
+grid = hjb.Grid([0.0], [1.0], (4001,))
+solution = hjb.Solution(grid, np.zeros(4001), np.zeros((4001, 1)), code=1)
+resource.setrlimit(resource.RLIMIT_FSIZE, (16384, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
+try:
+    solution.to_netcdf(sys.argv[1])
+except hjb.FileError as error:
+    print(error)
+gc.collect()
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="limits of file sizes are POSIX's")
+def test_a_disk_that_is_full_during_the_write_does_not_end_the_process(tmp_path):
+    """HDF5 ends it with SIGSEGV if it cannot close a file, in the destructor of the file."""
+    pytest.importorskip("h5netcdf")
+    command = [sys.executable, "-c", LIMITED, str(tmp_path / "run.nc")]
+    process = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (process.returncode, process.stderr) == (0, "")
+    assert process.stdout == f"{tmp_path / 'run.nc'}: cannot be written: File too large\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_missing_package_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "h5netcdf", None)
+    with pytest.raises(ImportError, match=r"^Solution.to_netcdf needs h5netcdf: pip install 'hjbjax\[io\]'"):
+        solved().to_netcdf(tmp_path / "run.nc")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_slash_in_a_name_makes_no_group(tmp_path):

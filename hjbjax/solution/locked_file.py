@@ -1,0 +1,120 @@
+"""A file that one run holds locked from its beginning to its end, and replaces as often as it likes.
+
+The lock is on the file itself, so that no second file is left behind, and the kernel releases it with the process,
+however that ends. Each new file is locked before it gets the name, so the name is never without a lock. A file system
+without locks leaves one check: a file that another run has put there is never replaced.
+"""
+
+import contextlib
+import os
+from collections.abc import Callable
+from typing import IO, TypeAlias
+
+from hjbjax.solution import files, placement
+from hjbjax.solution.placement import FileError
+
+TRIES = 100  # of opening a file that others replace meanwhile
+Held: TypeAlias = tuple[os.stat_result, int | None]  # which file, and a handle that keeps its lock
+
+
+class LockedFile:
+    """A file that belongs to one run until it is closed.
+
+    Args:
+      path: its absolute path, as ``placement.absolute`` gives it.
+    """
+
+    def __init__(self, path: str):
+        self.path = path
+        self._own: list[Held] = []  # the run's file at the path, and during a write the one that will replace it
+
+    def take(self) -> bool:
+        """Lock the file at the path; False if there is none.
+
+        Raises:
+          FileError: another run holds it, or it cannot be opened, or it is empty: on a file system without links that
+            is how another run reserves the name.
+        """
+        for _ in range(TRIES):
+            placement.check_place(self.path, force=True)
+            try:
+                handle = _open(self.path)
+            except OSError as error:
+                if not os.path.lexists(self.path):
+                    return False
+                raise FileError(f"{self.path}: cannot be opened: {error.strerror or error}") from error
+            try:
+                if not placement.lock(handle):
+                    raise FileError(f"{self.path}: another run is using it; wait for its end, or give another path")
+                if os.fstat(handle).st_size == 0:
+                    raise FileError(f"{self.path}: cannot be read: it is empty; remove it, or give another path")
+                self._own = [_held(handle)]
+            finally:
+                os.close(handle)
+            if self._is_own(self._there()):
+                return True
+            self.close()  # it was replaced or removed between opening and locking
+        raise FileError(f"{self.path}: others replace it again and again; give another path")
+
+    def write(self, fill: Callable[[IO[bytes]], object]) -> None:
+        """Replace the file, whole or not at all; the first write of a run that took none makes a new one.
+
+        Raises:
+          FileExistsError: there is a file by now, and this run has none.
+          FileError: another file was put there, or none can be written.
+        """
+        before = self._own
+
+        def fill_and_lock(stream: IO[bytes]) -> None:
+            fill(stream)
+            there = self._there()
+            if before and there is not None and not self._is_own(there):
+                raise OSError("another run or program has put its own file there")
+            self._own = [*before, _held(stream.fileno())]
+
+        try:
+            files.write_whole(self.path, fill_and_lock, force=bool(before))
+        finally:  # after Ctrl-C, too, the file at the path says how far the write came
+            there = self._there()
+            self._keep([each for each in self._own if there and os.path.samestat(there, each[0])] or before)
+
+    def remove(self) -> None:
+        """Remove the file, unless another one is there by now."""
+        if self._is_own(self._there()):
+            with contextlib.suppress(OSError):
+                os.unlink(self.path)
+
+    def close(self) -> None:
+        """Release the lock."""
+        self._keep([])
+
+    def _keep(self, some: list[Held]) -> None:
+        """Forget all own files but some, and close their handles."""
+        others, self._own = [each for each in self._own if each not in some], some
+        for _, handle in others:
+            if handle is not None:
+                os.close(handle)
+
+    def _there(self) -> os.stat_result | None:
+        """The file at the path, if there is one."""
+        try:
+            return os.stat(self.path)
+        except OSError:
+            return None
+
+    def _is_own(self, there: os.stat_result | None) -> bool:
+        """True if it is one of the run's own files."""
+        return there is not None and any(os.path.samestat(there, own) for own, _ in self._own)
+
+
+def _held(handle: int) -> Held:
+    """An open file, with a copy of its handle, which shares its lock; Windows replaces no open file, and gets none."""
+    return os.fstat(handle), None if placement.fcntl is None else os.dup(handle)
+
+
+def _open(path: str) -> int:
+    """A handle of a file, for writing if possible: NFS locks no other."""
+    try:
+        return os.open(path, os.O_RDWR)
+    except OSError:
+        return os.open(path, os.O_RDONLY)

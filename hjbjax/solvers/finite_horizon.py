@@ -171,6 +171,7 @@ def march(
         solution = with_last_phase(solution, clock)
     solution.stats.update(
         seconds=clock.stepping, compile_seconds=clock.elapsed() - clock.stepping, bytes=needed, horizon=horizon,
+        start=start is not None,
         **({} if mesh is None else {"mesh": mesh.devices.shape}),
     )  # fmt: skip
     if clock.journal is not None:

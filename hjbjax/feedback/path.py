@@ -61,8 +61,8 @@ class Path:
       controls: shape (k, m), the control at the start of each interval; under ``hold`` all through it.
       disturbances: shape (k, l), likewise, or None where there is no opponent.
       cost: discounted running cost, plus what is due at the end: the discounted exit cost on the target, ψ where V = ψ,
-        and what ``march`` assumed at the horizon. Of a tube the cost of the best moment to stop: the least ψ on the way,
-        the largest ``running_max``, or with both the least of max{ψ, largest ``running_max`` so far}.
+        and what ``march`` assumed at the horizon. Of a tube the cost of the best moment to stop: the least ψ on the
+        way, the largest ``running_max``, or with both the least of max{ψ, largest ``running_max`` so far}.
       reached: the time at which the target was reached, or None.
       code: a PathStatus number.
       steps: internal steps of the integrator, rejected ones included.

@@ -30,7 +30,9 @@ from hjbjax.tracing.components import of_state
 MANY = 10  # estimated errors: a path that misses V by more breaks its promise
 LEAST = 0.02  # of the range of V: what a feedback between the nodes may cost more
 UNKNOWN = 0.02  # of the range of V: taken for the error of a value without an estimate
-RESTS = 1e-3  # of the box, in the second half of a path that is at rest
+STILL = 1e-6  # of the box, in the second half of a path that is at rest
+RESTS, SLOWS = 1e-3, 1e-2  # of the box, and of the way in the first half, of one that comes to rest
+FAR = 1.5  # cells: a path that goes round leaves a state by more, and comes back within one
 
 
 @pytree_dataclass()
@@ -128,8 +130,8 @@ def promise(feedback: object, start: Array, t: float = 0.0) -> float | None:
 def still_ahead(problem: Problem, feedback: object, path: Path, *, to_horizon: bool) -> float | None:
     """What V says is still to be paid after a path that is cut short, discounted to its start.
 
-    A path at rest outside the target stays there and pays what it pays there: nothing, or L/β. None where V says
-    nothing of what follows.
+    A path that rests or goes round outside the target, without a discount, never gets what V promised: nothing is
+    ahead. None where V says nothing of what follows.
 
     Args:
       problem: what is simulated.
@@ -143,17 +145,31 @@ def still_ahead(problem: Problem, feedback: object, path: Path, *, to_horizon: b
         return None
     solution, end, beta = solution_of(feedback), float(path.times[-1]), float(problem.discount)
     assert solution is not None
-    if solution.times is None and _rests(path, solution.grid) and beta == 0:
-        # V at rest without a discount: zero where resting costs nothing, and never to be paid
+    if beta == 0 and solution.times is None and (_rests(path, solution.grid) or _goes_round(path, solution)):
         return 0.0
     value = promise(feedback, path.states[-1], end)
     return None if value is None else math.exp(-beta * end) * value
 
 
 def _rests(path: Path, grid: Grid) -> bool:
-    """True if a path does not move in its second half."""
-    late = path.states[len(path.states) // 2 :]
-    return bool(np.all(np.ptp(late, axis=0) <= RESTS * (np.asarray(grid.hi) - np.asarray(grid.lo))))
+    """True if a path comes to rest: in its second half it hardly moves, next to the box and to its first half."""
+    middle, box = len(path.states) // 2, np.asarray(grid.hi) - np.asarray(grid.lo)
+    early, late = (np.max(np.ptp(part, axis=0) / box) for part in (path.states[: middle + 1], path.states[middle:]))
+    return bool(late <= STILL or (late <= RESTS and late <= SLOWS * early))
+
+
+def _goes_round(path: Path, solution: Solution) -> bool:
+    """True if a path comes back in its second half to where it was, and V fell by no more than its error since."""
+    grid, late = solution.grid, path.states[len(path.states) // 2 :]
+    value = solution.value_at(late, clamp=True)
+    if not value[0] - value[-1] <= _grid_error(solution):
+        return False
+    width = np.asarray(grid.hi) - np.asarray(grid.lo)
+    apart = np.abs(late - late[-1])
+    apart = np.where(grid.periodic, np.minimum(apart % width, -apart % width), apart)
+    cells = np.max(apart / (width / (np.array(grid.shape) - 1)), axis=1)
+    far = np.flatnonzero(cells > FAR)
+    return bool(far.size and np.any(cells[: far[-1]] <= 1))
 
 
 def broken_promise(
@@ -170,7 +186,7 @@ def broken_promise(
     """
     solution = solution_of(feedback)
     # one noisy path says nothing of a mean
-    if path.promised is None or solution is None or problem.noise is not None:
+    if path.promised is None or solution is None or problem.noise is not None or not _knows(solution, path.states[0]):
         return None
     states = path.states
     free = np.array(solution.grid.periodic)
@@ -191,6 +207,14 @@ def broken_promise(
     return f"the path costs {path.cost:.6g},{further} and V promised {path.promised:.6g}: {advice}"
 
 
+def _knows(solution: Solution, start: Array) -> bool:
+    """True if some node around a state has a control, or there are none: in a hollow target V is that of its edge."""
+    if solution.policy is None or np.shape(solution.policy)[-1] == 0:
+        return True
+    where = (start,) if solution.times is None else (0.0, start)
+    return not np.any(np.isnan(solution.control_at(*where, clamp=True)))
+
+
 def _combined(problem: Problem, cost: float, ahead: float) -> float:
     """The cost of a path with what follows it."""
     if not is_tube(problem) or ahead == 0:
@@ -202,12 +226,22 @@ def _combined(problem: Problem, cost: float, ahead: float) -> float:
 
 def _allowed(solution: Solution) -> float:
     """By how much a path may miss V: many times the estimated error, and what a feedback between the nodes costs."""
-    value = np.asarray(solution.value if solution.times is None else solution.value[0])
-    finite = value[np.isfinite(value)]
-    extent = float(np.ptp(finite)) if finite.size else math.inf
-    found = None if solution.grid_error is None else np.asarray(solution.grid_error)
-    known = found is not None and bool(np.any(np.isfinite(found)))
-    spacing = float(np.nanmax(np.where(np.isfinite(found), found, np.nan))) if known else UNKNOWN * extent
+    extent = _extent(solution)
     algebraic = solution.error
     algebraic = 0.0 if algebraic is None or not math.isfinite(algebraic) else float(algebraic)
-    return MANY * (spacing + algebraic) + LEAST * extent
+    return MANY * (_grid_error(solution) + algebraic) + LEAST * extent
+
+
+def _extent(solution: Solution) -> float:
+    """The range of V at the earliest time."""
+    value = np.asarray(solution.value if solution.times is None else solution.value[0])
+    finite = value[np.isfinite(value)]
+    return float(np.ptp(finite)) if finite.size else math.inf
+
+
+def _grid_error(solution: Solution) -> float:
+    """The largest estimated error of the spacing, or a share of the range of V without an estimate."""
+    found = None if solution.grid_error is None else np.asarray(solution.grid_error)
+    if found is None or not np.any(np.isfinite(found)):
+        return UNKNOWN * _extent(solution)
+    return float(np.max(found, where=np.isfinite(found), initial=0.0))

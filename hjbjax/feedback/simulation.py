@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias, TypeGuard
 
@@ -21,6 +20,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, cast, is_traced, with_suggestions
 from hjbjax.problem.types import Key, Number, Numbers
 from hjbjax.solution.clock import CHUNK_SECONDS, Clock, noting_interrupts
+from hjbjax.solution.status import warn
 from hjbjax.tracing.closures import OF_ACTION, OF_STATE, holds_tracers, opened, settled
 
 Feedback: TypeAlias = GridFeedback | Callable | None  # None where there is no control
@@ -156,7 +156,7 @@ def simulate(
             problem, feedback, path, to_horizon=due == "V at the horizon", worst_case=disturbance is None
         )
         if broken is not None:
-            warnings.warn(f"simulate: {broken}", UserWarning, stacklevel=2)
+            warn(f"simulate: {broken}")
         if clock.interrupted:
             raise Interrupted(path)
     return path

@@ -380,8 +380,9 @@ class ImplicitStep:
           max_steps: policy improvements, at most.
         """
 
-        def look(value):
-            policy = self._complete(bellman.greedy(self.on, value, self.obstacles.fixed))
+        def look(value, incumbent):
+            # a search between samples may miss the action of the step before, and would go to and fro between two
+            policy = self._complete(bellman.greedy(self.on, value, self.obstacles.fixed, incumbent=incumbent))
             equation = self.equation(value, policy)
             iterate = Iterate(self.grid, value, policy, equation, self.obstacles, counted=True)
             bound = certificates.error_bound(Certificate.ADDITIVE, iterate, discount=self.on.problem.discount)
@@ -394,15 +395,27 @@ class ImplicitStep:
 
         def unfinished(carry):
             _, _, residual, done, _, count = carry
-            return ~done & (count < max_steps) & jnp.isfinite(residual)  # a NaN is the march's to report
+            # a NaN is the march's to report
+            return ~done & (count <= max_steps) & ((count == 0) | jnp.isfinite(residual))
 
         def improve(carry):
             value, policy, residual, _, least, count = carry
-            value = self._evaluated(value, policy, methods.inner_goal(residual, least), evaluation)
-            return value, *look(value), jnp.minimum(least, residual), count + 1
+            before = residual
+            policy, residual, done = look(value, policy)
+
+            def evaluated():
+                goal = methods.inner_goal(residual, jnp.minimum(least, before))
+                return self._evaluated(value, policy, goal, evaluation)
+
+            goes_on = ~done & jnp.isfinite(residual) & (count < max_steps)
+            value = jax.lax.cond(goes_on, evaluated, lambda: value)
+            return value, policy, residual, done, jnp.minimum(least, before), count + 1
 
         start = self.impose(value)  # V at t is a guess for W that is wrong by O(Δt) only
-        carry = (start, *look(start), jnp.asarray(jnp.inf, start.dtype), jnp.zeros((), jnp.int32))
+        endless, zero = jnp.asarray(jnp.inf, start.dtype), jnp.zeros_like(start)
+        sizes = (0 if each is None else each.dim for each in (self.on.problem.controls, self.on.problem.disturbances))
+        nobody = Greedy(zero, *((zero,) * size for size in sizes))  # moved into the sets before it is tried
+        carry = (start, nobody, endless, jnp.zeros((), bool), endless, jnp.zeros((), jnp.int32))
         value, policy, _, done, _, _ = jax.lax.while_loop(unfinished, improve, carry)
         return value, policy, done
 

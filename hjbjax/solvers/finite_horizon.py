@@ -272,7 +272,8 @@ def _prepare(
     obstacles = None if moving or not policy else _obstacles(on)
     return March(
         on, method, obstacles, None if moving and method.limited else limit, jnp.asarray(longest, dtype),
-        jnp.asarray(horizon, dtype), _blow_up_nodes(on, inner), looks[0], looks[1], looks[2] and policy, bare=not policy,
+        jnp.asarray(horizon, dtype), _blow_up_nodes(on, inner),
+        checks_rates=looks[0], checks_noise=looks[1], checks_gap=looks[2] and policy, bare=not policy,
     )  # fmt: skip
 
 

@@ -18,7 +18,7 @@ from hjbjax.iteration.isaacs import isaacs_gap
 from hjbjax.markov_chain import earnings
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import is_traced
-from hjbjax.problem.types import Array, Field, Mask, Nodes, Scalar
+from hjbjax.problem.types import Field, Nodes, Scalar
 from hjbjax.solution import nested_grids
 from hjbjax.solution.clock import CUT, Clock
 from hjbjax.solution.solution import Solution, question

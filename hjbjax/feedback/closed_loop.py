@@ -1,7 +1,7 @@
 """Closed loops and their integration: what a feedback does to the system, and what that costs.
 
     dx = f(x, u, d) dt + σ(x, u, d) dw,  u = control(x),  d = opponent(x)
-    cost = ∫ e^{−βt} L(x, u, d) dt  (+ e^{−βτ} exit cost, where the target is reached at τ; else e^{−βT} terminal cost)
+    cost = ∫ e^{−βt} L(x, u, d) dt + what is due at the end; of a tube an extreme along the path: see ``payments``
 
 The running cost is one more state of the integrator, so it has the accuracy of the path.
 
@@ -31,6 +31,7 @@ import numpy as np
 
 from hjbjax.feedback.loop import Actions, BridgeDraw, Loop, are_finite, bridging, meeting_flag, onto_edge
 from hjbjax.feedback.path import Path, PathStatus
+from hjbjax.feedback.payments import is_tube
 from hjbjax.hamiltonian.derivatives import with_both_modes
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import Array, Control, Key, Number, State
@@ -38,12 +39,14 @@ from hjbjax.problem.types import Array, Control, Key, Number, State
 if TYPE_CHECKING:
     import diffrax
 
-# Before an interval: the time, the state with the running cost (n+1), the PathStatus and the steps so far.
-Progress: TypeAlias = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
+# Before an interval: the time, the state with the running cost (n+1), the PathStatus, the steps so far, and of a tube
+# the least cost of stopping so far and the largest running maximum, (2,).
+Progress: TypeAlias = tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]
 Beginning: TypeAlias = tuple[Control, Number, State]  # of an interval: the control held through it, when and where
 # Of each interval: time and state at its end, both actions at its start, and True where the path runs through it.
 Rows: TypeAlias = tuple[jax.Array, jax.Array, jax.Array, jax.Array | None, jax.Array]
 
+LOOKS = 16  # in an output interval at the functions of a tube; between two looks an extreme is off by a 16² of it
 LEAST_STEPS = 10  # of an output interval with noise, where no estimate of the error shortens a step
 TREE = 64  # the shortest step over the tolerance of the Brownian tree, below which w is interpolated
 DEEPEST = 2**30  # the duration over that tolerance, at most: each halving is one level of the tree in every step
@@ -110,7 +113,7 @@ def blank_record(loop: Loop, x0: np.ndarray, times: np.ndarray) -> tuple[tuple, 
     count, players = len(times) - 1, (loop.problem.controls, loop.problem.disturbances)
     inputs = [0 if admissible is None else admissible.dim for admissible in players]
     controls, disturbances = (np.zeros((count, size), x0.dtype) for size in inputs)
-    state = times[0], np.append(x0, 0.0), np.int32(0), np.int32(0)
+    state = times[0], np.append(x0, 0.0), np.int32(0), np.int32(0), np.zeros(2, x0.dtype)
     shown = controls, None if loop.opponent is None else disturbances
     return state, (np.zeros(count, x0.dtype), np.zeros((count, len(x0)), x0.dtype), *shown, np.zeros(count, bool))
 
@@ -138,11 +141,11 @@ def integrate_part(
 
     # both ends are traced, so that chunks of every length share one compiled program
     state, rows = jax.lax.fori_loop(done, until, one, (state, rows))
-    t, y, code, count = state
+    t, y, code, count, extremes = state
     came = jnp.arange(len(ivp.times) - 1) < until
     later, states, controls, disturbances, active = rows
     cut = (code == PathStatus.DURATION) & (until < len(ivp.times) - 1)
-    last = t, y, jnp.where(cut, PathStatus.INTERRUPTED, code).astype(code.dtype), count
+    last = t, y, jnp.where(cut, PathStatus.INTERRUPTED, code).astype(code.dtype), count, extremes
     shown = jnp.where(came, later, t), jnp.where(came[:, None], states, y[:-1]), controls, disturbances, active & came
     return (state, rows), _path(ivp, stepping, last, shown)
 
@@ -153,50 +156,90 @@ def _intervals(ivp: InitialValueProblem, stepping: Stepping, reverse: bool = Fal
     solve = _solver(ivp, stepping, reverse)
 
     def interval(state: Progress, end: jax.Array) -> tuple[Progress, Rows]:
-        t, y, code, count = state
+        t, y, code, count, extremes = state
         u, d = loop.players(t, y[:-1])
         code = jnp.where((code == PathStatus.DURATION) & ~are_finite((u, d)), PathStatus.UNDEFINED, code)
         active = code == PathStatus.DURATION  # while all is well the code is that of a path which lasts to its end
         times = (t, jnp.where(active, end, t), ivp.times[-1])
-        later, moved, result, made = _advance(loop, stepping, solve, times, y, u)
+        later, moved, result, made, seen = _advance(loop, stepping, solve, times, y, u)
         count = count + made
         code = jnp.where(active, result, code)
         code = jnp.where((code == PathStatus.DURATION) & (count >= stepping.max_steps), PathStatus.MAX_STEPS, code)
         active &= jnp.all(jnp.isfinite(moved))  # if not, the path ends at the last output time before
         t, y = jnp.where(active, later, t), jnp.where(active, moved, y)
+        if is_tube(loop.problem):
+            extremes = jnp.where(active, _extremes(loop, start, seen, extremes), extremes)
         shown = jax.tree.map(lambda a: jnp.where(active, a, jnp.nan), (u, d))
-        return (t, y, code.astype(jnp.int32), count), (t, y[:-1], *shown, active)
+        return (t, y, code.astype(jnp.int32), count, extremes), (t, y[:-1], *shown, active)
 
     # the target comes last and wins: a start in both a target and beyond the edge has arrived
     code = jnp.where(loop.margin(x0) > 0, PathStatus.DURATION, PathStatus.LEFT_BOX)
     code = jnp.where(loop.target(start, x0) <= 0, PathStatus.TARGET, code).astype(jnp.int32)
-    return interval, (start, jnp.append(x0, 0.0), code, jnp.zeros((), jnp.int32))
+    # before anything is seen: no moment to stop, and no maximum
+    extremes = jnp.asarray([jnp.inf, -jnp.inf], x0.dtype)
+    if is_tube(loop.problem):
+        extremes = _extremes(loop, start, (start[None], x0[None]), extremes)
+    return interval, (start, jnp.append(x0, 0.0), code, jnp.zeros((), jnp.int32), extremes)
+
+
+def _extremes(loop: Loop, start: Number, seen: tuple[jax.Array, jax.Array], before: jax.Array) -> jax.Array:
+    """The least cost of stopping so far and the largest running maximum, (2,), after further points of the path.
+
+    Args:
+      loop: the closed loop.
+      start: the first time of the path, where discounting starts.
+      seen: times (k,) and states (k, n), in their order.
+      before: the two numbers before.
+    """
+    problem, (best, most) = loop.problem, before
+    times, states = seen
+
+    def along(function: Callable) -> jax.Array:
+        return jax.vmap(lambda t, x: loop.number(function, t, x))(times, states)
+
+    if problem.running_max is not None:
+        worst = jax.lax.cummax(jnp.maximum(along(problem.running_max), most))
+    else:
+        worst = jnp.full(times.shape, -jnp.inf, before.dtype)
+    if problem.stopping_cost is not None:
+        paid = jnp.maximum(loop.discount(times - start) * along(problem.stopping_cost), worst)
+        best = jnp.minimum(best, jnp.min(paid))
+    return jnp.stack([best, worst[-1]])
 
 
 def _path(ivp: InitialValueProblem, stepping: Stepping, last: Progress, shown: Rows) -> tuple[Path, jax.Array]:
     """The path of full length from its last state and the rows of its intervals, and a mask of those that it ran."""
     loop, x0, start = ivp.loop, ivp.x0, ivp.times[0]
-    (t, y, code, count), (later, states, controls, disturbances, active) = last, shown
+    (t, y, code, count, extremes), (later, states, controls, disturbances, active) = last, shown
     hit, ended = code == PathStatus.TARGET, code == PathStatus.DURATION
     times, states = jnp.append(start, later), jnp.concatenate([x0[None], states])
-    if loop.problem.running_max is None:
-        # e^{−βτ} exit cost or e^{−βT} terminal cost; a path that ends by leaving or failing owes neither
-        exit_cost, final = (loop.number(c, t, y[:-1]) for c in (loop.problem.exit_cost, loop.problem.terminal_cost))
-        due = jnp.where(hit, exit_cost, jnp.where(ended, final, 0))
-        cost = y[-1] + loop.discount(t - start) * due
-    else:  # V ≥ g: the cost is the maximum of g along the path, seen at the output times; it has no discount
-        cost = jnp.max(jax.vmap(lambda t, x: loop.number(loop.problem.running_max, t, x))(times, states))
-        if loop.problem.terminal_cost is not None:
-            final = loop.number(loop.problem.terminal_cost, t, y[:-1])
-            cost = jnp.where(ended, jnp.maximum(cost, final), cost)
+    # a path that ends by leaving or failing owes nothing
+    due = jnp.where(hit, loop.paid_at_end(t, y[:-1]), loop.paid_at_last(t, y[:-1]))
+    due, owes = loop.discount(t - start) * due, hit | (ended & _has_last_payment(loop))
+    if is_tube(loop.problem):
+        best, most = extremes
+        last_chance = jnp.where(owes, jnp.maximum(due, most), jnp.inf)
+        stops = loop.problem.stopping_cost is not None
+        cost = jnp.minimum(best, last_chance) if stops else jnp.where(owes, last_chance, most)
+    else:
+        cost = y[-1] + jnp.where(owes, due, 0)
     reached = jnp.where(hit, t, jnp.inf)
     return Path(times, states, controls, disturbances, cost, reached, code, count, held=stepping.held), active
 
 
+def _has_last_payment(loop: Loop) -> bool:
+    """True if something is due after the last time, be it zero."""
+    return loop.due == "V at the horizon" or (loop.due == "terminal cost" and loop.problem.terminal_cost is not None)
+
+
 def _advance(
     loop: Loop, stepping: Stepping, solve: Callable, times: tuple[jax.Array, ...], y: jax.Array, u: Control
-) -> Progress:
-    """The path at the end of an interval, or at the target or the edge if they come first: (time, y, code, steps)."""
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, tuple[jax.Array, jax.Array]]:
+    """The path at the end of an interval, or at the target or the edge if they come first.
+
+    Returns:
+      Time, state with cost, code, steps, and the times (k,) and states (k, n) of what a tube sees of the interval.
+    """
     import diffrax
 
     t, end, last = times  # of the interval, and the last of all
@@ -208,8 +251,12 @@ def _advance(
         # equal steps that end on the output time; the 1e-6 forgives a quotient that rounding lifts over an integer
         step = width / jnp.ceil(jnp.maximum(width / stepping.max_step, LEAST_STEPS) - 1e-6)
     beginning = (u, t, y[:-1])
-    solved = solve(t0=t, t1=end, dt0=step, y0=jnp.append(y, 1) if _is_bridged(loop) else y, args=beginning)
-    later, y, met = solved.ts[0], solved.ys[0], jnp.zeros((), bool)
+    looks, saved = _looks(loop, t, end)
+    solved = solve(
+        t0=t, t1=end, dt0=step, y0=jnp.append(y, 1) if _is_bridged(loop) else y, args=beginning, saveat=saved
+    )
+    (later, *between), (y, *passed) = solved.ts, solved.ys
+    later, y, met = later[0], y[0], jnp.zeros((), bool)
     if _is_bridged(loop):
         y, met = y[:-1], (y[-1] < 1) & diffrax.is_event(solved.result)
         y = jnp.append(jnp.where(met, _on_target(loop, stepping, later, y[:-1], beginning), y[:-1]), y[-1])
@@ -223,7 +270,23 @@ def _advance(
     code = jnp.where(jnp.all(jnp.isfinite(y)), code, PathStatus.NONFINITE)
     # diffrax hands back infinity where it ran out of steps, and the state need not have been
     code = jnp.where(diffrax.is_okay(solved.result), code, PathStatus.MAX_STEPS)
-    return later, y, code, solved.stats["num_steps"].astype(jnp.int32)
+    seen = later[None], y[None, :-1]
+    if looks:  # behind the end of the path, diffrax has infinity
+        came = (between[0] <= later) & jnp.all(jnp.isfinite(passed[0]), axis=-1)
+        seen = jnp.where(came, between[0], later), jnp.where(came[:, None], passed[0][:, : y.size - 1], y[:-1])
+        seen = jnp.append(seen[0], later), jnp.concatenate([seen[1], y[None, :-1]])
+    return later, y, code, solved.stats["num_steps"].astype(jnp.int32), seen
+
+
+def _looks(loop: Loop, t: jax.Array, end: jax.Array) -> tuple[bool, "diffrax.SaveAt"]:
+    """True if a tube sees the path between output times, which it does without noise; and what diffrax is to save."""
+    import diffrax
+
+    last = diffrax.SubSaveAt(t1=True)
+    if not is_tube(loop.problem) or loop.problem.noise is not None:
+        return False, diffrax.SaveAt(subs=(last,))
+    shares = jnp.arange(1, LOOKS, dtype=t.dtype) / LOOKS
+    return True, diffrax.SaveAt(subs=(last, diffrax.SubSaveAt(ts=t + shares * (end - t))))
 
 
 def _solver(ivp: InitialValueProblem, stepping: Stepping, reverse: bool) -> Callable:
@@ -268,21 +331,21 @@ def _solver(ivp: InitialValueProblem, stepping: Stepping, reverse: bool) -> Call
         kind, controller = diffrax.SRA1 if additive else diffrax.Euler, diffrax.ConstantStepSize()
         solver = bridging(kind)(flag=_flag_of_steps(ivp, stepping)) if bridged else kind()
     event = None
-    ends = loop.guarded or loop.problem.target is not None or (loop.grid is not None and not loop.clamp)
+    ends = loop.guarded or loop.ends or (loop.grid is not None and not loop.clamp)
     if ends:  # it doubles the compile time
         close = BRACKET * jnp.finfo(x0.dtype).eps
         # flip=True: the function falls through zero. "detect" would put a host callback into the compiled run.
         event = diffrax.Event(margin, _bisection()(close, close, flip=True), direction=False)
     return functools.partial(
         diffrax.diffeqsolve, terms, solver, stepsize_controller=controller, event=event,
-        saveat=diffrax.SaveAt(t1=True), max_steps=stepping.max_steps, throw=False,
+        max_steps=stepping.max_steps, throw=False,
         adjoint=diffrax.RecursiveCheckpointAdjoint(CHECKPOINTS) if reverse else diffrax.ForwardMode(),
     )  # fmt: skip
 
 
 def _is_bridged(loop: Loop) -> bool:
     """True if a path may meet a target between the ends of a step."""
-    return loop.problem.noise is not None and loop.problem.target is not None
+    return loop.problem.noise is not None and loop.ends
 
 
 def _acting(loop: Loop, stepping: Stepping, t: Number, x: State, beginning: Beginning) -> Actions:

@@ -2,7 +2,8 @@
 
     u(x) = argmin_u max_d [ L(x, u, d) + f(x, u, d)·DV(x) + ½ tr(σσᵀ(x, u, d) D²V(x)) ]
 
-with DV the interpolated central differences of ``costate_at`` and D²V from V one cell away. Where a control jumps
+with DV the interpolated central differences of ``costate_at`` and D²V from V one cell away, which beyond an end of the
+box goes on as the scheme has it: mirrored at a wall, on a parabola at an open end. Where a control jumps
 between two nodes, their mean is optimal for neither, and of an enumerated set not even a member; the minimiser jumps
 with DV.
 """
@@ -16,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hjbjax.discretisation import stencil
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Limited
 from hjbjax.discretisation.stencil import Links
@@ -287,7 +289,9 @@ def _at(greedy: Greedy, when: tuple[Number, ...], x: State, p: Costate) -> tuple
     value, bends = jnp.zeros((3,) * n, x.dtype), (jnp.zeros((), x.dtype),) * n
     if problem.noise is not None:
         steps = np.stack(np.meshgrid(*[(-1, 0, 1)] * n, indexing="ij"), axis=-1)
-        value = greedy.solution.value_at(*when, _reflected(jnp.asarray(x + h * steps), grid), clamp=True)
+        points = _reflected(jnp.asarray(x + h * steps), grid)
+        look = functools.partial(greedy.solution.value_at, *when, clamp=True)
+        value = beyond_open_ends(look, points, grid, [axis for axis, _ in grid.sides("open")])
         center = (1,) * n
         # D⁺ − D⁻ along every axis, the second difference times h: the form in which the Hamiltonian takes noise
         bends = tuple(
@@ -312,6 +316,39 @@ def _reflected(points: jax.Array, grid: Grid) -> jax.Array:
         along = points[..., axis]
         points = points.at[..., axis].set(jnp.where(step * (along - wall) > 0, 2 * wall - along, along))
     return points
+
+
+def beyond_open_ends(look: Callable, points: jax.Array, grid: Grid, axes: Sequence[int]) -> jax.Array:
+    """V at points (..., n) that may lie beyond open ends of some axes, where the scheme continues it.
+
+    One node beyond an end is the scheme's own, on the parabola through the last three; V is linear up to there.
+
+    Args:
+      look: V inside the box, as a function of points (..., n).
+      points: where.
+      grid: the nodes.
+      axes: the axes with open ends; repetitions count once.
+    """
+    if not axes:
+        return look(points)
+    axis, further = axes[0], [other for other in axes[1:] if other != axes[0]]
+    along, nodes = points[..., axis], jnp.asarray(grid.axis(axis), points.dtype)
+    places, weights = [along, along, along], [jnp.ones_like(along), jnp.zeros_like(along), jnp.zeros_like(along)]
+    for step in (step for which, step in grid.sides("open") if which == axis):
+        end = nodes[:3] if step < 0 else nodes[:-4:-1]  # from the end inwards
+        share = step * (along - end[0]) / jnp.abs(end[1] - end[0])
+        outside = share > 0
+        parabola = [jnp.asarray(weight, points.dtype) for weight in stencil.parabola(grid, axis, step)]
+        for k, weight in enumerate(parabola):
+            beyond = share * weight + (1 - share if k == 0 else 0)
+            places[k] = jnp.where(outside, end[k], places[k])
+            weights[k] = jnp.where(outside, beyond, weights[k])
+    values = [beyond_open_ends(look, points.at[..., axis].set(place), grid, further) for place in places]
+    # a node without weight has no say, be it infinite
+    return sum(
+        (jnp.where(weight == 0, 0, weight * value) for weight, value in zip(weights, values, strict=True)),
+        start=jnp.zeros(points.shape[:-1], points.dtype),
+    )
 
 
 def _middle(action: list[Array], dtype: DType, n: int) -> jax.Array:

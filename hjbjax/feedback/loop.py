@@ -40,7 +40,7 @@ NEWTON = 3  # steps onto the edge of the target, whose function need not be line
 EDGE = 1e-6  # the least share of a step before or after a meeting: shares of 0 and 1 would be no zero inside it
 
 
-@pytree_dataclass(static=("clamp",))
+@pytree_dataclass(static=("clamp", "due"))
 class Loop:
     """The closed loop as functions of (t, x).
 
@@ -50,6 +50,9 @@ class Loop:
       opponent: a pytree like it for the disturbance; None where nobody acts.
       grid: the Grid in whose box the players are known; None where that is everywhere.
       clamp: outside the box, True goes on with what the players say at its nearest point, False ends the path.
+      surplus: ψ − V as a function of (t, x), zero where the path is stopped; None where V stops no path.
+      due: what is paid after the last time: "terminal cost", "V at the horizon", or "nothing" of a path cut short.
+      at_horizon: V there as a function of (t, x), where it is not what the problem says.
     """
 
     problem: Problem
@@ -57,6 +60,9 @@ class Loop:
     opponent: Callable | None
     grid: Grid | None
     clamp: bool
+    surplus: Callable | None = None
+    due: str = "terminal cost"
+    at_horizon: Callable | None = None
 
     def wrap(self, x: State) -> State:
         """The state with its periodic entries in the box."""
@@ -102,9 +108,12 @@ class Loop:
     @property
     def guarded(self) -> bool:
         """True if there is a place where the players need not have an answer: inside a target, or on a grid."""
-        return (self.control is not None or self.opponent is not None) and (
-            self.problem.target is not None or self.grid is not None
-        )
+        return (self.control is not None or self.opponent is not None) and (self.ends or self.grid is not None)
+
+    @property
+    def ends(self) -> bool:
+        """True if a path may end at a target, or where V stops it."""
+        return self.problem.target is not None or self.surplus is not None
 
     def _ask(self, player: Callable, t: Number, x: State) -> jax.Array:
         """A player's action at (t, x); the player sees the state in the box."""
@@ -137,8 +146,9 @@ class Loop:
         return jnp.pad(sigma, ((0, 1), (0, 0)))
 
     def target(self, t: Number, x: State) -> jax.Array:
-        """The target's function at (t, x), ≤ 0 inside; inf where there is no target."""
-        return self.number(jnp.inf if self.problem.target is None else self.problem.target, t, x)
+        """A function ≤ 0 in the target and where V stops the path; inf where there is neither."""
+        level = self.number(jnp.inf if self.problem.target is None else self.problem.target, t, x)
+        return level if self.surplus is None else jnp.minimum(level, self.surplus(t, self.wrap(x)))
 
     def margin(self, x: State) -> jax.Array:
         """The distance to the edge of the box over its width, ≤ 0 outside; inf where the path may go anywhere."""
@@ -156,6 +166,31 @@ class Loop:
         if callable(value):
             value = value(*self.problem.state_arguments(self.wrap(x), t))
         return jnp.asarray(0.0 if value is None else value, x.dtype)
+
+    def paid_at_end(self, t: Number, x: State) -> jax.Array:
+        """The cost of ending at (t, x), where ``target`` is ≤ 0: on the target the exit cost, elsewhere ψ."""
+        exit_cost = self.number(self.problem.exit_cost, t, x)
+        if self.surplus is None:
+            return exit_cost
+        price = self.number(self.problem.stopping_cost, t, x)
+        if self.problem.target is None:
+            return price
+        return jnp.where(self.number(self.problem.target, t, x) <= 0, exit_cost, price)
+
+    def paid_at_last(self, t: Number, x: State) -> jax.Array:
+        """The cost due at (t, x) after the last time; see ``due``."""
+        problem = self.problem
+        if self.due == "nothing":
+            return jnp.zeros((), x.dtype)
+        if self.due == "terminal cost":
+            return self.number(problem.terminal_cost, t, x)
+        if self.at_horizon is not None:
+            return jnp.asarray(self.at_horizon(t, self.wrap(x)), x.dtype)
+        final = problem.terminal_cost
+        if final is None:
+            final = problem.running_max if problem.stopping_cost is None else problem.stopping_cost
+        paid = self.number(final, t, x)
+        return paid if problem.stopping_cost is None else jnp.minimum(paid, self.number(problem.stopping_cost, t, x))
 
 
 def are_finite(actions: Actions) -> jax.Array:

@@ -1,23 +1,16 @@
-"""The answer of a simulation: a path, where V says that it ends, why it ends, and the line that says so."""
+"""The result of a simulation: a path, why it ends, and the line that says so."""
 
 import enum
-import math
-from collections.abc import Callable
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem import streams
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import altered, as_partial, is_traced, pytree_dataclass
+from hjbjax.problem.pytree import is_traced, pytree_dataclass
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, holds
 from hjbjax.problem.streams import encodable
-from hjbjax.problem.types import Array, Numbers, State
-from hjbjax.solution.solution import Solution
-from hjbjax.tracing.components import of_state
+from hjbjax.problem.types import Array
 
 MANY = 1000  # internal steps, beside an eighth of those allowed: more of them tell of a feedback that jumps
 
@@ -67,14 +60,15 @@ class Path:
       states: shape (k+1, n), periodic states unwound (``grid.wrap`` brings them into the grid).
       controls: shape (k, m), the control at the start of each interval; under ``hold`` all through it.
       disturbances: shape (k, l), likewise, or None where there is no opponent.
-      cost: discounted running cost, plus the discounted exit cost if the target was reached; with
-        ``running_max`` the maximum of that function over the output times instead.
+      cost: discounted running cost, plus what is due at the end: the discounted exit cost on the target, ψ where V = ψ,
+        and what ``march`` assumed at the horizon. Of a tube the cost of the best moment to stop: the least ψ on the
+        way, the largest ``running_max``, or with both the least of max{ψ, largest ``running_max`` so far}.
       reached: the time at which the target was reached, or None.
       code: a PathStatus number.
       steps: internal steps of the integrator, rejected ones included.
       message: one line on how the path ended.
-      promised: V at the start, where the feedback is a Solution or comes of one: up to errors of the grid and the
-        integrator, and what is paid after a path that is cut short, no path costs less in the mean. Else None.
+      promised: V at the start, where the feedback is a Solution or comes of one. The cost in the mean, with what is
+        paid after a path that is cut short, up to errors of the grid and the integrator. Else None.
       held: whether each control was held through its interval, so that a picture shows steps.
     """
 
@@ -103,57 +97,6 @@ class Path:
 
     def __str__(self) -> str:
         return encodable(self.message)  # a terminal may lack a letter, and print would raise
-
-
-def promise(feedback: object, start: Array) -> float | None:
-    """V at the start of a path, by the solution of its feedback; None where there is none."""
-    solution = _solution_of(feedback)
-    if solution is None:
-        return None
-    where = (start,) if solution.times is None else (0.0, start)
-    value = float(solution.value_at(*where, clamp=True))
-    return value if math.isfinite(value) else None
-
-
-def _solution_of(feedback: object) -> Solution | None:
-    """The solution that is a feedback, or from which one comes."""
-    solution = feedback if isinstance(feedback, Solution) else getattr(feedback, "solution", None)
-    return solution if isinstance(solution, Solution) else None
-
-
-def with_stops(problem: Problem, feedback: object) -> Problem:
-    """The problem whose paths end, and pay ψ, where the Solution behind a feedback says that one had better stop.
-
-    That is where V = ψ at every node around. Problems whose value is no cost of a path, as of tubes, stay as they are.
-    """
-    solution = _solution_of(feedback)
-    no_path = problem.cost is None or problem.running_max is not None or problem.is_game or problem.time_dependent
-    if problem.stopping_cost is None or no_path or solution is None or solution.times is not None:
-        return problem
-    value, grid = jnp.asarray(solution.value), solution.grid
-    surplus = of_state(problem, problem.stopping_cost, grid.components(value.dtype), 0.0, value.dtype) - value
-    rounding = 16 * jnp.finfo(value.dtype).eps * jnp.max(jnp.where(jnp.isfinite(value), jnp.abs(value), 0))
-    surplus -= rounding
-    if problem.noise is not None:
-        # V fits ψ smoothly, so that ψ − V grows as the square of the distance, of which a bridge between two steps asks
-        surplus = jnp.sqrt(jnp.maximum(surplus, 0))
-    beyond = jax.tree_util.Partial(_beyond, grid, surplus, as_partial(problem.target))
-    pay = jax.tree_util.Partial(_pay, as_partial(problem.target), problem.exit_cost, problem.stopping_cost)
-    return altered(problem, target=beyond, exit_cost=pay)
-
-
-def _beyond(grid: Grid, surplus: Array, target: Callable | None, x: State) -> Array:
-    """ψ − V, or its root, between the nodes, or the target's function where that is less: ≤ 0 where the path ends."""
-    least = jnp.asarray(grid.interpolate(surplus, x, clamp=True), x.dtype)
-    return least if target is None else jnp.minimum(least, target(x))
-
-
-def _pay(target: Callable | None, exit_cost: Numbers | Callable | None, stopping_cost: Callable, x: State) -> Array:
-    """What is paid at the end: on the target the exit cost, elsewhere ψ."""
-    if target is None:
-        return stopping_cost(x)
-    on_target = exit_cost(x) if callable(exit_cost) else 0.0 if exit_cost is None else exit_cost
-    return jnp.where(target(x) <= 0, on_target, stopping_cost(x))
 
 
 def joined(first: Path, then: Path, discount: float) -> Path:

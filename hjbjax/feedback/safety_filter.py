@@ -17,6 +17,7 @@ import numpy as np
 
 from hjbjax.feedback.feedback import GridFeedback, Place, is_grid_feedback
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, is_traced, pytree_dataclass, with_suggestions
 from hjbjax.problem.types import Array, Number
 from hjbjax.solution.solution import Solution
@@ -77,8 +78,8 @@ def least_restrictive(solution: Solution, nominal: GridFeedback | Callable, *, m
 
     Raises:
       TypeError: no Solution, or a nominal control that cannot be called.
-      ValueError: a tube without controls, that did not converge, is nowhere safe, or was marched and kept at one time
-        only; a margin that is negative or NaN.
+      ValueError: a solution of another problem than a tube; a tube without controls, that did not converge, is nowhere
+        safe, or was marched and kept at one time only; a margin that is negative or NaN.
 
     Example:
       >>> import hjbjax as hjb
@@ -92,6 +93,11 @@ def least_restrictive(solution: Solution, nominal: GridFeedback | Callable, *, m
     """
     if not isinstance(solution, Solution):
         raise TypeError(f"least_restrictive: got {type(solution).__name__}, wanted the Solution of a tube")
+    if solution.problem is not None and not _is_tube(solution.problem):
+        raise ValueError(
+            "least_restrictive: got the solution of another problem than a tube; its V ≤ 0 does not say what is safe. "
+            "Give that of hjb.avoid(...), hjb.reach_avoid(...) or hjb.reach(...), with tube=True"
+        )
     control = _nominal(nominal)
     if solution.times is not None and np.size(solution.times) < 2:
         raise ValueError(
@@ -124,6 +130,14 @@ def least_restrictive(solution: Solution, nominal: GridFeedback | Callable, *, m
             f"{np.min(np.asarray(solution.value)):.3g}; give a smaller margin, a larger box or a finer grid"
         )
     return Filter(tube, control, margin)
+
+
+def _is_tube(problem: Problem) -> bool:
+    """True if V is an extreme of a signed distance along the path, whose sign says what is safe."""
+    priced = problem.cost is not None or problem.noise is not None or problem.target is not None
+    extreme = problem.running_max is not None or problem.stopping_cost is not None
+    undiscounted = is_traced(problem.discount) or not np.any(np.asarray(problem.discount))
+    return extreme and undiscounted and not priced
 
 
 def _nominal(nominal: GridFeedback | Callable) -> Callable:

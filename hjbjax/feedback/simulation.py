@@ -1,6 +1,5 @@
 """Simulation: ``simulate`` at the host, with checks and a report; ``rollout``, its integration as a pure function."""
 
-import copy
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
@@ -11,15 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.feedback.closed_loop import InitialValueProblem, Stepping, blank_record, integrate, integrate_part
-from hjbjax.feedback.feedback import GridFeedback, check_kept, is_grid_feedback, lookups
+from hjbjax.feedback.feedback import ROUNDING, GridFeedback, check_kept, is_grid_feedback, lookups
 from hjbjax.feedback.loop import Loop, check_shapes, random_key, settled_loop, timeless
-from hjbjax.feedback.path import Interrupted, Path, PathStatus, promise, truncate, with_stops
+from hjbjax.feedback.path import Interrupted, Path, PathStatus, truncate
+from hjbjax.feedback.payments import broken_promise, promise, surplus, value_at_horizon
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, cast, is_traced, with_suggestions
 from hjbjax.problem.types import Key, Number, Numbers
 from hjbjax.solution.clock import CHUNK_SECONDS, Clock, noting_interrupts
+from hjbjax.solution.status import warn
 from hjbjax.tracing.closures import OF_ACTION, OF_STATE, holds_tracers, opened, settled
 
 Feedback: TypeAlias = GridFeedback | Callable | None  # None where there is no control
@@ -60,9 +61,11 @@ def simulate(
       feedback: a Solution, a ``greedy_feedback``, or a function that returns the control, shape (m,). ``None`` if
         there is no control.
         Where a Solution of a problem with a stopping cost says that one had better stop, V = ψ at all nodes around,
-        the path ends as in a target and pays ψ.
-        A marched Solution must have been kept at enough times: at least ten over the duration. Its terminal cost,
-        and that of any problem, is paid at the end of a path that lasts as long as the horizon.
+        the path ends as in a target and pays ψ. Without a running cost and without noise it goes on, and its cost is
+        that of the best moment to stop.
+        A marched Solution must have been kept at enough times: at least ten over the duration. A path that lasts as
+        long as the horizon pays what ``march`` assumed there: ``start``, the terminal cost, else ψ, else g.
+        After a function the terminal cost is paid at the end.
       x0: the state at time 0, shape (n,).
       duration: how long to run unless the target is reached before, in units of time.
 
@@ -83,7 +86,8 @@ def simulate(
       max_steps: no internal step is shorter than 2·duration/max_steps, and no more are made.
 
     Returns:
-      A Path. One that ends early, except in the target, warns and says so in its ``status`` and ``message``.
+      A Path. One that ends early, except in the target, warns and says so in its ``status`` and ``message``. One that
+      costs something else than V promised, by many times its estimated error, warns as well.
 
     Raises:
       ValueError: an argument that is not admissible, or a function that returns the wrong shape.
@@ -105,16 +109,15 @@ def simulate(
     if not isinstance(problem, Problem):
         raise TypeError(f"simulate: got {type(problem).__name__}, wanted a Problem, and then its feedback")
     duration = float(arguments.positive(duration, "simulate: duration", "in units of time"))
-    if _is_marched(feedback):
-        problem = _within_horizon(problem, feedback, duration)
+    due = _due(feedback, duration)
     if _is_traced(problem, feedback, disturbance, x0, key, grid, rtol, atol, max_step):
         options: Any = {"disturbance": disturbance, "time_varying": time_varying, "grid": grid, "clamp": clamp}
         times, held = _times(duration, steps, None if hold is False else hold), hold is not None and hold is not False
         return rollout(
             problem, feedback, jnp.asarray(x0, jnp.result_type(float)), times, key=random_key(problem, key), hold=held,
-            rtol=rtol, atol=atol, max_step=max_step, max_steps=max_steps, **options,
+            rtol=rtol, atol=atol, max_step=max_step, max_steps=max_steps, due=due, **options,
         )  # fmt: skip
-    loop = _close(problem, feedback, disturbance, grid, clamp, time_varying)
+    loop = _close(problem, feedback, disturbance, grid, clamp, time_varying, due)
     start = _initial_state(x0, loop.grid)
     loop = settled_loop(loop, start.size, {"control": feedback, "opponent": disturbance})
     hold = None if hold is False else hold
@@ -149,6 +152,11 @@ def simulate(
         path, active, grid, controls = jax.tree.map(np.asarray, (path, active, loop.grid, problem.controls))
         path = dataclasses.replace(path, promised=promise(feedback, start))
         path = truncate(path, int(np.sum(active)), max_steps, grid, controls, problem.noise is not None)
+        broken = broken_promise(
+            problem, feedback, path, to_horizon=due == "V at the horizon", worst_case=disturbance is None
+        )
+        if broken is not None:
+            warn(f"simulate: {broken}")
         if clock.interrupted:
             raise Interrupted(path)
     return path
@@ -199,6 +207,7 @@ def rollout(
     atol: Number = 1e-8,
     max_step: Number | None = None,
     max_steps: int = 100_000,
+    due: str | None = None,
 ) -> Path:
     """``simulate`` as a pure function, for ``jit``, ``vmap`` (over keys, starts, parameters), ``grad`` and ``jvp``.
 
@@ -216,6 +225,8 @@ def rollout(
       key: a JAX random key; wanted exactly when the problem has noise.
       hold: True where the control is held from one output time to the next.
       grid: as in ``simulate``, like ``clamp``, ``rtol``, ``atol``, ``max_step`` and ``max_steps``.
+      due: what is paid after the last time: "terminal cost", "V at the horizon" of a march, or "nothing". ``None`` is
+        the terminal cost of a function, V at the horizon of a marched feedback, and nothing of a stationary one.
 
     Returns:
       A Path of JAX arrays without a message.
@@ -238,7 +249,9 @@ def rollout(
     key = random_key(problem, key)
     # numbers that functions close over become leaves: a rule of derivatives sees nothing else
     problem = settled(problem, start.size, start.dtype)
-    loop = _close(problem, feedback, disturbance, grid, clamp, time_varying)
+    if due is None:
+        due = "V at the horizon" if _is_marched(feedback) else "terminal cost"
+    loop = _close(problem, feedback, disturbance, grid, clamp, time_varying, due)
     moment = [jax.ShapeDtypeStruct(shape, start.dtype) for shape in ((), start.shape)]
     loop = dataclasses.replace(loop, control=opened(loop.control, *moment), opponent=opened(loop.opponent, *moment))
     check_shapes(loop, start)
@@ -253,6 +266,7 @@ def _close(
     grid: Grid | None,
     clamp: bool,
     time_varying: bool,
+    due: str,
 ) -> Loop:
     """The loop through a Solution, which brings its grid and its worst case, or through functions."""
     if disturbance is not None and not problem.is_game:
@@ -286,7 +300,10 @@ def _close(
             for player, given in ((control, feedback), (opponent, disturbance))
         )
     control = None if problem.controls is None else as_partial(control)
-    return Loop(with_stops(problem, feedback), control, as_partial(opponent), grid, bool(clamp))
+    return Loop(
+        problem, control, as_partial(opponent), grid, bool(clamp), surplus(problem, feedback), due,
+        value_at_horizon(feedback) if due == "V at the horizon" else None,
+    )  # fmt: skip
 
 
 def _is_marched(feedback: object) -> TypeGuard[GridFeedback]:
@@ -294,18 +311,17 @@ def _is_marched(feedback: object) -> TypeGuard[GridFeedback]:
     return getattr(feedback, "times", None) is not None
 
 
-def _within_horizon(problem: Problem, solution: GridFeedback, duration: float) -> Problem:
-    """The problem under a marched feedback, without its terminal cost if the path ends before the horizon.
+def _due(feedback: Feedback, duration: float) -> str:
+    """What is paid at the end of a path: V at the horizon of a march, if the path lasts as long; see ``Loop``.
 
     Raises:
-      ValueError: the feedback is not known well enough up to the duration.
+      ValueError: a marched feedback that is not known well enough up to the duration.
     """
-    horizon = check_kept(solution, duration, "simulate: duration")
+    if not _is_marched(feedback):
+        return "terminal cost"
+    horizon = check_kept(feedback, duration, "simulate: duration")
     # V at the horizon is owed there, not where a shorter path stops
-    if duration < horizon * (1 - 1e-9) and problem.terminal_cost is not None:
-        problem = copy.copy(problem)  # and no `replace`, which would check and wrap all other fields again
-        object.__setattr__(problem, "terminal_cost", None)
-    return problem
+    return "nothing" if duration < horizon * (1 - ROUNDING) else "V at the horizon"
 
 
 def _initial_state(x0: object, grid: Grid | None) -> np.ndarray:

@@ -1,19 +1,27 @@
 """Methods in time, as values: V at t − Δt from V at t. ``Tableau`` says how to write a Runge–Kutta method of your own.
 
-Explicit: strong-stability-preserving Runge–Kutta methods of Shu and Osher, with F = min max H − β V,
+The discount is integrated exactly, by steps in s with e^{−βτ} = 1 − β s, τ = t₀ − t the time since the step began:
+
+    dV/ds = (min max H − β V)/(1 − β s),
+
+whose right side is constant where H is, so that any step is exact there, whatever its length. S = (1 − e^{−βΔt})/β is
+the length of a step in s, and Δt without a discount.
+
+Explicit: strong-stability-preserving Runge–Kutta methods of Shu and Osher, with F = dV/ds and S for Δt,
 
     W ← a_k V + (1 − a_k) (W + c Δt F(W)),    a = (0), (0, ½), (0, ¾, ⅓) with c = 1; (0, 0, ⅔, 0) with c = ½,
 
 each stage a mean of Euler steps, so that what one Euler step keeps, they keep: V ← max(g, min(ψ, ·)) and the given
 values after every stage, and for the monotone chain the order of two values and the range of the data, as long as
-c Δt (max Q + β) ≤ 1 with Q the rate at which the chain leaves a node. Order 1, 2, 3 and 3 in time. A ``Tableau`` of
+c S e^{βΔt} (max Q + β) ≤ 1 with Q the rate at which the chain leaves a node; Euler's step lacks the factor e^{βΔt}.
+Order 1, 2, 3 and 3 in time. A ``Tableau`` of
 one's own goes into ``Explicit(stages=...)``.
 
-Implicit (Euler): with V at t known, W = V(·, t − Δt) solves the stationary problem
+Implicit (Euler): with V at t known and S' = S e^{βΔt}, W = V(·, t − Δt) solves the stationary problem
 
-    min{ max{ (β + 1/Δt) W − V/Δt − min max H(W), W − ψ }, W − g } = 0,
+    min{ max{ (β + 1/S') W − V/S' − min max H(W), W − ψ }, W − g } = 0,
 
-that is, with discount β + 1/Δt and V/Δt added to the running cost: any Δt, monotone, order 1. A step ends when the
+that is, with discount β + 1/S' and V/S' added to the running cost: any Δt, monotone, order 1. A step ends when the
 additive certificate of that problem is small enough, or the residual is rounding.
 """
 
@@ -31,12 +39,43 @@ from hjbjax.iteration.certificates import Certificate, Iterate
 from hjbjax.iteration.evaluation import Evaluation, check_evaluation, evaluate
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, is_traced, pytree_dataclass
 from hjbjax.problem.types import DType, Field, Number, Scalar
 
 ROUNDING = 16  # residuals below this many units in the last place of max|V| are rounding
 TOL = 1e-6  # cost units, for a value that spans one or more
 REPLIES = 20  # of the inner player to one policy of the outer one, at most
+
+
+def stretched(dt: Number, problem: Problem, dtype: DType) -> Scalar:
+    """(e^{βΔt} − 1)/β, cost units per unit of a constant cost that grows with the discount; Δt without one."""
+    dt = jnp.asarray(dt, dtype)
+    if problem.discounted is False:
+        return dt
+    discount = jnp.asarray(problem.discount, dtype)
+    some = discount > 0
+    # the inner where keeps 0/0 out of the branch not taken, whose NaN a derivative would bring back
+    return jnp.where(some, jnp.expm1(discount * dt) / jnp.where(some, discount, 1), dt)
+
+
+def longest_step(rate: Scalar, problem: Problem, share: Number, tableau: "Tableau") -> Scalar:
+    """The longest step whose Euler steps are monotone if ``share`` is 1/c; inf where nothing moves.
+
+    Args:
+      rate: the largest Q + β, per unit time.
+      problem: with the discount β.
+      share: the step over 1/(max Q + β), of a small discount.
+      tableau: the stages.
+    """
+    moves = rate > 0
+    # the inner where keeps 1/0 out of the branch not taken, whose NaN a derivative would bring back
+    step = jnp.where(moves, share / jnp.where(moves, rate, 1), jnp.inf)
+    if problem.discounted is False or len(tableau.means) == 1:
+        return step
+    scaled = jnp.where(moves, jnp.asarray(problem.discount, step.dtype) * jnp.where(moves, step, 1), 0)
+    some = scaled > 0  # S e^{βΔt} (Q + β) is the share at βΔt = log(1 + β share/(Q + β))
+    return step * jnp.where(some, jnp.log1p(scaled) / jnp.where(some, scaled, 1), 1)
 
 
 class Marching(Protocol):
@@ -180,19 +219,22 @@ class Explicit:
     def step(self, march: Marching, value: Field, t: Number, end: Number, dt: Number) -> tuple[Field, Scalar, Any]:
         """V at ``end`` = t − Δt from V at t by the stages of the tableau, true, and the rates and the noise seen."""
         dtype, tableau, fine = value.dtype, self.tableau, jnp.ones((), bool)
+        length = -stretched(-dt, march.on.problem, dtype)  # S
         if len(tableau.means) == 1:  # Euler: no loop of one turn
             rate, seen = march.rate(value, t)
-            return march.obstacles_at(t - dt).impose(value + dt * rate), fine, seen
+            return march.obstacles_at(t - dt).impose(value + length * rate), fine, seen
         means, starts, ends = (
             jnp.asarray(table, dtype) for table in (tableau.means, tableau.times[:-1], tableau.times[1:])
         )
 
         def stage(k, carry):
             w, seen = carry
-            rate, now = march.rate(w, t - starts[k] * dt)
+            begun, factor = _elapsed(march.on.problem, starts[k], length, dt)
+            rate, now = march.rate(w, t - begun)
             # a mean of V and of one Euler step with weights ≥ 0: what Euler's step keeps, this keeps
-            moved = means[k] * value + (1 - means[k]) * (w + tableau.euler * dt * rate)
-            return march.obstacles_at(t - ends[k] * dt).impose(moved), seen.joined(now)
+            moved = means[k] * value + (1 - means[k]) * (w + tableau.euler * length * factor * rate)
+            ended, _ = _elapsed(march.on.problem, ends[k], length, dt)
+            return march.obstacles_at(t - ended).impose(moved), seen.joined(now)
 
         # a loop, so that the slopes are compiled once and not once a stage
         value, seen = jax.lax.fori_loop(0, len(tableau.means), stage, (value, march.nothing_seen()))
@@ -252,6 +294,18 @@ class Implicit:
         return f"Implicit({self.evaluation!r}{tol})"
 
 
+def _elapsed(problem: Problem, share: Scalar, length: Scalar, dt: Number) -> tuple[Scalar, Scalar | float]:
+    """The time since a step began at a share of its length S in s, and the factor 1/(1 − β s) there."""
+    if problem.discounted is False:
+        return share * dt, 1.0
+    discount = jnp.asarray(problem.discount, length.dtype)
+    some = discount > 0
+    left = 1 - discount * share * length
+    time = -jnp.log(left) / jnp.where(some, discount, 1)
+    # at the end Δt itself, which a logarithm gives back up to rounding
+    return jnp.where(some & (share < 1), time, share * dt), 1 / left
+
+
 def _as(number: Number, dtype: DType) -> Number:
     """A number in the type of a march; one that is traced keeps its own."""
     return number if is_traced(number) else jnp.asarray(number, dtype)
@@ -288,9 +342,10 @@ class ImplicitStep:
     @classmethod
     def of(cls, on: Discretisation, obstacles: Obstacles, value: Field, dt: Number) -> "ImplicitStep":
         """The problem whose solution is V a time Δt before that of ``value``, on the chain of that earlier time."""
+        rate = 1 / stretched(dt, on.problem, value.dtype)
         # not by Problem(...), which refuses a discount beside a running maximum
-        shifted = altered(on.problem, discount=on.problem.discount + 1 / dt)
-        return cls(on.asking(shifted), obstacles, value / dt)
+        shifted = altered(on.problem, discount=on.problem.discount + rate)
+        return cls(on.asking(shifted), obstacles, value * rate)
 
     @property
     def grid(self) -> Grid:
@@ -325,27 +380,42 @@ class ImplicitStep:
           max_steps: policy improvements, at most.
         """
 
-        def look(value):
-            policy = self._complete(bellman.greedy(self.on, value, self.obstacles.fixed))
+        def look(value, incumbent):
+            # a search between samples may miss the action of the step before, and would go to and fro between two
+            policy = self._complete(bellman.greedy(self.on, value, self.obstacles.fixed, incumbent=incumbent))
             equation = self.equation(value, policy)
             iterate = Iterate(self.grid, value, policy, equation, self.obstacles, counted=True)
             bound = certificates.error_bound(Certificate.ADDITIVE, iterate, discount=self.on.problem.discount)
             # a short step's share of the tolerance may be less than the rounding of V, and would never be reached
             rounding = ROUNDING * jnp.finfo(value.dtype).eps * self.grid.largest(jnp.abs(value))
+            # below that a relative accuracy is lost to underflow, as over a horizon of 1e-300
+            rounding = jnp.maximum(rounding, jnp.finfo(value.dtype).tiny / jnp.finfo(value.dtype).eps)
             enough = (bound.error <= tol.at(value, self.grid)) | (bound.residual <= rounding)
             return policy, bound.residual, enough
 
         def unfinished(carry):
             _, _, residual, done, _, count = carry
-            return ~done & (count < max_steps) & jnp.isfinite(residual)  # a NaN is the march's to report
+            # a NaN is the march's to report
+            return ~done & (count <= max_steps) & ((count == 0) | jnp.isfinite(residual))
 
         def improve(carry):
             value, policy, residual, _, least, count = carry
-            value = self._evaluated(value, policy, methods.inner_goal(residual, least), evaluation)
-            return value, *look(value), jnp.minimum(least, residual), count + 1
+            before = residual
+            policy, residual, done = look(value, policy)
+
+            def evaluated():
+                goal = methods.inner_goal(residual, jnp.minimum(least, before))
+                return self._evaluated(value, policy, goal, evaluation)
+
+            goes_on = ~done & jnp.isfinite(residual) & (count < max_steps)
+            value = jax.lax.cond(goes_on, evaluated, lambda: value)
+            return value, policy, residual, done, jnp.minimum(least, before), count + 1
 
         start = self.impose(value)  # V at t is a guess for W that is wrong by O(Δt) only
-        carry = (start, *look(start), jnp.asarray(jnp.inf, start.dtype), jnp.zeros((), jnp.int32))
+        endless, zero = jnp.asarray(jnp.inf, start.dtype), jnp.zeros_like(start)
+        sizes = (0 if each is None else each.dim for each in (self.on.problem.controls, self.on.problem.disturbances))
+        nobody = Greedy(zero, *((zero,) * size for size in sizes))  # moved into the sets before it is tried
+        carry = (start, nobody, endless, jnp.zeros((), bool), endless, jnp.zeros((), jnp.int32))
         value, policy, _, done, _, _ = jax.lax.while_loop(unfinished, improve, carry)
         return value, policy, done
 

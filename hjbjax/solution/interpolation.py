@@ -90,15 +90,23 @@ def _moment(times: Array, t: Any, dtype: DType, name: str) -> Moment:
     except (TypeError, ValueError):
         raise TypeError(f"{name}: got t = {t!r}, wanted a time") from None
     times = jnp.asarray(times, dtype)
-    # a user's ``0.1 * k`` and the march's own times differ by rounding
-    slack = 8 * jnp.finfo(dtype).eps * jnp.max(jnp.abs(times))
-    inside = (t >= times[0] - slack) & (t <= times[-1] + slack)
+    inside = ~beyond(times, t)
     if len(times) == 1:
         return Moment(jnp.zeros(t.shape, int), jnp.zeros(t.shape, dtype), inside)
     # a kept time counts to the interval that begins there, the last one to the interval that ends there
     before = jnp.clip(jnp.searchsorted(times, t, side="right") - 1, 0, len(times) - 2)
     share = (t - times[before]) / (times[before + 1] - times[before])
     return Moment(before, jnp.clip(share, 0, 1), inside & ~jnp.isnan(t))
+
+
+def beyond(times: Array, t: Array) -> Any:
+    """The times t that lie outside the kept ones, bool; NaN counts as inside."""
+    xp: Any = jnp if is_traced(times, t) or isinstance(times, jax.Array) else np
+    times, t = xp.asarray(times), xp.asarray(t)
+    kind = times.dtype if np.issubdtype(times.dtype, np.floating) else t.dtype
+    # a user's ``0.1 * k`` and the march's own times differ by rounding
+    slack = 8 * np.finfo(kind if np.issubdtype(kind, np.floating) else float).eps * xp.max(xp.abs(times))
+    return (t < times[0] - slack) | (t > times[-1] + slack)
 
 
 def _states(grid: Grid, x: Numbers, dtype: DType, name: str) -> jax.Array:

@@ -29,6 +29,7 @@ from hjbjax.solution.interpolation import (
     Samples,
     between,
     between_defined,
+    beyond,
     check_query,
     nearest,
     query,
@@ -231,6 +232,18 @@ class Solution:
         t, x = check_query(self, name, values, trailing, where)
         samples = Samples(self.grid, values, self.times)
         found = query(look, samples, x, t, clamp=clamp, name=f"Solution.{name}")
+        if (
+            not clamp
+            and t is not None
+            and not is_traced(found, t, self.times)
+            and np.any(late := beyond(self.times, t))
+        ):
+            streams.warn(
+                f"Solution.{name}: {np.sum(late)} of {np.size(late)} times lie outside the kept ones, from "
+                f"{float(np.min(self.times)):.6g} to {float(np.max(self.times)):.6g}, where the answer is NaN; keep "
+                "more in march(..., times=), or clamp=True takes the nearest",
+                stacklevel=3,
+            )
         if not clamp and not is_traced(found, x, self.grid) and np.any(outside := self.grid.beyond(x)):
             streams.warn(
                 f"Solution.{name}: {np.sum(outside)} of {np.size(outside)} states lie outside the grid, where the "

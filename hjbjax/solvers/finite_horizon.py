@@ -35,17 +35,18 @@ from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solution.placement import Path
 from hjbjax.solution.solution import Solution, SolveError, question
 from hjbjax.solution.status import Status
-from hjbjax.solvers import host_loop, march_run
+from hjbjax.solvers import host_loop, march_run, time_probes
 from hjbjax.solvers.result import solution_at_start, with_last_phase
 from hjbjax.solvers.setup import check_on_one_state, choose_evaluation
 from hjbjax.solvers.stationary import check_node_values
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
 
+ROUNDING = 1e-12  # relative, by which a kept time may lie beyond the horizon
 PROBES = 33  # times at which a given step, and constrained ends, are held against a time-dependent problem
-FEWEST = 100  # steps where no stability limit is known for all of them: implicit, time-dependent, rates by samples
+FEWEST = 100  # steps where no stability limit is known for all of them: implicit, or rates by samples
 
-_stable = jax.jit(time_stepping.stable)
+_stable = jax.jit(time_stepping.stable, static_argnames="tableau")
 _obstacles = jax.jit(bellman.obstacles)
 
 
@@ -88,11 +89,12 @@ def march(
         order, or ``Upwind(split=True)`` for implicit steps: a game whose players drive one component is upwinded player
         by player, see ``Upwind``.
       method: ``Explicit(...)``, the default, whose steps the grid limits, or ``Implicit(...)``, of any step.
-      step: the longest time step; ``None`` is the stable one, and a hundredth of the horizon if implicit, if the
-        functions depend on the time, or if the fastest action may be between the samples of its set.
+      step: the longest time step; ``None`` is the stable one, and a hundredth of the horizon if implicit or if the
+        fastest action may be between the samples of its set. Where the functions depend on the time it is a hundredth,
+        and down to a 6400th of the horizon where they change faster.
       inner: for a disturbance that is bounded only by the size of its ``Box``, as in an L₂ gain: the march stops,
         DIVERGED, where the worst disturbance reaches that bound in this share of the grid's box about its middle,
-        since a value that blows up does. ``None``: ½ if the cost is quadratic in every disturbance, else 0, never.
+        since a value that blows up does. ``None`` is 0, never: the bound is a part of the problem.
       policy: whether the policy comes with the value; else V alone is kept, as by ``ValueIteration(policy=False)``.
       dtype: ``None`` is float64; ``"float32"`` for memory and accelerators.
       time_limit: at most so many seconds, checks and compilation included.
@@ -107,7 +109,8 @@ def march(
       The solution: ``value[i]`` is V(·, times[i]), shape (k, *grid), the policy likewise. One that stopped early
       holds the times that it came to, and the last one it reached; one cut short by the time or by Ctrl-C may have no
       policy there, which is NaN. Inside ``jit``, ``vmap`` and ``grad`` the
-      value is traced; there ``horizon``, ``times`` and ``step`` must be known numbers, and no limit is checked.
+      value is traced; there ``horizon``, ``times`` and ``step`` must be known numbers. A step above the stability limit
+      makes it NaN, derivatives included, and so does any other fault, unless ``throw=False``.
 
     Raises:
       ValueError: a bad argument; a step above the stability limit.
@@ -136,7 +139,7 @@ def march(
         mesh = checks.over_devices(mesh, "march", problem, grid, scheme, method, *by, traced=traced)
     if traced:
         on = Discretisation(problem, grid, scheme, arguments.traced_dtype(dtype, "march"))
-        return _march_traced(on, horizon, kept, start, method, step)
+        return _march_traced(on, horizon, kept, start, method, step, inner, throw)
     kind = arguments.as_dtype(dtype)
     if np.any(np.diff(kept.astype(kind)) <= 0):
         raise ValueError(f"march: two of the times {kept.tolist()} are the same number in {kind}; leave one out")
@@ -164,13 +167,14 @@ def march(
                     admissibility.values(problem, grid, kind, t)
                 clock.enter("the preparation")
                 task = _prepare(on, horizon, method, step, inner, policy=policy)
-                slices, front, code = march_run.drive(task, kept, start, clock)
+                slices, front, code = march_run.drive(task, horizon, kept, start, clock)
                 solution = march_run.assemble(task, grid, slices, front, code)
             except Stopped as stop:
                 solution = _solution_at_horizon(on, horizon, start, stop.status)
         solution = with_last_phase(solution, clock)
     solution.stats.update(
         seconds=clock.stepping, compile_seconds=clock.elapsed() - clock.stepping, bytes=needed, horizon=horizon,
+        start=start is not None,
         **({} if mesh is None else {"mesh": mesh.devices.shape}),
     )  # fmt: skip
     if clock.journal is not None:
@@ -222,6 +226,8 @@ def _times(horizon: float, times: Sequence[float] | Array | None) -> tuple[float
             f"march: times are not increasing: times[{first}] = {kept[first]:g}, times[{first + 1}] = "
             f"{kept[first + 1]:g}; sort them, as in np.unique(times)"
         )
+    if kept[-1] > horizon >= kept[-1] * (1 - ROUNDING):  # 3 × 0.1 is more than 0.3
+        kept[-1] = horizon
     if kept[0] < 0 or kept[-1] > horizon:
         raise ValueError(f"march: times run from {kept[0]:g} to {kept[-1]:g}; wanted them in [0, {horizon:g}]")
     return float(horizon), kept
@@ -249,31 +255,39 @@ def _prepare(
         # that is left open is found anew before every step
         probes = np.linspace(horizon, 0.0, PROBES) if moving else [horizon]
         if step is not None or not moving:
-            limits = [_stable(on.at(jnp.asarray(t, dtype))) for t in probes]
-            limit = jnp.min(jnp.stack(limits))
             # the Euler steps inside a stage are c Δt long, and c Δt (max Q + β) ≤ 1 is what keeps them monotone
-            _check_step(step, float(limit) / method.tableau.euler)
-        courant = method.courant if step is None else 1 / method.tableau.euler
-        limit = jnp.asarray(limit * courant, dtype)
+            shares = jnp.stack([jnp.asarray(share, dtype) for share in (1 / method.tableau.euler, method.courant)])
+            limits = jnp.stack([_stable(on.at(jnp.asarray(t, dtype)), method.tableau, shares) for t in probes])
+            stable, own = jnp.min(limits, axis=0)
+            _check_step(step, float(stable))
+            limit = own if step is None else stable
     looks = _checks(on, method)
-    if step is None:  # rates that are found on the way say nothing of the first steps
-        step = horizon / FEWEST if moving or looks[0] or not method.limited else math.inf
+    longest: Array | float = math.inf if step is None else step
+    if moving:
+        found = time_probes.resolution(problem, grid, horizon, dtype)
+        time_probes.report(found, horizon, step)
+        longest = found.lengths[:, None] if step is None else step
+    elif step is None and (looks[0] or not method.limited):
+        longest = horizon / FEWEST  # rates that are found on the way say nothing of the first steps
     obstacles = None if moving or not policy else _obstacles(on)
     return March(
-        on, method, obstacles, None if moving and method.limited else limit, jnp.asarray(step, dtype),
-        jnp.asarray(horizon, dtype), _blow_up_nodes(on, inner), *looks, bare=not policy,
+        on, method, obstacles, None if moving and method.limited else limit, jnp.asarray(longest, dtype),
+        jnp.asarray(horizon, dtype), _blow_up_nodes(on, inner),
+        checks_rates=looks[0], checks_noise=looks[1], checks_gap=looks[2] and policy, bare=not policy,
     )  # fmt: skip
 
 
-def _checks(on: Discretisation, method: TimeMethod) -> tuple[bool, bool]:
-    """Two flags: steps must look at the rates, and at correlated noise, under the actions that they choose."""
+def _checks(on: Discretisation, method: TimeMethod) -> tuple[bool, bool, bool]:
+    """Three flags: steps must look at the rates and at correlated noise under their actions, and at Isaacs' gap."""
     problem = on.problem
     players, moving = players_of(on), problem.time_dependent
     # Q is known beforehand where it is largest at an end of the sets; else under the actions that are chosen alone
     sampled = not (players.control.fastest_at_ends and players.disturbance.fastest_at_ends)
     # a stage after the first looks at a later time, at which Q may have grown beyond the limit of the first
     rates = method.limited and (sampled or (moving and len(method.tableau.means) > 1))
-    return rates, callable(problem.noise) and (moving or players.steers_noise)
+    # where the players act apart, min max is max min node by node
+    gap = problem.is_game and not players.decoupled
+    return rates, callable(problem.noise) and (moving or players.steers_noise), gap
 
 
 def _check_step(step: float | None, limit: float) -> None:
@@ -297,10 +311,7 @@ def _evaluation(problem: Problem, grid: Grid, *, divided: bool = False) -> Evalu
 def _blow_up_nodes(on: Discretisation, share: float | None) -> Mask | None:
     """The nodes where a disturbance at its bound is taken for a blow-up; or None."""
     problem, grid = on.problem, on.grid
-    if share is None:
-        players = players_of(on).disturbance
-        # under a penalty γ²|d|² the worst disturbance is gᵀDV/2γ², at its bound only where DV has grown out of hand
-        share = 0.5 if isinstance(players.admissible, Box) and all(players.curved) else 0.0
+    share = 0.0 if share is None else share
     if not arguments.is_number(share) or not 0 <= share <= 1:
         raise ValueError(f"march: inner = {share!r}; wanted the share of the box that is watched, from 0 (none) to 1")
     if share == 0:
@@ -312,7 +323,14 @@ def _blow_up_nodes(on: Discretisation, share: float | None) -> Mask | None:
 
 @as_one_program
 def _march_traced(
-    on: Discretisation, horizon: float, kept: np.ndarray, start: Nodes | None, method: TimeMethod, step: float | None
+    on: Discretisation,
+    horizon: float,
+    kept: np.ndarray,
+    start: Nodes | None,
+    method: TimeMethod,
+    step: float | None,
+    inner: float | None,
+    throw: bool,
 ) -> Solution:
     """The solution of a march inside a JAX transformation, in a scan of fixed length: no chunks, no value checks."""
     if step is None:
@@ -323,12 +341,18 @@ def _march_traced(
     kind, problem, grid = on.dtype, on.problem, on.grid
     on, method = cast(on, kind), method.filled(on, _evaluation(problem, grid))
     obstacles = None if problem.time_dependent else bellman.obstacles(on)
-    task = March(on, method, obstacles, jnp.inf, step, horizon, None)
+    checks_rates, checks_noise, _ = _checks(on, method)
+    task = March(
+        on, method, obstacles, jnp.inf, step, horizon, _blow_up_nodes(on, inner),
+        checks_rates=checks_rates, checks_noise=checks_noise,
+    )  # fmt: skip
     value, values, actions, count = time_stepping.terminal(on.at(horizon), start), [], [], 0
+    fine = _is_stable(on, method, horizon, step)
     for begin, end in itertools.pairwise([horizon, *kept[::-1].tolist()]):
         # an interval of a whole number of steps takes no step more by rounding; a kept time at the horizon takes none
         steps = max(math.ceil((begin - end) / step - 1e-6), int(begin > end))
-        value, count = time_stepping.repeat(task, value, begin, end, steps), count + steps
+        (value, ok), count = time_stepping.repeat(task, value, begin, end, steps), count + steps
+        fine &= ok & jnp.all(jnp.isfinite(value))
         values.append(value)
         actions.append(time_stepping.greedy(task, value, end))
     u, d = (
@@ -337,7 +361,25 @@ def _march_traced(
         )
         for player in (0, 1)
     )
+    values, u, d = jnp.stack(values[::-1]), u[::-1], d[::-1]
+    if throw:  # a factor and no `where`, so that derivatives are NaN as well
+        values, u, d = (array * jnp.where(fine, 1, jnp.nan).astype(kind) for array in (values, u, d))
+    code = jnp.where(fine, Status.CONVERGED, Status.STALLED if method.monotone_only else Status.DIVERGED)
     return Solution(
-        grid, jnp.stack(values[::-1]), u[::-1], d[::-1] if problem.is_game else None, code=Status.CONVERGED,
-        steps=count, times=kept, **question(problem),
+        grid, values, u, d if problem.is_game else None, code=code, steps=count, times=kept, **question(problem),
     )  # fmt: skip
+
+
+def _is_stable(on: Discretisation, method: TimeMethod, horizon: float, step: float) -> jax.Array:
+    """True if steps of this length are stable at the times that are held against it, as far as rates are known."""
+    if not method.limited:
+        return jnp.ones((), bool)
+    on = jax.lax.stop_gradient(on)
+    share = 1 / method.tableau.euler
+
+    def limit(t: Scalar) -> Scalar:
+        return time_stepping.stable(on.at(t), method.tableau, share)
+
+    moving = on.problem.time_dependent
+    limits = jax.lax.map(limit, jnp.linspace(horizon, 0.0, PROBES, dtype=on.dtype)) if moving else limit(horizon)
+    return step <= jnp.min(limits) * (1 + 1e-6)

@@ -66,10 +66,13 @@ def _gap_at(task: March, value: Field, t: Number) -> tuple[Scalar, Scalar]:
 
 
 def _isaacs_gap(task: March, front: Front, code: Status) -> float | None:
-    """The gap at the last time of a march, with a warning where it is large; None without a game, and after a cut."""
+    """The largest gap over all steps, with a warning where it is large; None without a game, and after a cut."""
     if not task.problem.is_game or task.bare or code in CUT:
         return None
-    gap, matter = (float(number) for number in _gap_at(task, front.value, front.t))
+    gap, matter = (float(number) for number in front.gap)
+    at_end, matter_there = (float(number) for number in _gap_at(task, front.value, front.t))
+    if not at_end <= gap:
+        gap, matter = at_end, matter_there
     warn_of_gap(gap, matter, task.problem.isaacs)
     return gap
 
@@ -113,8 +116,9 @@ class Slices:
         self.cut, self.ends = (np.zeros((len(kept), len(shape), 2), int) for _ in range(2))
         self.first = len(kept)  # of the filled ones; it counts down, as the march goes backward in time
 
-    def keep(self, task: March, value: Nodes, t: Number, answer: Any) -> None:
+    def keep(self, task: March, value: Nodes, moment: float, answer: Any) -> None:
         """Fill the next slice; the policy is NaN on the target, and everywhere where there is no ``answer``."""
+        t = np.asarray(moment, self.value.dtype)
         place = self.first - 1
         self.value[place] = value
         if answer is None:
@@ -126,7 +130,7 @@ class Slices:
             for array, action in ((self.policy, u), (self.disturbance, d)):
                 for j, entry in enumerate(action):
                     array[place, ..., j] = np.where(ended, np.nan, entry)  # the run is over there: no action
-        self.times[place] = float(t)
+        self.times[place] = moment
         self.first = place  # at last: an interrupt on the way leaves no slice half filled
 
     def saved(self) -> list[np.ndarray]:
@@ -152,22 +156,30 @@ class Slices:
         for array, entries in zip(whole, own, strict=True):
             array[self.first :] = entries
 
-    def misses(self, t: Number) -> bool:
+    def misses(self, t: float) -> bool:
         """True if the time t, which the march came to, is not among the times that are kept."""
-        return self.first > 0 and (self.first == len(self.times) or float(t) < self.times[self.first])
+        return self.first > 0 and (self.first == len(self.times) or t < self.times[self.first])
+
+    @property
+    def length(self) -> float:
+        """The time from the last filled slice to the next."""
+        return float(self.times[self.first] - self.times[self.first - 1])
 
 
-def drive(task: March, kept: np.ndarray, start: Nodes | None, clock: Clock) -> tuple[Slices, Front, Status]:
+def drive(
+    task: March, horizon: float, kept: np.ndarray, start: Nodes | None, clock: Clock
+) -> tuple[Slices, Front, Status]:
     """The slices at the kept times, the last front and its status; ends at a code, at the time limit, or at Ctrl-C."""
     start = None if start is None else jnp.asarray(start, np.dtype(task.horizon.dtype))
-    front, parts = time_stepping.begin(task, _terminal(task.on.at(task.horizon), start)), task.on.parts
+    value, parts = _terminal(task.on.at(task.horizon), start), task.on.parts
+    front = time_stepping.begin(task, value, horizon - kept[-1])
     finite = bool(jnp.all(jnp.isfinite(front.value)))
     run = MarchRun(task, front, kept) if parts is None else MarchInParts(task, front, kept, parts)
-    del front  # or it would hold on to the value at the horizon, which the first steps leave behind
+    del front, value  # or they would hold on to the value at the horizon, which the first steps leave behind
     status = host_loop.drive(run, clock) if finite else Status.NONFINITE
     slices, front = run.slices, run.gathered()
     # after a cut nothing is compiled, and the feedback has its program only if a slice was kept before
-    if status is not Status.CONVERGED and slices.misses(front.t) and bool(jnp.all(jnp.isfinite(front.value))):
+    if status is not Status.CONVERGED and slices.misses(run.time) and bool(jnp.all(jnp.isfinite(front.value))):
         run.store(feedback=status not in CUT or slices.first < len(kept))  # how far it came
     return slices, front, status
 
@@ -189,6 +201,12 @@ class MarchRun:
     def steps(self) -> int:
         """The steps that are done."""
         return int(self.front.steps)
+
+    @property
+    def time(self) -> float:
+        """The time that the march has come to."""
+        left, rest = (float(number) for number in self.front.left)
+        return float(self.slices.times[self.slices.first - 1]) + left + rest if self.slices.first else 0.0
 
     @property
     def until(self) -> Scalar:
@@ -218,14 +236,20 @@ class MarchRun:
 
     def between(self, status: Status, clock: Clock) -> Status:
         """Keep the slices at the times that the front has reached; CONVERGED after the last of them."""
-        slices, front = self.slices, self.front
-        while status is Status.RUNNING and slices.first > 0 and float(front.t) <= float(self.until):
+        slices = self.slices
+        while status is Status.RUNNING and slices.first > 0 and float(self.front.left[0]) <= 0:
             cut = clock.over()
             # at the last kept time nothing is missing any more, and a time limit that passes now takes nothing away
             if cut is not None and not (slices.first == 1 and cut is Status.TIME_LIMIT):
                 return cut
             self.store()
+            if slices.first > 0:
+                self.front = altered(self.front, left=self._clock(slices.length))
         return Status.CONVERGED if status is Status.RUNNING and slices.first == 0 else status
+
+    def _clock(self, left: float) -> Any:
+        """The clock of a front at the beginning of an interval."""
+        return jnp.asarray([left, 0], self.slices.value.dtype)
 
     def gathered(self) -> Front:
         """The front, with values at all nodes."""
@@ -236,7 +260,7 @@ class MarchRun:
         # one program for all kept times: the time is an argument
         asked = feedback and not self.task.bare
         answer = jax.device_get(self._greedy(self.task, self.front.value, self.front.t)) if asked else None
-        self.slices.keep(self.task, self.front.value, self.front.t, answer)
+        self.slices.keep(self.task, self.front.value, self.time, answer)
 
     def saved(self) -> list[Any]:
         """The slices that are kept, and the front."""
@@ -259,12 +283,12 @@ class MarchRun:
 
     def show(self, bar: Any) -> None:
         """Move the progress bar, which runs over the problem's own time."""
-        bar.update(float(self.task.horizon) - float(self.front.t) - bar.n)
+        bar.update(float(self.task.horizon) - self.time - bar.n)
         bar.set_postfix_str(f"{self.steps} steps", refresh=False)
 
     def keep(self, error: Exception) -> None:
         """Attach the solution so far to an exception."""
-        if self.slices.misses(self.front.t):
+        if self.slices.misses(self.time):
             # without a feedback: its program calls the function that raised once more
             self.store(feedback=False)
         solution = assemble(self.task, self.task.grid, self.slices, self.gathered(), Status.INTERRUPTED)
@@ -280,6 +304,10 @@ class MarchInParts(MarchRun):
         self._divided, self.front = parts.spread((task, front), (over_nodes(task, task.grid.shape), self._over))
         self._run = lambda _, *front_and_limits: _run_in_parts(self._divided, *front_and_limits, parts=parts)
 
+    def _clock(self, left: float) -> Any:
+        """The clock of a front at the beginning of an interval, on every device."""
+        return self.parts.spread(np.asarray(super()._clock(left)), False)
+
     def gathered(self) -> Front:
         """The front, with the values of all parts."""
         return self.parts.gathered(self.front, self._over)
@@ -290,7 +318,7 @@ class MarchInParts(MarchRun):
         if feedback and not self.task.bare:
             answer = _greedy_in_parts(self._divided, self.front.value, self.front.t, self.parts)
             answer = self.parts.gathered(answer, jax.tree.map(lambda _: True, answer))
-        self.slices.keep(self.task, front.value, front.t, answer)
+        self.slices.keep(self.task, front.value, self.time, answer)
 
     def keep(self, error: Exception) -> None:
         """Attach the solution so far to an exception; what other processes hold is out of reach."""
@@ -308,8 +336,9 @@ def assemble(task: March, grid: Grid, slices: Slices, front: Front, code: Status
     problem = task.problem
     kept = slice(slices.first, None)
     if len(slices.cut[kept]):
-        # at the earliest time, where an end that is cut off has worked its way furthest into the box
-        warn_of_cuts(slices.cut[kept][0], slices.ends[kept][0], grid)
+        # of all kept times: what an end cuts off at a later one has worked its way into the box
+        worst = np.argmax(slices.cut[kept] / np.maximum(slices.ends[kept], 1), axis=0)[None]
+        warn_of_cuts(*(np.take_along_axis(array[kept], worst, 0)[0] for array in (slices.cut, slices.ends)), grid)
     return Solution(
         grid,
         slices.value[kept],

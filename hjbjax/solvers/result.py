@@ -9,17 +9,16 @@ import numpy as np
 
 from hjbjax.discretisation import correlated_noise, edges
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.hamiltonian import discrete, optimum
+from hjbjax.hamiltonian import discrete
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import certificates, fixed_point
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.fixed_point import State, Task
+from hjbjax.iteration.isaacs import isaacs_gap
 from hjbjax.markov_chain import earnings
-from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import is_traced
-from hjbjax.problem.sets import AdmissibleSet
-from hjbjax.problem.types import Array, Field, Mask, Nodes, Scalar
+from hjbjax.problem.types import Field, Nodes, Scalar
 from hjbjax.solution import nested_grids
 from hjbjax.solution.clock import CUT, Clock
 from hjbjax.solution.solution import Solution, question
@@ -227,37 +226,6 @@ def _refuse_noise(task: Task, state: State, grid: Grid) -> None:
         f"that was found, first at node {index}, x = {np.asarray(x).tolist()}{played}.\n"
         + correlated_noise.advice(sigma @ sigma.T, grid, everywhere=False)
     )
-
-
-def isaacs_gap(hamiltonian: discrete.DiscreteHamiltonian, free: Mask) -> tuple[Scalar, Scalar]:
-    """The largest min max − max min over the ``free`` nodes, and how much the actions matter there, per unit time.
-
-    How much they matter is the largest difference of H between two pairs of them, of nine representatives a player.
-    """
-    problem, dtype = hamiltonian.on.problem, hamiltonian.on.dtype
-    upper, lower = (optimum.optimise(hamiltonian, isaacs=which)[0] for which in ("upper", "lower"))
-    sets_of = (problem.controls, problem.disturbances)
-    mine, theirs = (jnp.asarray(_representatives(admissible), dtype) for admissible in sets_of)
-
-    def compare(extremes: tuple[Field, Field], pair: jax.Array) -> tuple[tuple[Field, Field], None]:
-        total = hamiltonian.at(list(mine[pair[0]]), list(theirs[pair[1]]))
-        total = jnp.where(jnp.isfinite(total), total, upper)  # an action that an end of the box rules out
-        return (jnp.minimum(extremes[0], total), jnp.maximum(extremes[1], total)), None
-
-    pairs = jnp.asarray([(i, j) for i in range(len(mine)) for j in range(len(theirs))])
-    # one pair at a time: all 81 at once would be 81 arrays of the nodes
-    (least, most), _ = jax.lax.scan(compare, (lower, upper), pairs)
-    size = 1e3 * jnp.finfo(dtype).eps * (jnp.abs(least) + jnp.abs(most))  # no gap is less than rounding
-    return jnp.max(jnp.where(free, upper - lower, 0)), jnp.max(jnp.where(free, most - least + size, 0))
-
-
-def _representatives(admissible: AdmissibleSet | None) -> Array:
-    """At most nine actions of a player, shape (K, m), the first and the last of its samples among them."""
-    if admissible is None:
-        return np.zeros((1, 0))
-    points = sets.samples(admissible, 9)
-    # a finite set may have thousands of points
-    return points[np.unique(np.linspace(0, len(points) - 1, 9).round().astype(int))]
 
 
 def warn_of_gap(gap: float, matter: float, isaacs: str) -> None:

@@ -249,7 +249,7 @@ def test_a_place_where_nothing_can_be_written_is_found_before_the_solve(tmp_path
     (tmp_path / "gone").mkdir()
     monkeypatch.chdir(tmp_path / "gone")
     (tmp_path / "gone").rmdir()
-    with pytest.raises(hjb.FileError, match="run.npz: cannot be written: the working folder is gone; give an absolute"):
+    with pytest.raises(hjb.FileError, match="run.npz: cannot be written: the current folder has been removed"):
         hjb.solve(posed(), LINE, checkpoint="run.npz", resume=resume)
     assert sorted(os.listdir(tmp_path)) == ["file", "old.npz"]
 

@@ -42,6 +42,10 @@ GROWTH = 1e6  # a residual that has grown by this factor over its smallest has d
 PATIENCE = 10  # steps without progress of a residual that is rounding
 ROUNDING = 64  # residuals below this many units in the last place of max|V| are rounding
 FEW = 4  # such units: steps by the fastest rate of all, as V alone takes them, are small at a slow node long before
+# Corrections of a scheme of high order are halved, three times at most, where neither of the last two was smaller than
+# all before them: that ends limit cycles of the limiter. Halving from the start takes a third more steps.
+LEAST_SHARE, CALM = 0.125, 5
+SLOWEST = 0.95  # rate of contraction beyond which steps say nothing of the distance, and the step counts twentyfold
 LOST = 4  # roundings of numbers of the size lift · max(factor, 1) in factor · V + shift
 
 
@@ -54,6 +58,23 @@ class Certificate(enum.Enum):
     RESIDUAL = "the high-order equation, whose residual this is, has no comparison principle"
     OPEN = "open ends continue the value from inside, and have no comparison principle"
     NONE = "without discount and positive running cost the residual bounds nothing"
+
+
+@pytree_dataclass()
+class Moves:
+    """The sizes of the corrections of a scheme of high order, cost units, and what was concluded from them.
+
+    Args:
+      last: the last three, the latest first, as if each was taken whole; infinite where there was none.
+      least: the least one before the last two.
+      share: the part of a correction that is taken.
+      since: steps since ``share`` changed.
+    """
+
+    last: jax.Array
+    least: Scalar
+    share: Scalar
+    since: Scalar
 
 
 TO_THE_END = (Certificate.NONE, Certificate.BY_DISCOUNT)  # of tubes: V falls or climbs until nothing moves
@@ -239,6 +260,30 @@ def enclosure(kind: Certificate, bound: ErrorBound, discount: Number | None = No
 def steps_since_best(state: Any, bound: ErrorBound) -> Scalar:
     """The steps without progress, this one among them: neither error nor residual is less than ever before."""
     return jnp.where(jnp.any(_measures(bound) < state.best), 0, state.since_best + 1)
+
+
+def moves_after(state: Any, moved: Scalar) -> Moves:
+    """The sizes of the corrections after a step of size ``moved``; a look at a guess is not a step."""
+    old = state.moves
+    whole = moved / old.share
+    last, least = jnp.stack([whole, old.last[0], old.last[1]]), jnp.minimum(old.least, old.last[1])
+    stuck = (jnp.minimum(whole, old.last[0]) >= least) & (old.since >= CALM)
+    share = jnp.where(stuck, jnp.maximum(old.share / 2, LEAST_SHARE), old.share)
+    new = Moves(last, least, share, jnp.where(stuck, 0, old.since + 1))
+    return jax.tree.map(lambda after, before: jnp.where(state.step < 0, before, after), new, old)
+
+
+def distance(task: Any, moves: Moves, moved: Scalar, value: Field) -> Scalar:
+    """The distance from V to the limit of its iteration, cost units: step/(1 − ρ), with the measured contraction ρ."""
+    step, before = moves.last[0], jnp.stack([moves.last[1], moves.last[2]])
+    known = jnp.isfinite(before) & (before > 0)
+    # over one step and over two: two eigenvalues of opposite signs make every other step short
+    ratios = jnp.where(known, step / jnp.where(known, before, 1), 0) ** jnp.array([1.0, 0.5], step.dtype)
+    rate = jnp.where(jnp.isfinite(before[0]), jnp.max(ratios), SLOWEST)
+    rate = jnp.clip(rate, 0, SLOWEST)
+    # steps of the size of rounding do not contract, and lead nowhere
+    rounding = FEW * jnp.finfo(value.dtype).eps * _size(task.grid, value, task.counting)
+    return moved + jnp.maximum(moved - rounding, 0) * rate / (1 - rate)
 
 
 def judged(task: Any, value: Field, bound: ErrorBound, best: jax.Array, since: Scalar) -> Scalar:

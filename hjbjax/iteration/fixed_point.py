@@ -30,7 +30,6 @@ from hjbjax.problem.pytree import altered, is_traced, pytree_dataclass
 from hjbjax.problem.types import Field, Nodes, Number, Scalar
 from hjbjax.solution.status import Status
 
-FULL_STEPS = 10  # corrections of a limited scheme before they are halved, which ends limit cycles of the limiter
 HISTORY = 256  # steps whose residuals one chunk can record
 
 
@@ -52,6 +51,8 @@ class Task:
       bare: true if nothing but V is kept; then ``obstacles`` hold nothing and are made anew in every step.
       first_order: a truth value, which may be traced: with a scheme of high order its chain is solved, so that one
         program serves both; None: always the scheme itself. Without noise only.
+      floor: a bound that no value can be less than, cost units, for a scheme of high order; None where there is none.
+      shift: what is added to the discount in a correction by slopes of high order, per unit time; None: nothing.
     """
 
     on: Discretisation
@@ -66,6 +67,8 @@ class Task:
     has_lost: bool = False
     bare: bool = False
     first_order: Any = None
+    floor: Any = None
+    shift: Any = None
 
     @property
     def problem(self) -> Problem:
@@ -171,6 +174,7 @@ class State:
     bound: ErrorBound
     step: Scalar
     best: jax.Array  # the least error and the least residual so far, (2,): either one is progress
+    moves: certificates.Moves  # the sizes of the last steps
     since_best: Scalar
     code: Scalar
     history: jax.Array  # residuals of this chunk, (HISTORY,), −1 where there was no step
@@ -193,7 +197,8 @@ def begin(task: Task, guess: Nodes) -> State:
     bound = ErrorBound(xp.asarray(-infinite), infinite, xp.zeros((), dtype), infinite, infinite)
     counter, first = xp.zeros((), xp.int32), xp.full((), -1, xp.int32)
     history, best = xp.full(HISTORY, -1, dtype), xp.stack([infinite] * 2)  # no NaN, a fault to jax_debug_nans
-    return State(value, policy, infinite, bound, first, best, counter, code, history)
+    moves = certificates.Moves(xp.stack([infinite] * 3), infinite, xp.ones((), dtype), counter)
+    return State(value, policy, infinite, bound, first, best, moves, counter, code, history)
 
 
 def run(task: Task, state: State, until: Number) -> State:
@@ -220,17 +225,22 @@ def advance(task: Task, state: State, start: Scalar) -> State:
         return _relaxed_by_defect(task, state, start)
     delta = _correction(task, state)
     if not task.scheme.monotone:
-        delta = jnp.where((state.step < FULL_STEPS) | task.is_chain, 1.0, 0.5).astype(delta.dtype) * delta
+        delta = state.moves.share * delta
     value = task.impose(state.value + delta)
     # a node that does not count may move for ever
     moved = task.grid.largest(jnp.abs(jnp.where(task.counting, value - state.value, 0)))
     if task.certificate is Certificate.OPEN and not task.method.relaxes:
         moved = moved * methods.shift_factor(_shift(task, state), task.problem.discount)
-    policy, fastest, bound = _look(task, value, state.policy, moved=moved, first=state.step < 0)
+    moves, distance = state.moves, moved
+    if not task.scheme.monotone:
+        moves = certificates.moves_after(state, moved)
+        distance = jnp.where(task.is_chain, moved, certificates.distance(task, moves, moved, value))
+    policy, fastest, bound = _look(task, value, state.policy, moved=distance, first=state.step < 0)
     bound = dataclasses.replace(bound, error=jnp.where(_lacks_measure(task, state), jnp.inf, bound.error))
     since = certificates.steps_since_best(state, bound)
     code = certificates.at_rest(task, state, moved, certificates.judged(task, value, bound, state.best, since))
-    return certificates.booked(state, start, bound, code, since, value=value, policy=policy, fastest=fastest)
+    found = {"value": value, "policy": policy, "fastest": fastest, "moves": moves}
+    return certificates.booked(state, start, bound, code, since, **found)
 
 
 def _relaxed(task: Task, state: State, start: Scalar) -> State:
@@ -341,6 +351,11 @@ class Look:
         if task.problem.is_game:
             outer, goal = (state.value, state.policy), methods.inner_goal(state.bound.residual, state.best[1])
             return methods.evaluated(task, *outer, evaluation, goal=goal, replies=replies) - state.value
+        if task.shift is not None:  # a step in time of length 1/κ: see ``nested.sharpened``
+            later = altered(task.problem, discount=task.problem.discount + task.shift)
+            return evaluate(
+                evaluation, task.asking(later).equation(state.value, state.policy, state.fastest), task.grid
+            )
         return evaluate(evaluation, self.equation(), task.grid)
 
 

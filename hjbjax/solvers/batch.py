@@ -283,7 +283,7 @@ def _solve_together(
     better = _iterate([task for task, _ in raised], guesses, further_names, clock, over)
     for i, (task, assumptions), end in zip(further, raised, better, strict=True):
         sharp = Settled(task, assumptions, settled[i].reached, *end, settled[i])
-        settled[i] = nested.better_of(settled[i], sharp, sharpen=sharpen)
+        settled[i] = nested.better_of(settled[i], sharp, clock, sharpen=sharpen)
     solutions = [finish(each, on.grid, cut=clock.over() is not None) for each, on in zip(settled, asked, strict=True)]
     for i, each in enumerate(settled):
         if sharpen and asked[i].scheme.subcell and solutions[i].status is Status.CONVERGED:

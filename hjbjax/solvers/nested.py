@@ -29,9 +29,11 @@ from hjbjax.solvers.stationary_run import iterate
 
 VANISHING = (2.0, 0.2, 0.02)  # discounts on the way to none, over one by the time that crossing the box takes
 FURTHER = ((2e-3, 2e-4), (2e-5, 2e-6), (2e-7, 2e-8))  # where parts of the box are that much slower than the fastest
+AHEAD = 2.0  # of the time that a crossing takes, a step in time of a scheme of high order is one half
 FAILED = (Status.STALLED, Status.DIVERGED, Status.NONFINITE)
 # the last of the answers is a guess, and need not be exact
 WARM_STEPS = 60  # improvements for each of them
+LITTLE = 0.1  # of the range of V: by so much the second order may change it without being questioned
 FEWEST = 6  # intervals that an axis keeps on the coarser grid that tells the error of the finer one
 
 
@@ -80,7 +82,31 @@ def staged(task: Task, scheme: Scheme) -> Task:
     certified = task.certificate in (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE)
     if scheme.monotone or not (fits and certified):
         return task
-    return dataclasses.replace(task, on=dataclasses.replace(task.on, scheme=scheme), first_order=np.asarray(True))
+    return _at_order(dataclasses.replace(task, on=dataclasses.replace(task.on, scheme=scheme)), first=True)
+
+
+def _at_order(task: Task, *, first: bool) -> Task:
+    """The task of a scheme of high order, or that of its chain in the same program, which differ in numbers alone."""
+    return dataclasses.replace(sharpened(task, first=first), first_order=np.asarray(first))
+
+
+def sharpened(task: Task, *, first: bool = False) -> Task:
+    """The task with what the iteration of slopes of high order needs, and its chain does not (``first``).
+
+    Without a discount these slopes have false solutions. The artificial diffusion of upwinding, with which rest nodes
+    are reached, is gone. Where the slopes overshoot, a policy goes round a rest node and pays nothing, or less: V + c
+    with c < 0 then solves the equation at all nodes but the rest node and its neighbours. The floor holds V up: it is
+    zero where costs are not negative, and V is small next to a rest node. Corrections overshoot as well, since the
+    error of one is carried along a whole path. Each is an implicit step in time of length 1/κ instead, half of what a
+    crossing takes. With noise the error is not carried far, and whole corrections take fewer steps.
+    """
+    obstacles, shift = task.obstacles, None
+    if task.floor is not None:
+        floor = jnp.finfo(task.tol.dtype).min / 8 if first else task.floor
+        obstacles = dataclasses.replace(obstacles, lower=jnp.asarray(floor, task.tol.dtype))
+    if task.crossing is not None and task.problem.noise is None and not task.problem.is_game:
+        shift = jnp.asarray(0 if first else AHEAD / task.crossing, task.tol.dtype)
+    return dataclasses.replace(task, obstacles=obstacles, shift=shift)
 
 
 def levels(task: Task, method: Method, clock: Clock, *, asked_again: bool) -> list[Task]:
@@ -209,14 +235,14 @@ def raised(task: Task, assumptions: Assumptions, scheme: Scheme) -> tuple[Task, 
     # the matrix stays that of the chain, the residual is of the better slopes: defect correction
     on = dataclasses.replace(task.on, scheme=scheme)
     task = dataclasses.replace(task, certificate=Certificate.RESIDUAL, on=on, first_order=None)
-    return task, dataclasses.replace(assumptions, certificate=Certificate.RESIDUAL)
+    return sharpened(task), dataclasses.replace(assumptions, certificate=Certificate.RESIDUAL)
 
 
 def running(settled: Settled) -> Task:
     """The task of an answer of high order as its program has it: that of the monotone answer, where both share one."""
     if settled.origin is None or settled.origin.task.first_order is None:
         return settled.task
-    return dataclasses.replace(settled.origin.task, first_order=np.asarray(False))
+    return _at_order(settled.origin.task, first=False)
 
 
 def second_order(settled: Settled, scheme: Scheme, clock: Clock) -> Settled:
@@ -235,14 +261,45 @@ def second_order(settled: Settled, scheme: Scheme, clock: Clock) -> Settled:
     return sharp._replace(state=state, code=ended, residuals=residuals)
 
 
-def better_of(settled: Settled, sharp: Settled, *, sharpen: bool) -> Settled:
-    """The answer of second order; where nobody asked for it and it did not converge the monotone one, which says so."""
-    if sharpen and sharp.code is not Status.CONVERGED:
+def better_of(settled: Settled, sharp: Settled, clock: Clock, *, sharpen: bool) -> Settled:
+    """The second-order answer, or the monotone one with a note, where the caller left the choice (``sharpen``).
+
+    The monotone answer stands where the second-order iteration did not converge, or moved V further than the error of
+    the grid explains.
+    """
+    if not sharpen:
+        return sharp
+    if sharp.code is not Status.CONVERGED:
         # what was cut by hand has not come to its end; a time limit leaves the monotone answer whole
         code = sharp.code if sharp.code is Status.INTERRUPTED else settled.code
         note = f"It is of first order: the second-order iteration ended {sharp.code.name}."
         return settled._replace(code=code, note=note)
-    return sharp
+    contradiction = _contradiction(settled, sharp, clock)
+    return sharp if contradiction is None else settled._replace(note=contradiction)
+
+
+def _contradiction(settled: Settled, sharp: Settled, clock: Clock) -> str | None:
+    """The note on a second-order answer that contradicts the certified monotone one; None if it does not.
+
+    The error of the monotone answer is its change from the next coarser grid over 2^q − 1, with the least order q = ½.
+    Nothing is computed where the second order changed little.
+    """
+    before, after = _finite(settled.task, settled.state), _finite(sharp.task, sharp.state)
+    moved = float(np.max(nested_grids.apart(before, after)))
+    if moved <= LITTLE * float(np.ptp(before)):
+        return None
+    found = coarser_answer(settled, clock)
+    if found is None:
+        return None
+    coarse, value = found
+    change = nested_grids.apart(nested_grids.restrict(before, settled.task.grid, coarse), value)
+    explained = float(np.max(nested_grids.estimated_error(settled.task.grid, coarse, change, nested_grids.BROKEN)))
+    if moved <= explained + float(settled.task.tol):
+        return None
+    return (
+        f"It is of first order: the second-order answer differs from this certified one by up to {moved:.3g}, of which "
+        f"the grid explains {explained:.3g}."
+    )
 
 
 def plainly(settled: Settled) -> Settled:
@@ -294,6 +351,10 @@ def _on_coarser(task: Task, coarse: Grid) -> Task | None:
         made = prepared(level, method=task.method, tol=task.tol, assumptions=assumptions_of(level))
         on = dataclasses.replace(task.on.on_grid(coarse), cut=made.on.cut)
         made = dataclasses.replace(made, on=on, certificate=task.certificate)
+        if task.first_order is not None:
+            made = _at_order(made, first=bool(np.asarray(task.first_order)))
+        elif not task.scheme.monotone:
+            made = sharpened(made)
     held, kept = (bool(np.any(np.asarray(each.obstacles.fixed))) for each in (task, made))
     return None if held and not kept else made
 

@@ -314,5 +314,5 @@ def _message(code: Status, task: Task, state: State, grid: Grid) -> str:
     if code is Status.CONVERGED and task.certificate in (Certificate.NONE, Certificate.OPEN):
         return f"Residual and last step are at most {tol:.2g}; no certificate bounds the error."
     if code is Status.CONVERGED and task.certificate is Certificate.RESIDUAL:
-        return f"Residual of the high-order equation and last step are at most {tol:.2g} in cost units."
+        return f"Residual of the high-order equation and distance to its limit are at most {tol:.2g} in cost units."
     return code.message

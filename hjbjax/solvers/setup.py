@@ -12,7 +12,7 @@ from hjbjax.discretisation.rates import fastest_rate
 from hjbjax.discretisation.schemes import Limited, Upwind
 from hjbjax.hamiltonian.exact import concave_in_a_ball
 from hjbjax.hamiltonian.players import players_of
-from hjbjax.iteration import bellman
+from hjbjax.iteration import bellman, certificates
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.evaluation import Direct, Evaluation, Krylov, Sweeps
 from hjbjax.iteration.fixed_point import Task
@@ -21,7 +21,7 @@ from hjbjax.markov_chain import attainability, resting
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_constrained, is_discounted
 from hjbjax.problem.pytree import altered, cast, known
-from hjbjax.problem.types import Mask, Number
+from hjbjax.problem.types import Mask, Number, Scalar
 from hjbjax.solution.clock import Clock
 from hjbjax.solution.status import warn
 from hjbjax.tracing import checks
@@ -134,7 +134,23 @@ def prepare(on: Discretisation, *, method: Method, tol: Number, assumptions: "As
     return Task(
         on, method, obstacles, jnp.ones(on.grid.shape, bool), still.least if priced and still else None, outflow,
         jnp.asarray(tol, on.dtype), assumptions.certificate, still.crossing if priced and still else None,
+        floor=_floor(on, obstacles, still),
     )  # fmt: skip
+
+
+def _floor(on: Discretisation, obstacles: bellman.Obstacles, still: resting.Standstill | None) -> Scalar | None:
+    """A bound that no value can be less than: the least payment at the end of a run, where no action earns on the way.
+
+    None where it was not asked at which cost the system can rest. The least number that there is where something can
+    be earned: it may be traced whether that is so.
+    """
+    if still is None or is_constrained(on.problem):
+        return None
+    costs = jnp.where(jnp.isfinite(still.least), still.least, 0)
+    small = resting.ROUNDINGS * jnp.finfo(on.dtype).eps * jnp.max(jnp.abs(costs))
+    ends = certificates.lowest_end(obstacles, jnp.ones(on.grid.shape, bool), on.grid)
+    # finite, since a value is compared with a multiple of it
+    return jnp.where(jnp.all(costs >= -small), ends, jnp.finfo(on.dtype).min / 8).astype(on.dtype)
 
 
 def _obstacles(on: Discretisation, assumptions: "Assumptions") -> tuple[bellman.Obstacles, resting.Standstill | None]:

@@ -207,7 +207,7 @@ def solve_on_host(
     settled = nested.settle(nested.staged(task, on.scheme), assumptions, reached, start, clock)
     about: dict[str, Any] = {"levels": [*shapes, grid.shape]}
     if not on.scheme.monotone and (settled.code is Status.CONVERGED or not sharpen):
-        settled = nested.better_of(settled, nested.second_order(settled, on.scheme, clock), sharpen=sharpen)
+        settled = nested.better_of(settled, nested.second_order(settled, on.scheme, clock), clock, sharpen=sharpen)
     settled = nested.plainly(settled)
     solution = finish(settled, grid)
     if sharpen and solution.status is Status.CONVERGED:

@@ -69,11 +69,14 @@ def bends(up: Field, down: Field, grid: Grid, axis: int) -> Field:
     return jnp.where(walls(grid, axis), 2 * bend, bend)  # one of the two is zero there
 
 
-def parabola(grid: Grid, axis: int, step: int) -> tuple[Number, Number, Number]:
-    """The weights of the last node and of the two before it in the value beyond an end; their sum is one.
+def continuation(grid: Grid, axis: int, step: int) -> tuple[Number, ...]:
+    """The weights of the last node and of the nodes before it in the value beyond an end; their sum is one.
 
-    The next gap is taken as long as the last one.
+    Two weights of a straight line at a linear end, three of a parabola at an open one. The gap beyond the end has the
+    length of the last gap inside.
     """
+    if (axis, step) in grid.sides("linear"):
+        return 2.0, -1.0
     if grid.stretch[axis] is None:  # type: ignore[index]
         return 3.0, -3.0, 1.0
     gaps = jnp.diff(jnp.asarray(grid.whole.axis(axis)))
@@ -117,7 +120,7 @@ def inward(
                 continue
             outside = on_edge(grid, axis, step)
             kept.append((offset, jnp.where(outside, 0, value)))
-            for k, weight in enumerate(parabola(grid, axis, step)):
+            for k, weight in enumerate(continuation(grid, axis, step)):
                 place = (*offset[:axis], -k * step, *offset[axis + 1 :])  # the end itself, one before it, two
                 kept.append((place, jnp.where(outside, jnp.asarray(weight, value.dtype) * value, 0)))
         pairs = kept
@@ -164,12 +167,12 @@ def beyond(values: AtNodes, grid: Grid, axis: int, step: int, ended: jax.Array) 
 
 
 def _ended(values: AtNodes, grid: Grid, axis: int, step: int) -> jax.Array:
-    """The values beyond the end of an ordinary axis, one slice: a copy of the end, or the parabola's continuation."""
+    """The values beyond the end of an ordinary axis, one slice: a copy of the end node, or V continued from inside."""
     if (axis, step) not in grid.sides("open"):
         return slices(values, grid, axis, step)
-    nodes = [slices(values, grid, axis, step, k) for k in range(3)]
-    weights = [jnp.asarray(weight, values.dtype) for weight in parabola(grid, axis, step)]
-    return sum((w * v for w, v in zip(weights[1:], nodes[1:], strict=True)), start=weights[0] * nodes[0])
+    weights = [jnp.asarray(weight, values.dtype) for weight in continuation(grid, axis, step)]
+    terms = [weight * slices(values, grid, axis, step, k) for k, weight in enumerate(weights)]
+    return sum(terms[1:], start=terms[0])
 
 
 def neighbour(values: AtNodes, grid: Grid, offset: tuple[int, ...], *, ghost: bool = True) -> AtNodes:

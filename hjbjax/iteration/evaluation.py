@@ -317,7 +317,7 @@ def direct(equation: PolicyEquation, grid: Grid, *, transposed: bool = False) ->
         return np.ascontiguousarray(words).view(dtype).reshape(grid.shape).astype(np.float64)
 
     def on_host(source, *weights):
-        delta = _factor_and_solve(offsets, [numbers(w) for w in weights], numbers(source), grid, transposed)
+        delta = factor_and_solve(offsets, [numbers(w) for w in weights], numbers(source), grid, transposed)
         return np.ascontiguousarray(delta.astype(dtype)).view(word).reshape(source.shape)
 
     # a double is two words on one more axis, a single is one
@@ -328,8 +328,12 @@ def direct(equation: PolicyEquation, grid: Grid, *, transposed: bool = False) ->
     return jax.lax.bitcast_convert_type(delta, dtype)
 
 
-def _factor_and_solve(
-    offsets: Sequence[tuple[int, ...]], weights: list[np.ndarray], source: np.ndarray, grid: Grid, transposed: bool
+def factor_and_solve(
+    offsets: Sequence[tuple[int, ...]],
+    weights: list[np.ndarray],
+    source: np.ndarray,
+    grid: Grid,
+    transposed: bool = False,
 ) -> np.ndarray:
     """δ of (I − W) δ = s, or of its transpose; NaN where the matrix is singular."""
     from scipy.sparse.linalg import splu

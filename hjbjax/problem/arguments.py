@@ -26,7 +26,12 @@ COINCIDING = 16  # units in the last place of a coordinate, of which a spacing m
 INDEXABLE = 2**31  # nodes that 32-bit indices can number
 NO_GRID = "hjb.pontryagin(problem, x0) finds the optimal path from one state without a grid"
 SHOWN = 80  # characters of a refused value that are quoted
-EDGES = ("projected", "constrained", "open")  # names, as they carry no numbers: static, hashable, saved as they are
+EDGES = (
+    "projected",
+    "constrained",
+    "open",
+    "linear",
+)  # names, as they carry no numbers: static, hashable, saved as they are
 Ends = tuple[str, str] | None  # of an axis: the kinds of its lower and its upper end; none where it is periodic
 
 
@@ -177,7 +182,10 @@ def _ends(entry: object, axis: int, cyclic: bool, count: int) -> Ends:
         raise ValueError(f"Grid.edges: axis {axis} has {entry!r}; wanted a name or a pair (lower end, upper end)")
     lower, upper = (_kind(name, f"axis {axis}") for name in pair)
     if "open" in (lower, upper) and count < 3:  # a parabola goes on beyond the end
-        raise ValueError(f"Grid.edges: axis {axis} has {count} points; an open end continues the last three")
+        raise ValueError(
+            f"Grid.edges: axis {axis} has {count} points; an open end continues the last three. Take more points, or "
+            "edges='linear', which continues the last two"
+        )
     return lower, upper
 
 

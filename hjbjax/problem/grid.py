@@ -40,8 +40,9 @@ class Grid:
         a pair (lower end, upper end); ``None`` on a periodic axis, which has no ends.
         "projected": the component that leaves is cut off, while the control keeps what it costs and earns.
         "constrained": actions whose drift leaves are not admissible: the state-constrained problem.
-        "open": paths may leave; the value goes on beyond the end as the parabola through its last three nodes.
-        Noise reflects at a projected and at a constrained end, on the node itself, and goes on at an open one.
+        "open": paths may leave; beyond the end V continues as the parabola through its last three nodes.
+        "linear": paths may leave; beyond the end V continues as the straight line through its last two nodes.
+        Noise reflects at a projected and at a constrained end, on the node itself, and continues at the other two.
       units: one unit an axis, as in ("rad", "rad/s"), for pictures and printed tables; empty where there is none.
 
     Raises:
@@ -129,14 +130,19 @@ class Grid:
         return math.prod(self.shape)
 
     def sides(self, kind: str) -> list[tuple[int, int]]:
-        """The sides of the box with ends of this kind: pairs of an axis and a step, −1 lower and 1 upper."""
+        """The sides of the box with ends of this kind: pairs of an axis and a step, −1 lower and 1 upper.
+
+        Linear ends count as "open" as well: at both kinds V continues beyond the end.
+        """
+        kinds = ("open", "linear") if kind == "open" else (kind,)
         ends = ((axis, pair) for axis, pair in enumerate(self.edges) if pair is not None)  # None: a periodic axis
-        return [(axis, step) for axis, pair in ends for step, name in zip((-1, 1), pair, strict=True) if name == kind]
+        return [(axis, step) for axis, pair in ends for step, name in zip((-1, 1), pair, strict=True) if name in kinds]
 
     @property
     def walled(self) -> "Grid":
         """The grid with its open ends made projected ones."""
-        pairs = (pair and tuple("projected" if name == "open" else name for name in pair) for pair in self.edges)
+        continued = ("open", "linear")
+        pairs = (pair and tuple("projected" if name in continued else name for name in pair) for pair in self.edges)
         return altered(self, edges=tuple(pairs))
 
     def divided(self, parts: Parts) -> "Grid":

@@ -81,6 +81,7 @@ def plan(header: dict) -> dict[str, Expected]:
         "enclosure": Expected(((2, 2),)),
         "reached": Expected((shape, lead + shape), (np.bool_,)),
         "grid_error": Expected((shape,)),
+        "box_error": Expected((shape,)),
         "residuals": Expected((many,)),
         "cut": Expected(((*lead, len(shape), 2),), (np.int64, np.int32)),
         **({} if marched is None else {"times": Expected((lead,), optional=False)}),
@@ -117,11 +118,16 @@ def dataset(solution: Any) -> "xarray.Dataset":
     except ImportError:
         raise ImportError("Solution.to_xarray needs xarray: pip install 'hjbjax[io]'") from None
     grid, labels, marched = solution.grid, solution.labels, solution.times is not None
-    own = ["value", "grid_error", "reached", "time", "control", "disturbance"]
+    own = ["value", "grid_error", "box_error", "reached", "time", "control", "disturbance"]
     names = [f"state {name}" if name in own else name for name in grid.names]
     lead = ("time",) if marched else ()
     found: dict[str, Any] = {"value": ((*lead, *names), solution.value, {"long_name": "value function"})}
-    for name, about in (("grid_error", "estimated error of the grid"), ("reached", "the target can be reached")):
+    described = {
+        "grid_error": "estimated error of the grid",
+        "box_error": "estimated error of the ends of the box",
+        "reached": "the target can be reached",
+    }
+    for name, about in described.items():
         array = getattr(solution, name)
         if array is not None:
             found[name] = ([*lead, *names][-np.ndim(array) :], array, {"long_name": about})

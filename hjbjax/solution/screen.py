@@ -46,6 +46,8 @@ class _Answer(Protocol):
     @property
     def grid_error(self) -> Array | None: ...
     @property
+    def box_error(self) -> Array | None: ...
+    @property
     def monotone_error(self) -> Number | None: ...
     @property
     def isaacs_gap(self) -> Number | None: ...
@@ -72,7 +74,8 @@ def show(solution: _Answer) -> str:
         "method": ", ".join(number(stats[name]) for name in ("method", "scheme") if name in stats),
         "steps": f"{int(solution.steps)}{last}",
         "algebraic error": _error(solution),
-        "grid error": _grid_error(solution),
+        "grid error": _estimate(solution.grid_error),
+        "box error": _estimate(solution.box_error) or number(stats.get("box_error", "")),
         "reached": f"{percent(reached)} of the nodes" if reached < 1 else "",
         "cut": _cuts(solution),
         "isaacs gap": "" if solution.isaacs_gap is None else number(solution.isaacs_gap),
@@ -147,11 +150,11 @@ def _error(solution: _Answer) -> str:
     return what + asked + (f": {number(why)}" if why else "")
 
 
-def _grid_error(solution: _Answer) -> str:
-    """The estimated distance to the exact value, the largest and the mean over the nodes."""
-    if solution.grid_error is None:
+def _estimate(error: Any) -> str:
+    """The largest and the mean of an error that was estimated at every node; nothing without an estimate."""
+    if error is None:
         return ""
-    found = np.asarray(solution.grid_error)
+    found = np.asarray(error)
     found = found[np.isfinite(found)]
     return f"about {np.max(found):.3g}, {np.mean(found):.3g} in the mean" if found.size else ""
 

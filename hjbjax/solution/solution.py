@@ -72,6 +72,9 @@ class Solution:
       times: shape (k,) when marched; value and policy then have a leading axis.
       grid_error: an estimate of |V − V_exact| at the nodes, shape (*grid), in cost units, with V_exact the solution of
         the equation itself and not of the discrete one; NaN where V is infinite. ``None`` where none was made.
+      box_error: an estimate of how far V moves if another assumption is made at the ends of the box, shape (*grid), in
+        cost units. ``None`` where the ends cannot matter or nothing was estimated; ``stats["box_error"]`` has the
+        reason.
       monotone_error: of a value of second order the certified bound on the error of the monotone answer from which it
         started, against the exact solution of the monotone scheme; ``None`` without one.
       cut: at how many nodes of each end of the box the optimal drift is cut off, shape (n, 2), lower and upper; when
@@ -105,6 +108,7 @@ class Solution:
     reached: Any = None
     times: Any = None
     grid_error: Any = None
+    box_error: Any = None
     monotone_error: Any = None
     cut: Any = None
     discrete: bool = False

@@ -43,6 +43,7 @@ from hjbjax.solution.placement import Path
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status, keeping_warnings, warn
 from hjbjax.solvers import host_loop, nested
+from hjbjax.solvers.box_error import with_box_error
 from hjbjax.solvers.nested import Settled
 from hjbjax.solvers.result import finish, solution_at_start, with_grid_error, with_last_phase
 from hjbjax.solvers.setup import Assumptions, check_on_one_state, choose, choose_scheme, prepare_on_host
@@ -288,6 +289,8 @@ def _solve_together(
     for i, each in enumerate(settled):
         if sharpen and asked[i].scheme.subcell and solutions[i].status is Status.CONVERGED:
             solutions[i] = with_grid_error(solutions[i], each, nested.coarser_answer(each, clock))
+        if solutions[i].status is Status.CONVERGED:
+            solutions[i] = with_box_error(solutions[i], each, clock)
     about = {"seconds": clock.elapsed() - began, "lanes": len(lanes), "tol": tol}
     for on, solution in zip(asked, solutions, strict=True):
         solution.stats.update(method=method.described(on.problem.is_game), **about)

@@ -118,7 +118,7 @@ def levels(task: Task, method: Method, clock: Clock, *, asked_again: bool) -> li
     smaller = (_telling(task.grid) if asked_again else None) or below(task.grid, method)
     while smaller is not None and clock.over() is None:
         clock.phase = f"the preparation of {' x '.join(map(str, smaller.shape))} nodes"
-        level = _on_coarser(task, smaller)
+        level = on_coarser(task, smaller)
         if level is None:
             break
         found.insert(0, level)
@@ -315,7 +315,7 @@ def coarser_answer(settled: Settled, clock: Clock) -> tuple[Grid, np.ndarray] | 
     """
     task, fine = running(settled), settled.task.grid
     coarse = _telling(fine)
-    if coarse is None or clock.over() is not None or (level := _on_coarser(task, coarse)) is None:
+    if coarse is None or clock.over() is not None or (level := on_coarser(task, coarse)) is None:
         return None
     value = _finite(task, settled.state)  # infinite values are imposed anew by what is lost
     state, code, _ = iterate(level, nested_grids.restrict(value, fine, coarse).astype(value.dtype), clock)
@@ -331,7 +331,7 @@ def _telling(fine: Grid) -> Grid | None:
     return coarse if halved else None
 
 
-def _on_coarser(task: Task, coarse: Grid) -> Task | None:
+def on_coarser(task: Task, coarse: Grid) -> Task | None:
     """The task on a coarser grid; None where that is another question."""
     fine = task.grid
     strides = [divmod(fine.intervals(axis), coarse.intervals(axis)) for axis in range(fine.ndim)]

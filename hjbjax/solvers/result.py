@@ -47,7 +47,7 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
     code = code if earning is None else Status.DIVERGED
     gap = None if mute else _isaacs_gap(task, state)
     unanswered = mute or code in (Status.DIVERGED, Status.NONFINITE)  # there is no optimal drift to speak of
-    leaving = None if unanswered else _leaving(task, state, grid)
+    leaving = None if unanswered else _leaving(task, state)
     state = jax.device_get(state)
     message = _message(code, task, state, grid) if earning is None else _unbounded_message(earning, grid)
     solution = assemble(task, state, assumptions)
@@ -175,13 +175,11 @@ def assemble(task: Task, state: State, assumptions: Assumptions) -> Solution:
     )
 
 
-def _leaving(task: Task, state: State, grid: Grid) -> np.ndarray:
-    """Numbers of nodes at which the optimal drift is cut off, (n, 2), with a warning where they are most of an end."""
+def _leaving(task: Task, state: State) -> np.ndarray:
+    """Numbers of nodes at which the optimal drift is cut off, (n, 2)."""
     value, policy, obstacles, counted = jax.device_get((state.value, state.policy, task.obstacles, task.counted))
     u, d = (list(players) for players in (policy.controls, policy.disturbances))
-    cut, ends = edges.cut(task.problem, task.grid, value, (u, d), counted & obstacles.acting(value))
-    warn_of_cuts(cut, ends, grid)
-    return cut
+    return edges.cut(task.problem, task.grid, value, (u, d), counted & obstacles.acting(value))[0]
 
 
 def warn_of_cuts(cut: np.ndarray, ends: np.ndarray, grid: Grid) -> None:

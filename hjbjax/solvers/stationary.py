@@ -34,6 +34,7 @@ from hjbjax.solution.placement import Path
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop, nested, semi_lagrangian
+from hjbjax.solvers.box_error import with_box_error
 from hjbjax.solvers.result import assemble, finish, solution_at_start, with_grid_error, with_last_phase
 from hjbjax.solvers.setup import (
     COARSEST,
@@ -212,6 +213,8 @@ def solve_on_host(
     solution = finish(settled, grid)
     if sharpen and solution.status is Status.CONVERGED:
         solution = with_grid_error(solution, settled, nested.coarser_answer(settled, clock))
+    if solution.status is Status.CONVERGED:
+        solution = with_box_error(solution, settled, clock)
     if type(settled.task.method.evaluation) is not type(method.evaluation):
         about["method"] = settled.task.method.described(problem.is_game)
     solution.stats.update(about)

@@ -1,0 +1,269 @@
+"""An estimate of the error that the ends of the box cause.
+
+Nothing is known of V beyond the box, so every end comes with an assumption. At a projected end the drift that leaves
+is cut off and noise is reflected; at an open end V continues as a parabola. The estimate replaces the assumption by
+another one and measures how far V moves: at the other ends V continues as a straight line (as a parabola, if it was a
+line).
+
+Let F be the equation on a coarse grid with the ends of the caller, and G the same equation with the other ends. V is
+the answer, restricted to the coarse grid, and W solves
+
+    G(W) = F(V),        box_error = |W − V|.
+
+The defect F(V) of the restricted answer stands on the right, so W = V wherever the ends do not matter, whatever error
+the coarse grid itself has. Newton's method (policy iteration) starts at V, where G(V) − F(V) is zero except at the end
+nodes. Its linear equations are factored on the host: with the other ends the matrix does not belong to a Markov chain,
+and relaxations need not converge. Policies improve in every step. So the estimate also sees an action that only pays
+with the other ends, such as leaving where the control stands still at a wall.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.discretisation import edges, stencil
+from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.iteration import bellman
+from hjbjax.iteration.bellman import Obstacles
+from hjbjax.iteration.evaluation import factor_and_solve
+from hjbjax.iteration.fixed_point import Task
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import altered
+from hjbjax.problem.types import Field, Nodes
+from hjbjax.solution import nested_grids
+from hjbjax.solution.clock import Clock
+from hjbjax.solution.solution import Solution
+from hjbjax.solution.status import warn
+from hjbjax.solvers import nested
+from hjbjax.solvers.nested import Settled
+from hjbjax.solvers.result import warn_of_cuts
+
+SHARE, FEWEST, MOST = 16, 600, 3000  # nodes of the coarse grid: one in 16, but at least and at most this number
+MARCHED = 20_000  # most nodes of the coarse grid of a march, which is not factored
+FACTORED = 12_000  # nodes up to which a factorisation is fast enough where a coarser grid would lose the target
+INTERVALS = 6  # intervals that an axis keeps
+STEPS = 30  # most steps of Newton's method; most problems take two or three
+SETTLED = 0.05  # the iteration ends with a step below this part of the change so far
+ROUNDING = 1e-9  # changes at the end nodes below this part of the range of V are rounding
+LARGE = 0.1  # of the range of V: a larger box error is worth a warning ...
+NODES = 0.05  # ... at more than this share of the nodes
+
+CANNOT_MATTER = "no end of the box assumes anything"
+NEVER_REACHED = "no optimal path reaches an end of the box"
+TOO_MANY = "not estimated: no coarse grid of this problem is small enough"
+UNSETTLED = "not estimated: the equation with linear ends has no solution near this one"
+
+
+class BoxError(NamedTuple):
+    """The estimate, or the reason that there is none; and the ends that cause it, as pairs of an axis and a step."""
+
+    error: np.ndarray | None
+    reason: str = ""
+    sides: tuple[tuple[int, int], ...] = ()
+
+
+def with_box_error(solution: Solution, settled: Settled, clock: Clock) -> Solution:
+    """The solution with an estimate of what the assumption at the ends of the box costs; warns where that is much.
+
+    Args:
+      solution: a converged answer at host level.
+      settled: the end of its iteration.
+      clock: the limits; nothing is estimated once they are exceeded.
+    """
+    if clock.over() is not None:
+        return solution
+    clock.phase = "the estimate of the box error"
+    return _reported(solution, of_solve(settled.task, np.asarray(solution.value)))
+
+
+def with_march_box_error(solution: Solution, on: Discretisation, run: Callable, clock: Clock) -> Solution:
+    """``with_box_error`` for a march: ``on`` is the problem on its grid, and ``run`` is as in ``of_march``."""
+    if clock.over() is not None:
+        return solution
+    clock.phase = "the estimate of the box error"
+    return _reported(solution, of_march(on, np.asarray(solution.value), run))
+
+
+def _reported(solution: Solution, found: BoxError) -> Solution:
+    """The solution with the estimate or the reason that there is none, and the warning that belongs to it."""
+    grid = solution.grid
+    if found.error is not None:
+        warn_of_box(found, np.asarray(solution.value), grid)
+        return dataclasses.replace(solution, box_error=found.error)
+    solution.stats["box_error"] = found.reason
+    if found.reason in (TOO_MANY, UNSETTLED) and solution.cut is not None:
+        cut = np.max(np.reshape(solution.cut, (-1, grid.ndim, 2)), axis=0)
+        warn_of_cuts(cut, np.array([[grid.size // count] * 2 for count in grid.shape]), grid)
+    return solution
+
+
+def of_solve(task: Task, value: Nodes) -> BoxError:
+    """The estimate for one stationary answer, (*grid).
+
+    Args:
+      task: the task that the answer solves, of any scheme.
+      value: the answer, (*grid); infinite where the target cannot be reached.
+    """
+    if other_ends(task.problem, task.grid) == task.grid.edges:
+        return BoxError(None, CANNOT_MATTER)
+    level = _coarse_task(task)
+    if level is None:
+        return BoxError(None, TOO_MANY)
+    finite = np.where(np.isfinite(value), value, np.max(value[np.isfinite(value)], initial=0))
+    before = nested_grids.restrict(finite, task.grid, level.grid)
+    return _compare(level, before, task.grid)
+
+
+def of_march(on: Discretisation, value: Nodes, run: Callable[[Discretisation], np.ndarray | None]) -> BoxError:
+    """The estimate for a march: the difference between two marches on a coarse grid, (k, *grid).
+
+    Args:
+      on: the problem on its grid.
+      value: V at the kept times, (k, *grid).
+      run: marches the chain on another grid and returns V at the same times; None where the march does not come to its
+        end.
+    """
+    others = other_ends(on.problem, on.grid)
+    if others == on.grid.edges:
+        return BoxError(None, CANNOT_MATTER)
+    coarse = on.grid
+    wanted = int(np.clip(on.grid.size // SHARE, FEWEST, MARCHED))
+    while coarse.size > wanted and (smaller := nested_grids.coarser(coarse, INTERVALS)) is not None:
+        coarse = smaller
+    if coarse.size > max(wanted, MARCHED):
+        return BoxError(None, TOO_MANY)
+    chain = dataclasses.replace(on.chain.on_grid(coarse), mesh=None)
+    first = run(chain)
+    second = run(chain.on_grid(altered(coarse, edges=others)))
+    if first is None or second is None or not np.all(np.isfinite(second - first)):
+        return BoxError(None, UNSETTLED)
+    change, scale = np.abs(second - first), np.ptp(value)
+    if np.max(change) <= ROUNDING * scale:
+        return BoxError(None, NEVER_REACHED)
+    error = np.stack([nested_grids.prolong(each, coarse, on.grid) for each in change])
+    return BoxError(error, sides=_sides(coarse, np.max(change, axis=0) > LARGE * scale))
+
+
+def other_ends(problem: Problem, grid: Grid) -> tuple:
+    """The kinds of ends that the estimate compares with; those that assume nothing stay as they are.
+
+    A constrained end is part of the problem, but noise that is reflected there is an assumption.
+    """
+    others = {"projected": "linear", "linear": "open", "open": "linear"}
+    if problem.noise is not None:
+        others["constrained"] = "linear"
+    return tuple(pair and tuple(others.get(kind, kind) for kind in pair) for pair in grid.edges)
+
+
+def _coarse_task(task: Task) -> Task | None:
+    """The task of the chain on a grid that is small enough to be factored; None where the problem has none."""
+    on = dataclasses.replace(task.on.chain, mesh=None)
+    level = dataclasses.replace(task, on=on)
+    wanted = int(np.clip(task.grid.size // SHARE, FEWEST, MOST))
+    while level.grid.size > wanted:
+        coarse = nested_grids.coarser(level.grid, INTERVALS)
+        smaller = None if coarse is None else nested.on_coarser(level, coarse)
+        if smaller is None:
+            break
+        level = smaller
+    return level if level.grid.size <= FACTORED and level.grid.ndim < 6 else None
+
+
+def _compare(level: Task, before: np.ndarray, fine: Grid) -> BoxError:
+    """|W − V| on the grid ``fine``, from V on a coarse one."""
+    grid = altered(level.grid, edges=other_ends(level.problem, level.grid))
+    others = dataclasses.replace(level.on, grid=grid, cut=None)
+    start, defect = jax.device_get(_defect(level, jnp.asarray(before, level.tol.dtype)))
+    obstacles = _fixed_next_to_lost(level)
+    value, scale = start, np.ptp(start[np.asarray(level.counted)])
+    moved = np.zeros(grid.shape, bool)
+    for step in range(STEPS):
+        source, weights = jax.device_get(_equation(others, value, obstacles, defect))
+        if step == 0:
+            moved = np.abs(source) > ROUNDING * scale
+            if not np.any(moved):
+                return BoxError(None, NEVER_REACHED)
+        delta = factor_and_solve(list(weights), list(weights.values()), source, grid)
+        value, largest = value + delta, np.max(np.abs(delta))
+        if not np.isfinite(largest):
+            break
+        change = np.abs(value - start)
+        if largest <= SETTLED * np.max(change):
+            responsible = moved & (change > LARGE * scale)
+            return BoxError(nested_grids.prolong(change, grid, fine), sides=_sides(grid, responsible))
+    return BoxError(None, UNSETTLED)
+
+
+@jax.jit
+def _defect(task: Task, value: Field) -> tuple[Field, Field]:
+    """V with the prescribed values put in, and what V leaves of the equation where actions matter, both (*grid)."""
+    value = task.impose(value)
+    defect = bellman.greedy(task.on, value, task.obstacles.fixed, lost=task.lost).defect
+    return value, jnp.where(task.obstacles.acting(value), defect, 0)
+
+
+@jax.jit
+def _equation(on: Discretisation, value: Field, obstacles: Obstacles, defect: Field) -> tuple[Field, dict]:
+    """The right-hand side and the weights of Newton's equation for G(W) = F(V), F(V) being the ``defect``."""
+    policy = bellman.greedy(on, value, obstacles.fixed)
+    policy = dataclasses.replace(policy, defect=policy.defect - jnp.where(obstacles.fixed, 0, defect))
+    equation = bellman.policy_equation(on, value, policy, obstacles)
+    offsets, entries = stencil.inward(equation.weights.offsets, equation.weights.values, on.grid)
+    weights: dict[tuple[int, ...], Any] = {}
+    for offset, entry in zip(offsets, entries, strict=True):
+        weights[offset] = weights[offset] + entry if offset in weights else entry
+    return equation.source, weights
+
+
+def _fixed_next_to_lost(task: Task) -> Obstacles:
+    """The obstacles, with the neighbours of unreachable nodes fixed as well.
+
+    Unreachable nodes hold a number far above all others. Continued beyond an end next to them it would be far below.
+    """
+    if not task.has_lost:
+        return task.obstacles
+    near = functools.reduce(
+        np.logical_or, (np.asarray(side) for pair in edges.beside(task.lost, task.grid) for side in pair)
+    )
+    return dataclasses.replace(task.obstacles, fixed=task.obstacles.fixed | near)
+
+
+def _sides(grid: Grid, nodes: np.ndarray) -> tuple[tuple[int, int], ...]:
+    """The ends of the box with one of these nodes, bool (*grid)."""
+    ends = ((axis, step) for axis in range(grid.ndim) if not grid.periodic[axis] for step in (-1, 1))
+    return tuple((axis, step) for axis, step in ends if np.any(np.take(nodes, -1 if step > 0 else 0, axis=axis)))
+
+
+def warn_of_box(found: BoxError, value: np.ndarray, grid: Grid) -> None:
+    """Warn of ends whose assumption moves V by more than a tenth of its range at many nodes."""
+    finite = np.isfinite(value)
+    large = np.asarray(found.error) > LARGE * np.ptp(value[finite])
+    share = float(np.mean(large[finite]))
+    if share <= NODES or not found.sides:
+        return
+    words = {-1: "lower", 1: "upper"}
+    ends = " and ".join(f"the {words[step]} end of {grid.names[axis]}" for axis, step in found.sides)
+    kinds = {grid.edges[axis][(step + 1) // 2] for axis, step in found.sides}
+    warn(
+        f"the box decides V: with another assumption at {ends} V changes by more than a tenth of its range at "
+        f"{share:.0%} of the nodes (Solution.box_error). {_remedy(kinds)}"
+    )
+
+
+def _remedy(kinds: set[str]) -> str:
+    """What to do about ends of these kinds."""
+    if kinds & {"open", "linear"}:
+        return (
+            "Take a larger box, or a coordinate in which V grows like a parabola at most, or prescribe V at these ends "
+            "by a target."
+        )
+    return (
+        "Take a larger box. If the state may not leave it, use Grid(..., edges='constrained'); if the problem goes on "
+        "beyond, edges='open' or 'linear'."
+    )

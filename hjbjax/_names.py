@@ -25,6 +25,7 @@ from hjbjax.iteration.evaluation import Direct, Krylov, Sweeps
 from hjbjax.iteration.methods import Nested, PolicyIteration, ValueIteration
 from hjbjax.iteration.time_methods import Explicit, Implicit, Tableau
 from hjbjax.markov_chain import chain
+from hjbjax.problem.ends import Dirichlet, Neumann, Robin
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import Ball, Box, Finite
@@ -46,6 +47,7 @@ __all__ = [
     "Box",
     "Checkpoint",
     "Direct",
+    "Dirichlet",
     "Eno2",
     "Explicit",
     "FallbackWarning",
@@ -57,8 +59,10 @@ __all__ = [
     "Krylov",
     "Limited",
     "Nested",
+    "Neumann",
     "PolicyIteration",
     "Problem",
+    "Robin",
     "SemiLagrangian",
     "Sinh",
     "Solution",

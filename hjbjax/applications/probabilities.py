@@ -206,6 +206,8 @@ def expected_exit_time(
 
 def _refuse_open(grid: object, name: str) -> None:
     """Refuse a grid with open ends; what is no grid is refused by ``solve``."""
+    if isinstance(grid, Grid):
+        grid.refuse_prescribed(name, "which prescribe V and not a probability or a time")
     if isinstance(grid, Grid) and grid.sides("open"):
         raise ValueError(
             f"{name}: beyond an open end a value is continued from inside, which makes no probability and no time of "

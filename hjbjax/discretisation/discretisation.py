@@ -219,7 +219,7 @@ class Discretisation:
         pairs = list(itertools.product(sets.probes(self.problem.controls, self.dtype),
                                        sets.probes(self.problem.disturbances, self.dtype)))  # fmt: skip
         for axis, step in itertools.product(range(self.grid.ndim), (-1, 1)):
-            if self.grid.periodic[axis] or (axis, step) in self.grid.sides("open"):  # type: ignore[index]
+            if self.grid.periodic[axis] or not stencil.has_wall(self.grid, axis, step):  # type: ignore[index]
                 continue
             ends = [stencil.slices(c, self.grid, axis, step) if i == axis else c for i, c in enumerate(x)]
             noise = [self.diffusion(u, d, ends).get((axis, axis), jnp.zeros((), self.dtype)) for u, d in pairs]

@@ -29,6 +29,7 @@ from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import pytree_dataclass
+from hjbjax.problem.types import Array
 
 Offset = tuple[int, ...]
 
@@ -100,10 +101,25 @@ def _table(on: Discretisation, f: list, a: dict[tuple[int, int], Any]) -> dict[O
         for step, weight, length in ((1, upward, link.up), (-1, downward, link.down)):
             beyond = stencil.wall(grid, axis, step)
             table[stencil.unit(grid, axis, step)] = jnp.where(beyond, 0, weight / length)
+        for step in (step for i, step in grid.sides("neumann") if i == axis):
+            _reflect(table, grid, axis, step, noisy=on.problem.noise is not None)
     for (i, j), entry in a.items():
         if i != j:
             _add_diagonal_jumps(table, entry, grid, i, j)
     return table
+
+
+def _reflect(table: dict[Offset, Any], grid: Grid, axis: int, step: int, *, noisy: bool) -> None:
+    """Jumps beyond an end with a prescribed slope go to the mirror image, the node inside; drift alone stays.
+
+    The slope is a payment, which is no part of the rates.
+    """
+    outwards, inwards = (stencil.unit(grid, axis, sign * step) for sign in (1, -1))
+    beyond = stencil.on_edge(grid, axis, step)
+    rate = table[outwards]
+    if noisy:
+        table[inwards] = table[inwards] + jnp.where(beyond, rate, 0)
+    table[outwards] = jnp.where(beyond, 0, rate)
 
 
 def fastest_rate(on: Discretisation) -> jax.Array:
@@ -140,6 +156,13 @@ def largest_rate(on: Discretisation) -> jax.Array:
     return jax.lax.fori_loop(0, len(pairs), larger, jnp.zeros((), on.dtype))
 
 
+def _reflecting(grid: Grid, axis: int, step: int) -> Array:
+    """The nodes at an end beyond which a diagonal jump lands on the mirror image."""
+    return (
+        stencil.on_edge(grid, axis, step) if (axis, step) not in grid.sides("open") else stencil.wall(grid, axis, step)
+    )
+
+
 def _add_diagonal_jumps(table: dict[Offset, Any], entry: Any, grid: Grid, i: int, j: int) -> None:
     """A diagonal jump that would leave the box goes to the mirror image of its end: noise reflects."""
     scale = 2 * grid.spacing(i) * grid.spacing(j)
@@ -147,10 +170,10 @@ def _add_diagonal_jumps(table: dict[Offset, Any], entry: Any, grid: Grid, i: int
     # a_ij⁺ along the diagonal, a_ij⁻ across it
     rate = {(p, q): jnp.maximum(entry * (p * q), 0) / scale for p, q in pairs}
     for p, q in pairs:  # first across the walls of axis i, then, at a corner once more, across those of axis j
-        off = stencil.wall(grid, i, p)
+        off = _reflecting(grid, i, p)
         rate[-p, q], rate[p, q] = rate[-p, q] + jnp.where(off, rate[p, q], 0), jnp.where(off, 0, rate[p, q])
     for p, q in pairs:
-        off = stencil.wall(grid, j, q)
+        off = _reflecting(grid, j, q)
         rate[p, -q], rate[p, q] = rate[p, -q] + jnp.where(off, rate[p, q], 0), jnp.where(off, 0, rate[p, q])
     for p, q in pairs:
         table[tuple(p * (k == i) + q * (k == j) for k in range(grid.ndim))] = rate[p, q]

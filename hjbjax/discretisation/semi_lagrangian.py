@@ -97,6 +97,7 @@ class SemiLagrangian:
             (problem.is_game, "a game: the disturbance would have to answer in the middle of an arc"),
             (problem.running_max is not None, "a running_max: the maximum is looked for at nodes alone"),
             (bool(grid.sides("open")), "open ends, beyond which there is nothing to interpolate"),
+            (bool(grid.prescribed()), "prescribed ends, which arcs may cross on their way"),
             (bool(grid.sides("constrained")), "constrained ends, which all long arcs near them may cross"),
         ):
             if present:

@@ -11,7 +11,7 @@ beside: see ``problem.parts``.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -44,13 +44,23 @@ def on_edge(grid: Grid, axis: int, step: int) -> Array:
 
 def has_walls(grid: Grid, axis: int) -> bool:
     """True if an end of an axis, or both, stops drift and noise."""
-    return not grid.periodic[axis] and any((axis, step) not in grid.sides("open") for step in (-1, 1))  # type: ignore[index]
+    return not grid.periodic[axis] and any(has_wall(grid, axis, step) for step in (-1, 1))  # type: ignore[index]
+
+
+def has_wall(grid: Grid, axis: int, step: int) -> bool:
+    """True if an end stops drift and noise; False where V continues: at open ends and where its slope is prescribed."""
+    return (axis, step) not in grid.sides("open") and (axis, step) not in grid.sides("neumann")
+
+
+def sloped(grid: Grid, axis: int, step: int) -> Any:
+    """The prescription of a slope at an end, with its arrays; None where the slope is not prescribed."""
+    return next((end for i, s, end in grid.prescribed("neumann", "robin") if (i, s) == (axis, step)), None)
 
 
 def wall(grid: Grid, axis: int, step: int) -> Array:
     """The nodes at which drift and noise in direction ``step`` along ``axis`` are stopped: edges that are not open."""
     edge = on_edge(grid, axis, step)
-    return np.zeros(edge.shape, bool) if (axis, step) in grid.sides("open") else edge
+    return np.zeros(edge.shape, bool) if not has_wall(grid, axis, step) else edge
 
 
 def walls(grid: Grid, axis: int) -> Array:
@@ -73,10 +83,13 @@ def continuation(grid: Grid, axis: int, step: int) -> tuple[Number, ...]:
     """The weights of the last node and of the nodes before it in the value beyond an end; their sum is one.
 
     Two weights of a straight line at a linear end, three of a parabola at an open one. The gap beyond the end has the
-    length of the last gap inside.
+    length of the last gap inside. Where a slope s + r V is prescribed, V continues as the mirror image with that slope,
+    V_{N+1} = V_{N−1} ± 2h (s + r V_N), whose weights are ±2h r and 1.
     """
     if (axis, step) in grid.sides("linear"):
         return 2.0, -1.0
+    if (end := sloped(grid, axis, step)) is not None:
+        return step * 2 * _last_gap(grid, axis, step) * getattr(end, "rate", 0.0), 1.0
     if grid.stretch[axis] is None:  # type: ignore[index]
         return 3.0, -3.0, 1.0
     gaps = jnp.diff(jnp.asarray(grid.whole.axis(axis)))
@@ -86,17 +99,32 @@ def continuation(grid: Grid, axis: int, step: int) -> tuple[Number, ...]:
     return 2 + bend, -(1 + bend + bend * ratio), bend * ratio
 
 
-def continued(values: Field, grid: Grid, offset: tuple[int, ...], *, mirror: bool = False) -> Field:
-    """V at x + offset for every node x, shape (*grid): beyond open ends the parabola, else as in ``neighbour``.
+def _last_gap(grid: Grid, axis: int, step: int) -> Number:
+    """The distance between the end of an axis and the node next to it."""
+    if grid.stretch[axis] is None:  # type: ignore[index]
+        return grid.spacing(axis)
+    gaps = jnp.diff(jnp.asarray(grid.whole.axis(axis)))
+    return gaps[-1] if step > 0 else gaps[0]
 
-    With ``mirror`` beyond a wall the mirror image, which noise sees.
+
+def continued(
+    values: Field, grid: Grid, offset: tuple[int, ...], *, mirror: bool = False, change: bool = False
+) -> Field:
+    """V at x + offset for every node x, shape (*grid): beyond ends where V continues its continuation.
+
+    Args:
+      values: V, or a change of V.
+      grid: the nodes.
+      offset: one step −1, 0 or 1 per axis.
+      mirror: beyond a wall take the mirror image, which noise sees; otherwise as in ``neighbour``.
+      change: ``values`` are a change of V, to which a prescribed slope adds nothing.
     """
-    if not (grid.sides("open") or mirror):
+    if not (grid.sides("open") or grid.sides("neumann") or mirror):
         return neighbour(values, grid, offset)
     for axis, step in enumerate(offset):  # beyond a corner: what one axis says through what the other says
         moved = neighbour(values, grid, unit(grid, axis, step))
-        if step and (axis, step) in grid.sides("open"):
-            moved = jnp.where(on_edge(grid, axis, step), _ended(values, grid, axis, step), moved)
+        if step and not grid.periodic[axis] and not has_wall(grid, axis, step):
+            moved = jnp.where(on_edge(grid, axis, step), _ended(values, grid, axis, step, change=change), moved)
         elif step and mirror and not grid.periodic[axis]:  # type: ignore[index]
             moved = jnp.where(on_edge(grid, axis, step), slices(values, grid, axis, step, 1), moved)
         values = moved
@@ -166,12 +194,14 @@ def beyond(values: AtNodes, grid: Grid, axis: int, step: int, ended: jax.Array) 
     return found if cyclic else jnp.where(grid.parts.at_end(axis, step), ended, found)
 
 
-def _ended(values: AtNodes, grid: Grid, axis: int, step: int) -> jax.Array:
+def _ended(values: AtNodes, grid: Grid, axis: int, step: int, *, change: bool = False) -> jax.Array:
     """The values beyond the end of an ordinary axis, one slice: a copy of the end node, or V continued from inside."""
-    if (axis, step) not in grid.sides("open"):
+    if has_wall(grid, axis, step):
         return slices(values, grid, axis, step)
     weights = [jnp.asarray(weight, values.dtype) for weight in continuation(grid, axis, step)]
     terms = [weight * slices(values, grid, axis, step, k) for k, weight in enumerate(weights)]
+    if not change and (end := sloped(grid, axis, step)) is not None:
+        terms.append(jnp.asarray(step * 2 * _last_gap(grid, axis, step) * end.slope, values.dtype))
     return sum(terms[1:], start=terms[0])
 
 
@@ -270,6 +300,8 @@ def limited(
     """
     bend = 2 * (up - down) / (link.up + link.down)  # V'' on two gaps of any length
     for step in (1, -1):
+        if sloped(grid, axis, step) is not None:  # the mirror image with the prescribed slope has the bend of V
+            continue
         # D⁺ or D⁻ is missing on an edge, and with it the bend: that of the node before is taken
         ended = neighbour(bend, grid, unit(grid, axis, -step))
         if noisy and step in noisy:

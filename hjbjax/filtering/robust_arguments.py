@@ -26,6 +26,7 @@ def check_question(problem: object, grid: object, scheme: Any) -> None:
             f"robust_filter: got a problem with {what}, wanted drift (x, u) and cost (x, u): the disturbance of the "
             "filter is w, which pays ½γ²|w|²; leave the other out"
         )
+    grid.refuse_prescribed("robust_filter", "which prescribe V and not the information state p")
     if grid.sides("open"):
         raise ValueError(
             "robust_filter: got a grid with open ends, through which p would flow in from where nothing is known; "

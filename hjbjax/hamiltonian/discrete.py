@@ -154,9 +154,13 @@ def around(
     if first_order is not None and not getattr(on.scheme, "blends", False):
         choose = functools.partial(jnp.where, first_order)
         slopes = jax.tree.map(choose, list(differences), list(slopes))
-    up, down = zip(*slopes, strict=True)
+    up, down = (list(side) for side in zip(*slopes, strict=True))
+    for axis, step, end in grid.prescribed("neumann") if on.problem.noise is None else ():
+        # drift that leaves sees the prescribed slope; its mirror image would be a jump that the drift undoes at once
+        side = up if step > 0 else down
+        side[axis] = jnp.where(stencil.on_edge(grid, axis, step), jnp.asarray(end.slope, on.dtype), side[axis])
     # only constrained ends and lost nodes ask what of a drift is rounding, which costs a look at its terms
     careful = lost is not None or grid.sides("constrained")
     slack = tuple(edges.slack(on)) if careful else None
     beside = None if lost is None else edges.beside(lost, grid)
-    return DiscreteHamiltonian(on, x, value, up, down, bends, links, slack=slack, lost=beside)
+    return DiscreteHamiltonian(on, x, value, tuple(up), tuple(down), bends, links, slack=slack, lost=beside)

@@ -111,6 +111,10 @@ def obstacles(on: Discretisation) -> Obstacles:
     held = jnp.zeros(on.grid.shape, bool) if problem.target is None else cut_cells.level(on) <= 0
     # off the target an exit cost says nothing, and may be no number
     given = jnp.zeros((), on.dtype) if exit_cost is None else jnp.where(held, exit_cost, 0)
+    for axis, step, end in on.grid.prescribed("dirichlet"):
+        edge = jnp.asarray(stencil.on_edge(on.grid, axis, step))
+        given = jnp.where(edge & ~held, jnp.asarray(end.value, on.dtype), given)
+        held = held | edge
     return Obstacles(held, given, stop, floor, ended=held)
 
 

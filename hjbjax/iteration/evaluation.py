@@ -204,7 +204,7 @@ def left_over(equation: PolicyEquation, grid: Grid, delta: Field) -> Field:
     """s + Σ_o w_o δ(x + o) − δ: the residual that a correction leaves."""
     jumps = zip(equation.weights.offsets, equation.weights.values, strict=True)
     if grid.sides("open"):
-        terms = [w * stencil.continued(delta, grid, offset) for offset, w in jumps]
+        terms = [w * stencil.continued(delta, grid, offset, change=True) for offset, w in jumps]
     else:  # no weight leads out
         terms = [w * stencil.neighbour(delta, grid, offset, ghost=False) for offset, w in jumps]
     return sum(terms, start=equation.source - delta)

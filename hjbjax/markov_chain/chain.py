@@ -206,6 +206,7 @@ def _checked(
     Refuses what is not usable.
     """
     grid = on.grid
+    grid.refuse_prescribed("chain", "whose payments a table of rates and running costs does not hold")
     if grid.sides("open"):
         raise ValueError(
             "chain: a grid with open ends has no chain: a value that is continued from inside makes negative "

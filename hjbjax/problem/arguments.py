@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
+from hjbjax.problem.ends import KINDS, PRESCRIBED
 from hjbjax.problem.parts import FEWEST
 from hjbjax.problem.pytree import is_traced, numbers
 from hjbjax.problem.stretching import Sinh
@@ -26,12 +27,7 @@ COINCIDING = 16  # units in the last place of a coordinate, of which a spacing m
 INDEXABLE = 2**31  # nodes that 32-bit indices can number
 NO_GRID = "hjb.pontryagin(problem, x0) finds the optimal path from one state without a grid"
 SHOWN = 80  # characters of a refused value that are quoted
-EDGES = (
-    "projected",
-    "constrained",
-    "open",
-    "linear",
-)  # names, as they carry no numbers: static, hashable, saved as they are
+EDGES = ("projected", "constrained", "open", "linear")  # ends without numbers: static, hashable, saved as they are
 Ends = tuple[str, str] | None  # of an axis: the kinds of its lower and its upper end; none where it is periodic
 
 
@@ -156,47 +152,57 @@ def check_stretch(stretch: tuple, periodic: tuple[bool, ...]) -> None:
             raise ValueError(f"Grid.stretch: axis {axis} is periodic; only an axis with ends can be stretched")
 
 
-def kinds_of_ends(edges: object, periodic: tuple[bool, ...], shape: tuple[int, ...]) -> tuple[Ends, ...]:
-    """The kinds of both ends of every axis, checked."""
-    if edges is None or isinstance(edges, str):
+def pairs_of_ends(edges: object, periodic: tuple[bool, ...], shape: tuple[int, ...]) -> tuple[Any, ...]:
+    """Both ends of every axis, checked: names and prescribed ends; None for a periodic axis."""
+    if edges is None or isinstance(edges, (str, *PRESCRIBED)):
         _kind(edges, "every end")
         edges = [None if cyclic else edges for cyclic in periodic]
     if not isinstance(edges, Sequence) or len(edges) != len(periodic):
         pair = '(("open", "constrained"),)' if len(periodic) == 1 else '("open", ("projected", "constrained"))'
         raise ValueError(
-            f"Grid.edges: got {edges!r} for {len(periodic)} axes; wanted a name for all, or one entry an axis: a name "
+            f"Grid.edges: got {edges!r} for {len(periodic)} axes; wanted a name for all, or one entry per axis: a name "
             f"or a pair (lower end, upper end), as in {pair}"
         )
     return tuple(_ends(entry, axis, periodic[axis], shape[axis]) for axis, entry in enumerate(edges))
 
 
-def _ends(entry: object, axis: int, cyclic: bool, count: int) -> Ends:
-    """The kinds of the two ends of one axis."""
+def kinds_of_ends(pairs: tuple[Any, ...]) -> tuple[Ends, ...]:
+    """The kinds of both ends of every axis by their names."""
+    return tuple(pair and (_kind(pair[0], ""), _kind(pair[1], "")) for pair in pairs)
+
+
+def _ends(entry: object, axis: int, cyclic: bool, count: int) -> tuple[Any, Any] | None:
+    """The two ends of one axis."""
     if cyclic and entry is not None:
         raise ValueError(f"Grid.edges: axis {axis} is periodic and has no ends; got {entry!r} there, wanted None")
     if cyclic:
         return None
     # a name stands for both ends; as a Sequence it would be taken for a list of letters
-    pair = (entry, entry) if entry is None or isinstance(entry, str) else entry
+    pair = (entry, entry) if entry is None or isinstance(entry, (str, *PRESCRIBED)) else entry
     if not isinstance(pair, Sequence) or len(pair) != 2:
         raise ValueError(f"Grid.edges: axis {axis} has {entry!r}; wanted a name or a pair (lower end, upper end)")
-    lower, upper = (_kind(name, f"axis {axis}") for name in pair)
-    if "open" in (lower, upper) and count < 3:  # a parabola goes on beyond the end
+    kinds = [_kind(end, f"axis {axis}") for end in pair]
+    if "open" in kinds and count < 3:  # a parabola goes on beyond the end
         raise ValueError(
             f"Grid.edges: axis {axis} has {count} points; an open end continues the last three. Take more points, or "
             "edges='linear', which continues the last two"
         )
-    return lower, upper
+    return pair[0], pair[1]
 
 
 def _kind(name: object, where: str) -> str:
-    """The kind of one end by its name; "projected" without one."""
+    """The kind of one end by its name, or of a prescribed one; "projected" by default."""
     if name is None:
         return "projected"
-    if not isinstance(name, str) or name not in EDGES:
+    if isinstance(name, PRESCRIBED):
+        return name.kind
+    if not isinstance(name, str) or name not in (*EDGES, *KINDS):
         near = difflib.get_close_matches(str(name), EDGES, 1, 0.4)
         hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise ValueError(f"Grid.edges: got {name!r} for {where}; wanted one of {', '.join(map(repr, EDGES))}{hint}")
+        raise ValueError(
+            f"Grid.edges: got {name!r} for {where}; wanted one of {', '.join(map(repr, EDGES))}, or a prescribed end: "
+            f"hjb.Dirichlet(value), hjb.Neumann(slope) or hjb.Robin(rate){hint}"
+        )
     return name
 
 

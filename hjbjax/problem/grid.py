@@ -16,12 +16,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem import arguments
+from hjbjax.problem.ends import KINDS, PRESCRIBED, on_face
 from hjbjax.problem.labels import with_unit, words
 from hjbjax.problem.parts import Parts
 from hjbjax.problem.pytree import altered, is_traced, known, pytree_dataclass
 from hjbjax.problem.stretching import Stretching, checked_table, from_table, into_period
 from hjbjax.problem.types import Array, AtNodes, DType, Mask, Number, Numbers, Scalar, States, Verdict
 
+CONTINUED = ("open", "linear", "robin")  # kinds of ends beyond which V continues
 TABLED = 2**24  # points of an axis whose coordinates are kept, 128 MiB; a grid too large must not allocate them before
 
 
@@ -43,6 +45,7 @@ class Grid:
         "open": paths may leave; beyond the end V continues as the parabola through its last three nodes.
         "linear": paths may leave; beyond the end V continues as the straight line through its last two nodes.
         Noise reflects at a projected and at a constrained end, on the node itself, and continues at the other two.
+        A prescribed end: ``Dirichlet(value)``, ``Neumann(slope)`` or ``Robin(rate)``, see there.
       units: one unit an axis, as in ("rad", "rad/s"), for pictures and printed tables; empty where there is none.
 
     Raises:
@@ -66,6 +69,7 @@ class Grid:
     coordinates: tuple[Any, ...] = dataclasses.field(init=False, repr=False)
     spacings: tuple[Any, ...] | None = dataclasses.field(init=False, repr=False, default=None)  # see ``settled``
     parts: Parts | None = dataclasses.field(init=False, repr=False, default=None)  # over which devices; None: one
+    faces: tuple[Any, ...] = dataclasses.field(init=False, repr=False, default=())  # prescribed ends with their numbers
 
     def __post_init__(self):
         lo, hi = arguments.corner(self.lo, "lo"), arguments.corner(self.hi, "hi")
@@ -84,7 +88,8 @@ class Grid:
             for axis, (low, high) in enumerate(zip(lo, hi, strict=True)):
                 if not (math.isfinite(low) and math.isfinite(high) and low < high):
                     raise ValueError(f"Grid: axis {axis} runs from {low:g} to {high:g}; wanted finite lo < hi")
-        edges = arguments.kinds_of_ends(self.edges, periodic, shape)
+        ends = arguments.pairs_of_ends(self.edges, periodic, shape)
+        edges = arguments.kinds_of_ends(ends)
         units = words(self.units, len(shape), "Grid.units") or ("",) * len(shape)
         checked = {
             "lo": lo, "hi": hi, "shape": shape, "periodic": periodic, "names": names, "stretch": stretch,
@@ -94,7 +99,46 @@ class Grid:
             object.__setattr__(self, name, value)
         tables = (self._by_formula(axis) if count <= TABLED else None for axis, count in enumerate(shape))
         object.__setattr__(self, "coordinates", tuple(tables))
+        object.__setattr__(self, "faces", tuple(self._faces(axis, given) for axis, given in enumerate(ends)))
         self.check_spacings(np.float64)  # a solve asks again in its own dtype, which may be float32
+
+    def _faces(self, axis: int, pair: tuple[Any, Any] | None) -> tuple[Any, Any] | None:
+        """The prescriptions at the two ends of an axis, evaluated at their nodes; None without one."""
+        if pair is None or not any(isinstance(end, PRESCRIBED) for end in pair):
+            return None
+        found = []
+        for end, index in zip(pair, (0, -1), strict=True):
+            if not isinstance(end, PRESCRIBED):
+                found.append(None)
+                continue
+            along = [self.axis(i) if i != axis else self.axis(i)[index : index + 1 or None] for i in range(self.ndim)]
+            xp: Any = jnp if is_traced(along) else np
+            nodes = xp.stack(xp.meshgrid(*along, indexing="ij"), axis=-1)
+            name = f"Grid.edges: {type(end).__name__} at an end of {self.names[axis]}"
+            found.append(
+                dataclasses.replace(
+                    end,
+                    **{each.name: on_face(getattr(end, each.name), nodes, name) for each in dataclasses.fields(end)},
+                )
+            )
+        return found[0], found[1]
+
+    def prescribed(self, *kinds: str) -> list[tuple[int, int, Any]]:
+        """The prescribed ends of these kinds, or of all: an axis, a step, and the prescription at the nodes there."""
+        found = (
+            (axis, step, pair[(step + 1) // 2]) for axis, pair in enumerate(self.faces) if pair for step in (-1, 1)
+        )
+        return [each for each in found if each[2] is not None and (not kinds or each[2].kind in kinds)]
+
+    def refuse_prescribed(self, name: str, why: str) -> None:
+        """Refuse prescribed ends in the name of a function, with the reason.
+
+        Raises:
+          ValueError: with the ends.
+        """
+        found = sorted({type(end).__name__ for _, _, end in self.prescribed()})
+        if found:
+            raise ValueError(f"{name}: got a grid with {' and '.join(found)} ends, {why}; use edges='projected'")
 
     def check_spacings(self, dtype: DType) -> None:
         """Refuse nodes that coincide up to rounding in ``dtype``: differences of values would be rounding as well.
@@ -107,12 +151,21 @@ class Grid:
                 arguments.check_nodes(nodes, axis, dtype)
 
     def check_indices(self) -> None:
-        """Refuse more nodes than 32-bit indices number, before anything of their size is allocated or compiled.
+        """Refuse what no solve can start from, before anything of the size of the grid is allocated or compiled.
 
         Raises:
-          MemoryError: with the nodes, and the largest N that can be numbered.
+          MemoryError: more nodes than 32-bit indices number, with the largest N that can be numbered.
+          ValueError: prescribed ends without their numbers, as of a grid from a file.
         """
         arguments.check_count(self.shape)
+        known = {(axis, step) for axis, step, _ in self.prescribed()}
+        if missing := {side for kind in KINDS for side in self.sides(kind)} - known:
+            axis, step = min(missing)
+            raise ValueError(
+                f"Grid.edges: the {'upper' if step > 0 else 'lower'} end of {self.names[axis]} is prescribed, but its "
+                "numbers are unknown: files do not keep them. Make the Grid again, with hjb.Dirichlet(value), "
+                "hjb.Neumann(slope) or hjb.Robin(rate)"
+            )
 
     @property
     def ndim(self) -> int:
@@ -132,17 +185,16 @@ class Grid:
     def sides(self, kind: str) -> list[tuple[int, int]]:
         """The sides of the box with ends of this kind: pairs of an axis and a step, −1 lower and 1 upper.
 
-        Linear ends count as "open" as well: at both kinds V continues beyond the end.
+        Linear and Robin ends count as "open" as well: V continues beyond all of them, and none belongs to a chain.
         """
-        kinds = ("open", "linear") if kind == "open" else (kind,)
+        kinds = CONTINUED if kind == "open" else (kind,)
         ends = ((axis, pair) for axis, pair in enumerate(self.edges) if pair is not None)  # None: a periodic axis
         return [(axis, step) for axis, pair in ends for step, name in zip((-1, 1), pair, strict=True) if name in kinds]
 
     @property
     def walled(self) -> "Grid":
-        """The grid with its open ends made projected ones."""
-        continued = ("open", "linear")
-        pairs = (pair and tuple("projected" if name in continued else name for name in pair) for pair in self.edges)
+        """The grid with the ends of a chain: projected ones instead of open, linear and Robin ends."""
+        pairs = (pair and tuple("projected" if name in CONTINUED else name for name in pair) for pair in self.edges)
         return altered(self, edges=tuple(pairs))
 
     def divided(self, parts: Parts) -> "Grid":

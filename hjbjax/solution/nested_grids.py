@@ -13,9 +13,11 @@ all of V is off by a low power of h, be the policy what it may.
 import dataclasses
 from typing import Any
 
+import jax
 import numpy as np
 
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.pytree import altered
 
 FEWEST = 12  # intervals that an axis keeps
 USUAL, BROKEN = 1.65, 0.5  # orders of limited slopes
@@ -39,7 +41,20 @@ def coarser(grid: Grid, fewest: int = FEWEST) -> Grid | None:
         shape.append(count - intervals + half if half >= fewest else count)
     if tuple(shape) == grid.shape:
         return None
-    return dataclasses.replace(grid, shape=tuple(shape))
+    return with_faces_of(grid, dataclasses.replace(grid, shape=tuple(shape)))
+
+
+def with_faces_of(grid: Grid, coarse: Grid) -> Grid:
+    """The coarse grid with the prescribed ends of another grid of its box, at the nearest nodes."""
+
+    def nearest(values: Any) -> Any:
+        for axis, count in enumerate(coarse.shape):
+            if np.ndim(values) and values.shape[axis] > 1:
+                places = np.arange(count) * (grid.intervals(axis) / coarse.intervals(axis))
+                values = np.take(values, np.round(places).astype(int), axis=axis)
+        return values
+
+    return altered(coarse, faces=jax.tree.map(nearest, grid.faces)) if grid.faces else coarse
 
 
 def prolong(values: np.ndarray, coarse: Grid, fine: Grid) -> np.ndarray:

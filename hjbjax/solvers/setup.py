@@ -204,6 +204,7 @@ def assumptions_of(on: Discretisation) -> Assumptions:
     if discounted:
         return Assumptions(Certificate.ADDITIVE, players.exact, may_rest=False)
     fits = problem.running_max is None and problem.cost is not None and not players.disturbance_costs
+    fits &= not on.grid.sides("neumann")  # a slope is a cost at the end, which may be negative
     kind = Certificate.MULTIPLICATIVE if fits else Certificate.NONE
     may_rest = not is_constrained(problem) and problem.cost is not None
     return Assumptions(Certificate.BY_DISCOUNT if discounted is None else kind, players.exact, may_rest, fits)

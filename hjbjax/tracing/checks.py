@@ -342,6 +342,7 @@ def over_devices(
         return None
     if traced:
         raise ValueError(f"{caller}: mesh divides the nodes at host level only; leave it out inside jit, vmap and grad")
+    grid.refuse_prescribed(caller, "whose numbers are not divided over a mesh")
     if calls_back(problem, grid.ndim):
         raise ValueError(
             f"{caller}: a function of the problem calls Python on the host; leave out mesh, or write it in JAX"

@@ -123,7 +123,7 @@ def continued(
         return neighbour(values, grid, offset)
     for axis, step in enumerate(offset):  # beyond a corner: what one axis says through what the other says
         moved = neighbour(values, grid, unit(grid, axis, step))
-        if step and not grid.periodic[axis] and not has_wall(grid, axis, step):
+        if step and not grid.periodic[axis] and not has_wall(grid, axis, step):  # type: ignore[index]
             moved = jnp.where(on_edge(grid, axis, step), _ended(values, grid, axis, step, change=change), moved)
         elif step and mirror and not grid.periodic[axis]:  # type: ignore[index]
             moved = jnp.where(on_edge(grid, axis, step), slices(values, grid, axis, step, 1), moved)

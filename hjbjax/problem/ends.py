@@ -68,7 +68,7 @@ PRESCRIBED = (Dirichlet, Neumann, Robin)
 KINDS = tuple(each.kind for each in PRESCRIBED)
 
 
-def on_face(prescription: object, nodes: np.ndarray, name: str) -> Array:
+def on_face(prescription: Any, nodes: Array, name: str) -> Any:
     """A number, or a function of the state at the nodes of one end.
 
     Args:
@@ -102,7 +102,7 @@ def on_face(prescription: object, nodes: np.ndarray, name: str) -> Array:
     return found
 
 
-def _at(function: Callable, nodes: np.ndarray) -> Array:
+def _at(function: Callable, nodes: Array) -> jax.Array:
     """A function of one state at the states of an array (..., n)."""
     flat = jnp.asarray(nodes.reshape(-1, nodes.shape[-1]))
     found = jax.vmap(function)(flat)

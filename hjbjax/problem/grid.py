@@ -106,7 +106,7 @@ class Grid:
         """The prescriptions at the two ends of an axis, evaluated at their nodes; None without one."""
         if pair is None or not any(isinstance(end, PRESCRIBED) for end in pair):
             return None
-        found = []
+        found: list[Any] = []
         for end, index in zip(pair, (0, -1), strict=True):
             if not isinstance(end, PRESCRIBED):
                 found.append(None)
@@ -115,12 +115,8 @@ class Grid:
             xp: Any = jnp if is_traced(along) else np
             nodes = xp.stack(xp.meshgrid(*along, indexing="ij"), axis=-1)
             name = f"Grid.edges: {type(end).__name__} at an end of {self.names[axis]}"
-            found.append(
-                dataclasses.replace(
-                    end,
-                    **{each.name: on_face(getattr(end, each.name), nodes, name) for each in dataclasses.fields(end)},
-                )
-            )
+            numbers = {each.name: on_face(getattr(end, each.name), nodes, name) for each in dataclasses.fields(end)}
+            found.append(altered(end, **numbers))
         return found[0], found[1]
 
     def prescribed(self, *kinds: str) -> list[tuple[int, int, Any]]:

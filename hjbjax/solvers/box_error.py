@@ -226,7 +226,7 @@ def _fixed_next_to_lost(task: Task) -> Obstacles:
 
     Unreachable nodes hold a number far above all others. Continued beyond an end next to them it would be far below.
     """
-    if not task.has_lost:
+    if task.lost is None:
         return task.obstacles
     near = functools.reduce(
         np.logical_or, (np.asarray(side) for pair in edges.beside(task.lost, task.grid) for side in pair)
@@ -236,7 +236,7 @@ def _fixed_next_to_lost(task: Task) -> Obstacles:
 
 def _sides(grid: Grid, nodes: np.ndarray) -> tuple[tuple[int, int], ...]:
     """The ends of the box with one of these nodes, bool (*grid)."""
-    ends = ((axis, step) for axis in range(grid.ndim) if not grid.periodic[axis] for step in (-1, 1))
+    ends = ((axis, step) for axis, pair in enumerate(grid.edges) if pair for step in (-1, 1))
     return tuple((axis, step) for axis, step in ends if np.any(np.take(nodes, -1 if step > 0 else 0, axis=axis)))
 
 

@@ -4,6 +4,8 @@ At host level it validates, finds the longest stable step, goes backward in chun
 one kept time to the next, and reports. Under a tracer the same steps run in a scan of fixed length.
 """
 
+import dataclasses
+import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -29,13 +31,14 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, as_one_program, cast, is_traced
 from hjbjax.problem.sets import Box
 from hjbjax.problem.types import Array, DType, Mask, Nodes, Scalar
-from hjbjax.solution import checkpoints
+from hjbjax.solution import checkpoints, nested_grids
 from hjbjax.solution.checkpoints import Checkpoint
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solution.placement import Path
 from hjbjax.solution.solution import Solution, SolveError, question
 from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop, march_run, time_probes
+from hjbjax.solvers.box_error import with_march_box_error
 from hjbjax.solvers.result import solution_at_start, with_last_phase
 from hjbjax.solvers.setup import check_on_one_state, choose_evaluation
 from hjbjax.solvers.stationary import check_node_values
@@ -169,6 +172,9 @@ def march(
                 task = _prepare(on, horizon, method, step, inner, policy=policy)
                 slices, front, code = march_run.drive(task, horizon, kept, start, clock)
                 solution = march_run.assemble(task, grid, slices, front, code)
+                if code is Status.CONVERGED:
+                    again = functools.partial(_march_again, task, method, kept, start, clock)
+                    solution = with_march_box_error(solution, on, again, clock)
             except Stopped as stop:
                 solution = _solution_at_horizon(on, horizon, start, stop.status)
         solution = with_last_phase(solution, clock)
@@ -182,6 +188,23 @@ def march(
     if throw and solution.status is not Status.CONVERGED:
         raise SolveError(f"{solution.status.name}: {solution.message}", solution)
     return solution
+
+
+def _march_again(
+    task: March, method: TimeMethod, kept: np.ndarray, start: Nodes | None, clock: Clock, on: Discretisation
+) -> np.ndarray | None:
+    """V at the kept times by a march of the same problem on a coarser grid; None where it does not come to its end.
+
+    The steps are as long as those of ``task``, whose limit is the shorter one.
+    """
+    begin = None if start is None else nested_grids.restrict(np.asarray(start), task.grid, on.grid)
+    on = cast(on, on.dtype)
+    again = dataclasses.replace(
+        task, on=on, method=method.filled(on, _evaluation(on.problem, on.grid)), obstacles=None, watched=None,
+        checks_rates=False, checks_noise=False, checks_gap=False, bare=True,
+    )  # fmt: skip
+    slices, _, code = march_run.drive(again, float(task.horizon), kept, begin, clock.beside())
+    return slices.value if code is Status.CONVERGED else None
 
 
 def _solution_at_horizon(on: Discretisation, horizon: float, start: Nodes | None, code: Status) -> Solution:

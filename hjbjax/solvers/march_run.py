@@ -23,7 +23,7 @@ from hjbjax.solution.solution import Solution, question
 from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop
 from hjbjax.solvers.host_loop import WideJit
-from hjbjax.solvers.result import isaacs_gap, warn_of_cuts, warn_of_gap
+from hjbjax.solvers.result import isaacs_gap, warn_of_gap
 
 CERTIFICATE = "of a march there is none; halve the spacings and the step to see its error"
 ADVICE = {
@@ -335,10 +335,6 @@ def assemble(task: March, grid: Grid, slices: Slices, front: Front, code: Status
     """The solution of a march on the user's ``grid``: its slices, and how it went."""
     problem = task.problem
     kept = slice(slices.first, None)
-    if len(slices.cut[kept]):
-        # of all kept times: what an end cuts off at a later one has worked its way into the box
-        worst = np.argmax(slices.cut[kept] / np.maximum(slices.ends[kept], 1), axis=0)[None]
-        warn_of_cuts(*(np.take_along_axis(array[kept], worst, 0)[0] for array in (slices.cut, slices.ends)), grid)
     return Solution(
         grid,
         slices.value[kept],

@@ -10,7 +10,7 @@ from hjbjax.discretisation import cut_cells, schemes
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.rates import fastest_rate
 from hjbjax.discretisation.schemes import Limited, Upwind
-from hjbjax.hamiltonian.exact import concave_in_a_ball
+from hjbjax.hamiltonian.exact import may_miss
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import bellman
 from hjbjax.iteration.certificates import Certificate
@@ -218,7 +218,7 @@ def prepare_on_host(
     clock, problem, grid = clock or Clock(), on.problem, on.grid
     clock.enter(f"the preparation of {' x '.join(map(str, grid.shape))} nodes")
     assumptions = assumptions_of(on)
-    if concave_in_a_ball(on):
+    if may_miss(on):
         assumptions = dataclasses.replace(assumptions, exact=False)
     if is_bare(method):
         return *_bare(on, method, tol, assumptions), None

@@ -19,8 +19,8 @@ Convexity gives a lower bound on every program, from its multipliers s and the g
 so the distance of J(v) to the minimum is bounded at every node, whatever the iteration did.
 
 Where P is not positive semidefinite, a diagonal D makes P + D so. The concave rest, −D v²/2, is replaced by a tangent
-at an end of its input, and both are tried: the answer is a good one that may not be the minimum. The lower bound then
-takes the chord, −D/2.
+at an end of its input, and both are tried, then by tangents at the best point: the answer may be a local minimum. The
+lower bound takes the chord, −D/2.
 
 Derivatives come from the optimality conditions with the active set held.
 """
@@ -38,6 +38,7 @@ from hjbjax.problem.pytree import altered, pytree_dataclass
 STEPS = 40  # of the interior-point method; most nodes need 15, and the slowest of 100,000 random ones needed 27
 POLISH = 3  # Newton steps on the active set: its penalty contracts the error by the root of the rounding each
 CLOSE = 16  # units of rounding of the largest coefficient at which a node has converged
+DESCENTS = 12  # convex programs with tangents at the best point, where a cost is not convex
 TANGENTS = 256  # choices of tangents and kinks that are tried at most
 PENALTY = 0.4  # ε^(−0.4) times the largest slope is a jump that stands for a constraint: 2e6 in float64
 NODES = 1 << 14  # nodes in one pass: they need about a hundred numbers each while they are solved
@@ -226,6 +227,8 @@ def _best(program: Program, axes: tuple[int, ...], ball: bool) -> Best:
     def one(carry: tuple[jax.Array, Best]) -> tuple[jax.Array, Best]:
         number, best = carry
         on, ends = _choice(number, concave, program.sides, steep, axes)
+        # after the last choice, tangents at the best point so far
+        on, ends = jnp.where(number < count, on, best.on), jnp.where(number < count, ends, best.point.v)
         affine = jnp.where(on, program.jumps, 0)
         known = program.slope + _back(program.rows, affine)
         point = _solved(altered(convex, slope=known - shift * ends), ball)
@@ -247,7 +250,7 @@ def _best(program: Program, axes: tuple[int, ...], ball: bool) -> Best:
     endless, slacks = jnp.full_like(program.slope[0], jnp.inf), (1 if ball else 2 * len(shift)) + 2 * len(axes)
     empty = (jnp.zeros((rows, *endless.shape), endless.dtype) for rows in (len(shift), len(axes), slacks, slacks))
     start = Best(Point(*empty), endless, jnp.zeros(concave.shape, bool), endless)
-    most = jnp.max(count)
+    most = jnp.max(jnp.where(jnp.any(steep, 0), count + DESCENTS, count))
     return jax.lax.while_loop(lambda carry: carry[0] < most, one, (jnp.zeros((), jnp.int32), start))[1]
 
 
@@ -402,7 +405,10 @@ def _newton(
         matrix = matrix + eye * (weight[:m] + weight[m : 2 * m])[:, None]
         right = right + aim[:m] - aim[m : 2 * m]
     # so that rounding makes no pivot negative, nor zero where nothing bends; residuals are taken anew at every step
-    dv = _eliminated(matrix + eye * root**2 * (1 + 4 * matrix), right)
+    matrix = matrix + eye * root**2 * (1 + 4 * matrix)
+    dv = jax.lax.custom_linear_solve(
+        lambda move: _times(matrix, move), right, lambda _, known: _eliminated(matrix, known), symmetric=True
+    )
     ds = (jnp.sum(program.rows * dv, 1) + beyond) * soft
     bars_moved = [bar - jnp.sum(v * dv, 0, keepdims=True)] if ball else [dv, -dv]
     slack = jnp.concatenate([*bars_moved, -ds, ds])

@@ -15,6 +15,7 @@ from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.hamiltonian import discrete, exact, optimum
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.hamiltonian.quadratic_program import is_convex
+from hjbjax.problem.pytree import cast
 
 SHAPE = (4, 3)
 GRID = hjb.Grid([0.0, 0.0], [1.0, 1.0], SHAPE, periodic=(True, True))
@@ -54,7 +55,8 @@ def problem_of(numbers, admissible, sigma=None):
 
 @functools.partial(jax.jit, static_argnames="dtype")
 def found(problem, value, dtype=np.float64):
-    hamiltonian = discrete.around(Discretisation(problem, GRID, hjb.Upwind(), dtype), jnp.asarray(value, dtype))
+    on = cast(Discretisation(problem, GRID, hjb.Upwind(), dtype), dtype)
+    hamiltonian = discrete.around(on, jnp.asarray(value, dtype))
     best, u, _ = optimum.optimise(hamiltonian)
     missed = exact.missed(hamiltonian, players_of(hamiltonian.on).control, lambda u: (u, []))
     return best, jnp.stack([jnp.broadcast_to(each, SHAPE) for each in u], -1), missed
@@ -144,7 +146,8 @@ def test_shared_inputs_are_optimal(m, kind, noisy):
 def test_single_precision_is_as_good_as_its_rounding(kind):
     numbers, value, sigma = drawn(0, 3)
     problem = problem_of(numbers, admissible_set(kind, 3), sigma)
-    double, single = found(problem, value)[0], found(problem, value, np.float32)[0]
+    double = found(problem, value)[0]
+    single = found(problem, value, np.float32)[0]
     assert single.dtype == np.float32
     np.testing.assert_allclose(single, double, atol=1e-5 * np.max(np.abs(double)))
 
@@ -153,6 +156,7 @@ def test_single_precision_is_as_good_as_its_rounding(kind):
 def test_derivatives_of_the_optimum(kind):
     """Of H by every number of the problem, and of the action by one: against differences."""
     numbers, value, sigma = drawn(2, 3)
+    numbers["Q"] = numbers["Q"] + 0.2 * np.eye(3)  # convex also a step further
 
     def best(numbers):
         return jnp.sum(found(problem_of(numbers, admissible_set(kind, 3), sigma), value)[0])
@@ -184,9 +188,9 @@ def test_a_cost_that_is_not_convex_is_known():
 
 
 def test_where_it_is_not_convex_the_bound_holds():
-    """An indefinite cost: the answer is admissible and near the minimum, and not further off than the bound says."""
-    admissible = admissible_set("box", 3)
-    for seed in range(3):
+    """An indefinite cost: the answer is hardly ever a local minimum only, and not further off than the bound says."""
+    admissible, off = admissible_set("box", 3), []
+    for seed in range(5):
         numbers, value, _ = drawn(seed, 3)
         numbers["Q"] = numbers["Q"] - 0.8 * np.eye(3)
         best, _, missed = map(np.asarray, found(problem_of(numbers, admissible), value))
@@ -194,7 +198,8 @@ def test_where_it_is_not_convex_the_bound_holds():
             node = Node(numbers, value, None, index)
             least = scanned(node, admissible)
             assert best[index] - missed[index] <= least + 1e-9
-            assert best[index] <= least + 0.5
+            off.append(best[index] - least)
+    assert np.mean(np.array(off) > 1e-3) < 0.1
 
 
 # --- solves ---

@@ -249,16 +249,18 @@ def _cost_coefficients(
     return linear, quadratic
 
 
-def may_miss(on: Discretisation) -> bool:
-    """True if a player whose optimum is called exact may miss it at a node; host level.
+def needs_convexity(on: Discretisation) -> bool:
+    """True if a player's optimum is exact only where its cost is convex for a minimiser, concave for a maximiser."""
+    return any(_needs_convexity(player) for player in players_of(on).both)
 
-    Over a ball and in quadratic programs the cost must be convex for a minimiser and concave for a maximiser.
-    """
-    return any(_needs_convexity(player) for player in players_of(on).both) and bool(_is_concave(on))
+
+def may_miss(on: Discretisation) -> Verdict | bool:
+    """True if a player whose optimum is called exact may miss it at a node, since its cost is not convex there."""
+    return needs_convexity(on) and _is_concave(on)
 
 
 def _needs_convexity(player: Player) -> bool:
-    """True if a player's optimum is only found where its cost is convex."""
+    """True if a player's optimum over a ball or by quadratic programs has a quadratic cost."""
     quadratic = any(player.curved) or bool(player.products)
     return player.exact and quadratic and (any(player.programs) or isinstance(player.admissible, Ball))
 

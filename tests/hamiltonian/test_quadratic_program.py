@@ -213,15 +213,16 @@ def three_inputs(numbers):
     )
 
 
+@pytest.mark.filterwarnings("ignore:the optimal drift leaves")
 @pytest.mark.parametrize("scheme", [hjb.Upwind(), hjb.Limited()])
 def test_three_inputs_on_two_components(scheme):
     """V exceeded that of 21 values per input by 0.0044 with ``Upwind`` and by 0.042 with ``Limited``."""
     problem = three_inputs({"b": np.array([0.3, -0.05]), "G": B})
     grid = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (11, 13))
-    solution = hjb.solve(problem, grid, scheme=scheme)
+    solution = hjb.solve(problem, grid, scheme=scheme, progress=False)
     listed = hjb.solve(
         hjb.Problem(problem.drift, problem.cost, problem.controls.grid(9), discount=0.3), grid, scheme=scheme
     )
     assert np.max(solution.value - listed.value) < 1e-5
     assert np.min(solution.value - listed.value) > -0.2
-    assert "refined sample" not in solution.stats["certificate"]
+    assert (solution.bounds is not None) == scheme.monotone

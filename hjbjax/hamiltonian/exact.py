@@ -1,110 +1,285 @@
 """The exact optimum of the discrete Hamiltonian over a box or a ball: its pieces, read from a problem's functions.
 
-The drift is affine in the player's inputs and the cost separable and quadratic (see ``players``), so that derivatives
-at zero give all of their coefficients; ``piecewise`` and ``ball`` tell why the candidates suffice.
+The drift is affine in the player's inputs and the cost quadratic (see ``players``), so derivatives at zero give all
+coefficients. ``piecewise``, ``ball`` and ``quadratic_program`` find the optimum of each group of inputs from them.
 """
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from hjbjax.discretisation import correlated_noise
+from hjbjax.discretisation import correlated_noise, stencil
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.stencil import PerNode
+from hjbjax.hamiltonian import quadratic_program
 from hjbjax.hamiltonian.ball import kinked_ball
 from hjbjax.hamiltonian.discrete import DiscreteHamiltonian
 from hjbjax.hamiltonian.piecewise import Kinked, piecewise_input, piecewise_pair
 from hjbjax.hamiltonian.players import Player, players_of, shared
+from hjbjax.hamiltonian.quadratic_program import Program
 from hjbjax.hamiltonian.search import Action
+from hjbjax.problem.grid import Grid
 from hjbjax.problem.sets import Ball, Box
 from hjbjax.problem.types import Verdict
 from hjbjax.tracing import components
 
 
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """One player's part of H: l·u + Σ_jk Q_jk u_j u_k and the gains of the components that it drives.
+
+    Attributes:
+      hamiltonian: H, around a value.
+      player: whose part it is.
+      linear: l_j, per-node scalars.
+      quadratic: Q_jk by pairs j <= k, for a product j < k the coefficient of u_j u_k; zeros are left out.
+      offsets: the components of the drift without this player.
+      slopes: for every input the components of ∂f/∂u_j.
+      noise: the entries of a that these gains take with them.
+    """
+
+    hamiltonian: DiscreteHamiltonian
+    player: Player
+    linear: Sequence[PerNode]
+    quadratic: dict[tuple[int, ...], PerNode]
+    offsets: Sequence[PerNode]
+    slopes: Sequence[Any]
+    noise: dict[tuple[int, int], Any]
+
+    def square(self, j: int) -> PerNode:
+        """Q_jj."""
+        return self.quadratic.get((j, j), jnp.zeros((), self.hamiltonian.on.dtype))
+
+    def gain(self, axis: int, group: Sequence[int]) -> Kinked:
+        """The gain of one component as a function of some inputs; of one input, its slope is a number per node."""
+        left = correlated_noise.along_axis(self.noise, self.hamiltonian.on.grid, axis)
+        slope = [self.slopes[j][axis] for j in group]
+        return Kinked(
+            lambda f: self.hamiltonian.gain(axis, f, left), self.offsets[axis], slope[0] if len(group) == 1 else slope,
+            *self.hamiltonian.kinks(axis, left),
+        )  # fmt: skip
+
+
 def exact_optimum(hamiltonian: DiscreteHamiltonian, player: Player, join: Callable) -> Action:
     """One player's optimum over a box or a ball against the other's action; ``join(mine)`` makes the pair (u, d)."""
-    admissible = player.admissible
-    assert isinstance(admissible, (Box, Ball))
-    problem, dtype = hamiltonian.on.problem, hamiltonian.on.dtype
-    # at zero even if that is not admissible: an affine drift is known by its offset and its slopes there
-    zero = [jnp.zeros((), dtype)] * admissible.dim
-    u, d = join(zero)
-    arguments = problem.arguments(hamiltonian.x, u, d, hamiltonian.on.t)
-    parts = hamiltonian.on.drifts(u, d, hamiltonian.x)
-    # where drifts are upwinded apart, the noise goes with the control's
-    part = 0 if player.sign > 0 else len(parts) - 1
-    noise = hamiltonian.on.diffusion(u, d, hamiltonian.x) if part == 0 else {}
-    slopes = [
-        components.components(player.derivative(problem, problem.drift, j), *arguments, dtype=dtype)
-        for j in range(admissible.dim)
-    ]
-    linear, square = zip(
-        *(_cost_coefficients(hamiltonian.on, player, arguments, j) for j in range(admissible.dim)), strict=True
-    )
-
-    def piece(i: int, group: Sequence[int]) -> Kinked:
-        slope = [slopes[j][i] for j in group]
-        return _kinked(hamiltonian, noise, i, parts[part][i], slope[0] if len(group) == 1 else slope)
-
-    if isinstance(admissible, Ball):
-        single = [[piece(i, [j]) for i in player.driven[j]] for j in range(admissible.dim)]
-        gains = [each[0] if each else None for each in single]
-        return kinked_ball(player.sign, admissible.radius, linear, square, gains, curved=any(player.curved))
-    action = list(zero)
-    for group in player.groups:
-        pieces = [piece(i, group) for i in shared(player.driven, group)]
-        lo, hi, slope, bend = ([each[j] for j in group] for each in (admissible.lo, admissible.hi, linear, square))
-        curved = any(player.curved[j] for j in group)
-        if len(group) == 1:
-            found = [piecewise_input(player.sign, lo[0], hi[0], slope[0], bend[0], pieces, curved=curved)]
-        else:
-            found = piecewise_pair(player.sign, lo, hi, slope, bend, pieces, curved=curved)
+    part = _part(hamiltonian, player, join)
+    action: Action = [jnp.zeros((), hamiltonian.on.dtype)] * len(player.driven)
+    if isinstance(player.admissible, Ball) and not any(player.programs):
+        return _in_ball(part)
+    for group, program in zip(player.groups, player.programs, strict=True):
+        found = _programmed(part, group)[0] if program else _in_box(part, group)
         for j, u in zip(group, found, strict=True):
             action[j] = u
     return action
 
 
-def _cost_coefficients(on: Discretisation, player: Player, arguments: tuple, j: int) -> tuple[Any, Any]:
-    """l_j and q_j of a cost l_j u + q_j u² + ... by differentiation at zero."""
-    cost, none = on.problem.cost, jnp.zeros((), on.dtype)
-    if cost is None:
-        return none, none
-    slope = player.derivative(on.problem, cost, j)
-    linear = components.scalar(slope, *arguments, dtype=on.dtype)
-    if not player.curved[j]:  # known to be linear: the second derivative would be traced to find a zero
-        return linear, none
-    return linear, components.scalar(player.derivative(on.problem, slope, j), *arguments, dtype=on.dtype) / 2
+def missed(hamiltonian: DiscreteHamiltonian, player: Player, join: Callable) -> jax.Array:
+    """A bound on the distance of H at the ``exact_optimum`` to the true optimum, (*nodes), in cost per unit time.
 
-
-def concave_in_a_ball(on: Discretisation) -> bool:
-    """True if a cost is concave, for who pays it, in an input of a ball: there the optimum may be missed.
-
-    Of players whose optimum is called exact; see ``ball.kinked_ball``. Host level.
+    It is what convexity proves of quadratic programs, and zero up to rounding where the cost is convex for this player.
+    All other optima are those of formulas.
     """
-    return any(_in_a_ball(player) for player in players_of(on).both) and bool(_is_concave(on))
+    part = _part(hamiltonian, player, join)
+    groups = [group for group, program in zip(player.groups, player.programs, strict=True) if program]
+    bounds = (_programmed(part, group)[1] for group in groups)
+    return sum(bounds, start=jnp.zeros(hamiltonian.value.shape, hamiltonian.on.dtype))
 
 
-def _in_a_ball(player: Player) -> bool:
-    """True if the optimum over a ball is that of quadratics."""
-    return player.exact and isinstance(player.admissible, Ball) and any(player.curved)
+def _part(hamiltonian: DiscreteHamiltonian, player: Player, join: Callable) -> Part:
+    """The coefficients of a player's part of H."""
+    assert isinstance(player.admissible, (Box, Ball))
+    on, count = hamiltonian.on, player.admissible.dim
+    # at zero even if that is not admissible: an affine drift is known by its offset and its slopes there
+    u, d = join([jnp.zeros((), on.dtype)] * count)
+    arguments = on.problem.arguments(hamiltonian.x, u, d, on.t)
+    parts = on.drifts(u, d, hamiltonian.x)
+    # where drifts are upwinded apart, the noise goes with the control's
+    number = 0 if player.sign > 0 else len(parts) - 1
+    noise = on.diffusion(u, d, hamiltonian.x) if number == 0 else {}
+    slopes = [
+        components.components(player.derivative(on.problem, on.problem.drift, j), *arguments, dtype=on.dtype)
+        for j in range(count)
+    ]
+    return Part(hamiltonian, player, *_cost_coefficients(on, player, arguments), parts[number], slopes, noise)
+
+
+def _in_ball(part: Part) -> Action:
+    """The optimum over a ball of inputs with a component each."""
+    admissible, player = part.player.admissible, part.player
+    assert isinstance(admissible, Ball)
+    gains = [part.gain(axes[0], [j]) if axes else None for j, axes in enumerate(player.driven)]
+    squares = [part.square(j) for j in range(admissible.dim)]
+    return kinked_ball(player.sign, admissible.radius, part.linear, squares, gains, curved=any(player.curved))
+
+
+def _in_box(part: Part, group: Sequence[int]) -> Action:
+    """The optimum over one input of a box, or over two whose product is not in the cost."""
+    admissible, player = part.player.admissible, part.player
+    assert isinstance(admissible, Box)
+    pieces = [part.gain(i, group) for i in shared(player.driven, group)]
+    lo, hi, slope = ([each[j] for j in group] for each in (admissible.lo, admissible.hi, part.linear))
+    bend, curved = [part.square(j) for j in group], any(player.curved[j] for j in group)
+    if len(group) == 1:
+        return [piecewise_input(player.sign, lo[0], hi[0], slope[0], bend[0], pieces, curved=curved)]
+    return piecewise_pair(player.sign, lo, hi, slope, bend, pieces, curved=curved)
+
+
+def _programmed(part: Part, group: Sequence[int]) -> tuple[Action, jax.Array]:
+    """The optimum over a group of inputs as a quadratic program, and a bound on what it misses."""
+    admissible = part.player.admissible
+    assert isinstance(admissible, (Box, Ball))
+    program, axes = _program(part, group, [part.gain(i, group) for i in shared(part.player.driven, group)])
+    v, distance = quadratic_program.least(program, axes, ball=isinstance(admissible, Ball))
+    if isinstance(admissible, Ball):
+        return [admissible.radius * each for each in v], distance
+    action = []
+    for j, each in zip(group, v, strict=True):
+        lo, hi = admissible.lo[j], admissible.hi[j]
+        inside = (lo + hi) / 2 + (hi - lo) / 2 * each
+        action.append(jnp.where(each == 1, hi, jnp.where(each == -1, lo, inside)))  # an end as it was given
+    return action, distance
+
+
+def _ends(admissible: Box | Ball, group: Sequence[int]) -> tuple[list[Any], list[Any]]:
+    """The middle and half the width of each input's range; a ball is the unit ball times its radius."""
+    if isinstance(admissible, Ball):
+        return [0.0] * len(group), [admissible.radius] * len(group)
+    pairs = [(admissible.lo[j], admissible.hi[j]) for j in group]
+    return [(lo + hi) / 2 for lo, hi in pairs], [(hi - lo) / 2 for lo, hi in pairs]
+
+
+def _program(part: Part, group: Sequence[int], gains: Sequence[Kinked]) -> tuple[Program, tuple[int, ...]]:
+    """The coefficients of a group's part of H in unit variables, u = middle + half v, and each kink's component."""
+    admissible, sign = part.player.admissible, part.player.sign
+    assert isinstance(admissible, (Box, Ball))
+    middle, half = _ends(admissible, group)
+    bend = [[sign * _bend(part, j, k) for k in group] for j in group]
+    slope = [sign * part.linear[j] + _dot(row, middle) for j, row in zip(group, bend, strict=True)]
+    rows, offsets, jumps, sides, axes = [], [], [], [], []
+    for axis, gain in zip(shared(part.player.driven, group), gains, strict=True):
+        own = gain.slope if len(group) > 1 else [gain.slope]
+        start = gain.offset + _dot(own, middle)
+        base, found = _jumps(part.hamiltonian.on.grid, axis, gain)
+        slope = [s + sign * base * g for s, g in zip(slope, own, strict=True)]
+        for kink, jump, side in found:
+            rows.append([side * g * h for g, h in zip(own, half, strict=True)])
+            offsets.append(side * (start - kink))
+            jumps.append(sign * jump)
+            sides.append(side)
+            axes.append(axis)
+
+    shape, dtype = part.hamiltonian.value.shape, part.hamiltonian.on.dtype
+
+    def stacked(entries: Sequence) -> jax.Array:
+        if isinstance(entries, list):
+            return jnp.stack([stacked(each) for each in entries])
+        return jnp.broadcast_to(jnp.asarray(entries, dtype), shape)
+
+    return Program(
+        stacked([s * h for s, h in zip(slope, half, strict=True)]),
+        stacked([[b * h * w for b, w in zip(row, half, strict=True)] for row, h in zip(bend, half, strict=True)]),
+        stacked(rows) if rows else jnp.zeros((0, len(group), *shape), dtype),
+        *(stacked(each) if each else jnp.zeros((0, *shape), dtype) for each in (offsets, jumps, sides)),
+    ), tuple(axes)  # fmt: skip
+
+
+def _jumps(grid: Grid, axis: int, gain: Kinked) -> tuple[PerNode, list[tuple[Any, Any, Any]]]:
+    """A gain as base · f + Σ jump max(side (f − kink), 0): the base and the triples (kink, jump, side).
+
+    The base is the smallest slope of all pieces. Next to an unreachable node one of the others is a huge number, which
+    would leave no digits to the rest. A piece that leaves through a constrained end has an infinite jump.
+    """
+    barred = _barred(grid, axis, gain)
+    sizes = [jnp.where(out, jnp.inf, jnp.abs(d)) for out, d in zip(barred, gain.derivatives, strict=True)]
+    base, number, least = gain.derivatives[0], jnp.zeros((), int), sizes[0]
+    for k, (size, derivative) in enumerate(zip(sizes[1:], gain.derivatives[1:], strict=True), start=1):
+        base, number = jnp.where(size < least, derivative, base), jnp.where(size < least, k, number)
+        least = jnp.minimum(size, least)
+    found = []
+    for k, kink in enumerate(gain.kinks):
+        below, above = gain.derivatives[k], gain.derivatives[k + 1]
+        if below is above and not grid.sides("constrained"):
+            continue
+        jump = jnp.where(barred[k] ^ barred[k + 1], jnp.inf, jnp.where(barred[k], 0, above - below))
+        found.append((kink, jump, jnp.where(number <= k, 1, -1)))
+    return base, found
+
+
+def _barred(grid: Grid, axis: int, gain: Kinked) -> list[Any]:
+    """For every piece of a gain the nodes at which its drifts leave through a constrained end, bool."""
+    barred: list[Any] = [np.zeros((), bool)] * len(gain.derivatives)
+    for _, step in (each for each in grid.sides("constrained") if each[0] == axis):
+        edge = stencil.on_edge(grid, axis, step)
+        for k, kink in enumerate(gain.kinks):
+            piece = k + 1 if step > 0 else k
+            barred[piece] = barred[piece] | (edge & (step * kink >= 0))
+    return barred
+
+
+def _bend(part: Part, j: int, k: int) -> PerNode:
+    """∂²L/∂u_j∂u_k."""
+    return 2 * part.square(j) if j == k else part.quadratic.get((min(j, k), max(j, k)), 0.0)
+
+
+def _dot(a: Sequence[PerNode], b: Sequence[PerNode]) -> PerNode:
+    """Σ a_j b_j."""
+    return sum(p * q for p, q in zip(a, b, strict=True))
+
+
+def _cost_coefficients(
+    on: Discretisation, player: Player, arguments: tuple
+) -> tuple[list[Any], dict[tuple[int, ...], Any]]:
+    """l_j and Q_jk of a cost l·u + Σ Q_jk u_j u_k + ... by differentiation at zero, zeros of Q left out."""
+    cost, count = on.problem.cost, len(player.driven)
+    if cost is None:
+        return [jnp.zeros((), on.dtype)] * count, {}
+    slopes = [player.derivative(on.problem, cost, j) for j in range(count)]
+    linear: list[Any] = [components.scalar(slope, *arguments, dtype=on.dtype) for slope in slopes]
+    # what is known to be linear has no second derivatives: they would be traced to find zeros
+    pairs = [(j, j) for j in range(count) if player.curved[j]] + sorted(player.products)
+    quadratic: dict[tuple[int, ...], Any] = {
+        (j, k): components.scalar(player.derivative(on.problem, slopes[j], k), *arguments, dtype=on.dtype)
+        / (2 if j == k else 1)
+        for j, k in pairs
+    }
+    return linear, quadratic
+
+
+def needs_convexity(on: Discretisation) -> bool:
+    """True if a player's optimum is exact only where its cost is convex for a minimiser, concave for a maximiser."""
+    return any(_needs_convexity(player) for player in players_of(on).both)
+
+
+def may_miss(on: Discretisation) -> Verdict | bool:
+    """True if a player whose optimum is called exact may miss it at a node, since its cost is not convex there."""
+    return needs_convexity(on) and _is_concave(on)
+
+
+def _needs_convexity(player: Player) -> bool:
+    """True if a player's optimum over a ball or by quadratic programs has a quadratic cost."""
+    quadratic = any(player.curved) or bool(player.products)
+    return player.exact and quadratic and (any(player.programs) or isinstance(player.admissible, Ball))
 
 
 @jax.jit
 def _is_concave(on: Discretisation) -> Verdict:
-    """True if at some node the square of an input of a ball enters the cost of its player with a negative sign."""
+    """True if a cost is not convex for its player at some node, where that matters."""
     players, found = players_of(on), jnp.zeros((), bool)
-    u, d = ([jnp.zeros((), on.dtype)] * getattr(player.admissible, "dim", 0) for player in players.both)
+    u, d = ([jnp.zeros((), on.dtype)] * len(player.driven) for player in players.both)
     arguments = on.problem.arguments(on.coordinates(), u, d, on.t)
-    for player in filter(_in_a_ball, players.both):
-        for j in range(len(player.driven)):
-            found |= jnp.any(player.sign * _cost_coefficients(on, player, arguments, j)[1] < 0)
+    for player in filter(_needs_convexity, players.both):
+        _, quadratic = _cost_coefficients(on, player, arguments)
+        for group, program in zip(player.groups, player.programs, strict=True):
+            if not program and isinstance(player.admissible, Box):
+                continue
+            bend = [
+                [quadratic.get((min(j, k), max(j, k)), 0.0) * player.sign * (1 + (j == k)) for k in group]
+                for j in group
+            ]
+            rows = [jnp.stack([jnp.broadcast_to(entry, on.grid.shape) for entry in row]) for row in bend]
+            found |= ~jnp.all(quadratic_program.is_convex(jnp.stack(rows)))
     return found
-
-
-def _kinked(
-    hamiltonian: DiscreteHamiltonian, noise: dict[tuple[int, int], Any], axis: int, offset: Any, slope: Any
-) -> Kinked:
-    """The gain of one component as a function of an input: offset, slope, and where its derivative jumps."""
-    left = correlated_noise.along_axis(noise, hamiltonian.on.grid, axis)
-    return Kinked(lambda f: hamiltonian.gain(axis, f, left), offset, slope, *hamiltonian.kinks(axis, left))

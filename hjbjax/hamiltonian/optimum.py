@@ -1,9 +1,8 @@
 """The optimum of the discrete Hamiltonian over the admissible sets: min, max, min max and max min, node by node.
 
-Exact where the drift is affine in u, the cost separable and quadratic, the noise free of u, and the inputs fall into
-groups of one or two that drive components of their own, not too many (read from the jaxpr, see ``players``): all
-ends, kinks and stationary points are tried, by ``exact``. Of finitely many actions the best of all. Otherwise samples
-and a pattern search, and certificates hold for the refined sample.
+Exact where the drift is affine in u, the cost quadratic and the noise free of u, by ``exact``; for convex costs the
+number of inputs and what they share do not matter (see ``players``). The best of a finite set. Otherwise samples and a
+pattern search, which may miss the optimum: such solves have no certified bounds.
 """
 
 from collections.abc import Callable
@@ -12,15 +11,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax.hamiltonian import search
+from hjbjax.hamiltonian import exact, search
 from hjbjax.hamiltonian.discrete import DiscreteHamiltonian
-from hjbjax.hamiltonian.exact import exact_optimum
 from hjbjax.hamiltonian.piecewise import inverse_root
 from hjbjax.hamiltonian.players import SAMPLES, Player, players_of
 from hjbjax.hamiltonian.search import UNROLL, Action, best_of, enumerate_actions, refine
 from hjbjax.problem import sets
 from hjbjax.problem.pytree import altered
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite
+from hjbjax.problem.types import Field
 
 INNER = 8  # evaluations written out of a search inside a search: with all 33 XLA gets up to five times the lines
 
@@ -52,6 +51,32 @@ def optimal_value(hamiltonian: DiscreteHamiltonian) -> jax.Array:
     return search.optimum(lambda u: hamiltonian.at(u, []), points, player.sign, weight=player.effort)
 
 
+def missed(hamiltonian: DiscreteHamiltonian) -> tuple[Field, Field]:
+    """Bounds on what the exact optima of the control and of the disturbance miss, (*grid) each, cost per unit time.
+
+    Zero but for quadratic programs; see ``exact.missed``. Where the optima are searched they say nothing.
+    """
+    players = players_of(hamiltonian.on)
+    (control, disturbance), none = players.both, jnp.zeros(hamiltonian.value.shape, hamiltonian.on.dtype)
+    if disturbance.admissible is None or players.decoupled:
+        u, d = (_any_action(each.admissible) for each in players.both)
+        return (
+            exact.missed(hamiltonian, control, lambda mine: (mine, d)) if control.programmed else none,
+            exact.missed(hamiltonian, disturbance, lambda mine: (u, mine)) if disturbance.programmed else none,
+        )
+    upper = players.isaacs == "upper"
+    first, second = (control, disturbance) if upper else (disturbance, control)
+    if not (first.enumerated and second.programmed):
+        return none, none
+    points = jnp.zeros((1, 0)) if first.admissible is None else first.admissible.points  # type: ignore[union-attr]
+
+    def against(point: jax.Array) -> Field:
+        return exact.missed(hamiltonian, second, lambda mine: (list(point), mine) if upper else (mine, list(point)))
+
+    worst = jnp.max(jax.lax.map(against, jnp.asarray(points, hamiltonian.on.dtype)), 0)
+    return (none, worst) if upper else (worst, none)
+
+
 def best_response(
     hamiltonian: DiscreteHamiltonian, player: Player, join: Callable, most: int = UNROLL
 ) -> tuple[jax.Array, Action]:
@@ -62,7 +87,7 @@ def best_response(
     if player.admissible is None:
         return hamiltonian.at(*join([])), []
     if player.exact:
-        action = exact_optimum(hamiltonian, player, join)
+        action = exact.exact_optimum(hamiltonian, player, join)
     else:
         start = _admissible(hamiltonian, player, join)
         _, action, _ = _sampled(
@@ -95,7 +120,7 @@ def _admissible(hamiltonian: DiscreteHamiltonian, player: Player, join: Callable
     # without the cost H is the gain alone, infinite outside: the least of it is exact where the drift is affine
     free = altered(hamiltonian.on.problem, cost=None)
     alone = players_of(hamiltonian.asking(free).on).control
-    return exact_optimum(hamiltonian.asking(free), alone, join) if alone.exact else None
+    return exact.exact_optimum(hamiltonian.asking(free), alone, join) if alone.exact else None
 
 
 def _sampled(
@@ -133,8 +158,10 @@ def _projection(admissible: Box | Ball) -> Callable[[Action], Action]:
     return onto_ball
 
 
-def _any_action(admissible: AdmissibleSet) -> Action:
+def _any_action(admissible: AdmissibleSet | None) -> Action:
     """Some action of the set; zero need not be one."""
+    if admissible is None:
+        return []
     if isinstance(admissible, Ball):
         return [jnp.zeros(())] * admissible.dim
     first = admissible.lo if isinstance(admissible, Box) else admissible.points[0]

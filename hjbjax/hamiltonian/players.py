@@ -1,10 +1,17 @@
-"""The two players: what each may do, and how the Hamiltonian depends on it, read from the problem's functions.
+"""The two players: their sets, and how the Hamiltonian depends on them, read from the problem's functions.
 
-The optimum over a player's actions is exact where the drift is affine in them, the cost separable and quadratic, the
-noise free of them, and the inputs of a box fall into groups of one or two that drive components of their own, few
-enough that all their pieces can be tried; in a ball each input drives one component of its own. See ``piecewise``
-and ``ball``.
-In a game whose players meet in a component, in a cost or in the noise, that holds of the player who answers; the one
+The optimum over a player's actions is exact where the drift is affine in them, the noise free of them, and the cost
+quadratic, over a box or a ball of any dimension. Inputs that drive a common component, or whose product enters the
+cost, form a group. The method depends on the group:
+
+    one input of a box, or two without a product    all ends, kinks and stationary points are tried (``piecewise``)
+    a ball, one component per input at most         all combinations of pieces are tried (``ball``)
+    any other                                       convex quadratic programs (``quadratic_program``)
+
+The last one requires a cost that is convex for a minimiser and concave for a maximiser. That depends on numbers, which
+are not known here: see ``exact.may_miss``. All three require that the components have few pieces together.
+
+In a game whose players meet in a component, in a cost or in the noise, only the player who answers is exact. The player
 who moves first faces a function with ridges, which is searched.
 """
 
@@ -30,7 +37,8 @@ SHORT = 200  # operations on components up to which evaluations of H are written
 # run as fast as written out.
 ALONE = 80
 CELLS = {1: 64, 2: 16}  # by the inputs of a group: combinations of pieces that are tried at most
-QUADRATICS = 50  # in a ball: three inputs without noise make 27, two with noise 49; a search is at no more than this
+QUADRATICS = 50  # in a ball: three inputs without noise make 27, two with noise 49; programs are faster beyond
+PROGRAMS = 256  # choices of concave kinks, each a convex program: eight components without noise, four with noise
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,9 +50,12 @@ class Player:
       sign: +1 minimises, −1 maximises.
       exact: whether the optimum is found exactly rather than by samples.
       driven: for every input the drift components that it drives.
-      groups: the inputs by what they drive together; the groups drive disjoint sets of components.
+      groups: the inputs by what they drive together and by products in the cost; H is a sum over the groups. All inputs
+        of a ball are one group where they are a program.
       cells: for every group in how many pieces the Hamiltonian may fall.
+      programs: for every group whether its optimum is that of quadratic programs.
       curved: for every input whether the cost may hold its square.
+      products: the pairs of inputs, the lesser first, whose product the cost may hold.
       fastest_at_ends: whether no action moves the chain faster than all those at the ends of the set do.
       effort: how many evaluations of H one counts for where they would be written out.
     """
@@ -55,7 +66,9 @@ class Player:
     driven: tuple[tuple[int, ...], ...]
     groups: tuple[tuple[int, ...], ...]
     cells: tuple[int, ...]
+    programs: tuple[bool, ...]
     curved: tuple[bool, ...]
+    products: frozenset[tuple[int, ...]]
     fastest_at_ends: bool
     effort: int
 
@@ -89,9 +102,16 @@ class Player:
             return len(self.admissible.points) * self.effort
         if not self.exact:  # the pattern search between samples is a loop, which is compiled once
             return SAMPLES * self.effort
+        if any(self.programs):  # a loop in loops, which is compiled once
+            return SAMPLES * ALONE
         return self.effort * sum(
             3 + cells if len(group) == 1 else 10 * cells for group, cells in zip(self.groups, self.cells, strict=True)
         )
+
+    @property
+    def programmed(self) -> bool:
+        """True if the optimum of an exact player is that of quadratic programs, for some inputs."""
+        return self.exact and any(self.programs)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -146,27 +166,33 @@ def find_players(problem: Problem, n: int, dtype: Any) -> Players:
 
 
 def _player(admissible: AdmissibleSet | None, sign: int, found: dependence.Influence, branches: int) -> Player:
-    """The control, for ``sign`` 1, or the disturbance, −1; drifts have so many ``branches`` a component."""
+    """The control, for ``sign`` 1, or the disturbance, −1; drifts have ``branches`` pieces per component."""
     drift, cost, noise = found.drift, found.cost, found.noise
     inputs = found.control if sign > 0 else found.disturbance
     driven = tuple(drift.driven_by([j]) for j in inputs)
     curved = tuple(cost.has_square([j]) for j in inputs)
-    groups = _groups(driven)
-    cells = tuple(branches ** len(shared(driven, group)) for group in groups)
-    convex = drift.affine_in(inputs) and noise.free_of(inputs)  # so is the rate of leaving a node
-    at_ends = convex or isinstance(admissible, (Finite, type(None)))
-    # a minimum of pieces that are quadratic in each input; a product u₀u₁ in the cost has no such pieces
-    suits = convex and cost.separable_quadratic_in(inputs)
-    if isinstance(admissible, Box):
-        suits &= all(count <= CELLS.get(len(group), 0) for group, count in zip(groups, cells, strict=True))
-    elif isinstance(admissible, Ball):
+    affine = drift.affine_in(inputs) and noise.free_of(inputs)  # then the rate of leaving a node is convex
+    at_ends = affine or isinstance(admissible, (Finite, type(None)))
+    suits = affine and cost.quadratic_in(inputs) and isinstance(admissible, (Box, Ball))
+    products = frozenset(tuple(j - inputs.start for j in pair) for pair in cost.products_in(inputs))
+    groups = _groups(driven, products)
+    if isinstance(admissible, Ball):
         apart = all(len(group) == 1 for group in groups) and all(len(components) <= 1 for components in driven)
-        few = not any(curved) or combinations(cells) <= QUADRATICS
-        suits &= admissible.dim <= 3 and apart and few
+        few = not any(curved) or combinations([branches ** len(each) for each in driven]) <= QUADRATICS
+        together = not (apart and few and admissible.dim <= 3)
+        groups = (tuple(range(len(driven))),) if together else groups
+        programs = (together,) * len(groups)
+    else:
+        joined = {j for pair in products for j in pair}
+        programs = tuple(
+            branches ** len(shared(driven, group)) > CELLS.get(len(group), 0) or bool(joined & set(group))
+            for group in groups
+        )
+    cells = tuple(branches ** len(shared(driven, group)) for group in groups)
+    suits &= all(count <= PROGRAMS for count, program in zip(cells, programs, strict=True) if program)
     return Player(
-        admissible, sign, suits and isinstance(admissible, (Box, Ball)), driven, groups, cells, curved, at_ends,
-        _effort(found.operations),
-    )  # fmt: skip
+        admissible, sign, suits, driven, groups, cells, programs, curved, products, at_ends, _effort(found.operations)
+    )
 
 
 def _effort(needed: Operations) -> int:
@@ -174,17 +200,18 @@ def _effort(needed: Operations) -> int:
     return 1 if needed.whole == 0 and needed.single <= SHORT else ALONE
 
 
-def _groups(driven: tuple[tuple[int, ...], ...]) -> tuple[tuple[int, ...], ...]:
-    """The inputs in groups that drive no component together."""
+def _groups(driven: Sequence[tuple[int, ...]], products: frozenset[tuple[int, ...]]) -> tuple[tuple[int, ...], ...]:
+    """The inputs in groups that have no component and no product in common."""
     groups: list[list[int]] = []
     for j, components in enumerate(driven):
-        meets = [group for group in groups if set(shared(driven, group)) & set(components)]
+        partners = {k for pair in products if j in pair for k in pair}
+        meets = [group for group in groups if set(shared(driven, group)) & set(components) or partners & set(group)]
         # an input that drives what two groups drive makes them one: their pieces depend on one another
         joined = [*(k for group in meets for k in group), j]
         groups = [group for group in groups if group not in meets] + [joined]
     return tuple(tuple(sorted(group)) for group in sorted(groups))
 
 
-def shared(driven: tuple[tuple[int, ...], ...], group: Sequence[int]) -> tuple[int, ...]:
+def shared(driven: Sequence[tuple[int, ...]], group: Sequence[int]) -> tuple[int, ...]:
     """The components that a group of inputs drives."""
     return tuple(sorted({i for j in group for i in driven[j]}))

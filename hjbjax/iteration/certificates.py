@@ -219,6 +219,37 @@ def _multiplicative(iterate: Iterate, least_cost: Field, residual: Scalar) -> Er
     return ErrorBound(below, above, jnp.where(priced, lift, jnp.inf), error, residual)
 
 
+def widened(
+    kind: Certificate, bound: ErrorBound, missed: tuple[Field, Field], *, discount: Number, least_cost: Field | None
+) -> ErrorBound:
+    """The bounds with what the control and the disturbance may miss of their optima, (*grid) each, cost per unit time.
+
+    With H as it was found, min max H is at least H less what the control missed, and at most H and what the disturbance
+    missed, so that r is off by no more.
+    """
+    if kind is Certificate.BY_DISCOUNT:
+        other = Certificate.NONE if least_cost is None else Certificate.MULTIPLICATIVE
+        rate = jnp.where(discount > 0, discount, 1)
+        with_it, without = (
+            widened(each, bound, missed, discount=rate, least_cost=least_cost) for each in (Certificate.ADDITIVE, other)
+        )
+        return jax.tree.map(lambda mine, theirs: jnp.where(discount > 0, mine, theirs), with_it, without)
+    mine, theirs = missed
+    if kind is Certificate.ADDITIVE:
+        below, above = bound.below - jnp.max(mine) / discount, bound.above + jnp.max(theirs) / discount
+    elif kind is Certificate.MULTIPLICATIVE:
+        assert least_cost is not None
+        # bounds with a free node that pays nothing are endless already
+        shares = [
+            jnp.max(jnp.where(least_cost > 0, each / jnp.where(least_cost > 0, least_cost, 1), 0)) for each in missed
+        ]
+        below, inverse = 1 / (1 / bound.below + shares[0]), 1 / bound.above - shares[1]
+        above = jnp.where(inverse > 0, 1 / jnp.where(inverse > 0, inverse, 1), jnp.inf)
+    else:
+        return bound
+    return dataclasses.replace(bound, below=below, above=above)
+
+
 def lowest_end(obstacles: Obstacles, counted: Mask | bool, grid: Grid) -> Scalar:
     """The least payment at the end of a run, at most zero: exit costs, between nodes as well, and ψ."""
     lowest = grid.least(jnp.where(counted & obstacles.fixed, obstacles.fixed_value, 0))

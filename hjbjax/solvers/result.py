@@ -1,6 +1,7 @@
 """From a state of the iteration to a Solution: NumPy arrays, masks, the Isaacs gap, the message."""
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -9,10 +10,10 @@ import numpy as np
 
 from hjbjax.discretisation import correlated_noise, edges
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.hamiltonian import discrete
+from hjbjax.hamiltonian import discrete, exact, optimum
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import certificates, fixed_point
-from hjbjax.iteration.certificates import Certificate
+from hjbjax.iteration.certificates import Certificate, ErrorBound
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.isaacs import isaacs_gap
 from hjbjax.markov_chain import earnings
@@ -24,7 +25,7 @@ from hjbjax.solution.clock import CUT, Clock
 from hjbjax.solution.solution import Solution, question
 from hjbjax.solution.status import Status, warn
 from hjbjax.solvers.nested import Settled
-from hjbjax.solvers.setup import Assumptions
+from hjbjax.solvers.setup import BOUNDING, Assumptions
 
 GAP = 0.05  # of what the actions matter; where Isaacs' condition holds, upwinding left up to .019 on 21 nodes
 FIRST, CENTRAL = 1.0, 2.0  # orders of upwinding and of central differences
@@ -169,10 +170,34 @@ def assemble(task: Task, state: State, assumptions: Assumptions) -> Solution:
         disturbance=xp.stack(disturbances, axis=-1) if problem.is_game and not task.bare else None,
         code=state.code,
         steps=state.step,
-        enclosure=certificates.enclosure(assumptions.certificate, state.bound, problem.discount),
+        enclosure=_enclosure(task, state, assumptions),
         grid=task.grid,
         **question(problem),
     )
+
+
+def _enclosure(task: Task, state: State, assumptions: Assumptions) -> Any:
+    """The bounds on V_h, with what is missed of optima; None where these are searched, and without a certificate."""
+    kind, bound, discount = assumptions.certificate, state.bound, task.problem.discount
+    if kind not in BOUNDING or not assumptions.exact:
+        return None
+    traced = is_traced(state)  # the host knows before a solve whether costs are convex where they must be
+    if any(each.programmed for each in players_of(task.on).both) or (traced and exact.needs_convexity(task.on)):
+        bound = _widened(task, state.value, bound, kind)
+        bound = bound if traced else jax.device_get(bound)
+    return certificates.enclosure(kind, bound, discount)
+
+
+@functools.partial(jax.jit, static_argnames="kind")
+def _widened(task: Task, value: Field, bound: ErrorBound, kind: Certificate) -> ErrorBound:
+    """The bounds with what is missed of optima where V is not given; endless where costs are not convex."""
+    free, lost = task.counted & ~task.given.fixed, exact.may_miss(task.on)
+    control, disturbance = (
+        jnp.where(free, jnp.where(lost, jnp.inf, each), 0)
+        for each in optimum.missed(discrete.around(task.on, value, task.lost))
+    )
+    missed = (control, disturbance)
+    return certificates.widened(kind, bound, missed, discount=task.problem.discount, least_cost=task.least_cost)
 
 
 def _leaving(task: Task, state: State) -> np.ndarray:

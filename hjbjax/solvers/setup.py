@@ -10,7 +10,7 @@ from hjbjax.discretisation import cut_cells, schemes
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.rates import fastest_rate
 from hjbjax.discretisation.schemes import Limited, Upwind
-from hjbjax.hamiltonian.exact import concave_in_a_ball
+from hjbjax.hamiltonian.exact import may_miss
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import bellman, certificates
 from hjbjax.iteration.certificates import Certificate
@@ -170,13 +170,16 @@ def _obstacles(on: Discretisation, assumptions: "Assumptions") -> tuple[bellman.
     return dataclasses.replace(obstacles, fixed=obstacles.fixed | (still.rests & (problem.discount == 0))), still
 
 
+BOUNDING = (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE, Certificate.BY_DISCOUNT)
+
+
 @dataclasses.dataclass(frozen=True)
 class Assumptions:
     """Facts on a problem that are known before its numbers are looked at.
 
     Attributes:
       certificate: which bound on the error applies.
-      exact: true if the minimum over the actions is exact.
+      exact: true if the minimum over the actions is exact; there are no bounds otherwise.
       may_rest: true if rest points at zero cost close the problem (no discount, no constraint).
       costs_certify: true if without discount the running cost gives a bound, where it is positive.
     """
@@ -189,9 +192,9 @@ class Assumptions:
     @property
     def sentence(self) -> str:
         """The argument by which the error is certified, or the reason that it is not."""
-        if self.certificate is Certificate.NONE or self.exact:
-            return self.certificate.value
-        return self.certificate.value + "; for the refined sample of actions"
+        if self.certificate in BOUNDING and not self.exact:
+            return "no bounds: the optimum over the actions is searched, and may be missed"
+        return self.certificate.value
 
 
 def assumptions_of(on: Discretisation) -> Assumptions:
@@ -235,7 +238,7 @@ def prepare_on_host(
     clock, problem, grid = clock or Clock(), on.problem, on.grid
     clock.enter(f"the preparation of {' x '.join(map(str, grid.shape))} nodes")
     assumptions = assumptions_of(on)
-    if concave_in_a_ball(on):
+    if may_miss(on):
         assumptions = dataclasses.replace(assumptions, exact=False)
     if is_bare(method):
         return *_bare(on, method, tol, assumptions), None

@@ -74,6 +74,17 @@ class Dependence:
 
         return all(fits(term) for entry in self.entries for term in entry)
 
+    def quadratic_in(self, inputs: Sequence[int]) -> bool:
+        """True if every entry is a quadratic polynomial of these inputs together, whatever the others are."""
+        wanted = set(inputs)
+        return all(isinstance(term, tuple) or not wanted & term for entry in self.entries for term in entry)
+
+    def products_in(self, inputs: Sequence[int]) -> frozenset[tuple[int, ...]]:
+        """The pairs of different inputs, both among ``inputs`` and the lesser first, whose product is in some entry."""
+        wanted = set(inputs)
+        pairs = (term for entry in self.entries for term in entry if isinstance(term, tuple) and len(set(term)) == 2)
+        return frozenset(pair for pair in pairs if wanted.issuperset(pair))
+
     def free_of(self, inputs: Sequence[int]) -> bool:
         """True if no entry depends on these inputs."""
         return not self.driven_by(inputs)

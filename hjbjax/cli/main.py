@@ -11,6 +11,7 @@ Exit codes: 0 done, 1 a check of ``doctor`` failed, 2 usage, 3 not converged, 4 
 import contextlib
 import dataclasses
 import json
+import os
 import sys
 import warnings
 from collections.abc import Iterator
@@ -112,9 +113,8 @@ def solve(
             _raise_unless_converged(_solve(*_build(entry, parameters, shape), options))
         return
     out = Path(name) if out is None else out
-    # refusals in the order of what they cost: words, folder, problem; the solve comes after all of them
-    with _one_line_error(OSError, 2, "--out: "):
-        run_folder.check_folder(out, force)
+    # refusals in the order of what they cost: words, places, problem; the solve comes after all of them
+    _check_places(out, force, options["checkpoint"], options["resume"])
     problem, grid = _build(entry, parameters, shape)
     path, made = None, []
     with contextlib.ExitStack() as stack:  # the hidden folder goes last: after an interrupt, too
@@ -169,9 +169,33 @@ def _raise_unless_converged(solution: "Solution") -> None:
 @click.option("--heartbeat", type=Number(int), default=10, show_default=True, help="Seconds until one counts as dead.")
 @click.argument("words", nargs=-1, required=True, metavar="-- COMMAND")
 def launch(processes: int, heartbeat: int, words: tuple[str, ...]) -> None:
-    """Run a command, as in "hjbjax launch --processes 2 -- solve pendulum", by many processes that share its nodes."""
-    if code := processes_of.start(words, processes, heartbeat):
+    """Run a command, as in "hjbjax launch --processes 2 -- solve pendulum", in processes that divide its nodes."""
+    from hjbjax.cli import run_folder
+
+    processes_of.check(words, processes, heartbeat)
+    # a process takes ten seconds to start: what each of them would refuse is refused here
+    given = solve.make_context("solve", list(words[1:]), parent=click.get_current_context().parent).params
+    out = given["out"] or Path(given["name"])
+    if not given["dry_run"]:
+        processes_of.check_devices(given["devices"], processes)
+        _check_places(out, *(given[key] for key in ("force", "checkpoint", "resume")))
+        with _one_line_error(OSError, 2, "--out: "), run_folder.staging(out):
+            pass  # it can be written
+    if code := processes_of.start(words, processes, heartbeat, out / FILES[0]):
         raise SystemExit(code)
+
+
+def _check_places(out: Path, force: bool, checkpoint: Path | None, resume: bool) -> None:
+    """Refuse in one line a folder of results and a checkpoint that must not be replaced."""
+    from hjbjax.cli import run_folder
+    from hjbjax.solution import files
+
+    with _one_line_error(OSError, 2, "--out: "):
+        run_folder.check_folder(out, force)
+    if resume and checkpoint is None:
+        raise Failure("--resume goes on from a checkpoint; add --checkpoint FILE")
+    if checkpoint is not None and not resume and os.path.lexists(place := files.with_suffix(os.fspath(checkpoint))):
+        raise Failure(f"--checkpoint: {place} is there already; --resume goes on from it")
 
 
 @contextlib.contextmanager

@@ -188,30 +188,23 @@ class _Launcher:
 
         def listen() -> None:
             assert stream is not None
+            sink = out
             with stream:
                 for line in stream:
                     if line.strip():
                         last.append(line)
-                    if not line.startswith(self.muted):
-                        self._pass_on(line, out)
+                    if sink is None or self.quiet.is_set() or line.startswith(self.muted):
+                        continue
+                    try:
+                        _write(line, sink)
+                    except OSError as error:  # from here on lines are dropped, so that the child can go on writing
+                        self.unwritten.append(error)
+                        sink = None
 
         voice = threading.Thread(target=listen, daemon=True)
         voice.start()
         self.voices.append(voice)
         return voice
-
-    def _pass_on(self, line: bytes, out: Any) -> None:
-        """Write a line as it is; after an error the lines are dropped, and the child can still write them."""
-        if out is None or self.quiet.is_set() or self.unwritten:
-            return
-        try:
-            if hasattr(out, "buffer"):
-                out.buffer.write(line)
-            else:
-                out.write(line.decode(errors="replace"))
-            out.flush()
-        except OSError as error:
-            self.unwritten.append(error)
 
     def wait(self) -> None:
         """Handle events until every child has ended."""
@@ -301,6 +294,15 @@ class _Launcher:
         """How the children ended."""
         unwritten = next(iter(self.unwritten), None)
         return Outcome(tuple(self.ends), self.interrupted, self.hurried, self.stopped, self.killed, unwritten)
+
+
+def _write(line: bytes, out: Any) -> None:
+    """Write a line as it is, at once."""
+    if hasattr(out, "buffer"):
+        out.buffer.write(line)
+    else:
+        out.write(line.decode(errors="replace"))
+    out.flush()
 
 
 @contextlib.contextmanager

@@ -31,6 +31,7 @@ DIED, INTERRUPTED = 7, 130  # exit codes of a launch
 MOST = 256  # processes of a launch, and devices of a process: each takes threads
 LONGEST = 86_400  # seconds of a heartbeat
 _ADVICE = "'hjbjax launch' sets these variables; unset all of them to solve in one process"
+WITHOUT_PROXY = {"no_grpc_proxy": "127.0.0.1"}  # gRPC would look for processes of this host behind a proxy
 GREETING = b"[Gloo]"  # the start of a line that gloo writes when it connects
 
 
@@ -141,6 +142,7 @@ def _join(this: Member) -> None:
         jax.config.update("jax_cpu_collectives_implementation", "gloo")
         # its handler of SIGTERM would swallow a request to end that comes before the solve
         jax.config.update("jax_enable_preemption_service", False)
+        jax.config.update("jax_check_proxy_envs", False)  # a warning, see WITHOUT_PROXY
         jax.distributed.initialize(
             this.coordinator,
             this.processes,
@@ -164,7 +166,7 @@ def _check_port(coordinator: str) -> None:
 
 
 def leave() -> None:
-    """Wait for the other processes of a launch; the others would take one that ends before them for dead."""
+    """Part from the other processes of a launch when all have solved; they would take one that just ends for dead."""
     if member() is not None:
         import jax
 
@@ -205,14 +207,19 @@ def start(words: Sequence[str], processes: int, heartbeat: int, result: Path) ->
     """
     try:
         with reserved_port() as port:
-            shared = {PROCESSES: str(processes), COORDINATOR: f"127.0.0.1:{port}", HEARTBEAT: str(heartbeat)}
+            shared = {
+                PROCESSES: str(processes),
+                COORDINATOR: f"127.0.0.1:{port}",
+                HEARTBEAT: str(heartbeat),
+                **WITHOUT_PROXY,
+            }
             commands = [
                 children.followed("hjbjax", words, {**os.environ, **shared, RANK: str(number)})
                 for number in range(processes)
             ]
             # earlier than the others lose patience: they keep what they have if the stopped one goes on to its end
             outcome = children.run(commands, EXPLAINED, GREETING, heartbeat / 2)
-    except OSError as error:
+    except (OSError, RuntimeError) as error:  # RuntimeError: no thread can be started
         raise Failure(f"launch: {processes} processes could not be started: {error}", DIED) from error
     code = _verdict(outcome, _way_on(words, processes, result))
     if outcome.unwritten is not None:

@@ -110,7 +110,8 @@ def solve(
     options["mesh"] = processes_of.mesh_of(devices)
     if processes_of.rank() > 0:  # the first process of a launch writes, and speaks for all
         with interruptible():
-            _raise_unless_converged(_solve(*_build(entry, parameters, shape), options))
+            _solve(*_build(entry, parameters, shape), options)
+            processes_of.leave()
         return
     out = Path(name) if out is None else out
     # refusals in the order of what they cost: words, places, problem; the solve comes after all of them
@@ -125,6 +126,7 @@ def solve(
         if not no_cache:
             compile_cache.keep_for_the_command()
         solution = _solve(problem, grid, options)
+        processes_of.leave()  # pictures may take longer than JAX lets the other processes wait
         with _one_line_error(OSError, 5, "the results could not be written: "):
             try:
                 start = entry.initial_state(grid.ndim)
@@ -158,8 +160,7 @@ def solve(
 
 
 def _raise_unless_converged(solution: "Solution") -> None:
-    """A failure, with its exit code, of a status that is not CONVERGED; the processes of a launch part here."""
-    processes_of.leave()
+    """Raise a failure with its exit code for a status that is not CONVERGED."""
     if code := CODES.get(solution.status.name, 3):
         raise Failure(f"{solution.status.name}: {solution.message or solution.status.message}", code)
 

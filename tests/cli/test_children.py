@@ -152,7 +152,7 @@ def test_children_that_refuse_together_each_say_why(launch):
 
 def test_the_first_child_ends_all(launch):
     """It speaks for all: who is left has nothing to say, whether it hears or not."""
-    outcome = launch("pass", GENTLE, DEAF, grace=3).ended()
+    outcome = launch("pass", GENTLE, DEAF, settle=0.5, grace=1.5).ended()
     assert codes_of(outcome) == [0, 130, -9]
     assert outcome["killed"] == [2]
 

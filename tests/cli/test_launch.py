@@ -14,10 +14,11 @@ import pytest
 from click.testing import CliRunner
 
 import hjbjax as hjb
-from hjbjax.cli import children, launch
+from hjbjax.cli import children, launch, run_folder
 from hjbjax.cli.children import End, Outcome
 from hjbjax.cli.command_line import Failure
 from hjbjax.cli.main import main
+from hjbjax.solution.solution import Solution, Status
 
 ROOT = Path(__file__).parents[2]
 HEARTBEAT = 10
@@ -168,6 +169,25 @@ def test_a_port_is_reserved_until_the_first_process_has_it():
         with pytest.raises(OSError, match="in use"), socket.create_server(("127.0.0.1", port)):
             pass
         launch._check_port(f"127.0.0.1:{port}")
+
+
+@pytest.mark.parametrize("number", ["0", "1"])
+def test_the_processes_part_before_the_pictures(number, tmp_path, monkeypatch):
+    """JAX ends a process that waits for five minutes; and only the first one says that the steps ran out."""
+    monkeypatch.chdir(tmp_path)
+    as_member(monkeypatch, **{launch.RANK: number})
+    order = []
+
+    def solved(problem, grid, **options):
+        return Solution(grid, np.zeros(grid.shape), None, code=Status.MAX_STEPS, steps=7, residuals=np.array([1.0]))
+
+    monkeypatch.setattr(launch, "mesh_of", lambda counts: None)
+    monkeypatch.setattr(hjb, "solve", solved)
+    monkeypatch.setattr(launch, "leave", lambda: order.append("parted"))
+    monkeypatch.setattr(run_folder, "make", lambda *_, **__: order.append("drawn") or iter(()))
+    result = CliRunner().invoke(main, ["solve", "pendulum", "--no-cache"])
+    assert order == ["parted", "drawn"][: 1 + (number == "0")]
+    assert result.exit_code == (3 if number == "0" else 0), result.output
 
 
 # --- what is said at the end ---

@@ -1,7 +1,7 @@
 """A launcher of cheap children, as a script without JAX: it prints ``ready``, and at its end what became of them.
 
 The first argument is JSON: ``children``, the Python code of each, and optionally ``follow``, true for children that
-follow their launcher, ``grace`` and ``patience`` in seconds, and ``broken``, true for a last child that cannot be
+follow their launcher, ``grace``, ``settle`` and ``patience`` in seconds, and ``broken``, true for a last child that cannot be
 started. Each child finds its number in ``sys.argv[-1]`` and the functions of ``PRELUDE``.
 """
 
@@ -37,7 +37,7 @@ def children_module():
 
 def main():
     asked, children = json.loads(sys.argv[1]), children_module()
-    children.GRACE = asked.get("grace", children.GRACE)
+    children.GRACE, children.SETTLE = asked.get("grace", children.GRACE), asked.get("settle", children.SETTLE)
     commands = []
     scripts = Path.cwd() / "scripts"
     scripts.mkdir()

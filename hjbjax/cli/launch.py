@@ -1,50 +1,117 @@
-"""One solve by many processes, and over many devices: what ``hjbjax launch`` and ``hjbjax solve --devices`` do.
+"""One solve in many processes and on many devices, as by ``hjbjax launch`` and ``hjbjax solve --devices``.
 
-Every process runs the same command; the environment says which of them it is. They find each other by
-``jax.distributed``, and what they exchange goes by gloo on processors. All come to the same answer; the first one
-writes it. One that dies takes the others along within the heartbeat: ``launch`` says which it was, and how to go on.
+Every process runs the same command and reads its number from the environment. The processes find each other by
+``jax.distributed`` and exchange values on CPUs by gloo. All of them compute the same answer, and the first one writes
+it. ``hjbjax.cli.children`` starts them, ends them and reports how they ended.
 """
 
 import contextlib
+import dataclasses
 import difflib
 import math
 import os
 import shlex
 import signal
 import socket
-import subprocess
-import sys
-import threading
-import time
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, TextIO
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-from hjbjax.cli.command_line import Failure
+from hjbjax.cli import children
+from hjbjax.cli.command_line import Failure, finite
 
 if TYPE_CHECKING:
     from jax.sharding import Mesh
 
-RANK, PROCESSES, COORDINATOR, HEARTBEAT = (
-    f"HJBJAX_{word}" for word in ("RANK", "PROCESSES", "COORDINATOR", "HEARTBEAT")
-)
-SAID = (0, 2, 3, 4, 5, 6, 130)  # exit codes of a command that said why
-DIED, INTERRUPTED = 7, 130  # ours where one did not, and where that was asked for
-MOST = 256  # devices of a process, each of which takes threads
-GRACE = 15.0  # seconds beyond the heartbeat after which what is left is ended
+VARIABLES = RANK, PROCESSES, COORDINATOR, HEARTBEAT = (
+    "HJBJAX_RANK", "HJBJAX_PROCESSES", "HJBJAX_COORDINATOR", "HJBJAX_HEARTBEAT",
+)  # fmt: skip
+EXPLAINED = (2, 3, 4, 5, 6, 130)  # exit codes of a command that said why
+DIED, INTERRUPTED = 7, 130  # exit codes of a launch
+MOST = 256  # processes of a launch, and devices of a process: each takes threads
+LONGEST = 86_400  # seconds of a heartbeat
+_ADVICE = "'hjbjax launch' sets these variables; unset all of them to solve in one process"
+WITHOUT_PROXY = {"no_grpc_proxy": "127.0.0.1"}  # gRPC would look for processes of this host behind a proxy
+GREETING = b"[Gloo]"  # the start of a line that gloo writes when it connects
+
+
+# --- in each process ---
+
+
+@dataclasses.dataclass(frozen=True)
+class Member:
+    """A process of a launch.
+
+    Args:
+      rank: its number, from 0.
+      processes: the number of processes.
+      coordinator: host and port at which they meet.
+      heartbeat: seconds without a sign of life after which a process counts as dead.
+    """
+
+    rank: int
+    processes: int
+    coordinator: str
+    heartbeat: int
+
+
+def member() -> Member | None:
+    """This process as a member of a launch, by its environment; None outside a launch.
+
+    Raises:
+      Failure: a variable is missing or has an unusable value.
+    """
+    if not any(name in os.environ for name in VARIABLES):
+        return None
+    if missing := [name for name in VARIABLES if name not in os.environ]:
+        known = ", ".join(name for name in VARIABLES if name in os.environ)
+        raise Failure(f"{missing[0]} is not set, but {known} is; {_ADVICE}")
+    processes = _count(PROCESSES, 1, MOST)
+    host, _, port = os.environ[COORDINATOR].rpartition(":")
+    if not host or not 0 < (finite(port, int) or 0) < 2**16:
+        raise Failure(f"{COORDINATOR}: got {os.environ[COORDINATOR]!r}, wanted HOST:PORT; {_ADVICE}")
+    return Member(_count(RANK, 0, processes - 1), processes, os.environ[COORDINATOR], _count(HEARTBEAT, 1, LONGEST))
+
+
+def _count(name: str, least: int, most: int) -> int:
+    """The whole number in a variable of the environment."""
+    number = finite(os.environ[name], int)
+    if number is None or not least <= number <= most:
+        wanted = f"a whole number from {least} to {most}" if most > least else str(least)
+        raise Failure(f"{name}: got {os.environ[name]!r}, wanted {wanted}; {_ADVICE}")
+    return number
 
 
 def rank() -> int:
-    """The number of this process among those of a launch; 0 without one."""
-    return int(os.environ.get(RANK, "0"))
+    """The number of this process in a launch; 0 outside a launch."""
+    this = member()
+    return 0 if this is None else this.rank
+
+
+def check_devices(counts: tuple[int, ...] | None, processes: int) -> None:
+    """Refuse numbers of devices along the axes that the processes cannot have.
+
+    Raises:
+      Failure: the devices are too many, or not the same number in each process.
+    """
+    wanted = processes if counts is None else math.prod(counts)
+    if wanted % processes:
+        raise Failure(f"--devices: {wanted} devices cannot be the same number in each of {processes} processes")
+    if wanted > MOST * processes:
+        raise Failure(f"--devices: {wanted} devices were asked for; of a process {MOST} are the most")
 
 
 def mesh_of(counts: tuple[int, ...] | None) -> "Mesh | None":
-    """The mesh of so many devices along each axis, or of one of every process; None for one device.
+    """The mesh with ``counts`` devices along its axes; by default one device per process, and None for one process.
 
-    Joins the other processes of a launch. To be called before JAX computes anything: then the devices of a processor
-    are made.
+    Joins the other processes of a launch. Call it before JAX computes anything: later the number of CPU devices is
+    fixed.
+
+    Raises:
+      Failure: there are not enough devices, or the processes cannot meet.
     """
-    processes = int(os.environ.get(PROCESSES, "1"))
+    this = member()
+    processes = 1 if this is None else this.processes
     if counts is None and processes == 1:
         return None
     import jax
@@ -52,120 +119,183 @@ def mesh_of(counts: tuple[int, ...] | None) -> "Mesh | None":
     from jax.sharding import Mesh
 
     counts = counts or (processes,)
+    check_devices(counts, processes)
     wanted = math.prod(counts)
-    if wanted % processes:
-        raise Failure(f"--devices: {wanted} devices cannot be the same number in each of {processes} processes")
-    if wanted > MOST * processes:
-        raise Failure(f"--devices: {wanted} devices were asked for; of a process {MOST} are the most")
-    # once JAX has computed something the devices are those that there are
+    # JAX refuses a new number of devices once it has computed something
     with contextlib.suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", wanted // processes)
-    if processes > 1:
-        jax.config.update("jax_cpu_collectives_implementation", "gloo")
-        jax.distributed.initialize(
-            os.environ[COORDINATOR], processes, rank(), heartbeat_timeout_seconds=int(os.environ[HEARTBEAT])
-        )
+    if this is not None and processes > 1:
+        _join(this)
     devices = jax.devices()
     if len(devices) < wanted:
         raise Failure(f"--devices: {wanted} devices were asked for, and {len(devices)} are there")
     return Mesh(np.array(devices[:wanted]).reshape(counts), tuple(f"axis{k}" for k in range(len(counts))))
 
 
+def _join(this: Member) -> None:
+    """Meet the other processes of a launch."""
+    import jax
+
+    try:
+        if this.rank == 0:
+            _check_port(this.coordinator)  # JAX's own error does not name the port
+        jax.config.update("jax_cpu_collectives_implementation", "gloo")
+        # its handler of SIGTERM would swallow a request to end that comes before the solve
+        jax.config.update("jax_enable_preemption_service", False)
+        jax.config.update("jax_check_proxy_envs", False)  # a warning, see WITHOUT_PROXY
+        jax.distributed.initialize(
+            this.coordinator,
+            this.processes,
+            this.rank,
+            heartbeat_timeout_seconds=this.heartbeat,
+            coordinator_bind_address=this.coordinator,  # by default the whole network could connect
+        )
+    except (OSError, jax.errors.JaxRuntimeError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise Failure(
+            f"process {this.rank} of {this.processes} could not meet the others at {this.coordinator}: {why}; "
+            "another program may use the port: start the command again"
+        ) from error
+
+
+def _check_port(coordinator: str) -> None:
+    """Raise OSError if the service at which the processes meet cannot have its port."""
+    host, _, port = coordinator.rpartition(":")
+    with _shared_socket() as probe:
+        probe.bind((host, int(port)))
+
+
 def leave() -> None:
-    """Wait for the other processes of a launch: one that ended before them would count as dead."""
-    if PROCESSES in os.environ:
+    """Part from the other processes of a launch when all have solved; they would take one that just ends for dead."""
+    if member() is not None:
         import jax
 
         jax.distributed.shutdown()
 
 
-def start(words: Sequence[str], processes: int, heartbeat: int) -> int:
-    """Run a command of ``hjbjax`` in so many processes on this host; its exit code.
+# --- in the launcher ---
 
-    Args:
-      words: the command, as in ``("solve", "pendulum")``.
-      processes: how many.
-      heartbeat: seconds without a sign of life after which a process counts as dead.
+
+def check(words: Sequence[str], processes: int, heartbeat: int) -> None:
+    """Refuse what cannot be launched.
 
     Raises:
-      Failure: another command, or a process that died.
+      Failure: another command than ``solve``, or an unusable number.
     """
     if words[0].startswith("-"):
         near = difflib.get_close_matches(words[0], ("--processes", "--heartbeat"), 1)
         raise Failure(f"launch: no such option {words[0]!r}{f'; did you mean {near[0]!r}?' if near else ''}")
     if words[0] != "solve":
-        raise Failure(f"launch: got {words[0]!r}, wanted solve, which alone divides its nodes")
-    common = {PROCESSES: str(processes), COORDINATOR: f"127.0.0.1:{_free_port()}", HEARTBEAT: str(heartbeat)}
-    command, quiet = [sys.executable, "-m", "hjbjax", *words], threading.Event()
-    running = []
-    for number in range(processes):
-        # the first one speaks; sessions of their own, so that Ctrl-C comes once, by way of this process
-        said = subprocess.PIPE if number == 0 else subprocess.DEVNULL
-        options: Any = {"stdout": said, "stderr": said, "text": True, "errors": "replace", "start_new_session": True}
-        environment = {**os.environ, **common, RANK: str(number)}
-        running.append(subprocess.Popen(command, env=environment, stdin=subprocess.DEVNULL, **options))
-    voices = [
-        threading.Thread(target=_pass_on, args=(stream, out, quiet), daemon=True)
-        for stream, out in ((running[0].stdout, sys.stdout), (running[0].stderr, sys.stderr))
-    ]
-    for voice in voices:
-        voice.start()
-    dead = _watch(running, heartbeat, quiet)
-    for voice in voices:
-        voice.join(timeout=GRACE)
-    if dead is None:  # what the first one says holds for all
-        return running[0].returncode if running[0].returncode in SAID else INTERRUPTED
-    number, since = dead
-    raise Failure(_obituary(number, running[number].returncode, since, words, processes), DIED)
+        raise Failure(f"launch: got {words[0]!r}, wanted solve, the only command that can divide its nodes")
+    for option, number, most in (("--processes", processes, MOST), ("--heartbeat", heartbeat, LONGEST)):
+        if number > most:
+            raise Failure(f"launch: got {option} {number}, wanted at most {most}")
 
 
-def _watch(running: list[subprocess.Popen], heartbeat: int, quiet: threading.Event) -> tuple[int, float] | None:
-    """The first process that died, if one did, and for how long the others lived on; returns when all have ended."""
-    dead: int | None = None
-    asked, began = False, time.monotonic()
-    while any(process.poll() is None for process in running):
-        try:
-            if dead is None and not asked:
-                dead, began = _died(running), time.monotonic()
-                if dead is not None:
-                    quiet.set()  # the others end in many lines, which do not say more
-            if dead is not None and time.monotonic() - began > heartbeat + GRACE:
-                for process in running:
-                    process.kill()
-            time.sleep(0.05)
-        except KeyboardInterrupt:  # they keep what they have, and end by themselves; one may be at its pictures
-            asked = True
-            for process in running:
-                process.send_signal(signal.SIGTERM)
-    dead = _died(running) if dead is None and not asked else dead  # the last one to end
-    return None if dead is None else (dead, time.monotonic() - began)
+def start(words: Sequence[str], processes: int, heartbeat: int, result: Path) -> int:
+    """Run a command of ``hjbjax`` in several processes on this host; its exit code.
+
+    Args:
+      words: the command, as in ``("solve", "pendulum")``.
+      processes: the number of processes.
+      heartbeat: seconds without a sign of life after which a process counts as dead.
+      result: the file that the command writes.
+
+    Raises:
+      Failure: a process died, did not end when it was asked to, or could not be started.
+      OSError: the output of the first process could not be written.
+    """
+    try:
+        with reserved_port() as port:
+            shared = {
+                PROCESSES: str(processes),
+                COORDINATOR: f"127.0.0.1:{port}",
+                HEARTBEAT: str(heartbeat),
+                **WITHOUT_PROXY,
+            }
+            commands = [
+                children.followed("hjbjax", words, {**os.environ, **shared, RANK: str(number)})
+                for number in range(processes)
+            ]
+            # earlier than the others lose patience: they keep what they have if the stopped one goes on to its end
+            outcome = children.run(commands, EXPLAINED, GREETING, heartbeat / 2)
+    except (OSError, RuntimeError) as error:  # RuntimeError: no thread can be started
+        raise Failure(f"launch: {processes} processes could not be started: {error}", DIED) from error
+    code = _verdict(outcome, _way_on(words, processes, result))
+    if outcome.unwritten is not None:
+        raise outcome.unwritten
+    return code
 
 
-def _died(running: list[subprocess.Popen]) -> int | None:
-    """The number of a process that ended without saying why, as one that was killed; None where there is none."""
-    return next((number for number, each in enumerate(running) if each.poll() not in (None, *SAID)), None)
+def _verdict(outcome: children.Outcome, way_on: str) -> int:
+    """The exit code of a launch.
+
+    Raises:
+      Failure: with a line on the process that brought the others down, and on how to go on.
+    """
+    processes, first, culprit = len(outcome.ends), outcome.end_of(0), outcome.culprit
+    if outcome.interrupted:
+        if outcome.killed:
+            raise Failure(f"interrupted; {_killed(outcome)}; {way_on}", INTERRUPTED)
+        if first.code in (0, *EXPLAINED):
+            return first.code  # the first process has said it
+        raise Failure("interrupted", INTERRUPTED)
+    if culprit is None:
+        return 0
+    name = f"process {culprit.number} of {processes}"
+    if culprit.number in outcome.stopped:
+        raise Failure(f"{name} was stopped, and the others cannot go on without it; {way_on}", DIED)
+    if culprit.code < 0:
+        by = f"signal {-culprit.code} ({signal.Signals(-culprit.code).name})"
+        raise Failure(f"{name} was ended by {by}; {way_on}", DIED)
+    if culprit.code not in EXPLAINED:
+        said = f": {culprit.words}" if culprit.words else ""
+        raise Failure(f"{name} ended with exit code {culprit.code}{said}; {way_on}", DIED)
+    if culprit.code == first.code:
+        return first.code  # the first process has said it
+    raise Failure(f"{name}: {culprit.words.removeprefix('hjbjax: ')}", culprit.code)
 
 
-def _obituary(number: int, code: int, seconds: float, words: Sequence[str], processes: int) -> str:
-    """The process that died, and how to go on."""
-    how = f"was ended by signal {-code}" if code < 0 else f"ended with exit code {code}"
-    died = f"process {number} of {processes} {how}, and the others {seconds:.0f} s later"
+def _killed(outcome: children.Outcome) -> str:
+    """The processes that were killed, and why."""
+    numbers = [number for number in outcome.killed if number in outcome.stopped] or outcome.killed
+    which, were = ("process", "was") if len(numbers) == 1 else ("processes", "were")
+    name = f"{which} {', '.join(map(str, numbers))} of {len(outcome.ends)} {were} killed"
+    return f"{name} by the second signal" if outcome.hurried else f"{name}, not having ended in {children.GRACE:.0f} s"
+
+
+def _way_on(words: Sequence[str], processes: int, result: Path) -> str:
+    """The command that resumes a run, or the advice to make a run resumable."""
     if not any(word.split("=")[0] == "--checkpoint" for word in words):
-        return f"{died}; with --checkpoint FILE a run can be resumed"
-    again = [*words, *([] if "--resume" in words else ["--resume"])]
-    return f"{died}; go on with: hjbjax launch --processes {processes} -- {shlex.join(again)}"
+        return "with --checkpoint FILE a run can be resumed"
+    wanted = ["--resume", *(["--force"] if os.path.lexists(result) else [])]
+    again = shlex.join([*words, *(word for word in wanted if word not in words)])
+    return f"go on with: hjbjax launch --processes {processes} -- {again}"
 
 
-def _free_port() -> int:
-    """A port of this host that nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
+@contextlib.contextmanager
+def reserved_port() -> Iterator[int]:
+    """A free port of this host that no other program gets meanwhile; the service of the first process shares it.
+
+    Where the system cannot share a port it is let go of at once.
+
+    Raises:
+      OSError: there is none.
+    """
+    with _shared_socket() as keeper:
+        keeper.bind(("127.0.0.1", 0))
+        port = keeper.getsockname()[1]
+        if not _CAN_SHARE:
+            keeper.close()
+        yield port
 
 
-def _pass_on(stream: TextIO, out: TextIO, quiet: threading.Event) -> None:
-    """Pass on the lines of the first process, but for gloo's greetings, and for what it says when others have died."""
-    for line in stream:
-        if not quiet.is_set() and not line.startswith("[Gloo]"):
-            out.write(line)
-            out.flush()
+_CAN_SHARE = hasattr(socket, "SO_REUSEPORT")
+
+
+def _shared_socket() -> socket.socket:
+    """A socket whose port other sockets of this user may have too, if all of them agree, as gRPC's do."""
+    made = socket.socket()
+    if _CAN_SHARE:
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+    return made

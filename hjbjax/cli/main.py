@@ -12,6 +12,7 @@ Exit codes: 0 done, 1 a check of ``doctor`` failed, 2 usage, 3 not converged, 4 
 import contextlib
 import dataclasses
 import json
+import os
 import sys
 import warnings
 from collections.abc import Iterator
@@ -116,12 +117,12 @@ def solve(
     options["mesh"] = processes_of.mesh_of(devices)
     if processes_of.rank() > 0:  # the first process of a launch writes, and speaks for all
         with interrupts.raised(), interruptible():
-            _raise_unless_converged(_solve(*_build(entry, parameters, shape), options))
+            _solve(*_build(entry, parameters, shape), options)
+            processes_of.leave()
         return
     out = Path(name) if out is None else out
-    # refusals in the order of what they cost: words, folder, problem; the solve comes after all of them
-    with _one_line_error(OSError, 2, "--out: "):
-        run_folder.check_folder(out, force)
+    # refusals in the order of what they cost: words, places, problem; the solve comes after all of them
+    _check_places(out, force, options["checkpoint"], options["resume"])
     problem, grid = _build(entry, parameters, shape)
     with contextlib.ExitStack() as stack:  # the hidden folder is removed late: after an interrupt, too
         stack.enter_context(interrupts.raised())
@@ -132,6 +133,7 @@ def solve(
         if not no_cache:
             compile_cache.keep_for_the_command()
         solution = _solve(problem, grid, options)
+        processes_of.leave()  # pictures may take longer than JAX lets the other processes wait
         files, path = _write(entry, parameters, problem, solution, staging, out, force)
     off = None
     with contextlib.suppress(ValueError), _one_line_warnings():  # no answer is known for these parameters
@@ -153,8 +155,7 @@ def solve(
 
 
 def _raise_unless_converged(solution: "Solution") -> None:
-    """A failure, with its exit code, of a status that is not CONVERGED; the processes of a launch part here."""
-    processes_of.leave()
+    """Raise a failure with its exit code for a status that is not CONVERGED."""
     if code := CODES.get(solution.status.name, 3):
         raise Failure(f"{solution.status.name}: {solution.message or solution.status.message}", code)
 
@@ -164,11 +165,33 @@ def _raise_unless_converged(solution: "Solution") -> None:
 @click.option("--heartbeat", type=Number(int), default=10, show_default=True, help="Seconds until one counts as dead.")
 @click.argument("words", nargs=-1, required=True, metavar="-- COMMAND")
 def launch(processes: int, heartbeat: int, words: tuple[str, ...]) -> None:
-    """Run a command, as in "hjbjax launch --processes 2 -- solve pendulum", by many processes that share its nodes."""
-    with interrupts.raised():
-        code = processes_of.start(words, processes, heartbeat)
-    if code:
+    """Run a command, as in "hjbjax launch --processes 2 -- solve pendulum", in processes that divide its nodes."""
+    from hjbjax.cli import run_folder
+
+    processes_of.check(words, processes, heartbeat)
+    # a process takes ten seconds to start: what each of them would refuse is refused here
+    given = solve.make_context("solve", list(words[1:]), parent=click.get_current_context().parent).params
+    out = given["out"] or Path(given["name"])
+    if not given["dry_run"]:
+        processes_of.check_devices(given["devices"], processes)
+        _check_places(out, *(given[key] for key in ("force", "checkpoint", "resume")))
+        with _one_line_error(OSError, 2, "--out: "), run_folder.staging(out):
+            pass  # it can be written
+    if code := processes_of.start(words, processes, heartbeat, out / FILES[0]):
         raise SystemExit(code)
+
+
+def _check_places(out: Path, force: bool, checkpoint: Path | None, resume: bool) -> None:
+    """Refuse in one line a folder of results and a checkpoint that must not be replaced."""
+    from hjbjax.cli import run_folder
+    from hjbjax.solution import files
+
+    with _one_line_error(OSError, 2, "--out: "):
+        run_folder.check_folder(out, force)
+    if resume and checkpoint is None:
+        raise Failure("--resume goes on from a checkpoint; add --checkpoint FILE")
+    if checkpoint is not None and not resume and os.path.lexists(place := files.with_suffix(os.fspath(checkpoint))):
+        raise Failure(f"--checkpoint: {place} is there already; --resume goes on from it")
 
 
 @contextlib.contextmanager

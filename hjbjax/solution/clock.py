@@ -24,6 +24,7 @@ from hjbjax.solution.status import Status
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 CHUNK_SECONDS = 0.5  # between two looks at the clock, where steps are short: how long Ctrl-C may take to be heard
+REPEAT = 1.0  # seconds within which SIGTERM is sent twice: by a service manager to all processes, and by their launcher
 CUT = (Status.INTERRUPTED, Status.TIME_LIMIT)
 
 
@@ -145,10 +146,15 @@ class _Beside(Clock):
 
 _running: list[Clock] = []  # of the main thread, the outermost run first
 _raised: list[int] = []  # signals for which ``_interrupt`` raised
+_heard: dict[int, float] = {}  # when a signal came for the last time
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
     """What the command does on a signal: Ctrl-C's exception, and a note that there was one."""
+    now, before = time.monotonic(), _heard.get(number, -math.inf)
+    _heard[number] = now
+    if number == signal.SIGTERM and now - before < REPEAT:
+        return
     _raised.append(number)
     raise KeyboardInterrupt
 
@@ -156,6 +162,8 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
     """Context of a command that Ctrl-C and SIGTERM end alike: a run in it keeps what it has for either.
+
+    A second Ctrl-C cuts it short. SIGTERM within ``REPEAT`` seconds of another one does not.
 
     Python drops an exception in a callback of its garbage collector, and JAX has such; the next run notes the signal.
     A shell starts background jobs with SIGINT ignored, which stays so, and SIGTERM must not go by way of it.
@@ -166,6 +174,7 @@ def interruptible() -> Iterator[None]:
     ignored = signal.getsignal(signal.SIGINT) is not signal.default_int_handler
     usual = {number: signal.signal(number, _interrupt) for number in (SIGNALS[1:] if ignored else SIGNALS)}
     _raised.clear()
+    _heard.clear()
     try:
         yield
     finally:
@@ -193,6 +202,7 @@ def noting_interrupts(clock: Clock) -> Iterator[None]:
             signal.signal(number, usual)
 
     def note(number: int, frame: FrameType | None) -> None:
+        _heard[number] = time.monotonic()
         for each in _running:
             each.interrupted = True
         give_back()  # a second Ctrl-C is the usual KeyboardInterrupt

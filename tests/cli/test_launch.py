@@ -2,6 +2,7 @@
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -13,8 +14,11 @@ import pytest
 from click.testing import CliRunner
 
 import hjbjax as hjb
-from hjbjax.cli import launch
+from hjbjax.cli import children, launch, run_folder
+from hjbjax.cli.children import End, Outcome
+from hjbjax.cli.command_line import Failure
 from hjbjax.cli.main import main
+from hjbjax.solution.solution import Solution, Status
 
 ROOT = Path(__file__).parents[2]
 HEARTBEAT = 10
@@ -35,44 +39,232 @@ def ended(process):
     return process.returncode, out, err
 
 
-@pytest.mark.parametrize(
-    ("words", "part"),
-    [
-        (("launch", "--", "list"), "launch: got 'list', wanted solve"),
-        (("launch", "--proceses", "2", "--", "solve", "pendulum"), "'--proceses'; did you mean '--processes'?"),
-        (("launch", "--processes", "0", "--", "solve", "pendulum"), "wanted a whole number > 0"),
-        (
-            ("solve", "pendulum", "--devices", "1000x1000"),
-            "1000000 devices were asked for; of a process 256 are the most",
-        ),
-        (("solve", "pendulum", "--devices", "7"), "7 devices were asked for, and "),
-        (("solve", "pendulum", "--devices", "0x2"), "whole numbers of at least 1, one an axis, as in 4x2"),
-    ],
-)
-def test_refusals(words, part, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    jax.devices()  # from here on there are as many as there are
+def refused(words, part):
+    """Assert that a command is refused in one line with exit code 2."""
     result = CliRunner().invoke(main, list(words))
-    assert result.exit_code == 2
+    assert result.exit_code == 2, result.stderr
     assert part in result.stderr
     assert result.stderr.count("\n") == 1
 
 
+@pytest.fixture
+def _no_child(monkeypatch):
+    """A test in which no process may be started."""
+    monkeypatch.setattr(children, "run", lambda *_, **__: pytest.fail("a process was started"))
+
+
+@pytest.mark.usefixtures("_no_child")
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (("list",), "launch: got 'list', wanted solve"),
+        (("--proceses", "2", "--", "solve", "pendulum"), "'--proceses'; did you mean '--processes'?"),
+        (("--processes", "0", "--", "solve", "pendulum"), "wanted a whole number > 0"),
+        (("--processes", "100000", "--", "solve", "pendulum"), "--processes 100000, wanted at most 256"),
+        (("--heartbeat", "9" * 30, "--", "solve", "pendulum"), "wanted at most 86400"),
+        (("--", "solve", "pendulum", "--devices", "3"), "3 devices cannot be the same number in each of 2 processes"),
+        (("--", "solve", "pendulm"), "did you mean 'pendulum'?"),
+        (("--", "solve", "pendulum", "--tol", "nan"), "got 'nan', wanted a finite number > 0"),
+        (("--", "solve"), "Missing argument 'NAME'"),
+        (("--", "solve", "pendulum", "--resume"), "--resume goes on from a checkpoint; add --checkpoint FILE"),
+        (("--", "solve", "pendulum", "--out", "old"), "old holds value.png already"),
+        (("--", "solve", "pendulum", "--out", "run.npz"), "run.npz is there and is no folder"),
+        (("--", "solve", "pendulum", "--out", "run.npz/out"), "run.npz is no folder"),
+        (("--", "solve", "pendulum", "--checkpoint", "run"), "run.npz is there already; --resume goes on from it"),
+    ],
+)
+def test_a_launch_that_is_refused_starts_no_process(words, part, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "value.png").touch()
+    (tmp_path / "run.npz").touch()
+    refused(("launch", *words), part)
+
+
+def test_a_launch_in_a_folder_that_is_allowed_starts(tmp_path, monkeypatch):
+    """What is refused above, with --force and --resume; and a dry run, which writes nothing."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "pendulum").mkdir()
+    (tmp_path / "pendulum" / "value.png").touch()
+    (tmp_path / "run.npz").touch()
+    monkeypatch.setattr(children, "run", lambda *_, **__: Outcome((End(0, 0), End(1, 0))))
+    for more in (("--force", "--checkpoint", "run", "--resume"), ("--dry-run",)):
+        assert CliRunner().invoke(main, ["launch", "--", "solve", "pendulum", *more]).exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("devices", "part"),
+    [
+        ("1000x1000", "1000000 devices were asked for; of a process 256 are the most"),
+        ("7", "7 devices were asked for, and "),
+        ("0x2", "whole numbers of at least 1, one an axis, as in 4x2"),
+    ],
+)
+def test_devices_that_are_not_there(devices, part, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    jax.devices()  # from here on there are as many as there are
+    refused(("solve", "pendulum", "--devices", devices), part)
+
+
+# --- in each process ---
+
+MEMBER = {launch.RANK: "0", launch.PROCESSES: "2", launch.COORDINATOR: "127.0.0.1:4000", launch.HEARTBEAT: "10"}
+
+
+def as_member(monkeypatch, **changed):
+    """The environment of a process of a launch; None takes a variable out."""
+    for name, value in {**MEMBER, **changed}.items():
+        if value is None:
+            monkeypatch.delenv(name, raising=False)
+        else:
+            monkeypatch.setenv(name, value)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "wanted"),
+    [
+        (launch.RANK, "x", "got 'x', wanted a whole number from 0 to 1"),
+        (launch.RANK, "", "got '', wanted a whole number from 0 to 1"),
+        (launch.RANK, "2", "got '2', wanted a whole number from 0 to 1"),
+        (launch.RANK, "-1", "got '-1', wanted a whole number from 0 to 1"),
+        (launch.RANK, "0.5", "got '0.5', wanted a whole number from 0 to 1"),
+        (launch.RANK, None, "HJBJAX_RANK is not set, but HJBJAX_PROCESSES"),
+        (launch.PROCESSES, "x", "got 'x', wanted a whole number from 1 to 256"),
+        (launch.PROCESSES, "0", "got '0', wanted a whole number from 1 to 256"),
+        (launch.PROCESSES, "9" * 30, "wanted a whole number from 1 to 256"),
+        (launch.PROCESSES, None, "HJBJAX_PROCESSES is not set, but HJBJAX_RANK"),
+        (launch.COORDINATOR, "127.0.0.1", "got '127.0.0.1', wanted HOST:PORT"),
+        (launch.COORDINATOR, ":80", "got ':80', wanted HOST:PORT"),
+        (launch.COORDINATOR, "here:99999", "got 'here:99999', wanted HOST:PORT"),
+        (launch.COORDINATOR, None, "HJBJAX_COORDINATOR is not set"),
+        (launch.HEARTBEAT, "0", "got '0', wanted a whole number from 1 to 86400"),
+        (launch.HEARTBEAT, "soon", "got 'soon', wanted a whole number from 1 to 86400"),
+    ],
+)
+def test_a_bad_environment_is_refused_in_one_line(name, value, wanted, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    as_member(monkeypatch, **{name: value})
+    refused(("solve", "pendulum"), wanted)
+    refused(("solve", "pendulum"), f"{name}")
+    refused(("solve", "pendulum"), "unset all of them to solve in one process")
+
+
 def test_devices_that_are_not_the_same_number_in_each_process(monkeypatch):
-    monkeypatch.setenv(launch.PROCESSES, "2")
-    result = CliRunner().invoke(main, ["solve", "pendulum", "--devices", "3"])
-    assert result.exit_code == 2
-    assert "3 devices cannot be the same number in each of 2 processes" in result.stderr
+    as_member(monkeypatch)
+    refused(("solve", "pendulum", "--devices", "3"), "3 devices cannot be the same number in each of 2 processes")
 
 
-def test_a_process_that_died_is_named_with_the_command_that_goes_on():
-    died = launch._obituary(1, -9, 9.6, ("solve", "pendulum", "--checkpoint", "my run.npz"), 3)
-    assert died.startswith("process 1 of 3 was ended by signal 9, and the others 10 s later; go on with: ")
-    assert died.endswith("hjbjax launch --processes 3 -- solve pendulum --checkpoint 'my run.npz' --resume")
-    died = launch._obituary(0, 1, 0.2, ("solve", "pendulum"), 2)
-    assert died == (
-        "process 0 of 2 ended with exit code 1, and the others 0 s later; with --checkpoint FILE a run can be resumed"
-    )
+def test_a_port_that_is_taken_is_named_in_one_line(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    jax.devices()
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        place = f"127.0.0.1:{taken.getsockname()[1]}"
+        as_member(monkeypatch, **{launch.COORDINATOR: place})
+        refused(("solve", "pendulum"), f"process 0 of 2 could not meet the others at {place}: Address already in use")
+
+
+def test_a_port_is_reserved_until_the_first_process_has_it():
+    """No other program gets it meanwhile, and the service of the first process can share it."""
+    with launch.reserved_port() as port:
+        with pytest.raises(OSError, match="in use"), socket.create_server(("127.0.0.1", port)):
+            pass
+        launch._check_port(f"127.0.0.1:{port}")
+
+
+@pytest.mark.parametrize("number", ["0", "1"])
+def test_the_processes_part_before_the_pictures(number, tmp_path, monkeypatch):
+    """JAX ends a process that waits for five minutes; and only the first one says that the steps ran out."""
+    monkeypatch.chdir(tmp_path)
+    as_member(monkeypatch, **{launch.RANK: number})
+    order = []
+
+    def solved(problem, grid, **options):
+        return Solution(grid, np.zeros(grid.shape), None, code=Status.MAX_STEPS, steps=7, residuals=np.array([1.0]))
+
+    monkeypatch.setattr(launch, "mesh_of", lambda counts: None)
+    monkeypatch.setattr(hjb, "solve", solved)
+    monkeypatch.setattr(launch, "leave", lambda: order.append("parted"))
+    monkeypatch.setattr(run_folder, "make", lambda *_, **__: order.append("drawn") or iter(()))
+    result = CliRunner().invoke(main, ["solve", "pendulum", "--no-cache"])
+    assert order == ["parted", "drawn"][: 1 + (number == "0")]
+    assert result.exit_code == (3 if number == "0" else 0), result.output
+
+
+# --- what is said at the end ---
+
+WAY_ON = "go on"
+
+
+def outcome_of(*codes, words="", **more):
+    """An outcome with the exit codes of processes in the order in which they ended."""
+    return Outcome(tuple(End(number, code, words) for number, code in codes), **more)
+
+
+@pytest.mark.parametrize(
+    ("outcome", "code"),
+    [
+        (outcome_of((1, 0), (0, 0)), 0),
+        (outcome_of((1, 3), (0, 3)), 3),
+        (outcome_of((1, 130), (0, 130), interrupted=True), 130),
+        (outcome_of((1, -15), (0, 0), interrupted=True), 0),
+    ],
+)
+def test_the_first_process_has_said_it(outcome, code):
+    assert launch._verdict(outcome, WAY_ON) == code
+
+
+@pytest.mark.parametrize(
+    ("outcome", "code", "line"),
+    [
+        (outcome_of((1, -9), (0, 130)), 7, "process 1 of 2 was ended by signal 9 (SIGKILL); go on"),
+        (outcome_of((0, 4), (2, -11), (1, 4)), 7, "process 2 of 3 was ended by signal 11 (SIGSEGV); go on"),
+        (
+            outcome_of((1, 1), (0, 130), words="ValueError: no"),
+            7,
+            "process 1 of 2 ended with exit code 1: ValueError: no; go on",
+        ),
+        (outcome_of((1, 6), (0, -15), words="hjbjax: no memory"), 6, "process 1 of 2: no memory"),
+        (
+            outcome_of((0, -6), (1, 130), stopped=(1,)),
+            7,
+            "process 1 of 2 was stopped, and the others cannot go on without it; go on",
+        ),
+        (outcome_of((0, -15), (1, -15), interrupted=True), 130, "interrupted"),
+        (
+            outcome_of((0, 130), (1, -9), interrupted=True, killed=(1,)),
+            130,
+            "interrupted; process 1 of 2 was killed, not having ended in 7 s; go on",
+        ),
+        (
+            outcome_of((0, -9), (1, -9), (2, -9), interrupted=True, killed=(0, 1, 2), stopped=(1,)),
+            130,
+            "interrupted; process 1 of 3 was killed, not having ended in 7 s; go on",
+        ),
+        (
+            outcome_of((0, -9), (1, -9), interrupted=True, hurried=True, killed=(0, 1)),
+            130,
+            "interrupted; processes 0, 1 of 2 were killed by the second signal; go on",
+        ),
+    ],
+)
+def test_the_process_that_failed_is_named(outcome, code, line):
+    with pytest.raises(Failure) as failed:
+        launch._verdict(outcome, WAY_ON)
+    assert (failed.value.exit_code, failed.value.message) == (code, line)
+
+
+def test_the_command_that_goes_on(tmp_path):
+    words = ("solve", "pendulum", "--checkpoint", "my run.npz")
+    again = "go on with: hjbjax launch --processes 3 -- solve pendulum --checkpoint 'my run.npz' --resume"
+    result = tmp_path / "solution.npz"
+    assert launch._way_on(words, 3, result) == again
+    assert launch._way_on((*words, "--resume"), 3, result) == again
+    result.touch()
+    assert launch._way_on(words, 3, result) == f"{again} --force"
+    assert launch._way_on(("solve", "pendulum"), 2, result) == "with --checkpoint FILE a run can be resumed"
+
+
+# --- real processes ---
 
 
 @pytest.mark.slow
@@ -95,40 +287,80 @@ def test_two_processes_and_two_devices_give_the_answer_of_one(tmp_path):
     assert np.array_equal(others[0].value, others[1].value)  # the same parts
 
 
+LONG = ("solve", "pendulum", "--shape", "400x401", "--method", "value-iteration", "--tol", "1e-9")  # many minutes
+
+
+@pytest.fixture
+def running(tmp_path):
+    """A long solve in two processes under way, with the process ids of the two; at the end none of them may be left."""
+    if not Path("/proc/self/task").exists():
+        pytest.skip("the children of a process are found in /proc")
+    process = command(tmp_path, "launch", "--heartbeat", HEARTBEAT, "--", *LONG, "--checkpoint", "run.npz")
+    children_of = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+    wait_for(lambda: list(tmp_path.glob(".pendulum.*")))  # the hidden folder of the first process
+    time.sleep(15)
+    pids = [int(pid) for pid in children_of.read_text().split()]
+    yield process, pids
+    left = [pid for pid in (process.pid, *pids) if is_running(pid)]
+    for pid in left:
+        os.kill(pid, signal.SIGKILL)
+    process.communicate(timeout=60)
+    assert not left
+
+
+def wait_for(condition):
+    """Wait until a condition is true."""
+    end = time.monotonic() + 120
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.1)
+
+
+def is_running(pid):
+    """True if a process is there and has not ended."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
 @pytest.mark.slow
-def test_a_process_that_dies_takes_the_others_along_and_the_run_goes_on(tmp_path):
-    # a way from the start of 180 steps, which a checkpoint holds, and then a climb of many minutes
-    words = ("solve", "pendulum", "--shape", "400x401", "--method", "value-iteration", "--tol", "1e-9")
-    words = (*words, "--checkpoint", "run.npz")
-    process = command(tmp_path, "launch", "--heartbeat", HEARTBEAT, "--", *words)
-    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
-    if not children.exists():
-        process.kill()
-        pytest.skip("the children of a process are not to be seen here")
-    time.sleep(25)
-    _, second = map(int, children.read_text().split())
-    os.kill(second, signal.SIGKILL)
-    died = time.monotonic()
+def test_a_process_that_dies_is_named_and_the_run_goes_on(running, tmp_path):
+    process, pids = running
+    os.kill(pids[1], signal.SIGKILL)
     code, _, err = ended(process)
-    assert time.monotonic() - died < HEARTBEAT + launch.GRACE
     assert code == launch.DIED
     last = err.splitlines()[-1]
-    assert last.startswith("hjbjax: process 1 of 2 was ended by signal 9")
+    assert last.startswith("hjbjax: process 1 of 2 was ended by signal 9 (SIGKILL)")
     again = last.partition("go on with: hjbjax ")[2].split()
     assert again[-1] == "--resume"
-    assert (tmp_path / "run.npz").exists()
     code, _, err = ended(command(tmp_path, *again, "--max-steps", "200"))
     assert code == 3
     assert err.startswith("hjbjax: MAX_STEPS")
 
 
 @pytest.mark.slow
-def test_an_interrupt_ends_all_processes_at_one_step_and_leaves_the_answer_so_far(tmp_path):
-    words = ("solve", "pendulum", "--shape", "400x401", "--method", "value-iteration", "--tol", "1e-9")
-    process = command(tmp_path, "launch", "--", *words)
-    time.sleep(25)
-    process.send_signal(signal.SIGINT)
+def test_a_process_that_is_stopped_is_named_and_all_keep_what_they_have(running, tmp_path):
+    process, pids = running
+    os.kill(pids[1], signal.SIGSTOP)
+    code, _, err = ended(process)
+    assert code == launch.DIED
+    assert err.splitlines()[-1].startswith("hjbjax: process 1 of 2 was stopped")
+    assert (tmp_path / "run.npz").exists()
+    assert hjb.load(tmp_path / "pendulum" / "solution.npz").status.name == "INTERRUPTED"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_a_launcher_that_is_signalled_leaves_the_answer_so_far(running, tmp_path, number):
+    """By SIGKILL, too: the processes notice it."""
+    process, pids = running
+    process.send_signal(number)
     code, said, _ = ended(process)
-    assert code == 130
-    assert said.startswith("INTERRUPTED")
+    if number == signal.SIGKILL:
+        wait_for(lambda: not any(is_running(pid) for pid in pids))
+    else:
+        assert code == launch.INTERRUPTED
+        assert said.startswith("INTERRUPTED")
+    assert (tmp_path / "run.npz").exists()
     assert hjb.load(tmp_path / "pendulum" / "solution.npz").status.name == "INTERRUPTED"

@@ -19,7 +19,7 @@ from hjbjax.extremals import collocation, continuation, equilibria
 from hjbjax.feedback import simulation
 from hjbjax.markov_chain import node_checks
 from hjbjax.problem.pytree import pytree_dataclass
-from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
+from hjbjax.solution.clock import Clock, Stopped, interruptible, noting_interrupts
 from hjbjax.solvers import batch, host_loop, march_run, stationary_run
 from hjbjax.solvers.march_run import MarchRun
 from hjbjax.solvers.stationary_run import LanesRun, StationaryRun
@@ -201,6 +201,24 @@ def test_sigterm_where_it_was_made_to_do_what_ctrl_c_does():
             assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+def test_sigterm_that_comes_twice_at_once_ends_a_command_once():
+    """A service manager sends it to all processes of a launch, and so does their launcher."""
+    with interruptible():
+        mine = Clock()
+        with noting_interrupts(mine):
+            signal.raise_signal(signal.SIGTERM)
+            signal.raise_signal(signal.SIGTERM)
+            assert mine.over() is INTERRUPTED
+    with interruptible():
+        with pytest.raises(KeyboardInterrupt):  # outside of a run, as while pictures are drawn
+            signal.raise_signal(signal.SIGTERM)
+        signal.raise_signal(signal.SIGTERM)
+        with noting_interrupts(mine):
+            signal.raise_signal(signal.SIGINT)
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
 
 
 # --- before the steps ---

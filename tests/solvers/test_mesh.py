@@ -151,15 +151,16 @@ jax.distributed.shutdown()
 @pytest.mark.slow
 def test_a_batch_over_two_processes():
     """Each process has lanes of its own, and the answers of all of them."""
-    place, running = f"127.0.0.1:{launch._free_port()}", []
     environment = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
-    for rank in range(2):
-        command = [sys.executable, "-c", BATCH, place, str(rank)]
-        running.append(subprocess.Popen(command, env=environment, stdout=-1, stderr=-1, text=True))
-    for process in running:
-        said, err = process.communicate(timeout=300)
-        assert process.returncode == 0, err
-        assert float(said.split()[-1]) <= ULP * 2.3e-16
+    with launch.reserved_port() as port:
+        running = []
+        for rank in range(2):
+            command = [sys.executable, "-c", BATCH, f"127.0.0.1:{port}", str(rank)]
+            running.append(subprocess.Popen(command, env=environment, stdout=-1, stderr=-1, text=True))
+        for process in running:
+            said, err = process.communicate(timeout=300)
+            assert process.returncode == 0, err
+            assert float(said.split()[-1]) <= ULP * 2.3e-16
 
 
 def test_checkpoints(found):

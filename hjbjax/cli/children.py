@@ -1,0 +1,367 @@
+"""Child processes that end when their launcher ends, and a record of how each of them ended.
+
+The launcher handles one event at a time. Signals and ends of children are put into one queue, so no exception of a
+signal can fall between the start of a child and the note that it runs:
+
+    a signal (SIGINT, SIGTERM, SIGHUP)   ask every child to end; a second signal kills them
+    a child dies                         ask the others to end
+    a child fails and says why           ask the others to end after ``SETTLE`` seconds
+    the first child ends                 the same, as it speaks for all
+    a child has been stopped for long    ask all of them, and continue it
+    ``GRACE`` seconds after any of them  kill the children that still run
+
+Asking is SIGTERM, with SIGCONT for a child that is stopped. A launcher that is killed cannot ask. Children that were
+started by ``followed`` notice it on their own: their standard input is a pipe that ends with the launcher.
+
+The file imports the standard library only and runs as the script of a child, which follows its launcher from its first
+milliseconds on. Importing JAX takes seconds.
+"""
+
+import collections
+import contextlib
+import dataclasses
+import math
+import os
+import queue
+import runpy
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from types import FrameType
+from typing import IO, Any
+
+GRACE = 7.0  # seconds from a request to end until SIGKILL, so that all is over within 10
+SETTLE = 2.0  # seconds in which children that fail together may each say why
+BOUNCE = 0.3  # seconds within which a second signal is the first one again, as when a terminal and its shell close
+TICK = 0.5  # seconds between two looks at the clock
+LINGER = 0.5  # seconds to wait for the last words of a child that has ended
+SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+REQUEST = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGCONT") if hasattr(signal, name))
+SHARED = (signal.SIGTERM, signal.SIGABRT)  # signals by which a child also ends because of another child
+
+
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """The words of a command, and the environment in which it runs."""
+
+    words: Sequence[str]
+    environment: Mapping[str, str]
+
+
+@dataclasses.dataclass(frozen=True)
+class End:
+    """The end of a child.
+
+    Args:
+      number: of the child.
+      code: its exit code; minus the number of the signal that ended it.
+      words: the last line that it wrote on standard error.
+    """
+
+    number: int
+    code: int
+    words: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """How the children ended.
+
+    Args:
+      ends: one per child, in the order in which they ended.
+      interrupted: True if a signal came before any child failed.
+      hurried: True if a second signal killed the children.
+      stopped: numbers of the children that were stopped (SIGSTOP) when they were asked to end.
+      killed: numbers of the children that were killed.
+      unwritten: the error with which output of the first child could not be passed on.
+    """
+
+    ends: tuple[End, ...]
+    interrupted: bool = False
+    hurried: bool = False
+    stopped: tuple[int, ...] = ()
+    killed: tuple[int, ...] = ()
+    unwritten: OSError | None = None
+
+    def end_of(self, number: int) -> End:
+        """The end of one child."""
+        return next(end for end in self.ends if end.number == number)
+
+    @property
+    def culprit(self) -> End | None:
+        """The child that brought the others down; None if all ended with exit code 0.
+
+        Killing or stopping one child makes the others fail, and they may be seen to fail first.
+        """
+        alone = [end for end in self.ends if end.number not in self.killed]
+        crashed = [end for end in alone if end.code < 0 and -end.code not in SHARED]
+        stopped = [self.end_of(number) for number in self.stopped]
+        failed = [end for end in self.ends if end.code != 0]
+        return next(iter([*crashed, *stopped, *failed]), None)
+
+
+def followed(module: str, words: Sequence[str], environment: Mapping[str, str]) -> Command:
+    """The command ``python -m module words`` in a process that ends when its launcher ends, even by ``kill -9``.
+
+    It imports from where the launcher imports: a file ``random.py`` in the working directory is in nobody's way.
+    """
+    path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
+    return Command([sys.executable, "-P", __file__, module, *words], {**environment, "PYTHONPATH": path})
+
+
+def run(
+    commands: Sequence[Command],
+    explained: Collection[int] = (),
+    muted: bytes = b"\0",
+    patience: float = math.inf,
+) -> Outcome:
+    """Run commands side by side until all of them have ended; pass on what the first one writes.
+
+    Args:
+      commands: one per child.
+      explained: exit codes of a child that said why it failed.
+      muted: the start of lines that are not passed on.
+      patience: seconds for which a child may be stopped.
+
+    Raises:
+      OSError: a child could not be started. No child is left running.
+    """
+    launcher = _Launcher(explained, muted, patience)
+    with _signals_into(launcher.events):
+        try:
+            for command in commands:
+                launcher.start(command)
+            launcher.wait()
+        finally:
+            launcher.clear()
+    return launcher.outcome()
+
+
+class _Launcher:
+    """The children that run, the ends of the others, and when the next request is due."""
+
+    def __init__(self, explained: Collection[int], muted: bytes, patience: float):
+        self.explained, self.muted, self.patience = explained, muted, patience
+        self.events: queue.SimpleQueue[End | int] = queue.SimpleQueue()
+        self.running: dict[int, subprocess.Popen] = {}
+        self.voices: list[threading.Thread] = []
+        self.ends: list[End] = []
+        self.ask_at = self.kill_at = math.inf
+        self.asked_at: float | None = None
+        self.interrupted = self.hurried = False
+        self.standing: dict[int, float] = {}  # the seconds for which a child has been stopped
+        self.stopped: tuple[int, ...] = ()
+        self.killed: tuple[int, ...] = ()
+        self.quiet = threading.Event()  # from here on the first child only says that it misses the others
+        self.unwritten: list[OSError] = []
+
+    def start(self, command: Command) -> None:
+        """Start a child in a process group of its own, so that Ctrl-C reaches it through the launcher only."""
+        number = len(self.running) + len(self.ends)
+        first = number == 0
+        options: dict[str, Any] = {
+            "env": command.environment,
+            "stdin": subprocess.PIPE,
+            "stdout": subprocess.PIPE if first else subprocess.DEVNULL,
+            "stderr": subprocess.PIPE,
+            "process_group": 0,
+        }
+        process = self.running[number] = subprocess.Popen(command.words, **options)
+        last: collections.deque[bytes] = collections.deque(maxlen=1)
+        voice = self._listen(process.stderr, sys.stderr if first else None, last)
+        if first:
+            self._listen(process.stdout, sys.stdout, collections.deque(maxlen=1))
+
+        def report_end() -> None:
+            code = process.wait()
+            voice.join(LINGER)
+            words = last[0].decode(errors="replace").strip() if last else ""
+            self.events.put(End(number, code, words))
+
+        threading.Thread(target=report_end, daemon=True).start()
+
+    def _listen(self, stream: IO[bytes] | None, out: Any, last: collections.deque[bytes]) -> threading.Thread:
+        """A thread that reads what a child writes, keeps the last line and passes all of it on."""
+
+        def listen() -> None:
+            assert stream is not None
+            sink = out
+            with stream:
+                for line in stream:
+                    if line.strip():
+                        last.append(line)
+                    if sink is None or self.quiet.is_set() or line.startswith(self.muted):
+                        continue
+                    try:
+                        _write(line, sink)
+                    except OSError as error:  # from here on lines are dropped, so that the child can go on writing
+                        self.unwritten.append(error)
+                        sink = None
+
+        voice = threading.Thread(target=listen, daemon=True)
+        voice.start()
+        self.voices.append(voice)
+        return voice
+
+    def wait(self) -> None:
+        """Handle events until every child has ended."""
+        while self.running:
+            left = min(self.ask_at, self.kill_at) - time.monotonic()
+            try:
+                event = self.events.get(timeout=min(TICK, max(0.0, left)))
+            except queue.Empty:
+                self._note_stopped()
+            else:
+                if isinstance(event, End):
+                    self._note_end(event)
+                else:
+                    self._note_signal()
+            if time.monotonic() >= self.kill_at:
+                self._kill()
+            elif time.monotonic() >= self.ask_at:
+                self._ask()
+
+    def _note_end(self, end: End) -> None:
+        """Record an end, and ask the others to end where it means that they are not needed or cannot go on."""
+        self._close(self.running.pop(end.number))
+        self.ends.append(end)
+        if self.asked_at is not None or (end.number > 0 and end.code == 0):
+            return
+        now = time.monotonic()
+        died = end.code not in (0, *self.explained)
+        self.ask_at = min(self.ask_at, now if died else now + SETTLE)
+        self.kill_at = min(self.kill_at, now + GRACE)
+
+    def _note_signal(self) -> None:
+        """Ask the children to end; kill them if they were asked before."""
+        now = time.monotonic()
+        if self.asked_at is None:
+            self.interrupted = all(end.code == 0 for end in self.ends)
+            self.ask_at, self.kill_at = now, min(self.kill_at, now + GRACE)
+        elif now - self.asked_at > BOUNCE:
+            self.kill_at, self.hurried = now, True
+
+    def _note_stopped(self) -> None:
+        """Ask the children to end if one of them has been stopped for too long: the others wait for it."""
+        # counted in looks: a launcher that was stopped as well must not blame its children for that time
+        self.standing = {number: self.standing.get(number, 0.0) + TICK for number in self._stopped_now()}
+        if self.asked_at is None and any(seconds > self.patience for seconds in self.standing.values()):
+            self.ask_at = min(self.ask_at, time.monotonic())
+            self.kill_at = min(self.kill_at, self.ask_at + GRACE)
+
+    def _stopped_now(self) -> tuple[int, ...]:
+        """The numbers of the children that are stopped."""
+        return tuple(number for number, process in self.running.items() if _is_stopped(process))
+
+    def _ask(self) -> None:
+        """Ask the children to end."""
+        self.asked_at, self.ask_at = time.monotonic(), math.inf
+        self.stopped = self._stopped_now()
+        if 0 in self.running and not self.interrupted:
+            self.quiet.set()
+        for process in self.running.values():
+            for number in REQUEST:
+                process.send_signal(number)
+
+    def _kill(self) -> None:
+        """Kill the children."""
+        self.ask_at = self.kill_at = math.inf
+        self.killed = tuple(self.running)
+        for process in self.running.values():
+            process.kill()
+
+    def clear(self) -> None:
+        """Kill the children that still run, as after an error of the launcher, and let go of the pipes."""
+        for process in self.running.values():
+            process.kill()
+        for process in self.running.values():
+            process.wait()
+            self._close(process)
+        latest = time.monotonic() + LINGER  # a grandchild may hold a pipe open
+        for voice in self.voices:
+            voice.join(max(0.0, latest - time.monotonic()))
+
+    @staticmethod
+    def _close(process: subprocess.Popen) -> None:
+        """Close the pipe by which a child follows its launcher."""
+        assert process.stdin is not None
+        process.stdin.close()
+
+    def outcome(self) -> Outcome:
+        """How the children ended."""
+        unwritten = next(iter(self.unwritten), None)
+        return Outcome(tuple(self.ends), self.interrupted, self.hurried, self.stopped, self.killed, unwritten)
+
+
+def _write(line: bytes, out: Any) -> None:
+    """Write a line as it is, at once."""
+    if hasattr(out, "buffer"):
+        out.buffer.write(line)
+    else:
+        out.write(line.decode(errors="replace"))
+    out.flush()
+
+
+@contextlib.contextmanager
+def _signals_into(events: "queue.SimpleQueue[Any]") -> Iterator[None]:
+    """Context in which signals are events; one that is ignored, as by ``nohup``, stays ignored."""
+    if threading.current_thread() is not threading.main_thread():  # Python hands signals to the main thread only
+        yield
+        return
+
+    def note(number: int, frame: FrameType | None) -> None:
+        events.put(number)
+
+    usual: dict[int, Any] = {}
+    try:
+        for number in SIGNALS:
+            if signal.getsignal(number) not in (signal.SIG_IGN, None):
+                usual[number] = signal.signal(number, note)
+        if hasattr(signal, "SIGCHLD") and signal.getsignal(signal.SIGCHLD) is signal.SIG_IGN:
+            # some parents leave it ignored; then the system drops exit codes, and every child seems to end well
+            usual[signal.SIGCHLD] = signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        yield
+    finally:
+        for number, handler in usual.items():
+            signal.signal(number, handler)
+
+
+def _is_stopped(process: subprocess.Popen) -> bool:
+    """True if a child is stopped now, as by SIGSTOP; False where the system does not say."""
+    if not hasattr(os, "waitid"):
+        return False
+    try:  # nothing is taken away from the thread that waits for the end
+        return os.waitid(os.P_PID, process.pid, os.WSTOPPED | os.WNOHANG | os.WNOWAIT) is not None
+    except OSError:
+        return False
+
+
+# --- in the child ---
+
+
+def _follow(lifeline: int) -> None:
+    """End this process when the pipe ends: as on SIGTERM, which keeps what it has, and after ``GRACE`` for certain."""
+    while os.read(lifeline, 1):
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(GRACE)
+    os._exit(128 + signal.SIGTERM)
+
+
+def _main(module: str) -> None:
+    """Run a module as a script that follows its launcher."""
+    lifeline, nothing = os.dup(0), os.open(os.devnull, os.O_RDONLY)
+    os.dup2(nothing, 0)
+    os.close(nothing)
+    # the launcher sends SIGTERM; SIGINT comes from somebody who signals every process by name, the launcher among them
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_follow, args=(lifeline,), daemon=True).start()
+    runpy.run_module(module, run_name="__main__")
+
+
+if __name__ == "__main__":
+    del sys.argv[0]
+    _main(sys.argv[0])

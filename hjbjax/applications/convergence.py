@@ -30,7 +30,7 @@ from hjbjax.discretisation.schemes import Upwind
 from hjbjax.iteration.methods import Method
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import is_traced, with_suggestions
+from hjbjax.problem.pytree import front_door, is_traced
 from hjbjax.problem.types import Numbers
 from hjbjax.solution.clock import Clock, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
@@ -158,7 +158,7 @@ class Study:
         return "\n".join(line.rstrip() for line in lines)
 
 
-@with_suggestions
+@front_door
 def convergence_study(
     problem: Problem,
     grids: Sequence[Grid],

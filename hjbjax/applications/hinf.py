@@ -42,7 +42,7 @@ from hjbjax.discretisation.schemes import Weno5
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_discounted
-from hjbjax.problem.pytree import with_suggestions
+from hjbjax.problem.pytree import front_door
 from hjbjax.problem.sets import Ball, Box
 from hjbjax.solution.clock import Clock, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
@@ -70,7 +70,7 @@ class Settling:
     horizon: float
 
 
-@with_suggestions
+@front_door
 def hinf_level(
     problem_of_gamma: Callable[[float], Problem],
     grid: Grid,

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_partial, numbers, with_suggestions
+from hjbjax.problem.pytree import as_partial, front_door, numbers
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite
 from hjbjax.problem.types import Array, Number, Numbers
 from hjbjax.solution.solution import Solution
@@ -26,7 +26,7 @@ NEAR = 2e-3  # of the half width: a disturbance so near its bound sits on it
 InputMatrix: TypeAlias = Callable | Numbers | Sequence | None  # E, a number or a matrix (n, l), perhaps of the state
 
 
-@with_suggestions
+@front_door
 def attenuation(
     problem: Problem, gamma: Numbers, disturbances: AdmissibleSet, *, enters: InputMatrix = None
 ) -> Problem:
@@ -118,7 +118,7 @@ class Saturation:
         )
 
 
-@with_suggestions
+@front_door
 def saturation(solution: Solution, problem: Problem, *, inner: float = 0.5) -> Saturation:
     """How near the worst disturbance comes to its bound, which is meant to be inactive, in an inner box.
 

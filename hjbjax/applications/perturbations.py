@@ -13,7 +13,6 @@ orders are slopes of log error over log ε and log 1/γ by least squares, of err
 import dataclasses
 from collections.abc import Callable, Sequence
 
-import jax
 import numpy as np
 
 from hjbjax.applications.convergence import fitted_order
@@ -24,8 +23,9 @@ from hjbjax.discretisation.schemes import Limited
 from hjbjax.iteration.methods import Method
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import with_suggestions
+from hjbjax.problem.pytree import front_door
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Mask
 from hjbjax.solution.clock import Clock, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
@@ -104,7 +104,7 @@ class Perturbation:
         return "\n".join(lines)
 
 
-@with_suggestions
+@front_door
 def perturbation_study(
     problem: Problem,
     grid: Grid,
@@ -162,7 +162,7 @@ def perturbation_study(
     if not isinstance(disturbances, (Box, Ball)):
         raise ValueError(f"perturbation_study: the disturbances are {disturbances!r:.60}; wanted a Box or a Ball")
     # before the first solve, which may take long: E and the set of d are met by the games alone
-    with jax.enable_x64(True):
+    with own_settings(x64=True):
         checks.shapes(games[0], grid, scheme)
 
     # no raise for a perturbed one: it keeps its row and stays out of the fit

@@ -25,7 +25,8 @@ from hjbjax.markov_chain import attainability, memory, node_checks
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_partial, is_traced, with_suggestions
+from hjbjax.problem.pytree import as_partial, front_door, is_traced
+from hjbjax.problem.settings import own_settings
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solvers.finite_horizon import march
 from hjbjax.solvers.stationary import check_arguments, solve
@@ -35,7 +36,7 @@ from hjbjax.tracing.interpreter import FallbackWarning
 TOL = 1e-6  # the 1e-3 of ``solve`` would show in the third digit of a probability
 
 
-@with_suggestions
+@front_door
 def reach_probability(
     problem: Problem,
     grid: Grid,
@@ -99,7 +100,7 @@ def reach_probability(
         return _answer(question, grid, horizon, options, sign)
 
 
-@with_suggestions
+@front_door
 def stay_probability(
     problem: Problem,
     grid: Grid,
@@ -147,7 +148,7 @@ def stay_probability(
     return _affine(left, 1.0, -1.0)
 
 
-@with_suggestions
+@front_door
 def expected_exit_time(
     problem: Problem,
     grid: Grid,
@@ -280,7 +281,7 @@ def _count_staying(question: Problem, grid: Grid, options: dict) -> int:
     if is_traced(question, grid):  # values of the problem's functions are needed, which there are none of
         return 0
     method = options.get("method") or ValueIteration()  # needs the least; solve asks again for what it takes
-    with jax.enable_x64(kind == np.float64):
+    with own_settings(x64=kind == np.float64):
         memory.require(question, grid, method, kind, options.get("max_memory"))
         checks.shapes(question, grid, scheme)
         on = Discretisation(question, grid, scheme, kind)

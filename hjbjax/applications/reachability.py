@@ -19,12 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_partial, with_suggestions
+from hjbjax.problem.pytree import as_partial, front_door
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box
 from hjbjax.problem.types import Array, Control, State
 
 
-@with_suggestions
+@front_door
 def reach(
     drift: Callable,
     controls: AdmissibleSet | None,
@@ -68,7 +68,7 @@ def reach(
     )  # fmt: skip
 
 
-@with_suggestions
+@front_door
 def avoid(
     drift: Callable,
     controls: AdmissibleSet | None,
@@ -105,7 +105,7 @@ def avoid(
     )  # fmt: skip
 
 
-@with_suggestions
+@front_door
 def reach_avoid(
     drift: Callable,
     controls: AdmissibleSet | None,
@@ -146,7 +146,7 @@ def reach_avoid(
     )  # fmt: skip
 
 
-@with_suggestions
+@front_door
 def from_hj_reachability(dynamics: Any, distance: Callable, *, tube: bool = True) -> Problem:
     """The reachability problem of a ``Dynamics`` object of the package hj_reachability, by its modes.
 

@@ -15,6 +15,7 @@ import jax
 import numpy as np
 
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Mask, Nodes
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
@@ -105,7 +106,7 @@ def at_nodes_of(reference: Solution | Callable, grid: Grid, mask: Mask) -> np.nd
 
 def evaluate(function: Callable, grid: Grid, what: str, name: str = "convergence_study") -> np.ndarray:
     """A function of one state at all nodes, in float64; ``name`` is who asks, for refusals."""
-    with jax.enable_x64(True):  # the reference must not be what limits the errors seen
+    with own_settings(x64=True):  # the reference must not be what limits the errors seen
         # abstractly: a wrong shape is refused before anything is compiled
         got = jax.eval_shape(function, jax.ShapeDtypeStruct((grid.ndim,), np.float64))
         if getattr(got, "shape", None) != ():

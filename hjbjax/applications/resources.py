@@ -3,7 +3,6 @@
 import dataclasses
 import math
 
-import jax
 import numpy as np
 
 from hjbjax.discretisation.discretisation import Scheme
@@ -15,7 +14,8 @@ from hjbjax.problem import arguments
 from hjbjax.problem.arguments import INDEXABLE
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import with_suggestions
+from hjbjax.problem.pytree import front_door
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import DType
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import keeping_warnings
@@ -84,7 +84,7 @@ class Estimate:
         )
 
 
-@with_suggestions
+@front_door
 def estimate(
     problem: Problem,
     grid: Grid,
@@ -124,7 +124,7 @@ def estimate(
     chosen = choose(problem, grid, traced=False, method=method)
     if isinstance(scheme, PathScheme):
         scheme.check(problem, grid)
-        with jax.enable_x64(kind == np.float64):
+        with own_settings(x64=kind == np.float64):
             needed, programs = semi_lagrangian.estimate(grid, scheme.plan(problem, grid, kind), kind), 1
     else:
         needed, programs = memory.estimate(problem, grid, chosen.inner, kind), _programs(grid, chosen, scheme)

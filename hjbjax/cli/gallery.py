@@ -25,6 +25,7 @@ from hjbjax._version import __version__
 from hjbjax.cli import run_folder
 from hjbjax.cli.command_line import text_of
 from hjbjax.feedback.path import Path as Trajectory
+from hjbjax.problem.settings import own_settings
 from hjbjax.solution import placement
 from hjbjax.solution.solution import Solution, SolveError, Status
 from hjbjax.solution.status import SolveWarning
@@ -182,7 +183,7 @@ def _exact(entry: Entry, solution: Solution) -> list[tuple[str, str]]:
     exact = entry.exact()
     off = run_folder.difference(exact, solution)
     start = entry.initial_state(solution.grid.ndim)
-    with jax.enable_x64(True):
+    with own_settings(x64=True):
         there = float(exact(np.array(start)))
     state = ", ".join(f"{entry:g}" for entry in start)
     return [

@@ -175,8 +175,8 @@ def launch(processes: int, heartbeat: int, words: tuple[str, ...]) -> None:
     if not given["dry_run"]:
         processes_of.check_devices(given["devices"], processes)
         _check_places(out, *(given[key] for key in ("force", "checkpoint", "resume")))
-        with _one_line_error(OSError, 2, "--out: "), run_folder.staging(out):
-            pass  # it can be written
+        with _one_line_error(OSError, 2, "--out: "):
+            run_folder.check_writable(out)
     if code := processes_of.start(words, processes, heartbeat, out / FILES[0]):
         raise SystemExit(code)
 

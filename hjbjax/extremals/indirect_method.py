@@ -12,7 +12,6 @@ import dataclasses
 import itertools
 from collections.abc import Callable, Sequence
 
-import jax
 import numpy as np
 
 from hjbjax.extremals import arguments, continuation, equilibria, initial_guess, switching
@@ -21,7 +20,8 @@ from hjbjax.extremals.necessary_conditions import Extremal
 from hjbjax.hamiltonian.pointwise import rule_of
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import is_traced, pytree_dataclass, with_suggestions
+from hjbjax.problem.pytree import front_door, is_traced, pytree_dataclass
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Number, State
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
@@ -52,7 +52,7 @@ class FreeTime:
             raise ValueError(f"FreeTime: got guess = {self.guess!r}, wanted a finite number > 0")
 
 
-@with_suggestions
+@front_door
 def pontryagin(
     problem: Problem,
     x0: State | Sequence[float],
@@ -124,7 +124,7 @@ def pontryagin(
     clock = Clock()
     limits = Limits(tol, max_nodes, clock)
     # float64 whatever the session has: a residual of 1e-8 is below the rounding of float32
-    with noting_interrupts(clock), jax.enable_x64(True):
+    with noting_interrupts(clock), own_settings(x64=True):
         try:
             bvp = _pose(problem, start, horizon, terminal, guess.grid if isinstance(guess, Solution) else grid)
             arguments.check_start(bvp)

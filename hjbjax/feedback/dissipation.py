@@ -26,8 +26,9 @@ from hjbjax.feedback.path import Path, PathStatus
 from hjbjax.feedback.simulation import rollout
 from hjbjax.problem import arguments
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_partial, cast, is_traced, pytree_dataclass, with_suggestions
+from hjbjax.problem.pytree import as_partial, cast, front_door, is_traced, pytree_dataclass
 from hjbjax.problem.sets import Ball, Box, Finite
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Key, Number, Numbers, State
 from hjbjax.solution.solution import Solution
 from hjbjax.tracing import closures
@@ -97,7 +98,7 @@ class Dissipation:
         return "\n".join(lines)
 
 
-@with_suggestions
+@front_door
 def dissipation(
     problem: Problem,
     solution: Solution,
@@ -140,7 +141,7 @@ def dissipation(
     key = arguments.random_key(key, "dissipation: key")
     import diffrax  # noqa: F401  # before anything is compiled, see simulate
 
-    with jax.enable_x64(True):  # the margin is a difference of energies, near zero in the worst case
+    with own_settings(x64=True):  # the margin is a difference of energies, near zero in the worst case
         n = starts.shape[1]
         problem, solution = cast(closures.settled(problem, n), np.float64), cast(solution, np.float64)
         times = np.linspace(0.0, float(duration), STEPS + 1)

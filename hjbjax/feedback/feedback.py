@@ -25,7 +25,8 @@ from hjbjax.hamiltonian.discrete import DiscreteHamiltonian
 from hjbjax.hamiltonian.optimum import optimise
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_jax, as_partial, cast, is_traced, pytree_dataclass, with_suggestions
+from hjbjax.problem.pytree import as_jax, as_partial, cast, front_door, is_traced, pytree_dataclass
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Costate, DType, Number, Numbers, State
 from hjbjax.solution.interpolation import extended
 from hjbjax.solution.solution import Solution
@@ -193,13 +194,14 @@ class Greedy:
         """Both players' actions: float64 NumPy from concrete data, else of the tracer's dtype."""
         costate = self.solution.costate_at(*where, clamp=clamp)  # refuses what is no state
         if is_traced(costate, self):  # float64 must not be switched on in the middle of somebody's trace
-            return _minimax(as_jax(self), where, costate)
-        with jax.enable_x64(True):
+            with own_settings():
+                return _minimax(as_jax(self), where, costate)
+        with own_settings(x64=True):
             greedy, where, costate = cast((self, where, costate), np.float64)
             return jax.tree.map(np.array, _jit_minimax(greedy, where, costate))
 
 
-@with_suggestions
+@front_door
 def greedy_feedback(problem: Problem, solution: Solution) -> Greedy:
     """A feedback that minimises the Hamiltonian at the state, with the slopes of the solution's value there.
 

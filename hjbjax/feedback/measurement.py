@@ -14,6 +14,7 @@ import numpy as np
 from hjbjax.problem import arguments, sets
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import is_traced, numbers, pytree_dataclass
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Number, Numbers, State
 from hjbjax.tracing import checks, closures, indices
 
@@ -65,7 +66,7 @@ def measurement(h: Callable, n: int, noise: Numbers | Sequence, name: str, *, pe
     # as a problem's function of the state: other numbers in its closure are seen, and traced ones become leaves
     function = closures.settled(Problem(_rest, target=h), n).target
     try:
-        with jax.enable_x64(True):
+        with own_settings(x64=True):
             closed, found = jax.make_jaxpr(function, return_shape=True)(jax.ShapeDtypeStruct((n,), np.float64))
     except Exception as error:
         said = checks.refusal(error, "h(x)", {"x": (n,)})

@@ -20,18 +20,20 @@ from hjbjax.feedback.output_loop import (
     output_path,
 )
 from hjbjax.feedback.path import PathStatus
-from hjbjax.problem import arguments, streams
+from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import altered, as_partial, cast, is_traced, numbers, with_suggestions
+from hjbjax.problem.pytree import altered, as_partial, cast, front_door, is_traced, numbers
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Key, Numbers
+from hjbjax.solution.status import warn
 from hjbjax.tracing import checks, closures
 
 ROUNDING = 1e-9  # relative: a duration of 0.3 is three steps of 0.1
 MOST = 10**7  # intervals of a path: 80 MB a state
 
 
-@with_suggestions
+@front_door
 def simulate_output(
     problem: Problem,
     observer: Observer,
@@ -104,11 +106,7 @@ def simulate_output(
     if is_traced(loop, start, keys) or _sees_tracers(loop):
         start = jnp.asarray(start)
         return _paths(loop, start, jnp.asarray(times, start.dtype), keys, substeps)
-    with (
-        jax.core.eval_context(),
-        jax.enable_x64(True),
-        jax.debug_nans(False),
-    ):  # after the end of a path its controls are NaN
+    with jax.core.eval_context(), own_settings(x64=True):
         loop = cast(loop, np.float64)
         _check_shapes(loop, np.zeros(n))
         path = _jit_paths(loop, start, times, keys, substeps)
@@ -286,7 +284,7 @@ def _report(path: OutputPath) -> None:
             ends = np.atleast_2d(path.times)[codes == code, -1]
             many = f"{ends.size} of {codes.size} paths" if codes.size > 1 else "the path"
             message = ADVICE[status]
-            streams.warn(f"simulate_output: {many} {message}; the first at t = {ends.min():.6g}", stacklevel=3)
+            warn(f"simulate_output: {many} {message}; the first at t = {ends.min():.6g}", UserWarning)
 
 
 ADVICE = {

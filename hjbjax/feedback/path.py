@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from hjbjax.problem import streams
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, holds
 from hjbjax.problem.streams import encodable
 from hjbjax.problem.types import Array
+from hjbjax.solution.status import warn
 
 MANY = 1000  # internal steps, beside an eighth of those allowed: more of them tell of a feedback that jumps
 
@@ -168,7 +168,7 @@ def truncate(
     if _are_inadmissible(controls, applied):
         said.append("controls outside the problem's admissible set were applied as they are")
     if status not in (PathStatus.DURATION, PathStatus.TARGET, PathStatus.INTERRUPTED):  # that is raised
-        streams.warn(f"simulate: the path {said[0]}", UserWarning, stacklevel=3)  # at the line that calls simulate
+        warn(f"simulate: the path {said[0]}", UserWarning)
     return Path(
         times=times,
         states=states,

@@ -22,6 +22,7 @@ from hjbjax.feedback.path import Path, PathStatus
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Number, State
 from hjbjax.solution.interpolation import Samples, between, query
 from hjbjax.solution.solution import Solution
@@ -82,9 +83,9 @@ def surplus(problem: Problem, feedback: object) -> Lookup | None:
         return None
     known = not is_traced(problem, solution)
     # inside somebody's jit a constant must come out, in the precision of the solution
-    precise: Any = jax.enable_x64(np.result_type(solution.value) == np.float64) if known else contextlib.nullcontext()
+    double = np.result_type(solution.value) == np.float64 if known else None
     folded: Any = jax.ensure_compile_time_eval() if known else contextlib.nullcontext()
-    with folded, precise:
+    with folded, own_settings(x64=double):
         found = _surplus(problem, solution)
         return Lookup(solution.grid, np.asarray(found) if known else found, solution.times)
 

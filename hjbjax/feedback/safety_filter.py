@@ -18,7 +18,8 @@ import numpy as np
 from hjbjax.feedback.feedback import GridFeedback, Place, is_grid_feedback
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_partial, is_traced, pytree_dataclass, with_suggestions
+from hjbjax.problem.pytree import as_partial, front_door, is_traced, pytree_dataclass
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Number
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
@@ -40,24 +41,26 @@ class Filter:
 
     def __call__(self, *where: Place) -> jax.Array:
         """The control, shape (m,)."""
-        wanted = jnp.asarray(self.nominal(*where))
-        wanted = wanted.astype(jnp.result_type(wanted, float))  # or integers would cut off the safe action
-        acts = self.acts(*where)
-        # clamped: outside the grid the nearest point's action is a better guess than NaN, which would end a path
-        safe = jnp.asarray(self.tube.control_at(*self._arguments(where), clamp=True), wanted.dtype)
-        return jnp.where(acts, safe, wanted)
+        with own_settings():
+            wanted = jnp.asarray(self.nominal(*where))
+            wanted = wanted.astype(jnp.result_type(wanted, float))  # or integers would cut off the safe action
+            acts = self.acts(*where)
+            # clamped: outside the grid the nearest point's action is a better guess than NaN, which would end a path
+            safe = jnp.asarray(self.tube.control_at(*self._arguments(where), clamp=True), wanted.dtype)
+            return jnp.where(acts, safe, wanted)
 
     def acts(self, *where: Place) -> jax.Array:
         """True where the filter takes over."""
-        # the negation and no `>`: where V is NaN nothing is known to be safe, and the filter takes over
-        return ~(jnp.asarray(self.tube.value_at(*self._arguments(where), clamp=True)) <= -self.margin)
+        with own_settings():
+            # the negation and no `>`: where V is NaN nothing is known to be safe, and the filter takes over
+            return ~(jnp.asarray(self.tube.value_at(*self._arguments(where), clamp=True)) <= -self.margin)
 
     def _arguments(self, where: tuple[Place, ...]) -> tuple[Place, ...]:
         """The arguments of the tube's lookups: a stationary one does not want the time."""
         return where[-1:] if self.tube.times is None else where
 
 
-@with_suggestions
+@front_door
 def least_restrictive(solution: Solution, nominal: GridFeedback | Callable, *, margin: float | None = None) -> Filter:
     """A feedback that leaves the nominal control alone until the tube's boundary, and then does what is safe.
 

@@ -17,7 +17,8 @@ from hjbjax.feedback.payments import broken_promise, promise, surplus, value_at_
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_partial, cast, is_traced, with_suggestions
+from hjbjax.problem.pytree import as_partial, cast, front_door, is_traced
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Key, Number, Numbers
 from hjbjax.solution.clock import CHUNK_SECONDS, Clock, noting_interrupts
 from hjbjax.solution.status import warn
@@ -30,7 +31,7 @@ INTERVALS = 200  # of the output, where nobody says how many
 _jit_part = jax.jit(integrate_part, donate_argnames="so_far")  # the rows of all intervals are overwritten in place
 
 
-@with_suggestions
+@front_door
 def simulate(
     problem: Problem,
     feedback: Feedback,
@@ -135,11 +136,7 @@ def simulate(
     import diffrax  # noqa: F401
 
     clock = Clock()
-    with (
-        noting_interrupts(clock),
-        jax.enable_x64(True),
-        jax.debug_nans(False),
-    ):  # after the end of a path its controls are NaN
+    with noting_interrupts(clock), own_settings(x64=True):
         loop = cast(loop, np.float64)  # a solution of float32 closes the loop in float64, as the path is integrated
         check_shapes(loop, start)
         if loop.grid is not None and not _margin(loop, start) > 0:

@@ -32,8 +32,9 @@ import numpy as np
 from hjbjax.problem import arguments, sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_partial, is_traced, numbers, pytree_dataclass, with_suggestions
+from hjbjax.problem.pytree import as_partial, front_door, is_traced, numbers, pytree_dataclass
 from hjbjax.problem.sets import AdmissibleSet
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Control, Number, Numbers, State
 
 ROUNDING = 1e-12  # of the size of a generator or a diffusion: what counts as zero there
@@ -50,6 +51,7 @@ class BeliefCoordinates:
 
     basis: Any = None
 
+    @front_door
     def to_belief(self, x: State) -> jax.Array:
         """π at a state, shape (S,), entries ≥ 0 that sum to one; of states (..., S − 1) shape (..., S)."""
         x = jnp.asarray(x)
@@ -57,6 +59,7 @@ class BeliefCoordinates:
             return jnp.concatenate([x, 1 - x], axis=-1)  # no clip: on the grid x is in [0, 1]
         return jax.nn.softmax(x @ jnp.asarray(self.basis, x.dtype), axis=-1)
 
+    @front_door
     def from_belief(self, belief: Array) -> jax.Array:
         """The state of a belief, shape (S − 1,); of beliefs (..., S) shape (..., S − 1).
 
@@ -147,7 +150,7 @@ class BeliefProblem(NamedTuple):
     coordinates: BeliefCoordinates
 
 
-@with_suggestions
+@front_door
 def belief_problem(
     generator: Callable | Numbers,
     h: Callable | Numbers | Sequence,
@@ -210,7 +213,7 @@ def belief_problem(
         )
     rates, sensor = chain_functions(generator, h, measurement_noise, "belief_problem")
     chain = BeliefDynamics(BeliefCoordinates(), rates, sensor, as_partial(cost))
-    with jax.enable_x64(True):
+    with own_settings(x64=True):
         looks = _looks(controls)
         states = _check_chain(chain, looks)
         basis = None if states == 2 else _common_axes(sensor, looks, states)

@@ -29,12 +29,13 @@ from hjbjax.filtering.grid_filter import Density, GridFilter, at_ends, check_box
 from hjbjax.filtering.max_plus import refined_maximum
 from hjbjax.filtering.robust_filter import RobustGridFilter
 from hjbjax.hamiltonian import pointwise
-from hjbjax.problem import streams
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_partial, cast, is_traced, pytree_dataclass
+from hjbjax.problem.pytree import as_partial, cast, front_door, is_traced, pytree_dataclass
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Costate, Field, Number, Scalar, State
 from hjbjax.solution.solution import Solution
+from hjbjax.solution.status import warn
 from hjbjax.tracing import checks, closures
 
 
@@ -58,6 +59,7 @@ class AveragedHamiltonian:
     counts: Any
     exact: bool
 
+    @front_door
     def __call__(self, information: Density) -> Array:
         """The control, shape (m,); NaN where the law is no law."""
         self.observer.check_state(information)
@@ -72,6 +74,7 @@ class AveragedHamiltonian:
         u = pointwise.least(admissible, lambda u: self._average(weights, u), self.exact, dtype)
         return jnp.where(jnp.isfinite(jnp.sum(weights)), u, jnp.nan)
 
+    @front_door
     def average(self, information: Density, u: Array) -> Scalar:
         """⟨σ, L(·, u) + f(·, u)·DV + ½ tr(a(·, u) D²V)⟩, but for noise terms without u, in cost per unit time."""
         return self._average(self._weights(information), jnp.asarray(u, information.density.dtype))
@@ -112,30 +115,33 @@ class MinimumStress:
     value: Any
     feedback: Callable
 
+    @front_door
     def __call__(self, information: Field) -> Array:
         """The control, shape (m,)."""
         worst = self.worst_case(information)
         return jnp.asarray(self.feedback(0.0, worst), worst.dtype)
 
+    @front_door
     def worst_case(self, information: Field) -> State:
         """x̄, where p + V is largest, shape (n,), refined between the nodes."""
         return self._maximum(information)[1]
 
+    @front_door
     def stress(self, information: Field) -> Scalar:
         """The largest p + V, in the units of cost: what the record admits so far and V lets come."""
         return self._maximum(information)[0]
 
     def judge(self, path: OutputPath) -> None:
         """Warn where paths of ``simulate_output`` end with the worst case at an end of the box."""
-        with jax.enable_x64(True):
+        with own_settings(x64=True):
             find = jax.vmap(self.worst_case) if np.ndim(path.code) else self.worst_case
             states = np.atleast_2d(find(jnp.asarray(path.information)))
         if np.any(ends := np.any(at_ends(self.grid, states), axis=-1)):
-            streams.warn(
+            warn(
                 f"minimum_stress: the worst case is at an end of the box on {np.sum(ends)} of {len(ends)} paths, the "
                 f"first at {np.array2string(states[np.argmax(ends)], separator=', ')}: p + V has no maximum inside; γ "
                 "is too small for filter and feedback together, or V that of another γ, or the box too small",
-                stacklevel=3,
+                UserWarning,
             )
 
     def _maximum(self, information: Field) -> tuple[Scalar, State]:
@@ -146,6 +152,7 @@ class MinimumStress:
         return _largest(information + jnp.asarray(self.value, dtype), cast(self.grid, dtype))
 
 
+@front_door
 def certainty_equivalence(observer: Observer, feedback: GridFeedback | Callable) -> jax.tree_util.Partial:
     """A controller that takes the observer's estimate for the state, u = u*(x̂).
 
@@ -173,11 +180,13 @@ def certainty_equivalence(observer: Observer, feedback: GridFeedback | Callable)
     return jax.tree_util.Partial(_at_estimate, as_partial(observer.estimate), _stationary(feedback, name))
 
 
+@front_door
 def _at_estimate(estimate: Callable, feedback: Callable, information: Any) -> Array:
     x = jnp.asarray(estimate(information))
     return jnp.asarray(feedback(0.0, x), x.dtype)
 
 
+@front_door
 def averaged_hamiltonian(problem: Problem, solution: Solution, observer: GridFilter) -> AveragedHamiltonian:
     """A controller that minimises the Hamiltonian averaged over what the filter knows of the state.
 
@@ -243,6 +252,7 @@ def averaged_hamiltonian(problem: Problem, solution: Solution, observer: GridFil
     return AveragedHamiltonian(problem, observer, exact=exact, **found)
 
 
+@front_door
 def minimum_stress(
     observer: RobustGridFilter, solution: Solution, *, feedback: GridFeedback | Callable | None = None
 ) -> MinimumStress:
@@ -305,7 +315,7 @@ def minimum_stress(
 
 def _double(*trees: Any) -> Any:
     """float64, but not in the middle of somebody's trace."""
-    return jax.enable_x64(jnp.result_type(float) == np.float64 or not is_traced(*trees))
+    return own_settings(x64=jnp.result_type(float) == np.float64 or not is_traced(*trees))
 
 
 def _stationary(feedback: Any, name: str) -> Callable:

@@ -27,11 +27,13 @@ from hjbjax.feedback.measurement import Measurement, check_step, measurement, pl
 from hjbjax.filtering import forward_equation
 from hjbjax.filtering.forward_equation import advanced, cells
 from hjbjax.markov_chain.decision_process import refuse
-from hjbjax.problem import sets, streams
+from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import cast, is_traced, numbers, pytree_dataclass
+from hjbjax.problem.pytree import cast, front_door, is_traced, numbers, pytree_dataclass
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Control, DType, Field, Number, Numbers, State
+from hjbjax.solution.status import warn
 from hjbjax.tracing import components
 
 
@@ -87,6 +89,7 @@ class GridFilter:
     volumes: Any  # of the nodes, (*grid)
     cells: Any  # of the chain's law, (*grid)
 
+    @front_door
     def __init__(
         self,
         problem: Problem,
@@ -108,7 +111,7 @@ class GridFilter:
         system = plant(problem, grid.ndim, name)
         measured = measurement(h, grid.ndim, measurement_noise, name)
         # inside ``jit`` as well, what is known is computed here and now
-        with jax.enable_x64(True), jax.ensure_compile_time_eval():
+        with own_settings(x64=True), jax.ensure_compile_time_eval():
             on = Discretisation(*cast((system, grid), np.float64), Upwind(), np.dtype(np.float64))
             if not is_traced(system, grid):
                 _check_rates(on, name)
@@ -124,11 +127,13 @@ class GridFilter:
         for field, value in fields.items():
             object.__setattr__(self, field, value)
 
+    @front_door
     def initial(self) -> Density:
         """The law at t = 0, of likelihood one."""
         density = jnp.asarray(self.prior, jnp.result_type(float))
         return Density(density, jnp.zeros((), density.dtype))
 
+    @front_door
     def update(self, state: Density, u: Control, dy: Array, dt: Number) -> Density:
         """The law after holding the control u (m,) for dt and seeing the increment dy (p,)."""
         self.check_state(state)
@@ -148,20 +153,24 @@ class GridFilter:
         probability, after = _weighed(probability, half)
         return Density(self._density(probability), state.log_likelihood + before + after)
 
+    @front_door
     def estimate(self, state: Density) -> State:
         """The mean, shape (n,); along periodic axes the circular mean, in the box. See ``zakai``."""
         return forward_equation.mean(self.grid, self.probability(state))
 
+    @front_door
     def covariance(self, state: Density) -> jax.Array:
         """The covariance about the estimate, shape (n, n)."""
         return forward_equation.covariance(self.grid, self.probability(state))
 
+    @front_door
     def probability(self, state: Density) -> Field:
         """The probability of each node of the chain, shape (*grid), of sum 1: the density times the node's cell."""
         self.check_state(state)
         mass = state.density * jnp.asarray(self.cells, state.density.dtype)
         return mass / jnp.sum(mass)
 
+    @front_door
     def mode(self, state: Density) -> State:
         """The node at which the density is largest, shape (n,)."""
         return forward_equation.mode(self.grid, state.density)
@@ -193,11 +202,11 @@ def warn_at_ends(name: str, grid: Grid, places: Array, dt: float, what: str) -> 
     if not np.any(off := at_ends(grid, places)):
         return
     *_, step, axis = np.argwhere(off)[np.argmin(np.argwhere(off)[:, -2])]
-    streams.warn(
+    warn(
         f"{name}: {what} lies at an end of the box of axis {axis} after {np.sum(np.any(off, axis=-1))} of "
         f"{off[..., 0].size} measurements, the first at t = {(step + 1) * dt:.6g}: beyond it nothing is known; if the "
         "state can leave the box take a larger one, else there is none to heed",
-        stacklevel=3,
+        UserWarning,
     )
 
 

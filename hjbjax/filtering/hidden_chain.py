@@ -21,7 +21,8 @@ import numpy as np
 from hjbjax.feedback.measurement import check_length, check_vector
 from hjbjax.filtering.beliefs import Sensor, chain_functions, check_generator
 from hjbjax.problem import arguments
-from hjbjax.problem.pytree import as_jax, as_partial, cast, is_traced, numbers, pytree_dataclass, with_suggestions
+from hjbjax.problem.pytree import as_jax, as_partial, cast, front_door, is_traced, numbers, pytree_dataclass
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Control, Key, Number, Numbers
 
 TERMS = 19  # of the Taylor series: 1/19! is below the rounding of float64 where q dt ≤ 1
@@ -87,6 +88,7 @@ class WonhamFilter:
     sensor: Sensor
     prior: Any
 
+    @front_door
     def __init__(
         self,
         generator: Callable | Numbers,
@@ -110,11 +112,13 @@ class WonhamFilter:
         for name, value in {"generator": fixed, "sensor": sensor, "prior": law}.items():
             object.__setattr__(self, name, value)
 
+    @front_door
     def initial(self) -> jax.Array:
         """The prior, shape (S,), sum one."""
         law = jnp.asarray(self.prior, jnp.result_type(float))
         return law / jnp.sum(law)
 
+    @front_door
     def update(self, state: Array, u: Control, dy: Array, dt: Number) -> jax.Array:
         """π after holding the control u, shape (m,), for a time dt and seeing the increment dy, shape (p,)."""
         check_vector(state, "WonhamFilter.update: the belief", len(self.prior), "one entry a state")
@@ -140,6 +144,7 @@ class WonhamFilter:
         belief = belief @ half
         return belief / jnp.sum(belief)  # the factor e^{top} goes with the norm
 
+    @front_door
     def estimate(self, state: Array) -> jax.Array:
         """The conditional mean of the indicator of the hidden state: π, shape (S,)."""
         return jnp.asarray(state)
@@ -187,7 +192,7 @@ def _check_shapes(generator: Any, h: Any, sensor: Sensor, states: int) -> None:
     sensor.check("WonhamFilter", np.zeros(0))
 
 
-@with_suggestions
+@front_door
 def simulate_hidden(
     observer: WonhamFilter,
     control: Callable | None,
@@ -245,7 +250,7 @@ def simulate_hidden(
     steps = int(np.ceil(duration / dt * (1 - 1e-9)))
     keys = arguments.random_key(key, "simulate_hidden: key", batch=True)
     # float64: over thousands of steps beliefs near a corner would be rounding
-    with jax.enable_x64(True):
+    with own_settings(x64=True):
         law = np.asarray(observer.prior) if start is None else np.eye(states)[start]
         loop = cast(_Loop(observer, as_partial(control or _nothing), as_partial(cost), float(discount)), np.float64)
         _check_loop(loop, states)

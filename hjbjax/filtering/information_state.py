@@ -19,7 +19,8 @@ from hjbjax.filtering.forward_equation import MOST, substeps
 from hjbjax.filtering.grid_filter import Density, GridFilter, warn_at_ends
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_jax, cast, is_traced, pytree_dataclass, with_suggestions
+from hjbjax.problem.pytree import as_jax, cast, front_door, is_traced, pytree_dataclass
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Number, Numbers
 
 
@@ -42,7 +43,7 @@ class InformationState:
     log_likelihood: Any
 
 
-@with_suggestions
+@front_door
 def zakai(
     problem: Problem,
     h: Callable,
@@ -111,7 +112,7 @@ def zakai(
         count = _substeps(observer, record, acts, dt)
         return run(as_jax(observer), record, acts, dt, bool(normalised), None if is_traced(count) else int(count))
     # inside somebody's ``jit`` as well, what is known is computed here and now
-    with jax.core.eval_context(), jax.enable_x64(True):
+    with jax.core.eval_context(), own_settings(x64=True):
         answer = run(*cast((observer, record, acts, dt), np.float64), bool(normalised))
         found = jax.tree.map(np.asarray, answer)
     bad = ~np.isfinite(found.mean[..., 0])

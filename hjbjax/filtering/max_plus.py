@@ -29,7 +29,8 @@ from hjbjax.discretisation import stencil
 from hjbjax.discretisation.discretisation import Differences, Discretisation
 from hjbjax.iteration.time_methods import TABLEAUX
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.pytree import cast, is_traced, numbers, pytree_dataclass
+from hjbjax.problem.pytree import cast, front_door, is_traced, numbers, pytree_dataclass
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Field, Nodes, Number, Scalar
 
 MOST = (
@@ -115,6 +116,7 @@ class MaxPlusMarch:
         return p, count
 
 
+@front_door
 def sup_pairing(p: Nodes, psi: Nodes | float, grid: Grid) -> tuple[Array, Array]:
     """The maximum of p + ψ over the box and the state where it is attained: the max-plus inner product (p, ψ).
 
@@ -160,7 +162,7 @@ def sup_pairing(p: Nodes, psi: Nodes | float, grid: Grid) -> tuple[Array, Array]
     total = given["p"] + given["psi"]
     if is_traced(total, grid):
         return refined_maximum(jnp.asarray(total), grid)
-    with jax.enable_x64(True):
+    with own_settings(x64=True):
         value, state = _refined_maximum(jnp.asarray(total), cast(grid, np.float64))
         return np.asarray(value), np.asarray(state)
 

@@ -29,7 +29,8 @@ import numpy as np
 from hjbjax.feedback.measurement import Measurement, check_step, check_vector, measurement, plant
 from hjbjax.feedback.output_loop import Observer
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_partial, is_traced, numbers, pytree_dataclass
+from hjbjax.problem.pytree import as_partial, front_door, is_traced, numbers, pytree_dataclass
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Control, Number, Numbers, State
 
 __all__ = ["ExtendedKalman", "Gaussian", "Luenberger", "Observer", "affine_flow"]
@@ -94,6 +95,7 @@ class ExtendedKalman:
     mean: Any
     covariance: Any
 
+    @front_door
     def __init__(
         self,
         problem: Problem,
@@ -115,11 +117,13 @@ class ExtendedKalman:
         for field, value in fields.items():
             object.__setattr__(self, field, value)  # frozen, as what is compiled for it knows it
 
+    @front_door
     def initial(self) -> Gaussian:
         """The law at t = 0."""
         mean = jnp.asarray(self.mean, jnp.result_type(float))
         return Gaussian(mean, jnp.asarray(self.covariance, mean.dtype))
 
+    @front_door
     def update(self, state: Gaussian, u: Control, dy: Array, dt: Number) -> Gaussian:
         """The law after holding the control u (m,) for dt and seeing the increment dy (p,)."""
         mean, p = state.mean, self.measurement.dim
@@ -146,6 +150,7 @@ class ExtendedKalman:
         covariance = keep @ joint @ keep.T
         return Gaussian(mean + shift[:n] + gain @ innovation, (covariance + covariance.T) / 2)
 
+    @front_door
     def estimate(self, state: Gaussian) -> State:
         """The mean, shape (n,)."""
         return state.mean
@@ -183,6 +188,7 @@ class Luenberger:
     gain: Any
     start: Any
 
+    @front_door
     def __init__(
         self, problem: Problem, h: Callable, gain: Callable | Numbers | Sequence, start: Numbers | Sequence[float]
     ):
@@ -198,10 +204,12 @@ class Luenberger:
         for field, value in fields.items():
             object.__setattr__(self, field, value)
 
+    @front_door
     def initial(self) -> State:
         """x̂ at t = 0, shape (n,)."""
         return jnp.asarray(self.start, jnp.result_type(float))
 
+    @front_door
     def update(self, state: State, u: Control, dy: Array, dt: Number) -> State:
         """x̂ after holding the control u (m,) for dt and seeing the increment dy (p,)."""
         check_vector(state, "Luenberger.update: the estimate", len(self.start), "one entry a state")
@@ -217,6 +225,7 @@ class Luenberger:
         _, shift, _ = affine_flow(jax.jacfwd(rate)(state), rate(state), jnp.zeros((n, n), dtype), dt, states=n)
         return state + shift
 
+    @front_door
     def estimate(self, state: State) -> State:
         """x̂ itself."""
         return state
@@ -297,7 +306,7 @@ def _gain(given: Callable | Numbers | Sequence, wanted: tuple[int, int], name: s
     """G as a matrix or as a function of the estimate that returns one."""
     if callable(given):
         function: Any = as_partial(given, f"{name}: gain")
-        with jax.enable_x64(True):
+        with own_settings(x64=True):
             shape = jax.eval_shape(lambda x: jnp.asarray(function(x)), np.zeros(wanted[0])).shape
     else:
         function = numbers(given, f"{name}: gain")

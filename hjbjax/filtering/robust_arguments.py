@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -11,6 +10,7 @@ from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import cast, is_traced, numbers
+from hjbjax.problem.settings import own_settings
 from hjbjax.tracing import checks, components
 
 
@@ -47,7 +47,7 @@ def initial_values(initial: Any, grid: Grid) -> Any:
     """p₀ at the nodes, refused where it is not finite."""
     values: Any
     if callable(initial):
-        with jax.enable_x64(True):
+        with own_settings(x64=True):
             x = cast(grid, np.float64).components(np.float64)
             values = components.scalar(initial, x, dtype=np.dtype(np.float64))
             values = jnp.broadcast_to(values, grid.shape)

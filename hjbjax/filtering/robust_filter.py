@@ -37,7 +37,8 @@ from hjbjax.filtering.max_plus import MOST, MaxPlusMarch, refined_maximum
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_jax, cast, is_traced, pytree_dataclass, with_suggestions
+from hjbjax.problem.pytree import as_jax, cast, front_door, is_traced, pytree_dataclass
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Control, Field, Nodes, Number, Numbers, State
 from hjbjax.tracing import components
 from hjbjax.tracing.closures import settled
@@ -104,6 +105,7 @@ class RobustGridFilter:
     sigma: Any
     scheme: Scheme
 
+    @front_door
     def __init__(
         self,
         problem: Problem,
@@ -120,7 +122,7 @@ class RobustGridFilter:
         arguments.positive(gamma, "robust_filter: gamma")
         measured = measurement(h, grid.ndim, measurement_noise, "robust_filter")
         if not is_traced(measured, grid):
-            with jax.enable_x64(True), jax.ensure_compile_time_eval():
+            with own_settings(x64=True), jax.ensure_compile_time_eval():
                 signal(Discretisation(problem, grid, scheme, np.dtype(np.float64)), measured, "robust_filter")
         fields = {
             "problem": problem,
@@ -134,10 +136,12 @@ class RobustGridFilter:
         for name, value in fields.items():
             object.__setattr__(self, name, value)
 
+    @front_door
     def initial(self) -> Field:
         """p₀ at the nodes, shape (*grid)."""
         return jnp.asarray(self.p0, jnp.result_type(float))
 
+    @front_door
     def update(self, state: Field, u: Control, dy: Array, dt: Number) -> Field:
         """p after holding the control u, shape (m,), for a time dt, over which y = dy/dt was seen, dy (p,)."""
         self._check_state(state)
@@ -146,6 +150,7 @@ class RobustGridFilter:
         # compiled even where the caller does not: a loop whose body is new would be compiled at every call
         return _after(as_jax(self), state, jnp.asarray(u, dtype), jnp.asarray(dy, dtype) / dt, dt)[0]
 
+    @front_door
     def estimate(self, state: Field) -> State:
         """The worst case: the state where p is largest, shape (n,), refined between the nodes."""
         self._check_state(state)
@@ -180,7 +185,7 @@ class RobustGridFilter:
 _after, _largest = jax.jit(RobustGridFilter._after), jax.jit(refined_maximum)
 
 
-@with_suggestions
+@front_door
 def robust_filter(
     problem: Problem,
     h: Callable,
@@ -251,7 +256,7 @@ def robust_filter(
     if is_traced(asked, observer.measurement, grid, y, dt, observer.p0, gamma, controls, sigma):
         return _transformed(observer, jnp.asarray(y), jnp.asarray(controls), dt)
     # inside somebody's ``jit`` a record of known numbers is filtered at once
-    with jax.core.eval_context(), jax.enable_x64(True):
+    with jax.core.eval_context(), own_settings(x64=True):
         found, steps = _scan_compiled(*cast((observer, y, controls, float(dt)), np.float64))
         found = jax.tree.map(np.asarray, found)
     if not np.all(np.isfinite(found.p)):

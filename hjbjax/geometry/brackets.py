@@ -18,7 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem import arguments
-from hjbjax.problem.pytree import as_partial, cast, is_traced, pytree_dataclass, with_suggestions
+from hjbjax.problem.pytree import as_partial, cast, front_door, is_traced, pytree_dataclass
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Control, DType, Number, State
 from hjbjax.tracing import checks
 
@@ -27,7 +28,7 @@ T = TypeVar("T")
 Field: TypeAlias = Callable[[State], State]
 
 
-@with_suggestions
+@front_door
 def lie_derivative(f: Field, h: Callable) -> Callable:
     """L_f h, the rate of h along f, as a function of one state.
 
@@ -43,12 +44,13 @@ def lie_derivative(f: Field, h: Callable) -> Callable:
 
     def derivative(x):
         # forward mode, one pass through h whatever its shape: its Jacobian is never formed
-        return jax.jvp(in_state_dtype(h), (as_state(x),), (velocity(f)(as_state(x)),))[1]
+        with own_settings():
+            return jax.jvp(in_state_dtype(h), (as_state(x),), (velocity(f)(as_state(x)),))[1]
 
     return derivative
 
 
-@with_suggestions
+@front_door
 def lie_bracket(f: Field, g: Field) -> Field:
     """[f, g] = (∂g/∂x) f − (∂f/∂x) g, the sign of (4.4), as a function of one state.
 
@@ -63,14 +65,15 @@ def lie_bracket(f: Field, g: Field) -> Field:
     """
 
     def bracket(x):
-        # two directional derivatives in place of two n × n Jacobians
-        change = jax.jvp(velocity(g), (as_state(x),), (velocity(f)(as_state(x)),))[1]
-        return change - jax.jvp(velocity(f), (as_state(x),), (velocity(g)(as_state(x)),))[1]
+        # two directional derivatives instead of two n × n Jacobians
+        with own_settings():
+            change = jax.jvp(velocity(g), (as_state(x),), (velocity(f)(as_state(x)),))[1]
+            return change - jax.jvp(velocity(f), (as_state(x),), (velocity(g)(as_state(x)),))[1]
 
     return bracket
 
 
-@with_suggestions
+@front_door
 def ad(f: Field, g: Field, k: int) -> Field:
     """ad_f^k g, the k-fold bracket [f, [f, … [f, g]]], as a function of one state.
 
@@ -95,7 +98,7 @@ def ad(f: Field, g: Field, k: int) -> Field:
     return g
 
 
-@with_suggestions
+@front_door
 def affine_fields(drift: Callable, inputs: int) -> tuple[Field, Sequence[Field]]:
     """The fields f and g_1, …, g_m of a drift f(x) + Σ g_j(x) u_j, such as ``Problem.drift``.
 
@@ -122,12 +125,13 @@ class _Affine:
     j: int | None
 
     def __call__(self, x):
-        x = as_state(x)
-        zero = jnp.zeros(self.inputs, x.dtype)
-        if self.j is None:
-            return self.drift(x, zero)
-        # a derivative, exact for an affine drift: f(x, e_j) − f(x, 0) would lose g_j to rounding beside a large f(x, 0)
-        return jax.jvp(functools.partial(self.drift, x), (zero,), (zero.at[self.j].set(1),))[1]
+        with own_settings():
+            x = as_state(x)
+            zero = jnp.zeros(self.inputs, x.dtype)
+            if self.j is None:
+                return self.drift(x, zero)
+            # a derivative, exact for an affine drift: f(x, e_j) − f(x, 0) would lose g_j to rounding in a large f(x, 0)
+            return jax.jvp(functools.partial(self.drift, x), (zero,), (zero.at[self.j].set(1),))[1]
 
 
 def along(function: Callable[[State], T], x: State, directions: Array) -> tuple[T, T]:
@@ -197,7 +201,7 @@ def decide(
         allowed = default(x.dtype) if tolerance is None else tolerance
         return judge(derive(functions, x, allowed, **static), x, allowed)
     # float64 whatever the session has: in float32 √eps is 3.5e-4, and that would decide ranks
-    with jax.enable_x64(True):
+    with own_settings(x64=True):
         state = np.asarray(x, np.float64)
         if state.ndim != 1 or not np.all(np.isfinite(state)):
             raise ValueError(f"got x = {x!r}, wanted finite numbers of shape (n,): one state")

@@ -21,7 +21,7 @@ import numpy as np
 from hjbjax.geometry.brackets import Field, along, as_fields, as_pytree, decide, stack_fields, stack_outputs
 from hjbjax.geometry.scaling import balance, with_terms, without_rounding
 from hjbjax.problem import arguments
-from hjbjax.problem.pytree import is_traced, pytree_dataclass, with_suggestions
+from hjbjax.problem.pytree import front_door, is_traced, pytree_dataclass
 from hjbjax.problem.types import Array, Number, State
 
 Generations: TypeAlias = tuple[Sequence[Array], Sequence[Array]]  # vectors of each, (members, n), and their terms
@@ -45,18 +45,21 @@ class Distribution:
     tolerance: Number
 
     @property
+    @front_door
     def counted(self) -> Array:
         """A mask of the singular values that count towards the rank, shape (min(n, p),)."""
         # strictly above, so that fields that all vanish have rank 0
         return self.singular_values > self.tolerance * self.singular_values[0]
 
     @property
+    @front_door
     def rank(self) -> int | jax.Array:
         """The number of singular values that count; an int outside of a trace."""
         rank = self.counted.sum()
         return rank if is_traced(rank) else int(rank)
 
     @property
+    @front_door
     def basis(self) -> Array:
         """An orthonormal basis in columns, shape (n, rank); under a tracer all directions, with zeros past the rank."""
         # a traced rank is no shape, and a projection B Bᵀ is the same with columns of zeros
@@ -65,11 +68,13 @@ class Distribution:
         return self.directions[:, : self.rank]
 
     @property
+    @front_door
     def margin(self) -> Number:
         """The smallest singular value that counts over the largest; compare with ``tolerance``."""
         return self._largest_ratio(jnp.where(self.counted, self.singular_values, jnp.inf).min())
 
     @property
+    @front_door
     def residue(self) -> Number:
         """The largest singular value that does not count over the largest; compare with ``tolerance``."""
         return self._largest_ratio(jnp.where(self.counted, 0.0, self.singular_values).max())
@@ -82,7 +87,7 @@ class Distribution:
         return ratio if is_traced(ratio) else float(ratio)
 
 
-@with_suggestions
+@front_door
 def reachability_distribution(
     f: Field | None,
     gs: Field | Sequence[Field],
@@ -123,7 +128,7 @@ def reachability_distribution(
     return decide(_reach, _span_of_generations, fields, x, tolerance, depth=int(depth))
 
 
-@with_suggestions
+@front_door
 def observability_codistribution(
     f: Field | None,
     gs: Field | Sequence[Field],

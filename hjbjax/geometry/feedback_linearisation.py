@@ -36,7 +36,8 @@ from hjbjax.geometry.brackets import (
 )
 from hjbjax.geometry.scaling import balance, with_terms
 from hjbjax.problem import arguments
-from hjbjax.problem.pytree import is_traced, pytree_dataclass, with_suggestions
+from hjbjax.problem.pytree import front_door, is_traced, pytree_dataclass
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Control, DType, Number, State
 
 
@@ -62,16 +63,19 @@ class RelativeDegree:
     states: int
 
     @property
+    @front_door
     def defined(self) -> bool | jax.Array:
         """Whether inputs reach every output, and no combination of the outputs loses them at the state."""
         return as_bool((self.margin > self.tolerance) & jnp.all(jnp.asarray(self.degrees) > 0))
 
     @property
+    @front_door
     def degree(self) -> int | None:
         """Σ r_i, the number of states that the outputs govern; ``None`` where it is not defined."""
         return int(np.sum(self.degrees)) if self.defined else None
 
     @property
+    @front_door
     def message(self) -> str:
         """The verdict in words; it names the zero dynamics where there are any."""
         degrees = np.asarray(self.degrees)
@@ -104,27 +108,32 @@ class Linearisation:
 
     def alpha(self, x: State) -> Control:
         """α(x) = −β (L_f^{r_i} h_i), shape (m,)."""
-        last, matrix, _ = self._ladder(as_state(x))
-        return -jnp.linalg.solve(matrix, last)  # more accurate than β times L_f^r h
+        with own_settings():
+            last, matrix, _ = self._ladder(as_state(x))
+            return -jnp.linalg.solve(matrix, last)  # more accurate than β times L_f^r h
 
     def beta(self, x: State) -> jax.Array:
         """β(x), the inverse of the matrix of L_{g_j} L_f^{r_i − 1} h_i, shape (m, m)."""
-        return jnp.linalg.inv(self._ladder(as_state(x))[1])
+        with own_settings():
+            return jnp.linalg.inv(self._ladder(as_state(x))[1])
 
     def coordinates(self, x: State) -> jax.Array:
         """ξ = (h_1, L_f h_1, …, L_f^{r_1 − 1} h_1, h_2, …), shape (Σ r_i,): all coordinates where Σ r_i = n."""
-        return self._ladder(as_state(x))[2]
+        with own_settings():
+            return self._ladder(as_state(x))[2]
 
     def control(self, x: State, v: Array) -> Control:
         """α(x) + β(x) v, shape (m,)."""
-        last, matrix, _ = self._ladder(as_state(x))
-        return jnp.linalg.solve(matrix, v - last)  # from ξ^(r) = L_f^r h + (L_g L_f^{r−1} h) u = v
+        with own_settings():
+            last, matrix, _ = self._ladder(as_state(x))
+            return jnp.linalg.solve(matrix, v - last)  # from ξ^(r) = L_f^r h + (L_g L_f^{r−1} h) u = v
 
     def zero_dynamics(self, x: State) -> State:
         """f + g α, shape (n,): it keeps {ξ = 0}, and what it does there is the zero dynamics."""
-        x = as_state(x)
-        f, *gs = stack_fields(self.fields)(x)
-        return f + jnp.stack(gs).T @ self.alpha(x)
+        with own_settings():
+            x = as_state(x)
+            f, *gs = stack_fields(self.fields)(x)
+            return f + jnp.stack(gs).T @ self.alpha(x)
 
     def zero_spectrum(self, x: State | Sequence[float]) -> np.ndarray:
         """The eigenvalues of the zero dynamics at a rest point with ξ = 0, shape (n − r,); host level.
@@ -134,7 +143,7 @@ class Linearisation:
         Raises:
           ValueError: x is no such rest point.
         """
-        with jax.enable_x64(True):
+        with own_settings(x64=True):
             x = jnp.asarray(x, float)
             size = float(jnp.max(jnp.abs(self.coordinates(x)), initial=0) + jnp.max(jnp.abs(self.zero_dynamics(x))))
             # ``not <`` refuses NaN as well
@@ -149,7 +158,8 @@ class Linearisation:
 
     def message(self, states: int) -> str:
         """The relative degree out of ``states`` in words; it names the zero dynamics where there are any."""
-        return _verdict(self._known_degrees(states, float), states)
+        with own_settings():
+            return _verdict(self._known_degrees(states, float), states)
 
     def _ladder(self, x: State) -> tuple[jax.Array, jax.Array, jax.Array]:
         """L_f^{r_i} h_i, the decoupling matrix, and ξ."""
@@ -181,7 +191,7 @@ class Linearisation:
             return _degrees_or_refuse(_deepen(rule, states), "the origin")
 
 
-@with_suggestions
+@front_door
 def relative_degree(
     f: Field,
     g: Field | Sequence[Field],
@@ -230,7 +240,7 @@ def relative_degree(
     return rule(states) if is_traced(functions, x, tolerance) else _deepen(rule, states)
 
 
-@with_suggestions
+@front_door
 def linearising_feedback(
     f: Field, g: Field | Sequence[Field], h: Callable, x: State | Sequence[float] | None = None
 ) -> Linearisation:

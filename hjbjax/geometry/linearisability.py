@@ -31,7 +31,7 @@ from hjbjax.geometry.brackets import (
 from hjbjax.geometry.distributions import Distribution, span
 from hjbjax.geometry.scaling import ROUNDING, balance, with_terms, without_rounding
 from hjbjax.problem import arguments
-from hjbjax.problem.pytree import is_traced, pytree_dataclass, with_suggestions
+from hjbjax.problem.pytree import front_door, is_traced, pytree_dataclass
 from hjbjax.problem.types import Array, Number, State
 
 Ladders: TypeAlias = tuple[tuple[Array, Array], tuple[Array, Array]]  # members and slopes, and the terms of both
@@ -58,16 +58,19 @@ class Linearisability:
     tolerance: Number
 
     @property
+    @front_door
     def independent(self) -> bool | jax.Array:
         """The first condition: G_{n−1} has dimension n; with one input, {ad_f^k g, k ≤ n − 1} is independent."""
         return as_bool(self.independence > self.tolerance)
 
     @property
+    @front_door
     def involutive(self) -> bool | jax.Array:
         """The second condition: G_k is involutive, k ≤ n − 2."""
         return as_bool(self.involutivity <= self.tolerance)
 
     @property
+    @front_door
     def linearisable(self) -> bool | jax.Array:
         """Whether the system is independent, involutive and regular."""
         # with & on arrays: ``and`` would ask a tracer for its truth
@@ -76,7 +79,7 @@ class Linearisability:
         )
 
 
-@with_suggestions
+@front_door
 def is_feedback_linearisable(
     f: Field,
     g: Field | Sequence[Field],

@@ -17,8 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.geometry.unit_cube import half_widths, nearest_inside, state_of, time_of
-from hjbjax.problem.pytree import cast, pytree_dataclass, with_suggestions
+from hjbjax.problem.pytree import cast, front_door, pytree_dataclass
 from hjbjax.problem.sets import Ball, Box
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.streams import encodable
 from hjbjax.problem.types import Array, Number, State
 from hjbjax.tracing import checks
@@ -76,7 +77,7 @@ class LyapunovReport:
         return f"no violation found at {self.evaluations:,} points; the search proves nothing"
 
 
-@with_suggestions
+@front_door
 def lyapunov_derivative(V: Callable, f: Callable, *, time_varying: bool = False) -> Callable:
     """dV/dt along ẋ = f, a function of ``(x)``, or of ``(t, x)`` as V and f then are.
 
@@ -94,11 +95,11 @@ def lyapunov_derivative(V: Callable, f: Callable, *, time_varying: bool = False)
     """
     # one jvp along (1, f): ∂V/∂t and (∂V/∂x) f together
     if time_varying:
-        return lambda t, x: jax.jvp(V, (t, x), (jnp.ones_like(t), f(t, x)))[1]
-    return lambda x: jax.jvp(V, (x,), (f(x),))[1]
+        return own_settings()(lambda t, x: jax.jvp(V, (t, x), (jnp.ones_like(t), f(t, x)))[1])
+    return own_settings()(lambda x: jax.jvp(V, (x,), (f(x),))[1])
 
 
-@with_suggestions
+@front_door
 def lyapunov_check(
     V: Callable,
     f: Callable,
@@ -153,7 +154,7 @@ def lyapunov_check(
     checks.function_of(V, "V", (), **fed)
     checks.function_of(f, "f", rest.shape, **fed)
     # float64 whatever the session has: the default tolerance of 1e-9 is below the rounding of float32
-    with jax.enable_x64(True):
+    with own_settings(x64=True):
         place = cast((region, rest, span_of_times), np.float64)
         _check_inside(place[0], rest)
         starts = _starts(region.dim + (times is not None), int(samples))

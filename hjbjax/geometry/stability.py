@@ -19,7 +19,7 @@ from hjbjax.geometry.brackets import Field, as_fields, decide, near, stack_field
 from hjbjax.geometry.distributions import Distribution, span
 from hjbjax.geometry.lyapunov import LyapunovReport, lyapunov_check, lyapunov_derivative
 from hjbjax.geometry.scaling import balance, with_terms, without_rounding
-from hjbjax.problem.pytree import pytree_dataclass, with_suggestions
+from hjbjax.problem.pytree import front_door, pytree_dataclass
 from hjbjax.problem.types import Array, Number, State
 
 __all__ = ["BrockettVerdict", "LyapunovReport", "brockett_check", "lyapunov_check", "lyapunov_derivative"]
@@ -42,7 +42,7 @@ class BrockettVerdict:
     message: str
 
 
-@with_suggestions
+@front_door
 def brockett_check(
     f: Field | None, gs: Field | Sequence[Field], x: State | Sequence[float], *, tolerance: Number | None = None
 ) -> BrockettVerdict:

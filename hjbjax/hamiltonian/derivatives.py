@@ -18,6 +18,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hjbjax.problem.settings import own_settings
+
 
 def with_both_modes(forward: Callable[[Any], Any], backward: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """The function of a pytree that ``forward`` computes, with reverse derivatives of ``backward``.
@@ -41,6 +43,7 @@ def with_both_modes(forward: Callable[[Any], Any], backward: Callable[[Any], Any
         return forward(arguments)
 
     @function.defjvp
+    @own_settings()
     def tangent(primals: Any, tangents: Any) -> Any:
         leaves, structure = jax.tree.flatten(primals[0])
         moves = jax.tree.leaves(tangents[0])
@@ -70,9 +73,13 @@ def with_both_modes(forward: Callable[[Any], Any], backward: Callable[[Any], Any
 def _product(forward: Callable, backward: Callable, numbers: list, moves: list) -> list:
     """L a for a = ``moves``: by forward mode of one program, transposed by reverse mode of the other."""
 
+    # One program each, also under a ``grad`` without ``jit``. The caller's checks for infinity then see the derivative
+    # and not the bounds inside an integrator.
+    @jax.jit
     def push(move: list) -> list:
         return jax.jvp(forward, (numbers,), (move,))[1]
 
+    @jax.jit
     def pull(weights: list) -> list:
         return jax.vjp(backward, numbers)[1](weights)[0]
 

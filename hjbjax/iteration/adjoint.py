@@ -33,6 +33,7 @@ from hjbjax.iteration.evaluation import Evaluation, Krylov, direct, evaluate, le
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import pytree_dataclass
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Field, Number, Scalar
 
 Map: TypeAlias = Callable[[Field], Field]  # of node values
@@ -116,6 +117,7 @@ def _solution(
 
 
 @_solution.defjvp
+@own_settings()
 def _solution_tangent(primals: Any, tangents: Any) -> tuple[Field, Field]:
     """The value, and its tangent by one linear solve; transposed, by one transposed solve."""
     value, question, policy, equation, evaluation = primals
@@ -159,6 +161,7 @@ def _moving(policy: Greedy, on: Discretisation, value: Field, task: Task) -> Gre
 
 
 @_moving.defjvp
+@own_settings()
 def _moving_tangent(primals: Any, tangents: Any) -> tuple[Greedy, Greedy]:
     """The policy, and its tangent at the nodes where an action is taken."""
     policy, on, value, task = primals

@@ -15,6 +15,7 @@ from hjbjax.iteration import bellman
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import DType, Mask
 
 
@@ -32,7 +33,7 @@ def values(problem: Problem, grid: Grid, dtype: DType, t: float = 0.0) -> None:
     """
     if not grid.sides("constrained"):
         return
-    with jax.enable_x64(True):
+    with own_settings(x64=True):
         # the chain's scheme whatever the user's: which actions an end rules out depends on the drift alone
         stuck = np.asarray(_without_action(Discretisation(problem, grid, Upwind(), np.dtype(dtype), t)))
     if not stuck.any():

@@ -20,6 +20,7 @@ from hjbjax.markov_chain import decision_process, stationary_law
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import cast
+from hjbjax.problem.settings import own_settings
 from hjbjax.tracing.closures import with_settled_functions
 
 
@@ -129,7 +130,7 @@ def stationary_density(
     moves = stencil.sparse(jumps.offsets, jumps.values, -jumps.total(), grid)
     probabilities = decision_process.single_law(stationary_law.classes(moves), moves, grid)
     u, d, _ = decision_process.policies(problem, grid, policy, disturbance)
-    with jax.enable_x64(True):
+    with own_settings(x64=True):
         on = Discretisation(*cast((problem, grid), np.float64), scheme, np.dtype(np.float64), t)
         noise = on.diffusion(*cast((u, d), np.float64))
         density = probabilities.reshape(grid.shape) / grid.volumes()
@@ -175,7 +176,7 @@ def transition_arrays(
         _checked(Discretisation(problem, grid, scheme, np.float64), list(action), None, ~held, np.finfo(np.float64).eps)
         for action in actions
     )
-    with jax.enable_x64(True):
+    with own_settings(x64=True):
         cut = links(Discretisation(*cast((problem, grid), np.float64), scheme, np.dtype(np.float64)))
         surcharge = decision_process.surcharge(cut, given, grid)
     tables = (
@@ -212,7 +213,7 @@ def _checked(
             "chain: a grid with open ends has no chain: a value that is continued from inside makes negative "
             "probabilities; choose edges='projected' or 'constrained'"
         )
-    with jax.enable_x64(True):
+    with own_settings(x64=True):
         jumps, cost, lacking, leaving = jax.device_get(_evaluate(*cast((on, u, d), np.float64), eps))
     decision_process.refuse("the running cost is not finite", active & ~np.isfinite(cost), grid)
     decision_process.refuse(

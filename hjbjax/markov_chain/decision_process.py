@@ -19,6 +19,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_constrained
 from hjbjax.problem.pytree import is_traced
 from hjbjax.problem.sets import AdmissibleSet, Finite
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Mask
 
 if TYPE_CHECKING:
@@ -83,7 +84,7 @@ def single_law(classes: list[np.ndarray], generator: "csr_array", grid: Grid) ->
 def target(problem: Problem, grid: Grid, t: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """The nodes on the target, bool, and the exit cost; both (*grid)."""
     # in double precision whatever the session's: an export is read by others, who solve in double
-    with jax.enable_x64(True):
+    with own_settings(x64=True):
         on = Discretisation(problem, grid, Upwind(), np.dtype(np.float64), t)
         paid = np.asarray(on.at_nodes(problem.exit_cost))
         inside = np.zeros(grid.shape, bool)

@@ -20,6 +20,7 @@ from hjbjax.discretisation.schemes import Upwind
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Mask, Numbers, Scalar, Verdict
 from hjbjax.solution.clock import Clock
 from hjbjax.tracing import components
@@ -46,7 +47,7 @@ def values(on: Discretisation, clock: Clock | None = None) -> None:
     chain = Upwind() if isinstance(scheme.chain, Upwind) else scheme.chain
     on = dataclasses.replace(on, scheme=chain).settled
     # for counts of 64 bits; the functions are evaluated in ``dtype`` all the same
-    with jax.enable_x64(True):
+    with own_settings(x64=True):
         # nearly every problem passes, and is spared counts and first nodes, which are slow on a CPU
         if _all_pass(on, actions, clock):
             return

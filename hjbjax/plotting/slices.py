@@ -17,6 +17,7 @@ from hjbjax.plotting.scales import place_text
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import Labels
 from hjbjax.problem.sets import Ball, Box
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Number, State
 from hjbjax.tracing import checks
 
@@ -137,7 +138,7 @@ def span_of(solution: "Solution", input: int) -> float:
 def at_states(function: Callable[[State], Number], states: np.ndarray) -> np.ndarray:
     """A function of one state at states of shape (..., n), as one program, shape (...)."""
     # the states are float64; in float32 a level at a face of the box would round either way
-    with jax.enable_x64(True):
+    with own_settings(x64=True):
         every = jax.jit(lambda states: jax.lax.map(function, states, batch_size=CHUNK))
         return np.asarray(every(states.reshape(-1, states.shape[-1]))).reshape(states.shape[:-1])
 

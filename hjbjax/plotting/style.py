@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
 import numpy as np
 
 from hjbjax.problem.arguments import shown
-from hjbjax.problem.pytree import with_suggestions
+from hjbjax.problem.pytree import front_door
 
 if TYPE_CHECKING:
     import os
@@ -59,7 +59,7 @@ def drawing(function: Callable[P, T]) -> Callable[P, T]:
       TypeError: with what was got, what was wanted, and how to come to it.
     """
     names = list(inspect.signature(function).parameters)
-    checked = with_suggestions(function)
+    checked = front_door(function)
 
     @functools.wraps(function)
     def drawn(*arguments: P.args, **options: P.kwargs) -> T:

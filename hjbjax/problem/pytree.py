@@ -18,6 +18,7 @@ from typing import Any, ParamSpec, TypeVar, dataclass_transform
 import jax
 import numpy as np
 
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import DType, Numbers
 
 P = ParamSpec("P")
@@ -111,6 +112,17 @@ def with_suggestions(function: Callable[P, T], name: str | None = None) -> Calla
         return function(*arguments, **options)
 
     return called
+
+
+def front_door(function: Callable[P, T]) -> Callable[P, T]:
+    """Decorator of a public function: with the package's own options of JAX, and with ``with_suggestions``."""
+
+    @functools.wraps(function)
+    def entered(*arguments: P.args, **options: P.kwargs) -> T:
+        with own_settings():
+            return function(*arguments, **options)
+
+    return with_suggestions(entered)
 
 
 def keywords(function: Callable) -> Set[str] | None:

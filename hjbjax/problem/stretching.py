@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Number, Numbers
 
 ROUNDINGS = 16  # units of eps of the largest coordinate by which the formula may miss its table
@@ -83,6 +84,7 @@ from_table = jax.custom_jvp(checked_table)  # with the derivative of the formula
 
 
 @from_table.defjvp
+@own_settings()
 def _derivative_of_the_formula(primals: tuple, tangents: tuple) -> tuple:
     """Value and tangent: nodes move with the corners as the formula says; the table is constant."""
     return from_table(*primals), tangents[0]

@@ -17,6 +17,7 @@ import numpy as np
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import as_jax, cast, is_traced
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, DType, Numbers
 
 
@@ -71,16 +72,17 @@ def query(
     traced = [leaf for leaf in jax.tree.leaves((values, x, times, t)) if isinstance(leaf, jax.core.Tracer)]
     if not traced and not is_traced(grid):
         # Inside somebody's jit a constant must come out, and float64 must not be switched on in the middle of it.
-        with jax.ensure_compile_time_eval(), jax.enable_x64(True):
+        with jax.ensure_compile_time_eval(), own_settings(x64=True):
             when = None if times is None else _moment(times, t, np.float64, name)
             # JAX keeps what it made of a NumPy array in float32, outside of here, and would hand it in for float64.
             grid, values = cast((grid, values), np.float64)
             return np.array(look(grid, values, _states(grid, x, np.float64, name), clamp, when))[()]
-    dtype: DType = jnp.result_type(*traced) if traced else jnp.result_type(float)
-    if not jnp.issubdtype(dtype, jnp.floating):
-        dtype = jnp.result_type(float)
-    when = None if times is None else _moment(times, t, dtype, name)
-    return look(*as_jax((grid, values)), _states(grid, x, dtype, name), clamp, when).astype(dtype)
+    with own_settings():
+        dtype: DType = jnp.result_type(*traced) if traced else jnp.result_type(float)
+        if not jnp.issubdtype(dtype, jnp.floating):
+            dtype = jnp.result_type(float)
+        when = None if times is None else _moment(times, t, dtype, name)
+        return look(*as_jax((grid, values)), _states(grid, x, dtype, name), clamp, when).astype(dtype)
 
 
 def _moment(times: Array, t: Any, dtype: DType, name: str) -> Moment:

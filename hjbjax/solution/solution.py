@@ -15,7 +15,6 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.problem import streams
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import Labels
 from hjbjax.problem.problem import Problem
@@ -36,7 +35,7 @@ from hjbjax.solution.interpolation import (
     slopes_between,
 )
 from hjbjax.solution.placement import Path
-from hjbjax.solution.status import Status
+from hjbjax.solution.status import Status, warn
 
 __all__ = ["FileError", "Solution", "SolveError", "Status", "load"]
 
@@ -242,17 +241,17 @@ class Solution:
             and not is_traced(found, t, self.times)
             and np.any(late := beyond(self.times, t))
         ):
-            streams.warn(
+            warn(
                 f"Solution.{name}: {np.sum(late)} of {np.size(late)} times lie outside the kept ones, from "
                 f"{float(np.min(self.times)):.6g} to {float(np.max(self.times)):.6g}, where the answer is NaN; keep "
                 "more in march(..., times=), or clamp=True takes the nearest",
-                stacklevel=3,
+                UserWarning,
             )
         if not clamp and not is_traced(found, x, self.grid) and np.any(outside := self.grid.beyond(x)):
-            streams.warn(
+            warn(
                 f"Solution.{name}: {np.sum(outside)} of {np.size(outside)} states lie outside the grid, where the "
                 "answer is NaN; clamp=True takes the nearest point in it",
-                stacklevel=3,
+                UserWarning,
             )
         return found
 

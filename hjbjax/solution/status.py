@@ -65,8 +65,8 @@ def keeping_warnings() -> Iterator[list[str]]:
         _unsaid.reset(token)
 
 
-def warn(message: str) -> None:
-    """A ``SolveWarning`` at the line outside of the package from which the front door was called."""
+def warn(message: str, category: type[Warning] = SolveWarning) -> None:
+    """Warn at the line outside of the package from which the front door was called."""
     said = _unsaid.get()
     if said is not None:
         said.append(message)
@@ -75,4 +75,4 @@ def warn(message: str) -> None:
     package, frame, level = __name__.split(".")[0], sys._getframe(1), 2
     while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] == package:
         frame, level = frame.f_back, level + 1
-    streams.warn(message, SolveWarning, stacklevel=level)
+    streams.warn(message, category, stacklevel=level)

@@ -35,6 +35,7 @@ from hjbjax.problem.arguments import as_mesh, shown
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.parts import Lanes, spans_processes
 from hjbjax.problem.problem import Problem
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import DType, Mask, Nodes
 from hjbjax.solution import checkpoints
 from hjbjax.solution.checkpoints import Checkpoint, File
@@ -114,7 +115,7 @@ def solve_batch(
     opened = checkpoints.open_checkpoint(
         checkpoint, lanes, grid, resume=resume, caller="solve_batch", method=method, scheme=scheme, tol=tol, dtype=kind
     )
-    with noting_interrupts(clock), host_loop.telling(clock), jax.enable_x64(kind == np.float64), opened as kept:
+    with noting_interrupts(clock), host_loop.telling(clock), own_settings(x64=kind == np.float64), opened as kept:
         for members in _same_program(lanes):
             first = lanes[members[0]]
             # without nesting, whose levels the host drives one by one

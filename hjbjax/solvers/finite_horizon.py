@@ -30,6 +30,7 @@ from hjbjax.problem.parts import spans_processes
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, as_one_program, cast, is_traced
 from hjbjax.problem.sets import Box
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, DType, Mask, Nodes, Scalar
 from hjbjax.solution import checkpoints, nested_grids
 from hjbjax.solution.checkpoints import Checkpoint
@@ -154,7 +155,7 @@ def march(
         times=kept, start=start, method=method, scheme=scheme, step=step, inner=inner, policy=policy, dtype=kind,
     )  # fmt: skip
     # float64 for this call alone: the caller's own programs, and other threads, keep the type they have
-    with noting_interrupts(clock), host_loop.telling(clock), jax.enable_x64(kind == np.float64), opened as file:
+    with noting_interrupts(clock), host_loop.telling(clock), own_settings(x64=kind == np.float64), opened as file:
         clock.journal = file and file.journal()
         # within a second: what one state shows to be wrong, and a grid that does not fit, for which functions are read
         check_on_one_state(problem, grid, scheme)

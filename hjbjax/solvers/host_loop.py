@@ -22,6 +22,7 @@ import numpy as np
 from hjbjax.markov_chain import memory
 from hjbjax.problem import streams
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Nodes
 from hjbjax.solution.checkpoints import Part
 from hjbjax.solution.clock import CHUNK_SECONDS, Clock
@@ -256,18 +257,14 @@ def _memory_error(error: Exception, needed: int, where: str, solution: Solution 
     return report
 
 
-def settings() -> Callable[[], contextlib.ExitStack]:
-    """The context in which another thread has those settings of JAX that this one has by context managers."""
-    x64, nans, eager = setting("jax_enable_x64"), setting("jax_debug_nans"), setting("jax_disable_jit")
-    device, precision = setting("jax_default_device"), setting("jax_default_matmul_precision")
+def settings() -> Callable[[], contextlib.AbstractContextManager[None]]:
+    """The context in which another thread has the package's own settings of JAX, and this thread's device."""
+    x64, device = setting("jax_enable_x64"), setting("jax_default_device")
 
-    def entered() -> contextlib.ExitStack:
-        stack = contextlib.ExitStack()
-        for context in (jax.enable_x64(x64), jax.debug_nans(nans), jax.disable_jit(eager)):
-            stack.enter_context(context)
-        stack.enter_context(jax.default_device(device))
-        stack.enter_context(jax.default_matmul_precision(precision))
-        return stack
+    @contextlib.contextmanager
+    def entered() -> Iterator[None]:
+        with own_settings(x64=x64), jax.default_device(device):
+            yield
 
     return entered
 

@@ -26,6 +26,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.parts import spans_processes
 from hjbjax.problem.problem import Problem, is_constrained, is_discounted
 from hjbjax.problem.pytree import altered, as_one_program, is_traced
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import DType, Nodes, Number, Scalar
 from hjbjax.solution import checkpoints, nested_grids
 from hjbjax.solution.checkpoints import Checkpoint
@@ -143,7 +144,7 @@ def solve(
         scheme=scheme, tol=tol, guess=guess, dtype=kind,
     )  # fmt: skip
     if isinstance(scheme, PathScheme):
-        with noting_interrupts(clock), host_loop.telling(clock), jax.enable_x64(kind == np.float64), opened as kept:
+        with noting_interrupts(clock), host_loop.telling(clock), own_settings(x64=kind == np.float64), opened as kept:
             clock.journal = kept and kept.journal()
             options: Any = {"method": method, "tol": tol, "guess": guess, "max_memory": max_memory}
             solution = semi_lagrangian.solve_on_host(problem, grid, scheme, kind, clock=clock, **options)
@@ -151,7 +152,7 @@ def solve(
     method = choose(problem, grid, traced=False, method=method, divided=mesh is not None)
     on, sharpen = Discretisation(problem, grid, scheme or Upwind(subcell=True), kind, mesh=mesh), scheme is None
     # float64 for this call alone: another thread, and the caller's own programs, keep theirs
-    with noting_interrupts(clock), host_loop.telling(clock), jax.enable_x64(kind == np.float64), opened as kept:
+    with noting_interrupts(clock), host_loop.telling(clock), own_settings(x64=kind == np.float64), opened as kept:
         clock.journal = kept and kept.journal()
         check_on_one_state(problem, grid, on.scheme)  # before the memory, for which functions may be read
         needed = memory.require(problem, grid, method, kind, max_memory)

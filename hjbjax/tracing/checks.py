@@ -17,6 +17,7 @@ from hjbjax.problem.arguments import check_mesh
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, remembered
+from hjbjax.problem.settings import own_settings
 from hjbjax.tracing import indices
 from hjbjax.tracing.operations import Operations, operations
 
@@ -68,7 +69,7 @@ def shapes(problem: Problem, grid: Grid, scheme: object) -> None:
     of_one_state(problem, n, "the number of axes of the grid")
     if problem.noise is not None:
         # σ of shape (n, k), whose transitions go along diagonals
-        with jax.enable_x64(True):
+        with own_settings(x64=True):
             if len(_shape_or_fault(problem, "noise", n)) == 2:
                 refuse_stretched(grid)
 
@@ -98,7 +99,7 @@ def of_one_state(problem: Problem, n: int, meaning: str) -> None:
         _expect(problem, name, n, wanted, fits, "a scalar" if wanted == "()" else f"n = {n} is {meaning}")
 
     # answers are remembered, so they must not depend on the precision that JAX is set to when first asked
-    with jax.enable_x64(True):
+    with own_settings(x64=True):
         expect("drift", f"({n},)", lambda shape: shape == (n,))
         expect("noise", f"(), ({n},) or ({n}, k)", lambda shape: shape[:1] in ((), (n,)) and len(shape) <= 2)
         for name in ("cost", "target", *STATE_COSTS):
@@ -251,7 +252,7 @@ def function_of(function: Callable, name: str, wanted: tuple[int, ...], **fed: t
       ValueError: with what was returned, or what cannot be traced.
     """
     said_call = f"{name}({', '.join(fed)})"
-    with jax.enable_x64(True):
+    with own_settings(x64=True):
         verdict = _probed(as_partial(function, name) or function, fed, said_call)
     if verdict != wanted:
         returned = verdict if isinstance(verdict, str) else f"shape {verdict}"
@@ -266,7 +267,7 @@ def _lengths(problem: Problem, n: int) -> dict[str, tuple[int, ...]]:
 def calls_back(problem: Problem, n: int) -> bool:
     """True if a function of a problem calls Python while it runs, where anything may happen."""
     lengths = _lengths(problem, n)
-    with jax.enable_x64(True):
+    with own_settings(x64=True):
         for name in (*OF_ACTION, "target", *STATE_COSTS):
             function, names = getattr(problem, name), _names(problem, name)
             if callable(function) and _trace_once(function, names, tuple(lengths[letter] for letter in names))[2]:
@@ -277,7 +278,7 @@ def calls_back(problem: Problem, n: int) -> bool:
 def operations_of(problem: Problem, n: int) -> Operations:
     """What one evaluation of all functions of a problem with ``n`` states takes, as it is written out for XLA."""
     lengths, total = _lengths(problem, n), Operations()
-    with jax.enable_x64(True):
+    with own_settings(x64=True):
         for name in (*OF_ACTION, "target", *STATE_COSTS):
             function, names = getattr(problem, name), _names(problem, name)
             if callable(function):

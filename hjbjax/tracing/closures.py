@@ -27,7 +27,8 @@ from jax.tree_util import Partial
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import altered, as_partial, is_traced, with_suggestions
+from hjbjax.problem.pytree import altered, as_partial, front_door, is_traced
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import DType, Numbers
 from hjbjax.tracing import jaxprs
 from hjbjax.tracing.outside import (
@@ -74,7 +75,7 @@ def digest(problem: Problem, n: int) -> str:
     """A digest of a settled problem, the same in every process: what its functions compute, and all its numbers."""
     account = hashlib.blake2b(digest_size=16)
     # outside of the caller's ``jit``: only what is known has a digest
-    with jax.core.eval_context(), jax.enable_x64(True):
+    with jax.core.eval_context(), own_settings(x64=True):
         for name in (*OF_ACTION, *OF_STATE):
             function = getattr(problem, name)
             account.update(f"{name} {type(function).__name__} ".encode())
@@ -113,35 +114,35 @@ def holds_tracers(thing: object, depth: int = 4) -> bool:
     return any(holds_tracers(content(cell), depth - 1) for cell in thing.__closure__ or ())
 
 
-def with_settled_functions(front_door: Callable) -> Callable:
+def with_settled_functions(function: Callable) -> Callable:
     """Decorator of a function of (problem or problems, grid, ...): with the problems settled, and outside of traces.
 
     A problem of known numbers inside somebody's ``jit`` is solved at once, like any other.
     """
 
-    parameters = inspect.signature(front_door).parameters.values()
+    parameters = inspect.signature(function).parameters.values()
     names = [each.name for each in parameters if each.kind is each.POSITIONAL_OR_KEYWORD]
     first, second = names[:2]
 
-    @functools.wraps(front_door)
+    @functools.wraps(function)
     def entered(*arguments: Any, **options: Any) -> Any:
         positions = dict(zip(names, arguments, strict=False))
         if len(arguments) > len(names) or positions.keys() & options.keys():
-            return front_door(*arguments, **options)  # which Python refuses
+            return function(*arguments, **options)  # which Python refuses
         given = positions | options
         if (first, second) == ("problem", "grid") and {first, second} <= given.keys():
             kinds = [type(given[name]).__name__ for name in (first, second)]
             if not isinstance(given[first], Problem) or not isinstance(given[second], Grid):
-                raise TypeError(f"{front_door.__name__}: got {', '.join(kinds)}; wanted a Problem and a Grid")
+                raise TypeError(f"{function.__name__}: got {', '.join(kinds)}; wanted a Problem and a Grid")
         if isinstance(given.get(second), Grid) and first in given:
             given[first] = _settle_all(given[first], given[second].ndim, given.get("dtype"))
         if is_traced(given):
-            return front_door(**given)
+            return function(**given)
         # inside somebody's ``jit`` a problem of known numbers is still solved on the host, chunk by chunk
         with jax.core.eval_context():
-            return front_door(**given)
+            return function(**given)
 
-    return with_suggestions(entered)
+    return front_door(entered)
 
 
 def _settle_all(asked: object, n: int, dtype: DType | None) -> object:
@@ -284,7 +285,7 @@ def _settled_outside(function: Partial, shapes: Sequence[tuple[int, ...]]) -> Pa
         return Partial(Marked(function.func, mark), *function.args, **function.keywords)
     # outside of the caller's ``jit`` and always in float64: every front door finds one mark for one function
     arguments = [jax.ShapeDtypeStruct(shape, np.float64) for shape in shapes]
-    with jax.core.eval_context(), jax.enable_x64(True):
+    with jax.core.eval_context(), own_settings(x64=True):
         found, closed = _trace_with_numbers_as_leaves(function, arguments)
     return None if closed is not None and is_traced(closed.consts) else _with_mark(found, closed)
 

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.problem import Problem
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import DType, Numbers
 from hjbjax.tracing import indices, stacks
 from hjbjax.tracing.interpreter import evaluate, lift, pack
@@ -124,6 +125,7 @@ class _Arrays:
             return flat(inner, rows)
 
         @function.defjvp
+        @own_settings()
         def derivative(primals, tangents):
             def one(*args):  # at one state, where binding the equation brings the rule of its author into play
                 half = len(args) // 2

@@ -11,7 +11,7 @@ import numpy as np
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import is_traced, pytree_dataclass, with_suggestions
+from hjbjax.problem.pytree import front_door, is_traced, pytree_dataclass
 from hjbjax.problem.sets import Box
 from hjbjax.problem.types import Control, Number, State
 from hjbjax.zoo.ingredients import Exact, OutsideCube, Scalar, admissible, answer, positive
@@ -103,7 +103,7 @@ class Merton:
             admissible("merton", *RATES, consumption=self.consumption)
 
 
-@with_suggestions
+@front_door
 def merton(
     *,
     interest: Number = 0.03,
@@ -145,7 +145,7 @@ def merton(
     return problem, Grid([-1.0], [1.0], shape, names=("log wealth",))
 
 
-@with_suggestions
+@front_door
 def merton_exact(
     *,
     interest: Number = 0.03,

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import pytree_dataclass, with_suggestions
+from hjbjax.problem.pytree import front_door, pytree_dataclass
 from hjbjax.problem.sets import Box
 from hjbjax.problem.types import Control, Number, State
 from hjbjax.zoo.ingredients import Exact, Feedback, Scalar, answer, positive
@@ -125,7 +125,7 @@ class Lander:
         return self.margin(x) / self.gravity, self._ignition_point(self._log_ratio(x), x[2])[0]
 
 
-@with_suggestions
+@front_door
 def moon_landing(
     *,
     thrust: Number = 2.0,
@@ -159,7 +159,7 @@ def moon_landing(
     return problem, Grid([0.0, -2.0, 0.3], [1.5, 0.5, 1.0], shape, names=("height", "velocity", "mass"))
 
 
-@with_suggestions
+@front_door
 def moon_landing_burn(
     *, thrust: Number = 2.0, consumption: Number = 0.3, gravity: Number = 1.0
 ) -> tuple[Problem, Feedback]:
@@ -180,7 +180,7 @@ def moon_landing_burn(
     return problem, answer(lander.burn)
 
 
-@with_suggestions
+@front_door
 def moon_landing_exact(*, thrust: Number = 2.0, consumption: Number = 0.3, gravity: Number = 1.0) -> Exact:
     """m(1 − e^{−q}), with q of the burn that takes away the energy ½v² + gh; infinite where no landing is possible.
 

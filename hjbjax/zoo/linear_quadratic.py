@@ -14,7 +14,7 @@ import numpy as np
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import is_traced, pytree_dataclass, with_suggestions
+from hjbjax.problem.pytree import front_door, is_traced, pytree_dataclass
 from hjbjax.problem.sets import Box
 from hjbjax.problem.types import Control, Disturbance, Number, State
 from hjbjax.zoo.ingredients import (
@@ -100,7 +100,7 @@ class ScalarQuadratic:
         return p * jnp.sum(x * x) + constant
 
 
-@with_suggestions
+@front_door
 def double_integrator_lq(
     *,
     mass: Number = 1.0,
@@ -134,7 +134,7 @@ def double_integrator_lq(
     return problem, Grid([-2.0, -2.0], [2.0, 2.0], shape, names=("position", "velocity"), units=("m", "m/s"))
 
 
-@with_suggestions
+@front_door
 def double_integrator_lq_exact(
     *, mass: float = 1.0, control_weight: float = 1.0, noise: float = 0.0, discount: float = 0.0, bound: float = 8.0
 ) -> Exact:
@@ -169,7 +169,7 @@ def double_integrator_lq_exact(
     return answer(QuadraticValue(matrix, constant).value)
 
 
-@with_suggestions
+@front_door
 def stochastic_lq(
     *,
     rate: Number = 0.0,
@@ -212,7 +212,7 @@ def stochastic_lq(
     return problem, Grid([-2.0], [2.0], shape, names=("x",))
 
 
-@with_suggestions
+@front_door
 def stochastic_lq_exact(
     *,
     rate: Number = 0.0,
@@ -245,7 +245,7 @@ def stochastic_lq_exact(
     return answer(quadratic.value)
 
 
-@with_suggestions
+@front_door
 def lq_game(
     *,
     gamma: Number = 2.0,
@@ -277,7 +277,7 @@ def lq_game(
     return problem, Grid([-1.0], [1.0], shape, names=("x",))
 
 
-@with_suggestions
+@front_door
 def lq_game_exact(*, gamma: Number = 2.0, rate: Number = 0.0, discount: Number = 0.0, bound: Number = 4.0) -> Exact:
     """px² with p = 1/(√(α² + 1 − γ⁻²) − α), α = a − β/2, on [−1, 1]; with the defaults p = 2/√3.
 

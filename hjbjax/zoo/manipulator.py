@@ -25,7 +25,7 @@ import numpy as np
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_partial, pytree_dataclass, with_suggestions
+from hjbjax.problem.pytree import as_partial, front_door, pytree_dataclass
 from hjbjax.problem.sets import Box
 from hjbjax.problem.types import Array, Control, Number, State
 from hjbjax.zoo.ingredients import QuadraticCost, positive
@@ -253,7 +253,7 @@ def _solve_positive(matrix: list[list[jax.Array]], rest: list[jax.Array]) -> lis
     return rest
 
 
-@with_suggestions
+@front_door
 def manipulator(
     *,
     links: int = 1,

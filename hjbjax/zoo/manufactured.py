@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import pytree_dataclass, with_suggestions
+from hjbjax.problem.pytree import front_door, pytree_dataclass
 from hjbjax.problem.sets import Box
 from hjbjax.problem.types import Control, Number, State
 from hjbjax.zoo.ingredients import Exact, Scalar, answer
@@ -57,7 +57,7 @@ class Smooth:
         return jnp.sinh(x[0]) + 0.5 * x[0] * x[1] * x[1], 2 * x[1] + 0.5 * x[0] * x[0] * x[1]
 
 
-@with_suggestions
+@front_door
 def smooth(*, discount: Number = 0.5, shape: tuple[int, ...] = (81, 81)) -> tuple[Problem, Grid]:
     """A smooth nonlinear problem on [−1, 1]² whose value is known; compare on |x₁| ≤ .5, |x₂| ≤ .45.
 
@@ -71,7 +71,7 @@ def smooth(*, discount: Number = 0.5, shape: tuple[int, ...] = (81, 81)) -> tupl
     return problem, Grid([-1.0, -1.0], [1.0, 1.0], shape)
 
 
-@with_suggestions
+@front_door
 def smooth_exact(*, discount: Number = 0.5) -> Exact:
     """The value cosh x₁ − 1 + x₂² + ¼x₁²x₂², whatever the discount, where |½cV₂| ≤ 6: on [−1, 1]²."""
     return answer(Smooth(discount).value)

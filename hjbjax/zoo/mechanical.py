@@ -17,7 +17,7 @@ import numpy as np
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import pytree_dataclass, with_suggestions
+from hjbjax.problem.pytree import front_door, pytree_dataclass
 from hjbjax.problem.sets import Box
 from hjbjax.problem.types import Control, Number, State
 from hjbjax.zoo.ingredients import QuadraticCost, QuadraticValue, positive
@@ -178,7 +178,7 @@ class PlanarQuadrotor:
         return jnp.stack([x[3], x[4], x[5], -lift * jnp.sin(x[2]), lift * jnp.cos(x[2]) - self.g, u[1] / self.inertia])
 
 
-@with_suggestions
+@front_door
 def pendulum(
     *,
     mass: Number = 1.0,
@@ -219,7 +219,7 @@ def pendulum(
     return problem, Grid([-math.pi, -8.0], [math.pi, 8.0], shape, periodic=(True, False), names=names, units=units)
 
 
-@with_suggestions
+@front_door
 def pendulum_near_upright(
     *, mass: float = 1.0, as_printed: bool = False, g: float = 9.81, discount: float = 0.0
 ) -> QuadraticValue:
@@ -243,7 +243,7 @@ def pendulum_near_upright(
     return QuadraticValue(0.5 * matrix)  # the running cost is ½(|x|² + τ²), SciPy's is |x|² + τ²
 
 
-@with_suggestions
+@front_door
 def van_der_pol(
     *, stiffness: Number = 1.0, bound: Number = 1.0, discount: Number = 0.5, shape: tuple[int, ...] = (121, 121)
 ) -> tuple[Problem, Grid]:

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import pytree_dataclass, with_suggestions
+from hjbjax.problem.pytree import front_door, pytree_dataclass
 from hjbjax.problem.sets import Ball, Box
 from hjbjax.problem.types import Array, Control, Number, State
 from hjbjax.zoo.ingredients import Arrival, Disc, Exact, Scalar, answer, positive, root, unit_cost
@@ -91,7 +91,7 @@ class Boat:
         return jnp.where(square == 0, 0.0, time)  # at the origin both are 0, which reads as out of reach above
 
 
-@with_suggestions
+@front_door
 def double_integrator(
     *, mass: Number = 1.0, discount: Number = 1.0, radius: Number = 0.2, shape: tuple[int, ...] = (101, 101)
 ) -> tuple[Problem, Grid]:
@@ -121,7 +121,7 @@ def double_integrator(
     return problem, Grid([-2.0, -2.0], [2.0, 2.0], shape, names=("position", "velocity"), units=("m", "m/s"))
 
 
-@with_suggestions
+@front_door
 def double_integrator_exact(*, mass: Number = 1.0, discount: Number = 1.0, radius: Number = 0.2) -> Exact:
     """(1 − e^{−βT})/β with x₂ + √(4x₁ + 2x₂²) for T to the right of the switching curve, mirrored to its left.
 
@@ -133,7 +133,7 @@ def double_integrator_exact(*, mass: Number = 1.0, discount: Number = 1.0, radiu
     return answer(Arrival(DoubleIntegrator(mass), discount).value)
 
 
-@with_suggestions
+@front_door
 def zermelo(
     *,
     speed: Number = 1.0,
@@ -165,7 +165,7 @@ def zermelo(
     return problem, Grid([-2.0, -2.0], [2.0, 2.0], shape, names=("east", "north"), units=("m", "m"))
 
 
-@with_suggestions
+@front_door
 def zermelo_exact(
     *, speed: Number = 1.0, current: Sequence[Number] | Array = (0.5, 0.0), discount: Number = 1.0, radius: Number = 0.2
 ) -> Exact:

@@ -13,7 +13,7 @@ import numpy as np
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import pytree_dataclass, with_suggestions
+from hjbjax.problem.pytree import front_door, pytree_dataclass
 from hjbjax.problem.sets import Ball, Box, Finite
 from hjbjax.problem.types import Control, Number, State
 from hjbjax.zoo.ingredients import Arrival, Disc, Exact, Scalar, answer, positive, root, unit_cost
@@ -66,7 +66,7 @@ class Dubins:
         return jnp.stack([self.speed * jnp.cos(x[2]), self.speed * jnp.sin(x[2]), u[0]])
 
 
-@with_suggestions
+@front_door
 def eikonal(
     *,
     norm: float = 2,
@@ -105,7 +105,7 @@ def eikonal(
     return problem, Grid([-1.0] * dim, [1.0] * dim, (81,) * dim if shape is None else shape, units=("m",) * dim)
 
 
-@with_suggestions
+@front_door
 def eikonal_exact(
     *,
     norm: float = 2,
@@ -146,7 +146,7 @@ def _unit_ball(norm: float, dim: int, directions: int | None) -> Ball | Box | Fi
     return Ball(1.0, dim) if norm == 2 else Box([-1.0] * dim, [1.0] * dim)
 
 
-@with_suggestions
+@front_door
 def dubins(
     *,
     speed: Number = 1.0,

@@ -11,7 +11,7 @@ import numpy as np
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import pytree_dataclass, with_suggestions
+from hjbjax.problem.pytree import front_door, pytree_dataclass
 from hjbjax.problem.sets import Box
 from hjbjax.problem.types import Control, Number, State
 from hjbjax.zoo.ingredients import Exact, OutsideBall, OutsideCube, Scalar, answer, noise_or_none, positive, unit_cost
@@ -99,7 +99,7 @@ class BallExit:
         return (self.radius * self.radius - jnp.sum(x * x)) / (self.dim * self.noise * self.noise)
 
 
-@with_suggestions
+@front_door
 def brownian_exit(
     *,
     dim: int = 1,
@@ -125,7 +125,7 @@ def brownian_exit(
     return problem, Grid([-half_width] * dim, [half_width] * dim, shape, units=("m",) * dim)
 
 
-@with_suggestions
+@front_door
 def brownian_exit_exact(
     *, dim: int = 1, noise: Number = 1.0, discount: Number = 0.0, half_width: Number = 1.0
 ) -> Exact:
@@ -145,7 +145,7 @@ def brownian_exit_exact(
     return answer(CubeExit(noise, discount, half_width, dim).value)
 
 
-@with_suggestions
+@front_door
 def brownian_ball(
     *, dim: int = 2, noise: Number = 1.0, radius: Number = 1.0, shape: tuple[int, ...] | None = None
 ) -> tuple[Problem, Grid]:
@@ -170,7 +170,7 @@ def brownian_ball(
     return problem, Grid([-radius] * dim, [radius] * dim, (41,) * dim if shape is None else shape, units=("m",) * dim)
 
 
-@with_suggestions
+@front_door
 def brownian_ball_exact(*, dim: int = 2, noise: Number = 1.0, radius: Number = 1.0) -> Exact:
     """(R² − |x|²)/(nσ²) in the ball; outside it goes on, negative, as ``brownian_ball`` holds it there.
 
@@ -221,7 +221,7 @@ class BangBang:
         return parabola - 2 / (rate**2 * mu) * jnp.exp(-mu * distance)
 
 
-@with_suggestions
+@front_door
 def bang_bang(*, discount: Number = 1.0, noise: Number = 0.0, shape: tuple[int, ...] = (81,)) -> tuple[Problem, Grid]:
     """Hold a point near zero with |u| ≤ 1 at the cost x², on [−2, 2] with the ends held at the exact value.
 
@@ -243,7 +243,7 @@ def bang_bang(*, discount: Number = 1.0, noise: Number = 0.0, shape: tuple[int, 
     return problem, Grid([-2.0], [2.0], shape, names=("x",))
 
 
-@with_suggestions
+@front_door
 def bang_bang_exact(*, discount: Number = 1.0, noise: Number = 0.0) -> Exact:
     """The value on the whole line, with noise or without; see ``BangBang``.
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Number, State
 
 Prescription = Callable[[State], Any] | Number
@@ -90,7 +91,7 @@ def on_face(prescription: Any, nodes: Array, name: str) -> Any:
     elif isinstance(jnp.zeros(()), jax.core.Tracer):  # inside jit the floating-point type is the caller's choice
         found = _at(prescription, nodes)
     else:
-        with jax.enable_x64(True):
+        with own_settings(x64=True):
             found = _at(prescription, nodes)
             found = found if is_traced(found) else np.asarray(found)
     if callable(prescription) and np.shape(found) != nodes.shape[:-1]:

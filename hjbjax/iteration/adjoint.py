@@ -15,10 +15,9 @@ With slopes of high order Φ is not linear in V, and its derivative is no chain'
 they stand, at frozen actions, and a Krylov method, preconditioned by sweeps with I − W, solves with it.
 """
 
-import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +29,7 @@ from hjbjax.hamiltonian.derivatives import once
 from hjbjax.hamiltonian.search import Action
 from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
 from hjbjax.iteration.evaluation import Evaluation, Krylov, direct, evaluate, left_over, relaxed
-from hjbjax.iteration.fixed_point import State, Task
+from hjbjax.iteration.fixed_point import Task
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.settings import own_settings
@@ -47,6 +46,18 @@ GOAL = 1e3  # of the rounding unit of the right-hand side
 ROUNDING = 64  # of the rounding unit of the solution: below that no residual can be brought
 FRACTION = 1e-3  # of the residual, to which one run of the Krylov method goes that solves with slopes of high order
 KRYLOV = 200  # its steps, at most
+
+
+class Answer(Protocol):
+    """A value and its policy, found without derivatives."""
+
+    @property
+    def value(self) -> Field:
+        """V, (*grid)."""
+
+    @property
+    def policy(self) -> Greedy:
+        """The optimal actions at V."""
 
 
 @pytree_dataclass()
@@ -78,17 +89,16 @@ class FixedPoint:
         return jnp.where(obstacles.fixed, obstacles.fixed_value - value, phi)
 
 
-def attach(task: Task, state: State) -> Field:
-    """The value of ``state``, unchanged, as a differentiable function of the problem and of the grid in ``task``.
+def attach(task: Task, answer: Answer) -> Field:
+    """The value of ``answer``, unchanged, as a differentiable function of the problem and of the grid in ``task``.
 
     Args:
       task: the task as the user gave it, with its tracers.
-      state: a converged state of the same task, found without derivatives.
+      answer: the solution of the same task.
     """
     question = FixedPoint(task.on, task.obstacles, task.lost)
-    kept, state = jax.lax.stop_gradient((task, state))
-    equation = kept.equation(state.value, state.policy)
-    return _solution(state.value, question, state.policy, equation, kept.method.evaluation or Krylov())
+    kept, value, policy = jax.lax.stop_gradient((task, answer.value, answer.policy))
+    return _solution(value, question, policy, kept.equation(value, policy), kept.method.evaluation or Krylov())
 
 
 def attach_step(
@@ -137,21 +147,36 @@ def _solution_tangent(primals: Any, tangents: Any) -> tuple[Field, Field]:
         slope = jax.linearize(lambda at: question.residual(at, actions, bound), value)[1]
         operator, solvers = lambda delta: -slope(delta), _high_order_solvers(equation, grid)
     right = jax.jvp(residual, (question,), (tangents[1],))[1]
+    # a product, whose transpose is NaN as well
+    right = right * jnp.where(jnp.any(_rests_unheld(question, actions, value)), jnp.nan, 1).astype(right.dtype)
     # the value, the policy and the operator are constants here, whose own derivatives a second one would need
     right = right + once(question, "a solve").astype(right.dtype)
     return value, jax.lax.custom_linear_solve(operator, right, *solvers)
 
 
-def attach_policy(task: Task, state: State, value: Field) -> State:
-    """The state, its numbers unchanged, with a policy that is a differentiable function of ``value`` and of ``task``.
+def _rests_unheld(question: FixedPoint, actions: Actions, value: Field) -> jax.Array:
+    """The nodes at which the policy rests at no discount, although their value is not given: it has no derivative.
+
+    Leaving is worth as much there, and which of the two the search found first is chance.
+    """
+    on, obstacles = jax.lax.stop_gradient((question.on, question.obstacles))
+    rests = (jump_rates(on, *actions).total() + on.problem.discount <= 0) & ~obstacles.fixed
+    for constraint in (obstacles.upper, obstacles.lower):
+        if constraint is not None:
+            rests &= ~_is_constraint(value, constraint)
+    return rests
+
+
+def attach_policy(task: Task, policy: Greedy, value: Field) -> Greedy:
+    """The policy, its numbers unchanged, as a differentiable function of ``value`` and of ``task``.
 
     Args:
       task: the task as the user gave it, with its tracers.
-      state: a converged state of the same task, found without derivatives.
+      policy: that of the solution of the same task.
       value: its value with derivatives, of ``attach``.
     """
-    frozen, policy = jax.lax.stop_gradient((task, state.policy))
-    return dataclasses.replace(state, policy=_moving(policy, task.on, value, frozen))
+    frozen, policy = jax.lax.stop_gradient((task, policy))
+    return _moving(policy, task.on, value, frozen)
 
 
 @jax.custom_jvp

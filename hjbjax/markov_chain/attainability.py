@@ -19,7 +19,7 @@ from hjbjax.hamiltonian.players import players_of
 from hjbjax.markov_chain import tried_actions
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.types import Array, Mask, Number, Scalar
+from hjbjax.problem.types import Array, Number, Scalar
 from hjbjax.solution.clock import Clock
 
 FEW = 9  # of each player in a game, where all pairs are
@@ -147,21 +147,6 @@ def _reached_by_samples(
         # nodes are taken away and never put back, as the largest fixed point wants: at most one round a node
         found = inside & staying(jnp.asarray(inside))
     return found
-
-
-def surely_reached(on: Discretisation, held: Mask, *, least: Number = 0.0) -> jax.Array:
-    """The nodes from which the held ones are reached with probability one, bool (*grid); inside a transformation."""
-    points, on = tried_actions.control_samples(on.problem), on.on_grid(on.grid.walled)
-    grid, none = on.grid, _no_jumps(on, points)
-
-    def shrink(carry):
-        inside, _ = carry
-        # all in one program: no clock, no search on the host, and as many jumps as there are nodes if need be
-        jumps = _more_open_jumps(on, inside, none, points, least=least, kinks=True, outmost=True)
-        found = inside & _predecessors(held, jumps, grid, grid.size)[0]
-        return found, jnp.any(found != inside)
-
-    return jax.lax.while_loop(lambda carry: carry[1], shrink, (jnp.ones(grid.shape, bool), jnp.ones((), bool)))[0]
 
 
 def forced(on: Discretisation, held: np.ndarray, *, least: Number, clock: Clock) -> np.ndarray:

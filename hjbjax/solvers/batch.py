@@ -45,10 +45,11 @@ from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status, keeping_warnings, warn
 from hjbjax.solvers import host_loop, nested
 from hjbjax.solvers.box_error import with_box_error
+from hjbjax.solvers.host_solve import solve_on_host
 from hjbjax.solvers.nested import Settled
 from hjbjax.solvers.result import finish, solution_at_start, with_grid_error, with_last_phase
 from hjbjax.solvers.setup import Assumptions, check_on_one_state, choose, choose_scheme, prepare_on_host
-from hjbjax.solvers.stationary import check_arguments, check_limits, solve_on_host
+from hjbjax.solvers.stationary import check_arguments, check_limits
 from hjbjax.solvers.stationary_run import LanesRun, stacked, with_obstacles
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions

@@ -97,16 +97,6 @@ def choose_scheme(on: Discretisation, method: Method) -> Scheme:
     return Limited()
 
 
-def choose_traced_scheme(problem: Problem, method: Method | None) -> Scheme:
-    """The scheme that suits a problem inside a JAX transformation, where no values are looked at.
-
-    That of ``choose_scheme``, but for limited slopes where noise may let central differences be monotone: those slopes
-    are then the central ones. A tube stays with the chain, also where its discount is traced.
-    """
-    tube = is_constrained(problem) and not is_discounted(problem)
-    return Upwind() if tube or (method is not None and method.relaxes) else Limited()
-
-
 @jax.jit
 def _central(on: Discretisation) -> jax.Array:
     """True if central differences are monotone at all nodes, whatever the action."""
@@ -326,19 +316,6 @@ def _with_refuge(task: Task) -> Task:
 def _costs_positive(task: Task) -> bool:
     """True if the running cost is positive wherever the value is not given."""
     return bool(np.all(np.asarray(task.least_cost)[~np.asarray(task.obstacles.fixed)] > 0))
-
-
-def prepare_traced(on: Discretisation, *, method: Method, tol: Number) -> tuple[Task, Assumptions]:
-    """The task of ``prepare`` inside a JAX transformation, without the nodes that have no finite value."""
-    assumptions, problem = assumptions_of(on), on.problem
-    task = prepare(on, method=method, tol=tol, assumptions=assumptions)
-    ends = problem.target is not None or assumptions.may_rest
-    if problem.is_game or is_constrained(problem) or is_discounted(problem) or not ends:
-        return task, assumptions
-    # a set of nodes has no derivative
-    known = jax.lax.stop_gradient(task)
-    reached = attainability.surely_reached(known.on, known.obstacles.fixed, least=_least_rate(known))
-    return _finite_part(task, reached | (known.problem.discount > 0)), assumptions
 
 
 def _least_rate(task: Task) -> Number:

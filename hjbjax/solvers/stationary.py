@@ -1,14 +1,11 @@
 """The front door: ``solve``.
 
-At host level it validates, picks a method, drives the iteration from grid to grid and reports. Under a tracer the
-same iteration runs with a fixed method and none of that, and its value and its policy are differentiable.
+It validates its arguments, and hands over to the host, which picks a method, drives the iteration from grid to grid and
+reports. Inside JAX transformations the compiled program calls the host: see ``transformed``.
 """
 
-import dataclasses
-import functools
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
@@ -17,36 +14,26 @@ from hjbjax.discretisation import schemes
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.discretisation.semi_lagrangian import PathScheme
-from hjbjax.iteration import adjoint, fixed_point
-from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import Method, check_method
-from hjbjax.markov_chain import admissibility, memory, node_checks, resting
+from hjbjax.markov_chain import memory
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.parts import spans_processes
 from hjbjax.problem.problem import Problem, is_constrained, is_discounted
-from hjbjax.problem.pytree import altered, as_one_program, is_traced
+from hjbjax.problem.pytree import as_one_program, is_traced
 from hjbjax.problem.settings import own_settings
-from hjbjax.problem.types import DType, Nodes, Number, Scalar
+from hjbjax.problem.types import DType, Nodes, Number
 from hjbjax.solution import checkpoints, nested_grids
 from hjbjax.solution.checkpoints import Checkpoint
-from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
+from hjbjax.solution.clock import Clock, noting_interrupts
 from hjbjax.solution.placement import Path
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
-from hjbjax.solvers import host_loop, nested, semi_lagrangian
-from hjbjax.solvers.box_error import with_box_error
-from hjbjax.solvers.result import assemble, finish, solution_at_start, with_grid_error, with_last_phase
-from hjbjax.solvers.setup import (
-    COARSEST,
-    Assumptions,
-    check_on_one_state,
-    choose,
-    choose_scheme,
-    choose_traced_scheme,
-    prepare_on_host,
-    prepare_traced,
-)
+from hjbjax.solvers import host_loop, semi_lagrangian, transformed
+from hjbjax.solvers.host_solve import solve_on_host
+from hjbjax.solvers.result import solution_at_start, with_last_phase
+from hjbjax.solvers.setup import check_on_one_state, choose
+from hjbjax.solvers.transformed import Asked
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
 
@@ -90,12 +77,12 @@ def solve(
         no certificate exists the solution says so, and the bound is on the residual and on the last step, as it is for
         the high-order equation; a tube without discount goes on until V no longer changes.
       guess: node values to start from, shape (*grid); not for a tube without discount, which has many fixed points.
-      dtype: ``None`` is float64, inside a transformation that of ``float`` there; ``"float32"`` for memory, with a
-        tolerance that float32 can reach.
+      dtype: ``None`` is float64; inside a transformation the answer is rounded to the type of ``float`` there.
+        ``"float32"`` for memory, with a tolerance that float32 can reach.
       max_steps: at most so many steps, by each scheme and on each grid.
       time_limit: at most so many seconds, checks and compilation included; what cannot be cut, as one compilation or
         one step, is let come to its end.
-      throw: raise when the solve does not converge; otherwise the status says it.
+      throw: raise when the solve does not converge, or inside a transformation return NaN; else the status says it.
       progress: say each phase as it begins, and show a bar of the steps after a second; ``None``: on a terminal.
       max_memory: bytes that the solve may take, instead of what is free.
       checkpoint: a file that keeps what is done, every minute and at the end, or ``Checkpoint(path, every=)``.
@@ -104,10 +91,11 @@ def solve(
         ``jax.make_mesh((4, 2), ("a", "b"))``; host level.
 
     Returns:
-      The solution; NumPy arrays at host level. Inside ``jit``, ``vmap`` or ``grad`` its value and its policy are
-      traced, and differentiable with respect to every number in the problem and the grid; a derivative whose linear
-      solve does not come to its end is NaN. There a second-order iteration that does not converge leaves the monotone
-      answer, and its own code.
+      The solution; NumPy arrays at host level. Inside ``jit``, ``vmap`` and ``grad`` the compiled program calls the
+      host, so that the answer is the same, in the type of the transformation. Value and policy are then traced, and
+      differentiable with respect to every number in the problem and the grid. They are NaN, like their derivatives,
+      where the solve did not converge, unless ``throw`` is false. A derivative whose linear solve does not converge is
+      NaN, too. Warnings and messages do not leave a transformation.
 
     Raises:
       ValueError: a question without an answer, or a bad argument.
@@ -131,10 +119,14 @@ def solve(
         mesh = checks.over_devices(mesh, "solve", problem, grid, *filter(None, [scheme]), known, traced=traced)
     if traced:
         if isinstance(scheme, PathScheme):
-            raise ValueError(_at_host_level(scheme))
-        scheme, sharpen = scheme or choose_traced_scheme(problem, method), scheme is None
-        on = Discretisation(problem, grid, scheme, arguments.traced_dtype(dtype, "solve"))
-        return _solve_traced(on, method, tol, guess, max_steps, sharpen=sharpen)
+            raise ValueError(
+                f"solve: {type(scheme).__name__}() runs at host level only; inside jit, vmap and grad use Upwind()"
+            )
+        own = arguments.traced_dtype(dtype, "solve")
+        inner = np.dtype(np.float64) if dtype is None else own
+        x64 = np.float64 in (inner, jnp.result_type(float))
+        asked = Asked(method, scheme, max_steps, time_limit, throw, own, inner, x64)
+        return _solve_traced(problem, grid, asked, guess, tol)
     kind = arguments.as_dtype(dtype)
     check_node_values(guess, grid, "solve: the guess")
     grid.check_spacings(kind)
@@ -184,113 +176,13 @@ def _partial(on: Discretisation, kept: host_loop.Kept | None) -> Solution:
     return solution_at_start(on, value, Status.INTERRUPTED)
 
 
-def solve_on_host(
-    on: Discretisation, method: Method, tol: float, guess: Nodes | None, clock: Clock, *, sharpen: bool, free: bool
-) -> Solution:
-    """The solution by checks of nodes, preparation, coarser grids and steps, in this order, as the clock allows.
-
-    ``sharpen``: by the scheme that suits the problem, with an estimate of the grid's error. ``free``: nobody asked for
-    the method.
-    """
-    problem, grid = on.problem, on.grid
-    start: Nodes | None = None if guess is None else np.asarray(guess, on.dtype)
-    try:
-        # from cheap to dear: all nodes, the ends of the box, and only then what is compiled for the grid
-        node_checks.values(on, clock)
-        admissibility.values(problem, grid, on.dtype)
-        if sharpen:
-            on = dataclasses.replace(on, scheme=choose_scheme(on, method))
-            sharpen = on.scheme.subcell  # value iteration and tubes start from nowhere else, on a coarser grid neither
-        task, assumptions, reached = prepare_on_host(on.chain, method=method.inner, tol=tol, clock=clock)
-    except Stopped as stop:
-        return solution_at_start(on, np.zeros(grid.shape) if start is None else np.array(start), stop.status)
-    asked_again = sharpen and free and grid.size > COARSEST and not grid.sides("open")
-    start, shapes = nested.start(task, on.scheme, method, start, clock, asked_again=asked_again)
-    settled = nested.settle(nested.staged(task, on.scheme), assumptions, reached, start, clock)
-    about: dict[str, Any] = {"levels": [*shapes, grid.shape]}
-    if not on.scheme.monotone and (settled.code is Status.CONVERGED or not sharpen):
-        settled = nested.better_of(settled, nested.second_order(settled, on.scheme, clock), clock, sharpen=sharpen)
-    settled = nested.plainly(settled)
-    solution = finish(settled, grid)
-    if sharpen and solution.status is Status.CONVERGED:
-        solution = with_grid_error(solution, settled, nested.coarser_answer(settled, clock))
-    if solution.status is Status.CONVERGED:
-        solution = with_box_error(solution, settled, clock)
-    if type(settled.task.method.evaluation) is not type(method.evaluation):
-        about["method"] = settled.task.method.described(problem.is_game)
-    solution.stats.update(about)
-    return solution
-
-
 @as_one_program
-def _solve_traced(
-    on: Discretisation, method: Method | None, tol: Number, guess: Nodes | None, max_steps: int | None, *, sharpen: bool
-) -> Solution:
-    """The solution inside a JAX transformation: no chunks, no files, no exceptions, no checks of values.
+def _solve_traced(problem: Problem, grid: Grid, asked: Asked, guess: Nodes | None, tol: Number) -> Solution:
+    """The solution inside a JAX transformation: the host's, found by a call from the compiled program.
 
-    ``sharpen``: nobody asked for the scheme, and the monotone answer stands where another one is not found.
+    Its derivative is that of the equation that the answer solves, and is part of the program.
     """
-    method = choose(on.problem, on.grid, traced=True, method=method)
-    if method.coarsest is not None:
-        raise ValueError("solve: Nested(...) runs at host level only; inside jit, vmap and grad use its inner method")
-    task, assumptions = prepare_traced(on.chain, method=method, tol=tol)
-    # the derivative is that of the fixed point, by the implicit function theorem, and not of the steps that led there
-    frozen, most = jax.lax.stop_gradient(task), max_steps or TRACED_STEPS
-    start = frozen.start() if guess is None else jax.lax.stop_gradient(jnp.asarray(guess, on.dtype))
-    state = fixed_point.run(frozen, fixed_point.begin(frozen, start), most)
-    wrong = jnp.zeros((), bool)
-    if assumptions.may_rest:
-        state, wrong = _without_rests_to_leave(frozen, state)
-    solution = _differentiable(task, state, assumptions)
-    if not on.scheme.monotone:
-        further, assumptions = nested.raised(task, assumptions, on.scheme)
-        known = jax.lax.stop_gradient(further)
-        state = fixed_point.run(known, fixed_point.begin(known, state.value), most)
-        sharp = dataclasses.replace(_differentiable(further, state, assumptions), monotone_error=solution.error)
-        solution = _better_of(solution, sharp) if sharpen else sharp
-    wrong |= solution.code == Status.NONFINITE
-    value = solution.value * jnp.where(wrong, jnp.nan, 1).astype(on.dtype)  # a derivative drops the code: NaN, too
-    return altered(solution, value=jnp.where(task.counted, value, jnp.inf) if task.has_lost else value)
-
-
-def _differentiable(task: Task, state: State, assumptions: Assumptions) -> Solution:
-    """The solution of a state, whose value and policy are functions of the numbers in the task."""
-    value = adjoint.attach(task, state)
-    return altered(assemble(task, adjoint.attach_policy(task, state, value), assumptions), value=value)
-
-
-def _better_of(plain: Solution, sharp: Solution) -> Solution:
-    """The answer of second order; where its iteration did not converge the monotone one, with the code of what failed.
-
-    The host says it in the message, which does not leave a transformation.
-    """
-    started = plain.code == Status.CONVERGED
-    found = started & (sharp.code == Status.CONVERGED)
-    names = ("value", "policy", "disturbance", "steps")
-    chosen = {
-        name: jax.tree.map(functools.partial(jnp.where, found), getattr(sharp, name), getattr(plain, name))
-        for name in names
-    }
-    return altered(sharp, **chosen, code=jnp.where(started, sharp.code, plain.code))
-
-
-def _at_host_level(scheme: object) -> str:
-    """The refusal of a scheme inside a transformation."""
-    return f"solve: {type(scheme).__name__}() runs at host level only; inside jit, vmap and grad use Upwind()"
-
-
-def _without_rests_to_leave(task: Task, state: State) -> tuple[State, Scalar]:
-    """The state and a flag: stalled, without bounds, where it pays to leave a held rest node; only the host goes on."""
-    pays = resting.leaving_pays(task.on.chain, task.obstacles, task.counted, state.value)
-    # under a discount, which may be traced, no node was held for being at rest
-    wrong = jnp.any(pays) & (state.code == Status.CONVERGED) & (task.problem.discount == 0)
-    gap, infinite = state.bound, jnp.asarray(jnp.inf, state.value.dtype)
-    gap = dataclasses.replace(
-        gap, below=jnp.where(wrong, 0, gap.below), above=jnp.where(wrong, infinite, gap.above),
-        lift=jnp.where(wrong, infinite, gap.lift), error=jnp.where(wrong, infinite, gap.error),
-    )  # fmt: skip
-    code = jnp.where(wrong, Status.STALLED, state.code).astype(state.code.dtype)
-    return dataclasses.replace(state, bound=gap, code=code), wrong
+    return transformed.solve(problem, grid, asked, guess, tol)
 
 
 def check_limits(max_steps: object, time_limit: object) -> None:

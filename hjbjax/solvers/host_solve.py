@@ -1,0 +1,84 @@
+"""A stationary solve on the host: checks of nodes, preparation, coarser grids and steps, as the clock allows.
+
+Front doors and JAX transformations take the same path, so that their answers are the same.
+"""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.iteration.methods import Method
+from hjbjax.markov_chain import admissibility, node_checks
+from hjbjax.problem.types import Nodes
+from hjbjax.solution.clock import Clock, Stopped
+from hjbjax.solution.solution import Solution
+from hjbjax.solution.status import Status
+from hjbjax.solvers import nested
+from hjbjax.solvers.box_error import with_box_error
+from hjbjax.solvers.nested import Settled
+from hjbjax.solvers.result import finish, solution_at_start, with_grid_error
+from hjbjax.solvers.setup import COARSEST, choose_scheme, prepare_on_host
+
+
+def solve_on_host(
+    on: Discretisation, method: Method, tol: float, guess: Nodes | None, clock: Clock, *, sharpen: bool, free: bool
+) -> Solution:
+    """The solution, with an estimate of the grid's error where the caller left the choice of the scheme.
+
+    ``sharpen`` and ``free`` as in ``settled_on_host``.
+    """
+    try:
+        settled, about = settled_on_host(on, method, tol, guess, clock, sharpen=sharpen, free=free)
+    except Stopped as stop:
+        return solution_at_start(stop.reached[0], stop.reached[1], stop.status)
+    solution = finish(settled, on.grid)
+    # value iteration and tubes, whose targets are nodes, have no estimate
+    if sharpen and settled.task.scheme.subcell and solution.status is Status.CONVERGED:
+        solution = with_grid_error(solution, settled, nested.coarser_answer(settled, clock))
+    if solution.status is Status.CONVERGED:
+        solution = with_box_error(solution, settled, clock)
+    solution.stats.update(about)
+    return solution
+
+
+def settled_on_host(
+    on: Discretisation, method: Method, tol: float, guess: Nodes | None, clock: Clock, *, sharpen: bool, free: bool
+) -> tuple[Settled, dict[str, Any]]:
+    """The end of the iteration, and what there is to say about it.
+
+    Args:
+      on: the problem on its grid.
+      method: how it is solved, maybe of nested grids.
+      tol: as in ``solve``.
+      guess: node values to start from, or None.
+      clock: the limits.
+      sharpen: the caller left the choice of the scheme.
+      free: the caller left the choice of the method.
+
+    Raises:
+      Stopped: the clock said stop before the first step; ``reached`` is the discretisation and the start.
+    """
+    problem, grid = on.problem, on.grid
+    start: Nodes | None = None if guess is None else np.asarray(guess, on.dtype)
+    try:
+        # from cheap to expensive: all nodes, the ends of the box, and only then what is compiled for the grid
+        node_checks.values(on, clock)
+        admissibility.values(problem, grid, on.dtype)
+        if sharpen:
+            on = dataclasses.replace(on, scheme=choose_scheme(on, method))
+            sharpen = on.scheme.subcell  # value iteration and tubes start from nowhere else, on a coarser grid neither
+        task, assumptions, reached = prepare_on_host(on.chain, method=method.inner, tol=tol, clock=clock)
+    except Stopped as stop:
+        raise Stopped(stop.status, (on, np.zeros(grid.shape) if start is None else np.array(start))) from None
+    asked_again = sharpen and free and grid.size > COARSEST and not grid.sides("open")
+    start, shapes = nested.start(task, on.scheme, method, start, clock, asked_again=asked_again)
+    settled = nested.settle(nested.staged(task, on.scheme), assumptions, reached, start, clock)
+    about: dict[str, Any] = {"levels": [*shapes, grid.shape]}
+    if not on.scheme.monotone and (settled.code is Status.CONVERGED or not sharpen):
+        sharp = nested.second_order(settled, on.scheme, clock)
+        settled = nested.better_of(settled, sharp, clock, sharpen=sharpen)
+    if type(settled.task.method.evaluation) is not type(method.evaluation):
+        about["method"] = settled.task.method.described(problem.is_game)
+    return nested.plainly(settled), about

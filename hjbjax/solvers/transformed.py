@@ -1,0 +1,262 @@
+"""``solve`` inside ``jit``, ``vmap`` and ``grad``: the answer of the host, and its derivative.
+
+What the host decides between two programs (which certificate holds, vanishing discounts, nodes from which a target can
+be forced, rest nodes that are left, linear solves where sweeps stall, the second order) would be another method if a
+compiled program had to decide it. So the program calls the host, once for all lanes of a ``vmap``, and the answer is
+that of ``solve`` to the last bit. Derivatives never see the steps: they are those of the equation that the answer
+solves, by the implicit function theorem, and are compiled.
+
+Each lane runs as ``solve`` would run it, on the caller's device, in float64 unless float32 was asked for.
+"""
+
+import dataclasses
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.discretisation.discretisation import Discretisation, Scheme
+from hjbjax.discretisation.schemes import Limited, Upwind
+from hjbjax.iteration import adjoint
+from hjbjax.iteration.bellman import Greedy
+from hjbjax.iteration.certificates import Certificate
+from hjbjax.iteration.fixed_point import Task
+from hjbjax.iteration.methods import Method
+from hjbjax.markov_chain import memory
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.host_calls import call_on_host
+from hjbjax.problem.problem import Problem, is_constrained, is_discounted
+from hjbjax.problem.pytree import altered, is_traced, pytree_dataclass
+from hjbjax.problem.settings import own_settings
+from hjbjax.problem.types import Nodes, Number
+from hjbjax.solution.clock import Clock, Stopped
+from hjbjax.solution.solution import Solution, question
+from hjbjax.solution.status import Status, keeping_warnings
+from hjbjax.solvers import host_loop
+from hjbjax.solvers.host_solve import settled_on_host
+from hjbjax.solvers.result import finish
+from hjbjax.solvers.setup import assumptions_of, check_on_one_state, choose, is_bare, prepare
+
+NOTHING = [[1.0, -np.inf], [1.0, np.inf]]  # an enclosure that says nothing
+
+
+@pytree_dataclass(static=("scheme", "max_steps", "time_limit", "throw", "dtype", "inner", "x64"))
+class Asked:
+    """The choices of a solve.
+
+    Attributes:
+      method, scheme: as in ``solve``.
+      max_steps, time_limit, throw: as in ``solve``.
+      dtype: of the answer, in which derivatives are found.
+      inner: the floating-point type in which the host solves.
+      x64: true if JAX knows float64 meanwhile, as the caller's functions may have been traced with it.
+    """
+
+    method: Method | None
+    scheme: Scheme | None
+    max_steps: int | None
+    time_limit: float | None
+    throw: bool
+    dtype: np.dtype
+    inner: np.dtype
+    x64: bool
+
+
+@pytree_dataclass()
+class Found:
+    """What the host hands over.
+
+    Attributes:
+      value: V, (*grid), at unreachable nodes a finite number above all others.
+      policy: the optimal actions, and the defect of the equation under them.
+      fixed, counted: bool (*grid), the nodes whose value is given, and those with a finite value.
+      floor: the bound below which no value was let.
+      code, steps: as in ``Solution``.
+      sharp: true for an answer by slopes of high order.
+      enclosure: as in ``Solution``; of no meaning without a certificate.
+      monotone_error: of the monotone answer, infinite where nothing certifies it.
+    """
+
+    value: Any
+    policy: Greedy
+    fixed: Any
+    counted: Any
+    floor: Any
+    code: Any
+    steps: Any
+    sharp: Any
+    enclosure: Any
+    monotone_error: Any
+
+
+def solve(problem: Problem, grid: Grid, asked: Asked, guess: Nodes | None, tol: Number) -> Solution:
+    """The solution, whose value and policy are functions of the numbers in the problem and in the grid."""
+    method = choose(problem, grid, traced=True, method=asked.method).inner
+    on = Discretisation(problem, grid, asked.scheme or _scheme(problem, method), asked.dtype)
+    found = _on_host(asked, (problem, grid, asked.method, guess, tol), on)
+    task = _task(on, method, tol, found)
+    value, policy = _differentiable(task, on.scheme, found)
+    # a transformation drops the code, so that a failure must show in the numbers; a derivative is NaN with its value
+    good = (found.code == Status.CONVERGED) if asked.throw else jnp.ones((), bool)
+    value, policy = jax.tree.map(lambda leaf: leaf * jnp.where(good, 1, jnp.nan).astype(leaf.dtype), (value, policy))
+    if task.has_lost:
+        value = jnp.where(task.counted, value, jnp.inf)
+    chain = on.scheme.monotone
+    certified = chain and task.certificate not in (Certificate.NONE, Certificate.OPEN)
+    controls, disturbances = policy.controls, policy.disturbances
+    empty = jnp.zeros((*grid.shape, 0), asked.dtype)
+    return Solution(
+        grid, value, None if is_bare(method) else jnp.stack(controls, axis=-1) if controls else empty,
+        jnp.stack(disturbances, axis=-1) if problem.is_game and not is_bare(method) else None,
+        code=found.code, steps=found.steps,
+        enclosure=found.enclosure if certified else None,
+        monotone_error=None if chain else found.monotone_error,
+        **question(problem),
+    )  # fmt: skip
+
+
+def _scheme(problem: Problem, method: Method) -> Scheme:
+    """The scheme of ``choose_scheme`` as far as the structure of a problem tells: slopes, or surely none."""
+    tube = is_constrained(problem) and is_discounted(problem) is False
+    return Upwind() if method.relaxes or tube else Limited()
+
+
+def _task(on: Discretisation, method: Method, tol: Number, found: Found) -> Task:
+    """The task that the answer solves, with tracers among its numbers, by what the host found of its nodes."""
+    problem, assumptions = on.problem, assumptions_of(on.chain)
+    # where the system rests, and at which cost, the host has found out
+    plain = dataclasses.replace(assumptions, may_rest=False, costs_certify=False)
+    task = prepare(on.chain, method=method, tol=tol, assumptions=plain)
+    ends = problem.target is not None or assumptions.may_rest
+    may_lose = ends and not is_constrained(problem) and not is_discounted(problem)
+    obstacles = dataclasses.replace(task.obstacles, fixed=found.fixed)
+    return dataclasses.replace(task, obstacles=obstacles, counted=found.counted, has_lost=bool(may_lose))
+
+
+def _differentiable(task: Task, scheme: Scheme, found: Found) -> tuple[jax.Array, Greedy]:
+    """Value and policy of the answer, as functions of the numbers in its task."""
+    # what is given is imposed anew: nodes that are unreachable stand above all others in this type
+    answer = dataclasses.replace(found, value=jax.lax.stop_gradient(task).impose(found.value))
+
+    def by(task: Task) -> tuple[jax.Array, Greedy]:
+        value = adjoint.attach(task, answer)
+        return value, adjoint.attach_policy(task, found.policy, value)
+
+    if scheme.monotone:
+        return by(task)
+    sharp = dataclasses.replace(task, on=dataclasses.replace(task.on, scheme=scheme), certificate=Certificate.RESIDUAL)
+    if not task.constrained:
+        sharp = dataclasses.replace(sharp, obstacles=dataclasses.replace(sharp.obstacles, lower=found.floor))
+    return jax.lax.cond(found.sharp, lambda: by(sharp), lambda: by(task))
+
+
+def _on_host(asked: Asked, given: Any, on: Discretisation) -> Found:
+    """What the host finds, lane by lane where some of its arguments are batched."""
+    leaves, structure = jax.tree.flatten(given)
+    leaves = [jax.lax.stop_gradient(leaf) if is_traced(leaf) else leaf for leaf in leaves]
+    varying = [i for i, leaf in enumerate(leaves) if is_traced(leaf)]
+    ranks = [jnp.ndim(leaves[i]) for i in varying]
+    like = _shapes(on)
+    setting = host_loop.setting("jax_default_device")
+
+    def one(*numbers: np.ndarray) -> Found:
+        mine = list(leaves)
+        for i, number in zip(varying, numbers, strict=True):
+            mine[i] = number
+        with jax.default_device(setting):
+            return _solved(asked, *jax.tree.unflatten(structure, mine))
+
+    def all_lanes(*arrays: np.ndarray) -> Found:
+        return _in_lanes(one, arrays, ranks)
+
+    return call_on_host(all_lanes, like, *(leaves[i] for i in varying), vmap_method="expand_dims")
+
+
+def _shapes(on: Discretisation) -> Found:
+    """The shapes and types of what the host hands over."""
+    shape, inputs = on.grid.shape, (on.problem.controls, on.problem.disturbances)
+
+    def array(*axes: int, dtype: Any = on.dtype) -> Any:
+        return jax.ShapeDtypeStruct(axes, dtype)
+
+    players = (tuple(array(*shape) for _ in range(0 if each is None else each.dim)) for each in inputs)
+    mask, number, count = array(*shape, dtype=np.dtype(bool)), array(), array(dtype=np.dtype(np.int32))
+    return Found(
+        array(*shape), Greedy(array(*shape), *players), mask, mask, number, count, count,
+        array(dtype=np.dtype(bool)), array(2, 2), number,
+    )  # fmt: skip
+
+
+def _in_lanes(one: Callable[..., Found], arrays: tuple[np.ndarray, ...], ranks: list[int]) -> Found:
+    """The answers of all lanes, with their axes in front; side by side where there is more than one core."""
+    fronts = [array.shape[: array.ndim - rank] for array, rank in zip(arrays, ranks, strict=True)]
+    front = np.broadcast_shapes(*fronts)
+    rows = [np.broadcast_to(array, front + array.shape[len(own) :]) for array, own in zip(arrays, fronts, strict=True)]
+    lanes = list(np.ndindex(front))
+    settings = host_loop.settings()
+
+    def lane(index: tuple[int, ...]) -> Found:
+        with settings():
+            return one(*(row[index] for row in rows))
+
+    found = [one(*(row[index] for row in rows)) for index in lanes[:1]]  # on its own: it compiles for the others
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if cores > 1 and len(lanes) > 2:
+        with ThreadPoolExecutor(cores) as pool:
+            found += pool.map(lane, lanes[1:])
+    else:
+        found += [one(*(row[index] for row in rows)) for index in lanes[1:]]
+    return jax.tree.map(lambda *leaves: np.reshape(np.stack(leaves), front + np.shape(leaves[0])), *found)
+
+
+def _solved(
+    asked: Asked, problem: Problem, grid: Grid, method: Method | None, guess: Nodes | None, tol: Number
+) -> Found:
+    """The answer of one lane, in NumPy; its warnings stay here, as no line of the user's runs now."""
+    clock = Clock(asked.max_steps or 10**9, asked.time_limit, progress=False)
+    with own_settings(x64=asked.x64), keeping_warnings():
+        grid.check_spacings(asked.inner)
+        free, sharpen = method is None, asked.scheme is None
+        method = choose(problem, grid, traced=False, method=method)
+        on = Discretisation(problem, grid, asked.scheme or Upwind(subcell=True), asked.inner)
+        check_on_one_state(problem, grid, on.scheme)
+        memory.require(problem, grid, method, asked.inner, None)
+        try:
+            settled, _ = settled_on_host(on, method, float(tol), guess, clock, sharpen=sharpen, free=free)
+        except Stopped as stop:
+            like = _shapes(dataclasses.replace(on, dtype=asked.inner))
+            nothing = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), like)
+            return altered(nothing, code=np.int32(stop.status), enclosure=np.array(NOTHING))
+        solution = finish(settled, grid)
+    task, state = settled.task, jax.device_get(settled.state)
+    error = solution.error if settled.origin is None else solution.monotone_error
+    lower, least = task.obstacles.lower, np.finfo(asked.dtype).min / 8
+    floor = least if lower is None or np.ndim(lower) else max(float(lower), least)
+    return Found(
+        value=np.asarray(state.value),
+        policy=jax.tree.map(lambda leaf: np.broadcast_to(leaf, grid.shape), _whole(state.policy, problem)),
+        fixed=np.broadcast_to(np.asarray(task.obstacles.fixed), grid.shape),
+        counted=np.broadcast_to(np.asarray(task.counted), grid.shape),
+        floor=np.asarray(floor),
+        code=np.int32(solution.code),
+        steps=np.int32(solution.steps),
+        sharp=np.asarray(not task.scheme.monotone),
+        enclosure=np.asarray(NOTHING if solution.enclosure is None else solution.enclosure),
+        monotone_error=np.asarray(np.inf if error is None else error),
+    )
+
+
+def _whole(policy: Greedy, problem: Problem) -> Greedy:
+    """The policy with an array of zeros for every action that was not kept."""
+    kept: list[tuple[Any, ...]] = []
+    for actions, admissible in (
+        (policy.controls, problem.controls),
+        (policy.disturbances, problem.disturbances),
+    ):
+        count = 0 if admissible is None else admissible.dim
+        kept.append(tuple(actions) if len(actions) == count else (np.zeros(()),) * count)
+    return Greedy(policy.defect, *kept)

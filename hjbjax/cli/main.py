@@ -177,7 +177,9 @@ def launch(processes: int, heartbeat: int, words: tuple[str, ...]) -> None:
         _check_places(out, *(given[key] for key in ("force", "checkpoint", "resume")))
         with _one_line_error(OSError, 2, "--out: "):
             run_folder.check_writable(out)
-    if code := processes_of.start(words, processes, heartbeat, out / FILES[0]):
+    with interrupts.raised():
+        code = processes_of.start(words, processes, heartbeat, out / FILES[0])
+    if code:
         raise SystemExit(code)
 
 

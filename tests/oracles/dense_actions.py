@@ -113,7 +113,7 @@ def _in_space(admissible, components, linear, square, size):
 def _stationary(rows, ends, slope, square, face):
     """Where slope + 2 square u is a combination of the rows, with the rows at their places and a face's inputs fixed."""
     size, held, m = rows.shape
-    unit = max(np.max(np.abs(slope)), np.max(square)) or 1.0  # ``pinv`` drops what is tiny next to the largest entry
+    unit = max(np.max(np.abs(slope)), np.max(square)) or 1.0  # ``pinv`` drops what is tiny next to the rest
     slope, square, wide = slope / unit, square / unit, np.max(np.abs(rows), axis=-1, initial=0)
     wide = np.where(wide > 0, wide, 1)
     rows, ends = rows / wide[..., None], ends / wide

@@ -111,7 +111,7 @@ def _in_space(admissible, components, linear, square, size):
 
 
 def _stationary(rows, ends, slope, square, face):
-    """Where slope + 2 square u is a combination of the rows, with the rows at their places and a face's inputs fixed."""
+    """Where slope + 2 square u is a combination of the rows, with rows at their places and a face's inputs fixed."""
     size, held, m = rows.shape
     unit = max(np.max(np.abs(slope)), np.max(square)) or 1.0  # ``pinv`` drops what is tiny next to the rest
     slope, square, wide = slope / unit, square / unit, np.max(np.abs(rows), axis=-1, initial=0)

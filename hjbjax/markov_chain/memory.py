@@ -5,6 +5,7 @@ container) leave: the machine alone would say 60 GB where a container is killed 
 """
 
 import contextlib
+import itertools
 import math
 import os
 from collections.abc import Iterator
@@ -15,7 +16,7 @@ import numpy as np
 
 from hjbjax.discretisation import stencil
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.hamiltonian.players import find_players
+from hjbjax.hamiltonian.players import find_players, shared
 from hjbjax.iteration.evaluation import Krylov
 from hjbjax.iteration.methods import Method, PolicyIteration
 from hjbjax.iteration.time_methods import TimeMethod
@@ -95,12 +96,21 @@ def _actions(problem: Problem) -> int:
 
 
 def _searched(problem: Problem, n: int, dtype: DType) -> int:
-    """Words a node of a search between samples: the best so far, what is tried, and both players' actions of either."""
+    """Words per node of an optimum that is not a formula: of a search between samples, or of quadratic programs.
+
+    A search keeps the best action so far, the one that is tried, and both players' actions. A program has m + m²
+    numbers and m + 3 for every kink; it is solved in parts of the grid.
+    """
     players = find_players(problem, n, dtype)
     alone = [each for each in players.both if not (each.exact or each.enumerated)]
     if problem.is_game and not players.decoupled:
         return 10 + 2 * _actions(problem)
-    return max((5 + 2 * each.admissible.dim for each in alone if each.admissible is not None), default=0)
+    words = [5 + 2 * each.admissible.dim for each in alone if each.admissible is not None]
+    for player in players.both:
+        for group in itertools.compress(player.groups, player.programs if player.programmed else ()):
+            m, kinks = len(group), (1 if problem.noise is None else 2) * len(shared(player.driven, group))
+            words.append(2 * (m + m * m + kinks * (m + 3)) + m)
+    return max(words, default=0)
 
 
 def available() -> int | None:

@@ -144,11 +144,12 @@ def test_a_ball_is_minimised_exactly(kind, scheme, seed):
         (lambda x, u: x + u, lambda x, u: u @ u, Ball(1.0, 2), True),
         (lambda x, u: x + u[:2] * u[2], lambda x, u: u @ u, Ball(1.0, 3), False),
         (lambda x, u: x * u[0] + u[1], None, Box([-1.0] * 2, [1.0] * 2), True),  # both inputs drive both components
-        (lambda x, u: x * u[0] + u[1] - u[2], None, Box([-1.0] * 3, [1.0] * 3), False),  # three do
-        (lambda x, u: x * u[0] + u[1], None, Ball(1.0, 2), False),
+        (lambda x, u: x * u[0] + u[1] - u[2], None, Box([-1.0] * 3, [1.0] * 3), True),  # three do
+        (lambda x, u: x * u[0] + u[1], None, Ball(1.0, 2), True),
         (lambda x, u: x + u[0] ** 2, None, UNIT, False),
         (lambda x, u: x + jnp.sin(u[0]), None, UNIT, False),
-        (lambda x, u: x + u, lambda x, u: u[0] * u[1], Box([-1.0] * 2, [1.0] * 2), False),
+        (lambda x, u: x + u, lambda x, u: u[0] * u[1], Box([-1.0] * 2, [1.0] * 2), True),  # where it is convex
+        (lambda x, u: x + u, lambda x, u: u[0] * u[1] ** 2, Box([-1.0] * 2, [1.0] * 2), False),
         (lambda x, u: x + u[0], lambda x, u: u[0] ** 4, UNIT, False),
         (lambda x, u: x + u[0], lambda x, u: jnp.exp(x[0]) * u[0] ** 2 + jnp.sin(x[1]) * u[0], UNIT, True),
         (lambda x, u: x * u[0], None, UNIT, True),

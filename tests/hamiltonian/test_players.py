@@ -70,6 +70,14 @@ def apart(x, u, d):
     return jnp.stack([u[0] - u[1], d[0]])
 
 
+def apart_of_three(x, u, d):
+    return jnp.stack([u[0] - u[1] + 0.5 * u[2], d[0]])
+
+
+def effort(x, u, d):
+    return (u[0] + u[2]) ** 2 + u[1] ** 2 - d[0] ** 2
+
+
 def along(x, u, d):
     return 5 * jnp.abs(x[0]) + 0.3 * u[0]
 
@@ -93,6 +101,8 @@ CORNERS = hjb.Finite([[-1.0, -1.0], [0.93, -1.0], [0.93, 1.0]])
         (meeting, along, SQUARE, hjb.Finite([[-1.0], [1.0]]), "lower", True),
         (meeting, along, None, UNIT, "upper", True),
         (apart, along, SQUARE, UNIT, "upper", True),  # each drives a component of its own
+        (apart_of_three, effort, hjb.Box([-1.0] * 3, [1.0] * 3), UNIT, "upper", True),
+        (apart_of_three, effort, hjb.Ball(1.0, 3), UNIT, "lower", True),
         (apart, crossed, SQUARE, UNIT, "upper", False),  # but here they meet in the cost
         (apart, crossed, SQUARE, UNIT, "lower", False),
     ],

@@ -79,10 +79,11 @@ def _start(chain):
     """A policy with a finite value where there is one, and the nodes where there is none."""
     model = chain.model
     held, given, stop = _obstacles(model, chain.size)
-    tried = _supports(chain)
     lost = np.zeros(chain.size, bool)
     if model.discount > 0:
-        return np.where(held, given, np.where(np.isfinite(stop), stop, 0)), tried[0], lost
+        value = np.where(held, given, np.where(np.isfinite(stop), stop, 0))
+        return value, best_control(chain, value)[1], lost
+    tried = _supports(chain)
     ends = held | np.isfinite(stop)
     inside = np.ones(chain.size, bool)
     while True:

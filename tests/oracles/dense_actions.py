@@ -29,7 +29,10 @@ def candidates(chain, value, admissible, gain, linear, square, offset):
         linear + sum(p[:, None] * gain[:, i] for i, p in enumerate(pick)) for pick in itertools.product(*slopes)
     ]
     lines = [(gain[:, i], kink - offset[:, i]) for i in range(chain.n) for kink in chain.kinks(i)]
-    if m == 1:
+    if m > 2:
+        found = _in_space(admissible, [(gain[:, i], [k - offset[:, i] for k in chain.kinks(i)], slopes[i])
+                                       for i in range(chain.n)], linear, square, size)  # fmt: skip
+    elif m == 1:
         found = _on_a_line(admissible, gradients, lines, square, size)
     else:
         found = _in_the_plane(admissible, gradients, lines, square, size)
@@ -81,6 +84,61 @@ def _in_the_plane(admissible, gradients, lines, square, size):
     return found
 
 
+def _in_space(admissible, components, linear, square, size):
+    """Stationary points with some inputs at their ends, some components at a kink, and a slope for each of the others.
+
+    ``components`` are the rows, the places of the kinks on them, and the slopes between them.
+    """
+    found = [np.zeros((size, admissible.dim))]
+    options = [[(g, c, None) for c in kinks] + [(g, None, p) for p in slopes] for g, kinks, slopes in components]
+    for choice in itertools.product(*options):
+        held = [(g, c) for g, c, _ in choice if c is not None]
+        slope = (
+            linear + sum(np.asarray(p)[..., None] * g for g, _, p in choice if p is not None) + np.zeros(found[0].shape)
+        )
+        rows = np.stack([g for g, _ in held], 1) if held else np.zeros((size, 0, admissible.dim))
+        ends = np.stack([c for _, c in held], 1) if held else np.zeros((size, 0))
+        if admissible.kind == "ball":
+            found += _on_a_sphere(admissible.radius, rows, ends, slope, square)
+        else:
+            found += [
+                _stationary(rows, ends, slope, square, face)
+                for face in itertools.product(
+                    *([None, lo, hi] for lo, hi in zip(admissible.lo, admissible.hi, strict=True))
+                )
+            ]
+    return found
+
+
+def _stationary(rows, ends, slope, square, face):
+    """Where slope + 2 square u is a combination of the rows, with rows at their places and a face's inputs fixed."""
+    size, held, m = rows.shape
+    unit = max(np.max(np.abs(slope)), np.max(square)) or 1.0  # ``pinv`` drops what is tiny next to the rest
+    slope, square, wide = slope / unit, square / unit, np.max(np.abs(rows), axis=-1, initial=0)
+    wide = np.where(wide > 0, wide, 1)
+    rows, ends = rows / wide[..., None], ends / wide
+    matrix, right = np.zeros((size, m + held, m + held)), np.zeros((size, m + held))
+    matrix[:, :m, :m], right[:, :m] = np.diag(2 * square), -slope
+    matrix[:, :m, m:], matrix[:, m:, :m], right[:, m:] = np.swapaxes(rows, 1, 2), rows, ends
+    for j, end in enumerate(face):
+        if end is not None:
+            matrix[:, j], right[:, j] = np.eye(m + held)[j], end
+    return np.einsum("sij,sj->si", np.linalg.pinv(matrix), right)[:, :m]
+
+
+def _on_a_sphere(radius, rows, ends, slope, square):
+    """Of one square for all inputs: the stationary points on the rows' places, inside the ball and on its sphere."""
+    assert np.all(square == square[0])
+    wide = np.max(np.abs(rows), axis=-1, initial=0)
+    wide = np.where(wide > 0, wide, 1)
+    rows, ends = rows / wide[..., None], ends / wide
+    inverse = np.linalg.pinv(rows)
+    foot = np.einsum("sij,sj->si", inverse, ends)
+    along = slope - np.einsum("sij,sjk,sk->si", inverse, rows, slope)
+    reach = np.sqrt(np.maximum(radius**2 - np.sum(foot * foot, axis=-1, keepdims=True), 0)) * along / _length(along)
+    return [foot - reach, foot + reach, *([foot - along / (2 * square[0])] if square[0] else [])]
+
+
 def _length(g):
     length = np.sqrt(np.sum(g * g, axis=-1, keepdims=True))
     return np.where(length > 0, length, 1)
@@ -115,6 +173,10 @@ def best_disturbance(chain, value, u):
 def saddle(chain, value):
     """min max of H, or max min: the value and both actions. The outer set is finite, or both are intervals."""
     model, lower = chain.model, chain.model.lower
+    if not np.any(np.any(model.G, axis=(0, 2)) & np.any(model.E, axis=(0, 2))):  # a sum: neither matters to the other
+        u = best_control(chain, value, np.zeros((chain.size, model.disturbances.dim)))[1]
+        best, d = best_disturbance(chain, value, u)
+        return best, u, d
     outer, inner = (model.disturbances, best_control) if lower else (model.controls, best_disturbance)
     tried = [outer.points[k] for k in range(len(outer.points))] if outer.kind == "finite" else _outer(chain, value)
     found = []

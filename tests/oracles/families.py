@@ -29,7 +29,7 @@ def drift_game(p, x, u, d):
 
 def drift_apart(p, x, u, d):
     free = bare(jnp, p, x)
-    return jnp.stack([free[0] + p["gain"][0, 0] * u[0], free[1] + p["push"][1, 0] * d[0]])
+    return jnp.stack([free[0] + p["gain"][0] @ u, free[1] + p["push"][1] @ d])
 
 
 def of_state(xp, p, x):
@@ -41,8 +41,8 @@ def cost_linear(p, x, u, *d):
     return total + p["harm"] @ d[0] if d else total
 
 
-def cost_square(p, x, u):
-    return cost_linear(p, x, u) + p["square"] @ (u * u)
+def cost_square(p, x, u, *d):
+    return cost_linear(p, x, u, *d) + p["square"] @ (u * u)
 
 
 def target(p, x):
@@ -126,6 +126,10 @@ FAMILIES = [
     Family("plane, pairs", PLANE, "box2"),
     Family("plane, one input", PLANE, "box1", noise="diagonal", periodic=TUBE, ends=("target", "exit")),
     Family("plane, ball", PLANE, "ball2", drift="own", cost="linear", ends=("target", "exit")),
+    Family("plane, three inputs", PLANE, "box3", ends=("target", "exit")),
+    Family("plane, three inputs, noise", PLANE, "box3", noise="diagonal", periodic=TUBE),
+    Family("plane, shared ball", PLANE, "ball2", ends=("stop",)),
+    Family("plane, ball of three", PLANE, "ball3", noise="diagonal", ends=("target", "exit")),
     Family("plane, correlated", PLANE, "finite2", noise="matrix", ends=("stop",)),
     Family("plane, correlated box", PLANE, "box1", noise="matrix", ends=("target", "exit"), periodic=TUBE),
     Family("plane, stretched", PLANE, "box2", drift="own", noise="diagonal", stretched=(True, True)),
@@ -136,6 +140,7 @@ FAMILIES = [
     Family("time, correlated", PLANE, "box2", drift="own", noise="matrix", discounted=False, ends=("target", "exit")),
     Family("rest, plane", PLANE, "box2", drift="own", discounted=False, ends=("rest",)),
     Family("game, plane", PLANE, "box1", "box1", "apart", "linear", ends=("target", "exit")),
+    Family("game, three inputs", PLANE, "box3", "box2", "apart", ends=("target", "exit")),
     Family("game, plane lower", PLANE, "finite1", "finite2", "game", "linear", noise="diagonal", lower=True),
     Family("reach, plane", PLANE, "ball2", drift="own", cost="none", discounted=False, ends=("stop",)),
     Family("reach-avoid, plane", PLANE, "finite2", cost="none", discounted=False, ends=("stop", "floor")),

@@ -165,6 +165,7 @@ def _costs(family, rng, axes, mine, theirs, rate, money):
     square = rng.uniform(0, 1, m) * rng.choice([0.0, 1.0]) if family.cost == "square" else np.zeros(m)
     if family.cost == "square" and not positive:
         square = square * rng.choice([-1.0, 1.0], m)
+    square = np.full(m, abs(square[0])) if mine.kind == "ball" else square  # the oracle knows convex spheres only
     harm = rng.normal(size=theirs.dim) if family.cost == "linear" and family.disturbances else np.zeros(theirs.dim)
     slope = rng.choice([0.0, 1.0]) * rng.normal(size=n)
     p = {"toll": rng.normal(), "slope": slope, "middle": np.array([rng.choice(axis) for axis in axes]),

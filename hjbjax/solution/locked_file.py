@@ -40,7 +40,7 @@ class LockedFile:
             try:
                 handle = _open(self.path)
             except OSError as error:
-                if not os.path.lexists(self.path):
+                if isinstance(error, FileNotFoundError) or not os.path.lexists(self.path):
                     return False
                 raise FileError(f"{self.path}: cannot be opened: {error.strerror or error}") from error
             try:

@@ -116,10 +116,10 @@ def new_file(path: str) -> Iterator[tuple[str, IO[bytes]]]:
             yield temporary, stream
     except (FileError, FileExistsError):
         raise
-    except (FileNotFoundError, NotADirectoryError) as error:
-        raise FileError(f"{path}: cannot be written: there is no folder {folder}") from error
     except OSError as error:
-        raise FileError(f"{path}: cannot be written: {error.strerror or error}") from error
+        missing = isinstance(error, (FileNotFoundError, NotADirectoryError)) and not os.path.isdir(folder)
+        reason = f"there is no folder {folder}" if missing else error.strerror or error
+        raise FileError(f"{path}: cannot be written: {reason}") from error
     finally:
         if os.path.lexists(temporary):
             os.unlink(temporary)

@@ -85,7 +85,7 @@ def solve(
       throw: raise when the solve does not converge, or inside a transformation return NaN; else the status says it.
       progress: say each phase as it begins, and show a bar of the steps after a second; ``None``: on a terminal.
       max_memory: bytes that the solve may take, instead of what is free.
-      checkpoint: a file that keeps what is done, every minute and at the end, or ``Checkpoint(path, every=)``.
+      checkpoint: a file for the state of the run, written every minute and at the end, or ``Checkpoint(path, every=)``.
       resume: go on from that file if it is there, to the same bits; host level.
       mesh: divide the nodes over its devices, its i-th axis those along the i-th axis of the grid, as in
         ``jax.make_mesh((4, 2), ("a", "b"))``; host level.
@@ -100,7 +100,8 @@ def solve(
     Raises:
       ValueError: a question without an answer, or a bad argument.
       MemoryError: a grid that does not fit, before anything is compiled.
-      FileExistsError: a checkpoint that is there, without ``resume``; ``FileError``: one of another question.
+      FileExistsError: the checkpoint exists, without ``resume``.
+      FileError: the checkpoint belongs to another question, is in use by another run, or cannot be written.
       SolveError: no convergence, be it by Ctrl-C, with the partial solution as ``.solution``.
 
     Example:

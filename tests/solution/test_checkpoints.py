@@ -394,6 +394,55 @@ def test_a_file_that_appears_during_the_run_is_not_replaced(tmp_path):
     assert "its own file there" in file.outcome
 
 
+def in_processes(run, monkeypatch, count=3):
+    """The answers of a run in many processes of one solve, which here are threads."""
+    me, barrier, votes, answers = threading.local(), threading.Barrier(count), [None] * count, [None] * count
+
+    def agreed(number):
+        votes[me.number] = number
+        barrier.wait()
+        least = min(votes)
+        barrier.wait()
+        return least
+
+    def process(number):
+        me.number = number
+        try:
+            answers[number] = run(number)
+        except (hjb.FileError, FileExistsError) as error:
+            answers[number] = error
+
+    monkeypatch.setattr(checkpoints, "agreed", agreed)
+    monkeypatch.setattr(checkpoints.jax, "process_index", lambda: me.number)
+    threads = [threading.Thread(target=process, args=(number,)) for number in range(count)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return answers
+
+
+def test_of_many_processes_of_one_solve_the_first_holds_the_file_and_all_read_it(tmp_path, monkeypatch):
+    path = tmp_path / "run.npz"
+
+    def run(number, resume=False):
+        with opened(path, resume=resume, together=True) as file:
+            journal = file.journal()
+            known = [float(record.arrays[0][0]) for record in journal.records]
+            journal.leave(Counter(float(number)), hjb.Status.INTERRUPTED)
+            return known
+
+    assert in_processes(run, monkeypatch) == [[], [], []]
+    refused = in_processes(run, monkeypatch)
+    assert [type(each) for each in refused] == [FileExistsError, hjb.FileError, hjb.FileError]
+    assert "solve: " in str(refused[1])
+    assert "another process of this run could not open it" in str(refused[1])
+    with opened(path, resume=True):
+        refused = in_processes(lambda number: run(number, resume=True), monkeypatch)
+    assert "another run is using it" in str(refused[0])
+    assert in_processes(lambda number: run(number, resume=True), monkeypatch) == [[0.0], [0.0], [0.0]]
+
+
 # --- what is written, and when ---
 
 

@@ -207,6 +207,7 @@ def outcome_of(*codes, words="", **more):
         (outcome_of((1, 3), (0, 3)), 3),
         (outcome_of((1, 130), (0, 130), interrupted=True), 130),
         (outcome_of((1, -15), (0, 0), interrupted=True), 0),
+        (outcome_of((0, 130), (1, -9), interrupted=True, hurried=True, killed=(1,)), 130),  # it kept everything
     ],
 )
 def test_the_first_process_has_said_it(outcome, code):
@@ -231,7 +232,7 @@ def test_the_first_process_has_said_it(outcome, code):
         ),
         (outcome_of((0, -15), (1, -15), interrupted=True), 130, "interrupted"),
         (
-            outcome_of((0, 130), (1, -9), interrupted=True, killed=(1,)),
+            outcome_of((0, 4), (1, -9), interrupted=True, killed=(1,)),
             130,
             "interrupted; process 1 of 2 was killed, not having ended in 7 s; go on",
         ),

@@ -39,10 +39,10 @@ def ended(process):
     return process.returncode, out, err
 
 
-def refused(words, part):
-    """Assert that a command is refused in one line with exit code 2."""
+def refused(words, part, code=2):
+    """Assert that a command is refused in one line."""
     result = CliRunner().invoke(main, list(words))
-    assert result.exit_code == 2, result.stderr
+    assert result.exit_code == code, result.stderr
     assert part in result.stderr
     assert result.stderr.count("\n") == 1
 
@@ -69,7 +69,7 @@ def _no_child(monkeypatch):
         (("--", "solve", "pendulum", "--resume"), "--resume goes on from a checkpoint; add --checkpoint FILE"),
         (("--", "solve", "pendulum", "--out", "old"), "old holds value.png already"),
         (("--", "solve", "pendulum", "--out", "run.npz"), "run.npz is there and is no folder"),
-        (("--", "solve", "pendulum", "--out", "run.npz/out"), "run.npz is no folder"),
+        (("--", "solve", "pendulum", "--out", "run.npz/out"), "run.npz/out cannot be written"),
         (("--", "solve", "pendulum", "--checkpoint", "run"), "run.npz is there already; --resume goes on from it"),
     ],
 )
@@ -79,6 +79,17 @@ def test_a_launch_that_is_refused_starts_no_process(words, part, tmp_path, monke
     (tmp_path / "old" / "value.png").touch()
     (tmp_path / "run.npz").touch()
     refused(("launch", *words), part)
+
+
+@pytest.mark.usefixtures("_no_child")
+@pytest.mark.parametrize(
+    ("checkpoint", "part"),
+    [("nowhere/run.npz", "there is no folder"), (".", "it is a folder")],
+)
+def test_a_checkpoint_that_cannot_be_written_is_found_before_a_process_starts(checkpoint, part, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    refused(("launch", "--", "solve", "pendulum", "--resume", "--checkpoint", checkpoint), part, 5)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_launch_in_a_folder_that_is_allowed_starts(tmp_path, monkeypatch):

@@ -235,11 +235,11 @@ def _verdict(outcome: children.Outcome, way_on: str) -> int:
     """
     processes, first, culprit = len(outcome.ends), outcome.end_of(0), outcome.culprit
     if outcome.interrupted:
-        if outcome.killed:
-            raise Failure(f"interrupted; {_killed(outcome)}; {way_on}", INTERRUPTED)
-        if first.code in (0, *EXPLAINED):
-            return first.code  # the first process has said it
-        raise Failure("interrupted", INTERRUPTED)
+        # the first process has kept everything, whatever became of the others
+        if first.code in (0, INTERRUPTED) or (first.code in EXPLAINED and not outcome.killed):
+            return first.code
+        killed = f"; {_killed(outcome)}; {way_on}" if outcome.killed else ""
+        raise Failure(f"interrupted{killed}", INTERRUPTED)
     if culprit is None:
         return 0
     name = f"process {culprit.number} of {processes}"

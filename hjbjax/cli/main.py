@@ -177,10 +177,23 @@ def launch(processes: int, heartbeat: int, words: tuple[str, ...]) -> None:
         _check_places(out, *(given[key] for key in ("force", "checkpoint", "resume")))
         with _one_line_error(OSError, 2, "--out: "):
             run_folder.check_writable(out)
+        if given["checkpoint"] is not None:
+            with _one_line_error(OSError, 5, "--checkpoint: "):
+                _try_checkpoint(given["checkpoint"])
     with interrupts.raised():
         code = processes_of.start(words, processes, heartbeat, out / FILES[0])
     if code:
         raise SystemExit(code)
+
+
+def _try_checkpoint(checkpoint: Path) -> None:
+    """Raise OSError if a checkpoint cannot be written."""
+    from hjbjax.solution import files, placement
+
+    path = placement.absolute(files.with_suffix(os.fspath(checkpoint)))
+    placement.check_place(path, force=True)
+    with placement.new_file(path):
+        pass
 
 
 def _check_places(out: Path, force: bool, checkpoint: Path | None, resume: bool) -> None:

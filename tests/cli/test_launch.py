@@ -39,10 +39,10 @@ def ended(process):
     return process.returncode, out, err
 
 
-def refused(words, part):
-    """Assert that a command is refused in one line with exit code 2."""
+def refused(words, part, code=2):
+    """Assert that a command is refused in one line."""
     result = CliRunner().invoke(main, list(words))
-    assert result.exit_code == 2, result.stderr
+    assert result.exit_code == code, result.stderr
     assert part in result.stderr
     assert result.stderr.count("\n") == 1
 
@@ -69,7 +69,7 @@ def _no_child(monkeypatch):
         (("--", "solve", "pendulum", "--resume"), "--resume goes on from a checkpoint; add --checkpoint FILE"),
         (("--", "solve", "pendulum", "--out", "old"), "old holds value.png already"),
         (("--", "solve", "pendulum", "--out", "run.npz"), "run.npz is there and is no folder"),
-        (("--", "solve", "pendulum", "--out", "run.npz/out"), "run.npz is no folder"),
+        (("--", "solve", "pendulum", "--out", "run.npz/out"), "run.npz/out cannot be written"),
         (("--", "solve", "pendulum", "--checkpoint", "run"), "run.npz is there already; --resume goes on from it"),
     ],
 )
@@ -79,6 +79,17 @@ def test_a_launch_that_is_refused_starts_no_process(words, part, tmp_path, monke
     (tmp_path / "old" / "value.png").touch()
     (tmp_path / "run.npz").touch()
     refused(("launch", *words), part)
+
+
+@pytest.mark.usefixtures("_no_child")
+@pytest.mark.parametrize(
+    ("checkpoint", "part"),
+    [("nowhere/run.npz", "there is no folder"), (".", "it is a folder")],
+)
+def test_a_checkpoint_that_cannot_be_written_is_found_before_a_process_starts(checkpoint, part, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    refused(("launch", "--", "solve", "pendulum", "--resume", "--checkpoint", checkpoint), part, 5)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_launch_in_a_folder_that_is_allowed_starts(tmp_path, monkeypatch):
@@ -207,6 +218,7 @@ def outcome_of(*codes, words="", **more):
         (outcome_of((1, 3), (0, 3)), 3),
         (outcome_of((1, 130), (0, 130), interrupted=True), 130),
         (outcome_of((1, -15), (0, 0), interrupted=True), 0),
+        (outcome_of((0, 130), (1, -9), interrupted=True, hurried=True, killed=(1,)), 130),  # it kept everything
     ],
 )
 def test_the_first_process_has_said_it(outcome, code):
@@ -231,7 +243,7 @@ def test_the_first_process_has_said_it(outcome, code):
         ),
         (outcome_of((0, -15), (1, -15), interrupted=True), 130, "interrupted"),
         (
-            outcome_of((0, 130), (1, -9), interrupted=True, killed=(1,)),
+            outcome_of((0, 4), (1, -9), interrupted=True, killed=(1,)),
             130,
             "interrupted; process 1 of 2 was killed, not having ended in 7 s; go on",
         ),

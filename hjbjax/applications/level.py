@@ -15,9 +15,12 @@ from hjbjax.feedback.path import PathStatus
 from hjbjax.feedback.simulation import rollout
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import cast
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, State
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
+from hjbjax.tracing.closures import settled
 
 LOOKS = 8  # output intervals: only the last state counts
 RTOL, ATOL = 1e-4, 1e-6  # of the paths: a mode that grows does so at any tolerance
@@ -114,20 +117,30 @@ def comes_back(problem: Problem, solution: Solution, inner: float, duration: flo
       duration: of the paths, in units of time.
     """
     grid = solution.grid
-    assert problem.disturbances is not None
     signs = np.array(list(itertools.product((-1.0, 1.0), repeat=grid.ndim)))
     half = 0.5 * (np.asarray(grid.hi) - np.asarray(grid.lo))
     starts = np.asarray(grid.lo) + half + inner * half * signs  # (2^n, n)
-    times, nothing = np.linspace(0.0, duration, LOOKS + 1), jnp.zeros(problem.disturbances.dim)
+    times = np.linspace(0.0, duration, LOOKS + 1)
+    # in float64 and with the marks by which ``jit`` knows the functions of an earlier call
+    with own_settings(x64=True):
+        found = _ends(*cast((settled(problem, grid.ndim), solution, starts, times), np.float64))
+    codes, ends = map(np.asarray, found)
+    if np.any(codes != PathStatus.DURATION):
+        return False
+    return bool(np.all(_spread(grid, ends) <= NEARER * _spread(grid, starts)))
+
+
+@jax.jit
+def _ends(problem: Problem, solution: Solution, starts: Array, times: Array) -> tuple[Array, Array]:
+    """How the undisturbed paths from states (k, n) end: their codes and last states."""
+    assert problem.disturbances is not None
+    nothing = jnp.zeros(problem.disturbances.dim, starts.dtype)
 
     def end(start: State) -> tuple[Array, Array]:
         path = rollout(problem, solution, start, times, disturbance=lambda x: nothing, rtol=RTOL, atol=ATOL)
         return path.code, path.states[-1]
 
-    codes, ends = map(np.asarray, jax.jit(jax.vmap(end))(jnp.asarray(starts)))
-    if np.any(codes != PathStatus.DURATION):
-        return False
-    return bool(np.all(_spread(grid, ends) <= NEARER * _spread(grid, starts)))
+    return jax.vmap(end)(starts)
 
 
 def _spread(grid: Grid, states: np.ndarray) -> np.ndarray:

@@ -46,7 +46,8 @@ def positive(value: T, name: str, unit: str = "", *, most: float = math.inf, end
     """
     if is_traced(value) or (endless and is_number(value) and value == math.inf):
         return value
-    number: Any = value
+    # in NumPy: inside ``jit`` a comparison with a JAX number is traced, and has no truth value
+    number: Any = np.asarray(value) if isinstance(value, jax.Array) else value
     if not (is_number(value) and math.isfinite(number) and 0 < number <= most):
         wanted = "a finite number > 0" if most == math.inf else f"a number > 0 and at most {most:g}"
         raise ValueError(f"{name} = {shown(value)}; wanted {wanted}{unit and ', ' + unit}")

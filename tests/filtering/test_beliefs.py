@@ -320,6 +320,7 @@ def test_a_third_state_that_is_as_the_second_changes_nothing():
     [
         ({"generator": [[1.0, -1.0], [0.0, 0.0]]}, r"has the rate -1 from state 0 to 1; wanted rates ≥ 0"),
         ({"generator": [[-1.0, 2.0], [0.0, 0.0]]}, r"has a row 0 that sums to 1, wanted zero"),
+        ({"generator": [[-1.0, 1.0 + 1e-9], [0.0, 0.0]]}, r"has a row 0 that sums to 1e-09, wanted zero"),
         ({"generator": [-1.0, 2.0]}, r"generator returns shape \(2,\), wanted \(S, S\)"),
         ({"generator": [[np.nan, 1.0], [0.0, 0.0]]}, r"generator is not finite"),
         ({"h": [1.0, 2.0, 3.0]}, r"h has shape \(3,\), wanted \(2,\) or \(2, 3\)"),

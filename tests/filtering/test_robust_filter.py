@@ -342,6 +342,20 @@ def test_a_cost_without_bound_is_reported_with_its_time():
         robust_filter(plant, lambda x: x, hjb.Grid([-2.0], [2.0], (31,)), [[0.0]], 0.1, prior, gamma=1.0)
 
 
+def test_an_interval_of_too_many_inner_steps_is_refused():
+    """3.75 steps per unit time, a hundred thousand at most: 26 667 is the longest interval."""
+    plant, grid = hjb.Problem(lambda x, u: -x), hjb.Grid([-4.0], [4.0], (9,))
+
+    def filtered(dt):
+        return robust_filter(
+            plant, lambda x: 0 * x, grid, [[0.0]], dt, prior, gamma=1.0, sigma=0.0, scheme=hjb.Upwind()
+        )
+
+    assert np.all(np.isfinite(filtered(2.6e4).p))
+    with pytest.raises(ValueError, match=r"dt = 27000 asks for over 100000 inner steps.* give a shorter one"):
+        filtered(2.7e4)
+
+
 def test_correlated_measurements_count_as_their_whitened_ones():
     root = np.array([[0.5, 0.0], [0.8, 1.5]])
     inverse = np.linalg.inv(root)

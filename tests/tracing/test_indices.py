@@ -41,6 +41,8 @@ WITHIN = {
     "interp": lambda x: jnp.interp(x[0], TABLE, TABLE),
     "loop": lambda x: jax.lax.fori_loop(0, 2, lambda i, s: s + x[i], 0.0),
     "backwards": lambda x: jax.lax.scan(lambda s, i: (s + x[i], s), 0.0, jnp.arange(2), reverse=True)[0],
+    # after the 64 turns that are followed the counter is 37, which is not its last value
+    "long loop": lambda x: x[jax.lax.fori_loop(0, 100, lambda k, i: i - 1, 101)],
     "sorted": lambda x: jnp.sort(x)[1] + jnp.argmax(x),
     "solve": lambda x: jnp.linalg.solve(jnp.outer(x, x) + jnp.eye(2), x)[1],
     "roll": lambda x: jnp.roll(x, 3)[0] + jnp.diff(x)[0] + jnp.diag(x)[1, 1] + jnp.cross(jnp.append(x, 1.0), TABLE)[2],

@@ -13,8 +13,11 @@ from hjbjax import zoo
 
 # name, nodes of each axis, or None for those of the problem
 QUICK = [("pendulum", (30, 31)), ("double-integrator", (21, 21)), ("bang-bang", (41,))]
-SIZES = {1: [(41,), (60,)], 2: [(30, 31), (45, 46)], 3: [(11, 12, 13), (15, 14, 12)]}
-TABLE = [(name, shape) for name, entry in zoo.catalogue.items() for shape in SIZES[len(entry.start)]]
+SIZES = {1: [(41,), (61,)], 2: [(31, 31), (45, 45)], 3: [(11, 12, 13), (15, 14, 12)]}
+ON_A_RING = {"pendulum": [(30, 31), (44, 45)], "manipulator": [(30, 31), (44, 45)]}  # with a node at rest
+TABLE = [
+    (name, shape) for name, entry in zoo.catalogue.items() for shape in ON_A_RING.get(name, SIZES[len(entry.start)])
+]
 
 
 def posed(name, shape):

@@ -187,7 +187,7 @@ def broken_promise(
     """
     solution = solution_of(feedback)
     # one noisy path says nothing of a mean
-    if path.promised is None or solution is None or problem.noise is not None or not _knows(solution, path.states[0]):
+    if path.promised is None or solution is None or problem.noise is not None:
         return None
     states = path.states
     free = np.array(solution.grid.periodic)
@@ -208,14 +208,6 @@ def broken_promise(
     return f"the path costs {path.cost:.6g},{further} and V promised {path.promised:.6g}: {advice}"
 
 
-def _knows(solution: Solution, start: Array) -> bool:
-    """True if some node around a state has a control, or there are none: in a hollow target V is that of its edge."""
-    if solution.policy is None or np.shape(solution.policy)[-1] == 0:
-        return True
-    where = (start,) if solution.times is None else (0.0, start)
-    return not np.any(np.isnan(solution.control_at(*where, clamp=True)))
-
-
 def _combined(problem: Problem, cost: float, ahead: float) -> float:
     """The cost of a path with what follows it."""
     if not is_tube(problem) or ahead == 0:
@@ -228,6 +220,8 @@ def _combined(problem: Problem, cost: float, ahead: float) -> float:
 def _allowed(solution: Solution) -> float:
     """By how much a path may miss V: many times the estimated error, and what a feedback between the nodes costs."""
     extent = _extent(solution)
+    if extent == 0:  # of a policy without its value, as one made by hand
+        return math.inf
     algebraic = solution.error
     algebraic = 0.0 if algebraic is None or not math.isfinite(algebraic) else float(algebraic)
     return MANY * (_grid_error(solution) + algebraic) + LEAST * extent

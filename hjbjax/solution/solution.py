@@ -235,16 +235,13 @@ class Solution:
         t, x = check_query(self, name, values, trailing, where)
         samples = Samples(self.grid, values, self.times)
         found = query(look, samples, x, t, clamp=clamp, name=f"Solution.{name}")
-        if (
-            not clamp
-            and t is not None
-            and not is_traced(found, t, self.times)
-            and np.any(late := beyond(self.times, t))
-        ):
+        known = not clamp and t is not None and not is_traced(found, t, self.times)
+        if known and np.any(late := beyond(self.times, t)):
+            first, last = float(np.min(self.times)), float(np.max(self.times))
             warn(
-                f"Solution.{name}: {np.sum(late)} of {np.size(late)} times lie outside the kept ones, from "
-                f"{float(np.min(self.times)):.6g} to {float(np.max(self.times)):.6g}, where the answer is NaN; keep "
-                "more in march(..., times=), or clamp=True takes the nearest",
+                f"Solution.{name}: {np.sum(late)} of {np.size(late)} times lie outside the kept ones, from {first:.6g} "
+                f"to {last:.6g}, where the answer is NaN; keep more in march(..., times=), or clamp=True takes the "
+                "nearest",
                 UserWarning,
             )
         if not clamp and not is_traced(found, x, self.grid) and np.any(outside := self.grid.beyond(x)):

@@ -146,7 +146,7 @@ def _of_integral(at_ends: np.ndarray, between: np.ndarray, shares: np.ndarray) -
 
 
 def _of_level(at_ends: np.ndarray, between: np.ndarray) -> tuple[np.ndarray, int]:
-    """The largest excursion beyond both ends of a step, over the range, in any part; its length in shortest steps."""
+    """The largest excursion beyond both ends of a step, over the range, by part; their number in shortest steps."""
     finest = len(between)
     extent = max(float(np.ptp(at_ends)), float(np.ptp(between)))
     if extent == 0:

@@ -182,7 +182,7 @@ def _intervals(ivp: InitialValueProblem, stepping: Stepping, reverse: bool = Fal
     return interval, (start, jnp.append(x0, 0.0), code, jnp.zeros((), jnp.int32), extremes)
 
 
-def _extremes(loop: Loop, start: Number, seen: tuple[jax.Array, jax.Array], before: jax.Array) -> jax.Array:
+def _extremes(loop: Loop, start: Number, seen: tuple[Array, Array], before: jax.Array) -> jax.Array:
     """The least cost of stopping so far and the largest running maximum, (2,), after further points of the path.
 
     Args:

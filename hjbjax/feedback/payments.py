@@ -167,7 +167,7 @@ def _goes_round(path: Path, solution: Solution) -> bool:
         return False
     width = np.asarray(grid.hi) - np.asarray(grid.lo)
     apart = np.abs(late - late[-1])
-    apart = np.where(grid.periodic, np.minimum(apart % width, -apart % width), apart)
+    apart = np.where(np.array(grid.periodic), np.minimum(apart % width, -apart % width), apart)
     cells = np.max(apart / (width / (np.array(grid.shape) - 1)), axis=1)
     far = np.flatnonzero(cells > FAR)
     return bool(far.size and np.any(cells[: far[-1]] <= 1))

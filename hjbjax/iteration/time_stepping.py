@@ -86,12 +86,13 @@ class March:
 
     def step_at(self, t: Number) -> Scalar:
         """The longest step wanted from the time t on, backwards."""
-        if jnp.ndim(self.step) == 0:
-            return self.step
-        count = len(self.step)
+        steps = jnp.asarray(self.step)
+        if steps.ndim == 0:
+            return steps
+        count = len(steps)
         # a time between two parts belongs to the earlier one, which comes next
         part = jnp.ceil(t / self.horizon * count - 1e-3).astype(jnp.int32) - 1
-        return self.step[jnp.clip(part, 0, count - 1), 0]
+        return steps[jnp.clip(part, 0, count - 1), 0]
 
     def rate(self, value: Field, t: Number) -> tuple[Field, "Seen"]:
         """F = min max H − β V, cost per unit time, and the rates and the noise under the optimal actions."""

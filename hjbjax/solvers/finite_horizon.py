@@ -385,12 +385,13 @@ def _march_traced(
         )
         for player in (0, 1)
     )
-    values, u, d = jnp.stack(values[::-1]), u[::-1], d[::-1]
+    found = jnp.stack(values[::-1]), u[::-1], d[::-1]
     if throw:  # a factor and no `where`, so that derivatives are NaN as well
-        values, u, d = (array * jnp.where(fine, 1, jnp.nan).astype(kind) for array in (values, u, d))
+        found = jax.tree.map(lambda array: array * jnp.where(fine, 1, jnp.nan).astype(kind), found)
     code = jnp.where(fine, Status.CONVERGED, Status.STALLED if method.monotone_only else Status.DIVERGED)
     return Solution(
-        grid, values, u, d if problem.is_game else None, code=code, steps=count, times=kept, **question(problem),
+        grid, found[0], found[1], found[2] if problem.is_game else None, code=code, steps=count, times=kept,
+        **question(problem),
     )  # fmt: skip
 
 
@@ -401,7 +402,7 @@ def _is_stable(on: Discretisation, method: TimeMethod, horizon: float, step: flo
     on = jax.lax.stop_gradient(on)
     share = 1 / method.tableau.euler
 
-    def limit(t: Scalar) -> Scalar:
+    def limit(t: Scalar | float) -> Scalar:
         return time_stepping.stable(on.at(t), method.tableau, share)
 
     moving = on.problem.time_dependent

@@ -60,8 +60,9 @@ def resolution(problem: Problem, grid: Grid, horizon: float, dtype: DType) -> Re
     times = np.concatenate([ends, inside.ravel()])
     found = _sample(problem, *_places(problem, grid, random, dtype), jnp.asarray(times, dtype))
     errors, deviations, pulses = np.zeros((len(CUTS), PARTS)), np.zeros((len(CUTS), PARTS)), 0
-    for name, values in jax.device_get(found).items():
-        values = np.where(np.isfinite(values), values, 0.0).astype(float)
+    for name, seen in found.items():
+        values = np.asarray(seen, float)
+        values = np.where(np.isfinite(values), values, 0.0)
         at_ends, between = values[: finest + 1], values[finest + 1 :].reshape(finest, INSIDE, *values.shape[1:])
         if name in ("drift", "cost", "noise"):
             np.maximum(errors, _of_integral(at_ends, between, shares), out=errors)
@@ -99,7 +100,7 @@ def _places(problem: Problem, grid: Grid, random: np.random.Generator, dtype: DT
     lo, hi = np.asarray(grid.lo, float), np.asarray(grid.hi, float)
     states = lo + (hi - lo) * random.uniform(size=(PLACES, grid.ndim))
 
-    def actions(admissible: AdmissibleSet | None) -> Array:
+    def actions(admissible: AdmissibleSet | None) -> np.ndarray:
         points = np.zeros((1, 0)) if admissible is None else np.asarray(sets.samples(admissible, PLACES))
         return points[random.integers(len(points), size=PLACES)]
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import jax
 import pytest
+import xla
 from hypothesis import settings
 
 os.environ["MPLBACKEND"] = "Agg"  # for this process and for the commands and notebooks that tests start
@@ -22,14 +23,16 @@ settings.load_profile("hjbjax")
 MAPS = 20_000  # of the 65 530 that Linux allows a process; every compiled kernel takes a few, and XLA crashes beyond
 
 
-# Two thirds of a run are XLA's: without its optimiser it takes half of the time, and without the emitters of fusions a
-# third. Those of old write a value anew in every block of a fusion: one that chooses among many actions at constrained
-# ends takes them time that doubles with every action. Such tests are marked ``emitters``, or a program asks for them
-# itself (``compiler_options``). Without the optimiser what computes for long takes up to seventy times as long: such
-# tests are marked ``optimised``. Who wants all tests with what users run says ``XLA_FLAGS= pytest``.
-QUICK = "--xla_cpu_use_fusion_emitters=false"
-HASTE = "jax_disable_most_optimizations"  # its variable is for the processes that tests start
-if os.environ.setdefault("XLA_FLAGS", QUICK) == QUICK:  # read when JAX starts to compute, here and in those processes
+# Two thirds of a run are spent in XLA. Without its optimiser it takes half of the time, and jaxlib 0.10 takes half of
+# that again with its old emitters of fusions. Jaxlib 0.12 has only new ones, which take 1.4 times as long as the old;
+# of its flags none is faster, and `xla_cpu_opt_preset=FAST_COMPILE` takes 1.6 times as long. The old emitters compute a
+# value again in every block of a fusion: their time doubles with every action of a choice among many at constrained
+# boundaries. Tests of this kind are marked ``emitters``, or compile their programs with ``xla.with_emitters()``.
+# Without the optimiser a long computation takes up to seventy times as long: these tests are marked ``optimised``.
+# `XLA_FLAGS= pytest` runs all tests with what users run.
+HASTE = "jax_disable_most_optimizations"
+if "XLA_FLAGS" not in os.environ:  # processes that tests start inherit both variables
+    os.environ["XLA_FLAGS"] = xla.OLD_EMITTERS if xla.knows(xla.EMITTERS) else ""
     os.environ[HASTE.upper()] = "1"
     jax.config.update(HASTE, True)
 
@@ -50,8 +53,8 @@ def pytest_configure(config):
 
 
 def pytest_runtest_setup(item):
-    """Skip what the old emitters do not come to an end with."""
-    if item.get_closest_marker("emitters") and os.environ["XLA_FLAGS"] == QUICK:
+    """Skip programs that the old emitters take minutes to compile."""
+    if item.get_closest_marker("emitters") and os.environ["XLA_FLAGS"] == xla.OLD_EMITTERS:
         pytest.skip("takes the old emitters too long: XLA_FLAGS= pytest -m emitters")
 
 

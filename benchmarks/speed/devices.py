@@ -34,7 +34,6 @@ COLUMNS = (
 )  # fmt: skip
 SIZES, EIGHT, TOL, ACTIONS = (800, 1600), 800, 1e-3, 21
 SAMPLE = 40  # nodes an axis that are compared
-FLAG = "--xla_force_host_platform_device_count"
 
 
 class Worker:
@@ -62,9 +61,9 @@ class Worker:
 
 def _of_process(nodes: int, mesh: Sequence[int]) -> tuple[list[str], dict[str, str]]:
     """The command and the environment of a process of this file with as many devices as a mesh has."""
-    flags = f"{os.environ.get('XLA_FLAGS', '')} {FLAG}={int(np.prod(mesh))}"
+    devices = str(np.prod(mesh, dtype=int))
     command = [sys.executable, "-m", "benchmarks.speed.devices", str(nodes), "x".join(map(str, mesh))]
-    return command, os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
+    return command, os.environ | {"JAX_NUM_CPU_DEVICES": devices, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
 
 
 def work(nodes: int, mesh: Sequence[int]) -> None:

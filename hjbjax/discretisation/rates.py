@@ -28,7 +28,7 @@ from hjbjax.discretisation.cut_cells import links
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.pytree import pytree_dataclass
+from hjbjax.problem.pytree import pytree_dataclass, tie
 from hjbjax.problem.types import Array
 
 Offset = tuple[int, ...]
@@ -81,7 +81,7 @@ def jump_rates(on: Discretisation, u: list, d: list | None = None) -> Rates:
       d: likewise of the disturbance, in a game.
     """
     grid = on.grid
-    x, u, d = jax.lax.optimization_barrier((on.coordinates(), u, d))  # or loops keep drift that u does not move
+    x, u, d = tie((on.coordinates(), u, d))  # or loops keep drift that u does not move
     first, *others = on.drifts(u, d, x)
     table = _table(on, first, on.diffusion(u, d, x))
     for other in others:  # jumps of one chain or of the other

@@ -22,6 +22,7 @@ from hjbjax.discretisation import correlated_noise, cut_cells, edges, schemes, s
 from hjbjax.discretisation.discretisation import Differences, Discretisation
 from hjbjax.hamiltonian.search import Action
 from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import tie
 
 
 @dataclasses.dataclass(frozen=True)
@@ -146,7 +147,7 @@ def around(
     """
     grid = on.grid
     # without it XLA hoists products of coordinates out of the loop, as arrays of all nodes, one an action
-    x, value = jax.lax.optimization_barrier((on.coordinates(), value))
+    x, value = tie((on.coordinates(), value))
     links = tuple(cut_cells.links(on))
     differences = tuple(stencil.one_sided(value, grid, axis, link) for axis, link in enumerate(links))
     bends = tuple(stencil.bends(*pair, grid, axis) for axis, pair in enumerate(differences))

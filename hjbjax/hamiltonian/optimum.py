@@ -17,7 +17,7 @@ from hjbjax.hamiltonian.piecewise import inverse_root
 from hjbjax.hamiltonian.players import SAMPLES, Player, players_of
 from hjbjax.hamiltonian.search import UNROLL, Action, best_of, enumerate_actions, refine
 from hjbjax.problem import sets
-from hjbjax.problem.pytree import altered
+from hjbjax.problem.pytree import altered, tie
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite
 from hjbjax.problem.types import Field
 
@@ -95,7 +95,7 @@ def best_response(
             weight=player.effort, most=most, start=start,
         )  # fmt: skip
     if not hamiltonian.bare:
-        action = jax.lax.optimization_barrier(action)  # or the search is done twice, for the action and for the value
+        action = tie(action)  # or the search is done twice, for the action and for the value
     return hamiltonian.at(*join(action)), action
 
 

@@ -222,6 +222,21 @@ def as_one_program(function: Callable[P, T]) -> Callable[P, T]:
     return called
 
 
+@jax.custom_jvp
+def tie(tree: Any) -> Any:
+    """The same tree behind one barrier, so that XLA hoists nothing computed from it out of a loop if one leaf varies.
+
+    Tangents pass without a barrier. JAX 0.12 cannot transpose a barrier of linear and constant tangents together, and a
+    rule of ``jax.custom_jvp`` makes both: the tangent of what does not move is an array of zeros there.
+    """
+    return jax.lax.optimization_barrier(tree)
+
+
+@tie.defjvp
+def _tie_tangent(primals: tuple, tangents: tuple) -> tuple:
+    return tie(*primals), tangents[0]
+
+
 @jax.tree_util.register_pytree_node_class
 class _PartlyTraced:
     """A pytree whose leaves are the tracers in another one; the numbers that are known belong to its structure."""

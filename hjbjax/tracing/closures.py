@@ -65,7 +65,9 @@ def settled(problem: Problem, n: int, dtype: DType | None = None) -> Problem:
         if None not in known.values():
             return altered(problem, **known)
     # tracers belong to the caller's transformation, so that these functions are traced inside it, in its type
-    kind = jnp.result_type(float) if dtype is None else jnp.dtype(dtype)
+    kind = jnp.result_type(float)
+    if dtype is not None and kind == np.float64:  # in 32 bits JAX would truncate, and the front door refuses float64
+        kind = jnp.dtype(dtype)
     return altered(
         problem, **{name: _settled_inside(each, _shapes(problem, name, n), kind) for name, each in functions.items()}
     )

@@ -11,6 +11,7 @@ The slopes of an affine function are taken by JAX's derivative rules, so that a 
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -110,12 +111,13 @@ def dependence(function: Callable, *arguments: tuple[int | None, bool], dtype: D
 
     Args:
       function: a function of one state, as a problem holds it: a pytree.
-      *arguments: for every argument (length, counts): its length (``None`` for a scalar), and whether its
-        entries are inputs; inputs are numbered through all counted arguments.
-      dtype: the floating-point type in which it is traced.
+      *arguments: one pair (length, counts) per argument. The length is ``None`` for a scalar; ``counts`` is true if the
+        entries are inputs. Inputs are numbered through all counted arguments.
+      dtype: the floating-point type of the trace. Float64 does not depend on the caller's ``jax.enable_x64``.
     """
-    shapes = [jax.ShapeDtypeStruct(() if length is None else (length,), dtype) for length, _ in arguments]
-    closed = jax.make_jaxpr(function)(*shapes)
+    with jax.enable_x64(True) if dtype == np.float64 else contextlib.nullcontext():
+        shapes = [jax.ShapeDtypeStruct(() if length is None else (length,), dtype) for length, _ in arguments]
+        closed = jax.make_jaxpr(function)(*shapes)
     packed, number = [], 0
     for (_, counts), shape in zip(arguments, shapes, strict=True):
         entries = np.empty(shape.shape, dtype=object)

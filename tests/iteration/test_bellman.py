@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import xla
 from hypothesis import given, settings
 from systems import SEEDS, random_game, random_grid, random_problem
 
@@ -24,8 +25,8 @@ from hjbjax.problem.sets import Ball, Box, Finite
 UNIT = Box([-1.0], [1.0])
 NOISES = ["none", "diagonal", "matrix"]
 laws = settings(max_examples=12)
-# every candidate of a minimum looks at several neighbours, and with noise at more: see QUICK in tests/conftest.py
-jitted = functools.partial(jax.jit, compiler_options={"xla_cpu_use_fusion_emitters": True})
+# the old emitters take minutes: every candidate of a minimum reads several neighbours, and more with noise
+jitted = functools.partial(jax.jit, compiler_options=xla.with_emitters())
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import xla
 from equations import LAYOUTS, SHAPES, ids, make_grid, random_equation
 from hypothesis import given, settings
 from systems import SEEDS
@@ -89,9 +90,8 @@ def test_one_signed_weight_does_for_two_of_which_one_is_zero(cache, monkeypatch)
     grid = make_grid(3, (True, False, True))
     monkeypatch.setattr(gauss_seidel, "SLAB", 1)
     monkeypatch.setattr(gauss_seidel, "CACHE", cache)
-    # bits: the emitters of fusions round the two alike, see QUICK in tests/conftest.py
-    options = {"xla_cpu_use_fusion_emitters": True}
-    sweep = jax.jit(lambda equation: gauss_seidel.sweep(equation, grid, 2), compiler_options=options)
+    # the new emitters of fusions round the two alike, to the last bit
+    sweep = jax.jit(lambda equation: gauss_seidel.sweep(equation, grid, 2), compiler_options=xla.with_emitters())
     for seed in range(8):
         rng = np.random.default_rng(seed)
         equation, _, _ = random_equation(rng, grid)

@@ -18,6 +18,7 @@ from hjbjax.problem.pytree import (
     numbers,
     pytree_dataclass,
     remembered,
+    tie,
 )
 
 
@@ -271,3 +272,19 @@ def test_a_copy_may_hold_what_the_checks_refuse():
     assert changed.drift is problem.drift
     with pytest.raises(ValueError, match="running_max"):
         dataclasses.replace(problem, discount=1.0)
+
+
+def test_a_tied_tree_has_both_derivatives_where_only_one_leaf_moves():
+    """A rule of ``custom_jvp`` receives an array of zeros for the leaf that does not move."""
+
+    @jax.custom_jvp
+    def product(at):
+        return at[0] * at[1]
+
+    @product.defjvp
+    def rule(primals, tangents):
+        return product(*primals), jax.jvp(lambda at: (lambda x, y: jnp.sin(x) * y)(*tie(at)), primals, tangents)[1]
+
+    for derivative in (jax.grad, jax.jacfwd):
+        for form in (derivative, lambda f, d=derivative: jax.jit(d(f))):
+            assert form(lambda x: product((x, 2.0)))(0.0) == 2.0

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import xla
 
 from hjbjax.cli import launch
 
@@ -32,11 +33,10 @@ ULP = 8  # roundings of the largest value: XLA fuses the same operations otherwi
 
 def found_by(names):
     """What these cases found, by their names."""
-    # the emitters of fusions, which round alike in arrays of any shape: see QUICK in tests/conftest.py
-    more = "--xla_force_host_platform_device_count=8 --xla_cpu_use_fusion_emitters=true"
-    flags = f"{os.environ.get('XLA_FLAGS', '')} {more}"
+    # the new emitters of fusions, which round alike in arrays of any shape
+    flags = os.environ["XLA_FLAGS"].replace(xla.OLD_EMITTERS, "")
     path = f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
-    environment = {**os.environ, "XLA_FLAGS": flags, "PYTHONPATH": path}
+    environment = {**os.environ, "XLA_FLAGS": flags, "JAX_NUM_CPU_DEVICES": "8", "PYTHONPATH": path}
     command = [sys.executable, str(SCRIPT), *names]
     answer = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     assert answer.returncode == 0, answer.stderr

@@ -1,7 +1,7 @@
 """Solves and marches on eight virtual devices beside the same on one: a script, as a process begins with its devices.
 
-``python over_devices.py CASE ...``, with ``--xla_force_host_platform_device_count=8`` in ``XLA_FLAGS``, prints one JSON
-object: what each case found, or how it failed. ``tests/solvers/test_mesh.py`` reads it.
+``JAX_NUM_CPU_DEVICES=8 python over_devices.py CASE ...`` prints one JSON object: the findings of each case, or how it
+failed. ``tests/solvers/test_mesh.py`` reads it.
 """
 
 import dataclasses

@@ -46,6 +46,17 @@ def own_transpose(u):
 own_transpose.defvjp(lambda u: (own_transpose(u), None), lambda _, bar: (0 * bar,))
 
 
+def test_the_type_of_a_trace_does_not_depend_on_the_caller():
+    types = []
+
+    def drift(x, u):
+        types.extend((x.dtype, u.dtype))
+        return u
+
+    dependence.dependence(as_partial(drift), *ARGUMENTS, dtype=np.float64)
+    assert types == [np.float64] * 2
+
+
 VERDICTS = {
     "state alone": (lambda x, u: jnp.linalg.norm(x) * jnp.sin(x), "constant"),
     "number": (lambda x, u: 1.0, "constant"),

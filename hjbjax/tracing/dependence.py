@@ -11,7 +11,6 @@ The slopes of an affine function are taken by JAX's derivative rules, so that a 
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -21,6 +20,7 @@ import numpy as np
 
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import remembered
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import DType, Numbers
 from hjbjax.tracing.interpreter import evaluate
 from hjbjax.tracing.jaxprs import array_type
@@ -115,7 +115,7 @@ def dependence(function: Callable, *arguments: tuple[int | None, bool], dtype: D
         entries are inputs. Inputs are numbered through all counted arguments.
       dtype: the floating-point type of the trace. Float64 does not depend on the caller's ``jax.enable_x64``.
     """
-    with jax.enable_x64(True) if dtype == np.float64 else contextlib.nullcontext():
+    with own_settings(x64=dtype == np.float64 or None):
         shapes = [jax.ShapeDtypeStruct(() if length is None else (length,), dtype) for length, _ in arguments]
         closed = jax.make_jaxpr(function)(*shapes)
     packed, number = [], 0

@@ -205,6 +205,8 @@ class MarchRun:
     @property
     def time(self) -> float:
         """The time that the march has come to."""
+        if self._is_kept:
+            return float(self.slices.times[self.slices.first])
         left, rest = (float(number) for number in self.front.left)
         return float(self.slices.times[self.slices.first - 1]) + left + rest if self.slices.first else 0.0
 
@@ -238,14 +240,22 @@ class MarchRun:
         """Keep the slices at the times that the front has reached; CONVERGED after the last of them."""
         slices = self.slices
         while status is Status.RUNNING and slices.first > 0 and float(self.front.left[0]) <= 0:
-            cut = clock.over()
-            # at the last kept time nothing is missing any more, and a time limit that passes now takes nothing away
-            if cut is not None and not (slices.first == 1 and cut is Status.TIME_LIMIT):
-                return cut
-            self.store()
+            if not self._is_kept:
+                cut = clock.over()
+                # at the last kept time nothing is missing any more, so a time limit that passes now takes nothing away
+                if cut is not None and not (slices.first == 1 and cut is Status.TIME_LIMIT):
+                    return cut
+                self.store()
             if slices.first > 0:
                 self.front = altered(self.front, left=self._clock(slices.length))
         return Status.CONVERGED if status is Status.RUNNING and slices.first == 0 else status
+
+    @property
+    def _is_kept(self) -> bool:
+        """True if the front is at the last slice: an interrupt can come before its clock is set for the next interval."""
+        times, first = self.slices.times, self.slices.first
+        at_end = float(self.front.left[0]) <= 0 and first < len(times)
+        return at_end and self.slices.value.dtype.type(times[first]) == np.asarray(self.front.t)
 
     def _clock(self, left: float) -> Any:
         """The clock of a front at the beginning of an interval."""

@@ -252,7 +252,7 @@ class MarchRun:
 
     @property
     def _is_kept(self) -> bool:
-        """True if the front is at the last slice: an interrupt can come before its clock is set for the next interval."""
+        """True if the front is at the last slice: an interrupt can come before its clock is set for the next one."""
         times, first = self.slices.times, self.slices.first
         at_end = float(self.front.left[0]) <= 0 and first < len(times)
         return at_end and self.slices.value.dtype.type(times[first]) == np.asarray(self.front.t)

@@ -45,7 +45,7 @@ def test_edges_come_as_a_name_or_one_entry_an_axis():
         ("constrainde", "did you mean 'constrained'.*"),
         ("free", "wanted one of 'projected', 'constrained', 'open'"),
         (("open", "free"), "got 'free' for axis 1"),
-        (("open",), "got .* for 2 axes; wanted a name for all, or one entry an axis"),
+        (("open",), "got .* for 2 axes; wanted a name for all, or one entry per axis"),
         (("open", ("open",) * 3), r"axis 1 has .* wanted a name or a pair \(lower end, upper end\)"),
         (3, "wanted a name for all"),
         ((("open", 3), "open"), "got 3 for axis 0"),
@@ -202,7 +202,7 @@ def assert_at_most_so_much_below(value, known, spacing_error):
 
 @pytest.mark.parametrize("grid", [LINE, GATHERED], ids=["uniform", "stretched"])
 @pytest.mark.parametrize("sigma", [0.0, 0.3])
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error", "ignore:the box decides V")
 def test_one_input_against_the_oracle(grid, sigma):
     for seed in range(3):
         problem = random_question(seed, 1, quadratic, hjb.Box([-1.0], [1.5]), sigma=sigma)
@@ -334,7 +334,7 @@ def test_growth_with_constrained_ends(most):
     solution = hjb.solve(problem, grid, tol=1e-6, scheme=hjb.Upwind())
     exact = grid.axis(0) * (IMPATIENCE + (1 - CAPITAL_SHARE) * DECAY) / CAPITAL_SHARE
     assert np.max(np.abs(solution.policy[:, 0] / exact - 1)) <= 5e-3
-    assert solution.error <= 1e-6
+    assert solution.error is None  # the cost is not quadratic, so its minimum is searched and nothing is certified
     for feedback in (solution.control_at, hjb.greedy_feedback(problem, solution)):
         assert growth(1.5, feedback(np.array([1.5]))) >= -1e-12
         assert growth(9.5, feedback(np.array([9.5]))) <= 1e-12

@@ -27,6 +27,7 @@ VARIABLES = RANK, PROCESSES, COORDINATOR, HEARTBEAT = (
     "HJBJAX_RANK", "HJBJAX_PROCESSES", "HJBJAX_COORDINATOR", "HJBJAX_HEARTBEAT",
 )  # fmt: skip
 EXPLAINED = (2, 3, 4, 5, 6, 130)  # exit codes of a command that said why
+SOLVED = (0, 3)  # exit codes of a command that all processes have taken to its end
 DIED, INTERRUPTED = 7, 130  # exit codes of a launch
 MOST = 256  # processes of a launch, and devices of a process: each takes threads
 LONGEST = 86_400  # seconds of a heartbeat
@@ -234,19 +235,20 @@ def _verdict(outcome: children.Outcome, way_on: str) -> int:
       Failure: with a line on the process that brought the others down, and on how to go on.
     """
     processes, first, culprit = len(outcome.ends), outcome.end_of(0), outcome.culprit
+    if first.code in SOLVED or culprit is None:
+        return first.code
     if outcome.interrupted:
         # the first process has kept everything, whatever became of the others
-        if first.code in (0, INTERRUPTED) or (first.code in EXPLAINED and not outcome.killed):
+        if first.code == INTERRUPTED or (first.code in EXPLAINED and not outcome.killed):
             return first.code
         killed = f"; {_killed(outcome)}; {way_on}" if outcome.killed else ""
         raise Failure(f"interrupted{killed}", INTERRUPTED)
-    if culprit is None:
-        return 0
     name = f"process {culprit.number} of {processes}"
     if culprit.number in outcome.stopped:
         raise Failure(f"{name} was stopped, and the others cannot go on without it; {way_on}", DIED)
     if culprit.code < 0:
-        by = f"signal {-culprit.code} ({signal.Signals(-culprit.code).name})"
+        names = {each.value: f" ({each.name})" for each in signal.Signals}  # real-time signals have none
+        by = f"signal {-culprit.code}{names.get(-culprit.code, '')}"
         raise Failure(f"{name} was ended by {by}; {way_on}", DIED)
     if culprit.code not in EXPLAINED:
         said = f": {culprit.words}" if culprit.words else ""

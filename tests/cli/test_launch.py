@@ -215,7 +215,9 @@ def outcome_of(*codes, words="", **more):
     ("outcome", "code"),
     [
         (outcome_of((1, 0), (0, 0)), 0),
-        (outcome_of((1, 3), (0, 3)), 3),
+        (outcome_of((0, 0), (1, -15)), 0),  # as after a dry run, for which the first does not need the others
+        (outcome_of((0, 3), (1, -9), killed=(1,)), 3),
+        (outcome_of((1, 2), (0, 2)), 2),
         (outcome_of((1, 130), (0, 130), interrupted=True), 130),
         (outcome_of((1, -15), (0, 0), interrupted=True), 0),
         (outcome_of((0, 130), (1, -9), interrupted=True, hurried=True, killed=(1,)), 130),  # it kept everything
@@ -229,6 +231,7 @@ def test_the_first_process_has_said_it(outcome, code):
     ("outcome", "code", "line"),
     [
         (outcome_of((1, -9), (0, 130)), 7, "process 1 of 2 was ended by signal 9 (SIGKILL); go on"),
+        (outcome_of((1, -40), (0, 130)), 7, "process 1 of 2 was ended by signal 40; go on"),
         (outcome_of((0, 4), (2, -11), (1, 4)), 7, "process 2 of 3 was ended by signal 11 (SIGSEGV); go on"),
         (
             outcome_of((1, 1), (0, 130), words="ValueError: no"),

@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import types
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
@@ -11,6 +12,7 @@ import pytest
 from compilation import compiling
 
 import hjbjax as hjb
+from hjbjax.problem.pytree import front_door
 from hjbjax.problem.settings import own_settings
 
 F = hjb.filtering
@@ -235,6 +237,36 @@ def test_an_answer_of_another_door_does_not_depend_on_a_setting(door, setting):
 def test_an_answer_does_not_depend_on_an_option_that_is_left_to_the_caller(door, setting):
     if (door, setting) != ("simulate", "not_partitionable"):  # which are other random numbers
         check(door, setting, OTHERS[setting])
+
+
+def is_own(function, module):
+    """True if a file without ``__all__`` defines a public function."""
+    return function.__module__ == module.__name__ and not function.__name__.startswith("_")
+
+
+MODULES = (hjb, F, hjb.geometry, hjb.stability, hjb.chain, hjb.zoo)
+FUNCTIONS = {
+    f"{module.__name__}.{name}": thing
+    for module in MODULES
+    for name, thing in list(vars(module).items())
+    if isinstance(thing, types.FunctionType) and (name in getattr(module, "__all__", ()) or is_own(thing, module))
+}
+OF_OBSERVERS = {
+    f"{kind}.{name}": getattr(getattr(F, kind), name)
+    for kind in OBSERVERS
+    for name in ("__init__", "initial", "update", "estimate")
+}
+ENTERED = front_door(lambda **options: None).__code__
+WITHOUT_JAX = {"hjbjax.load", "hjbjax.keep_compiled"}
+
+
+@pytest.mark.parametrize("name", sorted((FUNCTIONS.keys() | OF_OBSERVERS.keys()) - WITHOUT_JAX))
+def test_a_public_function_is_a_front_door(name):
+    function, codes = (FUNCTIONS | OF_OBSERVERS)[name], set()
+    while function is not None:
+        codes.add(function.__code__)
+        function = getattr(function, "__wrapped__", None)
+    assert ENTERED in codes
 
 
 def options_here():

@@ -10,6 +10,7 @@ with DV.
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Protocol, TypeAlias
 
@@ -293,7 +294,7 @@ def _at(greedy: Greedy, when: tuple[Number, ...], x: State, p: Costate) -> tuple
         steps = np.stack(np.meshgrid(*[(-1, 0, 1)] * n, indexing="ij"), axis=-1)
         points = _reflected(jnp.asarray(x + h * steps), grid)
         look = functools.partial(greedy.solution.value_at, *when, clamp=True)
-        value = beyond_open_ends(look, points, grid, [axis for axis, _ in grid.sides("open")])
+        value = beyond_ends(look, points, grid, continuing_sides(grid))
         center = (1,) * n
         # D⁺ − D⁻ along every axis, the second difference times h: the form in which the Hamiltonian takes noise
         bends = tuple(
@@ -320,37 +321,42 @@ def _reflected(points: jax.Array, grid: Grid) -> jax.Array:
     return points
 
 
-def beyond_open_ends(look: Callable, points: jax.Array, grid: Grid, axes: Sequence[int]) -> jax.Array:
-    """V at points (..., n) that may lie beyond open ends of some axes, where the scheme continues it.
+def beyond_ends(look: Callable, points: jax.Array, grid: Grid, sides: Sequence[tuple[int, int]]) -> jax.Array:
+    """V at points (..., n) that may lie beyond ends where the scheme continues it.
 
-    One node beyond an end is the scheme's own, on the parabola through the last three; V is linear up to there.
+    The node beyond an end has the scheme's own value, see ``stencil.continuation``; V is linear up to there.
 
     Args:
       look: V inside the box, as a function of points (..., n).
       points: where.
       grid: the nodes.
-      axes: the axes with open ends; repetitions count once.
+      sides: the ends, pairs of an axis and a step, in the order of ``continuing_sides``.
     """
-    if not axes:
+    if not sides:
         return look(points)
-    axis, further = axes[0], [other for other in axes[1:] if other != axes[0]]
+    (axis, step), further = sides[0], sides[1:]
     along, nodes = points[..., axis], jnp.asarray(grid.axis(axis), points.dtype)
-    places, weights = [along, along, along], [jnp.ones_like(along), jnp.zeros_like(along), jnp.zeros_like(along)]
-    for step in (step for which, step in grid.sides("open") if which == axis):
-        end = nodes[:3] if step < 0 else nodes[:-4:-1]  # from the end inwards
-        share = step * (along - end[0]) / jnp.abs(end[1] - end[0])
-        outside = share > 0
-        parabola = [jnp.asarray(weight, points.dtype) for weight in stencil.parabola(grid, axis, step)]
-        for k, weight in enumerate(parabola):
-            beyond = share * weight + (1 - share if k == 0 else 0)
-            places[k] = jnp.where(outside, end[k], places[k])
-            weights[k] = jnp.where(outside, beyond, weights[k])
-    values = [beyond_open_ends(look, points.at[..., axis].set(place), grid, further) for place in places]
-    # a node without weight has no say, be it infinite
-    return sum(
-        (jnp.where(weight == 0, 0, weight * value) for weight, value in zip(weights, values, strict=True)),
-        start=jnp.zeros(points.shape[:-1], points.dtype),
-    )
+    inwards = nodes if step < 0 else nodes[::-1]
+    gap = jnp.abs(inwards[1] - inwards[0])
+    share = step * (along - inwards[0]) / gap
+    outside, total = share > 0, jnp.zeros(points.shape[:-1], points.dtype)
+    for k, weight in enumerate(stencil.continuation(grid, axis, step)):
+        inside = 0 if k else 1  # the weight of this node for a point that is not beyond
+        weight = jnp.where(outside, share * jnp.asarray(weight, points.dtype) + inside * (1 - share), inside)
+        place = points.at[..., axis].set(jnp.where(outside, inwards[k], along))
+        value = beyond_ends(look, place, grid, further)
+        total = total + jnp.where(weight == 0, 0, weight * value)  # a node without weight has no say, be it infinite
+    if (end := stencil.sloped(grid, axis, step)) is None:
+        return total
+    slope = jnp.broadcast_to(jnp.asarray(end.slope, points.dtype), grid.shape)
+    added = step * 2 * gap * share * grid.interpolate(slope, points, clamp=True)
+    return total + jnp.where(outside, added, 0)
+
+
+def continuing_sides(grid: Grid) -> list[tuple[int, int]]:
+    """The ends beyond which V continues: pairs of an axis and a step, −1 lower and 1 upper."""
+    sides = itertools.product(range(grid.ndim), (-1, 1))
+    return [side for side in sides if not grid.periodic[side[0]] and not stencil.has_wall(grid, *side)]  # type: ignore[index]
 
 
 def _middle(action: list[Array], dtype: DType, n: int) -> jax.Array:

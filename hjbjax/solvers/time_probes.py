@@ -86,12 +86,12 @@ def report(found: Resolution, horizon: float, step: float | None) -> None:
                 "that are taken for them; give a shorter step=, or the mean of what oscillates"
             )
         return
-    count = np.searchsorted(CUTS, horizon / PARTS / step * (1 + 1e-9), side="right") - 1
-    shortest = float(np.min(found.lengths))
-    if found.errors[max(count, 0)] > WARNS and shortest < step:
+    place = sum(cut <= horizon / PARTS / step * (1 + 1e-9) for cut in CUTS) - 1
+    error, shortest = float(found.errors[max(place, 0)]), float(np.min(found.lengths))
+    if error > WARNS and shortest < step:
         warn(
             f"the functions of the time change within steps of step = {step:.3g}: they are off by "
-            f"{found.errors[max(count, 0)]:.0%} of their integral; leave step out, or take at most {shortest:.3g}"
+            f"{error:.0%} of their integral; leave step out, or take at most {shortest:.3g}"
         )
 
 

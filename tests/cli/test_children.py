@@ -26,9 +26,9 @@ pytestmark = pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason=
 LIMIT = 60  # seconds: a wait that is longer is a failure
 MARK = "HJBJAX_TEST_MARK"
 
-SLEEPS = "up(); time.sleep(600)"
-GENTLE = "on_request(130); up(); time.sleep(600)"
-DEAF = "signal.signal(signal.SIGTERM, signal.SIG_IGN); up(); time.sleep(600)"
+SLEEPS = "up(); time.sleep(90)"
+GENTLE = "on_request(130); up(); time.sleep(90)"
+DEAF = "signal.signal(signal.SIGTERM, signal.SIG_IGN); up(); time.sleep(90)"
 WELL = "print('said by', number, flush=True); print('noted by', number, file=sys.stderr)"
 
 
@@ -58,11 +58,11 @@ def stop(pid):
 class Launch:
     """A running launcher in a folder, and its children."""
 
-    def __init__(self, folder, mark, codes, launcher=(), **options):
+    def __init__(self, folder, mark, codes, **options):
         self.folder, self.mark, self.count = folder, mark, len(codes)
         words = [sys.executable, "-S", cheap_launch.__file__, json.dumps({"children": codes, **options})]
         self.process = subprocess.Popen(
-            [*launcher, *words], cwd=folder, env={**os.environ, MARK: mark}, stdout=-1, stderr=-1, bufsize=0
+            words, cwd=folder, env={**os.environ, MARK: mark}, stdout=-1, stderr=-1, bufsize=0
         )
         assert self.process.stdout.readline() == b"ready\n"
 
@@ -225,7 +225,7 @@ def test_a_second_signal_kills(launch):
 
 def test_signals_that_come_together_are_one_request(launch):
     """A terminal that closes tells the launcher, and so does its shell; a service manager sends two kinds at once."""
-    slow = "signal.signal(signal.SIGTERM, lambda *_: (time.sleep(0.2), os._exit(130))); up(); time.sleep(600)"
+    slow = "signal.signal(signal.SIGTERM, lambda *_: (time.sleep(0.2), os._exit(130))); up(); time.sleep(90)"
     found = launch(slow, slow)
     found.pids()
     for number in (signal.SIGHUP, signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
@@ -282,10 +282,7 @@ def test_a_signal_to_the_launcher_and_all_children_at_once(launch):
 
 
 def test_a_signal_that_is_ignored_stays_ignored(launch):
-    ignoring = (
-        "import os, signal, sys; signal.signal(signal.SIGHUP, signal.SIG_IGN); os.execv(sys.argv[1], sys.argv[1:])"
-    )
-    found = launch(GENTLE, launcher=[sys.executable, "-Sc", ignoring])
+    found = launch(GENTLE, ignored=["SIGHUP"])
     found.pids()
     found.process.send_signal(signal.SIGHUP)
     time.sleep(0.2)
@@ -295,10 +292,7 @@ def test_a_signal_that_is_ignored_stays_ignored(launch):
 
 
 def test_ends_are_seen_where_the_parent_ignores_them(launch):
-    ignoring = (
-        "import os, signal, sys; signal.signal(signal.SIGCHLD, signal.SIG_IGN); os.execv(sys.argv[1], sys.argv[1:])"
-    )
-    found = launch(GENTLE, "os.kill(os.getpid(), 9)", launcher=[sys.executable, "-Sc", ignoring])
+    found = launch(GENTLE, "os.kill(os.getpid(), 9)", ignored=["SIGCHLD"])
     outcome = found.ended()
     assert (outcome["culprit"], codes_of(outcome)[1]) == (1, -9)
 

@@ -22,13 +22,19 @@ from hjbjax.solution.solution import Solution, Status
 
 ROOT = Path(__file__).parents[2]
 HEARTBEAT = 10
+COMMAND = """
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
+from hjbjax.__main__ import start
+start()
+"""
 
 
 def command(folder, *words):
     """A process of the command, in a folder of its own."""
     environment = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
     return subprocess.Popen(
-        [sys.executable, "-m", "hjbjax", *map(str, words)],
+        [sys.executable, "-c", COMMAND, *map(str, words)],
         cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
 

@@ -1,8 +1,9 @@
 """A launcher of cheap children, as a script without JAX: it prints ``ready``, and at its end what became of them.
 
 The first argument is JSON: ``children``, the Python code of each, and optionally ``follow``, true for children that
-follow their launcher, ``grace``, ``settle`` and ``patience`` in seconds, and ``broken``, true for a last child that
-cannot be started. Each child finds its number in ``sys.argv[-1]`` and the functions of ``PRELUDE``.
+follow their launcher, ``grace``, ``settle`` and ``patience`` in seconds, ``broken``, true for a last child that cannot
+be started, and ``ignored``, the names of signals that the launcher ignores. Each child finds its number in
+``sys.argv[-1]`` and the functions of ``PRELUDE``.
 """
 
 import dataclasses
@@ -10,6 +11,7 @@ import importlib.util
 import json
 import math
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -37,6 +39,11 @@ def children_module():
 
 def main():
     asked, children = json.loads(sys.argv[1]), children_module()
+    for number in children.SIGNALS:  # tests that run in the background ignore some
+        signal.signal(number, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    for name in asked.get("ignored", ()):
+        signal.signal(getattr(signal, name), signal.SIG_IGN)
     children.GRACE, children.SETTLE = asked.get("grace", children.GRACE), asked.get("settle", children.SETTLE)
     commands = []
     scripts = Path.cwd() / "scripts"

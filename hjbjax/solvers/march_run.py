@@ -285,8 +285,11 @@ class MarchRun:
         count = len(self.slices.saved())
         check_alike(arrays[count:], jax.tree.leaves(self.gathered()))
         front = jax.tree.unflatten(jax.tree.structure(self.front), map(jnp.asarray, arrays[count:]))
-        if not 0 <= front.t <= self.task.horizon:
-            raise ValueError(f"its time is {front.t}, outside [0, {self.task.horizon}]")
+        # with NaN in either the march would never come to its end
+        if not (0 <= front.t <= self.task.horizon and np.all(np.isfinite(front.left))):
+            raise ValueError(
+                f"its time is {front.t}, wanted one in [0, {self.task.horizon}], and {front.left} are left"
+            )
         Status(int(front.code))
         self.slices.restore(arrays[:count])
         self.front = front

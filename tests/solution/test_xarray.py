@@ -44,7 +44,7 @@ def test_a_march_has_a_time_a_game_both_players_and_no_name_is_lost():
     marched = hjb.march(problem, grid, 0.2, times=[0.0, 0.1, 0.2], scheme=hjb.Upwind(split=True))
     found = marched.to_xarray()
     assert found["value"].dims == ("time", "state time")
-    assert set(found.data_vars) == {"value", "control value", "d"}
+    assert set(found.data_vars) == {"value", "box_error", "control value", "d"}
     np.testing.assert_array_equal(found["time"], [0.0, 0.1, 0.2])
     np.testing.assert_array_equal(found["d"], marched.disturbance[..., 0])
 

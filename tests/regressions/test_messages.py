@@ -310,3 +310,12 @@ def test_a_path_is_one_line_and_a_missing_file_is_what_python_calls_it(tmp_path)
 def test_a_bad_drift_is_told_by_every_front_door_that_reads_it(door, drift, said):
     with pytest.raises(ValueError, match=said or "drift"):
         door(problem(drift))
+
+
+def test_warnings_name_the_line_that_called():
+    """Python shows a warning once a line: inside the package every later one would be missing."""
+    with pytest.warns(UserWarning, match="simulate: the path") as path:
+        hjb.simulate(problem(), lambda x: x + 1, [0.9], 2.0, steps=4, grid=GRID)  # out of the box
+    with pytest.warns(UserWarning, match="value_at: 1 of 1 states lie outside") as lookup:
+        ANSWER.value_at([2.0])
+    assert {each.filename for each in [*path, *lookup]} == {__file__}

@@ -16,7 +16,7 @@ SWINGS = [(2.0, (60, 61), 47.25), (2.0, (100, 101), 42.69), (3.0, (60, 61), 35.0
 MORE = [(2.0, (200, 201), 42.73), (1.5, (60, 61), 67.6), (2.5, (100, 101), 37.62), (3.0, (200, 201), 34.88)]
 
 
-@pytest.mark.filterwarnings("ignore:the grid is coarse")
+@pytest.mark.filterwarnings("ignore::hjbjax.SolveWarning")
 @pytest.mark.parametrize(
     ("torque", "shape", "known"), [*SWINGS, *(pytest.param(*each, marks=pytest.mark.slow) for each in MORE)]
 )
@@ -29,7 +29,7 @@ def test_a_pendulum_of_several_swings_does_not_slide_off_its_rest_node(torque, s
     assert float(solution.value_at(HANGING)) == pytest.approx(known, rel=1e-3)
 
 
-@pytest.mark.filterwarnings("ignore:the grid is coarse")
+@pytest.mark.filterwarnings("ignore::hjbjax.SolveWarning")
 @pytest.mark.parametrize(("time", "cost"), [(1e6, 1e9), (1e-6, 1e-9)])
 def test_units_of_time_and_cost_do_not_matter(time, cost):
     problem, grid = zoo.pendulum(torque=2.0, shape=(60, 61))
@@ -40,7 +40,7 @@ def test_units_of_time_and_cost_do_not_matter(time, cost):
     assert float(solution.value_at(HANGING)) / cost == pytest.approx(47.25, rel=1e-3)
 
 
-@pytest.mark.filterwarnings("ignore:the grid is coarse")
+@pytest.mark.filterwarnings("ignore::hjbjax.SolveWarning")
 def test_an_answer_that_contradicts_the_certified_one_is_not_returned(monkeypatch):
     second_order = nested.second_order
 

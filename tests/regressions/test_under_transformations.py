@@ -108,7 +108,7 @@ def at_rest(price, **options):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:the grid is coarse")
+@pytest.mark.filterwarnings("ignore::hjbjax.SolveWarning")
 def test_an_answer_that_did_not_converge_is_no_number_unless_it_is_asked_for():
     def read(price, **options):
         return at_rest(price, **options).value_at(jnp.array([1.0, 0.5]))

@@ -75,8 +75,8 @@ MUTANTS = (
     Mutant(
         "ghost cell",
         "discretisation/stencil.py",
-        "        return slices(values, grid, axis, step)\n    nodes",
-        "        return slices(values, grid, axis, step, 1)\n    nodes",
+        "        return slices(values, grid, axis, step)\n    weights",
+        "        return slices(values, grid, axis, step, 1)\n    weights",
         ("tests/discretisation/test_stencil.py",),
     ),
     Mutant(

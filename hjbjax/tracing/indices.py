@@ -116,8 +116,11 @@ def _walk_turns(
 ) -> tuple[list[np.ndarray | None], str | None]:
     """Known results of a loop, turn by turn as far as its counters are known, and the first index outside its array."""
     body, length = eqn.params["jaxpr"], eqn.params["length"]
-    fixed = eqn.params["num_consts"]
-    start = fixed + eqn.params["num_carry"]  # operands of ``scan``: constants, carry, and arrays taken row by row
+    # operands of ``scan``: constants, carry, and arrays taken row by row
+    start, carried = (
+        _count_whole(*pair) for pair in ((eqn.invars, body.jaxpr.invars), (eqn.outvars, body.jaxpr.outvars))
+    )
+    fixed = start - carried
     carry, rows = known[fixed:start], known[start:]
     turns = range(length)[:: -1 if eqn.params["reverse"] else 1]
     for turn in turns[:TURNS]:
@@ -130,6 +133,15 @@ def _walk_turns(
             break  # nothing known is left, so that every other turn would look like this one
     followed = length <= TURNS and any(each is not None for each in carry)
     return [*(carry if followed else (None,) * len(carry)), *(None for _ in eqn.outvars[len(carry) :])], None
+
+
+def _count_whole(outside: Sequence[jex.Var | jex.Literal], inside: Sequence[jex.Var | jex.Literal]) -> int:
+    """The number of values that a turn of a loop takes, or returns, whole and not as rows of arrays.
+
+    By their ranks: JAX 0.12 keeps the numbers of operands under other parameters than JAX 0.10.
+    """
+    pairs = zip(outside, inside, strict=True)
+    return sum(len(array_type(whole).shape) == len(array_type(part).shape) for whole, part in pairs)
 
 
 def _inner(eqn: jex.JaxprEqn) -> list[jex.ClosedJaxpr]:

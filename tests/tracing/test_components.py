@@ -86,6 +86,8 @@ COMPONENTS = {
     "checkpoint inside": lambda x, p: jax.checkpoint(lambda a: jnp.cos(p * a) @ a)(x),
     "grad inside": lambda x, p: jax.grad(energy)(x, p),
     "grad of a gather": lambda x, p: jax.grad(lambda q: energy(q[np.array([3, 1, 1])], p))(x),
+    "slope of tanh": lambda x, p: jax.grad(lambda q: jnp.sum(jnp.tanh(p * q)))(x),
+    "sinc": lambda x, p: jnp.sinc(p * x),
     "hessian inside": lambda x, p: jax.hessian(energy)(x, p) @ x,
     "jvp inside": lambda x, p: jax.jvp(lambda q: energy(q, p), (x,), (x[::-1],))[1],
     "integers": lambda x, p: 2 * x + 1 - p * jnp.array([1, 0, 2, 0]) + np.arange(4),

@@ -165,11 +165,7 @@ def march(
             clock, needed, lambda _: _solution_at_horizon(on, horizon, start, Status.INTERRUPTED)
         ):
             try:
-                node_checks.values(on.asking(_without_moving_target(problem)), clock)
-                # a drift that changes in time may keep inside a constrained end now and not later
-                for t in np.linspace(horizon, 0.0, PROBES) if problem.time_dependent else (0.0,):
-                    admissibility.values(problem, grid, kind, t)
-                clock.enter("the preparation")
+                _check_nodes(on, horizon, clock)
                 task = _prepare(on, horizon, method, step, inner, policy=policy)
                 slices, front, code = march_run.drive(task, horizon, kept, start, clock)
                 solution = march_run.assemble(task, grid, slices, front, code)
@@ -189,6 +185,16 @@ def march(
     if throw and solution.status is not Status.CONVERGED:
         raise SolveError(f"{solution.status.name}: {solution.message}", solution)
     return solution
+
+
+def _check_nodes(on: Discretisation, horizon: float, clock: Clock) -> None:
+    """Look at the values of the problem's functions at all nodes, then leave the clock at the preparation."""
+    problem = on.problem
+    node_checks.values(on.asking(_without_moving_target(problem)), clock)
+    # a drift that changes in time may keep inside a constrained end now and not later
+    for t in np.linspace(horizon, 0.0, PROBES) if problem.time_dependent else (0.0,):
+        admissibility.values(problem, on.grid, on.dtype, t)
+    clock.enter("the preparation")
 
 
 def _march_again(

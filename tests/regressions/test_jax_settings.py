@@ -222,7 +222,7 @@ def test_an_answer_does_not_depend_on_a_setting(door, setting):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:.*cannot reach the target")
+@pytest.mark.filterwarnings("ignore::hjbjax.solution.status.SolveWarning")  # these small grids are poor
 @pytest.mark.parametrize("setting", SETTINGS)
 @pytest.mark.parametrize("door", MORE)
 def test_an_answer_of_another_door_does_not_depend_on_a_setting(door, setting):
@@ -231,7 +231,7 @@ def test_an_answer_of_another_door_does_not_depend_on_a_setting(door, setting):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:.*cannot reach the target")
+@pytest.mark.filterwarnings("ignore::hjbjax.solution.status.SolveWarning")  # these small grids are poor
 @pytest.mark.parametrize("setting", OTHERS)
 @pytest.mark.parametrize("door", DOORS | MORE)
 def test_an_answer_does_not_depend_on_an_option_that_is_left_to_the_caller(door, setting):

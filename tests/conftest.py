@@ -71,9 +71,9 @@ def _optimised(request, monkeypatch):
     jax.config.update(HASTE, before)
 
 
-@pytest.fixture(autouse=True, scope="module")
+@pytest.fixture(autouse=True)
 def _room_for_code():
-    """Compiled programs are forgotten after a file of tests once they take much room."""
+    """Compiled programs are forgotten after a test once they take much room."""
     yield
     maps = Path("/proc/self/maps")
     if maps.exists() and maps.read_bytes().count(b"\n") > MAPS:

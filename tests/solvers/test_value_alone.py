@@ -187,7 +187,7 @@ def test_a_march_takes_what_is_told_beforehand(n, count, policy, scheme):
     with jax.enable_x64(False):
         on = Discretisation(*cast((problem, grid), kind), scheme, kind)
         task = finite_horizon._prepare(on, 1.0, hjb.Explicit(), None, None, policy=policy)
-        front = jax.eval_shape(time_stepping.begin, task, jax.ShapeDtypeStruct(grid.shape, kind))
+        front = jax.eval_shape(time_stepping.begin, task, jax.ShapeDtypeStruct(grid.shape, kind), 1.0)
         taken = peak(march_run._run.lower(task, front, jnp.zeros((), kind), 1)) / grid.size
         filling = peak(march_run._greedy.lower(task, front.value, jnp.zeros((), kind))) / grid.size
     told = [memory.of_march(on, k, hjb.Explicit(), policy=policy) / grid.size for k in (1, 3)]

@@ -196,8 +196,10 @@ def broken_promise(
     if ahead is None or not np.all(inside[:-1]):
         return None
     total = _combined(problem, float(path.cost), ahead)
-    off, allowed = total - path.promised, _allowed(solution)
-    if not (off > allowed or (off < -allowed and worst_case)):
+    off = total - path.promised
+    if off <= 0 and not worst_case:
+        return None
+    if abs(off) <= _allowed(solution) or abs(off) <= LEAST * _range_of_extremes(problem, solution):
         return None
     further = "" if ahead == 0 else f" with what V says of the time after, {ahead:.4g},"
     advice = (
@@ -232,6 +234,18 @@ def _extent(solution: Solution) -> float:
     value = np.asarray(solution.value if solution.times is None else solution.value[0])
     finite = value[np.isfinite(value)]
     return float(np.ptp(finite)) if finite.size else math.inf
+
+
+def _range_of_extremes(problem: Problem, solution: Solution) -> float:
+    """The range of ψ and g at the nodes, of which a tube takes extremes: V may be the same at all of them."""
+    dtype = np.result_type(solution.value)
+    when = 0.0 if solution.times is None else float(solution.times[0])
+    x = solution.grid.components(dtype)
+    ranges = [0.0]
+    for ingredient in (problem.stopping_cost, problem.running_max):
+        if ingredient is not None and is_tube(problem):
+            ranges.append(float(np.ptp(np.asarray(of_state(problem, ingredient, x, when, dtype)))))
+    return max(ranges)
 
 
 def _grid_error(solution: Solution) -> float:

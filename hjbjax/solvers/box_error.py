@@ -179,7 +179,8 @@ def _compare(level: Task, before: np.ndarray, fine: Grid) -> BoxError:
     """|W − V| on the grid ``fine``, from V on a coarse one."""
     grid = altered(level.grid, edges=other_ends(level.problem, level.grid))
     others = dataclasses.replace(level.on, grid=grid, cut=None)
-    start, defect = jax.device_get(_defect(level, jnp.asarray(before, level.tol.dtype)))
+    start, policy = jax.device_get(_defect(level, jnp.asarray(before, level.tol.dtype)))
+    defect = policy.defect
     obstacles = _fixed_next_to_lost(level)
     value, scale = start, np.ptp(start[np.asarray(level.counted)])
     moved = np.zeros(grid.shape, bool)
@@ -201,11 +202,14 @@ def _compare(level: Task, before: np.ndarray, fine: Grid) -> BoxError:
 
 
 @jax.jit
-def _defect(task: Task, value: Field) -> tuple[Field, Field]:
-    """V with the prescribed values put in, and what V leaves of the equation where actions matter, both (*grid)."""
+def _defect(task: Task, value: Field) -> tuple[Field, bellman.Greedy]:
+    """V with the prescribed values put in, and its policy with what V leaves of the equation where actions matter.
+
+    Without the actions among its results, XLA works them out anew for every branch of the defect.
+    """
     value = task.impose(value)
-    defect = bellman.greedy(task.on, value, task.obstacles.fixed, lost=task.lost).defect
-    return value, jnp.where(task.obstacles.acting(value), defect, 0)
+    policy = bellman.greedy(task.on, value, task.obstacles.fixed, lost=task.lost)
+    return value, dataclasses.replace(policy, defect=jnp.where(task.obstacles.acting(value), policy.defect, 0))
 
 
 @jax.jit

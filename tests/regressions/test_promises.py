@@ -71,10 +71,12 @@ def numbers(seed):
 
 
 def missed(problem, solution, x0, duration):
-    """How far a path from x0 misses V, over the range of V."""
+    """How far a path from x0 misses V, over the range of V, or of the distance of a tube: V may be its least everywhere."""
     path = hjb.simulate(problem, solution, [x0], duration, steps=400)
-    value = solution.value if solution.times is None else solution.value[0]
-    return abs(path.cost - path.promised) / np.ptp(value), path
+    extent = np.ptp(solution.value if solution.times is None else solution.value[0])
+    if problem.cost is None and problem.stopping_cost is not None:
+        extent = max(extent, np.ptp([problem.stopping_cost(x) for x in solution.grid.nodes()]))
+    return abs(path.cost - path.promised) / extent, path
 
 
 CHEAP = ("stopping", "start")

@@ -67,7 +67,7 @@ def test_the_value_is_that_of_a_solve_with_its_policy(name):
         assert getattr(found, absent) is None
     assert found.stats["method"] == "ValueIteration(policy=False)"
     assert len(found.residuals) == found.steps + 1
-    if problem.discount:
+    if problem.discount and name != "sampled":  # whose minima are searched, so that nothing bounds what is missed
         exact = hjb.solve(problem, PLANE, scheme=hjb.Upwind(), tol=1e-10).value
         lower, upper = found.bounds
         assert found.error <= tol

@@ -47,7 +47,7 @@ from hjbjax.problem.sets import Ball, Box
 from hjbjax.solution.clock import Clock, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
-from hjbjax.solvers.finite_horizon import march
+from hjbjax.solvers.finite_horizon import march_part
 
 DOUBLINGS = 6  # of the time marched, at most: the first look is at a 64th of the horizon
 SOON = 1e-6  # seconds: a limit that ends a march after its first look
@@ -195,7 +195,7 @@ def _try(
     value, total, span, gains = np.zeros(grid.shape), 0.0, horizon / 2**DOUBLINGS, [math.inf]
     while True:
         # V_T goes on from where it stood: the march from V = 0 over 2T is one over T from V_T
-        solution = march(problem, grid, span, start=value, inner=watch, throw=False, scheme=scheme, time_limit=left)
+        solution = march_part(problem, grid, span, start=value, inner=watch, scheme=scheme, time_limit=left)
         if solution.status in CUTS:
             return _no_verdict(solution, gamma, total + span - float(solution.times[0]), inner)
         # a march that was decided early stands at times[0] > 0, and less than the span has passed

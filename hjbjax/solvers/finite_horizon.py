@@ -165,11 +165,8 @@ def march(
             clock, needed, lambda _: _solution_at_horizon(on, horizon, start, Status.INTERRUPTED)
         ):
             try:
-                _check_nodes(on, horizon, clock)
-                task = _prepare(on, horizon, method, step, inner, policy=policy)
-                slices, front, code = march_run.drive(task, horizon, kept, start, clock)
-                solution = march_run.assemble(task, grid, slices, front, code)
-                if code is Status.CONVERGED:
+                task, solution = _on_host(on, horizon, kept, start, method, step, inner, clock, policy=policy)
+                if solution.status is Status.CONVERGED:
                     again = functools.partial(_march_again, task, method, kept, start, clock)
                     solution = with_march_box_error(solution, on, again, clock)
             except Stopped as stop:
@@ -185,6 +182,57 @@ def march(
     if throw and solution.status is not Status.CONVERGED:
         raise SolveError(f"{solution.status.name}: {solution.message}", solution)
     return solution
+
+
+@with_settled_functions
+def march_part(
+    problem: Problem,
+    grid: Grid,
+    horizon: float,
+    *,
+    start: Nodes,
+    inner: float,
+    scheme: Scheme | None,
+    time_limit: float | None,
+) -> Solution:
+    """``march(..., throw=False)`` as one part of a longer march by the caller, who has no use for its box error.
+    """
+    scheme, method = Limited(split=True) if scheme is None else scheme, Explicit()
+    _check(problem, grid, scheme, method, None, time_limit)
+    horizon, kept = _times(horizon, None)
+    clock = Clock(seconds=time_limit)
+    with noting_interrupts(clock), host_loop.telling(clock), own_settings(x64=True):
+        check_on_one_state(problem, grid, scheme)
+        on = Discretisation(problem, grid, scheme, np.dtype(np.float64))
+        memory.fitting(memory.of_march(on, len(kept), method, policy=True), grid, None)
+        try:
+            _, solution = _on_host(on, horizon, kept, start, method, None, inner, clock, policy=True)
+        except Stopped as stop:
+            solution = _solution_at_horizon(on, horizon, start, stop.status)
+        return with_last_phase(solution, clock)
+
+
+def _on_host(
+    on: Discretisation,
+    horizon: float,
+    kept: np.ndarray,
+    start: Nodes | None,
+    method: TimeMethod,
+    step: float | None,
+    inner: float | None,
+    clock: Clock,
+    *,
+    policy: bool,
+) -> tuple[March, Solution]:
+    """What was marched, and the solution as far as the clock allows.
+
+    Raises:
+      Stopped: the clock said stop before the first step.
+    """
+    _check_nodes(on, horizon, clock)
+    task = _prepare(on, horizon, method, step, inner, policy=policy)
+    slices, front, code = march_run.drive(task, horizon, kept, start, clock)
+    return task, march_run.assemble(task, on.grid, slices, front, code)
 
 
 def _check_nodes(on: Discretisation, horizon: float, clock: Clock) -> None:

@@ -135,6 +135,28 @@ def trace(on: Discretisation, plan: Plan, held: Mask, *, running: bool) -> Arcs:
     return jax.tree.map(lambda entry: entry.reshape(-1, *on.grid.shape), found)
 
 
+def trace_chosen(on: Discretisation, plan: Plan, number: AtNodes, held: Mask) -> Arcs:
+    """One arc of a plan per node, that with the number which ``number`` has there; differentiable.
+
+    The legs are those of ``trace``, in a loop of fixed length, which reverse-mode derivatives require.
+    """
+    count = len(plan.legs)
+    u = [jnp.asarray(plan.actions)[number // count, j] for j in range(np.shape(plan.actions)[1])]
+    legs = jnp.asarray(plan.legs)[number % count]
+    slowest = SLOWEST * _fastest(on, plan)
+
+    def further(path: _Path, leg: Scalar) -> tuple[_Path, None]:
+        moved = _leg(on, path, u, slowest)
+        return jax.tree.map(lambda new, old: jnp.where(leg < legs, new, old), moved, path), None
+
+    start = [jnp.broadcast_to(x, on.grid.shape) for x in on.coordinates()]
+    level = None if on.problem.target is None else cut_cells.level(on)
+    zero = jnp.zeros(on.grid.shape, on.dtype)
+    path = _Path(start, zero, zero, level, jnp.asarray(held))
+    path = jax.lax.scan(further, path, jnp.arange(int(np.max(plan.legs))))[0]
+    return _as_jumps(on, path, held, running=False)
+
+
 class _Path(NamedTuple):
     """Paths from all nodes: where they are, their time and discounted cost so far, l there, and whether they ended."""
 

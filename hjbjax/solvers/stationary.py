@@ -30,7 +30,7 @@ from hjbjax.solution.placement import Path
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop, semi_lagrangian, transformed
-from hjbjax.solvers.host_solve import solve_on_host
+from hjbjax.solvers.host_solve import Choices, solve_on_host
 from hjbjax.solvers.result import solution_at_start, with_last_phase
 from hjbjax.solvers.setup import check_on_one_state, choose
 from hjbjax.solvers.transformed import Asked
@@ -143,14 +143,15 @@ def solve(
             solution = semi_lagrangian.solve_on_host(problem, grid, scheme, kind, clock=clock, **options)
         return _ended(with_last_phase(solution, clock), clock, tol, throw=throw)
     method = choose(problem, grid, traced=False, method=method, divided=mesh is not None)
-    on, sharpen = Discretisation(problem, grid, scheme or Upwind(subcell=True), kind, mesh=mesh), scheme is None
+    on = Discretisation(problem, grid, scheme or Upwind(subcell=True), kind, mesh=mesh)
+    choices = Choices(scheme=scheme is None, method=free, levels=free)
     # float64 for this call alone: another thread, and the caller's own programs, keep theirs
     with noting_interrupts(clock), host_loop.telling(clock), own_settings(x64=kind == np.float64), opened as kept:
         clock.journal = kept and kept.journal()
         check_on_one_state(problem, grid, on.scheme)  # before the memory, for which functions may be read
         needed = memory.require(problem, grid, method, kind, max_memory)
         with host_loop.with_solution(clock, needed, lambda kept: _partial(on, kept)):
-            solution = with_last_phase(solve_on_host(on, method, tol, guess, clock, sharpen=sharpen, free=free), clock)
+            solution = with_last_phase(solve_on_host(on, method, tol, guess, clock, choices), clock)
     solution.stats.setdefault("method", method.described(problem.is_game))
     solution.stats.update(bytes=needed, **({} if mesh is None else {"mesh": mesh.devices.shape}))
     return _ended(solution, clock, tol, throw=throw)

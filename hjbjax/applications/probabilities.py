@@ -57,8 +57,12 @@ def reach_probability(
     away from both, value iteration from zero finds the probability among several solutions, which is slower. It stops
     at a step of at most 1e-9 (4e-6 in float32), which bounds nothing: where steps shrink slowly more is left.
 
-    Inside ``jit``, ``vmap`` and ``grad`` it is not looked for whether the state may stay away for ever: where it may,
-    the answer there may be wrong.
+    Without noise the probability is 0 or 1, and is read from a minimum time or from a tube. Not so if ``scheme`` or
+    ``method`` is passed, or ``least`` together with ``obstacle``: then it is the probability of the Markov chain, which
+    moves at random by about a cell.
+
+    Inside ``jit``, ``vmap`` and ``grad`` a problem with noise is not searched for states that may stay away
+    indefinitely. If there are any, the answer may be wrong.
 
     Args:
       problem: the system; its costs and its discount play no part.
@@ -92,9 +96,12 @@ def reach_probability(
     _refuse_open(grid, name)
     # a path that ends on the target gets 1, one that ends in the obstacle 0, one that never ends 0
     problem, inside, hit = _system(problem, target, obstacle, feedback, horizon, name)
-    if _is_decided(problem, horizon, options, asked=least, obstacle=hit):
-        with _no_fallback_warning(feedback):
-            return _yes_or_no(problem, grid, (inside, hit), horizon, options, least=least and horizon is not None)
+    if _has_no_chance(problem, options):
+        decides = least and (problem.is_game or problem.controls is not None)
+        # to be kept out of the target by an obstacle is no tube
+        if not (decides and hit is not None):
+            with _no_fallback_warning(feedback):
+                return _yes_or_no(problem, grid, (inside, hit), horizon, options, least=decides)
     sign = 1.0 if least else -1.0  # the control minimises: the greatest probability is minus the least of −P
     question = exit_problems.exit_problem(problem, inside, hit, 0.0, sign)  # no running cost: V is the exit cost alone
     with _no_fallback_warning(feedback):
@@ -166,7 +173,8 @@ def expected_exit_time(
     """The least expected time in which the control can bring the state into the target.
 
     V(x) = inf_u sup_d E τ, τ the first time in the target: min max (1 + f·DV + ½ tr σσᵀD²V) = 0, V = 0 there. The
-    bound on |V − V_h| is certified, except for the greatest time.
+    bound on |V − V_h| is certified, except for the greatest time. Without noise and disturbance the scheme and the
+    certificate are those of ``solve``, unless ``scheme`` or ``method`` is passed.
 
     Args:
       problem: the system; its costs and its discount play no part.
@@ -278,31 +286,20 @@ def _has_no_chance(problem: Problem, options: dict) -> bool:
     return problem.noise is None and options.get("scheme") is None and options.get("method") is None
 
 
-def _is_decided(
-    problem: Problem, horizon: float | None, options: dict, *, asked: bool, obstacle: Callable | None
-) -> bool:
-    """True if a probability is 0 or 1 and a minimum time or a tube tells which; ``asked`` for the least one.
-
-    The chain of a system without noise moves at random all the same, which would make a probability of its own.
-    """
-    if not _has_no_chance(problem, options):
-        return False
-    if horizon is not None:
-        return not (asked and obstacle is not None)
-    # without controls the least probability is the greatest one
-    return not problem.is_game and not (asked and problem.controls is not None)
-
-
 def _yes_or_no(
     problem: Problem, grid: Grid, sets: tuple[Callable, Callable | None], horizon: float | None, options: dict,
     *, least: bool,
 ) -> Solution:  # fmt: skip
-    """The probability, 0 or 1, with which a system without noise comes into the target and not into the obstacle."""
-    if horizon is None:
+    """The probability, 0 or 1, with which a system without noise comes into the target and not into the obstacle.
+
+    The chain of such a system moves at random all the same, and would give a probability of its own. A minimum time is
+    finite, or a tube has the sign, where the answer is yes.
+    """
+    if horizon is None and not (problem.is_game or least):
         question, is_one = exit_problems.arrival(problem, *sets), _is_finite
     else:
         question, is_one = exit_problems.tube(problem, *sets, least=least), _above if least else _below
-    # what is said of that question, as that times are infinite, is not about the probability
+    # warnings about that question, such as infinite times, do not apply to the probability
     with keeping_warnings(), _map_partial(lambda partial: _decided(partial, is_one)):
         found = solve(question, grid, **options) if horizon is None else march(question, grid, horizon, **options)
     return _decided(found, is_one)

@@ -197,15 +197,15 @@ def check_limits(max_steps: object, time_limit: object) -> None:
 
 def check_arguments(
     problem: object, grid: object, method: object, scheme: object, tol: object, guess: object = None,
-    *, paths: bool = False, caller: str = "solve",
+    *, paths: bool = False,
 ) -> None:  # fmt: skip
     """Refuse arguments with which no solve can start; needs no values of the problem's functions.
 
-    ``paths``: whether a scheme that follows paths is offered. ``caller``: who got them in another order, or others.
+    ``paths``: a scheme that follows paths is offered.
     """
     if not isinstance(problem, Problem) or not isinstance(grid, Grid):
         kinds = f"{type(problem).__name__}, {type(grid).__name__}"
-        raise TypeError(f"{caller}: got {kinds}; wanted a Problem and a Grid")
+        raise TypeError(f"solve: got {kinds}; wanted a Problem and a Grid")
     if method is not None:
         check_method(method, "solve: method")
     if scheme is not None:

@@ -24,6 +24,7 @@ from hjbjax.solution import nested_grids
 from hjbjax.solution.clock import CUT, Clock
 from hjbjax.solution.solution import Solution, question
 from hjbjax.solution.status import Status, warn
+from hjbjax.solvers.arrival import warn_of_no_arrival
 from hjbjax.solvers.nested import Settled
 from hjbjax.solvers.setup import BOUNDING, Assumptions
 
@@ -49,6 +50,8 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
     gap = None if mute else _isaacs_gap(task, state)
     unanswered = mute or code in (Status.DIVERGED, Status.NONFINITE)  # there is no optimal drift to speak of
     leaving = None if unanswered else _leaving(task, state)
+    if not mute and code is Status.CONVERGED:
+        warn_of_no_arrival(task, state)
     state = jax.device_get(state)
     message = _message(code, task, state, grid) if earning is None else _unbounded_message(earning, grid)
     solution = assemble(task, state, assumptions)

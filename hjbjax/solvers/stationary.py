@@ -72,7 +72,9 @@ def solve(
         ``Weno5()``, fifth order there, on equal spacings, for a ``tol`` as small as its error; or ``SemiLagrangian()``,
         monotone, for deterministic problems whose optimal paths run along kinks of the value. ``None`` is
         ``Limited()`` where its iteration converges, with an estimate of the grid's error. It is ``Upwind()`` for value
-        iteration and tubes without discount, and wherever noise lets central differences be monotone.
+        iteration and tubes without discount, and wherever noise lets central differences be monotone. It is
+        ``SemiLagrangian()`` where the chain may be carried past an undiscounted target that paths without noise reach,
+        if ``method`` is ``None``, too; the message of the solution says so.
       tol: bound to reach on |V − V_h|, in cost units, V_h the exact solution on the grid of the monotone scheme. Where
         no certificate exists the solution says so, and the bound is on the residual and on the last step, as it is for
         the high-order equation; a tube without discount goes on until V no longer changes.

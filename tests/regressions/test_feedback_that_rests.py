@@ -21,7 +21,7 @@ def mountain_car(cost, **changes):
 
 
 @pytest.mark.filterwarnings("ignore:the box decides", "ignore:the grid is coarse")
-@pytest.mark.parametrize("together", [False, True])
+@pytest.mark.parametrize("together", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_feedback_that_rests_is_told(together, monkeypatch):
     monkeypatch.setattr("hjbjax.solvers.batch._fills_with_lanes", lambda: True)
     problem = mountain_car(lambda x, u: 0.1 * u @ u)
@@ -33,6 +33,7 @@ def test_a_feedback_that_rests_is_told(together, monkeypatch):
         hjb.simulate(problem, solution, [-0.5, 0.0], 300.0)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the box decides", "ignore:the grid is coarse")
 @pytest.mark.parametrize("changes", [{"cost": lambda x, u: 1.0}, {"cost": lambda x, u: 0.1 * u @ u, "discount": 0.005}])
 def test_a_price_of_time_is_enough(changes):

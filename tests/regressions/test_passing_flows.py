@@ -114,7 +114,7 @@ def test_derivatives_are_those_of_the_answer():
         differences = [(value(numbers + shift) - value(numbers - shift)) / (2 * step) for shift in shifts]
         tangent = jax.jvp(value, (numbers,), (jnp.ones(5),))[1]
     np.testing.assert_allclose(slope, differences, rtol=1e-4, atol=1e-5)
-    assert float(tangent) == pytest.approx(float(np.sum(slope)), rel=1e-8)
+    assert float(tangent) == pytest.approx(float(np.sum(np.asarray(slope))), rel=1e-8)
 
 
 def swirling(x, u):

@@ -60,7 +60,7 @@ def assert_near(value, exact, mean, atol, share):
     assert np.mean(np.isfinite(value) != np.isfinite(exact)) <= share
 
 
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 def test_the_default_reaches_the_target(dtype):
     grid = square(21)
     with pytest.warns(hjb.SolveWarning, match=UNREACHED):
@@ -80,6 +80,7 @@ def test_any_resolution_gives_the_same_share():
         assert float(solution.value_at(CORNER)) == pytest.approx(0.760, abs=0.005)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*cannot reach the target")
 def test_batches_and_transformations_decide_alike(monkeypatch):
     """Of three lanes the third, whose control is faster than the drift, keeps the chain."""
@@ -197,9 +198,16 @@ def in_the_way(x):
 
 @pytest.mark.filterwarnings("ignore:.*cannot reach the target")
 def test_a_flow_has_its_own_times():
+    """The same in a batch of one and inside ``jit``."""
     grid = square(31)
     found = hjb.expected_exit_time(FLOW, grid, disc)
     assert_near(found.value, least_time(grid.nodes(), ANGLE, 0.0, 0.3), 0.005, 0.07, 0.02)
+    question = hjb.Problem(FLOW.drift, lambda x, u: 1.0, target=disc)
+    (lane,) = hjb.solve_batch([question], grid, tol=1e-6)
+    np.testing.assert_array_equal(lane.value, found.value)
+    with jax.enable_x64(True):
+        inside = jax.jit(lambda one: hjb.solve(question, grid, tol=1e-6 * one).value)(1.0)
+    np.testing.assert_allclose(inside, found.value, rtol=1e-8)
 
 
 def test_a_flow_arrives_or_does_not():

@@ -127,6 +127,41 @@ def exit_problem(
     )  # fmt: skip
 
 
+def arrival(problem: Problem, target: Callable, obstacle: Callable | None) -> Problem:
+    """The minimum time to the target of a system that stops for ever where it meets the obstacle.
+
+    Its value is finite exactly where the target is reached, and before the obstacle. Arguments are those of
+    ``exit_problem``.
+    """
+    drift = problem.drift if obstacle is None else jax.tree_util.Partial(_stopping, problem.drift, obstacle)
+    inside = target if obstacle is None else jax.tree_util.Partial(_outside_of, target, obstacle)
+    return Problem(
+        drift, jax.tree_util.Partial(_constant, 1.0), problem.controls, target=inside,
+        isaacs=problem.isaacs, time_dependent=problem.time_dependent,
+    )  # fmt: skip
+
+
+def tube(problem: Problem, target: Callable, obstacle: Callable | None, *, least: bool) -> Problem:
+    """The tube of the states that reach the target, {V ≤ 0}; of those that cannot avoid it, {V ≥ 0}, if ``least``."""
+    stop, most = (None, target) if least else (target, obstacle)
+    return Problem(
+        problem.drift, None, problem.controls, disturbances=problem.disturbances, stopping_cost=stop,
+        running_max=None if most is None else jax.tree_util.Partial(complement, most),
+        isaacs=problem.isaacs, time_dependent=problem.time_dependent,
+    )  # fmt: skip
+
+
+def _stopping(drift: Callable, obstacle: Callable, *arguments: Array) -> jax.Array:
+    """f off the obstacle, and zero in it."""
+    rates = jnp.asarray(drift(*arguments))
+    return jnp.where(jnp.asarray(obstacle(arguments[0])) <= 0, 0, rates)
+
+
+def _outside_of(target: Callable, obstacle: Callable, *where: Place) -> jax.Array:
+    """A function ≤ 0 in the target where that is not the obstacle."""
+    return jnp.maximum(jnp.asarray(target(*where)), -jnp.asarray(obstacle(*where)))
+
+
 def complement(region: Callable, *where: Place) -> Array:
     """A function ≤ 0 outside of a set, which is given by a function ≤ 0 inside."""
     return -region(*where)

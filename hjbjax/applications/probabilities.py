@@ -28,6 +28,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, front_door, is_traced
 from hjbjax.problem.settings import own_settings
 from hjbjax.solution.solution import Solution, SolveError
+from hjbjax.solution.status import keeping_warnings
 from hjbjax.solvers.finite_horizon import march
 from hjbjax.solvers.stationary import check_arguments, solve
 from hjbjax.tracing import checks
@@ -56,8 +57,12 @@ def reach_probability(
     away from both, value iteration from zero finds the probability among several solutions, which is slower. It stops
     at a step of at most 1e-9 (4e-6 in float32), which bounds nothing: where steps shrink slowly more is left.
 
-    Inside ``jit``, ``vmap`` and ``grad`` it is not looked for whether the state may stay away for ever: where it may,
-    the answer there may be wrong.
+    Without noise the probability is 0 or 1, and is read from a minimum time or from a tube. Not so if ``scheme`` or
+    ``method`` is passed, or ``least`` together with ``obstacle``: then it is the probability of the Markov chain, which
+    moves at random by about a cell.
+
+    Inside ``jit``, ``vmap`` and ``grad`` a problem with noise is not searched for states that may stay away
+    indefinitely. If there are any, the answer may be wrong.
 
     Args:
       problem: the system; its costs and its discount play no part.
@@ -91,6 +96,12 @@ def reach_probability(
     _refuse_open(grid, name)
     # a path that ends on the target gets 1, one that ends in the obstacle 0, one that never ends 0
     problem, inside, hit = _system(problem, target, obstacle, feedback, horizon, name)
+    if _has_no_chance(problem, options):
+        decides = least and (problem.is_game or problem.controls is not None)
+        # to be kept out of the target by an obstacle is no tube
+        if not (decides and hit is not None):
+            with _no_fallback_warning(feedback):
+                return _yes_or_no(problem, grid, (inside, hit), horizon, options, least=decides)
     sign = 1.0 if least else -1.0  # the control minimises: the greatest probability is minus the least of −P
     question = exit_problems.exit_problem(problem, inside, hit, 0.0, sign)  # no running cost: V is the exit cost alone
     with _no_fallback_warning(feedback):
@@ -162,7 +173,8 @@ def expected_exit_time(
     """The least expected time in which the control can bring the state into the target.
 
     V(x) = inf_u sup_d E τ, τ the first time in the target: min max (1 + f·DV + ½ tr σσᵀD²V) = 0, V = 0 there. The
-    bound on |V − V_h| is certified, except for the greatest time.
+    bound on |V − V_h| is certified, except for the greatest time. Without noise and disturbance the scheme and the
+    certificate are those of ``solve``, unless ``scheme`` or ``method`` is passed.
 
     Args:
       problem: the system; its costs and its discount play no part.
@@ -202,6 +214,8 @@ def expected_exit_time(
             # the least time is inf where the target is out of reach, and is found; the greatest would grow without end
             if greatest:
                 _refuse_staying(question, grid, options)
+            elif _has_no_chance(problem, options) and not problem.is_game:
+                options = {"scheme": None} | options  # the one that suits a path, as the chain may miss the target
         return _answer(question, grid, horizon, options, sign)
 
 
@@ -267,6 +281,56 @@ def _without_end(question: Problem, grid: Grid, least: bool, options: dict) -> t
     return dataclasses.replace(question, **bound), {"method": ValueIteration()} | options
 
 
+def _has_no_chance(problem: Problem, options: dict) -> bool:
+    """True if the system has no noise, and the caller left scheme and method to the package."""
+    return problem.noise is None and options.get("scheme") is None and options.get("method") is None
+
+
+def _yes_or_no(
+    problem: Problem, grid: Grid, sets: tuple[Callable, Callable | None], horizon: float | None, options: dict,
+    *, least: bool,
+) -> Solution:  # fmt: skip
+    """The probability, 0 or 1, with which a system without noise comes into the target and not into the obstacle.
+
+    The chain of such a system moves at random all the same, and would give a probability of its own. A minimum time is
+    finite, or a tube has the sign, where the answer is yes.
+    """
+    if horizon is None and not (problem.is_game or least):
+        question, is_one = exit_problems.arrival(problem, *sets), _is_finite
+    else:
+        question, is_one = exit_problems.tube(problem, *sets, least=least), _above if least else _below
+    # warnings about that question, such as infinite times, do not apply to the probability
+    with keeping_warnings(), _map_partial(lambda partial: _decided(partial, is_one)):
+        found = solve(question, grid, **options) if horizon is None else march(question, grid, horizon, **options)
+    return _decided(found, is_one)
+
+
+def _decided(solution: Solution, is_one: Callable[[Any], Any]) -> Solution:
+    """The solution with 1 where its value says so and 0 elsewhere; nothing said of the value holds of these."""
+    value: Any = solution.value
+    xp: Any = jnp if is_traced(value) else np
+    one = xp.asarray(is_one(value), value.dtype)
+    return dataclasses.replace(
+        solution, value=xp.where(xp.isnan(value), value, one), enclosure=None, monotone_error=None, grid_error=None,
+        box_error=None,
+    )  # fmt: skip
+
+
+def _is_finite(value: Any) -> Any:
+    """Where a time is finite."""
+    return value < np.inf
+
+
+def _below(value: Any) -> Any:
+    """The tube of what is reached."""
+    return value <= 0
+
+
+def _above(value: Any) -> Any:
+    """The tube of what cannot be avoided."""
+    return value >= 0
+
+
 def _zero(*where: Place) -> jax.Array:
     """Zero, a bound of every probability."""
     return jnp.zeros(())
@@ -313,14 +377,19 @@ def _answer(question: Problem, grid: Grid, horizon: float | None, options: dict,
     return _affine(found, 0.0, sign)
 
 
-@contextlib.contextmanager
-def _map_errors(offset: float, sign: float) -> Iterator[None]:
+def _map_errors(offset: float, sign: float) -> contextlib.AbstractContextManager[None]:
     """An error raised inside has offset + sign · V for V in its partial solution."""
+    return _map_partial(lambda partial: _affine(partial, offset, sign))
+
+
+@contextlib.contextmanager
+def _map_partial(change: Callable[[Solution], Solution]) -> Iterator[None]:
+    """An error raised inside leaves with its partial solution changed."""
     try:
         yield
     except SolveError as error:
         if error.solution is not None:
-            error.solution = _affine(error.solution, offset, sign)  # in place: the traceback stays what it is
+            error.solution = change(error.solution)  # in place: the traceback stays what it is
         raise
 
 

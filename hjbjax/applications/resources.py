@@ -118,7 +118,7 @@ def estimate(
       >>> hjb.estimate(problem, grid, dtype="float32", measure=False).bytes // grid.size
       70
     """
-    check_arguments(problem, grid, method, scheme, tol, paths=True, caller="estimate")
+    check_arguments(problem, grid, method, scheme, tol, paths=True)
     kind, free = arguments.as_dtype(dtype), memory.available()
     check_on_one_state(problem, grid, scheme or Upwind())
     chosen = choose(problem, grid, traced=False, method=method)

@@ -121,22 +121,44 @@ def trace(on: Discretisation, plan: Plan, held: Mask, *, running: bool) -> Arcs:
     def under(action: jax.Array) -> Arcs:
         u = [action[j] for j in range(action.shape[0])]
 
-        def longer(path: _Path, count: Scalar) -> tuple[_Path, Arcs]:
+        def longer(path: Path, count: Scalar) -> tuple[Path, Arcs]:
             # the next longer arc goes on where this one ends
-            path = jax.lax.fori_loop(0, count, lambda _, path: _leg(on, path, u, slowest), path)
+            path = jax.lax.fori_loop(0, count, lambda _, path: leg(on, path, u, slowest), path)
             return path, _as_jumps(on, path, held, running=running)
 
         # a loop over actions must not hoist tables of all nodes out of itself
         places, signs = jax.lax.optimization_barrier((start, level))
         zero = jnp.zeros(on.grid.shape, on.dtype)
-        return jax.lax.scan(longer, _Path(places, zero, zero, signs, jnp.asarray(held)), further)[1]
+        return jax.lax.scan(longer, Path(places, zero, zero, signs, jnp.asarray(held)), further)[1]
 
     found = jax.lax.map(under, jnp.asarray(plan.actions))  # (A, R, *grid)
     return jax.tree.map(lambda entry: entry.reshape(-1, *on.grid.shape), found)
 
 
-class _Path(NamedTuple):
-    """Paths from all nodes: where they are, their time and discounted cost so far, l there, and whether they ended."""
+def trace_chosen(on: Discretisation, plan: Plan, number: AtNodes, held: Mask) -> Arcs:
+    """One arc of a plan per node, that with the number which ``number`` has there; differentiable.
+
+    The legs are those of ``trace``, in a loop of fixed length, which reverse-mode derivatives require.
+    """
+    count = len(plan.legs)
+    u = [jnp.asarray(plan.actions)[number // count, j] for j in range(np.shape(plan.actions)[1])]
+    legs = jnp.asarray(plan.legs)[number % count]
+    slowest = SLOWEST * _fastest(on, plan)
+
+    def further(path: Path, done: Scalar) -> tuple[Path, None]:
+        moved = leg(on, path, u, slowest)
+        return jax.tree.map(lambda new, old: jnp.where(done < legs, new, old), moved, path), None
+
+    start = [jnp.broadcast_to(x, on.grid.shape) for x in on.coordinates()]
+    level = None if on.problem.target is None else cut_cells.level(on)
+    zero = jnp.zeros(on.grid.shape, on.dtype)
+    path = Path(start, zero, zero, level, jnp.asarray(held))
+    path = jax.lax.scan(further, path, jnp.arange(int(np.max(plan.legs))))[0]
+    return _as_jumps(on, path, held, running=False)
+
+
+class Path(NamedTuple):
+    """Paths: where they are, their time and discounted cost so far, l there, and whether they ended."""
 
     x: list[jax.Array]
     time: jax.Array
@@ -145,7 +167,7 @@ class _Path(NamedTuple):
     ended: jax.Array
 
 
-def _as_jumps(on: Discretisation, path: _Path, held: Mask, *, running: bool) -> Arcs:
+def _as_jumps(on: Discretisation, path: Path, held: Mask, *, running: bool) -> Arcs:
     """Paths that have come to their end, as jumps of the chain."""
     grid, problem = on.grid, on.problem
     weight, pay = jnp.exp(-problem.discount * path.time), path.cost
@@ -162,15 +184,16 @@ def _as_jumps(on: Discretisation, path: _Path, held: Mask, *, running: bool) -> 
     return Arcs(pay, weight, cell, tuple(fractions), path.cost if running else None)
 
 
-def _leg(on: Discretisation, path: _Path, u: list[jax.Array], slowest: Scalar) -> _Path:
+def leg(on: Discretisation, path: Path, u: list[jax.Array], slowest: Scalar) -> Path:
     """The paths one leg further under an action, up to the target where they come to it; those that ended stay."""
     grid, x, beta = on.grid, path.x, on.problem.discount
+    shape = jnp.shape(x[0])
 
     def drift(places: list[jax.Array]) -> list[jax.Array]:
-        return [jnp.broadcast_to(f, grid.shape) for f in on.drift(u, [], places)]
+        return [jnp.broadcast_to(f, shape) for f in on.drift(u, [], places)]
 
     f1 = drift(x)
-    length = 1 / jnp.maximum(_speed(grid, x, f1), slowest)  # seconds for one cell
+    length = 1 / jnp.maximum(speed(grid, x, f1), slowest)  # seconds for one cell
     f2 = drift(_moved(grid, x, f1, length / 2))
     f3 = drift(_moved(grid, x, f2, length / 2))
     f4 = drift(_moved(grid, x, f3, length))
@@ -183,10 +206,10 @@ def _leg(on: Discretisation, path: _Path, u: list[jax.Array], slowest: Scalar) -
         steps: list[Any] = [rises[0] * m + rises[1] * a + rises[2] * b for m, a, b in ends]
         return _moved(grid, x, steps, length)
 
-    share, ended, level = jnp.ones(grid.shape, on.dtype), path.ended, path.level
+    share, ended, level = jnp.ones(shape, on.dtype), path.ended, path.level
     if level is not None:
         beyond = components.of_state(on.problem, on.problem.target, at(1.0), on.t, on.dtype)
-        beyond = jnp.broadcast_to(beyond, grid.shape)
+        beyond = jnp.broadcast_to(beyond, shape)
         meets = (level > 0) & (beyond <= 0) & ~ended
         # the inner where keeps the quotient finite on legs that do not meet it
         share = jnp.where(meets, level / jnp.where(meets, level - beyond, 1), 1)
@@ -199,7 +222,7 @@ def _leg(on: Discretisation, path: _Path, u: list[jax.Array], slowest: Scalar) -
     weight = jnp.exp(-beta * path.time) * jnp.where(beta > 0, -jnp.expm1(-beta * lasts) / safe, lasts)
     stays = [jnp.where(path.ended, before, after) for before, after in zip(x, end, strict=True)]
     cost = path.cost + jnp.where(path.ended, 0, weight * mean_cost)
-    return _Path(stays, path.time + lasts, cost, level, ended)
+    return Path(stays, path.time + lasts, cost, level, ended)
 
 
 def _moved(grid: Grid, x: Sequence[jax.Array], f: Sequence[jax.Array], time: jax.Array) -> list[jax.Array]:
@@ -215,7 +238,7 @@ def _moved(grid: Grid, x: Sequence[jax.Array], f: Sequence[jax.Array], time: jax
     return found
 
 
-def _speed(grid: Grid, x: Sequence[jax.Array], f: Sequence[jax.Array]) -> jax.Array:
+def speed(grid: Grid, x: Sequence[jax.Array], f: Sequence[jax.Array]) -> jax.Array:
     """Cells per unit time along the axis on which that is most."""
     most = jnp.zeros((), f[0].dtype)
     for axis, (place, velocity) in enumerate(zip(x, f, strict=True)):
@@ -230,12 +253,12 @@ def _fastest(on: Discretisation, plan: Plan) -> Scalar:
     """The greatest speed at the nodes under the actions of a plan, cells per unit time; one where nothing moves."""
     x = [jnp.broadcast_to(place, on.grid.shape) for place in on.coordinates()]
 
-    def speed(action: jax.Array) -> Scalar:
+    def largest(action: jax.Array) -> Scalar:
         u = [action[j] for j in range(action.shape[0])]
         f = [jnp.broadcast_to(entry, on.grid.shape) for entry in on.drift(u, [], x)]
-        return jnp.max(_speed(on.grid, x, f))
+        return jnp.max(speed(on.grid, x, f))
 
-    most = jnp.max(jax.lax.map(speed, jnp.asarray(plan.actions)))
+    most = jnp.max(jax.lax.map(largest, jnp.asarray(plan.actions)))
     return jnp.where(most > 0, most, 1)
 
 

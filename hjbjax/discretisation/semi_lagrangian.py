@@ -15,13 +15,14 @@ the scheme with a held control.
 import math
 from typing import Any, Protocol, runtime_checkable
 
+import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation.arcs import Plan
 from hjbjax.problem import arguments, sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_discounted
-from hjbjax.problem.pytree import known, pytree_dataclass
+from hjbjax.problem.pytree import is_traced, known, pytree_dataclass
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite
 from hjbjax.problem.types import DType
 from hjbjax.tracing import dependence
@@ -120,8 +121,9 @@ def _actions(problem: Problem, n: int, dtype: DType, budget: int) -> Any:
     admissible = problem.controls
     if admissible is None:
         return np.zeros((1, 0), dtype)
-    points = known(_rim(admissible, budget) if _bang_bang(problem, n, dtype) else sets.samples(admissible, budget))
-    return np.asarray(points, dtype)
+    points = _rim(admissible, budget) if _bang_bang(problem, n, dtype) else sets.samples(admissible, budget)
+    # bounds of a set may be traced, so that arcs are differentiated with respect to them
+    return jnp.asarray(points, dtype) if is_traced(points) else np.asarray(known(points), dtype)
 
 
 def _bang_bang(problem: Problem, n: int, dtype: DType) -> bool:
@@ -141,6 +143,6 @@ def _rim(admissible: AdmissibleSet, budget: int) -> Any:
     assert isinstance(admissible, Ball)
     if admissible.dim == 2:  # at equal angles, the axes among them where their number is a multiple of four
         angles = 2 * np.pi * np.arange(budget) / budget
-        return known(admissible.radius) * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+        return admissible.radius * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     points = np.asarray(sets.samples(Ball(1.0, admissible.dim), budget))
-    return known(admissible.radius) * points[np.linalg.norm(points, axis=1) > 0.99]
+    return admissible.radius * points[np.linalg.norm(points, axis=1) > 0.99]

@@ -33,6 +33,7 @@ LEAST = 0.02  # of the range of V: what a feedback between the nodes may cost mo
 UNKNOWN = 0.02  # of the range of V: taken for the error of a value without an estimate
 STILL = 1e-6  # of the box, in the second half of a path that is at rest
 RESTS, SLOWS = 1e-3, 1e-2  # of the box, and of the way in the first half, of one that comes to rest
+AWAY, BACK = 0.5, 0.1  # of the extent of its second half, for a path that goes round inside of a cell
 FAR = 1.5  # cells: a path that goes round leaves a state by more, and comes back within one
 
 
@@ -169,8 +170,14 @@ def _goes_round(path: Path, solution: Solution) -> bool:
     apart = np.abs(late - late[-1])
     apart = np.where(np.array(grid.periodic), np.minimum(apart % width, -apart % width), apart)
     cells = np.max(apart / (width / (np.array(grid.shape) - 1)), axis=1)
-    far = np.flatnonzero(cells > FAR)
-    return bool(far.size and np.any(cells[: far[-1]] <= 1))
+    # a small orbit, inside of a cell, is measured by its own size
+    return _comes_back(cells, FAR, 1) or _comes_back(cells / max(np.max(cells), 1e-300), AWAY, BACK)
+
+
+def _comes_back(apart: np.ndarray, far: float, near: float) -> bool:
+    """True if distances from the last state were small before the last time that they were large."""
+    away = np.flatnonzero(apart > far)
+    return bool(away.size and np.any(apart[: away[-1]] <= near))
 
 
 def broken_promise(

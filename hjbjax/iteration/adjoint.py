@@ -245,7 +245,7 @@ def _high_order_solvers(equation: PolicyEquation, grid: Grid) -> tuple[LinearSol
 
         def solve(matvec: Map, right: Field) -> Field:
             stages = [(functools.partial(correct, matvec), jnp.inf)]
-            return _stages(right, lambda delta: right - matvec(delta), stages)
+            return solve_in_stages(right, lambda delta: right - matvec(delta), stages)
 
         return solve
 
@@ -286,10 +286,10 @@ def refined(evaluation: Evaluation, equation: PolicyEquation, grid: Grid) -> Fie
 
     # to the end, however slowly, with the last of them: nothing follows it
     stages = [(by(evaluation), SLOW), (by(Krylov()), jnp.inf)] if evaluation.rough else [(by(evaluation), jnp.inf)]
-    return _stages(equation.source, functools.partial(left_over, equation, grid), stages)
+    return solve_in_stages(equation.source, functools.partial(left_over, equation, grid), stages)
 
 
-def _stages(right: Field, left_over: Map, stages: Sequence[tuple[Map, Number]]) -> Field:
+def solve_in_stages(right: Field, left_over: Map, stages: Sequence[tuple[Map, Number]]) -> Field:
     """The solution of a linear system by corrections of what is left, one kind after the other; NaN if not reached.
 
     Args:

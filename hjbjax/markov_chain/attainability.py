@@ -7,6 +7,7 @@ found on the device, paths by a breadth-first search on the host, or on large gr
 """
 
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +20,7 @@ from hjbjax.hamiltonian.players import players_of
 from hjbjax.markov_chain import tried_actions
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.types import Array, Number, Scalar
+from hjbjax.problem.types import Array, Mask, Number, Scalar
 from hjbjax.solution.clock import Clock
 
 FEW = 9  # of each player in a game, where all pairs are
@@ -108,45 +109,57 @@ def _stays(rates: Rates, grid: Grid, inside: jax.Array, least: Number) -> jax.Ar
     return stays
 
 
+class Reach(NamedTuple):
+    """The nodes from which a set of held nodes is reached under some policy, each bool (*grid).
+
+    Attributes:
+      surely: with probability one.
+      maybe: with some probability. Without noise the difference is due to the chain: its jumps spread like noise of
+        the size of a cell, which may carry it past a target that the path meets.
+    """
+
+    surely: Mask
+    maybe: Mask
+
+
 def reached(
     on: Discretisation, held: np.ndarray, *, surely: bool, least: Number = 0.0, clock: Clock | None = None
-) -> np.ndarray:
+) -> Reach:
     """The nodes from which the held nodes can be reached; host level, for problems with one player.
 
     Args:
       on: the chain.
       held: bool (*grid), the nodes to reach.
-      surely: with probability one rather than with some probability.
+      surely: find the nodes that reach them with probability one; otherwise both sets are the larger one.
       least: a rate per unit time; up to it jumps are rounding.
-      clock: where a limit is looked at on the way; ``Stopped`` leaves then.
-
-    Returns:
-      bool (*grid).
+      clock: the limits; raises ``Stopped`` where they are exceeded.
     """
     on = on.on_grid(on.grid.walled)  # what goes on beyond an open end is not known to come back
-    clock, found = clock or Clock(), np.zeros(on.grid.shape, bool)
+    clock, found, maybe = clock or Clock(), np.zeros(on.grid.shape, bool), np.zeros(on.grid.shape, bool)
     for kinks in (False, True):  # what samples do not reach may be reached by the one action that keeps to a way
-        # each pass alone is sound: whatever it finds is reached by actions of the set, so that the union is, too
-        found |= _reached_by_samples(on, held, surely, clock, least=least, kinks=kinks)
+        # each pass is sound: whatever it finds is reached by actions of the set, so that the union is, too
+        more = _reached_by_samples(on, held, surely, clock, least=least, kinks=kinks)
+        found, maybe = found | more.surely, maybe | more.maybe
         if found.all():
             break
-    return found
+    return Reach(found, maybe)
 
 
 def _reached_by_samples(
     on: Discretisation, held: np.ndarray, surely: bool, clock: Clock, *, least: Number, kinks: bool
-) -> np.ndarray:
-    """The nodes from which the held ones are reached by the actions that are tried, bool (*grid)."""
+) -> Reach:
+    """The nodes from which the held ones are reached by the actions that are tried."""
 
     def staying(inside: jax.Array | None) -> np.ndarray:
         return _backward_reach(held, _open_jumps(on, inside, clock, least=least, kinks=kinks), on.grid, clock)
 
-    found, inside = staying(None), np.ones(on.grid.shape, bool)
+    maybe = found = staying(None)
+    inside = np.ones(on.grid.shape, bool)
     while surely and not np.array_equal(found, inside):
         inside = found
         # nodes are taken away and never put back, as the largest fixed point wants: at most one round a node
         found = inside & staying(jnp.asarray(inside))
-    return found
+    return Reach(found, maybe)
 
 
 def forced(on: Discretisation, held: np.ndarray, *, least: Number, clock: Clock) -> np.ndarray:

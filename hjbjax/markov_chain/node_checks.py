@@ -64,7 +64,7 @@ def values(on: Discretisation, clock: Clock | None = None) -> None:
             "only an (n, k) matrix may hold negative entries"
         )
     if "correlation" in found and found["correlation"].nodes:
-        _refuse_noise(problem, grid, found["correlation"], actions)
+        _refuse_noise(on, found["correlation"], actions)
     if "diffusion" in found and found["diffusion"].nodes:
         raise ValueError(
             f"scheme: the chain of {scheme!r} has too little diffusion at "
@@ -283,13 +283,18 @@ def _check_target(problem: Problem, grid: Grid, inside: int, nearest: tuple[Arra
     )
 
 
-def _refuse_noise(problem: Problem, grid: Grid, finding: _Finding, actions: tuple) -> NoReturn:
+def _refuse_noise(on: Discretisation, finding: _Finding, actions: tuple) -> NoReturn:
     """Refuse correlated noise, with spacings for which its diagonal jumps leave no negative probability."""
-    _, x = _place(grid, finding.first)
+    _, x = _place(on.grid, finding.first)
     u, d = (rows[finding.action] for rows in actions)
-    sigma = np.asarray(problem.diffusion(x, u, d, 0.0), dtype=float)
+    sigma = np.asarray(on.problem.diffusion(x, u, d, 0.0), dtype=float)
     raise ValueError(
         f"noise: correlated noise that the chain cannot represent with non-negative probabilities at "
-        f"{_where(problem, grid, finding, actions)}.\n"
-        + correlated_noise.advice(sigma @ sigma.T, grid, everywhere=not callable(problem.noise))
+        f"{_where(on.problem, on.grid, finding, actions)}.\n" + correlated_noise.advice(on, sigma @ sigma.T, actions)
     )
+
+
+def representatives(problem: Problem, u: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The pairs of actions that are tried, and one more, shapes (K, m) and (K, l)."""
+    us, ds = _actions(problem)
+    return np.concatenate([us, [u]]), np.concatenate([ds, [d]])

@@ -12,6 +12,7 @@ import difflib
 import functools
 import hashlib
 import inspect
+import re
 from collections.abc import Callable, Iterable, Sequence, Set
 from typing import Any, ParamSpec, TypeVar, dataclass_transform
 
@@ -44,6 +45,8 @@ ELSEWHERE = {  # words that other packages and books have for an argument, and o
     **dict.fromkeys(("accuracy", "order", "discretization"), ("scheme",)),
     **dict.fromkeys(("solver", "algorithm"), ("method",)),
 }
+# what other public functions call, as it stands at the beginning of a refusal
+INNER = re.compile(r"^(lane \d+: )?(?:solve|solve_batch|march|reach_probability): ")
 REMEMBERED = 256  # answers of one function that are kept, the latest: the keys hold functions, and what these hold
 
 
@@ -115,14 +118,27 @@ def with_suggestions(function: Callable[P, T], name: str | None = None) -> Calla
 
 
 def front_door(function: Callable[P, T]) -> Callable[P, T]:
-    """Decorator of a public function: with the package's own options of JAX, and with ``with_suggestions``."""
+    """Decorator of a public function: with the package's own options of JAX, and with ``with_suggestions``.
+
+    A refusal of ``solve`` or ``march`` that the function called begins with the name of the function.
+    """
 
     @functools.wraps(function)
     def entered(*arguments: P.args, **options: P.kwargs) -> T:
         with own_settings():
-            return function(*arguments, **options)
+            try:
+                return function(*arguments, **options)
+            except (ValueError, TypeError) as refusal:
+                _rename(refusal, function.__name__)
+                raise
 
     return with_suggestions(entered)
+
+
+def _rename(refusal: Exception, caller: str) -> None:
+    """Let the message of a refusal begin with the function that the user called, in place."""
+    if refusal.args and isinstance(refusal.args[0], str):
+        refusal.args = (INNER.sub(rf"\1{caller}: ", refusal.args[0], count=1), *refusal.args[1:])
 
 
 def keywords(function: Callable) -> Set[str] | None:

@@ -30,13 +30,14 @@ from hjbjax.discretisation.schemes import Upwind
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import Method
 from hjbjax.markov_chain import admissibility, memory, node_checks
+from hjbjax.markov_chain.attainability import Reach
 from hjbjax.problem import arguments
 from hjbjax.problem.arguments import as_mesh, shown
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.parts import Lanes, spans_processes
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.settings import own_settings
-from hjbjax.problem.types import DType, Mask, Nodes
+from hjbjax.problem.types import DType, Nodes
 from hjbjax.solution import checkpoints
 from hjbjax.solution.checkpoints import Checkpoint, File
 from hjbjax.solution.clock import CUT, Clock, Stopped, noting_interrupts
@@ -45,10 +46,18 @@ from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status, keeping_warnings, warn
 from hjbjax.solvers import host_loop, nested
 from hjbjax.solvers.box_error import with_box_error
-from hjbjax.solvers.host_solve import solve_on_host
+from hjbjax.solvers.host_solve import Choices, solve_on_host
 from hjbjax.solvers.nested import Settled
 from hjbjax.solvers.result import finish, solution_at_start, with_grid_error, with_last_phase
-from hjbjax.solvers.setup import Assumptions, check_on_one_state, choose, choose_scheme, prepare_on_host
+from hjbjax.solvers.semi_lagrangian import finish_replacement, replace_chain
+from hjbjax.solvers.setup import (
+    Assumptions,
+    check_on_one_state,
+    choose,
+    choose_scheme,
+    prepare_on_host,
+    warn_unreached,
+)
 from hjbjax.solvers.stationary import check_arguments, check_limits
 from hjbjax.solvers.stationary_run import LanesRun, stacked, with_obstacles
 from hjbjax.tracing import checks
@@ -121,7 +130,8 @@ def solve_batch(
             first = lanes[members[0]]
             # without nesting, whose levels the host drives one by one
             chosen = choose(first, grid, traced=False, method=method, divided=mesh is not None).inner
-            on, sharpen = Discretisation(first, grid, scheme or Upwind(subcell=True), kind), scheme is None
+            on = Discretisation(first, grid, scheme or Upwind(subcell=True), kind)
+            choices = Choices(scheme=scheme is None, method=method is None, levels=False)
             with _naming(members[0]):
                 check_on_one_state(first, grid, on.scheme)
             needed = memory.require(first, grid, chosen, kind, max_memory)
@@ -130,9 +140,9 @@ def solve_batch(
                 with host_loop.with_solution(clock, needed * len(some), lambda _: next(filter(None, solutions), None)):
                     members_of = {i: on.asking(lanes[i]) for i in some}
                     if mesh is not None or (_fills_with_lanes() and kept is None):
-                        together = _solve_together(members_of, chosen, tol, clock, over, sharpen=sharpen)
+                        together = _solve_together(members_of, chosen, tol, clock, over, choices)
                     else:
-                        together = _solve_side_by_side(members_of, chosen, tol, clock, kept, sharpen=sharpen)
+                        together = _solve_side_by_side(members_of, chosen, tol, clock, kept, choices)
                 for index, solution in zip(some, together, strict=True):
                     solutions[index] = solution
         if solutions and not any(solution.status in CUT for solution in solutions):
@@ -206,7 +216,7 @@ def _cores() -> int:
 
 
 def _solve_side_by_side(
-    lanes: dict[int, Discretisation], method: Method, tol: float, clock: Clock, kept: File | None, *, sharpen: bool
+    lanes: dict[int, Discretisation], method: Method, tol: float, clock: Clock, kept: File | None, choices: Choices
 ) -> list[Solution]:
     """The solutions of problems that share a program, by the numbers of their lanes, one thread a core."""
     settings, names = host_loop.settings(), list(lanes)
@@ -215,7 +225,7 @@ def _solve_side_by_side(
         own = clock.beside()
         own.journal = kept and kept.journal(f"lane{name}")
         with _naming(name), settings(), keeping_warnings() as said:
-            solution = solve_on_host(lanes[name], method, tol, None, own, sharpen=sharpen, free=False)
+            solution = solve_on_host(lanes[name], method, tol, None, own, choices)
         solution.stats.setdefault("method", method.described(lanes[name].problem.is_game))
         solution.stats.update(seconds=own.stepping, lanes=len(lanes), tol=tol)
         return with_last_phase(solution, own) if solution.status in CUT else solution, said
@@ -252,29 +262,51 @@ def _told(name: int, solution: Solution, said: Sequence[str]) -> Solution:
 
 
 def _solve_together(
-    lanes: dict[int, Discretisation], method: Method, tol: float, clock: Clock, over: Lanes, *, sharpen: bool
+    lanes: dict[int, Discretisation], method: Method, tol: float, clock: Clock, over: Lanes, choices: Choices
 ) -> list[Solution]:
-    """The solutions of problems that run as one loop, by the numbers of their lanes; ``sharpen`` as in ``solve``."""
-    began, names, asked = clock.elapsed(), list(lanes), list(lanes.values())
-    prepared: list[tuple[Task, Assumptions, Mask | None]] = []
-    for i, on in enumerate(asked):
+    """The solutions of problems that run as one loop, by the numbers of their lanes; ``choices`` as in ``solve``."""
+    asked, found = dict(lanes), dict[int, Solution]()
+    prepared: dict[int, tuple[Task, Assumptions, Reach | None]] = {}
+    for name, on in lanes.items():
         try:
-            with _naming(names[i]):
+            with _naming(name):
                 node_checks.values(on, clock)
                 admissibility.values(on.problem, on.grid, on.dtype)
-                if sharpen:
-                    on = asked[i] = dataclasses.replace(on, scheme=choose_scheme(on, method))
-                prepared.append(prepare_on_host(on.chain, method=method, tol=tol, clock=clock))
+                if choices.scheme:
+                    on = asked[name] = dataclasses.replace(on, scheme=choose_scheme(on, method))
+                prepared[name] = prepare_on_host(on.chain, method=method, tol=tol, clock=clock)
+                followed = replace_chain(on, prepared[name][2], tol, None, clock) if choices.both else None
         except Stopped as stop:
-            nothing = [solution_at_start(each, np.zeros(each.grid.shape), stop.status) for each in asked]
+            nothing = [solution_at_start(each, np.zeros(each.grid.shape), stop.status) for each in asked.values()]
             return [with_last_phase(solution, clock) for solution in nothing]
+        if followed is not None:
+            found[name] = finish_replacement(followed)
+            continue
+        reach = prepared[name][2]
+        if reach is not None and not reach.surely.all():
+            warn_unreached(reach, undiscounted=bool(on.problem.discount == 0))
+    left = [name for name in lanes if name not in found]
+    if left:
+        rest = _solve_chains(
+            {i: asked[i] for i in left}, [prepared[i] for i in left], method, tol, clock, over, choices
+        )
+        found |= dict(zip(left, rest, strict=True))
+    return [found[name] for name in lanes]
+
+
+def _solve_chains(
+    lanes: dict[int, Discretisation], prepared: Sequence[tuple[Task, Assumptions, Reach | None]], method: Method,
+    tol: float, clock: Clock, over: Lanes, choices: Choices,
+) -> list[Solution]:  # fmt: skip
+    """The solutions of prepared lanes that run as one loop, in their order."""
+    began, names, asked, sharpen = clock.elapsed(), list(lanes), list(lanes.values()), choices.scheme
     # a static flag, set for all lanes as soon as one has nodes out of reach, so that they share a program
     has_lost = any(task.has_lost for task, _, _ in prepared)
     tasks = [dataclasses.replace(task, has_lost=has_lost) for task, _, _ in prepared]
     ended = _iterate(tasks, _starts(tasks, names, clock, over), names, clock, over)
     settled = [
-        _settled(Settled(task, assumptions, reached, *end), clock)
-        for task, (_, assumptions, reached), end in zip(tasks, prepared, ended, strict=True)
+        _settled(Settled(task, assumptions, None if reach is None else reach.surely, *end), clock)
+        for task, (_, assumptions, reach), end in zip(tasks, prepared, ended, strict=True)
     ]
     further = [
         i

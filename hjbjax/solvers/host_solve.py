@@ -15,27 +15,50 @@ from hjbjax.problem.types import Nodes
 from hjbjax.solution.clock import Clock, Stopped
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
-from hjbjax.solvers import nested
+from hjbjax.solvers import nested, semi_lagrangian
 from hjbjax.solvers.box_error import with_box_error
 from hjbjax.solvers.nested import Settled
 from hjbjax.solvers.result import finish, solution_at_start, with_grid_error
-from hjbjax.solvers.setup import COARSEST, choose_scheme, prepare_on_host
+from hjbjax.solvers.semi_lagrangian import Followed
+from hjbjax.solvers.setup import COARSEST, choose_scheme, prepare_on_host, warn_unreached
+
+
+@dataclasses.dataclass(frozen=True)
+class Choices:
+    """The choices that the caller left to the package.
+
+    Attributes:
+      scheme: the scheme.
+      method: the method.
+      levels: coarser grids.
+    """
+
+    scheme: bool
+    method: bool
+    levels: bool
+
+    @property
+    def both(self) -> bool:
+        """True if scheme and method may be replaced together."""
+        return self.scheme and self.method
 
 
 def solve_on_host(
-    on: Discretisation, method: Method, tol: float, guess: Nodes | None, clock: Clock, *, sharpen: bool, free: bool
+    on: Discretisation, method: Method, tol: float, guess: Nodes | None, clock: Clock, choices: Choices
 ) -> Solution:
     """The solution, with an estimate of the grid's error where the caller left the choice of the scheme.
 
-    ``sharpen`` and ``free`` as in ``settled_on_host``.
+    The arguments are those of ``settled_on_host``.
     """
     try:
-        settled, about = settled_on_host(on, method, tol, guess, clock, sharpen=sharpen, free=free)
+        settled, about = settled_on_host(on, method, tol, guess, clock, choices)
     except Stopped as stop:
         return solution_at_start(stop.reached[0], stop.reached[1], stop.status)
+    if isinstance(settled, Followed):
+        return semi_lagrangian.finish_replacement(settled)
     solution = finish(settled, on.grid)
     # value iteration and tubes, whose targets are nodes, have no estimate
-    if sharpen and settled.task.scheme.subcell and solution.status is Status.CONVERGED:
+    if choices.scheme and settled.task.scheme.subcell and solution.status is Status.CONVERGED:
         solution = with_grid_error(solution, settled, nested.coarser_answer(settled, clock))
     if solution.status is Status.CONVERGED:
         solution = with_box_error(solution, settled, clock)
@@ -44,8 +67,8 @@ def solve_on_host(
 
 
 def settled_on_host(
-    on: Discretisation, method: Method, tol: float, guess: Nodes | None, clock: Clock, *, sharpen: bool, free: bool
-) -> tuple[Settled, dict[str, Any]]:
+    on: Discretisation, method: Method, tol: float, guess: Nodes | None, clock: Clock, choices: Choices
+) -> tuple[Settled | Followed, dict[str, Any]]:
     """The end of the iteration, and what there is to say about it.
 
     Args:
@@ -54,8 +77,7 @@ def settled_on_host(
       tol: as in ``solve``.
       guess: node values to start from, or None.
       clock: the limits.
-      sharpen: the caller left the choice of the scheme.
-      free: the caller left the choice of the method.
+      choices: what the caller left to the package.
 
     Raises:
       Stopped: the clock said stop before the first step; ``reached`` is the discretisation and the start.
@@ -66,13 +88,20 @@ def settled_on_host(
         # from cheap to expensive: all nodes, the ends of the box, and only then what is compiled for the grid
         node_checks.values(on, clock)
         admissibility.values(problem, grid, on.dtype)
+        sharpen = choices.scheme
         if sharpen:
             on = dataclasses.replace(on, scheme=choose_scheme(on, method))
             sharpen = on.scheme.subcell  # value iteration and tubes start from nowhere else, on a coarser grid neither
-        task, assumptions, reached = prepare_on_host(on.chain, method=method.inner, tol=tol, clock=clock)
+        task, assumptions, reach = prepare_on_host(on.chain, method=method.inner, tol=tol, clock=clock)
+        followed = semi_lagrangian.replace_chain(on, reach, tol, start, clock) if choices.both else None
     except Stopped as stop:
         raise Stopped(stop.status, (on, np.zeros(grid.shape) if start is None else np.array(start))) from None
-    asked_again = sharpen and free and grid.size > COARSEST and not grid.sides("open")
+    if followed is not None:
+        return followed, {}
+    if reach is not None and not reach.surely.all():
+        warn_unreached(reach, undiscounted=bool(problem.discount == 0))
+    reached = None if reach is None else reach.surely
+    asked_again = sharpen and choices.levels and grid.size > COARSEST and not grid.sides("open")
     start, shapes = nested.start(task, on.scheme, method, start, clock, asked_again=asked_again)
     settled = nested.settle(nested.staged(task, on.scheme), assumptions, reached, start, clock)
     about: dict[str, Any] = {"levels": [*shapes, grid.shape]}

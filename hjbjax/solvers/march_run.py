@@ -13,6 +13,7 @@ from hjbjax.hamiltonian import discrete
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import time_stepping
 from hjbjax.iteration.time_stepping import Front, March
+from hjbjax.markov_chain import node_checks
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.parts import Parts, spans_processes
 from hjbjax.problem.pytree import altered
@@ -397,5 +398,5 @@ def _noise_message(task: March, front: Front) -> str:
     return (
         "noise: correlated noise that the chain cannot represent with non-negative probabilities at "
         f"t = {float(t):.6g}, node {index}, x = {np.asarray(x).tolist()}{''.join(', ' + each for each in played)}.\n"
-        + correlated_noise.advice(sigma @ sigma.T, grid, everywhere=False)
+        + correlated_noise.advice(task.on.at(t), sigma @ sigma.T, node_checks.representatives(task.problem, u, d))
     )

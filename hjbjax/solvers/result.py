@@ -16,7 +16,7 @@ from hjbjax.iteration import certificates, fixed_point
 from hjbjax.iteration.certificates import Certificate, ErrorBound
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.isaacs import isaacs_gap
-from hjbjax.markov_chain import earnings
+from hjbjax.markov_chain import earnings, node_checks
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import is_traced
 from hjbjax.problem.types import Field, Nodes, Scalar
@@ -24,6 +24,7 @@ from hjbjax.solution import nested_grids
 from hjbjax.solution.clock import CUT, Clock
 from hjbjax.solution.solution import Solution, question
 from hjbjax.solution.status import Status, warn
+from hjbjax.solvers.arrival import warn_of_no_arrival
 from hjbjax.solvers.nested import Settled
 from hjbjax.solvers.setup import BOUNDING, Assumptions
 
@@ -49,6 +50,8 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
     gap = None if mute else _isaacs_gap(task, state)
     unanswered = mute or code in (Status.DIVERGED, Status.NONFINITE)  # there is no optimal drift to speak of
     leaving = None if unanswered else _leaving(task, state)
+    if not mute and code is Status.CONVERGED:
+        warn_of_no_arrival(task, state)
     state = jax.device_get(state)
     message = _message(code, task, state, grid) if earning is None else _unbounded_message(earning, grid)
     solution = assemble(task, state, assumptions)
@@ -241,13 +244,16 @@ def _refuse_noise(task: Task, state: State, grid: Grid) -> None:
     if first < 0:
         return
     index = tuple(int(i) for i in np.unravel_index(first, grid.shape))
-    x, u, d = grid.state(index), *([float(a[index]) for a in each] for each in (policy.controls, policy.disturbances))
-    sigma = np.asarray(task.problem.diffusion(x, np.array(u), np.array(d), 0.0), dtype=float)
-    played = "".join(f", {letter} = {action}" for letter, action in (("u", u), ("d", d)) if action)
+    x, u, d = (
+        grid.state(index),
+        *(np.array([a[index] for a in each]) for each in (policy.controls, policy.disturbances)),
+    )
+    sigma = np.asarray(task.problem.diffusion(x, u, d, 0.0), dtype=float)
+    played = "".join(f", {letter} = {action.tolist()}" for letter, action in (("u", u), ("d", d)) if action.size)
     raise ValueError(
         "noise: correlated noise that the chain cannot represent with non-negative probabilities under the policy "
         f"that was found, first at node {index}, x = {np.asarray(x).tolist()}{played}.\n"
-        + correlated_noise.advice(sigma @ sigma.T, grid, everywhere=False)
+        + correlated_noise.advice(task.on, sigma @ sigma.T, node_checks.representatives(task.problem, u, d))
     )
 
 

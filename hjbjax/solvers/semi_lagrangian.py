@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ from hjbjax.discretisation import edges
 from hjbjax.discretisation.arcs import Arcs, Plan
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.discretisation.semi_lagrangian import PathScheme
+from hjbjax.discretisation.semi_lagrangian import PathScheme, SemiLagrangian
 from hjbjax.iteration import arc_iteration, bellman, certificates
 from hjbjax.iteration.arc_iteration import ArcState, ArcTask
 from hjbjax.iteration.certificates import Certificate
@@ -20,8 +21,9 @@ from hjbjax.iteration.evaluation import Sweeps
 from hjbjax.iteration.fixed_point import HISTORY
 from hjbjax.iteration.methods import Method
 from hjbjax.markov_chain import memory, node_checks
+from hjbjax.markov_chain.attainability import Reach
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.problem import Problem
+from hjbjax.problem.problem import Problem, is_discounted
 from hjbjax.problem.pytree import cast
 from hjbjax.problem.sets import Finite
 from hjbjax.problem.types import DType, Mask, Nodes
@@ -31,9 +33,15 @@ from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop
 from hjbjax.solvers.host_loop import FIRST_NODES, WideJit
 from hjbjax.solvers.result import solution_at_start, warn_of_cuts, within_reach
-from hjbjax.solvers.setup import check_on_one_state, warn_unreached
+from hjbjax.solvers.setup import check_on_one_state, is_carried_past, warn_unreached
 from hjbjax.solvers.stationary_run import StatesInChunks
 
+REPLACEMENT = SemiLagrangian()  # of the chain, where that is carried past the target
+REASON = (
+    "It was solved by SemiLagrangian(): the Markov chain of Upwind() and Limited() spreads by about a cell per step "
+    "and may be carried past the target, so its expected cost is infinite where that of the path is finite."
+)
+FAILED = (Status.STALLED, Status.DIVERGED, Status.NONFINITE)
 WORDS = {
     Certificate.ADDITIVE: "from the discount, V + min r/(1 − e^{−βτ}) ≤ V_h ≤ V + max r/(1 − e^{−βτ})",
     Certificate.MULTIPLICATIVE: "from the running cost, V/(1 + η) ≤ V_h ≤ V/(1 − ρ)",
@@ -91,14 +99,94 @@ def solve_on_host(
         needed = memory.fitting(estimate(grid, plan, kind), grid, max_memory)
         node_checks.values(on, clock)
         with host_loop.with_solution(clock, needed, lambda kept: _partial(on, kept)):
-            task, reached = _prepare(on, plan, tol, times, clock)
-            start = np.asarray(_start(task)) if start is None else start
-            solution = _finish(on, scheme, plan, _Run(task, start, clock.max_steps), reached, clock)
+            solution = finish(follow(on, scheme, plan, tol, times, start, clock))
     except Stopped as stop:
         return _said(solution_at_start(on, np.zeros(grid.shape) if start is None else start, stop.status), scheme)
     described = "PolicyIteration()" if method is None else method.described(False)
     solution.stats.update(bytes=needed, method=f"{described}, {plan.count} arcs a node")
     return solution
+
+
+class Followed(NamedTuple):
+    """A solve on arcs at the end of its iteration.
+
+    Attributes:
+      on, scheme, plan: the problem on its grid, the scheme, and the arcs that it tries.
+      task, state: the task and the last state, on the device.
+      code: how the iteration ended.
+      reached: the nodes from which the target is reached; None where there is nothing to reach, or a run was cut.
+      residuals: those of all steps.
+    """
+
+    on: Discretisation
+    scheme: PathScheme
+    plan: Plan
+    task: ArcTask
+    state: ArcState
+    code: Status
+    reached: Mask | None
+    residuals: np.ndarray
+
+
+def follow(
+    on: Discretisation, scheme: PathScheme, plan: Plan, tol: float, times: int, guess: Nodes | None, clock: Clock
+) -> Followed:
+    """The arcs of a plan and the iteration on them, as far as the clock allows."""
+    task, reached = _prepare(on, plan, tol, times, clock)
+    run = _Run(task, np.asarray(_start(task)) if guess is None else guess, clock.max_steps)
+    code = host_loop.drive(run, clock)
+    task, state, problem = run.task, run.state, on.problem
+    ends = problem.target is not None and problem.stopping_cost is None
+    if reached is None and int(state.step) >= 0 and ends and code not in CUT:
+        reached = np.asarray(_arriving(task, state.number))
+    residuals = np.concatenate(run.residuals)[: int(state.step) + 1]
+    return Followed(on, scheme, plan, task, state, code, reached, residuals)
+
+
+def can_replace_chain(problem: Problem, grid: Grid) -> bool:
+    """True if ``SemiLagrangian()`` may solve a problem whose chain is carried past the target; reads no values."""
+    ends = problem.target is not None and problem.stopping_cost is None and is_discounted(problem) is not True
+    try:
+        REPLACEMENT.check(problem, grid)
+    except ValueError:
+        return False
+    return ends
+
+
+def replace_chain(
+    on: Discretisation, reach: Reach | None, tol: float, guess: Nodes | None, clock: Clock
+) -> Followed | None:
+    """The answer on arcs where the chain may be carried past a target that the paths of the system meet.
+
+    Without noise and discount the chain still spreads like noise of the size of a cell. If it may miss the target under
+    every policy, its expected cost is infinite, at nodes whose true cost is finite, on every grid. Arcs keep together.
+
+    Args:
+      on: the problem on its grid.
+      reach: the nodes that the chain reaches, from ``prepare_on_host``.
+      tol: as in ``solve``.
+      guess: the caller's, or None.
+      clock: the limits; raises ``Stopped``.
+
+    Returns:
+      The end of the iteration. None where the chain is not carried past the target, or the arcs do no better.
+    """
+    if reach is None or on.mesh is not None or np.asarray(on.problem.discount) > 0 or not is_carried_past(reach):
+        return None
+    if not can_replace_chain(on.problem, on.grid):
+        return None
+    on = dataclasses.replace(on, scheme=Upwind(), cut=None)
+    try:
+        plan = REPLACEMENT.plan(on.problem, on.grid, on.dtype)
+        memory.fitting(estimate(on.grid, plan, on.dtype), on.grid, None)
+        found = follow(on, REPLACEMENT, plan, tol, relaxations(None, on.grid.ndim), guess, clock)
+    except (
+        ValueError,
+        MemoryError,
+    ):  # arcs that cost nothing, or too many of them: the chain answers as well as it can
+        return None
+    gains = found.reached is None or bool(np.any(found.reached & ~reach.surely))
+    return None if found.code in FAILED or not gains else found
 
 
 def _partial(on: Discretisation, kept: host_loop.Kept | None) -> Solution:
@@ -122,7 +210,6 @@ def _prepare(on: Discretisation, plan: Plan, tol: float, times: int, clock: Cloc
         clock.enter("the search for nodes that reach the target")
         reached = np.asarray(_surely_arriving(links, grid, obstacles.fixed))
         if not reached.all():
-            warn_unreached(reached, True)
             counted = jnp.asarray(reached)
             links = _without(links, grid, counted)
             obstacles = dataclasses.replace(obstacles, fixed=obstacles.fixed | ~counted)
@@ -185,18 +272,16 @@ class _Run(StatesInChunks):
         return int(np.clip(FIRST_NODES / (self.nodes * self.task.arcs.count), 1, HISTORY - 1))
 
 
-def _finish(
-    on: Discretisation, scheme: PathScheme, plan: Plan, run: _Run, reached: Mask | None, clock: Clock
-) -> Solution:
+def finish(followed: Followed) -> Solution:
     """The solution at the end of a run: values, first actions of the best arcs, bounds, and the words for them."""
-    code = host_loop.drive(run, clock)
-    task, state, problem = run.task, jax.device_get(run.state), on.problem
-    looked, counted = int(state.step) >= 0, np.asarray(task.counted)
+    on, scheme, plan, task, state, code, reached, residuals = followed
+    problem, looked, counted = on.problem, int(state.step) >= 0, np.asarray(task.counted)
+    state = jax.device_get(state)
+    if reached is not None and not reached.all():
+        warn_unreached(Reach(reached, reached), undiscounted=task.certificate is not Certificate.ADDITIVE)
     value = np.array(state.value if looked else task.obstacles.impose(jnp.asarray(state.value)))
     value[~counted] = np.inf
     policy = np.array(np.asarray(plan.actions)[state.number // len(plan.legs)])
-    if reached is None and looked and problem.target is not None and problem.stopping_cost is None and code not in CUT:
-        reached = _who_arrives(task, run.state)
     leaving = None if code in CUT or not looked else _leaving(on, value, policy, task)
     policy[~counted | np.asarray(task.obstacles.ended) | (not looked)] = np.nan
     best = float(state.best[0])
@@ -204,12 +289,18 @@ def _finish(
     solution = solution_at_start(on, value, code)
     solution = dataclasses.replace(
         solution, policy=policy, message=message, reached=reached, cut=leaving, steps=max(int(state.step), 0),
-        residuals=np.concatenate(run.residuals)[: int(state.step) + 1],
-        enclosure=certificates.enclosure(task.certificate, state.bound) if looked else None,
+        residuals=residuals, enclosure=certificates.enclosure(task.certificate, state.bound) if looked else None,
         discrete=isinstance(problem.controls, Finite),
     )  # fmt: skip
     solution.stats["certificate"] = WORDS[task.certificate] + "; for the arcs that are tried"
     return _said(solution, scheme)
+
+
+def finish_replacement(followed: Followed) -> Solution:
+    """The solution that stands in for the chain's, with the reason in its message."""
+    solution = finish(followed)
+    solution.stats["method"] = f"PolicyIteration(), {followed.plan.count} arcs a node"
+    return dataclasses.replace(solution, message=f"{solution.message} {REASON}")
 
 
 def _said(solution: Solution, scheme: PathScheme) -> Solution:
@@ -225,14 +316,6 @@ def _leaving(on: Discretisation, value: np.ndarray, policy: np.ndarray, task: Ar
     cut, ends = edges.cut(on.problem, on.grid, np.where(acting, value, 0), (u, []), acting)
     warn_of_cuts(cut, ends, on.grid)
     return cut
-
-
-def _who_arrives(task: ArcTask, state: ArcState) -> Mask:
-    """The nodes that can be brought to the target, under a discount, with a warning where some cannot."""
-    reached = np.asarray(_arriving(task, state.number))
-    if not reached.all():
-        warn_unreached(reached, False)
-    return reached
 
 
 @jax.jit

@@ -18,6 +18,7 @@ from hjbjax.iteration.evaluation import Direct, Evaluation, Krylov, Sweeps
 from hjbjax.iteration.fixed_point import Task
 from hjbjax.iteration.methods import Method, Nested, PolicyIteration, ValueIteration
 from hjbjax.markov_chain import attainability, resting
+from hjbjax.markov_chain.attainability import Reach
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_constrained, is_discounted
 from hjbjax.problem.pytree import altered, cast, known
@@ -214,10 +215,10 @@ def prepared(on: Discretisation, *, method: Method, tol: Number, assumptions: As
 
 def prepare_on_host(
     on: Discretisation, *, method: Method, tol: float, clock: Clock | None = None
-) -> tuple[Task, Assumptions, Mask | None]:
+) -> tuple[Task, Assumptions, Reach | None]:
     """The task of ``prepare`` with the checks that need values: that there is a finite solution, and where.
 
-    It looks at the clock on the way and may raise ``Stopped``.
+    It checks the clock between its phases and may raise ``Stopped``.
 
     Returns:
       The task, the assumptions, and the nodes that reach the target (None where there is nothing to reach).
@@ -252,12 +253,10 @@ def prepare_on_host(
     # a game is asked when it fails: all pairs of actions are dear; and a constraint gives every node a finite value
     if problem.is_game or is_constrained(problem) or not held.any():
         return task, assumptions, None
-    reached = attainability.reached(task.on, held, surely=undiscounted, least=_least_rate(task), clock=clock)
-    if not reached.all():
-        warn_unreached(reached, undiscounted)
-        if undiscounted:
-            task = _finite_part(task, reached)
-    return task, assumptions, reached
+    reach = attainability.reached(task.on, held, surely=undiscounted, least=_least_rate(task), clock=clock)
+    if undiscounted and not reach.surely.all():
+        task = _finite_part(task, reach.surely)
+    return task, assumptions, reach
 
 
 def is_bare(method: Method) -> bool:
@@ -294,7 +293,7 @@ def forced_only(task: Task, clock: Clock) -> tuple[Task, Mask | None]:
     reached = attainability.forced(task.on, held, least=_least_rate(task), clock=clock)
     if reached.all():
         return task, reached
-    warn_unreached(reached, True)
+    warn_unreached(Reach(reached, reached), undiscounted=True)
     return _finite_part(task, reached), reached
 
 
@@ -332,8 +331,21 @@ def _finite_part(task: Task, reached: Mask) -> Task:
     return dataclasses.replace(task, obstacles=obstacles, counted=task.counted & jnp.asarray(reached), has_lost=True)
 
 
-def warn_unreached(reached: Mask, undiscounted: bool) -> None:
-    """Warn of nodes from which no policy is sure to reach the target, and say what their value is."""
-    share = 100 * (1 - float(np.mean(reached)))
+def is_carried_past(reach: Reach) -> bool:
+    """True if from some nodes the chain reaches the target with some probability, but under no policy surely."""
+    return bool(np.any(reach.maybe & ~reach.surely))
+
+
+def warn_unreached(reach: Reach, *, undiscounted: bool) -> None:
+    """Warn of nodes from which the target is not reached, or not surely; and say what their value is."""
+    never, passed = (100 * float(np.mean(each)) for each in (~reach.maybe, reach.maybe & ~reach.surely))
     what = "their value is inf" if undiscounted else "their value is the discounted cost of never arriving"
-    warn(f"{share:.3g} % of the nodes cannot reach the target: {what}; see Solution.reached")
+    if not passed:
+        warn(f"{never:.3g} % of the nodes cannot reach the target: {what}; see Solution.reached")
+        return
+    none = f"{never:.3g} % of the nodes cannot reach the target under any control, and " if never else ""
+    warn(
+        f"{none}from {passed:.3g} % of the nodes the Markov chain may be carried past the target under every control, "
+        f"so its expected cost is infinite: {what}; see Solution.reached. Without noise a path may still arrive from "
+        "there: use scheme=hjb.SemiLagrangian(), or a discount > 0"
+    )

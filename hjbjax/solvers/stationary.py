@@ -30,7 +30,7 @@ from hjbjax.solution.placement import Path
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop, semi_lagrangian, transformed
-from hjbjax.solvers.host_solve import solve_on_host
+from hjbjax.solvers.host_solve import Choices, solve_on_host
 from hjbjax.solvers.result import solution_at_start, with_last_phase
 from hjbjax.solvers.setup import check_on_one_state, choose
 from hjbjax.solvers.transformed import Asked
@@ -72,7 +72,9 @@ def solve(
         ``Weno5()``, fifth order there, on equal spacings, for a ``tol`` as small as its error; or ``SemiLagrangian()``,
         monotone, for deterministic problems whose optimal paths run along kinks of the value. ``None`` is
         ``Limited()`` where its iteration converges, with an estimate of the grid's error. It is ``Upwind()`` for value
-        iteration and tubes without discount, and wherever noise lets central differences be monotone.
+        iteration and tubes without discount, and wherever noise lets central differences be monotone. It is
+        ``SemiLagrangian()`` where the chain may be carried past an undiscounted target that paths without noise reach,
+        if ``method`` is ``None``, too; the message of the solution says so.
       tol: bound to reach on |V − V_h|, in cost units, V_h the exact solution on the grid of the monotone scheme. Where
         no certificate exists the solution says so, and the bound is on the residual and on the last step, as it is for
         the high-order equation; a tube without discount goes on until V no longer changes.
@@ -143,14 +145,15 @@ def solve(
             solution = semi_lagrangian.solve_on_host(problem, grid, scheme, kind, clock=clock, **options)
         return _ended(with_last_phase(solution, clock), clock, tol, throw=throw)
     method = choose(problem, grid, traced=False, method=method, divided=mesh is not None)
-    on, sharpen = Discretisation(problem, grid, scheme or Upwind(subcell=True), kind, mesh=mesh), scheme is None
+    on = Discretisation(problem, grid, scheme or Upwind(subcell=True), kind, mesh=mesh)
+    choices = Choices(scheme=scheme is None, method=free, levels=free)
     # float64 for this call alone: another thread, and the caller's own programs, keep theirs
     with noting_interrupts(clock), host_loop.telling(clock), own_settings(x64=kind == np.float64), opened as kept:
         clock.journal = kept and kept.journal()
         check_on_one_state(problem, grid, on.scheme)  # before the memory, for which functions may be read
         needed = memory.require(problem, grid, method, kind, max_memory)
         with host_loop.with_solution(clock, needed, lambda kept: _partial(on, kept)):
-            solution = with_last_phase(solve_on_host(on, method, tol, guess, clock, sharpen=sharpen, free=free), clock)
+            solution = with_last_phase(solve_on_host(on, method, tol, guess, clock, choices), clock)
     solution.stats.setdefault("method", method.described(problem.is_game))
     solution.stats.update(bytes=needed, **({} if mesh is None else {"mesh": mesh.devices.shape}))
     return _ended(solution, clock, tol, throw=throw)
@@ -196,15 +199,15 @@ def check_limits(max_steps: object, time_limit: object) -> None:
 
 def check_arguments(
     problem: object, grid: object, method: object, scheme: object, tol: object, guess: object = None,
-    *, paths: bool = False, caller: str = "solve",
+    *, paths: bool = False,
 ) -> None:  # fmt: skip
     """Refuse arguments with which no solve can start; needs no values of the problem's functions.
 
-    ``paths``: whether a scheme that follows paths is offered. ``caller``: who got them in another order, or others.
+    ``paths``: a scheme that follows paths is offered.
     """
     if not isinstance(problem, Problem) or not isinstance(grid, Grid):
         kinds = f"{type(problem).__name__}, {type(grid).__name__}"
-        raise TypeError(f"{caller}: got {kinds}; wanted a Problem and a Grid")
+        raise TypeError(f"solve: got {kinds}; wanted a Problem and a Grid")
     if method is not None:
         check_method(method, "solve: method")
     if scheme is not None:

@@ -21,7 +21,8 @@ import numpy as np
 
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.schemes import Limited, Upwind
-from hjbjax.iteration import adjoint
+from hjbjax.iteration import adjoint, arc_adjoint
+from hjbjax.iteration.arc_adjoint import ArcEquation
 from hjbjax.iteration.bellman import Greedy
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.fixed_point import Task
@@ -30,15 +31,17 @@ from hjbjax.markov_chain import memory
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.host_calls import call_on_host
 from hjbjax.problem.problem import Problem, is_constrained, is_discounted
-from hjbjax.problem.pytree import altered, is_traced, pytree_dataclass
+from hjbjax.problem.pytree import altered, cast, is_traced, pytree_dataclass
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Nodes, Number
 from hjbjax.solution.clock import Clock, Stopped
 from hjbjax.solution.solution import Solution, question
 from hjbjax.solution.status import Status, keeping_warnings
 from hjbjax.solvers import host_loop
-from hjbjax.solvers.host_solve import settled_on_host
+from hjbjax.solvers.host_solve import Choices, settled_on_host
 from hjbjax.solvers.result import finish
+from hjbjax.solvers.semi_lagrangian import REPLACEMENT, Followed, can_replace_chain
+from hjbjax.solvers.semi_lagrangian import finish as finish_arcs
 from hjbjax.solvers.setup import assumptions_of, check_on_one_state, choose, is_bare, prepare
 
 NOTHING = [[1.0, -np.inf], [1.0, np.inf]]  # an enclosure that says nothing
@@ -79,6 +82,8 @@ class Found:
       sharp: true for an answer by slopes of high order.
       enclosure: as in ``Solution``; of no meaning without a certificate.
       monotone_error: of the monotone answer, infinite where nothing certifies it.
+      followed: true for an answer on arcs; None where there is none of this kind.
+      arc: the number of the best arc of every node, (*grid); None likewise.
     """
 
     value: Any
@@ -91,6 +96,8 @@ class Found:
     sharp: Any
     enclosure: Any
     monotone_error: Any
+    followed: Any = None
+    arc: Any = None
 
 
 def solve(problem: Problem, grid: Grid, asked: Asked, guess: Nodes | None, tol: Number) -> Solution:
@@ -100,6 +107,8 @@ def solve(problem: Problem, grid: Grid, asked: Asked, guess: Nodes | None, tol: 
     found = _on_host(asked, (problem, grid, asked.method, guess, tol), on)
     task = _task(on, method, tol, found)
     value, policy = _differentiable(task, on.scheme, found)
+    if found.followed is not None:
+        value, policy = jax.lax.cond(found.followed, lambda: _on_arcs(on, found), lambda: (value, policy))
     # a transformation drops the code, so that a failure must show in the numbers; a derivative is NaN with its value
     good = (found.code == Status.CONVERGED) if asked.throw else jnp.ones((), bool)
     value, policy = jax.tree.map(lambda leaf: leaf * jnp.where(good, 1, jnp.nan).astype(leaf.dtype), (value, policy))
@@ -154,13 +163,29 @@ def _differentiable(task: Task, scheme: Scheme, found: Found) -> tuple[jax.Array
     return jax.lax.cond(found.sharp, lambda: by(sharp), lambda: by(task))
 
 
+def _on_arcs(on: Discretisation, found: Found) -> tuple[jax.Array, Greedy]:
+    """Value and policy of an answer on arcs, as functions of the numbers in the problem and in the grid."""
+    on = cast(dataclasses.replace(on, scheme=Upwind()), on.dtype)
+    plan = REPLACEMENT.plan(on.problem, on.grid, on.dtype)
+    legs = tuple(int(leg) for leg in plan.legs)
+    equation = ArcEquation(on, plan.actions, legs, found.arc, found.fixed, found.counted)
+    value = arc_adjoint.attach(found.value, equation)
+    actions = jnp.asarray(plan.actions, on.dtype)[found.arc // len(legs)]
+    return value, Greedy(found.policy.defect, tuple(actions[..., j] for j in range(actions.shape[-1])), ())
+
+
+def _may_follow(asked: Asked, problem: Problem, grid: Grid) -> bool:
+    """True if the host may answer on arcs, as far as the structure of the question tells."""
+    return asked.method is None and asked.scheme is None and can_replace_chain(problem, grid)
+
+
 def _on_host(asked: Asked, given: Any, on: Discretisation) -> Found:
     """What the host finds, lane by lane where some of its arguments are batched."""
     leaves, structure = jax.tree.flatten(given)
     leaves = [jax.lax.stop_gradient(leaf) if is_traced(leaf) else leaf for leaf in leaves]
     varying = [i for i, leaf in enumerate(leaves) if is_traced(leaf)]
     ranks = [jnp.ndim(leaves[i]) for i in varying]
-    like = _shapes(on)
+    like = _shapes(on, may_follow=_may_follow(asked, on.problem, on.grid))
     setting = host_loop.setting("jax_default_device")
 
     def one(*numbers: np.ndarray) -> Found:
@@ -176,8 +201,8 @@ def _on_host(asked: Asked, given: Any, on: Discretisation) -> Found:
     return call_on_host(all_lanes, like, *(leaves[i] for i in varying), vmap_method="expand_dims")
 
 
-def _shapes(on: Discretisation) -> Found:
-    """The shapes and types of what the host hands over."""
+def _shapes(on: Discretisation, *, may_follow: bool) -> Found:
+    """The shapes and types of what the host hands over; ``may_follow``: it may be an answer on arcs."""
     shape, inputs = on.grid.shape, (on.problem.controls, on.problem.disturbances)
 
     def array(*axes: int, dtype: Any = on.dtype) -> Any:
@@ -188,6 +213,7 @@ def _shapes(on: Discretisation) -> Found:
     return Found(
         array(*shape), Greedy(array(*shape), *players), mask, mask, number, count, count,
         array(dtype=np.dtype(bool)), array(2, 2), number,
+        array(dtype=np.dtype(bool)) if may_follow else None, array(*shape, dtype=count.dtype) if may_follow else None,
     )  # fmt: skip
 
 
@@ -220,17 +246,20 @@ def _solved(
     clock = Clock(asked.max_steps or 10**9, asked.time_limit, progress=False)
     with own_settings(x64=asked.x64), keeping_warnings():
         grid.check_spacings(asked.inner)
-        free, sharpen = method is None, asked.scheme is None
+        choices = Choices(scheme=asked.scheme is None, method=method is None, levels=method is None)
+        may_follow = _may_follow(asked, problem, grid)
         method = choose(problem, grid, traced=False, method=method)
         on = Discretisation(problem, grid, asked.scheme or Upwind(subcell=True), asked.inner)
         check_on_one_state(problem, grid, on.scheme)
         memory.require(problem, grid, method, asked.inner, None)
         try:
-            settled, _ = settled_on_host(on, method, float(tol), guess, clock, sharpen=sharpen, free=free)
+            settled, _ = settled_on_host(on, method, float(tol), guess, clock, choices)
         except Stopped as stop:
-            like = _shapes(dataclasses.replace(on, dtype=asked.inner))
+            like = _shapes(dataclasses.replace(on, dtype=asked.inner), may_follow=may_follow)
             nothing = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), like)
             return altered(nothing, code=np.int32(stop.status), enclosure=np.array(NOTHING))
+        if isinstance(settled, Followed):
+            return _found_on_arcs(settled)
         solution = finish(settled, grid)
     task, state = settled.task, jax.device_get(settled.state)
     error = solution.error if settled.origin is None else solution.monotone_error
@@ -247,6 +276,30 @@ def _solved(
         sharp=np.asarray(not task.scheme.monotone),
         enclosure=np.asarray(NOTHING if solution.enclosure is None else solution.enclosure),
         monotone_error=np.asarray(np.inf if error is None else error),
+        followed=np.asarray(False) if may_follow else None,
+        arc=np.zeros(grid.shape, np.int32) if may_follow else None,
+    )
+
+
+def _found_on_arcs(followed: Followed) -> Found:
+    """An answer on arcs, in NumPy."""
+    solution, task, state = finish_arcs(followed), followed.task, jax.device_get(followed.state)
+    counted = np.asarray(task.counted)
+    policy: Any = np.where(np.isnan(solution.policy), 0, solution.policy)
+    no_defect: Any = np.zeros(counted.shape)
+    return Found(
+        value=np.where(counted, solution.value, 0),
+        policy=Greedy(no_defect, tuple(policy[..., j] for j in range(policy.shape[-1])), ()),
+        fixed=np.asarray(task.obstacles.fixed) | ~counted,
+        counted=counted,
+        floor=np.asarray(np.finfo(solution.value.dtype).min / 8),
+        code=np.int32(solution.code),
+        steps=np.int32(solution.steps),
+        sharp=np.asarray(False),
+        enclosure=np.asarray(NOTHING if solution.enclosure is None else solution.enclosure),
+        monotone_error=np.asarray(np.inf if solution.error is None else solution.error),
+        followed=np.asarray(True),
+        arc=np.asarray(state.number),
     )
 
 

@@ -42,7 +42,9 @@ def on_line(drifts, noises):
 
 def reached(problem, grid, held, surely):
     with jax.enable_x64(True):
-        return attainability.reached(Discretisation(problem, grid, hjb.Upwind(), np.float64), held, surely=surely)
+        return attainability.reached(
+            Discretisation(problem, grid, hjb.Upwind(), np.float64), held, surely=surely
+        ).surely
 
 
 def brute(problem, grid, held, surely):

@@ -113,7 +113,40 @@ def test_correlated_noise_at_some_nodes():
     def noise(x, u):
         return jnp.stack([jnp.stack([x[0], 0.0]), jnp.stack([x[1], 0.1])])
 
-    refused("values", r"(?s)24 of 45 nodes.*representable there", noise=noise)
+    # near x₀ = 0 the noise of the second axis is all that is left of a, so that no spacing does at all nodes
+    refused("values", r"(?s)24 of 45 nodes.*No spacings were found that do at all nodes", noise=noise)
+
+
+def spread(a, now):
+    return correlated_noise.dominance(a), now, np.sqrt(np.where(np.diag(a) > 0, np.diag(a), 1))
+
+
+def test_advice_holds_at_all_nodes():
+    """The ratio of spacings that the first node at fault asks for was not enough for the others."""
+
+    def noise(x, u):
+        return jnp.stack([jnp.stack([1.0 + 0 * x[0], 0.0]), jnp.stack([0.5 + 0.1 * x[0] * x[1], 0.9])])
+
+    grid = Grid([-1.0, -2.0], [1.0, 2.0], (61, 9))
+    message = refused("values", r"(?s)Use Grid.*representable at all of its nodes", grid=grid, noise=noise)
+    shape = eval(message.partition("shape=")[2].partition(")")[0] + ")")
+    accepted(noise=noise, grid=Grid(grid.lo, grid.hi, shape))
+
+
+@pytest.mark.parametrize(("power", "name"), [(1.0, "log S"), (0.5, "√S"), (1.5, "∫ dS/√a_00")])
+def test_noise_that_no_spacing_fits_is_constant_in_another_coordinate(power, name):
+    def noise(x, u):
+        return jnp.stack([jnp.stack([x[0] ** power, 0.0]), jnp.stack([0.5, 0.5])])
+
+    grid = Grid([0.5, -1.0], [4.0, 1.0], (11, 11), names=("S", "r"))
+    refused("values", rf"(?s)all nodes. Take \({name}, r\) as the state", grid=grid, noise=noise)
+
+
+def test_coordinates_of_another_problem_are_not_advised():
+    def noise(x, u):
+        return jnp.stack([jnp.stack([x[0], 0.0]), jnp.stack([0.5 * x[0] * x[1], 0.5])])
+
+    refused("values", r"(?s)all nodes. Turn the", grid=Grid([0.5, 0.1], [4.0, 1.0], (11, 11)), noise=noise)
 
 
 def test_three_strong_correlations_are_beyond_any_spacing():
@@ -129,7 +162,7 @@ ENTRY = st.floats(0.1, 3.0)
 @given(ENTRY, ENTRY, st.floats(-1.0, 1.0), ENTRY)
 def test_in_two_dimensions_some_spacing_always_does(s1, s2, r, h):
     a = np.array([[s1 * s1, r * s1 * s2], [r * s1 * s2, s2 * s2]])
-    spacings = correlated_noise.spacings(a, [h, 1.0])
+    spacings = correlated_noise.spacings(*spread(a, [h, 1.0]))
     assert spacings is not None
     assert np.prod(spacings) == pytest.approx(h)
     assert least(a, Grid([0.0, 0.0], spacings, (2, 2))) >= -1e-6  # in float32
@@ -139,7 +172,7 @@ def test_in_two_dimensions_some_spacing_always_does(s1, s2, r, h):
 def test_in_three_dimensions_spacings_do_what_they_promise_and_exist_when_equal_ones_do(entries):
     sigma = np.reshape(entries, (3, 3)) + 0.5 * np.eye(3)
     a = sigma @ sigma.T + 1e-3 * np.eye(3)
-    spacings = correlated_noise.spacings(a, [1.0, 1.0, 1.0])
+    spacings = correlated_noise.spacings(*spread(a, [1.0, 1.0, 1.0]))
     if spacings is not None:
         assert least(a, Grid([0.0] * 3, spacings, (2, 2, 2))) >= -1e-5
     else:
@@ -148,5 +181,5 @@ def test_in_three_dimensions_spacings_do_what_they_promise_and_exist_when_equal_
 
 def test_axes_without_correlation_keep_their_spacing():
     a = np.array([[1.0, 0.0, 0.9], [0.0, 0.0, 0.0], [0.9, 0.0, 4.0]])
-    spacings = correlated_noise.spacings(a, [0.1, 0.3, 0.1])
+    spacings = correlated_noise.spacings(*spread(a, [0.1, 0.3, 0.1]))
     np.testing.assert_allclose(spacings, [0.1 / np.sqrt(2), 0.3, 0.1 * np.sqrt(2)])

@@ -319,3 +319,31 @@ def test_warnings_name_the_line_that_called():
     with pytest.warns(UserWarning, match="value_at: 1 of 1 states lie outside") as lookup:
         ANSWER.value_at([2.0])
     assert {each.filename for each in [*path, *lookup]} == {__file__}
+
+
+# --- the name of the function that was called ---
+
+TARGET = {"target": lambda x: jnp.abs(x[0]) - 0.1}
+
+
+@pytest.mark.parametrize(
+    ("ask", "name"),
+    [
+        (lambda: hjb.solve_batch([problem()], GRID, tol=-1), "solve_batch"),
+        (lambda: hjb.solve_batch([problem()], GRID, max_steps=0), "solve_batch"),
+        (lambda: hjb.solve_batch([problem(terminal_cost=lambda x: x @ x)], GRID), "solve_batch"),
+        (lambda: hjb.estimate(problem(), GRID, tol=-1), "estimate"),
+        (lambda: hjb.estimate(problem(), None), "estimate"),
+        (lambda: hjb.expected_exit_time(problem(), GRID, **TARGET, tol=-1), "expected_exit_time"),
+        (lambda: hjb.reach_probability(problem(), GRID, **TARGET, horizon=-1), "reach_probability"),
+        (lambda: hjb.stay_probability(problem(), GRID, TARGET["target"], horizon=-1), "stay_probability"),
+        (lambda: hjb.stay_probability(None, GRID, TARGET["target"]), "stay_probability"),
+        (lambda: hjb.convergence_study(problem(), [GRID, GRID], tol=-1), "convergence_study"),
+        (lambda: hjb.hinf_level(lambda gamma: problem(), GRID, 0.5, 2.0, scheme="Weno5"), "hinf_level"),
+        (lambda: hjb.solve(problem(), GRID, tol=-1), "solve"),
+    ],
+)
+def test_a_refusal_names_the_function_that_was_called(ask, name):
+    with pytest.raises((ValueError, TypeError)) as caught:
+        ask()
+    assert str(caught.value).startswith(f"{name}: ")

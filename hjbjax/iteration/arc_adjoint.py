@@ -1,0 +1,104 @@
+"""The derivative of a solution on arcs with respect to the numbers in the problem and in the grid.
+
+The value V of a converged solve satisfies, at every node that is not held,
+
+    Φ(V, θ) = pay(θ) + keep(θ) I[V](y(θ)) − V = 0
+
+for the best arc of the node, whose action and length stay as they are. With W the weights of that arc
+∂Φ/∂V = −(I − W), so that dV = (I − W)⁻¹ ∂Φ/∂θ dθ: one linear solve in forward mode and one transposed solve in reverse
+mode. All arcs that are best arrive, so the solve may follow them again and again.
+"""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.discretisation import arcs
+from hjbjax.discretisation.arcs import Arcs, Plan, widened
+from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.hamiltonian.derivatives import once
+from hjbjax.iteration import bellman
+from hjbjax.iteration.adjoint import Map, solve_in_stages
+from hjbjax.problem.pytree import pytree_dataclass
+from hjbjax.problem.settings import own_settings
+from hjbjax.problem.types import AtNodes, Field, Mask, Scalar
+
+FOLLOWED = 32  # arcs in a row between two evaluations of the residual
+
+
+@pytree_dataclass(static=("legs",))
+class ArcEquation:
+    """The equation of the best arcs, with all numbers θ in it.
+
+    Args:
+      on: the problem on its grid.
+      actions: those of the plan, (A, m).
+      legs: the lengths of its arcs, R integers.
+      number: the best arc of every node, integers (*grid).
+      fixed: bool (*grid), the nodes whose value is prescribed, unreachable ones among them.
+      counted: bool (*grid), the nodes with a finite value.
+    """
+
+    on: Discretisation
+    actions: Any
+    legs: tuple[int, ...]
+    number: AtNodes
+    fixed: Mask
+    counted: Mask
+
+    def best(self) -> Arcs:
+        """The best arc of every node."""
+        return arcs.trace_chosen(self.on, Plan(self.actions, np.array(self.legs, np.int32)), self.number, self.fixed)
+
+    def residual(self, value: Field) -> Field:
+        """Φ at a value, cost units, (*grid)."""
+        grid, given = self.on.grid, jnp.where(self.counted, bellman.obstacles(self.on).fixed_value, 0)
+        worth = self.best().worth(widened(value, grid), grid)
+        return jnp.where(self.fixed, jnp.where(self.counted, given - value, 0), worth - value)
+
+
+@jax.custom_jvp
+def attach(value: Field, equation: ArcEquation) -> Field:
+    """``value``, unchanged, as a differentiable function of the numbers in ``equation``, which it solves."""
+    return value
+
+
+@attach.defjvp
+@own_settings()
+def _attach_tangent(primals: Any, tangents: Any) -> tuple[Field, Field]:
+    """The value, and its tangent by one linear solve; transposed, by one transposed solve."""
+    value, equation = primals
+    grid, best = equation.on.grid, jax.lax.stop_gradient(equation.best())
+
+    def weighted(delta: Field) -> Field:
+        """W δ."""
+        return jnp.where(equation.fixed, 0, best.keep * best.read(widened(delta, grid), grid))
+
+    def operator(delta: Field) -> Field:
+        """(I − W) δ."""
+        return delta - weighted(delta)
+
+    right = jax.jvp(lambda question: question.residual(value), (equation,), (tangents[1],))[1]
+    # the value and the operator are constants here, whose own derivatives a second one would need
+    right = right + once(equation, "a solve").astype(right.dtype)
+    return value, jax.lax.custom_linear_solve(operator, right, _solve, _solve)
+
+
+def _solve(matvec: Map, right: Field) -> Field:
+    """δ with (I − W) δ = right, or with the transposed matrix."""
+
+    def follow(left: Field) -> Field:
+        def once_more(_: Scalar, delta: Field) -> Field:
+            return delta + (left - matvec(delta))
+
+        return jax.lax.fori_loop(0, FOLLOWED, once_more, jnp.zeros_like(left))
+
+    return solve_in_stages(right, functools.partial(_left_over, matvec, right), [(follow, jnp.inf)])
+
+
+def _left_over(matvec: Map, right: Field, delta: Field) -> Field:
+    """What δ leaves of the right-hand side."""
+    return right - matvec(delta)

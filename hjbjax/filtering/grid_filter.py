@@ -23,7 +23,7 @@ from hjbjax.discretisation import correlated_noise
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.rates import jump_rates
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.feedback.measurement import Measurement, check_step, measurement, plant
+from hjbjax.feedback.measurement import Measurement, check_step, measurement, plant, sample_of
 from hjbjax.filtering import forward_equation, resolution, transport
 from hjbjax.filtering.forward_equation import advanced, cells
 from hjbjax.markov_chain.decision_process import refuse
@@ -139,13 +139,42 @@ class GridFilter:
         return Density(density, jnp.zeros((), density.dtype))
 
     @front_door
-    def update(self, state: Density, u: Control, dy: Array, dt: Number) -> Density:
-        """The law after holding the control u (m,) for dt and seeing the increment dy (p,)."""
+    def update(self, state: Density, u: Control, dy: Array | None, dt: Number) -> Density:
+        """The law after holding the control u (m,) for dt and seeing the increment dy (p,), or nothing (None)."""
         self.check_state(state)
         check_step("GridFilter.update", self.plant, self.measurement.dim, (u, dy, dt))
         after = self._after(state, u, dy, dt)
-        if not is_traced(self, after):
+        if dy is not None and not is_traced(self, after):
             self.warn_if_coarse("GridFilter.update", np.asarray(after.density)[None], float(dt))
+        return after
+
+    @front_door
+    def correct(self, state: Density, y: Array, *, measurement_noise: Numbers | Sequence) -> Density:
+        """The law after a sample y = h(x) + s v, shape (p,), at one time: Bayes' rule.
+
+        Args:
+          state: the law before.
+          y: the sample, shape (p,), in the units of h.
+
+        Keyword Args:
+          measurement_noise: s, a number, (p,) or (p, p), in the units of h: standard deviations.
+
+        Raises:
+          ValueError: a sample or a noise of the wrong shape, or not finite.
+        """
+        name = "GridFilter.correct"
+        self.check_state(state)
+        sampled = sample_of(self.measurement, y, measurement_noise, name)
+        dtype = state.density.dtype
+        # the signal is r⁻¹ h: back to h, and into units of s
+        h = jnp.tensordot(jnp.asarray(self.measurement.root, dtype), jnp.asarray(self.signal, dtype), 1)
+        signal = sampled.whitened(h.reshape(len(h), -1)).reshape(h.shape)
+        seen = sampled.whitened(jnp.asarray(y, dtype))
+        exponent = jnp.tensordot(seen, signal, 1) - jnp.sum(signal**2, axis=0) / 2
+        probability, gained = _weighed(self.probability(state), exponent)
+        after = Density(self._density(probability), state.log_likelihood + gained)
+        if not is_traced(self, after):
+            self.warn_if_coarse(name, np.asarray(after.density)[None], 0.0)
         return after
 
     def warn_if_coarse(self, name: str, densities: np.ndarray, dt: float) -> None:
@@ -154,17 +183,20 @@ class GridFilter:
         Args:
           name: the function called.
           densities: the law at some times, shape (k, *grid).
-          dt: the time between two measurements.
+          dt: the time between two measurements; 0 for a sample.
         """
         with own_settings(x64=True), jax.ensure_compile_time_eval():
             masses = np.asarray(densities, np.float64) * np.asarray(self.cells)
             laws = masses / np.sum(masses, axis=tuple(range(1, masses.ndim)), keepdims=True)
             resolution.warn_if_coarse(name, self._on(np.dtype(np.float64)), np.asarray(self.signal), laws, dt)
 
-    def _after(self, state: Density, u: Control, dy: Array, dt: Number, most: int | None = None) -> Density:
+    def _after(self, state: Density, u: Control, dy: Array | None, dt: Number, most: int | None = None) -> Density:
         """The law a step later, by ``most`` sub-steps if their number is to be known beforehand."""
         dtype = state.density.dtype
         dt, u = jnp.asarray(dt, dtype), jnp.asarray(u, dtype)
+        if dy is None:
+            moved = advanced(self._on(dtype), self.probability(state), u, dt, most, axes=self.axes)
+            return Density(self._density(moved), state.log_likelihood)
         signal = jnp.asarray(self.signal, dtype)
         seen = self.measurement.whitened(jnp.asarray(dy, dtype))
         # half of ℓ, before the state moves and after it

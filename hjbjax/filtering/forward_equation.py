@@ -22,6 +22,8 @@ brought into the box, and differences from it are taken the short way round, in 
 of a uniform law, there is no direction and the mean is ``lo``.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -47,7 +49,7 @@ def _entries(u: Control, dtype: np.dtype) -> list:
     return [jnp.asarray(u[j], dtype) for j in range(len(u))]
 
 
-def _leaving(jumps: Rates, corrected: list[Correction]) -> Field:
+def _leaving(jumps: Rates, corrected: list[Correction]) -> Any:
     """The largest rate at which mass leaves each node."""
     return sum((each.rate for each in corrected), start=jumps.total())
 

@@ -70,8 +70,8 @@ def warn_if_coarse(name: str, on: Discretisation, signal: Array, laws: np.ndarra
         return
     pace, information, variance = found
     # a prior may be narrow and spread out: most laws count, or the last
-    fastest = np.tensordot(rows, pace, on.grid.ndim)
-    fastest = max(fastest[-1], np.median(fastest))
+    forgetting = np.tensordot(rows, pace, on.grid.ndim)
+    fastest = max(float(forgetting[-1]), float(np.median(forgetting)))
     enough = min(dt, 1 / fastest) if fastest else dt
     if fastest * dt > 1 + 1e-6:  # the dt that the warning names is not warned of
         longest = _rounded_down(1 / fastest)
@@ -88,10 +88,12 @@ def warn_if_coarse(name: str, on: Discretisation, signal: Array, laws: np.ndarra
             continue
         marginal = np.sum(rows[-1], axis=tuple(i for i in range(on.grid.ndim) if i != axis))
         gaps = np.diff(np.asarray(on.grid.axis(axis), np.float64))
-        spacing = gaps[min(int(np.argmax(marginal)), len(gaps) - 1)]
+        spacing = float(gaps[min(int(np.argmax(marginal)), len(gaps) - 1)])
         seen, renewed = (float(np.sum(rows[-1] * each[axis])) * enough for each in (information, variance))
         # the variance after a measurement in the steady state, where the noise of the axis renews it
-        steady = np.sqrt((np.sqrt(renewed**2 + 4 * renewed / seen) - renewed) / 2) if seen * renewed > 0 else 0.0
+        steady = 0.0
+        if seen * renewed > 0:
+            steady = math.sqrt((math.sqrt(renewed**2 + 4 * renewed / seen) - renewed) / 2)
         wanted = steady if 0 < steady < spacing else max(width, 0.01) * spacing
         warn(
             f"{name}: the law is narrower than a cell of axis {axis}, whose spacing is {spacing:.3g}, so mean and "

@@ -20,7 +20,6 @@ import jax.numpy as jnp
 from hjbjax.discretisation import correlated_noise, stencil
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.types import Array, Field
 
 
 class Correction(NamedTuple):
@@ -34,7 +33,7 @@ class Correction(NamedTuple):
 
     ahead: tuple[int, ...]
     behind: tuple[int, ...]
-    rate: Array
+    rate: jax.Array
 
 
 def corrections(on: Discretisation, u: list, axes: tuple[int, ...]) -> list[Correction]:
@@ -55,7 +54,7 @@ def corrections(on: Discretisation, u: list, axes: tuple[int, ...]) -> list[Corr
     return found
 
 
-def gained(grid: Grid, correction: Correction, p: Field) -> Field:
+def gained(grid: Grid, correction: Correction, p: jax.Array) -> jax.Array:
     """The mass per unit time that every node gains by a correction, shape (*grid); its sum is zero."""
     q = correction.rate * p
     ahead = stencil.neighbour(q, grid, correction.ahead, ghost=False) - q

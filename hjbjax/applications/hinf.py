@@ -170,7 +170,9 @@ def hinf_level(
 
 def _bisect(at: Callable[..., Trial], lo: float, hi: float, tol: float, settle: float) -> None:
     """Try γ after γ until the bracket is narrow enough and its upper end is feasible up to the horizon."""
-    feasible = (at(hi),)  # first: if even hi fails, sets, grid or horizon are at fault, and lo adds nothing
+    feasible: tuple[Trial, ...] = (
+        at(hi),
+    )  # first: if even hi fails, sets, grid or horizon are at fault, and lo adds nothing
     if not feasible[0].feasible:
         raise ValueError(f"hinf_level: hi = {hi:g} is not feasible: {_why(feasible[0], settle)}")
     bottom = at(lo)

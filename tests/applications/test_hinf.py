@@ -218,6 +218,7 @@ def test_a_plateau_that_ends_late_is_found_by_the_march_to_the_horizon(monkeypat
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 @pytest.mark.filterwarnings("ignore:the box decides V")
 @pytest.mark.parametrize(("count", "least", "most"), [(41, 0.87, 0.97), (161, 0.92, 0.97)])
 def test_the_level_of_a_nonlinear_plant_is_that_of_the_box(count, least, most):

@@ -142,6 +142,19 @@ def test_equal_exact_sensors_leave_a_law_on_a_grid():
     law = F.zakai(PLANT, twice, GRID, np.full((3, 2), 5e-3), 0.01, lambda x: jnp.exp(-x @ x), measurement_noise=1e-9)
     np.testing.assert_allclose(law.mean[-1], 0.5, atol=0.05)
     assert np.all(np.isfinite(law.covariance))
+    record = np.full((1, 2), 0.5)
+    with pytest.raises(ValueError, match="asks for over"):
+        F.robust_filter(PLANT, twice, GRID, record, 0.01, lambda x: -x @ x, gamma=2.0, measurement_noise=1e-9)
+
+
+@pytest.mark.parametrize("r", [1e-2, 1e-3])
+def test_a_nearly_exact_sensor_of_the_worst_case(r):
+    """With r = 1e-3 the worst case was −2.93 and p was 1e8, where p ≤ 0."""
+    found = F.robust_filter(
+        PLANT, identity, GRID, np.full((2, 1), 0.5), 0.01, lambda x: -x @ x, gamma=2.0, measurement_noise=r
+    )
+    np.testing.assert_allclose(found.worst_case[-1], 0.5, atol=0.01)
+    assert np.all(found.p <= 1e-9)
 
 
 @pytest.mark.parametrize(

@@ -173,7 +173,7 @@ class ExtendedKalman:
         Example:
           >>> filter = ExtendedKalman(Problem(lambda x, u: -x, noise=1.0), lambda x: x, [0.0], [1.0])
           >>> state = filter.correct(filter.initial(), np.ones(1), measurement_noise=1.0)
-          >>> float(state.mean[0]), float(state.covariance[0, 0])
+          >>> round(float(state.mean[0]), 5), round(float(state.covariance[0, 0]), 5)
           (0.5, 0.5)
         """
         name, mean = "ExtendedKalman.correct", state.mean

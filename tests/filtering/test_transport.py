@@ -57,7 +57,7 @@ def test_a_position_without_noise_has_the_law_of_kalman(count, most):
 
 
 def test_a_rotation_keeps_mass_sign_and_width():
-    """x₁' = x₂, x₂' = −x₁ over a quarter of a turn: the law of the chain is twice as wide."""
+    """x₁' = x₂, x₂' = −x₁ over a quarter of a turn."""
     turning = Problem(lambda x, u: jnp.stack([x[1], -x[0]]))
     grid = Grid([-2.0] * 2, [2.0] * 2, (61, 61))
     observer = GridFilter(turning, place, grid, lambda x: jnp.exp(-25 / 2 * ((x[0] - 1) ** 2 + x[1] ** 2)))

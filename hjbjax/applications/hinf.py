@@ -8,27 +8,34 @@ with a stabilising P ≥ 0 of A'P + PA − P(BB' − EE'/γ²)P + C'C = 0, and V
 costs nothing to leave alone: V is then finite at levels that no stabilising feedback holds. So at the end the loop is
 run with d = 0 from the corners of the inner box, and the answer says where it does not come back.
 
-How infeasible is told from feasible, where a bounded set of disturbances makes every γ finite: march from V = 0. The
-value V_T of the problem over the time T grows with T, since d = 0 is allowed and costs nothing, and its limit is V, so
-that γ is feasible if and only if V_T stays bounded. In an inner box, away from the edge, one of three things is seen:
+A bounded set of disturbances makes every γ finite, so infeasible levels are recognised by growth. March from V = 0: the
+value V_T of the problem over the time T grows with T, since d = 0 is allowed and costs nothing, and its limit is V. So
+γ is feasible if and only if V_T stays bounded. One of three things happens:
 
-* V_T settles, and no d sits on its bound: from T to 2T it grows by less than a small fraction, or by not ten times as
-  much and by less than a third of what it grew by before. Feasible.
-* The worst disturbance comes to its bound: what would be unbounded is cut off there. Infeasible.
-* V_T still grows at the horizon, be it that the worst disturbance takes the state to the edge of the grid and gains
-  there at a constant rate, or that the growth is slow near the level. Not shown to be feasible.
+* V_T settles in an inner box and in the whole box, and no d of the inner box sits on its bound: feasible. Settled means
+  that from T to 2T it grows by less than a small fraction, or by less than ten times that fraction and by less than a
+  third of the growth before.
+* The worst disturbance comes to its bound in the inner box: the set cuts off what would be unbounded. Infeasible.
+* V_T still grows at the horizon. The worst disturbance may take the state to a place where it gains at a constant rate,
+  or growth is slow near the level. Not shown to be feasible.
+
+The whole box counts because a nonlinear plant may have its largest gain away from the rest point. Near the rest point V
+then stays on a plateau until the worst path has crept out to that place, and nothing on the plateau shows for how long.
+The level is that of the box: take a smaller box for a local level. A plateau may also end late. So the march of the
+reported γ, and of a ``lo`` that has settled, goes on to the horizon.
 
 Doubling T has no scale: a constant rate makes growth one half, in any unit. At the level itself a P that stays finite
-is approached like 1/T, so that what is gained halves with each doubling; above the level it falls faster each time,
-below it, behind a bottleneck, slower, and rises. A third tells them apart sooner than waiting until all has settled:
-for a time constant τ of the closed loop a level that is off by the fraction e shows at T of about τ/√e. Narrow sets of
-controls or disturbances, a small grid and a short horizon make the level too high; so do coarse grids where P grows
-without bound at the level. ``Weno5()`` is exact on quadratics, and of all schemes feels the edge of the grid least.
+is approached like 1/T, so that the gain halves with each doubling. Above the level it falls faster each time. Below it,
+behind a bottleneck, it falls more slowly and then rises. A third separates the two sooner than waiting until all has
+settled: for a time constant τ of the closed loop a level that is off by the fraction e shows at T of about τ/√e.
+Narrow sets of controls or disturbances, a small grid and a short horizon make the level too high. So do coarse grids
+where P grows without bound at the level. ``Weno5()`` is exact on quadratics and depends least on the edge of the grid.
 Source: A. van der Schaft, L₂-gain and passivity techniques in nonlinear control; T. Başar and P. Bernhard,
 H∞-optimal control and related minimax design problems.
 """
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable
 from time import perf_counter
@@ -36,7 +43,7 @@ from time import perf_counter
 import numpy as np
 
 from hjbjax.applications.l2_gain import Saturation, saturation
-from hjbjax.applications.level import Level, Trial, comes_back
+from hjbjax.applications.level import Growth, Level, Trial, comes_back
 from hjbjax.discretisation.discretisation import Scheme
 from hjbjax.discretisation.schemes import Weno5
 from hjbjax.problem import arguments
@@ -46,7 +53,7 @@ from hjbjax.problem.pytree import front_door
 from hjbjax.problem.sets import Ball, Box
 from hjbjax.solution.clock import Clock, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
-from hjbjax.solution.status import Status
+from hjbjax.solution.status import Status, keeping_warnings, warn
 from hjbjax.solvers.finite_horizon import march_part
 
 DOUBLINGS = 6  # of the time marched, at most: the first look is at a 64th of the horizon
@@ -57,17 +64,21 @@ CLOSE, FALL = 10.0, 1 / 3  # growth so near settle counts as settled if it falls
 
 @dataclasses.dataclass(frozen=True)
 class Settling:
-    """Where, how far and until when V must settle.
+    """Where, how far and until when V must settle, and the march that shows it.
 
     Args:
-      inner: the share of the grid's box that is looked at, around its middle.
+      inner: the share of the grid's box around its middle in which no disturbance may saturate.
       settle: growth over a doubling of the time below which V has settled.
       horizon: the longest time to march.
+      scheme: of the march.
+      time_limit: seconds for one γ, or None.
     """
 
     inner: float
     settle: float
     horizon: float
+    scheme: Scheme
+    time_limit: float | None
 
 
 @front_door
@@ -84,12 +95,13 @@ def hinf_level(
     scheme: Scheme = Weno5(),
     time_limit: float | None = None,
 ) -> Level:
-    """The least γ that a feedback can hold, by bisection; the rule is in the module's docstring.
+    """The least γ that a feedback can hold in the box, by bisection; the rule is in the module's docstring.
 
-    Each γ takes one march, which stops as soon as it is decided. The level comes out too high where a set of controls
-    or disturbances is too narrow, where worst paths from the inner box leave the grid, or where the horizon is short;
-    the table says how the marches below it ended. For a level with stability every unstable mode must be seen in L
-    (detectability); ``Level.stabilises`` is False where a run without a disturbance shows one that is not.
+    Each γ takes one march, which stops as soon as it is decided. The march of the reported γ goes on to the horizon. V
+    must settle over the whole box, so the level of a nonlinear plant depends on the box. It comes out too high if a set
+    of controls or disturbances is too narrow, if worst paths leave the grid, or if the horizon is short; the table says
+    how the marches below it ended. For a level with stability every unstable mode must be seen in L (detectability).
+    ``Level.stabilises`` is False where a run without a disturbance shows one that is not.
 
     Args:
       problem_of_gamma: γ to the game with cost L − ½γ²|d|², as ``lambda gamma: hjb.attenuation(plant, gamma, set)``.
@@ -98,7 +110,8 @@ def hinf_level(
       lo: a γ that is infeasible.
       hi: a γ that is feasible.
       tol: how close the bracket is to be, relative to γ.
-      inner: the share of the grid's box, around its middle, where V must settle without saturation.
+      inner: the share of the grid's box, around its middle, where V must settle without saturation. In the rest of the
+        box V must settle, too, but disturbances may sit on their bound.
       settle: growth of V over a doubling of the time below which it has settled.
       horizon: the longest time to march, in units of time: many times the slowest of the closed loop.
       scheme: as for ``march``.
@@ -123,46 +136,73 @@ def hinf_level(
       >>> abs(level.gamma / 0.5**0.5 - 1) < 0.02
       True
     """
-    settling = Settling(inner, settle, horizon)
+    settling = Settling(inner, settle, horizon, scheme, time_limit)
     _check_rule(problem_of_gamma, lo, hi, tol, settling)
-    clock, trials = Clock(), []
+    trials: dict[float, Trial] = {}
+    said: dict[float, list[str]] = {}
+    clock = Clock()
 
-    def at(gamma: float) -> Trial:
+    def at(gamma: float, before: Trial | None = None) -> Trial:
         problem = problem_of_gamma(gamma)
         _check_problem(problem, gamma)
-        trial = _try(problem, grid, float(gamma), settling, scheme, time_limit)
-        trials.append(trial)
+        # an infeasible V has no limit: what its march warns of says nothing about the level
+        with keeping_warnings() as said[gamma]:
+            trial = _try(problem, grid, float(gamma), settling, before)
+        trials[gamma] = trial
         if trial.reason in CUTS.values():
-            raise SolveError(f"hinf_level: at gamma = {gamma:g}: {trial.solution.message}", _level(trials, trial))
+            level = _level(list(trials.values()), trial)
+            raise SolveError(f"hinf_level: at gamma = {gamma:g}: {trial.solution.message}", level)
         return trial
 
     with noting_interrupts(clock):
         _bisect(at, lo, hi, tol, settle)
-        level = _level(trials)
+        level = _level(list(trials.values()))
         if not clock.interrupted:
             stabilises = comes_back(problem_of_gamma(level.gamma), level.solution, inner, horizon)
             level = dataclasses.replace(level, stabilises=stabilises)
         if clock.interrupted:
             level = dataclasses.replace(level, status=Status.INTERRUPTED)
             raise SolveError(f"hinf_level: interrupted after it had come to its end: {level!r}", level)
+    for message in dict.fromkeys(said[level.gamma]):
+        warn(message)
     return level
 
 
-def _bisect(at: Callable[[float], Trial], lo: float, hi: float, tol: float, settle: float) -> None:
-    """Try γ after γ until the bracket is narrow enough."""
-    top = at(hi)  # first: where even hi fails, sets, grid or horizon are at fault, and lo says nothing more
-    if not top.feasible:
-        raise ValueError(f"hinf_level: hi = {hi:g} is not feasible: {_why(top, settle)}")
+def _bisect(at: Callable[..., Trial], lo: float, hi: float, tol: float, settle: float) -> None:
+    """Try γ after γ until the bracket is narrow enough and its upper end is feasible up to the horizon."""
+    feasible: tuple[Trial, ...] = (
+        at(hi),
+    )  # first: if even hi fails, sets, grid or horizon are at fault, and lo adds nothing
+    if not feasible[0].feasible:
+        raise ValueError(f"hinf_level: hi = {hi:g} is not feasible: {_why(feasible[0], settle)}")
     bottom = at(lo)
-    if bottom.feasible:
+    if bottom.feasible and (bottom := at(lo, bottom)).feasible:
         raise ValueError(
             f"hinf_level: lo = {lo:g} is feasible: V settles at {bottom.value:.3g} after t = {bottom.time:g}; "
             "give a smaller lo"
         )
-    while top.gamma > bottom.gamma * (1 + tol):
-        # the geometric mean: tol is relative, and each trial halves the logarithm of what is left
-        middle = at(math.sqrt(bottom.gamma * top.gamma))
-        bottom, top = (bottom, middle) if middle.feasible else (middle, top)
+    while feasible:
+        bottom, feasible = _narrowed(at, bottom, feasible, tol)
+        # V may have been on a plateau when its march stopped
+        bottom = at(feasible[-1].gamma, feasible[-1])
+        if bottom.feasible:
+            return
+        feasible = feasible[:-1]
+    raise ValueError(f"hinf_level: hi = {hi:g} is not feasible: {_why(bottom, settle)}")
+
+
+def _narrowed(
+    at: Callable[..., Trial], bottom: Trial, feasible: tuple[Trial, ...], tol: float
+) -> tuple[Trial, tuple[Trial, ...]]:
+    """The bracket after bisection: its lower end, and all feasible trials with the least γ at the end."""
+    while feasible[-1].gamma > bottom.gamma * (1 + tol):
+        # the geometric mean: tol is relative, and each trial halves the logarithm of the ratio
+        middle = at(math.sqrt(bottom.gamma * feasible[-1].gamma))
+        if middle.feasible:
+            feasible = (*feasible, middle)
+        else:
+            bottom = middle
+    return bottom, feasible
 
 
 def _level(trials: list[Trial], cut: Trial | None = None) -> Level:
@@ -174,51 +214,67 @@ def _level(trials: list[Trial], cut: Trial | None = None) -> Level:
     return Level(top, (bottom, top), tuple(sorted(trials, key=lambda trial: trial.gamma)), status)
 
 
-def _try(
-    problem: Problem,
-    grid: Grid,
-    gamma: float,
-    settling: Settling,
-    scheme: Scheme,
-    time_limit: float | None,
-) -> Trial:
-    """The verdict on one γ: the time marched is doubled until the value settles, saturates or the horizon is there."""
-    began, left = perf_counter(), time_limit
-    inner, settle, horizon = settling.inner, settling.settle, settling.horizon
-    # a march stops by itself where the worst case comes to the bound of a Box; of a Ball only its end is looked at
+def _try(problem: Problem, grid: Grid, gamma: float, settling: Settling, before: Trial | None) -> Trial:
+    """The verdict on one γ: double the time marched until V settles or d saturates, or until the horizon.
+
+    Args:
+      problem: the game at γ.
+      grid: the nodes.
+      gamma: γ.
+      settling: the rule.
+      before: a trial of the same γ that has settled. Its march goes on to the horizon.
+    """
+    going_on = ("growing",) if before is None else ("growing", "settled")
+    trial = before
+    so_far = Growth((np.zeros(grid.shape),)) if before is None else before.march
+    # the time is a sum of spans, by rounding
+    while trial is None or (trial.reason in going_on and so_far.time < settling.horizon * (1 - 1e-9)):
+        trial = _longer(problem, grid, gamma, so_far, settling)
+        so_far = trial.march
+    return trial
+
+
+def _longer(problem: Problem, grid: Grid, gamma: float, so_far: Growth, settling: Settling) -> Trial:
+    """The verdict on one γ after a march over twice the time."""
+    began, inner, inside = perf_counter(), settling.inner, _inner_nodes(grid, settling.inner)
+    # a march stops early if the worst case comes to the bound of a Box; of a Ball only the end is checked
     watch = inner if isinstance(problem.disturbances, Box) else 0.0
-    inside = grid.inner(inner)
-    # some node of the inner box needs both of its neighbours in it
-    if not np.all([np.sum(np.any(inside, axis=_others(grid, k))) >= 3 for k in range(grid.ndim)]):
-        raise ValueError(f"hinf_level: inner = {inner:g} of {grid.shape} nodes holds fewer than 3 along an axis")
-    # gains: of V over each doubling, the first against nothing before
-    value, total, span, gains = np.zeros(grid.shape), 0.0, horizon / 2**DOUBLINGS, [math.inf]
-    while True:
-        # V_T goes on from where it stood: the march from V = 0 over 2T is one over T from V_T
-        solution = march_part(problem, grid, span, start=value, inner=watch, scheme=scheme, time_limit=left)
-        if solution.status in CUTS:
-            return _no_verdict(solution, gamma, total + span - float(solution.times[0]), inner)
-        # a march that was decided early stands at times[0] > 0, and less than the span has passed
-        after, total = np.asarray(solution.value[0]), total + span - float(solution.times[0])
-        size, gain = (float(np.max(np.abs(each[inside]))) for each in (after, after - value))
-        bound = saturation(solution, problem, inner=inner)
-        reason = _reason(solution.status, bound, gain / size if size else 0.0, gain / gains[-1], settle)
-        if reason or total >= horizon * (1 - 1e-9):  # the total is a sum of spans, by rounding
-            break
-        value, span, gains = after, total, [*gains, gain]  # as long again as all before: T doubles
-        # never 0 or less: march wants a positive limit, and hands back what there is after its first look
-        left = time_limit and max(time_limit - (perf_counter() - began), SOON)
-    kept = _as_stationary(solution, total)
-    reason, growth = reason or "growing", gain / size if size else 0.0
-    return Trial(gamma, reason == "settled", reason, total, growth, size, bound, kept)
+    span = so_far.time or settling.horizon / 2**DOUBLINGS
+    # never 0 or less: march requires a positive limit, and returns what there is after its initial evaluation
+    left = settling.time_limit and max(settling.time_limit - so_far.seconds, SOON)
+    # V_T goes on from its last value: the march from V = 0 over 2T is one over T from V_T
+    solution = march_part(
+        problem, grid, span, start=so_far.values[-1], inner=watch, scheme=settling.scheme, time_limit=left
+    )
+    # a march that stopped early is at times[0] > 0, and less than the span has passed
+    time = so_far.time + span - float(solution.times[0])
+    if solution.status in CUTS:
+        return _no_verdict(solution, gamma, so_far, time, inner)
+    values = (*so_far.values, np.asarray(solution.value[0]))[-3:]
+    bound = saturation(solution, problem, inner=inner)
+    grew = [_grew(values, nodes, settling.settle) for nodes in (inside, np.ones_like(inside))]
+    reason = _reason(solution.status, bound, all(settled for _, settled in grew))
+    size = float(np.max(np.abs(values[-1][inside])))
+    growth = max(share for share, _ in grew)
+    later = Growth(values, time, so_far.seconds + perf_counter() - began)
+    return Trial(gamma, reason == "settled", reason, time, growth, size, bound, _as_stationary(solution, time), later)
 
 
-def _no_verdict(solution: Solution, gamma: float, total: float, inner: float) -> Trial:
+def _grew(values: tuple[np.ndarray, ...], nodes: np.ndarray, settle: float) -> tuple[float, bool]:
+    """The growth of V over the last doubling relative to its size in a part of the box, and True if V has settled."""
+    size = float(np.max(np.abs(values[-1][nodes])))
+    # the first doubling has none before it
+    gains = [math.inf, *(float(np.max(np.abs(after - before)[nodes])) for before, after in itertools.pairwise(values))]
+    growth = gains[-1] / size if size else 0.0
+    return growth, growth <= settle or (growth <= CLOSE * settle and gains[-1] <= FALL * gains[-2])
+
+
+def _no_verdict(solution: Solution, gamma: float, so_far: Growth, time: float, inner: float) -> Trial:
     """A trial without a verdict, from a march that was cut short."""
-    kept = _as_stationary(solution, total)
+    kept = _as_stationary(solution, time)
     size = float(np.max(np.abs(kept.value[kept.grid.inner(inner)])))
     unknown = Saturation(math.nan, math.nan, np.full(kept.grid.ndim, math.nan), inner)
-    return Trial(gamma, False, CUTS[solution.status], total, math.nan, size, unknown, kept)
+    return Trial(gamma, False, CUTS[solution.status], time, math.nan, size, unknown, kept, so_far)
 
 
 def _as_stationary(solution: Solution, total: float) -> Solution:
@@ -228,16 +284,15 @@ def _as_stationary(solution: Solution, total: float) -> Solution:
     return dataclasses.replace(solution, times=None, stats={**solution.stats, "horizon": total}, **first)
 
 
-def _reason(status: Status, bound: Saturation, growth: float, ratio: float, settle: float) -> str:
-    """The verdict after a march, as ``Trial.reason`` has it; empty to go on."""
+def _reason(status: Status, bound: Saturation, settled: bool) -> str:
+    """The verdict after a march, as ``Trial.reason`` has it."""
     # DIVERGED is what the march calls a disturbance that came to its bound while it watched
     # first of all: where d is cut off V settles too, at a value that is the set's and no gain
     if status is Status.DIVERGED or bound.share > 0:
         return "saturated"
     if status is not Status.CONVERGED:
         return "not finite"
-    falls = growth <= CLOSE * settle and ratio <= FALL
-    return "settled" if growth <= settle or falls else ""
+    return "settled" if settled else "growing"
 
 
 def _why(trial: Trial, settle: float) -> str:
@@ -247,9 +302,18 @@ def _why(trial: Trial, settle: float) -> str:
     if trial.reason == "growing":
         return (
             f"V still grew by {trial.growth:.2g} of itself over the last doubling of the time to {trial.time:g}, "
-            f"settle = {settle:g};\ngive a larger hi, a longer horizon, or a larger grid if worst paths leave it"
+            f"settle = {settle:g};\ngive a larger hi or a longer horizon, a larger grid if worst paths leave it, or a "
+            "smaller one if the gain is large only far from the rest point"
         )
     return f"{trial.solution.message}\nLook at drift and cost, or give a larger hi"
+
+
+def _inner_nodes(grid: Grid, inner: float) -> np.ndarray:
+    """The nodes of the inner box, bool (*grid); refused where no node has both of its neighbours in it."""
+    inside = grid.inner(inner)
+    if not np.all([np.sum(np.any(inside, axis=_others(grid, k))) >= 3 for k in range(grid.ndim)]):
+        raise ValueError(f"hinf_level: inner = {inner:g} of {grid.shape} nodes holds fewer than 3 along an axis")
+    return inside
 
 
 def _others(grid: Grid, axis: int) -> tuple[int, ...]:

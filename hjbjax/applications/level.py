@@ -28,6 +28,21 @@ NEARER = 0.5  # the ends over the starts, in their spread along each axis; a mod
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
+class Growth:
+    """A march from V = 0, whose time is doubled again and again.
+
+    Args:
+      values: V_T at the last three times at most, the latest at the end, each shape (*grid).
+      time: the last T.
+      seconds: the wall clock that it took.
+    """
+
+    values: tuple[np.ndarray, ...]
+    time: float = 0.0
+    seconds: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
 class Trial:
     """The verdict on one γ, and what it rests on.
 
@@ -36,10 +51,12 @@ class Trial:
       feasible: True where the value settled.
       reason: "settled", "saturated", "growing" or "not finite"; "interrupted" or "out of time" is no verdict.
       time: the time T that was marched.
-      growth: what V grew by over the last doubling of T, over its size, in the inner box.
-      value: the largest V there.
+      growth: the growth of V over the last doubling of T relative to its size, in the inner box or in the whole box,
+        whichever is larger.
+      value: the largest V in the inner box.
       saturation: how near the worst disturbance came to its bound at the end.
       solution: V_T and both feedbacks, as a stationary solution; its status is that of the last march.
+      march: the values of the march, from which it can go on.
     """
 
     gamma: float
@@ -50,6 +67,7 @@ class Trial:
     value: float
     saturation: Saturation
     solution: Solution
+    march: Growth
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

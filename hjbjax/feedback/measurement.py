@@ -1,7 +1,7 @@
 """What is measured of a state that is not: dy = h(x) dt + r dv, and how a plant must be for it to be filtered.
 
-Records come as increments dy over steps of length dt. A sensor that is sampled, y_k = h(x_k) + s v_k, is the case
-dy = y_k dt with r² = s² dt.
+Records come as increments dy over steps of length dt, or as samples y = h(x) + s v at single times. A sensor that is
+sampled once per step is also the case dy = y dt with r² = s² dt.
 """
 
 from collections.abc import Callable, Sequence
@@ -86,6 +86,19 @@ def measurement(h: Callable, n: int, noise: Numbers | Sequence, name: str, *, pe
     return Measurement(function, _root(noise, shape[0], name, perfect))
 
 
+def sample_of(known: Measurement, y: Array, noise: Numbers | Sequence, name: str) -> Measurement:
+    """The measurement of a sample y = h(x) + s v, with s for r.
+
+    Args:
+      known: the measurement, whose h is sampled.
+      y: the sample, shape (p,).
+      noise: s, a number, (p,) or (p, p), in the units of h.
+      name: the method called, for refusals.
+    """
+    check_vector(y, f"{name}: y", known.dim, "the sample, one entry a measured quantity")
+    return Measurement(known.h, _root(noise, known.dim, name, perfect=False))
+
+
 def _root(noise: Numbers | Sequence, p: int, name: str, perfect: bool) -> Any:
     """r as a matrix, shape (p, p)."""
     given = numbers(noise, f"{name}: measurement_noise")
@@ -150,12 +163,13 @@ def check_step(name: str, problem: Problem, outputs: int, told: tuple[Any, Any, 
       name: who asks, for refusals.
       problem: the plant, with its admissible set.
       outputs: the number p of measured quantities.
-      told: u (m,), dy (p,) and dt.
+      told: u (m,), dy (p,) or None, and dt.
     """
     u, dy, dt = told
     m = 0 if problem.controls is None else problem.controls.dim
     check_vector(u, f"{name}: u", m, "what was held over the step, one entry an input")
-    check_vector(dy, f"{name}: dy", outputs, "the increment over the step, one entry a measured quantity")
+    if dy is not None:
+        check_vector(dy, f"{name}: dy", outputs, "the increment over the step, one entry a measured quantity")
     check_admissible(problem, u, f"{name}: u")
     check_length(dt, f"{name}: dt", "the length of the step")
 

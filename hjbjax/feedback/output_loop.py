@@ -47,7 +47,10 @@ class Observer(Protocol):
         """The information state at t = 0, any pytree of arrays."""
 
     def update(self, state: Any, u: Control, dy: Array, dt: Number) -> Any:
-        """The information state after holding the control u (m,) for dt and seeing the increment dy (p,)."""
+        """The information state after holding the control u (m,) for dt and seeing the increment dy (p,).
+
+        The observers of ``hjbjax.filtering`` take ``dy=None`` for a prediction, a step without a measurement.
+        """
 
     def estimate(self, state: Any) -> State:
         """The point estimate of x, shape (n,)."""

@@ -6,7 +6,8 @@
 
 is a step of a Markov chain, and the mean of p and of two of them, ½ p + ½ (1 + τ𝓛*)² p, K. Heun's, is of second
 order in τ. The number of sub-steps is the least, ⌈dt max Q⌉, so that a step of any length is admissible; each costs two
-passes over the nodes.
+passes over the nodes. Along axes whose noise is too small for central differences ``transport`` takes the diffusion of
+upwinding away, in sub-steps that are up to half as long.
 
 The chain's law is a probability at each node. Its density is that over the node's cell: half a cell at a wall on which
 noise reflects, a whole one at an end of an axis without noise, see ``chain.stationary_density``.
@@ -21,6 +22,8 @@ brought into the box, and differences from it are taken the short way round, in 
 of a uniform law, there is no direction and the mean is ``lo``.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,6 +31,7 @@ import numpy as np
 from hjbjax.discretisation import stencil
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.rates import Rates, jump_rates
+from hjbjax.filtering.transport import Correction, corrections, gained
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import known
 from hjbjax.problem.types import Array, Control, Field, Number, State
@@ -35,13 +39,19 @@ from hjbjax.problem.types import Array, Control, Field, Number, State
 MOST = 10_000_000  # sub-steps; a law that moves by a cell in each is at rest on any grid that fits in memory
 
 
-def substeps(on: Discretisation, u: Control, dt: Number) -> jax.Array:
+def substeps(on: Discretisation, u: Control, dt: Number, axes: tuple[int, ...] = ()) -> jax.Array:
     """The number of sub-steps ⌈dt max Q⌉ under the control u (m,), from 1 to ``MOST`` + 1."""
-    return _count(_rates(on, u, on.dtype).total(), dt)
+    entries = _entries(u, on.dtype)
+    return _count(_leaving(jump_rates(on, entries), corrections(on, entries, axes)), dt)
 
 
-def _rates(on: Discretisation, u: Control, dtype: np.dtype) -> Rates:
-    return jump_rates(on, [jnp.asarray(u[j], dtype) for j in range(len(u))])
+def _entries(u: Control, dtype: np.dtype) -> list:
+    return [jnp.asarray(u[j], dtype) for j in range(len(u))]
+
+
+def _leaving(jumps: Rates, corrected: list[Correction]) -> Any:
+    """The largest rate at which mass leaves each node."""
+    return sum((each.rate for each in corrected), start=jumps.total())
 
 
 def _count(leaving: Field, dt: Number) -> jax.Array:
@@ -50,23 +60,47 @@ def _count(leaving: Field, dt: Number) -> jax.Array:
     return jnp.where(jnp.isfinite(wanted), jnp.clip(wanted, 1, MOST + 1), 1).astype(jnp.int32)
 
 
-def advanced(on: Discretisation, probability: Field, u: Control, dt: Number, most: int | None = None) -> Field:
+def advanced(
+    on: Discretisation,
+    probability: Field,
+    u: Control,
+    dt: Number,
+    most: int | None = None,
+    *,
+    axes: tuple[int, ...] = (),
+) -> Field:
     """The probabilities at the nodes after the time dt under the control u (m,): their sum is kept, none negative.
 
-    NaN where more than ``MOST`` sub-steps are wanted. With ``most``, which must be enough, there are so many: of a
-    known number of steps there is a derivative in reverse mode, too.
+    NaN where more than ``MOST`` sub-steps are needed.
+
+    Args:
+      on: the chain.
+      probability: at the nodes, shape (*grid).
+      u: the control, shape (m,).
+      dt: the time.
+      most: the number of sub-steps, which must be enough: a loop of known length has a reverse derivative, too.
+      axes: the axes along which the diffusion of upwinding is taken away.
     """
     dtype = probability.dtype
-    jumps = _rates(on, u, dtype)
-    leaving, arriving = jumps.total(), jumps.inflow(on.grid)
-    count = _count(leaving, dt) if most is None else most
+    entries = _entries(u, dtype)
+    jumps, corrected = jump_rates(on, entries), corrections(on, entries, axes)
+    arriving = jumps.inflow(on.grid)
+    count = _count(_leaving(jumps, corrected), dt) if most is None else most
     probability = jnp.where(jnp.asarray(count) > MOST, jnp.nan, probability)
     tau = jnp.asarray(dt / count, dtype)
-    stays = jnp.maximum(1 - tau * leaving, 0)  # of the fastest node 1 − 1, which may round below zero
+    stays = jnp.maximum(1 - tau * jumps.total(), 0)  # of the fastest node 1 − 1, which may round below zero
     moves = arriving.scaled(tau)
+    corrected = [each._replace(rate=tau * each.rate) for each in corrected]
+
+    def moved(p: Field) -> Field:
+        found = _moved(on, stays, moves, p)
+        for correction in corrected:
+            found = found + gained(on.grid, correction, p)
+        # fluxes that cancel to zero may round below it
+        return jnp.maximum(found, 0) if corrected else found
 
     def substep(_: int, p: Field) -> Field:
-        return (p + _moved(on, stays, moves, _moved(on, stays, moves, p))) / 2
+        return (p + moved(moved(p))) / 2
 
     # of more than MOST none is made: what comes back says so
     return jax.lax.fori_loop(0, jnp.where(count > MOST, 0, count) if most is None else most, substep, probability)

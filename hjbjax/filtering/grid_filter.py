@@ -6,10 +6,10 @@ A step of length dt of the Duncan–Mortensen–Zakai equation is split as G. St
 
 where the factors are exact for a state that rests, and the middle step keeps sums and signs, see ``forward_equation``:
 q ≥ 0 for any dt and any record. Of second order in dt along a smooth record; the likelihood of a record with noise is
-of first order, since an increment does not tell where in its interval the noise was. In the spacing of the order of
-the chain, two where its differences are central and one elsewhere. The factors are multiplied as logarithms, with the
-largest product taken out, so that nothing overflows or vanishes; what is taken out is kept in the logarithm of the
-mass.
+of first order, since an increment does not tell where in its interval the noise was. Of second order in the spacing
+where the law is smooth, by central differences or by a limited flux, see ``transport``. The factors are multiplied as
+logarithms, with the largest product taken out, so that nothing overflows or vanishes. What is taken out is kept in the
+logarithm of the mass.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,8 +23,8 @@ from hjbjax.discretisation import correlated_noise
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.rates import jump_rates
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.feedback.measurement import Measurement, check_step, measurement, plant
-from hjbjax.filtering import forward_equation
+from hjbjax.feedback.measurement import Measurement, check_step, measurement, plant, sample_of
+from hjbjax.filtering import forward_equation, resolution, transport
 from hjbjax.filtering.forward_equation import advanced, cells
 from hjbjax.markov_chain.decision_process import refuse
 from hjbjax.problem import sets
@@ -50,13 +50,14 @@ class Density:
     log_likelihood: Any
 
 
-@pytree_dataclass()
+@pytree_dataclass(static=("axes",))
 class GridFilter:
     """The law of the state given what was measured, on a grid: an ``Observer`` for any drift, noise and h.
 
     One update is a step of the Duncan–Mortensen–Zakai equation (12.6), see ``zakai``. Its state is a ``Density``. The
-    state of the plant stays on the grid: the box must hold it, with room to spare. Costs 2⌈dt max Q⌉ passes over the
-    nodes a step, Q the rate at which the chain leaves a node, Σ |f_i|/h_i + a_ii/h_i².
+    state of the plant stays on the grid: the box must hold it, with room to spare. A step costs
+    2⌈dt max Q⌉ passes over the nodes, with Q = Σ |f_i|/h_i + a_ii/h_i² the rate at which the chain leaves a node;
+    |f_i|/h_i counts twice along axes with little noise or none, where the flux is limited.
 
     Args:
       problem: the plant: its drift, controls and noise matter.
@@ -73,6 +74,9 @@ class GridFilter:
         at a node, noise that the chain cannot represent, an initial density that is none.
       TypeError: no Problem, no Grid, an h that cannot be called.
 
+    Warns outside ``jit`` and ``vmap`` if the law is narrower than a cell, or if dt is longer than r/(σ|h'|), and names
+    the spacing or the dt that is enough.
+
     Example:
       >>> grid = Grid([-3.0], [3.0], (61,))
       >>> filter = GridFilter(Problem(lambda x, u: -x, noise=1.0), lambda x: x, grid, lambda x: jnp.exp(-x @ x))
@@ -88,6 +92,7 @@ class GridFilter:
     prior: Any  # the density at t = 0, (*grid)
     volumes: Any  # of the nodes, (*grid)
     cells: Any  # of the chain's law, (*grid)
+    axes: tuple[int, ...]  # along which the noise is too small for central differences, see ``transport``
 
     @front_door
     def __init__(
@@ -113,8 +118,7 @@ class GridFilter:
         # inside ``jit`` as well, what is known is computed here and now
         with own_settings(x64=True), jax.ensure_compile_time_eval():
             on = Discretisation(*cast((system, grid), np.float64), Upwind(), np.dtype(np.float64))
-            if not is_traced(system, grid):
-                _check_rates(on, name)
+            axes = tuple(range(grid.ndim)) if is_traced(system, grid) else _check_rates(on, name)
             fields = {
                 "plant": system,
                 "grid": grid,
@@ -123,6 +127,7 @@ class GridFilter:
                 "prior": _prior(on, initial_density, name),
                 "volumes": grid.volumes(),
                 "cells": cells(on),
+                "axes": axes,
             }
         for field, value in fields.items():
             object.__setattr__(self, field, value)
@@ -134,22 +139,70 @@ class GridFilter:
         return Density(density, jnp.zeros((), density.dtype))
 
     @front_door
-    def update(self, state: Density, u: Control, dy: Array, dt: Number) -> Density:
-        """The law after holding the control u (m,) for dt and seeing the increment dy (p,)."""
+    def update(self, state: Density, u: Control, dy: Array | None, dt: Number) -> Density:
+        """The law after holding the control u (m,) for dt and seeing the increment dy (p,), or nothing (None)."""
         self.check_state(state)
         check_step("GridFilter.update", self.plant, self.measurement.dim, (u, dy, dt))
-        return self._after(state, u, dy, dt)
+        after = self._after(state, u, dy, dt)
+        if dy is not None and not is_traced(self, after):
+            self.warn_if_coarse("GridFilter.update", np.asarray(after.density)[None], float(dt))
+        return after
 
-    def _after(self, state: Density, u: Control, dy: Array, dt: Number, most: int | None = None) -> Density:
+    @front_door
+    def correct(self, state: Density, y: Array, *, measurement_noise: Numbers | Sequence) -> Density:
+        """The law after a sample y = h(x) + s v, shape (p,), at one time: Bayes' rule.
+
+        Args:
+          state: the law before.
+          y: the sample, shape (p,), in the units of h.
+
+        Keyword Args:
+          measurement_noise: s, a number, (p,) or (p, p), in the units of h: standard deviations.
+
+        Raises:
+          ValueError: a sample or a noise of the wrong shape, or not finite.
+        """
+        name = "GridFilter.correct"
+        self.check_state(state)
+        sampled = sample_of(self.measurement, y, measurement_noise, name)
+        dtype = state.density.dtype
+        # the signal is r⁻¹ h: back to h, and into units of s
+        h = jnp.tensordot(jnp.asarray(self.measurement.root, dtype), jnp.asarray(self.signal, dtype), 1)
+        signal = sampled.whitened(h.reshape(len(h), -1)).reshape(h.shape)
+        seen = sampled.whitened(jnp.asarray(y, dtype))
+        exponent = jnp.tensordot(seen, signal, 1) - jnp.sum(signal**2, axis=0) / 2
+        probability, gained = _weighed(self.probability(state), exponent)
+        after = Density(self._density(probability), state.log_likelihood + gained)
+        if not is_traced(self, after):
+            self.warn_if_coarse(name, np.asarray(after.density)[None], 0.0)
+        return after
+
+    def warn_if_coarse(self, name: str, densities: np.ndarray, dt: float) -> None:
+        """Warn where a law is narrower than a cell, or where it is forgotten within a step.
+
+        Args:
+          name: the function called.
+          densities: the law at some times, shape (k, *grid).
+          dt: the time between two measurements; 0 for a sample.
+        """
+        with own_settings(x64=True), jax.ensure_compile_time_eval():
+            masses = np.asarray(densities, np.float64) * np.asarray(self.cells)
+            laws = masses / np.sum(masses, axis=tuple(range(1, masses.ndim)), keepdims=True)
+            resolution.warn_if_coarse(name, self._on(np.dtype(np.float64)), np.asarray(self.signal), laws, dt)
+
+    def _after(self, state: Density, u: Control, dy: Array | None, dt: Number, most: int | None = None) -> Density:
         """The law a step later, by ``most`` sub-steps if their number is to be known beforehand."""
         dtype = state.density.dtype
         dt, u = jnp.asarray(dt, dtype), jnp.asarray(u, dtype)
+        if dy is None:
+            moved = advanced(self._on(dtype), self.probability(state), u, dt, most, axes=self.axes)
+            return Density(self._density(moved), state.log_likelihood)
         signal = jnp.asarray(self.signal, dtype)
         seen = self.measurement.whitened(jnp.asarray(dy, dtype))
         # half of ℓ, before the state moves and after it
         half = (jnp.tensordot(seen, signal, 1) - jnp.sum(signal**2, axis=0) * (dt / 2)) / 2
         probability, before = _weighed(self.probability(state), half)
-        probability = advanced(self._on(dtype), probability, u, dt, most)
+        probability = advanced(self._on(dtype), probability, u, dt, most, axes=self.axes)
         probability, after = _weighed(probability, half)
         return Density(self._density(probability), state.log_likelihood + before + after)
 
@@ -281,17 +334,24 @@ def _prior(on: Discretisation, given: Callable | Numbers, name: str) -> Any:
     return density / np.sum(density * on.grid.volumes())
 
 
-def _check_rates(on: Discretisation, name: str) -> None:
-    """Refuse drift or noise that is not finite at a node, and correlated noise that the chain cannot represent."""
+def _check_rates(on: Discretisation, name: str) -> tuple[int, ...]:
+    """Refuse drift or noise that is not finite at a node, and correlated noise that the chain cannot represent.
+
+    Returns:
+      The axes whose noise is too small for central differences at some node, under some control.
+    """
+    largest = np.zeros(on.grid.ndim)
     for u in sets.probes(on.problem.controls, on.dtype)[:3]:
-        leaving, lacking = _look(on, u)
+        leaving, lacking, upwinded = _look(on, u)
         refuse("a jump rate, made of drift and noise, is not finite", ~jnp.isfinite(leaving), on.grid, name)
         refuse("the noise is correlated more than the spacings allow", lacking, on.grid, name)
+        largest = np.maximum(largest, np.asarray(upwinded))
+    return tuple(int(axis) for axis in np.flatnonzero(largest))
 
 
 @jax.jit
-def _look(on: Discretisation, u: list) -> tuple[jax.Array, jax.Array]:
-    """Q at every node, and the nodes at which correlated noise leaves a negative rate."""
+def _look(on: Discretisation, u: list) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Q at every node, the nodes at which correlated noise leaves a negative rate, and the upwinded rates per axis."""
     short = correlated_noise.lacking(on, on.diffusion(u))
     lacking = jnp.broadcast_to(jnp.zeros((), bool) if short is None else short, on.grid.shape)
-    return jump_rates(on, u).total(), lacking
+    return jump_rates(on, u).total(), lacking, transport.largest_rates(on, u)

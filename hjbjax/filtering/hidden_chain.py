@@ -119,18 +119,23 @@ class WonhamFilter:
         return law / jnp.sum(law)
 
     @front_door
-    def update(self, state: Array, u: Control, dy: Array, dt: Number) -> jax.Array:
-        """π after holding the control u, shape (m,), for a time dt and seeing the increment dy, shape (p,)."""
+    def update(self, state: Array, u: Control, dy: Array | None, dt: Number) -> jax.Array:
+        """π after holding the control u (m,) for a time dt and seeing the increment dy (p,), or nothing (None)."""
         check_vector(state, "WonhamFilter.update: the belief", len(self.prior), "one entry a state")
         check_vector(u, "WonhamFilter.update: u", np.size(u), "what was held over the step, one entry an input")
-        outputs = jax.eval_shape(self.sensor.values, jnp.asarray(u)).shape[1]
-        check_vector(dy, "WonhamFilter.update: dy", outputs, "the increment over the step, one entry a measurement")
         check_length(dt, "WonhamFilter.update: dt", "the length of the step")
-        return _updated(as_jax(self), jnp.asarray(state), jnp.asarray(u), jnp.asarray(dy), dt)
+        if dy is not None:
+            outputs = jax.eval_shape(self.sensor.values, jnp.asarray(u)).shape[1]
+            check_vector(dy, "WonhamFilter.update: dy", outputs, "the increment over the step, one entry a measurement")
+            dy = jnp.asarray(dy)
+        return _updated(as_jax(self), jnp.asarray(state), jnp.asarray(u), dy, dt)
 
-    def _after(self, belief: jax.Array, u: jax.Array, dy: jax.Array, dt: Number) -> jax.Array:
+    def _after(self, belief: jax.Array, u: jax.Array, dy: jax.Array | None, dt: Number) -> jax.Array:
         """π after a step."""
         mine, u = cast(self, belief.dtype), jnp.asarray(u, belief.dtype)
+        if dy is None:
+            belief = belief @ transition_matrix(jnp.asarray(mine.generator(u), belief.dtype), dt)
+            return belief / jnp.sum(belief)
         # half a step of jumps on either side of the evidence: Strang's splitting, of second order
         half = transition_matrix(jnp.asarray(mine.generator(u), belief.dtype), dt / 2)
         gains = mine.sensor(u)

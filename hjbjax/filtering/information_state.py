@@ -62,10 +62,10 @@ def zakai(
 
     for dx = f(x, u) dt + σ dw and dy = h(x) dt + r dv, R = r rᵀ. Positive, and of mass one up to rounding, whatever dt
     and the record. Mean and covariance of a linear system are of second order in dt, ``log_likelihood`` of a record
-    with noise of first; in the spacing all are of second order where the noise of an axis makes central differences
-    monotone, a_ii ≥ h|f_i|, and of first elsewhere. All k densities are kept; a ``GridFilter`` keeps the last. In
-    float64; under a tracer in the type of the record, with forward derivatives (``jacfwd``); outside ``jit`` and
-    ``vmap`` with reverse ones, too (``grad``).
+    with noise of first. In the spacing all are of second order where the law is smooth, by central differences if the
+    noise of an axis makes them monotone, a_ii ≥ h|f_i|, and by a limited flux elsewhere. All k densities are kept; a
+    ``GridFilter`` keeps the last. In float64; under a tracer in the type of the record, with forward derivatives
+    (``jacfwd``); outside ``jit`` and ``vmap`` with reverse ones, too (``grad``).
 
     Along a periodic axis the mean is the circular one, the angle of the mean of e^{iθ}, brought into the box, and the
     covariance that of the differences from it the short way round.
@@ -91,7 +91,9 @@ def zakai(
         refuses; a law that is not finite, as where dt asks for more sub-steps than there are.
       TypeError: as ``GridFilter``.
 
-    Warns where the mode lies at an end of the box.
+    Warns where the mode lies at an end of the box, where the law is narrower than a cell, and where dt is longer than
+    r/(σ|h'|), the time in which the noise of the state undoes what a measurement shows. The warning names the spacing
+    or the dt that is enough.
 
     Example:
       >>> rest = Problem(lambda x, u: 0 * x)  # a constant that is measured, of prior variance 1
@@ -123,6 +125,8 @@ def zakai(
             "measurement leaves no state a chance; give a shorter dt, a coarser grid, or more measurement_noise"
         )
     warn_at_ends(name, grid, found.mode, float(dt), "the mode of the law")
+    densities = found.density if record.ndim == 2 else found.density[0]  # records of a batch share noise and dt
+    observer.warn_if_coarse(name, densities, float(dt))
     return found
 
 
@@ -130,7 +134,7 @@ def zakai(
 def _substeps(observer: GridFilter, record: Array, acts: Array, dt: Number) -> jax.Array:
     """The largest number of sub-steps that a step of a record wants."""
     on, rows = observer._on(record.dtype), jnp.reshape(acts, (record.size // record.shape[-1], acts.shape[-1]))
-    return jnp.max(jax.lax.map(lambda u: substeps(on, u, dt), rows))
+    return jnp.max(jax.lax.map(lambda u: substeps(on, u, dt, observer.axes), rows))
 
 
 def _law(

@@ -81,6 +81,19 @@ class MaxPlusMarch:
         gain = jnp.where(noisy, jnp.maximum(from_below, from_above), from_below + from_above)
         return gain, jnp.maximum(rising / link.down, -falling / link.up)
 
+    def growth(self) -> Scalar:
+        """The rate at which the source makes Σ_i |v_i|/h_i grow, per unit time squared."""
+        source, grid = jnp.asarray(self.source), self.on.grid
+        if source.ndim == 0:
+            return jnp.zeros((), self.on.dtype)
+        source, total = jnp.broadcast_to(source, grid.shape), jnp.zeros((), self.on.dtype)
+        for axis in range(grid.ndim):
+            link = stencil.links(grid, axis)
+            up, down = stencil.one_sided(source, grid, axis, link)
+            slope = jnp.maximum(jnp.abs(up) / link.up, jnp.abs(down) / link.down)
+            total = total + jnp.max(jnp.asarray(self.spread[axis]) * slope)
+        return total
+
     def after(self, p: Field, dt: Number, most: int | None = None) -> tuple[Field, jax.Array]:
         """p a time dt later, by as many steps as the velocities want, and their number.
 
@@ -88,12 +101,14 @@ class MaxPlusMarch:
         many steps, of no length once the time is used up: it has then a derivative in reverse mode, too.
         """
         tableau = TABLEAUX[self.on.scheme.stages]
+        # a measurement with little noise bends p so much within a step that its velocities at the start say nothing
+        least = jnp.sqrt(jax.lax.stop_gradient(self.growth()))  # the root of zero has no derivative
         means = jnp.asarray(tableau.means, p.dtype)
 
         def step(carry):
             p, left, count = carry
             first, speed = self.rate(p)
-            whole = jnp.ceil(left * speed / FRACTION)
+            whole = jnp.ceil(left * jnp.maximum(speed / FRACTION, least))
             dt = left / jnp.maximum(whole, 1)  # equal steps, were the velocities to stay as they are
             moved = p + dt * first  # the first mean is zero in every tableau
 

@@ -3,7 +3,13 @@
     dx = f(x, u) dt + σ dw,    dy = h(x) dt + r dv
 
 An observer holds an information state, any pytree of arrays. It sees the control that was held over a step and the
-increment dy of the record, and nothing else. Steps on which the drift is affine are made exactly, whatever their
+increment dy of the record, and nothing else. Steps may differ in length. ``update`` with ``dy=None`` predicts, and
+``correct`` takes a sample y = h(x) + s v at one time, so a sensor that is sampled at irregular times t_k is
+
+    state = observer.update(state, u, None, t_k − t_{k−1})
+    state = observer.correct(state, y_k, measurement_noise=s)
+
+Steps on which the drift is affine are made exactly, whatever their
 length: with dξ = (F ξ + g) dt + dw, W dt the covariance of dw, so are
 
     Φ = e^{F t},    s = ∫₀ᵗ e^{F σ} g dσ,    Q = ∫₀ᵗ e^{F σ} W e^{Fᵀ σ} dσ
@@ -26,7 +32,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.feedback.measurement import Measurement, check_step, check_vector, measurement, plant
+from hjbjax.feedback.measurement import Measurement, check_step, check_vector, measurement, plant, sample_of
 from hjbjax.feedback.output_loop import Observer
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, front_door, is_traced, numbers, pytree_dataclass
@@ -62,7 +68,8 @@ class ExtendedKalman:
 
     with A = ∂f/∂x and C = ∂h/∂x at the estimate. In each step f and h are linear about the estimate at its start; the
     law of the state and of dy at its end is then normal with moments that are known exactly, and P is conditioned on
-    dy by a congruence, P⁺ = [I, −K] S [I, −K]ᵀ: symmetric, without a negative eigenvalue, whatever dt. For a linear
+    dy by a congruence, P⁺ = [I, −K] S [I, −K]ᵀ: symmetric, without a negative eigenvalue, whatever dt. Sensors that
+    rounding cannot tell apart count by their mean. For a linear
     plant the result is the exact law given the increments, which is Kalman and Bucy's up to O(dt²).
 
     Noise that depends on the state counts with its value at the estimate. Angles are not wrapped: measure their sine
@@ -124,8 +131,8 @@ class ExtendedKalman:
         return Gaussian(mean, jnp.asarray(self.covariance, mean.dtype))
 
     @front_door
-    def update(self, state: Gaussian, u: Control, dy: Array, dt: Number) -> Gaussian:
-        """The law after holding the control u (m,) for dt and seeing the increment dy (p,)."""
+    def update(self, state: Gaussian, u: Control, dy: Array | None, dt: Number) -> Gaussian:
+        """The law after holding the control u (m,) for dt and seeing the increment dy (p,), or nothing (None)."""
         mean, p = state.mean, self.measurement.dim
         check_vector(mean, "ExtendedKalman.update: the mean", len(self.mean), "one entry a state")
         check_step("ExtendedKalman.update", self.plant, p, (u, dy, dt))
@@ -141,14 +148,46 @@ class ExtendedKalman:
         # the slopes in y are zero: what was measured does not come back into the plant
         slopes = jnp.pad(jax.jacfwd(rates)(mean), ((0, 0), (0, p)))
         transition, shift, spread = affine_flow(slopes, rates(mean), noise, dt, states=n)
-        # the joint law of the deviation of x at the end and of dy, given dy's before
-        joint = transition[:, :n] @ state.covariance @ transition[:, :n].T + spread
-        # in units of its noise dy has a covariance of dt and more, so that the solve is sound
-        gain = jnp.linalg.solve(joint[n:, n:], joint[n:, :n]).T
+        predicted, flow = mean + shift[:n], transition[:, :n]
+        if dy is None:
+            covariance = flow[:n] @ state.covariance @ flow[:n].T + spread[:n, :n]
+            return Gaussian(predicted, (covariance + covariance.T) / 2)
         innovation = self.measurement.whitened(jnp.asarray(dy, dtype)) - shift[n:]
-        keep = jnp.concatenate([jnp.eye(n, dtype=dtype), -gain], axis=1)
-        covariance = keep @ joint @ keep.T
-        return Gaussian(mean + shift[:n] + gain @ innovation, (covariance + covariance.T) / 2)
+        # in units of its noise dy has a covariance of dt and more
+        return _conditioned(Gaussian(predicted, state.covariance), innovation, flow, spread, dt)
+
+    @front_door
+    def correct(self, state: Gaussian, y: Array, *, measurement_noise: Numbers | Sequence) -> Gaussian:
+        """The law after a sample y = h(x) + s v, shape (p,), at one time, with h linear about the mean.
+
+        Args:
+          state: the law before.
+          y: the sample, shape (p,), in the units of h.
+
+        Keyword Args:
+          measurement_noise: s, a number, (p,) or (p, p), in the units of h: standard deviations.
+
+        Raises:
+          ValueError: a sample or a noise of the wrong shape, or not finite.
+
+        Example:
+          >>> filter = ExtendedKalman(Problem(lambda x, u: -x, noise=1.0), lambda x: x, [0.0], [1.0])
+          >>> state = filter.correct(filter.initial(), np.ones(1), measurement_noise=1.0)
+          >>> round(float(state.mean[0]), 5), round(float(state.covariance[0, 0]), 5)
+          (0.5, 0.5)
+        """
+        name, mean = "ExtendedKalman.correct", state.mean
+        check_vector(mean, f"{name}: the mean", len(self.mean), "one entry a state")
+        sampled = sample_of(self.measurement, y, measurement_noise, name)
+        n, p, dtype = mean.shape[0], sampled.dim, mean.dtype
+
+        def seen(x: State) -> jax.Array:
+            return sampled.whitened(sampled.at(x))
+
+        flow = jnp.concatenate([jnp.eye(n, dtype=dtype), jax.jacfwd(seen)(mean)])
+        spread = jnp.zeros((n + p, n + p), dtype).at[n:, n:].set(jnp.eye(p, dtype=dtype))
+        innovation = sampled.whitened(jnp.asarray(y, dtype)) - seen(mean)
+        return _conditioned(state, innovation, flow, spread, jnp.ones((), dtype))
 
     @front_door
     def estimate(self, state: Gaussian) -> State:
@@ -210,15 +249,18 @@ class Luenberger:
         return jnp.asarray(self.start, jnp.result_type(float))
 
     @front_door
-    def update(self, state: State, u: Control, dy: Array, dt: Number) -> State:
-        """x̂ after holding the control u (m,) for dt and seeing the increment dy (p,)."""
+    def update(self, state: State, u: Control, dy: Array | None, dt: Number) -> State:
+        """x̂ after holding the control u (m,) for dt and seeing the increment dy (p,), or nothing (None)."""
         check_vector(state, "Luenberger.update: the estimate", len(self.start), "one entry a state")
         check_step("Luenberger.update", self.plant, self.measurement.dim, (u, dy, dt))
         n, dtype = state.shape[0], state.dtype
         dt = jnp.asarray(dt, dtype)
-        u, y = jnp.asarray(u, dtype), jnp.asarray(dy, dtype) / dt  # the mean of y over the step
+        u = jnp.asarray(u, dtype)
+        y = None if dy is None else jnp.asarray(dy, dtype) / dt  # the mean of y over the step
 
         def rate(x: State) -> jax.Array:
+            if y is None:
+                return jnp.asarray(self.plant.drift(x, u), dtype)
             gain = jnp.asarray(self.gain(x) if callable(self.gain) else self.gain, dtype)
             return jnp.asarray(self.plant.drift(x, u), dtype) + gain @ (y - self.measurement.at(x))
 
@@ -229,6 +271,31 @@ class Luenberger:
     def estimate(self, state: State) -> State:
         """x̂ itself."""
         return state
+
+
+def _conditioned(law: Gaussian, innovation: Array, flow: Array, spread: Array, least: Array) -> Gaussian:
+    """The law of the state given what was measured.
+
+    Args:
+      law: the predicted mean, shape (n,), and the covariance P before the step, shape (n, n).
+      innovation: the measurement less its mean, in units of its noise, shape (p,).
+      flow: the rows of the state and of the measurement, shape (n + p, n): their covariance is flow P flowᵀ + spread.
+      spread: the covariance of what is added, shape (n + p, n + p).
+      least: the variance of the measurement noise alone.
+    """
+    n = len(law.mean)
+    joint = flow @ law.covariance @ flow.T + spread
+    sizes = jnp.sqrt(jnp.maximum(jnp.diagonal(joint)[n:], least))
+    p = len(sizes)
+    correlation = joint[n:, n:] / jnp.outer(sizes, sizes)
+    if p > 1:  # of sensors that agree up to rounding the correlation has no inverse, and their difference says nothing
+        correlation = correlation + ROUNDINGS * p * jnp.finfo(joint.dtype).eps * jnp.eye(p, dtype=joint.dtype)
+    gain = jnp.linalg.solve(correlation, joint[n:, :n] / sizes[:, None]).T / sizes
+    # two congruences, neither of which cancels below zero as the one of their sum does for nearly exact sensors
+    keep = jnp.concatenate([jnp.eye(n, dtype=joint.dtype), -gain], axis=1)
+    carried = keep @ flow
+    covariance = carried @ law.covariance @ carried.T + keep @ spread @ keep.T
+    return Gaussian(law.mean + gain @ innovation, (covariance + covariance.T) / 2)
 
 
 def affine_flow(matrix: Array, source: Array, noise: Array, dt: Number, *, states: int) -> tuple[Array, Array, Array]:

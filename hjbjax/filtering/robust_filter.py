@@ -30,7 +30,7 @@ import numpy as np
 
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.schemes import Weno5
-from hjbjax.feedback.measurement import Measurement, check_step, controls_of, measurement, record_of
+from hjbjax.feedback.measurement import Measurement, check_step, controls_of, measurement, record_of, sample_of
 from hjbjax.filtering import robust_arguments
 from hjbjax.filtering.grid_filter import signal, warn_at_ends
 from hjbjax.filtering.max_plus import MOST, MaxPlusMarch, refined_maximum
@@ -142,13 +142,14 @@ class RobustGridFilter:
         return jnp.asarray(self.p0, jnp.result_type(float))
 
     @front_door
-    def update(self, state: Field, u: Control, dy: Array, dt: Number) -> Field:
-        """p after holding the control u, shape (m,), for a time dt, over which y = dy/dt was seen, dy (p,)."""
+    def update(self, state: Field, u: Control, dy: Array | None, dt: Number) -> Field:
+        """p after holding the control u (m,) for a time dt, in which y = dy/dt was seen, dy (p,), or nothing (None)."""
         self._check_state(state)
         check_step("RobustGridFilter.update", self.problem, self.measurement.dim, (u, dy, dt))
         dtype = state.dtype
         # compiled even where the caller does not: a loop whose body is new would be compiled at every call
-        return _after(as_jax(self), state, jnp.asarray(u, dtype), jnp.asarray(dy, dtype) / dt, dt)[0]
+        y = None if dy is None else jnp.asarray(dy, dtype) / dt
+        return _after(as_jax(self), state, jnp.asarray(u, dtype), y, dt)[0]
 
     @front_door
     def estimate(self, state: Field) -> State:
@@ -163,15 +164,42 @@ class RobustGridFilter:
                 f"RobustGridFilter: the state has shape {np.shape(state)}, wanted {self.grid.shape}: one number a node"
             )
 
-    def _after(self, p: Field, u: Control, y: Array, dt: Number, most: int | None = None) -> tuple[Field, jax.Array]:
+    @front_door
+    def correct(self, state: Field, y: Array, *, measurement_noise: Numbers | Sequence) -> Field:
+        """p after a sample y = h(x) + s v, shape (p,), at one time: its error costs ½γ²|v|².
+
+        Args:
+          state: p before.
+          y: the sample, shape (p,), in the units of h.
+
+        Keyword Args:
+          measurement_noise: s, a number, (p,) or (p, p): a sample that is off by s costs ½γ².
+
+        Raises:
+          ValueError: a sample or a noise of the wrong shape, or not finite.
+        """
+        self._check_state(state)
+        sampled = sample_of(self.measurement, y, measurement_noise, "RobustGridFilter.correct")
+        mine = cast(self, state.dtype)
+        return state - mine.gamma**2 / 2 * mine._misfit(sampled, jnp.asarray(y, state.dtype))
+
+    def _misfit(self, measured: Measurement, y: Array) -> Field:
+        """|r⁻¹(y − h)|² at the nodes, shape (*grid)."""
+        dtype = y.dtype
+        on = Discretisation(self.problem, self.grid, self.scheme, dtype)
+        seen = components.components(measured.h, on.coordinates(), dtype=dtype)
+        errors = [y[k] - at_node for k, at_node in enumerate(seen)]
+        whitening = measured.whitened(jnp.eye(len(errors), dtype=dtype))  # r⁻¹
+        return sum(sum(row[k] * error for k, error in enumerate(errors)) ** 2 for row in whitening)
+
+    def _after(
+        self, p: Field, u: Control, y: Array | None, dt: Number, most: int | None = None
+    ) -> tuple[Field, jax.Array]:
         """p a time dt later, with control and measurement held, and the number of inner steps."""
         mine = cast(self, p.dtype)
         on = Discretisation(mine.problem, mine.grid, self.scheme, p.dtype)
         entries = [u[k] for k in range(u.shape[0])]
-        seen = components.components(mine.measurement.h, on.coordinates(), dtype=p.dtype)
-        errors = [y[k] - at_node for k, at_node in enumerate(seen)]
-        whitening = mine.measurement.whitened(jnp.eye(len(errors), dtype=p.dtype))  # r⁻¹
-        misfit = sum(sum(row[k] * error for k, error in enumerate(errors)) ** 2 for row in whitening)
+        misfit = 0.0 if y is None else mine._misfit(mine.measurement, y)
         # slopes alone are asked of the scheme: noise would make some of them central, wrong without second derivatives
         bare = dataclasses.replace(on, problem=Problem(mine.problem.drift))
         return MaxPlusMarch(

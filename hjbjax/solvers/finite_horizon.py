@@ -195,8 +195,7 @@ def march_part(
     scheme: Scheme | None,
     time_limit: float | None,
 ) -> Solution:
-    """``march(..., throw=False)`` as one part of a longer march by the caller, who has no use for its box error.
-    """
+    """``march(..., throw=False)`` as one part of a longer march by the caller, who has no use for its box error."""
     scheme, method = Limited(split=True) if scheme is None else scheme, Explicit()
     _check(problem, grid, scheme, method, None, time_limit)
     horizon, kept = _times(horizon, None)

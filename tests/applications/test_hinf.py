@@ -1,5 +1,6 @@
 """The H-infinity level against the Hamiltonian matrix, what saturates, and energies along paths."""
 
+import collections
 import dataclasses
 import functools
 
@@ -170,6 +171,61 @@ def test_the_level_of_any_stable_scalar_plant(a, e, c):
 
     level = hjb.hinf_level(game, cube(1, 41), 0.8 * wanted, 1.2 * wanted)
     assert level.gamma == pytest.approx(wanted, rel=0.02)
+
+
+# --- a nonlinear plant, whose gain grows towards the ends of the box ---
+
+
+def hardening(gamma):
+    """ẋ = −x + x³ + u + d with z = (x, u)."""
+    plant = hjb.Problem(lambda x, u: -x + x**3 + u, lambda x, u: 0.5 * (x @ x + u @ u), Box([-6.0], [6.0]))
+    return hjb.attenuation(plant, gamma, Box([-6.0], [6.0]))
+
+
+def level_up_to(b):
+    """The level on |x| ≤ b: the discriminant (x − x³)² − (1/γ² − 1) x² is negative first where |x| is largest."""
+    return 1 / np.sqrt(1 + (1 - b**2) ** 2)
+
+
+@pytest.mark.filterwarnings("ignore:the box decides V")
+def test_a_plateau_near_the_rest_point_is_not_settled():
+    """At γ = 0.87 V(0.08) stays at 0.0018 up to T = 8 and is 12.4 at T = 128."""
+    grid = hjb.Grid([-0.8], [0.8], (41,))
+    with pytest.raises(ValueError, match=r"hi = 0.87 is not feasible: V still grew by 0\.\d+ of itself"):
+        hjb.hinf_level(hardening, grid, 0.6, 0.87)
+
+
+def test_a_plateau_that_ends_late_is_found_by_the_march_to_the_horizon(monkeypatch):
+    """A march that grows again after it had settled: the γ above is reported, and marched to the horizon itself."""
+    marched = collections.defaultdict(float)
+
+    def march(problem, grid, span, *, start, **options):
+        gamma = float(problem.cost.args[1])
+        marched[gamma] += span
+        grows = gamma < 0.65 or (gamma < 0.8 and marched[gamma] > 16)
+        actions = np.zeros((1, *grid.shape, 1))
+        value = (start + 1 if grows else np.ones(grid.shape))[None]
+        return hjb.Solution(grid, value, actions, actions, times=np.zeros(1), code=int(hjb.Status.CONVERGED))
+
+    monkeypatch.setattr(hinf, "march", march)
+    monkeypatch.setattr(hinf, "comes_back", lambda *given: True)
+    level = hjb.hinf_level(LAG.game(), cube(1, 21), 0.6, 1.0, horizon=32.0)
+    assert 0.8 <= level.gamma <= 0.81
+    reported = next(trial for trial in level.trials if trial.gamma == level.gamma)
+    assert reported.time == 32.0
+    assert all(trial.reason == "growing" for trial in level.trials if trial.gamma < 0.8)
+    assert marched[1.0] < 32.0  # only what is reported goes on to the horizon
+
+
+@pytest.mark.slow
+@pytest.mark.optimised
+@pytest.mark.filterwarnings("ignore:the box decides V")
+@pytest.mark.parametrize(("count", "least", "most"), [(41, 0.87, 0.97), (161, 0.92, 0.97)])
+def test_the_level_of_a_nonlinear_plant_is_that_of_the_box(count, least, most):
+    level = hjb.hinf_level(hardening, hjb.Grid([-0.8], [0.8], (count,)), 0.8, 1.2)
+    assert level_up_to(0.8) == pytest.approx(0.9409, abs=1e-4)
+    assert least <= level.gamma <= most
+    assert level.stabilises is True
 
 
 UNSEEN = Linear([[0.5, 0.0], [0.0, -1.0]], [[1.0], [1.0]], [[0.0], [1.0]], [[0.0, 1.0]], bound=12.0)

@@ -71,7 +71,7 @@ def numbers(seed):
 
 
 def missed(problem, solution, x0, duration):
-    """How far a path from x0 misses V, over the range of V, or of the distance of a tube: V may be its least everywhere."""
+    """How far a path from x0 misses V, over the range of V, or of a tube's distance: V may be its least everywhere."""
     path = hjb.simulate(problem, solution, [x0], duration, steps=400)
     extent = np.ptp(solution.value if solution.times is None else solution.value[0])
     if problem.cost is None and problem.stopping_cost is not None:

@@ -207,7 +207,7 @@ def test_a_plateau_that_ends_late_is_found_by_the_march_to_the_horizon(monkeypat
         value = (start + 1 if grows else np.ones(grid.shape))[None]
         return hjb.Solution(grid, value, actions, actions, times=np.zeros(1), code=int(hjb.Status.CONVERGED))
 
-    monkeypatch.setattr(hinf, "march", march)
+    monkeypatch.setattr(hinf, "march_part", march)
     monkeypatch.setattr(hinf, "comes_back", lambda *given: True)
     level = hjb.hinf_level(LAG.game(), cube(1, 21), 0.6, 1.0, horizon=32.0)
     assert 0.8 <= level.gamma <= 0.81
@@ -338,7 +338,7 @@ def test_the_marches_of_one_gamma_share_its_time(monkeypatch):
         now[0] += 3.0
         return hjb.march(*arguments, **options)
 
-    monkeypatch.setattr(hinf, "march", slow)
+    monkeypatch.setattr(hinf, "march_part", slow)
     monkeypatch.setattr(hinf, "perf_counter", lambda: now[0])
     with pytest.raises(ValueError, match=r"hi = 0.6 is not feasible"):
         hjb.hinf_level(LAG.game(), cube(1, 21), 0.5, 0.6, horizon=8.0, time_limit=10.0)

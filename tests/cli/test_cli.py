@@ -776,7 +776,7 @@ def test_a_checkpoint_is_gone_on_from(folder):
     np.testing.assert_array_equal(load("c/solution.npz").value, load("d/solution.npz").value)
     other = run("solve", "stochastic-lq", "--shape", "43", "--checkpoint", "run", "--resume", "--out", "e")
     assert refused(other, 5, "it was made for another grid")
-    assert refused(run("solve", "stochastic-lq", "--resume", "--out", "f"), 2, "give checkpoint=, the file")
+    assert refused(run("solve", "stochastic-lq", "--resume", "--out", "f"), 2, "add --checkpoint FILE")
     assert not (folder / "e").exists()
 
 

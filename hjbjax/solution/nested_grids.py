@@ -44,22 +44,28 @@ def telling(grid: Grid, held: np.ndarray, *, nested: bool = False) -> Grid | Non
       held: the fixed nodes, bool (*grid).
       nested: all coarse nodes are to be nodes of ``grid``.
     """
-    found: dict[int, int] = {}
-    for axis, count in enumerate(grid.shape):
-        if count == 2 and not grid.periodic[axis]:  # type: ignore[index]
-            continue
-        tried = _fewer(grid.intervals(axis), nested)
-        kept = next((few for few in tried if _keeps(held, grid, _resized(grid, {axis: few}))), None)
-        if kept is None:
+    many = [axis for axis, count in enumerate(grid.shape) if count > 2 or grid.periodic[axis]]  # type: ignore[index]
+    choices = {axis: _fewer(grid.intervals(axis), nested) for axis in many}
+    if not choices or not all(choices.values()):
+        return None
+    coarse = _resized(grid, {axis: tried[0] for axis, tried in choices.items()})
+    if not _keeps(held, grid, coarse):
+        # axis by axis, since there are many pairs and triples
+        kept = {axis: [few for few in tried if _keeps(held, grid, _resized(grid, {axis: few}))][:1]
+                for axis, tried in choices.items()}  # fmt: skip
+        if not all(kept.values()):
             return None
-        found[axis] = kept
-    coarse = _resized(grid, found)
-    return with_faces_of(grid, coarse) if found and _keeps(held, grid, coarse) else None
+        coarse = _resized(grid, {axis: few for axis, (few,) in kept.items()})
+        if not _keeps(held, grid, coarse):
+            return None
+    return with_faces_of(grid, coarse)
 
 
 def _fewer(intervals: int, nested: bool) -> list[int]:
     """The numbers of intervals to try, best first: half, other divisors, and numbers not far from half."""
     half = (intervals + 1) // 2
+    if half < FEWEST_TELLING:
+        return []
     least = max(math.ceil(intervals / FARTHEST), FEWEST_TELLING)
     divisors = [few for few in range(half, least - 1, -1) if intervals % few == 0]
     if nested:
@@ -72,13 +78,16 @@ def _fewer(intervals: int, nested: bool) -> list[int]:
 def _resized(grid: Grid, intervals: dict[int, int]) -> Grid:
     """The grid with other numbers of intervals on some axes."""
     shape = [
-        count - grid.intervals(axis) + intervals.get(axis, grid.intervals(axis)) for axis, count in enumerate(grid.shape)
+        count - grid.intervals(axis) + intervals.get(axis, grid.intervals(axis))
+        for axis, count in enumerate(grid.shape)
     ]
     return dataclasses.replace(grid, shape=tuple(shape))
 
 
 def _keeps(held: np.ndarray, fine: Grid, coarse: Grid) -> bool:
     """True if every held node lies in a coarse cell with a held corner."""
+    if not np.any(held):
+        return True
     known = prolong(held.astype(float), fine, coarse) > 1 - ROUNDING
     return bool(np.all(prolong(known.astype(float), coarse, fine)[held] > ROUNDING))
 

@@ -65,10 +65,12 @@ def test_a_layer_that_is_thinner_than_a_cell():
 
 
 def test_an_axis_of_two_nodes_is_a_chain_of_two_states():
-    solution, error, estimate = solved(known.income(41, 0.3, True), tol=1e-9)
+    _, error, estimate = solved(known.income(41, 0.3, True), tol=1e-9)
     assert error < 1e-7
     assert estimate < 1e-6
-    np.testing.assert_allclose(hjb.solve(known.income(41, 0.3, False).problem, solution.grid).value[20, 1], -7.6, atol=3)
+    np.testing.assert_allclose(
+        hjb.solve(known.income(41, 0.3, False).problem, solution.grid).value[20, 1], -7.6, atol=3
+    )
 
 
 def test_the_estimate_is_finite_where_v_is_not():

@@ -77,10 +77,9 @@ def _fewer(intervals: int, nested: bool) -> list[int]:
 
 def _resized(grid: Grid, intervals: dict[int, int]) -> Grid:
     """The grid with other numbers of intervals on some axes."""
-    shape = [
-        count - grid.intervals(axis) + intervals.get(axis, grid.intervals(axis))
-        for axis, count in enumerate(grid.shape)
-    ]
+    shape = list(grid.shape)
+    for axis, few in intervals.items():
+        shape[axis] += few - grid.intervals(axis)
     return dataclasses.replace(grid, shape=tuple(shape))
 
 

@@ -101,6 +101,17 @@ def summary(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return found
 
 
+def quoted(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """The lines of the summary as a table of the documentation."""
+    found = ["| problems | rows | count | too small | smallest ratio | median | largest |"]
+    found.append("| --- | --- | --- | --- | --- | --- | --- |")
+    for row in summary(rows):
+        ratios = [f"{row[key]:.2g}" if key in row else "" for key in ("least", "median", "most")]
+        cells = [row["kind"], *(str(row[key]) for key in ("rows", "count", "too small")), *ratios]
+        found.append(f"| {' | '.join(cells)} |")
+    return found
+
+
 def verdict(rows: Sequence[dict[str, Any]]) -> str:
     """The share of estimates that are too small, and how many of these came without a warning."""
     counted = [row for row in rows if row.get("counts")]

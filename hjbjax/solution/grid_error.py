@@ -68,7 +68,8 @@ def estimate(answers: TwoGrids) -> np.ndarray:
     finite = np.isfinite(value)
     free = finite & ~answers.held
     fine = _along_axes(np.where(free, value, np.nan), grid, coarse)
-    rough = _around(np.where(nearest(free, grid, coarse), answers.before, np.nan), coarse)
+    known = nearest(free, grid, coarse) & np.isfinite(answers.before)
+    rough = _around(np.where(known, answers.before, np.nan), coarse)
     order = np.minimum(_order_of_bends(fine, rough, ratio), answers.highest)
     if answers.chain is not None:
         gain = nested_grids.apart(nearest(value, grid, coarse), nearest(answers.chain, grid, coarse))

@@ -36,8 +36,8 @@ def coarser(grid: Grid, fewest: int = FEWEST) -> Grid | None:
 def telling(grid: Grid, held: np.ndarray, *, nested: bool = False) -> Grid | None:
     """The coarser grid whose answer tells the error of ``grid``; None where an axis has too few intervals.
 
-    About half of the intervals per axis. Every held node lies in a coarse cell with a held corner: a grid that loses a
-    target of one node answers another problem. An axis of two nodes is a chain of two states and stays.
+    About half of the intervals per axis. Every held node, or a held neighbour of it, lies in a coarse cell with a held
+    corner: a grid that loses a target of one node answers another problem. An axis of two nodes is a chain of two states and stays.
 
     Args:
       grid: the grid.
@@ -84,11 +84,18 @@ def _resized(grid: Grid, intervals: dict[int, int]) -> Grid:
 
 
 def _keeps(held: np.ndarray, fine: Grid, coarse: Grid) -> bool:
-    """True if every held node lies in a coarse cell with a held corner."""
+    """True if every held node, or a held neighbour of it, lies in a coarse cell with a held corner."""
     if not np.any(held):
         return True
     known = prolong(held.astype(float), fine, coarse) > 1 - ROUNDING
-    return bool(np.all(prolong(known.astype(float), coarse, fine)[held] > ROUNDING))
+    kept = held & (prolong(known.astype(float), coarse, fine) > ROUNDING)
+    for axis in range(fine.ndim):  # the tip of a disc is kept with the disc
+        along = np.moveaxis(kept, axis, 0)
+        wide = along.copy()
+        wide[1:] |= along[:-1]
+        wide[:-1] |= along[1:]
+        kept = np.moveaxis(wide, 0, axis)
+    return bool(np.all(kept[held]))
 
 
 def ratio_of(fine: Grid, coarse: Grid) -> float:

@@ -72,3 +72,10 @@ def test_a_second_target_is_not_lost_either():
     assert coarse is None or np.min(np.abs(np.asarray(coarse.axis(0)) - 13 / 40)) < 1e-9
     held[13:20] = True  # a wide one is on any grid
     assert nested_grids.telling(grid, held).shape == (21,)
+
+
+def test_the_tip_of_a_disc_is_kept_with_the_disc():
+    grid = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (41, 41))
+    x = np.asarray(grid.nodes()).reshape(41, 41, 2)
+    disc = np.hypot(x[..., 0] - 0.4, x[..., 1] + 0.55) < 0.2 + 1e-9  # its tips lie between coarse nodes
+    assert nested_grids.telling(grid, disc).shape == (21, 21)

@@ -37,8 +37,8 @@ def telling(grid: Grid, held: np.ndarray, *, nested: bool = False) -> Grid | Non
     """The coarser grid whose answer tells the error of ``grid``; None where an axis has too few intervals.
 
     About half of the intervals per axis. Every held node, or a held neighbour of it, lies in a coarse cell with a held
-    corner: a grid that loses a target of one node answers another problem. An axis of two nodes is a chain of two states
-    and stays.
+    corner: a grid that loses a target of one node answers another problem. An axis of two nodes is a chain of two
+    states and stays.
 
     Args:
       grid: the grid.

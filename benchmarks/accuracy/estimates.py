@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+import jax
 import numpy as np
 
 import hjbjax as hjb
@@ -132,6 +133,7 @@ def command(quick: bool, out: Path) -> None:
     """The estimated error beside the true one, over problems with known answers."""
     rows = []
     for row in measured(quick):
+        jax.clear_caches()  # the programs of so many problems are more than a process may map
         rows.append({"benchmark": "estimates", "dtype": "float64", "tol": TOL, **row})
         click.echo(table(rows[-1:], COLUMNS).splitlines()[-1])
     click.echo(table(rows, COLUMNS))

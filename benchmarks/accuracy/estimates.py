@@ -1,64 +1,142 @@
-"""How far ``solution.grid_error`` is from the error: default solves of the zoo's problems with known answers.
+"""The estimated error beside the true one: default answers to problems with known values.
 
-On three grids each, the largest estimate over the largest true error, and the means likewise, over the nodes where
-errors count. A case counts where its error is above the tolerance; of the ratios nine in ten are to lie between 1/3
-and 5 and none under 1/10. Writes ``estimates.json``.
+The zoo's problems on three grids each, and those of ``known_answers``. The estimate is the largest ``grid_error``, plus
+the largest ``box_error``, plus what the iteration left. A row counts where the true error is above a thousandth of the
+range of V and an estimate was made. Of the rows that count at most one in twenty may have an estimate below a third of
+the error, and none of these without a warning. Writes ``estimates.json``.
 """
 
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
+import jax
 import numpy as np
 
 import hjbjax as hjb
-from benchmarks.accuracy.accuracy import CASES, Case
+from benchmarks.accuracy.accuracy import CASES
+from benchmarks.accuracy.known_answers import Known, problems
 from benchmarks.harness.report import RESULTS, Folder, attempt, publish, table
 from hjbjax.applications.reference import at_nodes_of, mask_of
 
-COLUMNS = ("problem", "shape", "scheme", "error", "estimate", "ratio", "mean_ratio", "status")
-LEAST, MOST = 1 / 3, 5.0
+COLUMNS = ("kind", "problem", "shape", "error", "range", "estimate", "ratio", "warned", "verdict", "status")
+LEAST, MOST = 1 / 3, 5.0  # ratios outside are "too small" and "too large"
+SMALL = 1e-3  # of the range of V: smaller errors do not count
 TOL = 1e-6
+MISSING = "not estimated"  # so begins the reason that there is no estimate
 
 
-def estimated(case: Case, nodes: Sequence[int]) -> list[dict[str, Any]]:
-    """One row a grid."""
-    problem, grids, exact = case.build(nodes)
-    rows = []
-    for grid in grids:
-        solution, mask = hjb.solve(problem, grid, tol=TOL, throw=False), mask_of(case.region, grid)
-        true = np.abs(np.asarray(solution.value) - at_nodes_of(exact, grid, mask))[mask]
-        found = np.full(1, np.nan) if solution.grid_error is None else solution.grid_error[mask]
-        row = {"shape": list(grid.shape), "nodes": grid.size, "scheme": solution.stats["scheme"], "tol": TOL}
-        row |= {"error": float(true.max()), "estimate": float(np.max(found)), "status": solution.status.name}
-        row |= {"ratio": row["estimate"] / row["error"], "mean_ratio": float(np.mean(found) / true.mean())}
-        rows.append(row | {"counts": row["error"] > TOL})
-    return rows
+def row_of(solution: hjb.Solution, exact: np.ndarray, mask: np.ndarray, warned: bool, walls: bool) -> dict[str, Any]:
+    """What the table says of one answer; ``exact`` and ``mask`` are (*grid)."""
+    value = np.asarray(solution.value) if solution.times is None else np.asarray(solution.value)[0]
+    true, known = np.abs(value - exact)[mask], exact[mask]
+    parts = [0.0 if solution.error is None else min(solution.error, TOL)]
+    silent = solution.status is not hjb.Status.CONVERGED
+    for name in ("grid_error",) if walls else ("grid_error", "box_error"):
+        found = getattr(solution, name)
+        if found is not None:
+            parts.append(float(np.max((found if solution.times is None else found[0])[mask])))
+        elif name == "grid_error" or str(solution.stats.get(name, MISSING)).startswith(MISSING):
+            silent = True
+    error, extent = float(np.max(true)), float(np.ptp(known)) or float(np.max(np.abs(known)))
+    row = {"error": error, "range": extent, "warned": warned, "status": solution.status.name}
+    ratio = sum(parts) / error if error > 0 else np.inf
+    row |= {"estimate": sum(parts), "ratio": ratio, "counts": error > SMALL * extent and not silent}
+    row["verdict"] = "silent" if silent else "exact" if not row["counts"] else _verdict(ratio)
+    return row
+
+
+def _verdict(ratio: float) -> str:
+    return "too small" if ratio < LEAST else "too large" if ratio > MOST else "within"
+
+
+def of_known(case: Known) -> dict[str, Any]:
+    """The row of a problem of ``known_answers``."""
+    states = np.asarray(case.grid.nodes()).reshape(-1, case.grid.ndim)
+    exact = case.exact(states).reshape(case.grid.shape)
+    mask = np.ones(len(states), bool) if case.region is None else case.region(states)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        solution = case.solved(TOL)
+    return row_of(solution, exact, mask.reshape(case.grid.shape), bool(caught), case.walls)
+
+
+def of_zoo(problem: hjb.Problem, grid: hjb.Grid, exact: Any, region: Any) -> dict[str, Any]:
+    """The row of a problem of the zoo."""
+    mask = mask_of(region, grid)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        solution = hjb.solve(problem, grid, tol=TOL, throw=False)
+    return row_of(solution, at_nodes_of(exact, grid, mask), mask, bool(caught), False)
+
+
+def measured(quick: bool) -> Iterator[dict[str, Any]]:
+    """One row per problem and grid."""
+    for case in CASES:
+        if quick and case.entry not in ("bang-bang", "merton"):
+            continue
+        problem, grids, exact = case.build(case.nodes[1:2] if quick else case.nodes[-3:])
+        for grid in grids:
+            about = {"kind": "zoo", "problem": case.name, "shape": list(grid.shape)}
+            yield from attempt(lambda: [of_zoo(problem, grid, exact, case.region)], about)  # noqa: B023
+    for known in problems():
+        if quick and known.kind not in ("two nodes", "march"):
+            continue
+        about = {"kind": known.kind, "problem": known.name, "shape": list(known.grid.shape)}
+        yield from attempt(lambda: [of_known(known)], about)  # noqa: B023
+
+
+def summary(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """One row per kind of problem: how many count, and how far the estimates are from the errors."""
+    found = []
+    for kind in dict.fromkeys(row["kind"] for row in rows):
+        mine = [row for row in rows if row["kind"] == kind]
+        ratios = [row["ratio"] for row in mine if row.get("counts")]
+        said = {"kind": kind, "rows": len(mine), "silent": sum(row.get("verdict") == "silent" for row in mine)}
+        said |= {"count": len(ratios), "too small": sum(row.get("verdict") == "too small" for row in mine)}
+        if ratios:
+            said |= {"least": min(ratios), "median": float(np.median(ratios)), "most": max(ratios)}
+        found.append(said)
+    return found
+
+
+def quoted(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """The lines of the summary as a table of the documentation."""
+    found = ["| problems | rows | count | too small | smallest ratio | median | largest |"]
+    found.append("| --- | --- | --- | --- | --- | --- | --- |")
+    for row in summary(rows):
+        ratios = [f"{row[key]:.2g}" if key in row else "" for key in ("least", "median", "most")]
+        cells = [row["kind"], *(str(row[key]) for key in ("rows", "count", "too small")), *ratios]
+        found.append(f"| {' | '.join(cells)} |")
+    return found
 
 
 def verdict(rows: Sequence[dict[str, Any]]) -> str:
-    """The share of ratios within the bounds, and the least and the largest of all."""
-    ratios = np.array([row["ratio"] for row in rows if row.get("counts")])
-    within = np.sum((ratios >= LEAST) & (ratios <= MOST))
+    """The share of estimates that are too small, and how many of these came without a warning."""
+    counted = [row for row in rows if row.get("counts")]
+    small = [row for row in counted if row["verdict"] == "too small"]
+    quiet = sum(not row["warned"] for row in small)
+    problems_ = len({(row["kind"], row["problem"]) for row in rows})
     return (
-        f"estimate over error between {LEAST:.2g} and {MOST:g} in {within} of {len(ratios)} cases, "
-        f"between {ratios.min():.2g} and {ratios.max():.3g} in all"
+        f"{problems_} problems, {len(rows)} rows, {len(counted)} with an error above {SMALL:g} of the range and an "
+        f"estimate: {len(small)} estimates too small by more than a factor of 3, {quiet} of them without a warning; "
+        f"{sum(row['verdict'] == 'too large' for row in counted)} larger than {MOST:g} times the error"
     )
 
 
 @click.command()
-@click.option("--quick", is_flag=True, help="The second coarsest grid of every problem on a line.")
+@click.option("--quick", is_flag=True, help="A few problems, on one grid each.")
 @click.option("--out", type=Folder(), default=RESULTS, help="Folder of the files.")
 def command(quick: bool, out: Path) -> None:
-    """The estimated error of the grid beside the true one, over the zoo's problems with known answers."""
-    rows: list[dict[str, Any]] = []
-    for case in CASES:
-        if quick and case.entry not in ("bang-bang", "merton"):
-            continue
-        nodes = case.nodes[1:2] if quick else case.nodes[-3:]
-        about = {"benchmark": "estimates", "problem": case.name, "dtype": "float64"}
-        rows += attempt(lambda: estimated(case, nodes), about)  # noqa: B023
+    """The estimated error beside the true one, over problems with known answers."""
+    rows = []
+    for row in measured(quick):
+        jax.clear_caches()  # the programs of so many problems are more than a process may map
+        rows.append({"benchmark": "estimates", "dtype": "float64", "tol": TOL, **row})
+        click.echo(table(rows[-1:], COLUMNS).splitlines()[-1])
     click.echo(table(rows, COLUMNS))
+    click.echo(table(summary(rows), ("kind", "rows", "silent", "count", "too small", "least", "median", "most")))
     click.echo(verdict(rows))
     publish(out, "estimates", rows)

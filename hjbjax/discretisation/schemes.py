@@ -228,7 +228,8 @@ class Limited:
 
         D⁺ − (h/2) φ(s_i, s_{i+1}),   D⁻ + (h/2) φ(s_i, s_{i−1}),   φ(a, b) = ab (a + b)/(a² + b²) if ab > 0 else 0
 
-    (van Albada), with quadratic ghost values at ends that are not periodic, and mirrored ones where noise reflects.
+    (van Albada), with quadratic ghost values at ends that are not periodic, and mirrored ones where noise reflects. An
+    axis of two nodes has no second difference and keeps its one-sided differences: it is a chain of two states.
     The scheme is no chain: the residual of the equation with these slopes is driven to zero by corrections with the
     matrix of the monotone one, from its answer. There is no certificate; the tolerance bounds that residual and the
     last step, in cost units.
@@ -258,6 +259,9 @@ class Limited:
 
         found = []
         for axis, (pair, link) in enumerate(pairs):
+            if grid.shape[axis] == 2:  # no second difference: the axis is a chain of two states
+                found.append(pair)
+                continue
             if link.meets_up is link.meets_down is None and _is_plain(grid, axis):
                 # from V where that is all: the differences are then no arrays
                 sharp = slopes.of_second_order(around.value, grid, axis, mean, noisy)

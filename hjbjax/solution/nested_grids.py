@@ -1,16 +1,7 @@
-"""Two grids of one box: coarser ones, values carried from one to the other, and the error of a value that both tell.
-
-    |V − V_h| ≈ |V_h − V_2h|/(2^q − 1)
-
-by the leading term c h^q of the error. Limited slopes have q = 2 where V is smooth and 1 at kinks, which two grids do
-not tell apart: by an order between them the estimate is 1.4 times the error at the one and half of it at the other.
-Where optimal paths run along a curve at which the policy jumps V is Hölder continuous and no better, as beside the
-switching curve of a minimum time, and q = ½. What the slopes changed of the chain's answer tells that: elsewhere it is
-the chain's whole error, of first order, and many times the change from grid to grid. From a target that no cell holds
-all of V is off by a low power of h, be the policy what it may.
-"""
+"""Two grids of one box: coarser ones, and values carried from one to the other."""
 
 import dataclasses
+import math
 from typing import Any
 
 import jax
@@ -20,11 +11,9 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import altered
 
 FEWEST = 12  # intervals that an axis keeps
-USUAL, BROKEN = 1.65, 0.5  # orders of limited slopes
-OTHERS = 1.3  # where the coarser grid has other nodes, as at odd intervals, and one of them may meet a kink
-# of the mean change between grids over that between schemes: slopes gain nothing, and where both schemes are one
-LARGE, ALIKE = 0.5, 10.0
-JUMP = 0.9  # of the range of a control, between neighbours
+FEWEST_TELLING = 6  # on the coarser grid that tells the error of the finer one
+FARTHEST = 5  # the largest ratio of spacings of the two
+ROUNDING = 1e-9  # of a place between two nodes
 
 
 def coarser(grid: Grid, fewest: int = FEWEST) -> Grid | None:
@@ -42,6 +31,78 @@ def coarser(grid: Grid, fewest: int = FEWEST) -> Grid | None:
     if tuple(shape) == grid.shape:
         return None
     return with_faces_of(grid, dataclasses.replace(grid, shape=tuple(shape)))
+
+
+def telling(grid: Grid, held: np.ndarray, *, nested: bool = False) -> Grid | None:
+    """The coarser grid whose answer tells the error of ``grid``; None where an axis has too few intervals.
+
+    About half of the intervals per axis. Every held node, or a held neighbour of it, lies in a coarse cell with a held
+    corner: a grid that loses a target of one node answers another problem. An axis of two nodes is a chain of two
+    states and stays.
+
+    Args:
+      grid: the grid.
+      held: the fixed nodes, bool (*grid).
+      nested: all coarse nodes are to be nodes of ``grid``.
+    """
+    many = [axis for axis, count in enumerate(grid.shape) if count > 2 or grid.periodic[axis]]  # type: ignore[index]
+    choices = {axis: _fewer(grid.intervals(axis), nested) for axis in many}
+    if not choices or not all(choices.values()):
+        return None
+    coarse = _resized(grid, {axis: tried[0] for axis, tried in choices.items()})
+    if not _keeps(held, grid, coarse):
+        # axis by axis, since there are many pairs and triples
+        kept = {axis: [few for few in tried if _keeps(held, grid, _resized(grid, {axis: few}))][:1]
+                for axis, tried in choices.items()}  # fmt: skip
+        if not all(kept.values()):
+            return None
+        coarse = _resized(grid, {axis: few for axis, (few,) in kept.items()})
+        if not _keeps(held, grid, coarse):
+            return None
+    return with_faces_of(grid, coarse)
+
+
+def _fewer(intervals: int, nested: bool) -> list[int]:
+    """The numbers of intervals to try, best first: half, other divisors, and numbers not far from half."""
+    half = (intervals + 1) // 2
+    if half < FEWEST_TELLING:
+        return []
+    least = max(math.ceil(intervals / FARTHEST), FEWEST_TELLING)
+    divisors = [few for few in range(half, least - 1, -1) if intervals % few == 0]
+    if nested:
+        return divisors
+    close = [few for few in (half, *divisors) if few >= max(least, intervals / 3)]
+    near = [few for k in range(1, half // 4 + 1) for few in (half + k, half - k) if few >= least]
+    return [*close, *near, *divisors]
+
+
+def _resized(grid: Grid, intervals: dict[int, int]) -> Grid:
+    """The grid with other numbers of intervals on some axes."""
+    shape = list(grid.shape)
+    for axis, few in intervals.items():
+        shape[axis] += few - grid.intervals(axis)
+    return dataclasses.replace(grid, shape=tuple(shape))
+
+
+def _keeps(held: np.ndarray, fine: Grid, coarse: Grid) -> bool:
+    """True if every held node, or a held neighbour of it, lies in a coarse cell with a held corner."""
+    if not np.any(held):
+        return True
+    known = prolong(held.astype(float), fine, coarse) > 1 - ROUNDING
+    kept = held & (prolong(known.astype(float), coarse, fine) > ROUNDING)
+    for axis in range(fine.ndim):  # the tip of a disc is kept with the disc
+        along = np.moveaxis(kept, axis, 0)
+        wide = along.copy()
+        wide[1:] |= along[:-1]
+        wide[:-1] |= along[1:]
+        kept = np.moveaxis(wide, 0, axis)
+    return bool(np.all(kept[held]))
+
+
+def ratio_of(fine: Grid, coarse: Grid) -> float:
+    """The least ratio of the spacings of two grids over the axes on which they differ."""
+    ratios = [fine.intervals(axis) / coarse.intervals(axis) for axis in range(fine.ndim)]
+    return min((ratio for ratio in ratios if ratio != 1), default=1.0)
 
 
 def with_faces_of(grid: Grid, coarse: Grid) -> Grid:
@@ -105,49 +166,3 @@ def apart(value: np.ndarray, other: np.ndarray) -> np.ndarray:
     with np.errstate(invalid="ignore"):
         change = np.abs(value - other)
     return np.where(np.isfinite(change), change, 0)
-
-
-def estimated_error(grid: Grid, coarse: Grid, change: np.ndarray, order: float) -> np.ndarray:
-    """|V − V_h| at the nodes, about, shape (*grid), in cost units.
-
-    Args:
-      grid: the grid.
-      coarse: the grid with half of the intervals.
-      change: |V_h − V_2h| at the nodes of ``coarse``.
-      order: q.
-    """
-    return prolong(change / (2**order - 1), coarse, grid)
-
-
-def order_of_slopes(grid: Grid, coarse: Grid, change: np.ndarray, gain: np.ndarray, policy: np.ndarray | None) -> float:
-    """q of limited slopes, by what they changed of the chain's answer.
-
-    Args:
-      grid: the grid.
-      coarse: the grid with half of the intervals.
-      change: |V_h − V_2h| at the nodes of ``coarse``, V by limited slopes.
-      gain: |V_h − the answer of the chain| on ``grid``.
-      policy: the controls on it, shape (*grid, m), NaN where there are none; None without controls.
-    """
-    moved, gained = np.mean(change), np.mean(gain)
-    if LARGE * gained <= moved <= ALIKE * gained and moved > 0 and _jumps(policy):
-        return BROKEN
-    nested = all(grid.intervals(axis) % coarse.intervals(axis) == 0 for axis in range(grid.ndim))
-    return USUAL if nested else OTHERS
-
-
-def is_a_point(target: np.ndarray) -> bool:
-    """True if a target, bool (*grid), holds no more nodes than a cell has; on a line that is no small target."""
-    return target.ndim > 1 and 0 < np.sum(target) <= 2**target.ndim
-
-
-def _jumps(policy: np.ndarray | None) -> bool:
-    """True if a control jumps from end to end of its range across a surface: at half as many nodes as a layer has."""
-    if policy is None:
-        return False
-    *shape, _ = policy.shape
-    known = policy[np.all(np.isfinite(policy), axis=-1)]
-    span = np.ptp(known, axis=0) if len(known) else np.zeros(policy.shape[-1])
-    steps = (np.abs(np.diff(policy, axis=axis)) > JUMP * span for axis in range(len(shape)))
-    # a comparison with NaN is False, and so is one of a control that never changes
-    return bool(sum(np.sum(np.any(step, axis=-1)) for step in steps) >= 0.5 * np.prod(shape) / max(shape))

@@ -74,7 +74,7 @@ def show(solution: _Answer) -> str:
         "method": ", ".join(number(stats[name]) for name in ("method", "scheme") if name in stats),
         "steps": f"{int(solution.steps)}{last}",
         "algebraic error": _error(solution),
-        "grid error": _estimate(solution.grid_error),
+        "grid error": _estimate(solution.grid_error) or number(stats.get("grid_error", "")),
         "box error": _estimate(solution.box_error) or number(stats.get("box_error", "")),
         "reached": f"{percent(reached)} of the nodes" if reached < 1 else "",
         "cut": _cuts(solution),
@@ -140,10 +140,11 @@ def _error(solution: _Answer) -> str:
     """The certified error and its certificate, or why there is none; beside it that of the monotone answer."""
     error, tol = solution.error, solution.stats.get("tol")
     if error is None and solution.monotone_error is not None and tol is not None:
-        return (
-            f"residual at most {number(tol)} at high order; of the monotone start at most "
-            f"{number(solution.monotone_error)}"
-        )
+        said = f"residual at most {number(tol)} at high order"
+        # a bound above the range of V says nothing
+        finite = np.asarray(solution.value)[np.isfinite(np.asarray(solution.value))]
+        useful = finite.size and solution.monotone_error < np.ptp(finite)
+        return f"{said}; of the monotone start at most {number(solution.monotone_error)}" if useful else said
     what = "no certificate" if error is None else f"at most {error:.3g}"
     asked = "" if error is None or tol is None else f" (tol {number(tol)})"
     why = solution.stats.get("certificate")

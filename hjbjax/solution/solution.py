@@ -70,7 +70,8 @@ class Solution:
       reached: the nodes from which the target can be reached, bool (*grid); ``None`` means all.
       times: shape (k,) when marched; value and policy then have a leading axis.
       grid_error: an estimate of |V − V_exact| at the nodes, shape (*grid), in cost units, with V_exact the solution of
-        the equation itself and not of the discrete one; NaN where V is infinite. ``None`` where none was made.
+        the equation itself and not of the discrete one; zero where V is infinite. ``None`` where none was made;
+        ``stats["grid_error"]`` has the reason where the caller left the choice of the scheme.
       box_error: an estimate of how far V moves if another assumption is made at the ends of the box, shape (*grid), in
         cost units. ``None`` where the ends cannot matter or nothing was estimated; ``stats["box_error"]`` has the
         reason.

@@ -21,7 +21,7 @@ from hjbjax.markov_chain import resting
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import altered, known
 from hjbjax.problem.types import Mask, Nodes
-from hjbjax.solution import nested_grids
+from hjbjax.solution import grid_error, nested_grids
 from hjbjax.solution.clock import Clock, Stopped
 from hjbjax.solution.status import Status
 from hjbjax.solvers.setup import Assumptions, assumptions_of, forced_only, linear_solve, prepared
@@ -34,7 +34,10 @@ FAILED = (Status.STALLED, Status.DIVERGED, Status.NONFINITE)
 # the last of the answers is a guess, and need not be exact
 WARM_STEPS = 60  # improvements for each of them
 LITTLE = 0.1  # of the range of V: by so much the second order may change it without being questioned
-FEWEST = 6  # intervals that an axis keeps on the coarser grid that tells the error of the finer one
+TOO_FEW = f"not estimated: it takes at least {2 * nested_grids.FEWEST_TELLING - 1} intervals per axis"
+LOSES = "not estimated: no coarser grid keeps the fixed and the unreachable nodes"
+OVER = "not estimated: the limits of the solve were reached"
+UNSETTLED = "not estimated: the solve on the coarser grid ended {}"
 
 
 def start(
@@ -115,7 +118,7 @@ def levels(task: Task, method: Method, clock: Clock, *, asked_again: bool) -> li
     ``asked_again``: the next coarser grid in any case, if it can tell the error of the grid.
     """
     found: list[Task] = []
-    smaller = (_telling(task.grid) if asked_again else None) or below(task.grid, method)
+    smaller = (_telling(task) if asked_again else None) or below(task.grid, method)
     while smaller is not None and clock.over() is None:
         clock.phase = f"the preparation of {' x '.join(map(str, smaller.shape))} nodes"
         level = on_coarser(task, smaller)
@@ -289,11 +292,11 @@ def _contradiction(settled: Settled, sharp: Settled, clock: Clock) -> str | None
     if moved <= LITTLE * float(np.ptp(before)):
         return None
     found = coarser_answer(settled, clock)
-    if found is None:
+    if found.grid is None or found.value is None:
         return None
-    coarse, value = found
+    coarse, value = found.grid, found.value
     change = nested_grids.apart(nested_grids.restrict(before, settled.task.grid, coarse), value)
-    explained = float(np.max(nested_grids.estimated_error(settled.task.grid, coarse, change, nested_grids.BROKEN)))
+    explained = float(np.max(change)) / (nested_grids.ratio_of(settled.task.grid, coarse) ** grid_error.LEAST - 1)
     if moved <= explained + float(settled.task.tol):
         return None
     return (
@@ -308,27 +311,37 @@ def plainly(settled: Settled) -> Settled:
     return settled if task.first_order is None else settled._replace(task=task.of_chain)
 
 
-def coarser_answer(settled: Settled, clock: Clock) -> tuple[Grid, np.ndarray] | None:
-    """The answer of the next coarser grid, with half of the intervals, by the scheme of ``settled`` and from its value.
+class CoarserAnswer(NamedTuple):
+    """The answer on the coarser grid that tells the error of the finer one, or the reason that there is none."""
 
-    None where an axis cannot do with so few, the coarser grid loses what is held, or the iteration does not converge.
-    """
+    grid: Grid | None
+    value: np.ndarray | None = None
+    reason: str = ""
+
+
+def coarser_answer(settled: Settled, clock: Clock) -> CoarserAnswer:
+    """The answer on the next coarser grid, by the scheme of ``settled`` and from its value."""
     task, fine = running(settled), settled.task.grid
-    coarse = _telling(fine)
-    if coarse is None or clock.over() is not None or (level := on_coarser(task, coarse)) is None:
-        return None
-    value = _finite(task, settled.state)  # infinite values are imposed anew by what is lost
+    coarse = _telling(task)
+    if coarse is None:
+        few = nested_grids.telling(fine, np.zeros(fine.shape, bool)) is None
+        return CoarserAnswer(None, reason=TOO_FEW if few else LOSES)
+    if clock.over() is not None:
+        return CoarserAnswer(None, reason=OVER)
+    if (level := on_coarser(task, coarse)) is None:
+        return CoarserAnswer(None, reason=LOSES)
+    value = _finite(task, settled.state)  # infinite values are imposed again by the unreachable nodes
     state, code, _ = iterate(level, nested_grids.restrict(value, fine, coarse).astype(value.dtype), clock)
     if code is not Status.CONVERGED:
-        return None
-    return coarse, np.where(np.asarray(level.counted), np.asarray(state.value), np.inf)
+        return CoarserAnswer(None, reason=UNSETTLED.format(code.name))
+    return CoarserAnswer(coarse, np.where(np.asarray(level.counted), np.asarray(state.value), np.inf))
 
 
-def _telling(fine: Grid) -> Grid | None:
-    """The grid with half of the intervals on every axis, which tells the error of ``fine``; None where one has few."""
-    coarse = nested_grids.coarser(fine, FEWEST)
-    halved = coarse is not None and all(few < many for many, few in zip(fine.shape, coarse.shape, strict=True))
-    return coarse if halved else None
+def _telling(task: Task) -> Grid | None:
+    """The coarser grid that tells the error of the grid of a task; None where there is none."""
+    # which nodes cannot reach the target is known of nodes of the finer grid only
+    fixed = np.broadcast_to(np.asarray(task.obstacles.fixed), task.grid.shape)
+    return nested_grids.telling(task.grid, fixed, nested=task.has_lost)
 
 
 def on_coarser(task: Task, coarse: Grid) -> Task | None:

@@ -20,16 +20,15 @@ from hjbjax.markov_chain import earnings, node_checks
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import is_traced
 from hjbjax.problem.types import Field, Nodes, Scalar
-from hjbjax.solution import nested_grids
+from hjbjax.solution import grid_error
 from hjbjax.solution.clock import CUT, Clock
 from hjbjax.solution.solution import Solution, question
 from hjbjax.solution.status import Status, warn
 from hjbjax.solvers.arrival import warn_of_no_arrival
-from hjbjax.solvers.nested import Settled
+from hjbjax.solvers.nested import CoarserAnswer, Settled
 from hjbjax.solvers.setup import BOUNDING, Assumptions
 
 GAP = 0.05  # of what the actions matter; where Isaacs' condition holds, upwinding left up to .019 on 21 nodes
-FIRST, CENTRAL = 1.0, 2.0  # orders of upwinding and of central differences
 COARSE = 0.1  # of the range of V: a larger error of the grid is worth a warning
 MOST = 2 / 3  # of an end's nodes: whatever has a velocity leaves by half of those where its position ends
 
@@ -100,35 +99,46 @@ def _apart(state: State, origin: Settled) -> float:
     return float(np.max(np.abs(np.asarray(state.value) - np.asarray(origin.state.value))[counted], initial=0))
 
 
-def with_grid_error(solution: Solution, settled: Settled, coarser: tuple[Grid, np.ndarray] | None) -> Solution:
+def with_grid_error(solution: Solution, settled: Settled, coarser: CoarserAnswer) -> Solution:
     """The solution with an estimate of its distance to the exact value, and a warning where that is large.
 
-    From the answer of its scheme on a coarser grid, or, without one, from what its scheme changed of the monotone one.
+    Without an answer on a coarser grid ``stats["grid_error"]`` has the reason instead.
     """
-    value, origin = np.asarray(solution.value), settled.origin
-    if coarser is not None:
-        coarse, before = coarser
-        change = nested_grids.apart(nested_grids.restrict(value, solution.grid, coarse), before)
-        order = FIRST if settled.note else CENTRAL
-        if origin is not None:
-            gain = nested_grids.apart(value, np.asarray(origin.state.value))
-            order = nested_grids.order_of_slopes(solution.grid, coarse, change, gain, solution.policy)
-        found = nested_grids.estimated_error(solution.grid, coarse, change, order)
-        if origin is not None and nested_grids.is_a_point(np.asarray(settled.task.obstacles.ended)):
-            found = np.maximum(nested_grids.estimated_error(solution.grid, coarse, change, nested_grids.BROKEN), gain)
-    elif origin is not None and settled.task.problem.noise is None:
-        with np.errstate(invalid="ignore"):
-            found = np.abs(value - np.asarray(origin.state.value))
-    else:  # with noise both schemes may be one, and their difference says nothing
+    if coarser.grid is None or coarser.value is None:
+        solution.stats["grid_error"] = coarser.reason
         return solution
+    value, origin = np.asarray(solution.value), settled.origin
+    answers = grid_error.TwoGrids(
+        solution.grid,
+        coarser.grid,
+        value,
+        coarser.value,
+        held=np.broadcast_to(np.asarray(settled.task.obstacles.fixed), value.shape),
+        chain=None if origin is None else np.asarray(origin.state.value),
+        highest=_highest(settled),
+    )
     finite = np.isfinite(value)
-    found = np.where(finite, found, np.nan)
-    if finite.any() and (largest := np.max(found[finite])) > COARSE * np.ptp(value[finite]):
+    found = np.where(finite, grid_error.estimate(answers) + _left(solution, settled), 0)
+    if finite.any() and (largest := np.max(found)) > COARSE * np.ptp(value[finite]):
         warn(
             f"the grid is coarse for this problem: its error is about {largest:.3g}, over a tenth of the range of the "
             "value; take more nodes, or gather them where the value bends: Grid(..., stretch=)"
         )
     return dataclasses.replace(solution, grid_error=found)
+
+
+def _highest(settled: Settled) -> float:
+    """The largest order that the error may have: that of the scheme, less from a target that no cell resolves."""
+    if grid_error.is_a_point(np.asarray(settled.task.obstacles.ended)):
+        return grid_error.LEAST
+    return grid_error.FIRST if settled.note else grid_error.SECOND
+
+
+def _left(solution: Solution, settled: Settled) -> float:
+    """The distance to the discrete solution that the iteration left, cost units."""
+    error = solution.error
+    known = float(settled.state.best[0]) if error is None else float(error)
+    return min(known, float(settled.task.tol))
 
 
 def solution_at_start(on: Discretisation, value: Nodes, code: Status) -> Solution:

@@ -1,6 +1,7 @@
 """Values of one grid at the nodes of another."""
 
 import numpy as np
+import pytest
 
 import hjbjax as hjb
 from hjbjax.solution import nested_grids
@@ -41,3 +42,40 @@ def test_back_and_forth():
     np.testing.assert_allclose(
         nested_grids.prolong(nested_grids.restrict(plane, fine, coarse), coarse, fine), plane, rtol=0, atol=1e-12
     )
+
+
+@pytest.mark.parametrize(
+    ("shape", "nested", "wanted"),
+    [
+        ((41, 41), False, (21, 21)),
+        ((42, 60), False, (22, 31)),  # an odd number of intervals is rounded up
+        ((31, 121), False, (11, 61)),  # half of 30 intervals has no node at the middle
+        ((51, 51), False, (27, 27)),
+        ((51, 51), True, (11, 11)),
+        ((60, 60), True, None),  # 59 intervals have no divisor
+        ((41, 2), False, (21, 2)),  # a chain of two states stays
+        ((41, 9), False, None),
+    ],
+)
+def test_the_grid_that_tells_the_error_keeps_the_held_node(shape, nested, wanted):
+    grid, held = hjb.Grid([-1.0, -1.0], [1.0, 1.0], shape), np.zeros(shape, bool)
+    if all(count % 2 for count in shape):
+        held[shape[0] // 2, shape[1] // 2] = True
+    coarse = nested_grids.telling(grid, held, nested=nested)
+    assert (None if coarse is None else coarse.shape) == wanted
+
+
+def test_a_second_target_is_not_lost_either():
+    grid, held = hjb.Grid([0.0], [1.0], (41,)), np.zeros(41, bool)
+    held[[0, 13, 40]] = True
+    coarse = nested_grids.telling(grid, held)
+    assert coarse is None or np.min(np.abs(np.asarray(coarse.axis(0)) - 13 / 40)) < 1e-9
+    held[13:20] = True  # a wide one is on any grid
+    assert nested_grids.telling(grid, held).shape == (21,)
+
+
+def test_the_tip_of_a_disc_is_kept_with_the_disc():
+    grid = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (41, 41))
+    x = np.asarray(grid.nodes()).reshape(41, 41, 2)
+    disc = np.hypot(x[..., 0] - 0.4, x[..., 1] + 0.55) < 0.2 + 1e-9  # its tips lie between coarse nodes
+    assert nested_grids.telling(grid, disc).shape == (21, 21)

@@ -178,16 +178,6 @@ def test_a_coarse_grid_warns():
 
 
 @pytest.mark.slow
-def test_without_a_coarser_grid_the_change_of_the_scheme_is_the_estimate():
-    grid = hjb.Grid([-1.0], [1.0], (11,))  # half of its intervals are too few
-    solution = hjb.solve(line(), grid)
-    first = hjb.solve(line(), grid, scheme=hjb.Upwind(subcell=True))
-    np.testing.assert_allclose(solution.grid_error, np.abs(solution.value - first.value), rtol=0, atol=1e-12)
-    # with noise both schemes may be one, and their difference says nothing
-    assert hjb.solve(line(noise=0.3), grid).grid_error is None
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("parameters", [{}, {"noise": 0.5**0.5}])
 def test_an_odd_number_of_intervals_has_no_half(parameters):
     entry = zoo.catalogue["bang-bang"]
@@ -217,8 +207,8 @@ def test_nodes_that_do_not_reach_the_target_have_no_estimate():
     )
     with pytest.warns(hjb.SolveWarning, match="cannot reach the target"):
         solution = hjb.solve(problem, hjb.Grid([-1.0], [1.0], (41,)))
-    assert np.array_equal(np.isnan(solution.grid_error), np.isinf(solution.value))
     assert np.isinf(solution.value).any()
+    assert np.all(solution.grid_error[np.isinf(solution.value)] == 0)
 
 
 def test_lanes_are_solves():

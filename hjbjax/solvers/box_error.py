@@ -50,6 +50,7 @@ FACTORED = 12_000  # nodes up to which a factorisation is fast enough where a co
 INTERVALS = 6  # intervals that an axis keeps
 STEPS = 30  # most steps of Newton's method; most problems take two or three
 SETTLED = 0.05  # the iteration ends with a step below this part of the change so far
+FARTHEST = 100  # of the range of V: the equation with the other ends has no solution near V, or none at all
 ROUNDING = 1e-9  # changes at the end nodes below this part of the range of V are rounding
 LARGE = 0.1  # of the range of V: a larger box error is worth a warning ...
 NODES = 0.05  # ... at more than this share of the nodes
@@ -192,9 +193,9 @@ def _compare(level: Task, before: np.ndarray, fine: Grid) -> BoxError:
                 return BoxError(None, NEVER_REACHED)
         delta = factor_and_solve(list(weights), list(weights.values()), source, grid)
         value, largest = value + delta, np.max(np.abs(delta))
-        if not np.isfinite(largest):
-            break
         change = np.abs(value - start)
+        if not np.isfinite(largest) or np.max(change) > FARTHEST * scale:
+            break
         if largest <= SETTLED * np.max(change):
             responsible = moved & (change > LARGE * scale)
             return BoxError(nested_grids.prolong(change, grid, fine), sides=_sides(grid, responsible))

@@ -298,7 +298,8 @@ def test_two_processes_and_two_devices_give_the_answer_of_one(tmp_path):
         "one": problem,
     }.items():
         code, said, err = ended(command(tmp_path, *words, "--out", tmp_path / out))
-        assert (code, err) == (0, ""), err
+        unexpected = [line for line in err.splitlines() if "the box decides V" not in line]
+        assert (code, unexpected) == (0, [])
         assert said.startswith("CONVERGED")
         assert "Gloo" not in said
         assert {"one": "cpu", "both": "2 x 2 cpu"}.get(out, "2 cpu") in said

@@ -422,6 +422,7 @@ def swing_up():
     return hjb.solve(SWING, ROUND, tol=1e-2)
 
 
+@pytest.mark.filterwarnings("ignore:the grid is coarse")
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["extended Kalman", "grid"])
 def test_a_pendulum_swings_up_on_its_angle_alone(swing_up, kind):

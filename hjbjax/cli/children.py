@@ -115,7 +115,7 @@ def followed(module: str, words: Sequence[str], environment: Mapping[str, str]) 
 def run(
     commands: Sequence[Command],
     explained: Collection[int] = (),
-    muted: bytes = b"\0",
+    muted: Collection[bytes] = (),
     patience: float = math.inf,
 ) -> Outcome:
     """Run commands side by side until all of them have ended; pass on what the first one writes.
@@ -123,7 +123,7 @@ def run(
     Args:
       commands: one per child.
       explained: exit codes of a child that said why it failed.
-      muted: the start of lines that are not passed on.
+      muted: parts of lines that are not passed on.
       patience: seconds for which a child may be stopped.
 
     Raises:
@@ -143,7 +143,7 @@ def run(
 class _Launcher:
     """The children that run, the ends of the others, and when the next request is due."""
 
-    def __init__(self, explained: Collection[int], muted: bytes, patience: float):
+    def __init__(self, explained: Collection[int], muted: Collection[bytes], patience: float):
         self.explained, self.muted, self.patience = explained, muted, patience
         self.events: queue.SimpleQueue[End | int] = queue.SimpleQueue()
         self.running: dict[int, subprocess.Popen] = {}
@@ -193,7 +193,7 @@ class _Launcher:
                 for line in stream:
                     if line.strip():
                         last.append(line)
-                    if sink is None or self.quiet.is_set() or line.startswith(self.muted):
+                    if sink is None or self.quiet.is_set() or any(part in line for part in self.muted):
                         continue
                     try:
                         _write(line, sink)

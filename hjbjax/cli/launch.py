@@ -33,7 +33,7 @@ MOST = 256  # processes of a launch, and devices of a process: each takes thread
 LONGEST = 86_400  # seconds of a heartbeat
 _ADVICE = "'hjbjax launch' sets these variables; unset all of them to solve in one process"
 WITHOUT_PROXY = {"no_grpc_proxy": "127.0.0.1"}  # gRPC would look for processes of this host behind a proxy
-GREETING = b"[Gloo]"  # the start of a line that gloo writes when it connects
+GREETING = (b"[Gloo]", b"connected peer ranks")  # in lines of gloo, which threads may write into one another
 
 
 # --- in each process ---

@@ -107,7 +107,8 @@ def test_enumerated_controls_are_members_and_marched_values_are_asked_at_the_tim
     assert greedy(np.array([0.0, 1.0]), np.array([[0.31], [0.31]])).tolist() == [[1.0], [-1.0]]
     batched = jax.jit(jax.vmap(lambda t, x: greedy(t, x)))(jnp.array([0.1, 0.9]), jnp.array([[-0.4], [-0.4]]))
     assert batched.tolist() == [[-1.0], [1.0]]
-    assert np.isnan(greedy.control_at(2.0, [0.31])).all()
+    with pytest.warns(UserWarning, match="lie outside the kept ones"):
+        assert np.isnan(greedy.control_at(2.0, [0.31])).all()
 
 
 def test_it_is_blind_where_the_value_is_infinite_and_refuses_what_is_no_solution():
@@ -131,6 +132,7 @@ def test_it_is_blind_where_the_value_is_infinite_and_refuses_what_is_no_solution
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:simulate. the path costs")  # V is made by hand
 def test_it_does_not_leave_across_a_constrained_end():
     """V falls towards both ends; only the upper one is constrained, and the nodes' control vanishes there."""
     grid = Grid([0.0], [1.0], (11,), edges=[("projected", "constrained")])

@@ -60,7 +60,7 @@ def main():
         commands.append(children.Command(["/no/such/program"], os.environ))
     print("ready", flush=True)
     try:
-        outcome = children.run(commands, [2, 3, 4, 130], b"[muted]", asked.get("patience", math.inf))
+        outcome = children.run(commands, [2, 3, 4, 130], [b"[muted]"], asked.get("patience", math.inf))
     except OSError as error:
         print(json.dumps({"error": str(error)}))
     else:

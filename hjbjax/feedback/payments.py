@@ -34,6 +34,7 @@ UNKNOWN = 0.02  # of the range of V: taken for the error of a value without an e
 STILL = 1e-6  # of the box, in the second half of a path that is at rest
 RESTS, SLOWS = 1e-3, 1e-2  # of the box, and of the way in the first half, of one that comes to rest
 AWAY, BACK = 0.5, 0.1  # of the extent of its second half, for a path that goes round inside of a cell
+SAME = 1e-5  # two problems are one whose numbers at a state differ by no more
 FAR = 1.5  # cells: a path that goes round leaves a state by more, and comes back within one
 
 
@@ -208,6 +209,8 @@ def broken_promise(
         return None
     if abs(off) <= _allowed(solution) or abs(off) <= LEAST * _range_of_extremes(problem, solution):
         return None
+    if not _is_answer_to(problem, solution, path):
+        return None
     further = "" if ahead == 0 else f" with what V says of the time after, {ahead:.4g},"
     advice = (
         "the feedback does not do what V assumes: a finer grid, another scheme, a running cost or a discount helps"
@@ -215,6 +218,36 @@ def broken_promise(
         else "V is too large there: a finer grid or a larger box helps"
     )
     return f"the path costs {path.cost:.6g},{further} and V promised {path.promised:.6g}: {advice}"
+
+
+def _is_answer_to(problem: Problem, solution: Solution, path: Path) -> bool:
+    """True if V belongs to the problem that is simulated: both problems say the same of the first state of the path.
+
+    V of another problem, such as one with a nominal drift or another cost, promises nothing.
+    """
+    posed = solution.problem
+    if posed is None:  # of a file, or made by hand
+        return True
+    if (posed.is_game, posed.time_dependent) != (problem.is_game, problem.time_dependent) or not len(path.controls):
+        return False
+    x, d = jnp.asarray(path.states[0]), None if path.disturbances is None else jnp.asarray(path.disturbances[0])
+    played = problem.arguments(x, jnp.asarray(path.controls[0]), d, 0.0)
+    alone = problem.state_arguments(x, 0.0)
+    for arguments, names in (
+        (played, ("drift", "cost")),
+        (alone, ("stopping_cost", "running_max", "target", "exit_cost", "terminal_cost", "discount")),
+    ):
+        for name in names:
+            mine, theirs = (_number_of(getattr(each, name), arguments) for each in (problem, posed))
+            if not np.allclose(mine, theirs, rtol=SAME, atol=SAME, equal_nan=True):
+                return False
+    return True
+
+
+def _number_of(ingredient: Any, arguments: tuple) -> np.ndarray:
+    """An ingredient of a problem at its arguments: a function, a number, or None for zero."""
+    found = ingredient(*arguments) if callable(ingredient) else ingredient
+    return np.asarray(0.0 if found is None else found, float)
 
 
 def _combined(problem: Problem, cost: float, ahead: float) -> float:

@@ -81,7 +81,7 @@ def plan(header: dict) -> dict[str, Expected]:
         "enclosure": Expected(((2, 2),)),
         "reached": Expected((shape, lead + shape), (np.bool_,)),
         "grid_error": Expected((shape,)),
-        "box_error": Expected((shape,)),
+        "box_error": Expected((shape, lead + shape)),
         "residuals": Expected((many,)),
         "cut": Expected(((*lead, len(shape), 2),), (np.int64, np.int32)),
         **({} if marched is None else {"times": Expected((lead,), optional=False)}),

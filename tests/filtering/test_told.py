@@ -155,9 +155,9 @@ def test_reverse_derivatives_are_those_of_finite_differences(which):
         return F.robust_filter(plant, h, GRID, jnp.asarray(record), 0.1, lambda x: -x @ x, **options).value[-1]
 
     with jax.enable_x64(True):
-        found = jax.grad(loss)(1.0)
-        step = 1e-5
-        wanted = (float(loss(1.0 + step)) - float(loss(1.0 - step))) / (2 * step)
+        rate, step = 1.05, 1e-5  # at 1 the number of sub-steps changes
+        found = jax.grad(loss)(rate)
+        wanted = (float(loss(rate + step)) - float(loss(rate - step))) / (2 * step)
     np.testing.assert_allclose(found, wanted, rtol=1e-6)
 
 

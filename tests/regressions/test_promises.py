@@ -174,7 +174,8 @@ def test_a_promise_that_is_never_kept_is_a_warning():
         lambda x, u: jnp.stack([x[1], 0.0015 * u[0] - 0.0025 * jnp.cos(3 * x[0])]), lambda x, u: 0.1 * u @ u, UNIT,
         target=lambda x: 0.45 - x[0], exit_cost=-100.0,
     )  # fmt: skip
-    solution = hjb.solve(problem, hjb.Grid([-1.2, -0.07], [0.6, 0.07], (91, 91)))
+    with pytest.warns(UserWarning, match="the feedback never arrives"):
+        solution = hjb.solve(problem, hjb.Grid([-1.2, -0.07], [0.6, 0.07], (91, 91)))
     with pytest.warns(UserWarning, match="the path costs .* and V promised -99.9"):
         hjb.simulate(problem, solution, [-0.5, 0.0], 999.0)
 

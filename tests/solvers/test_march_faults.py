@@ -142,10 +142,13 @@ def test_times_and_what_they_hold(tmp_path):
     solution.save(tmp_path / "march.npz")
     again = hjb.load(tmp_path / "march.npz")
     np.testing.assert_array_equal(again.value, solution.value)
+    np.testing.assert_array_equal(again.box_error, solution.box_error)
+    assert solution.box_error.shape == (3, 41)
     assert again.value_at(0.65, [0.5]) == solution.value_at(0.65, [0.5])
     between = (solution.value_at(0.3, [0.5]) + solution.value_at(1.0, [0.5])) / 2
     assert solution.value_at(0.65, [0.5]) == pytest.approx(between, rel=1e-12)
-    assert np.isnan(solution.value_at(1.5, [0.5]))
+    with pytest.warns(UserWarning, match="lie outside the kept ones"):
+        assert np.isnan(solution.value_at(1.5, [0.5]))
     assert solution.value_at(1.5, [0.5], clamp=True) == solution.value_at(1.0, [0.5])
     several = solution.value_at([0.0, 0.3], [[0.5], [-0.5]])
     assert several.shape == (2,)

@@ -69,7 +69,7 @@ def by_numpy(layers):
 def answers():
     """Two networks with their values: the oracle's, and the solver's."""
     layers = [weights(seed) for seed in (1, 2)]
-    with pytest.warns(hjb.SolveWarning, match="drift leaves the box"):
+    with pytest.warns(hjb.SolveWarning, match="the box decides V"):
         found = hjb.solve_batch(map(posed, layers), GRID, **UPWIND)
     return layers, [by_numpy(each) for each in layers], found
 

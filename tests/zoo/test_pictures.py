@@ -28,6 +28,7 @@ def exact_solution(entry, **parameters):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:simulate. the path costs")  # the policy is not that of V
 def test_the_picture_of_the_moon_landing_coasts_and_burns_and_stands_on_the_ground(tmp_path):
     entry = zoo.catalogue["moon-landing"]
     problem, solution = exact_solution(entry)

@@ -168,6 +168,7 @@ def test_a_quadratic_goes_on_beyond_open_ends(ndim):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the grid is coarse")
 def test_a_promise_that_is_never_kept_is_a_warning():
     """A car in a valley whose reward is at the end, and that pays nothing for time: it swings there and waits."""
     problem = hjb.Problem(

@@ -41,7 +41,7 @@ from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, is_traced, pytree_dataclass
-from hjbjax.problem.types import DType, Field, Number, Scalar
+from hjbjax.problem.types import DType, Field, Number, Numbers, Scalar
 
 ROUNDING = 16  # residuals below this many units in the last place of max|V| are rounding
 TOL = 1e-6  # cost units, for a value that spans one or more
@@ -59,13 +59,13 @@ def stretched(dt: Number, problem: Problem, dtype: DType) -> Scalar:
     return jnp.where(some, jnp.expm1(discount * dt) / jnp.where(some, discount, 1), dt)
 
 
-def longest_step(rate: Scalar, problem: Problem, share: Number, tableau: "Tableau") -> Scalar:
+def longest_step(rate: Scalar, problem: Problem, share: Numbers, tableau: "Tableau") -> jax.Array:
     """The longest step whose Euler steps are monotone if ``share`` is 1/c; inf where nothing moves.
 
     Args:
       rate: the largest Q + β, per unit time.
       problem: with the discount β.
-      share: the step over 1/(max Q + β), of a small discount.
+      share: the step over 1/(max Q + β), of a small discount; one or several.
       tableau: the stages.
     """
     moves = rate > 0

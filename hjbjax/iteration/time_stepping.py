@@ -25,7 +25,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Box
-from hjbjax.problem.types import Field, Mask, Nodes, Number, Scalar
+from hjbjax.problem.types import Field, Mask, Nodes, Number, Numbers, Scalar
 from hjbjax.solution.status import Status
 
 TRIES = 30  # of a step that is shortened, at most; what its first stage sees does not depend on its length
@@ -170,7 +170,7 @@ class Seen:
         )
 
 
-def stable(on: Discretisation, tableau: Tableau = TABLEAUX[1], share: Number = 1.0) -> Scalar:
+def stable(on: Discretisation, tableau: Tableau = TABLEAUX[1], share: Numbers = 1.0) -> jax.Array:
     """The longest step at the time of ``on``, see ``longest_step``, of Euler's method by default."""
     return longest_step(largest_rate(on) + on.problem.discount, on.problem, share, tableau)
 

@@ -16,6 +16,7 @@ warnings.simplefilter("ignore")
 from jaxtyping import install_import_hook
 with install_import_hook("hjbjax", "array_checks.check"):
     import hjbjax as hjb
+    hjb.solve  # the package loads its modules when a name is asked for
 import array_checks
 import jax.numpy as jnp
 

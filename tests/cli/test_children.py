@@ -50,9 +50,10 @@ def marked(mark):
 
 
 def stop(pid):
-    """Stop a process, and wait until it is stopped."""
+    """Stop a process with all of its threads: the system continues no other when the launcher dies."""
     os.kill(pid, signal.SIGSTOP)
-    until(lambda: Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "T")
+    threads = Path(f"/proc/{pid}/task")
+    until(lambda: {each.read_text().rpartition(")")[2].split()[0] for each in threads.glob("*/stat")} == {"T"})
 
 
 class Launch:

@@ -68,11 +68,13 @@ def estimate(answers: TwoGrids) -> np.ndarray:
     finite = np.isfinite(value)
     free = finite & ~answers.held
     fine = _along_axes(np.where(free, value, np.nan), grid, coarse)
-    known = nearest(free, grid, coarse) & np.isfinite(answers.before)
+    known = nested_grids.nearest(free, grid, coarse) & np.isfinite(answers.before)
     rough = _around(np.where(known, answers.before, np.nan), coarse)
     order = np.minimum(_order_of_bends(fine, rough, ratio), answers.highest)
     if answers.chain is not None:
-        gain = nested_grids.apart(nearest(value, grid, coarse), nearest(answers.chain, grid, coarse))
+        gain = nested_grids.apart(
+            nested_grids.nearest(value, grid, coarse), nested_grids.nearest(answers.chain, grid, coarse)
+        )
         order = np.minimum(order, _order_of_slopes(change, gain, coarse))
     error = np.maximum(change / (ratio**order - 1), _jumps(fine, rough, ratio))
     return np.where(finite, nested_grids.prolong(error, coarse, grid), 0)
@@ -81,18 +83,6 @@ def estimate(answers: TwoGrids) -> np.ndarray:
 def is_a_point(target: np.ndarray) -> bool:
     """True if a target, bool (*grid), has at most the nodes of one cell; on a line that is not a small target."""
     return target.ndim > 1 and 0 < np.sum(target) <= 2**target.ndim
-
-
-def nearest(values: np.ndarray, fine: Grid, coarse: Grid) -> np.ndarray:
-    """Node values on the finer grid at the nodes closest to those of the coarser one, (*coarse)."""
-    for axis in range(fine.ndim):
-        values = np.take(values, _places(fine, coarse, axis), axis=axis)
-    return values
-
-
-def _places(fine: Grid, coarse: Grid, axis: int) -> np.ndarray:
-    """The numbers of the nodes of an axis of the finer grid that are closest to those of the coarser one."""
-    return np.rint(np.arange(coarse.shape[axis]) * (fine.intervals(axis) / coarse.intervals(axis))).astype(int)
 
 
 class _Differences(NamedTuple):
@@ -111,8 +101,8 @@ def _along_axes(value: np.ndarray, fine: Grid, coarse: Grid) -> _Differences:
             continue
         line = value
         for other in range(fine.ndim):
-            line = line if other == axis else np.take(line, _places(fine, coarse, other), axis=other)
-        wide, places = _padded(line, fine, axis, np.nan, REACH), _places(fine, coarse, axis)
+            line = line if other == axis else np.take(line, nested_grids.places(fine, coarse, other), axis=other)
+        wide, places = _padded(line, fine, axis, np.nan, REACH), nested_grids.places(fine, coarse, axis)
         near = [np.take(wide, places + k, axis=axis) for k in range(2 * REACH + 1)]
         steps = [above - below for below, above in itertools.pairwise(near)]
         bends = [above - below for below, above in itertools.pairwise(steps)]

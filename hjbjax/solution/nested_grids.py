@@ -108,14 +108,25 @@ def ratio_of(fine: Grid, coarse: Grid) -> float:
 def with_faces_of(grid: Grid, coarse: Grid) -> Grid:
     """The coarse grid with the prescribed ends of another grid of its box, at the nearest nodes."""
 
-    def nearest(values: Any) -> Any:
-        for axis, count in enumerate(coarse.shape):
+    def at_nodes(values: Any) -> Any:
+        for axis in range(coarse.ndim):
             if np.ndim(values) and values.shape[axis] > 1:
-                places = np.arange(count) * (grid.intervals(axis) / coarse.intervals(axis))
-                values = np.take(values, np.round(places).astype(int), axis=axis)
+                values = np.take(values, places(grid, coarse, axis), axis=axis)
         return values
 
-    return altered(coarse, faces=jax.tree.map(nearest, grid.faces)) if grid.faces else coarse
+    return altered(coarse, faces=jax.tree.map(at_nodes, grid.faces)) if grid.faces else coarse
+
+
+def nearest(values: np.ndarray, fine: Grid, coarse: Grid) -> np.ndarray:
+    """Node values on the finer grid at the nodes closest to those of the coarser one, (*coarse)."""
+    for axis in range(fine.ndim):
+        values = np.take(values, places(fine, coarse, axis), axis=axis)
+    return values
+
+
+def places(fine: Grid, coarse: Grid, axis: int) -> np.ndarray:
+    """The indices of the nodes of an axis of the finer grid that are closest to those of the coarser one."""
+    return np.rint(np.arange(coarse.shape[axis]) * (fine.intervals(axis) / coarse.intervals(axis))).astype(int)
 
 
 def prolong(values: np.ndarray, coarse: Grid, fine: Grid) -> np.ndarray:

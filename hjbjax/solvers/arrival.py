@@ -1,8 +1,8 @@
-"""Whether the feedback of a solution arrives where it must, by following its paths.
+"""A test by simulation that the feedback of a solution arrives at the target.
 
-Without discount, and where going on costs nothing, V is the same for a policy that arrives at a reward and for one that
-rests on the way: the chain of the second arrives by its own diffusion, sooner or later, and pays nothing until then. A
-path of the system rests for ever. So some paths are followed.
+Without a discount, where going on costs nothing, V does not tell a policy that arrives at a reward from one that rests
+on the way. The chain of the resting policy arrives sooner or later by numerical diffusion, and pays nothing until then.
+A path of the system rests forever. Following a few paths shows the difference.
 """
 
 import functools
@@ -29,7 +29,7 @@ SHARE = 0.1  # of the paths: if more never arrive that is worth a warning
 
 
 def warn_of_no_arrival(task: Task, state: State) -> None:
-    """Warn where the feedback never comes to the reward that V promises; host level, for a converged answer."""
+    """Warn if the feedback never reaches the reward that V promises; host level, for a converged answer."""
     if not _may_rest(task):
         return
     value, counted = np.asarray(state.value), np.asarray(task.counted)

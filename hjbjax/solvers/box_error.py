@@ -50,7 +50,7 @@ FACTORED = 12_000  # nodes up to which a factorisation is fast enough where a co
 INTERVALS = 6  # intervals that an axis keeps
 STEPS = 30  # most steps of Newton's method; most problems take two or three
 SETTLED = 0.05  # the iteration ends with a step below this part of the change so far
-FARTHEST = 100  # of the range of V: the equation with the other ends has no solution near V, or none at all
+FARTHEST = 100  # of the range of V: a larger change means that the equation with the other ends has no solution near V
 ROUNDING = 1e-9  # changes at the end nodes below this part of the range of V are rounding
 LARGE = 0.1  # of the range of V: a larger box error is worth a warning ...
 NODES = 0.05  # ... at more than this share of the nodes
@@ -180,8 +180,8 @@ def _compare(level: Task, before: np.ndarray, fine: Grid) -> BoxError:
     """|W − V| on the grid ``fine``, from V on a coarse one."""
     grid = altered(level.grid, edges=other_ends(level.problem, level.grid))
     others = dataclasses.replace(level.on, grid=grid, cut=None)
-    start, policy = jax.device_get(_defect(level, jnp.asarray(before, level.tol.dtype)))
-    defect = policy.defect
+    restricted, policy = _defect(level, jnp.asarray(before, level.tol.dtype))
+    start, defect = jax.device_get((restricted, policy.defect))
     obstacles = _fixed_next_to_lost(level)
     value, scale = start, np.ptp(start[np.asarray(level.counted)])
     moved = np.zeros(grid.shape, bool)
@@ -206,7 +206,7 @@ def _compare(level: Task, before: np.ndarray, fine: Grid) -> BoxError:
 def _defect(task: Task, value: Field) -> tuple[Field, bellman.Greedy]:
     """V with the prescribed values put in, and its policy with what V leaves of the equation where actions matter.
 
-    Without the actions among its results, XLA works them out anew for every branch of the defect.
+    The actions are results too, because XLA would otherwise recompute them in every branch of the defect.
     """
     value = task.impose(value)
     policy = bellman.greedy(task.on, value, task.obstacles.fixed, lost=task.lost)

@@ -195,7 +195,7 @@ def march_part(
     scheme: Scheme | None,
     time_limit: float | None,
 ) -> Solution:
-    """``march(..., throw=False)`` as one part of a longer march by the caller, who has no use for its box error."""
+    """``march(..., throw=False)`` on the host for a part of a longer march, without the box error."""
     scheme, method = Limited(split=True) if scheme is None else scheme, Explicit()
     _check(problem, grid, scheme, method, None, time_limit)
     horizon, kept = _times(horizon, None)
@@ -223,7 +223,7 @@ def _on_host(
     *,
     policy: bool,
 ) -> tuple[March, Solution]:
-    """What was marched, and the solution as far as the clock allows.
+    """The task of a march, and its solution as far as the clock allows.
 
     Raises:
       Stopped: the clock said stop before the first step.

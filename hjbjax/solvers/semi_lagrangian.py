@@ -180,11 +180,8 @@ def replace_chain(
         plan = REPLACEMENT.plan(on.problem, on.grid, on.dtype)
         memory.fitting(estimate(on.grid, plan, on.dtype), on.grid, None)
         found = follow(on, REPLACEMENT, plan, tol, relaxations(None, on.grid.ndim), guess, clock)
-    except (
-        ValueError,
-        MemoryError,
-    ):  # arcs that cost nothing, or too many of them: the chain answers as well as it can
-        return None
+    except (ValueError, MemoryError):
+        return None  # arcs that cost nothing, or too many of them: the chain's answer stands
     gains = found.reached is None or bool(np.any(found.reached & ~reach.surely))
     return None if found.code in FAILED or not gains else found
 

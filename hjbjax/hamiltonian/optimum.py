@@ -21,7 +21,7 @@ from hjbjax.problem.pytree import altered, tie
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite
 from hjbjax.problem.types import Field
 
-INNER = 8  # evaluations written out of a search inside a search: with all 33 XLA gets up to five times the lines
+INNER = 8  # actions of the player who moves second that are written out, inside the search of the first
 
 
 def optimise(hamiltonian: DiscreteHamiltonian, isaacs: str | None = None) -> tuple[jax.Array, Action, Action]:
@@ -134,9 +134,9 @@ def _sampled(
     """The best of samples, refined by a pattern search between them; of finitely many actions the best of all."""
     assert player.admissible is not None
     points = jnp.asarray(sets.samples(player.admissible, SAMPLES), hamiltonian.on.dtype)
-    best = enumerate_actions(objective, points, player.sign, weight=weight, most=most)
     if isinstance(player.admissible, Finite):
-        return best
+        return enumerate_actions(objective, points, player.sign, weight=weight, most=most)
+    best = enumerate_actions(objective, points, player.sign, weight=weight, most=search.WRITTEN)
     project = _projection(player.admissible)
     # samples may miss a part of the set in which the drift stays inside, or the action of the last step
     if start is not None:

@@ -20,8 +20,10 @@ Action = list
 Objective = Callable[[Action], tuple[jax.Array, list]]
 Best: TypeAlias = tuple[jax.Array, Action, list]  # the best value so far, the action there, and the extra there
 
-UNROLL = 80  # evaluations written out in one fused kernel; beyond that XLA's compile time grows and its speed falls
+UNROLL = 80  # of finitely many actions: written out in one fused kernel, which beyond compiles long and runs slowly
 CHUNK = 20  # evaluations in one step of the scan that takes over
+WRITTEN = 2  # evaluations in one step of a loop that searches a continuum: with 80, programs take three times as long
+# to compile and nothing runs faster; with 4, the search of a long function (``zoo.merton``) takes twice as long
 TURNED = 2  # rounds of each length in turned directions
 REFINEMENTS = 24  # halvings of the sample spacing: 2⁻²⁴ of it is below the rounding of float32
 
@@ -142,7 +144,7 @@ def refine(
         return best
 
     rounds, moves, inputs = table.shape
-    if weight * moves <= CHUNK:
+    if weight * moves <= WRITTEN:
         return jax.lax.fori_loop(0, rounds, one_round, best)
     return jax.lax.fori_loop(0, rounds * moves, lambda k, best: one_move(table.reshape(-1, inputs)[k], best), best)
 

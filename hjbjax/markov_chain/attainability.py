@@ -2,11 +2,13 @@
 
 Without discount the value is finite exactly where some policy reaches the held nodes with probability one (a
 proper policy). The largest such set R is a fixed point: take away the nodes from which no path of jumps leads
-to the target by actions that keep every jump inside R, until nothing changes. Jumps under sampled actions are
-found on the device, paths by a breadth-first search on the host, or on large grids on the device as well.
+to the target by actions that keep every jump inside R, until nothing changes. The jumps of sampled actions are found
+on the device. The paths are followed on the host by sweeps: one running "or" along an axis follows all jumps of one
+direction to their end, so that two or three rounds of sweeps usually find every path, however long it is.
 """
 
 import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -24,31 +26,26 @@ from hjbjax.problem.types import Array, Mask, Number, Scalar
 from hjbjax.solution.clock import Clock
 
 FEW = 9  # of each player in a game, where all pairs are
-SMALL = 20_000  # nodes up to which NumPy follows paths in less time than SciPy's graphs take to import
-LARGE = 200_000  # nodes beyond which paths are first followed on the device, all at once
-LONG = 4  # times the nodes of all axes together: jumps of a path that are followed there
-SEARCHABLE = 5 * 10**7  # jumps that a search on the host can list: some 60 bytes each
-LOOK = 10**7  # nodes times actions, or times jumps of a path, between two looks at the clock: about a second
+WINDING = 30  # rounds of sweeps after which a search takes over: each follows paths round one more corner
+SEARCHABLE = 5 * 10**7  # jumps that a search can list: some 60 bytes each
+LOOK = 10**7  # nodes times actions between two looks at the clock: about a second
 
 
 def _open_jumps(
-    on: Discretisation, inside: jax.Array | None, clock: Clock, *, least: Number = 0.0, kinks: bool = False
+    on: Discretisation, points: Array, count: int, clock: Clock, inside: jax.Array | None, *, least: Number, kinks: bool
 ) -> Rates:
     """For every jump the nodes, bool (*grid), with an action that makes it and whose jumps all stay ``inside``.
 
-    Without ``inside`` it is the box. Rates up to ``least`` are rounding; with ``kinks`` actions between the samples, at
-    which a component of the drift vanishes, are tried as well.
+    The first ``count`` actions of ``points`` are tried. Without ``inside`` it is the box. Rates up to ``least`` are
+    rounding; with ``kinks`` actions between the samples, at which a component of the drift vanishes, are tried as well.
     """
-    points = tried_actions.control_samples(on.problem)
     known = _no_jumps(on, points)
-    count, some = len(points), max(1, LOOK // on.grid.size)
+    some = max(1, LOOK // on.grid.size)
     for first in range(0, count, some):
         clock.enter(f"the jumps of the chain, {first} of {count} actions")
-        last = min(first + some, count)
-        # always as many actions, the last lot overlapping the one before: another number would be another program
-        lot = points[max(last - some, 0) : last]
-        # the actions between the samples of a ball do not depend on these: once, with the first lot
-        known = _more_open_jumps(on, inside, known, lot, least=least, kinks=kinks, outmost=kinks and first == 0)
+        lot = first, min(first + some, count)
+        # the actions beside the samples do not depend on these: once, with the first lot
+        known = _more_open_jumps(on, inside, known, points, lot, least=least, kinks=kinks, others=kinks and first == 0)
     return known
 
 
@@ -65,18 +62,19 @@ def _no_jumps(on: Discretisation, points: Array) -> Rates:
     return Rates(offsets, tuple(np.zeros(on.grid.shape, bool) for _ in offsets))
 
 
-@functools.partial(jax.jit, static_argnames=("kinks", "outmost"))
+@functools.partial(jax.jit, static_argnames=("kinks", "others"))
 def _more_open_jumps(
     on: Discretisation,
     inside: jax.Array | None,
     known: Rates,
     points: Array,
+    lot: tuple[int, int],
     *,
-    least: Number = 0.0,
-    kinks: bool = False,
-    outmost: bool = False,
+    least: Number,
+    kinks: bool,
+    others: bool,
 ) -> Rates:
-    """The jumps that are known to be open and those of the actions ``points``, shape (count, m)."""
+    """The jumps that are known to be open and those of a lot of the actions ``points``, from one row to another."""
     # a jump is open once any action makes it, so that the order of the actions, and one tried twice, change nothing
     grid, points = on.grid, jnp.asarray(points, on.dtype)
     mine = players_of(on).control
@@ -95,9 +93,9 @@ def _more_open_jumps(
         action = list(points[k])
         return tried(tried_actions.with_kinks(on, mine, action) if kinks else [action], opened)
 
-    first = tried_actions.of_a_ball(on, mine) if outmost else []
+    first = tried_actions.beside_samples(on, mine) if others else []
     opened = tried(first, tuple(map(jnp.asarray, known.values)))
-    return Rates(known.offsets, jax.lax.fori_loop(0, len(points), also, opened))
+    return Rates(known.offsets, jax.lax.fori_loop(*lot, also, opened))
 
 
 def _stays(rates: Rates, grid: Grid, inside: jax.Array, least: Number) -> jax.Array:
@@ -136,25 +134,26 @@ def reached(
     """
     on = on.on_grid(on.grid.walled)  # what goes on beyond an open end is not known to come back
     clock, found, maybe = clock or Clock(), np.zeros(on.grid.shape, bool), np.zeros(on.grid.shape, bool)
-    for kinks in (False, True):  # what samples do not reach may be reached by the one action that keeps to a way
-        # each pass is sound: whatever it finds is reached by actions of the set, so that the union is, too
-        more = _reached_by_samples(on, held, surely, clock, least=least, kinks=kinks)
+    points, few = tried_actions.control_samples(on.problem)
+    # few actions are enough for most problems, and what samples do not reach may be reached by the one action that
+    # keeps to a way. Each pass is sound: whatever it finds is reached by actions of the set, so that the union is, too
+    for count, kinks in dict.fromkeys([(few, False), (len(points), False), (len(points), True)]):
+        jumps = functools.partial(_open_jumps, on, points=points, count=count, clock=clock, least=least, kinks=kinks)
+        more = _reached_by(jumps, held, surely, on.grid, clock)
         found, maybe = found | more.surely, maybe | more.maybe
         if found.all():
             break
     return Reach(found, maybe)
 
 
-def _reached_by_samples(
-    on: Discretisation, held: np.ndarray, surely: bool, clock: Clock, *, least: Number, kinks: bool
-) -> Reach:
-    """The nodes from which the held ones are reached by the actions that are tried."""
+def _reached_by(open_jumps: Callable[..., Rates], held: np.ndarray, surely: bool, grid: Grid, clock: Clock) -> Reach:
+    """The nodes from which the held ones are reached by ``open_jumps(inside=...)``."""
 
     def staying(inside: jax.Array | None) -> np.ndarray:
-        return _backward_reach(held, _open_jumps(on, inside, clock, least=least, kinks=kinks), on.grid, clock)
+        return _backward_reach(held, open_jumps(inside=inside), grid, clock)
 
     maybe = found = staying(None)
-    inside = np.ones(on.grid.shape, bool)
+    inside = np.ones(held.shape, bool)
     while surely and not np.array_equal(found, inside):
         inside = found
         # nodes are taken away and never put back, as the largest fixed point wants: at most one round a node
@@ -218,24 +217,51 @@ def _controllable_predecessors(
     return new, jnp.any(new != found)
 
 
-@jax.jit
 def refuge(on: Discretisation, inside: jax.Array | None = None, dearest: Scalar | None = None) -> jax.Array:
     """The nodes from which some actions of both players keep the state off the target for ever, bool (*grid).
 
     The largest set in which every node has an action whose jumps all stay in it: nodes without one are taken away until
-    nothing changes. Empty means that under every policy the target is reached with probability one.
+    nothing changes. Empty means that under every policy the target is reached with probability one. Host level.
 
     Args:
       on: the chain.
       inside: the nodes among which it is sought, bool (*grid); ``None`` is all off the target.
       dearest: actions of a higher running cost do not count; ``None`` for all.
     """
-    problem, grid, dtype = on.problem, on.grid, on.dtype
+    start = cut_cells.level(on) > 0 if inside is None else inside
     u, d = (
-        jnp.asarray(np.zeros((1, 0)) if admissible is None else sets.samples(admissible, tried_actions.SAMPLES), dtype)
-        for admissible in (problem.controls, problem.disturbances)
+        np.zeros((1, 0)) if admissible is None else np.asarray(sets.samples(admissible, tried_actions.SAMPLES))
+        for admissible in (on.problem.controls, on.problem.disturbances)
     )
-    mine, start = players_of(on).control, cut_cells.level(on) > 0 if inside is None else inside
+    pairs = np.concatenate([np.repeat(u, len(d), axis=0), np.tile(d, (len(u), 1))], axis=1)
+    count = len(pairs)
+    if dearest is not None:  # mostly few actions are cheap anywhere, and every one is tried again and again
+        cheap = np.asarray(_cheap_somewhere(on, start, dearest, pairs))
+        pairs, count = np.concatenate([pairs[cheap], pairs[~cheap]]), int(np.sum(cheap))
+    return _refuge(on, start, dearest, pairs, count)
+
+
+@jax.jit
+def _cheap_somewhere(on: Discretisation, inside: jax.Array, dearest: Scalar, pairs: Array) -> jax.Array:
+    """For every pair of actions, or those at the kinks next to it, if it costs at most ``dearest`` at some node."""
+    mine = players_of(on).control
+    m = len(mine.driven)
+
+    def cheap(pair: jax.Array) -> jax.Array:
+        u, d = list(pair[:m]), list(pair[m:])
+        costs = [on.running_cost(action, d) for action in tried_actions.with_kinks(on, mine, u)]
+        return functools.reduce(jnp.logical_or, (jnp.any(inside & (cost <= dearest)) for cost in costs))
+
+    return jax.lax.map(cheap, jnp.asarray(pairs, on.dtype))
+
+
+@jax.jit
+def _refuge(
+    on: Discretisation, start: jax.Array, dearest: Scalar | None, pairs: Array, count: int | Scalar
+) -> jax.Array:
+    """``refuge`` in the set ``start`` by the first ``count`` rows of ``pairs``: the inputs of u, then those of d."""
+    mine, pairs = players_of(on).control, jnp.asarray(pairs, on.dtype)
+    m = len(mine.driven)
 
     def shrink(carry):
         inside, _ = carry
@@ -245,19 +271,18 @@ def refuge(on: Discretisation, inside: jax.Array | None = None, dearest: Scalar 
             allowed = ~edges.inadmissible(on, action, answer)
             if dearest is not None:
                 allowed &= on.running_cost(action, answer) <= dearest
-            return allowed & _stays(jump_rates(on, action, answer), grid, inside, 0.0)
+            return allowed & _stays(jump_rates(on, action, answer), on.grid, inside, 0.0)
 
-        def also(found, pair):
-            for action in tried_actions.with_kinks(on, mine, list(u[pair[0]])):
-                found |= kept(action, list(d[pair[1]]))
-            return found, None
+        def also(k, found):
+            for action in tried_actions.with_kinks(on, mine, list(pairs[k, :m])):
+                found |= kept(action, list(pairs[k, m:]))
+            return found
 
-        pairs = jnp.stack(jnp.meshgrid(jnp.arange(len(u)), jnp.arange(len(d)), indexing="ij"), -1).reshape(-1, 2)
-        found = jnp.zeros(grid.shape, bool)
-        for action in tried_actions.of_a_ball(on, mine):
-            # with any disturbance: kinks and a ball's outmost actions are those of one player, and a game has none
-            found |= kept(action, list(d[0]))
-        found = inside & jax.lax.scan(also, found, pairs)[0]
+        found = jnp.zeros(on.grid.shape, bool)
+        for action in tried_actions.beside_samples(on, mine):
+            # with any disturbance: these are actions of one player, and a game has none
+            found |= kept(action, list(pairs[0, m:]))
+        found = inside & jax.lax.fori_loop(0, count, also, found)
         return found, jnp.any(found != inside)
 
     return jax.lax.while_loop(lambda carry: carry[1], shrink, (start, jnp.ones((), bool)))[0]
@@ -265,64 +290,43 @@ def refuge(on: Discretisation, inside: jax.Array | None = None, dearest: Scalar 
 
 def _backward_reach(held: np.ndarray, jumps: Rates, grid: Grid, clock: Clock) -> np.ndarray:
     """The nodes with a path of jumps to a held node, bool (*grid)."""
-    # a pass over all nodes costs little on the device, and a path has as many as it has jumps: long ones, as in a maze,
-    # are left to the search, whose list of jumps has to fit into memory
-    if grid.size > LARGE:
-        listed = grid.size * len(jumps.offsets) <= SEARCHABLE
-        found = _reach_on_device(held, jumps, grid, clock, LONG * sum(grid.shape) if listed else grid.size)
-        if found is not None:
-            return found
-    clock.enter("the search for nodes that reach the target")
-    found = _reach_in_passes(held, jumps, LONG * sum(grid.shape)) if grid.size <= SMALL else None
-    return _reach_on_host(held, jumps, grid) if found is None else found
+    lines, found, listed = _along_axes(jumps), held, grid.size * len(jumps.offsets) <= SEARCHABLE
+    before, rounds = -1, 0
+    while before < np.count_nonzero(found) < grid.size:
+        clock.enter("the search for nodes that reach the target")
+        if rounds == WINDING and listed:
+            return _searched(found, jumps, grid)
+        before, rounds = int(np.count_nonzero(found)), rounds + 1
+        for axis, opened in lines.items():
+            found = _swept(found, axis, opened)
+    return found
 
 
-def _reach_on_device(held: np.ndarray, jumps: Rates, grid: Grid, clock: Clock, most: int) -> np.ndarray | None:
-    """Nodes that lead to a held one, all at once on the device; None if their paths have more than ``most`` jumps."""
-    found, more, some = jnp.asarray(held), True, max(1, LOOK // grid.size)  # jumps between two looks at the clock
-    for step in range(0, most, some):
-        clock.enter(f"the search for nodes that reach the target, paths of {step} jumps")
-        found, more = _predecessors(found, jumps, grid, min(some, most - step))
-        if not more:
-            return np.asarray(found)
-    return None
+def _along_axes(jumps: Rates) -> dict[int, list[tuple[tuple[int, ...], np.ndarray]]]:
+    """For every axis the jumps that lead along it, and along no axis before, as arrays that begin with that axis."""
+    lines: dict[int, list] = {}
+    for offset, jump in zip(jumps.offsets, jumps.values, strict=True):
+        axis = next(axis for axis, step in enumerate(offset) if step)
+        turned = offset[axis : axis + 1] + offset[:axis] + offset[axis + 1 :]
+        lines.setdefault(axis, []).append((turned, np.ascontiguousarray(np.moveaxis(np.asarray(jump), axis, 0))))
+    return lines
 
 
-@jax.jit
-def _predecessors(found: jax.Array, jumps: Rates, grid: Grid, most: int | Scalar) -> tuple[jax.Array, Scalar]:
-    """``found`` with the nodes that lead there in ``most`` jumps; and if there may be more."""
-
-    def step(carry):
-        found, _, count = carry
-        more = found
-        for offset, jump in zip(jumps.offsets, jumps.values, strict=True):
-            # with what this pass has found so far, so that one pass may follow several jumps
-            more |= jump & stencil.neighbour(more, grid, offset)
-        return more, jnp.any(more != found), count + 1
-
-    def goes_on(carry):
-        return carry[1] & (carry[2] < most)
-
-    found, more, _ = jax.lax.while_loop(goes_on, step, (found, jnp.ones((), bool), 0))
-    return found, more
+def _swept(found: np.ndarray, axis: int, opened: list[tuple[tuple[int, ...], np.ndarray]]) -> np.ndarray:
+    """``found`` with the nodes that lead there by any number of equal jumps, one kind of jump after the other."""
+    rows = np.array(np.moveaxis(found, axis, 0), order="C")
+    sides = tuple(range(rows.ndim - 1))
+    for (step, *aside), jump in opened:
+        for k in range(len(rows))[:: -1 if step > 0 else 1]:
+            ahead = rows[(k + step) % len(rows)]  # no jump leads out of the box: on a periodic axis it leads round
+            if any(aside):
+                ahead = np.roll(ahead, [-each for each in aside], sides)
+            rows[k] |= jump[k] & ahead
+    return np.moveaxis(rows, 0, axis)
 
 
-def _reach_in_passes(held: np.ndarray, jumps: Rates, most: int) -> np.ndarray | None:
-    """Nodes that lead to a held one, all at once in NumPy; None if their paths have more than ``most`` jumps."""
-    found, axes = held, tuple(range(held.ndim))
-    opened = [(offset, np.asarray(jump)) for offset, jump in zip(jumps.offsets, jumps.values, strict=True)]
-    for _ in range(most):
-        more = found
-        for offset, jump in opened:
-            more = more | (jump & np.roll(more, [-step for step in offset], axes))  # no jump leads out of the box
-        if np.array_equal(more, found):
-            return found
-        found = more
-    return None
-
-
-def _reach_on_host(held: np.ndarray, jumps: Rates, grid: Grid) -> np.ndarray:
-    """The nodes with a path of jumps to a held node by a breadth-first search, however long the paths are."""
+def _searched(held: np.ndarray, jumps: Rates, grid: Grid) -> np.ndarray:
+    """The nodes with a path of jumps to a held node by a breadth-first search, however winding the paths are."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import breadth_first_order
 

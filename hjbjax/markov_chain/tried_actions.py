@@ -23,18 +23,28 @@ COMBINATIONS = 32  # of kinks of all inputs that are tried with one action
 SAMPLES = 33  # actions of a continuum that are tried
 
 
-def control_samples(problem: Problem) -> Array:
-    """Actions of the control, shape (count, m); one of no entries where there is no control."""
-    return np.zeros((1, 0)) if problem.controls is None else sets.samples(problem.controls, SAMPLES)
+def control_samples(problem: Problem) -> tuple[Array, int]:
+    """Actions of the control, shape (count, m), and how many of them come first that may do without the others.
+
+    Those are the actions of which every input is the least, the middle or the greatest. Without a control the only
+    action has no inputs.
+    """
+    if problem.controls is None:
+        return np.zeros((1, 0)), 1
+    points = np.asarray(sets.samples(problem.controls, SAMPLES))
+    values = [np.unique(column) for column in points.T]
+    outer = np.all([np.isin(c, v[[0, len(v) // 2, -1]]) for c, v in zip(points.T, values, strict=True)], axis=0)
+    return np.concatenate([points[outer], points[~outer]]), int(np.sum(outer))
 
 
 def with_kinks(on: Discretisation, player: Player, action: list) -> list[list]:
     """An action, and those with some inputs moved to where a component of the drift vanishes; each input (*grid).
 
-    Only there may a jump stay away that all samples make. Where the drift is not affine in the inputs there are none.
+    Only there may a jump stay away that all samples make. Where the drift is not affine in the inputs there are none,
+    and for one input they are the same whatever the action: see ``beside_samples``.
     """
     found = [action]
-    if not player.exact or on.problem.is_game:
+    if not _knows_kinks(on, player) or len(player.driven) == 1:
         return found
     for j, driven in enumerate(player.driven):
         # every input multiplies the count by one more than the components it drives: six inputs of one each make 64
@@ -48,15 +58,33 @@ def with_kinks(on: Discretisation, player: Player, action: list) -> list[list]:
     return found
 
 
-def of_a_ball(on: Discretisation, player: Player) -> list[list]:
-    """The actions of a ball that go furthest along one input while others let their components vanish; else none.
+def beside_samples(on: Discretisation, player: Player) -> list[list]:
+    """The actions that are tried beside the samples and do not depend on these; each input (*grid).
+
+    Of one input those at which a component of the drift vanishes; of a ball those of ``_of_a_ball``.
+    """
+    if not _knows_kinks(on, player):
+        return []
+    found = _of_a_ball(on, player.admissible, player) if isinstance(player.admissible, Ball) else []
+    if len(player.driven) > 1:
+        return found
+    assert isinstance(player.admissible, (Box, Ball))
+    some = [jnp.asarray(sets.samples(player.admissible, 1)[0, 0], on.dtype)]
+    return found + [_where(_contains(player.admissible, [kink]), [kink], some) for kink in _kinks(on, player, some, 0)]
+
+
+def _knows_kinks(on: Discretisation, player: Player) -> bool:
+    """True if the drift is affine in a control of a box or a ball, and no disturbance adds to it."""
+    return player.exact and not on.problem.is_game
+
+
+def _of_a_ball(on: Discretisation, ball: Ball, player: Player) -> list[list]:
+    """The actions of a ball that go furthest along one input while others let their components vanish.
 
     Each input u_j drives one component f_j of its own. Among the actions with given signs of all f_j, that with the
     largest |f_k| has some inputs S at their kinks, f_S = 0, no others, and all the room they leave in u_k.
     """
-    if not player.exact or on.problem.is_game or not isinstance(player.admissible, Ball):
-        return []
-    none, radius = [jnp.zeros((), on.dtype)] * player.admissible.dim, player.admissible.radius
+    none, radius = [jnp.zeros((), on.dtype)] * ball.dim, ball.radius
     # inputs of a ball drive at most one component each, so that a kink does not depend on the other inputs
     kinks = [_kinks(on, player, none, j) or [none[j]] for j in range(len(none))]
     found: list[list] = []

@@ -1,5 +1,8 @@
 """Which nodes reach the target, against a plain search over the chain's transition matrices."""
 
+import dataclasses
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +12,8 @@ from hypothesis import strategies as st
 
 import hjbjax as hjb
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.markov_chain import attainability, chain
+from hjbjax.discretisation.rates import Rates
+from hjbjax.markov_chain import attainability, chain, tried_actions
 from hjbjax.solution.clock import Clock
 
 MOVES = np.array([[-1.0], [0.0], [1.0]])
@@ -98,43 +102,109 @@ def test_reached_nodes_in_the_plane(corner, noise, surely):
     assert not found[:, corner[1] + 1 :].any()  # everything moves upwards
 
 
-@pytest.mark.parametrize("long", [4, 0])
-@pytest.mark.parametrize("surely", [True, False])
-def test_paths_followed_on_the_device_are_those_of_the_search(monkeypatch, surely, long):
-    """With ``long`` = 0 no path is short enough, and the search has the last word."""
-    problem = hjb.Problem(turning, None, hjb.Finite(MOVES), noise=[0.5, 0.0], discount=1.0)
-    held = np.zeros(PLANE.shape, bool)
-    held[3, 4] = True
-    searched = reached(problem, PLANE, held, surely)
-    monkeypatch.setattr(attainability, "LARGE", 0)
-    monkeypatch.setattr(attainability, "LONG", long)
-    np.testing.assert_array_equal(reached(problem, PLANE, held, surely), searched)
-    with jax.enable_x64(True):
-        jumps = attainability._open_jumps(Discretisation(problem, PLANE, hjb.Upwind(), np.float64), None, Clock())
-        found = attainability._reach_on_device(held, jumps, PLANE, Clock(), long * sum(PLANE.shape))
-    if long:
-        np.testing.assert_array_equal(found, attainability._reach_on_host(held, jumps, PLANE))
-    else:
-        assert found is None
+def searched(held, jumps, periodic):
+    """The nodes with a path of jumps to a held one, one node after the other."""
+    found, waiting, shape = held.copy(), list(zip(*np.nonzero(held), strict=True)), held.shape
+    while waiting:
+        node = waiting.pop()
+        for offset, jump in zip(jumps.offsets, jumps.values, strict=True):
+            before = [k - step for k, step in zip(node, offset, strict=True)]
+            if any(not (0 <= k < n or ring) for k, n, ring in zip(before, shape, periodic, strict=True)):
+                continue
+            before = tuple(k % n for k, n in zip(before, shape, strict=True))
+            if jump[before] and not found[before]:
+                found[before] = True
+                waiting.append(before)
+    return found
+
+
+def inside_box(jump, offset, periodic):
+    """The jumps that lead to a node, as those of a chain do."""
+    for axis, (step, ring) in enumerate(zip(offset, periodic, strict=True)):
+        places = np.arange(jump.shape[axis]) + step
+        leaves = (places < 0) | (places >= jump.shape[axis])
+        jump = jump & (ring | ~np.expand_dims(leaves, tuple(k for k in range(jump.ndim) if k != axis)))
+    return jump
+
+
+@pytest.mark.parametrize("winding", [30, 1])
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_paths_are_those_of_a_plain_search(monkeypatch, dim, winding):
+    """200 random sets of jumps in all; with ``winding`` 1 the search for winding paths has the last word."""
+    monkeypatch.setattr(attainability, "WINDING", winding)
+    rng = np.random.default_rng(10 * dim + winding)
+    for _ in range(34):
+        shape, periodic = tuple(rng.integers(2, 9, dim)), rng.random(dim) < 0.4
+        every = [offset for offset in itertools.product((-1, 0, 1), repeat=dim) if any(offset)]
+        offsets = tuple(every[k] for k in rng.permutation(len(every))[: 2 * dim])
+        likely = rng.choice([0.2, 0.5, 0.9])
+        values = tuple(inside_box(rng.random(shape) < likely, offset, periodic) for offset in offsets)
+        held, jumps = rng.random(shape) < 0.1, Rates(offsets, values)
+        grid = hjb.Grid(np.zeros(dim), np.ones(dim), shape, periodic=tuple(map(bool, periodic)))
+        found = attainability._backward_reach(held, jumps, grid, Clock())
+        np.testing.assert_array_equal(found, searched(held, jumps, periodic))
+
+
+def test_a_maze_is_searched():
+    """A corridor with 40 corners: a round of sweeps turns two of them."""
+    grid = hjb.Grid([0.0, 0.0], [1.0, 1.0], (21, 21))
+    corridor = np.zeros(grid.shape, bool)
+    corridor[::2], corridor[1::4, -1], corridor[3::4, 0] = True, True, True
+    offsets = ((1, 0), (-1, 0), (0, 1), (0, -1))
+    leads = [np.roll(corridor, [-k for k in offset], (0, 1)) & corridor for offset in offsets]
+    values = tuple(inside_box(jump, offset, (False, False)) for jump, offset in zip(leads, offsets, strict=True))
+    held = np.zeros(grid.shape, bool)
+    held[0, 0] = True
+    found = attainability._backward_reach(held, Rates(offsets, values), grid, Clock())
+    np.testing.assert_array_equal(found, corridor)
+
+
+def test_few_actions_come_first():
+    problem = hjb.Problem(turning, None, hjb.Box([-1.0, 0.0], [1.0, 3.0]), discount=1.0)
+    points, few = tried_actions.control_samples(problem)
+    assert {tuple(row) for row in points[:few]} == set(itertools.product((-1.0, 0.0, 1.0), (0.0, 1.5, 3.0)))
+    assert len(np.unique(points, axis=0)) == len(points) == 49
+    assert tried_actions.control_samples(hjb.Problem(lambda x: x, None, discount=1.0))[1] == 1
 
 
 @pytest.mark.parametrize("surely", [True, False])
 def test_how_often_the_clock_is_looked_at_changes_no_node(monkeypatch, surely):
-    """Some actions, and some jumps of the paths, at a time; where no host could list the jumps, to their very end."""
     problem = hjb.Problem(turning, None, hjb.Finite(MOVES), noise=[0.5, 0.0], discount=1.0)
     held = np.zeros(PLANE.shape, bool)
     held[3, 4] = True
-    searched = reached(problem, PLANE, held, surely)
+    expected = reached(problem, PLANE, held, surely)
     phases, enter = [], Clock.enter
     monkeypatch.setattr(Clock, "enter", lambda clock, phase: (phases.append(phase), enter(clock, phase)))
-    monkeypatch.setattr(attainability, "LARGE", 0)
     monkeypatch.setattr(attainability, "LOOK", 2 * PLANE.size)
-    monkeypatch.setattr(attainability, "LONG", 0)
-    monkeypatch.setattr(attainability, "SEARCHABLE", 0)
-    monkeypatch.setattr(attainability, "_reach_on_host", None)
-    np.testing.assert_array_equal(reached(problem, PLANE, held, surely), searched)
+    np.testing.assert_array_equal(reached(problem, PLANE, held, surely), expected)
     assert sum("jumps of the chain" in phase for phase in phases) >= len(MOVES) // 2
-    assert sum("paths of" in phase for phase in phases) > 2
+
+
+def priced(x, u):
+    return u[0] * u[0]
+
+
+@pytest.mark.parametrize("dearest", [None, 0.0])
+def test_a_refuge_is_the_largest_set_that_an_action_keeps_to(dearest):
+    """On a line with random moves, against the definition; dear actions do not count."""
+    rng = np.random.default_rng(3)
+    for _ in range(10):
+        drifts, noises = rng.choice([-1.0, 0.0, 1.0], (8, 3)), rng.choice([0.0, 0.0, 0.0, 0.5], (8, 3))
+        problem = dataclasses.replace(on_line(drifts, noises), cost=jax.tree_util.Partial(priced))
+        start = rng.random(8) < 0.8
+        tables = [
+            chain.matrix(problem, GRID, np.full((8, 1), u), scheme=hjb.Upwind()).toarray()
+            for u in ([0.0] if dearest == 0 else MOVES[:, 0])
+        ]
+        expected = start
+        for _ in range(8):
+            stays = [~np.any((table > 0) & ~expected, axis=1) for table in tables]
+            expected = expected & np.any(stays, axis=0)
+        with jax.enable_x64(True):
+            on = Discretisation(problem, GRID, hjb.Upwind(), np.float64)
+            price = None if dearest is None else np.float64(dearest)
+            found = attainability.refuge(on, np.asarray(start), price)
+        np.testing.assert_array_equal(found, expected)
 
 
 def test_certain_arrival_is_more_than_possible_arrival():

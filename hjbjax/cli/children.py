@@ -7,6 +7,7 @@ signal can fall between the start of a child and the note that it runs:
     a child dies                         ask the others to end
     a child fails and says why           ask the others to end after ``SETTLE`` seconds
     the first child ends                 the same, as it speaks for all
+    another one ends without a farewell  ask the others to end
     a child has been stopped for long    ask all of them, and continue it
     ``GRACE`` seconds after any of them  kill the children that still run
 
@@ -37,6 +38,7 @@ GRACE = 7.0  # seconds from a request to end until SIGKILL, so that all is over 
 SETTLE = 2.0  # seconds in which children that fail together may each say why
 BOUNCE = 0.3  # seconds within which a second signal is the first one again, as when a terminal and its shell close
 TICK = 0.5  # seconds between two looks at the clock
+LINES = 20  # of standard output among which a farewell is looked for
 LINGER = 0.5  # seconds to wait for the last words of a child that has ended
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 REQUEST = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGCONT") if hasattr(signal, name))
@@ -59,11 +61,13 @@ class End:
       number: of the child.
       code: its exit code; minus the number of the signal that ended it.
       words: the last line that it wrote on standard error.
+      early: True if it ended with exit code 0, but without its farewell.
     """
 
     number: int
     code: int
     words: str = ""
+    early: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,15 +96,16 @@ class Outcome:
 
     @property
     def culprit(self) -> End | None:
-        """The child that brought the others down; None if all ended with exit code 0.
+        """The child that brought the others down; None if all ended with exit code 0 and a farewell.
 
         Killing or stopping one child makes the others fail, and they may be seen to fail first.
         """
         alone = [end for end in self.ends if end.number not in self.killed]
         crashed = [end for end in alone if end.code < 0 and -end.code not in SHARED]
         stopped = [self.end_of(number) for number in self.stopped]
+        early = [end for end in self.ends if end.early]
         failed = [end for end in self.ends if end.code != 0]
-        return next(iter([*crashed, *stopped, *failed]), None)
+        return next(iter([*crashed, *early, *stopped, *failed]), None)
 
 
 def followed(module: str, words: Sequence[str], environment: Mapping[str, str]) -> Command:
@@ -117,6 +122,7 @@ def run(
     explained: Collection[int] = (),
     muted: Collection[bytes] = (),
     patience: float = math.inf,
+    farewell: bytes = b"",
 ) -> Outcome:
     """Run commands side by side until all of them have ended; pass on what the first one writes.
 
@@ -125,11 +131,13 @@ def run(
       explained: exit codes of a child that said why it failed.
       muted: parts of lines that are not passed on.
       patience: seconds for which a child may be stopped.
+      farewell: words on standard output with which a child, other than the first, says that the others can do without
+        it; empty if exit code 0 says so.
 
     Raises:
       OSError: a child could not be started. No child is left running.
     """
-    launcher = _Launcher(explained, muted, patience)
+    launcher = _Launcher(explained, muted, patience, farewell)
     with _signals_into(launcher.events):
         try:
             for command in commands:
@@ -143,8 +151,8 @@ def run(
 class _Launcher:
     """The children that run, the ends of the others, and when the next request is due."""
 
-    def __init__(self, explained: Collection[int], muted: Collection[bytes], patience: float):
-        self.explained, self.muted, self.patience = explained, muted, patience
+    def __init__(self, explained: Collection[int], muted: Collection[bytes], patience: float, farewell: bytes):
+        self.explained, self.muted, self.patience, self.farewell = explained, muted, patience, farewell
         self.events: queue.SimpleQueue[End | int] = queue.SimpleQueue()
         self.running: dict[int, subprocess.Popen] = {}
         self.voices: list[threading.Thread] = []
@@ -165,26 +173,30 @@ class _Launcher:
         options: dict[str, Any] = {
             "env": command.environment,
             "stdin": subprocess.PIPE,
-            "stdout": subprocess.PIPE if first else subprocess.DEVNULL,
+            "stdout": subprocess.PIPE,
             "stderr": subprocess.PIPE,
             "process_group": 0,
         }
         process = self.running[number] = subprocess.Popen(command.words, **options)
-        last: collections.deque[bytes] = collections.deque(maxlen=1)
-        voice = self._listen(process.stderr, sys.stderr if first else None, last)
-        if first:
-            self._listen(process.stdout, sys.stdout, collections.deque(maxlen=1))
+        noted: collections.deque[bytes] = collections.deque(maxlen=1)
+        said: collections.deque[bytes] = collections.deque(maxlen=LINES)
+        voices = (
+            self._listen(process.stderr, sys.stderr if first else None, noted),
+            self._listen(process.stdout, sys.stdout if first else None, said),
+        )
 
         def report_end() -> None:
             code = process.wait()
-            voice.join(LINGER)
-            words = last[0].decode(errors="replace").strip() if last else ""
-            self.events.put(End(number, code, words))
+            for voice in voices:
+                voice.join(LINGER)
+            words = noted[0].decode(errors="replace").strip() if noted else ""
+            early = not first and code == 0 and not any(self.farewell in line for line in (*said, b""))
+            self.events.put(End(number, code, words, early))
 
         threading.Thread(target=report_end, daemon=True).start()
 
     def _listen(self, stream: IO[bytes] | None, out: Any, last: collections.deque[bytes]) -> threading.Thread:
-        """A thread that reads what a child writes, keeps the last line and passes all of it on."""
+        """A thread that reads what a child writes, keeps the last lines and passes all of it on."""
 
         def listen() -> None:
             assert stream is not None
@@ -228,10 +240,10 @@ class _Launcher:
         """Record an end, and ask the others to end where it means that they are not needed or cannot go on."""
         self._close(self.running.pop(end.number))
         self.ends.append(end)
-        if self.asked_at is not None or (end.number > 0 and end.code == 0):
+        if self.asked_at is not None or (end.number > 0 and end.code == 0 and not end.early):
             return
         now = time.monotonic()
-        died = end.code not in (0, *self.explained)
+        died = end.early or end.code not in (0, *self.explained)
         self.ask_at = min(self.ask_at, now if died else now + SETTLE)
         self.kill_at = min(self.kill_at, now + GRACE)
 
@@ -239,7 +251,7 @@ class _Launcher:
         """Ask the children to end; kill them if they were asked before."""
         now = time.monotonic()
         if self.asked_at is None:
-            self.interrupted = all(end.code == 0 for end in self.ends)
+            self.interrupted = all(end.code == 0 and not end.early for end in self.ends)
             self.ask_at, self.kill_at = now, min(self.kill_at, now + GRACE)
         elif now - self.asked_at > BOUNCE:
             self.kill_at, self.hurried = now, True

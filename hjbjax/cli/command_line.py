@@ -96,10 +96,12 @@ def _for_a_parameter(error: click.ClickException) -> str | None:
     """The message for a parameter of a problem that was given as an option of the command; None for other errors."""
     if not isinstance(error, click.NoSuchOption):
         return None
-    from hjbjax import zoo
-
     name = error.option_name.lstrip("-").replace("-", "_")
-    if not any(name in entry.parameters for entry in zoo.catalogue.values()):
+    try:
+        known = any(name in entry.parameters for entry in catalogue().values())
+    except Failure:  # JAX cannot start
+        return None
+    if not known:
         return None
     return (
         f"No such option '{error.option_name}'. A parameter of a problem is given by --set, as in --set {name}=VALUE."
@@ -139,6 +141,8 @@ class Place(click.Path):
         """The path."""
         if "\0" in os.fspath(value):
             self.fail(f"{os.fspath(value)!r} holds a null byte, which is no part of a name", param, ctx)
+        if not os.fspath(value):  # an unset variable of a script; "." names the current folder
+            self.fail("got an empty path, wanted a name", param, ctx)
         return super().convert(value, param, ctx)
 
 
@@ -255,11 +259,40 @@ def _value_of(key: str, text: str, default: object) -> bool | float | tuple[floa
     return known if len(parts) > 1 else known[0]
 
 
-def systems() -> Iterable[str]:
-    """The names of the ready problems; a function, so that they are looked up only when a name is checked."""
-    from hjbjax import zoo
+def catalogue() -> "dict[str, Entry]":
+    """The ready problems by name; a function, so that they are looked up only when a name is checked.
 
+    Raises:
+      Failure: JAX cannot be imported.
+    """
+    with starting_jax():
+        from hjbjax import zoo
     return zoo.catalogue
+
+
+def check_jax() -> None:
+    """Start JAX.
+
+    Raises:
+      Failure: it finds no device.
+    """
+    with starting_jax():
+        import jax
+
+        jax.devices()
+
+
+@contextlib.contextmanager
+def starting_jax() -> Iterator[None]:
+    """Context in which JAX starts: a fault of the installation or of a variable of the environment is one line.
+
+    Raises:
+      Failure: with the reason that JAX gives.
+    """
+    try:
+        yield
+    except (ImportError, ValueError, RuntimeError) as error:
+        raise Failure(f"JAX cannot start: {' '.join(str(error).split())}; 'hjbjax doctor' says more") from error
 
 
 def names_of(table: dict[str, str]) -> Callable[[], Iterable[str]]:

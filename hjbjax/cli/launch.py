@@ -13,12 +13,14 @@ import os
 import shlex
 import signal
 import socket
+import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hjbjax.cli import children
-from hjbjax.cli.command_line import Failure, finite
+from hjbjax.cli.command_line import Failure, finite, starting_jax
+from hjbjax.problem import streams
 
 if TYPE_CHECKING:
     from jax.sharding import Mesh
@@ -33,6 +35,7 @@ MOST = 256  # processes of a launch, and devices of a process: each takes thread
 LONGEST = 86_400  # seconds of a heartbeat
 _ADVICE = "'hjbjax launch' sets these variables; unset all of them to solve in one process"
 WITHOUT_PROXY = {"no_grpc_proxy": "127.0.0.1"}  # gRPC would look for processes of this host behind a proxy
+FAREWELL = "hjbjax: parted"  # of a process that the others can do without
 GREETING = (b"[Gloo]", b"connected peer ranks")  # in lines of gloo, which threads may write into one another
 
 
@@ -127,7 +130,8 @@ def mesh_of(counts: tuple[int, ...] | None) -> "Mesh | None":
         jax.config.update("jax_num_cpu_devices", wanted // processes)
     if this is not None and processes > 1:
         _join(this)
-    devices = jax.devices()
+    with starting_jax():
+        devices = jax.devices()
     if len(devices) < wanted:
         raise Failure(f"--devices: {wanted} devices were asked for, and {len(devices)} are there")
     return Mesh(np.array(devices[:wanted]).reshape(counts), tuple(f"axis{k}" for k in range(len(counts))))
@@ -168,10 +172,16 @@ def _check_port(coordinator: str) -> None:
 
 def leave() -> None:
     """Part from the other processes of a launch when all have solved; they would take one that just ends for dead."""
-    if member() is not None:
-        import jax
+    this = member()
+    if this is None:
+        return
+    import jax
 
-        jax.distributed.shutdown()
+    jax.distributed.shutdown()
+    if this.rank > 0:  # the first process goes on and speaks for all
+        out = streams.Expendable(sys.stdout)
+        out.write(f"{FAREWELL}\n")
+        out.flush()
 
 
 # --- in the launcher ---
@@ -219,7 +229,7 @@ def start(words: Sequence[str], processes: int, heartbeat: int, result: Path) ->
                 for number in range(processes)
             ]
             # earlier than the others lose patience: they keep what they have if the stopped one goes on to its end
-            outcome = children.run(commands, EXPLAINED, GREETING, heartbeat / 2)
+            outcome = children.run(commands, EXPLAINED, GREETING, heartbeat / 2, FAREWELL.encode())
     except (OSError, RuntimeError) as error:  # RuntimeError: no thread can be started
         raise Failure(f"launch: {processes} processes could not be started: {error}", DIED) from error
     code = _verdict(outcome, _way_on(words, processes, result))
@@ -244,6 +254,8 @@ def _verdict(outcome: children.Outcome, way_on: str) -> int:
         killed = f"; {_killed(outcome)}; {way_on}" if outcome.killed else ""
         raise Failure(f"interrupted{killed}", INTERRUPTED)
     name = f"process {culprit.number} of {processes}"
+    if culprit.early:
+        raise Failure(f"{name} ended with exit code 0 before the others were done; {way_on}", DIED)
     if culprit.number in outcome.stopped:
         raise Failure(f"{name} was stopped, and the others cannot go on without it; {way_on}", DIED)
     if culprit.code < 0:

@@ -31,11 +31,12 @@ from hjbjax.cli.command_line import (
     OneLineGroup,
     Place,
     Shape,
+    catalogue,
+    check_jax,
     names_of,
     parameters_of,
     say,
     show,
-    systems,
     text_of,
 )  # fmt: skip
 from hjbjax.problem import streams
@@ -66,18 +67,19 @@ def main(context: click.Context) -> None:
 
 
 @main.command("list", short_help="The ready problems; all about one.")
-@click.argument("name", required=False, type=Name("problem", systems))
+@click.argument("name", required=False, type=Name("problem", catalogue))
 def list_problems(name: str | None) -> None:
     """List the ready problems, with their states; or all there is to say of NAME, its parameters among it."""
-    from hjbjax import zoo
+    known = catalogue()
+    check_jax()
     from hjbjax.cli import listing
 
-    for line in listing.overview() if name is None else listing.details(zoo.catalogue[name]):
+    for line in listing.overview() if name is None else listing.details(known[name]):
         show(line)
 
 
 @main.command(short_help="Solve a problem, draw the answer.")
-@click.argument("name", type=Name("problem", systems))
+@click.argument("name", type=Name("problem", catalogue))
 @click.option("--shape", type=Shape(), help="Nodes along each axis, as in 200x201.")
 @click.option("--set", "settings", multiple=True, metavar="NAME=VALUE", help="A parameter; may be given several times.")
 @click.option("--method", type=Name("method", names_of(METHODS)), help=f"{' or '.join(METHODS)}; chosen if not given.")
@@ -106,15 +108,17 @@ def solve(
     **options: Any,
 ) -> None:
     """Solve the ready problem NAME; write solution.npz, value.png, policy.png and trajectory.png."""
-    from hjbjax import zoo
+    entry = catalogue()[name]
     from hjbjax.cli import compile_cache, run_folder
 
-    entry = zoo.catalogue[name]
     parameters = parameters_of(entry, settings)
     if dry_run:
+        check_jax()
         _estimate(*_build(entry, parameters, shape), options, as_json=as_json)
+        processes_of.leave()
         return
     options["mesh"] = processes_of.mesh_of(devices)
+    check_jax()
     if processes_of.rank() > 0:  # the first process of a launch writes, and speaks for all
         with interrupts.raised(), interruptible():
             _solve(*_build(entry, parameters, shape), options)
@@ -166,11 +170,11 @@ def _raise_unless_converged(solution: "Solution") -> None:
 @click.argument("words", nargs=-1, required=True, metavar="-- COMMAND")
 def launch(processes: int, heartbeat: int, words: tuple[str, ...]) -> None:
     """Run a command, as in "hjbjax launch --processes 2 -- solve pendulum", in processes that divide its nodes."""
-    from hjbjax.cli import run_folder
-
     processes_of.check(words, processes, heartbeat)
     # a process takes ten seconds to start: what each of them would refuse is refused here
     given = solve.make_context("solve", list(words[1:]), parent=click.get_current_context().parent).params
+    from hjbjax.cli import run_folder
+
     out = given["out"] or Path(given["name"])
     if not given["dry_run"]:
         processes_of.check_devices(given["devices"], processes)
@@ -200,13 +204,17 @@ def _check_places(out: Path, force: bool, checkpoint: Path | None, resume: bool)
     """Refuse in one line a folder of results and a checkpoint that must not be replaced."""
     from hjbjax.cli import run_folder
     from hjbjax.solution import files
+    from hjbjax.solution.placement import FileError, check_place
 
     with _one_line_error(OSError, 2, "--out: "):
         run_folder.check_folder(out, force)
     if resume and checkpoint is None:
         raise Failure("--resume goes on from a checkpoint; add --checkpoint FILE")
-    if checkpoint is not None and not resume and os.path.lexists(place := files.with_suffix(os.fspath(checkpoint))):
-        raise Failure(f"--checkpoint: {place} is there already; --resume goes on from it")
+    if checkpoint is None or resume or not os.path.lexists(place := files.with_suffix(os.fspath(checkpoint))):
+        return
+    with _one_line_error(FileError, 5, "--checkpoint: "):
+        check_place(place, force=True)
+    raise Failure(f"--checkpoint: {place} is there already; --resume goes on from it")
 
 
 @contextlib.contextmanager
@@ -353,12 +361,13 @@ def _write(
 
 @main.command(short_help="All ready problems on a page.")
 @click.option("--out", type=Place(), required=True, help="Folder of the page, index.html.")
-@click.option("--only", multiple=True, type=Name("problem", systems), help="One problem; may be given several times.")
+@click.option("--only", multiple=True, type=Name("problem", catalogue), help="One problem; may be given several times.")
 @click.option("--force", is_flag=True, help="Replace a page that is there already.")
 @click.option("--no-cache", is_flag=True, help="Keep no compiled programs in the user's folder for caches.")
 def gallery(out: Path, only: tuple[str, ...], force: bool, no_cache: bool) -> None:
     """Solve every ready problem on a small grid; write one page with pictures, figures and errors."""
-    from hjbjax import zoo
+    known = catalogue()
+    check_jax()
     from hjbjax.cli import compile_cache, run_folder
     from hjbjax.cli import gallery as pages
 
@@ -373,12 +382,12 @@ def gallery(out: Path, only: tuple[str, ...], force: bool, no_cache: bool) -> No
         stack.enter_context(interruptible())
         if not no_cache:
             compile_cache.keep_for_the_command()
-        names = [name for name in zoo.catalogue if name in only or not only]
+        names = [name for name in known if name in only or not only]
         try:
             for number, name in enumerate(names, 1):
                 line = f"{number:>2}/{len(names)}  {name:<20}  "
                 show(line, newline=False)
-                cards.append(pages.card(zoo.catalogue[name]))
+                cards.append(pages.card(known[name]))
                 # on a terminal the phases of the solve have been written over the line
                 show((f"\r{line}" if streams.is_terminal(sys.stdout) else "") + cards[-1].status)
         finally:  # what is done is kept, after an interrupt, too

@@ -6,6 +6,7 @@ of the one it replaces.
 """
 
 import contextlib
+import errno
 import os
 import re
 import secrets
@@ -43,7 +44,7 @@ def path_of(path: Path, done: str) -> str:
       done: what was to be done with the file, as in "read".
 
     Raises:
-      FileError: not a path, or one with a null byte, which no system takes.
+      FileError: not a path, or one that no system takes: with a null byte, or with half of a surrogate pair.
     """
     try:
         text = os.fsdecode(path)
@@ -51,6 +52,10 @@ def path_of(path: Path, done: str) -> str:
         raise FileError(f"{path!r:.80}: cannot be {done}: it is no path; wanted the name of a file") from None
     if "\0" in text:
         raise FileError(f"{path!r}: cannot be {done}: there is a null byte in the name")
+    try:
+        os.fsencode(text)
+    except UnicodeEncodeError:
+        raise FileError(f"{path!r}: cannot be {done}: the system has no bytes for this name") from None
     return text
 
 
@@ -83,11 +88,13 @@ def check_place(path: str | os.PathLike[str], force: bool) -> None:
 
     Raises:
       FileExistsError: a file is there and ``force`` is false.
-      FileError: a folder is there, or a device: to replace a device would take it from the whole machine.
+      FileError: a folder is there, a device, or a link to itself: to replace a device would take it from the machine.
     """
     try:
         mode = os.stat(path).st_mode
-    except OSError:  # nothing is there, or writing reports the reason
+    except OSError as error:  # nothing is there, or writing reports the reason
+        if error.errno == errno.ELOOP and not force:
+            raise FileError(f"{path}: cannot be written: it is a link to itself") from error
         return
     if stat.S_ISDIR(mode):
         raise FileError(f"{path}: cannot be written: it is a folder; give a file in it, as in 'run.npz'")

@@ -220,6 +220,15 @@ class Marked:
     def __hash__(self) -> int:
         return hash(self._key())
 
+    def __reduce__(self) -> tuple[Callable, tuple[Callable]]:
+        """Pickle and copy the function only: jaxprs cannot be pickled, and the next front door makes the mark again."""
+        return _function_itself, (self.__wrapped__,)
+
+
+def _function_itself(function: Callable) -> Callable:
+    """The copy of a marked function: the function, without its mark."""
+    return function
+
 
 class Opened:
     """A traced function of what it closed over, of the leaves it held, and of its arguments.

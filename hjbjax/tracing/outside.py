@@ -222,6 +222,10 @@ class OfNumbers:
     def __hash__(self) -> int:
         return hash((self.function, self.names))
 
+    def __reduce__(self) -> tuple[type, tuple[Callable, tuple[str, ...]]]:
+        """Pickle what it was made of: the code object of a function cannot be pickled."""
+        return OfNumbers, (self.function, self.names)
+
     def __call__(self, numbers: tuple, *arguments: Any, **options: Any) -> Any:
         """What the function returns where it reads ``numbers``."""
         return _reading(self.function, dict(zip(self.names, numbers, strict=True)))(*arguments, **options)

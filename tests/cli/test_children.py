@@ -142,7 +142,9 @@ def test_a_child_that_is_killed_is_the_culprit_and_the_others_are_asked(launch, 
 def test_a_child_that_raises_is_the_culprit_with_its_last_words(launch):
     outcome = launch(GENTLE, "raise ValueError('the disk of process 1')").ended()
     assert outcome["culprit"] == 1
-    assert outcome["ends"][0] == {"number": 1, "code": 1, "words": "ValueError: the disk of process 1"}
+    assert outcome["ends"][0] == {
+        "number": 1, "code": 1, "words": "ValueError: the disk of process 1", "early": False
+    }  # fmt: skip
 
 
 def test_children_that_refuse_together_each_say_why(launch):
@@ -156,6 +158,18 @@ def test_the_first_child_ends_all(launch):
     outcome = launch("pass", GENTLE, DEAF, settle=0.5, grace=1.5).ended()
     assert codes_of(outcome) == [0, 130, -9]
     assert outcome["killed"] == [2]
+
+
+def test_a_child_that_ends_without_a_farewell_is_the_culprit_and_the_others_are_asked(launch):
+    """As by ``exit(0)`` in a library: the others would wait for it."""
+    early = "while not any(name.startswith('up-0') for name in os.listdir()): time.sleep(0.01)\nos._exit(0)"
+    outcome = launch(GENTLE, early, farewell="farewell").ended()
+    assert (outcome["culprit"], codes_of(outcome)) == (1, [130, 0])
+
+
+def test_a_child_that_says_farewell_may_end_before_the_first_one(launch):
+    outcome = launch("time.sleep(0.5)", "print('and farewell')", farewell="farewell").ended()
+    assert (outcome["culprit"], codes_of(outcome)) == (None, [0, 0])
 
 
 def test_a_stopped_child_is_the_culprit_and_not_the_one_that_fails_for_want_of_it(launch):

@@ -152,6 +152,43 @@ def test_bad_words_are_refused_in_one_line_before_anything_runs(words, parts):
     assert refused(run("solve", *words), 2, *parts)
 
 
+@pytest.mark.usefixtures("no_solver", "folder")
+@pytest.mark.parametrize(
+    "words", [("solve", "bang-bang", "--out", ""), ("solve", "bang-bang", "--checkpoint", ""), ("gallery", "--out", "")]
+)
+def test_an_empty_path_is_refused(words):
+    """It is an unset variable of a script, and must not spread results over the current folder."""
+    assert refused(run(*words), 2, words[-2], "empty path")
+
+
+@pytest.mark.usefixtures("no_solver", "folder")
+@pytest.mark.parametrize(("place", "reason"), [(".", "it is a folder"), (os.devnull, "it is a device")])
+def test_a_checkpoint_that_is_no_file_is_named(place, reason):
+    assert refused(run("solve", "bang-bang", "--checkpoint", place), 5, "--checkpoint", reason)
+
+
+@pytest.mark.usefixtures("no_solver", "folder")
+@pytest.mark.parametrize("words", ["list", "solve bang-bang", "solve bang-bang --dry-run", "gallery --out page"])
+def test_jax_without_a_device_is_refused_in_one_line(words, monkeypatch):
+    def fail():
+        raise RuntimeError("Unable to initialize\nbackend 'gpu'")
+
+    monkeypatch.setattr("jax.devices", fail)
+    assert refused(run(*words.split()), 2, "JAX cannot start: Unable to initialize backend 'gpu'")
+
+
+@pytest.mark.parametrize("words", [("list",), ("launch", "--", "solve", "bang-bang")])
+def test_a_variable_that_jax_refuses_is_named_in_one_line(words):
+    ended = subprocess.run(
+        [sys.executable, "-m", "hjbjax", *words],
+        env={**os.environ, "JAX_ENABLE_X64": "banana"}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert ended.returncode == 2, ended.stderr
+    assert ended.stderr.startswith("hjbjax: JAX cannot start: ")
+    assert ended.stderr.count("\n") == 1
+    assert "JAX_ENABLE_X64" in ended.stderr
+
+
 @pytest.mark.usefixtures("no_solver")
 def test_an_unknown_command_is_refused():
     assert refused(run("slove", "pendulum"), 2, "slove")

@@ -207,6 +207,13 @@ def test_the_processes_part_before_the_pictures(number, tmp_path, monkeypatch):
     assert result.exit_code == (3 if number == "0" else 0), result.output
 
 
+@pytest.mark.parametrize(("number", "words"), [("0", ""), ("1", f"{launch.FAREWELL}\n")])
+def test_a_process_that_is_not_needed_any_more_says_so(number, words, monkeypatch, capsys):
+    as_member(monkeypatch, **{launch.RANK: number})
+    launch.leave()  # it has not met the others: JAX has nothing to part from
+    assert capsys.readouterr().out == words
+
+
 # --- what is said at the end ---
 
 WAY_ON = "go on"
@@ -249,6 +256,11 @@ def test_the_first_process_has_said_it(outcome, code):
             outcome_of((0, -6), (1, 130), stopped=(1,)),
             7,
             "process 1 of 2 was stopped, and the others cannot go on without it; go on",
+        ),
+        (
+            Outcome((End(1, 0, early=True), End(0, -6))),
+            7,
+            "process 1 of 2 ended with exit code 0 before the others were done; go on",
         ),
         (outcome_of((0, -15), (1, -15), interrupted=True), 130, "interrupted"),
         (

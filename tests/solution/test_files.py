@@ -144,11 +144,21 @@ def test_what_cannot_be_written(tmp_path):
         example().save(tmp_path, force=True)
 
 
-@pytest.mark.parametrize("name", [None, 5, 2.5, ["run.npz"], "a\0b", b"a\0b"])
+@pytest.mark.parametrize("name", [None, 5, 2.5, ["run.npz"], "a\0b", b"a\0b", "\ud800"])
 def test_what_is_no_name_of_a_file(name):
     for done, ask in (("written", example().save), ("read", load)):
-        with pytest.raises(FileError, match=f"cannot be {done}: (it is no path|there is a null byte)"):
+        with pytest.raises(
+            FileError, match=f"cannot be {done}: (it is no path|there is a null byte|the system has no bytes)"
+        ):
             ask(name)
+
+
+def test_a_link_to_itself_is_no_file(tmp_path):
+    loop = tmp_path / "run.npz"
+    loop.symlink_to(loop)
+    with pytest.raises(FileError, match="run.npz: cannot be written: it is a link to itself"):
+        example().save(loop)
+    assert os.listdir(tmp_path) == ["run.npz"]
 
 
 def test_bytes_and_paths_are_names(tmp_path):

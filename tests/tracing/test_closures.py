@@ -1,6 +1,8 @@
 """What functions read from outside: changed objects and globals, traced numbers, solves inside of transformations."""
 
+import copy
 import functools
+import pickle
 
 import jax
 import jax.numpy as jnp
@@ -70,6 +72,27 @@ def test_a_changed_global_is_seen(function, monkeypatch):
     assert value(function) == pytest.approx(0.36, abs=1e-6)
     monkeypatch.setitem(globals(), "GAIN", 1.0)
     assert value(function) == moving
+
+
+def no_cost(x, u):
+    return x @ x
+
+
+@pytest.mark.parametrize(
+    "again", [copy.deepcopy, lambda held: pickle.loads(pickle.dumps(held))], ids=["copy", "pickle"]
+)
+def test_a_solution_goes_to_another_process(again):
+    """With functions of a module, one of which reads a global; the copy is simulated and solved like the original."""
+    grid = hjb.Grid([-1.0], [1.0], (9,))
+    problem = hjb.Problem(by_global, no_cost, hjb.Box([-1.0], [1.0]), discount=1.0)
+    solution = hjb.solve(problem, grid)
+    copied = again(solution)
+    assert np.array_equal(copied.value, solution.value)
+    assert np.array_equal(hjb.solve(copied.problem, grid).value, solution.value)
+    assert np.array_equal(hjb.greedy_feedback(copied.problem, copied)([0.3]), [-1.0])
+    error = again(hjb.SolveError("stopped", solution))
+    assert str(error) == "stopped"
+    assert np.array_equal(error.solution.value, solution.value)
 
 
 def of_helpers(x, u):

@@ -64,7 +64,6 @@ def test_a_small_problem_has_one_answer(name, shape):
 
 
 @pytest.mark.slow
-@pytest.mark.optimised
 @pytest.mark.parametrize(("name", "shape"), TABLE)
 def test_every_problem_of_the_zoo_has_one_answer(name, shape):
     agree(name, shape)

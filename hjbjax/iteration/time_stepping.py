@@ -49,6 +49,8 @@ class March:
       checks_noise: true if steps look for correlated noise that the chain cannot represent.
       checks_gap: true if the gap between min max and max min is looked at before every step.
       bare: true if nothing but V is kept: what can be made of it is made where it is used.
+      missed: the relative error of integrals over functions of the time with these steps, where they were made shorter
+        for them; else zero.
     """
 
     on: Discretisation
@@ -62,6 +64,7 @@ class March:
     checks_noise: bool = False
     checks_gap: bool = False
     bare: bool = False
+    missed: Number = 0.0
 
     @property
     def problem(self) -> Problem:

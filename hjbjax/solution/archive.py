@@ -80,7 +80,7 @@ def plan(header: dict) -> dict[str, Expected]:
         "disturbance": controls,
         "enclosure": Expected(((2, 2),)),
         "reached": Expected((shape, lead + shape), (np.bool_,)),
-        "grid_error": Expected((shape,)),
+        "grid_error": Expected((shape, lead + shape)),
         "box_error": Expected((shape, lead + shape)),
         "residuals": Expected((many,)),
         "cut": Expected(((*lead, len(shape), 2),), (np.int64, np.int32)),

@@ -11,6 +11,9 @@ decide, and the lower order counts:
 - Second differences of V fall like h² where V is smooth, like h at a kink, and not at all at a jump or in a layer that
   is thinner than a cell.
 
+A march has no answer of its chain. Its steps grow with the spacings, so the change between grids includes the error of
+the step in time. Only second differences are observed, and a kink that is carried along is smeared; see ``SMEARED``.
+
 First differences fall like h where V is Lipschitz continuous and not at all where V jumps. A jump is off by up to its
 height within the few cells over which the scheme smears it, which no comparison of grids measures: there the
 estimate is at least the range of V over two coarse cells.
@@ -32,6 +35,11 @@ LEAST, FIRST, SECOND = 0.5, 1.0, 2.0  # orders
 # the estimates two to seven times the error
 SMOOTH, ALIKE, ONE = 0.05, 0.5, 10.0
 REACH = 2  # fine nodes to both sides of a coarse one
+# Orders of second differences and of the error without an answer of the chain. A kink that is carried along is smeared
+# over a width h^a, a = 1/2 or 2/3. Second differences fall like h^(2 − a) there, and the error like h^a. V counts as
+# smooth from STRAIGHT on; below, the change between grids may vanish at single nodes.
+STRAIGHT = 1.9
+SMEARED = (0.5, 1.0, 1.5, 1.75, STRAIGHT), (0.5, 1.0, 0.6, 0.67, 2.0)
 BENT = 0.1  # second differences below this part of the first ones say nothing about the order
 # differences fall like h^a: a jump below the one number and none above the other; a root of the distance has ½
 JUMP, CONTINUOUS = 0.3, 0.6
@@ -70,12 +78,18 @@ def estimate(answers: TwoGrids) -> np.ndarray:
     fine = _along_axes(np.where(free, value, np.nan), grid, coarse)
     known = nested_grids.nearest(free, grid, coarse) & np.isfinite(answers.before)
     rough = _around(np.where(known, answers.before, np.nan), coarse)
-    order = np.minimum(_order_of_bends(fine, rough, ratio), answers.highest)
-    if answers.chain is not None:
+    bends = _order_of_bends(fine, rough, ratio)
+    if answers.chain is None:
+        for _ in range(REACH):  # the width of what is smeared
+            near = _combined(bends, coarse, np.minimum)
+            change = np.where(near < STRAIGHT, _combined(change, coarse, np.maximum), change)
+        order = np.interp(bends, *SMEARED)
+    else:
         gain = nested_grids.apart(
             nested_grids.nearest(value, grid, coarse), nested_grids.nearest(answers.chain, grid, coarse)
         )
-        order = np.minimum(order, _order_of_slopes(change, gain, coarse))
+        order = np.minimum(bends, _order_of_slopes(change, gain, coarse))
+    order = np.minimum(order, answers.highest)
     error = np.maximum(change / (ratio**order - 1), _jumps(fine, rough, ratio))
     return np.where(finite, nested_grids.prolong(error, coarse, grid), 0)
 

@@ -70,11 +70,12 @@ class Solution:
       reached: the nodes from which the target can be reached, bool (*grid); ``None`` means all.
       times: shape (k,) when marched; value and policy then have a leading axis.
       grid_error: an estimate of |V − V_exact| at the nodes, shape (*grid), in cost units, with V_exact the solution of
-        the equation itself and not of the discrete one; zero where V is infinite. ``None`` where none was made;
-        ``stats["grid_error"]`` has the reason where the caller left the choice of the scheme.
-      box_error: an estimate of how far V moves if another assumption is made at the ends of the box, shape (*grid), in
-        cost units. ``None`` where the ends cannot matter or nothing was estimated; ``stats["box_error"]`` has the
-        reason.
+        the equation itself and not of the discrete one; zero where V is infinite. When marched it includes the error of
+        the step in time, shape (k, *grid). ``None`` where none was made; ``stats["grid_error"]`` has the reason where
+        the caller left the choice of the scheme, and of every march.
+      box_error: an estimate of how far V moves if another assumption is made at the ends of the box, shape (*grid), or
+        (k, *grid) when marched, in cost units. ``None`` where the ends cannot matter or nothing was estimated;
+        ``stats["box_error"]`` has the reason.
       monotone_error: of a value of second order the certified bound on the error of the monotone answer from which it
         started, against the exact solution of the monotone scheme; ``None`` without one.
       cut: at how many nodes of each end of the box the optimal drift is cut off, shape (n, 2), lower and upper; when

@@ -19,7 +19,6 @@ with the other ends, such as leaving where the control stands still at a wall.
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -45,7 +44,7 @@ from hjbjax.solvers.nested import Settled
 from hjbjax.solvers.result import warn_of_cuts
 
 SHARE, FEWEST, MOST = 16, 600, 3000  # nodes of the coarse grid: one in 16, but at least and at most this number
-MARCHED = 20_000  # most nodes of the coarse grid of a march, which is not factored
+MARCHED = 20_000  # most nodes of a coarse grid of marches for the box error only
 FACTORED = 12_000  # nodes up to which a factorisation is fast enough where a coarser grid would lose the target
 INTERVALS = 6  # intervals that an axis keeps
 STEPS = 30  # most steps of Newton's method; most problems take two or three
@@ -80,18 +79,10 @@ def with_box_error(solution: Solution, settled: Settled, clock: Clock) -> Soluti
     if clock.over() is not None:
         return solution
     clock.phase = "the estimate of the box error"
-    return _reported(solution, of_solve(settled.task, np.asarray(solution.value)))
+    return reported(solution, of_solve(settled.task, np.asarray(solution.value)))
 
 
-def with_march_box_error(solution: Solution, on: Discretisation, run: Callable, clock: Clock) -> Solution:
-    """``with_box_error`` for a march: ``on`` is the problem on its grid, and ``run`` is as in ``of_march``."""
-    if clock.over() is not None:
-        return solution
-    clock.phase = "the estimate of the box error"
-    return _reported(solution, of_march(on, np.asarray(solution.value), run))
-
-
-def _reported(solution: Solution, found: BoxError) -> Solution:
+def reported(solution: Solution, found: BoxError) -> Solution:
     """The solution with the estimate or the reason that there is none, and the warning that belongs to it."""
     grid = solution.grid
     if found.error is not None:
@@ -121,33 +112,29 @@ def of_solve(task: Task, value: Nodes) -> BoxError:
     return _compare(level, before, task.grid)
 
 
-def of_march(on: Discretisation, value: Nodes, run: Callable[[Discretisation], np.ndarray | None]) -> BoxError:
-    """The estimate for a march: the difference between two marches on a coarse grid, (k, *grid).
-
-    Args:
-      on: the problem on its grid.
-      value: V at the kept times, (k, *grid).
-      run: marches the chain on another grid and returns V at the same times; None where the march does not come to its
-        end.
-    """
-    others = other_ends(on.problem, on.grid)
-    if others == on.grid.edges:
-        return BoxError(None, CANNOT_MATTER)
-    coarse = on.grid
-    wanted = int(np.clip(on.grid.size // SHARE, FEWEST, MARCHED))
+def coarse_for_marches(grid: Grid) -> Grid | None:
+    """The coarse grid of two marches of which only their difference counts; None where none is small enough."""
+    wanted = int(np.clip(grid.size // SHARE, FEWEST, MARCHED))
+    coarse = grid
     while coarse.size > wanted and (smaller := nested_grids.coarser(coarse, INTERVALS)) is not None:
         coarse = smaller
-    if coarse.size > max(wanted, MARCHED):
-        return BoxError(None, TOO_MANY)
-    chain = dataclasses.replace(on.chain.on_grid(coarse), mesh=None)
-    first = run(chain)
-    second = run(chain.on_grid(altered(coarse, edges=others)))
-    if first is None or second is None or not np.all(np.isfinite(second - first)):
-        return BoxError(None, UNSETTLED)
+    return coarse if coarse.size <= max(wanted, MARCHED) else None
+
+
+def of_two_marches(first: np.ndarray, second: np.ndarray, coarse: Grid, value: Nodes, fine: Grid) -> BoxError:
+    """The estimate for a march: the difference between two marches on a coarse grid, (k, *fine).
+
+    Args:
+      first: V at k times by a march with the ends of the caller, (k, *coarse).
+      second: the same with other ends.
+      coarse: their grid.
+      value: V at the kept times, (k, *fine), whose range is the scale.
+      fine: the grid of the estimate.
+    """
     change, scale = np.abs(second - first), np.ptp(value)
     if np.max(change) <= ROUNDING * scale:
         return BoxError(None, NEVER_REACHED)
-    error = np.stack([nested_grids.prolong(each, coarse, on.grid) for each in change])
+    error = np.stack([nested_grids.prolong(each, coarse, fine) for each in change])
     return BoxError(error, sides=_sides(coarse, np.max(change, axis=0) > LARGE * scale))
 
 

@@ -4,8 +4,6 @@ At host level it validates, finds the longest stable step, goes backward in chun
 one kept time to the next, and reports. Under a tracer the same steps run in a scan of fixed length.
 """
 
-import dataclasses
-import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -20,7 +18,7 @@ from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.schemes import Limited, Upwind
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import bellman, time_stepping
-from hjbjax.iteration.evaluation import Evaluation, Krylov, Sweeps, check_pytree
+from hjbjax.iteration.evaluation import check_pytree
 from hjbjax.iteration.time_methods import Explicit, TimeMethod
 from hjbjax.iteration.time_stepping import March
 from hjbjax.markov_chain import admissibility, memory, node_checks
@@ -32,16 +30,16 @@ from hjbjax.problem.pytree import altered, as_one_program, cast, is_traced
 from hjbjax.problem.sets import Box
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, DType, Mask, Nodes, Scalar
-from hjbjax.solution import checkpoints, nested_grids
+from hjbjax.solution import checkpoints
 from hjbjax.solution.checkpoints import Checkpoint
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solution.placement import Path
 from hjbjax.solution.solution import Solution, SolveError, question
 from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop, march_run, time_probes
-from hjbjax.solvers.box_error import with_march_box_error
+from hjbjax.solvers.march_errors import Marched, with_march_errors
 from hjbjax.solvers.result import solution_at_start, with_last_phase
-from hjbjax.solvers.setup import check_on_one_state, choose_evaluation
+from hjbjax.solvers.setup import check_on_one_state, march_evaluation
 from hjbjax.solvers.stationary import check_node_values
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
@@ -139,7 +137,11 @@ def march(
     horizon, kept = _times(horizon, times)
     traced = is_traced(problem, grid, method, start)
     if mesh is not None:
-        by = [] if method.limited else [getattr(method, "evaluation", None) or _evaluation(problem, grid, divided=True)]
+        by = (
+            []
+            if method.limited
+            else [getattr(method, "evaluation", None) or march_evaluation(problem, grid, divided=True)]
+        )
         mesh = checks.over_devices(mesh, "march", problem, grid, scheme, method, *by, traced=traced)
     if traced:
         on = Discretisation(problem, grid, scheme, arguments.traced_dtype(dtype, "march"))
@@ -167,8 +169,8 @@ def march(
             try:
                 task, solution = _on_host(on, horizon, kept, start, method, step, inner, clock, policy=policy)
                 if solution.status is Status.CONVERGED:
-                    again = functools.partial(_march_again, task, method, kept, start, clock)
-                    solution = with_march_box_error(solution, on, again, clock)
+                    marched = Marched(task, method, start, int(solution.steps))
+                    solution = with_march_errors(solution, marched, clock)
             except Stopped as stop:
                 solution = _solution_at_horizon(on, horizon, start, stop.status)
         solution = with_last_phase(solution, clock)
@@ -244,23 +246,6 @@ def _check_nodes(on: Discretisation, horizon: float, clock: Clock) -> None:
     clock.enter("the preparation")
 
 
-def _march_again(
-    task: March, method: TimeMethod, kept: np.ndarray, start: Nodes | None, clock: Clock, on: Discretisation
-) -> np.ndarray | None:
-    """V at the kept times by a march of the same problem on a coarser grid; None where it does not come to its end.
-
-    The steps are as long as those of ``task``, whose limit is the shorter one.
-    """
-    begin = None if start is None else nested_grids.restrict(np.asarray(start), task.grid, on.grid)
-    on = cast(on, on.dtype)
-    again = dataclasses.replace(
-        task, on=on, method=method.filled(on, _evaluation(on.problem, on.grid)), obstacles=None, watched=None,
-        checks_rates=False, checks_noise=False, checks_gap=False, bare=True,
-    )  # fmt: skip
-    slices, _, code = march_run.drive(again, float(task.horizon), kept, begin, clock.beside())
-    return slices.value if code is Status.CONVERGED else None
-
-
 def _solution_at_horizon(on: Discretisation, horizon: float, start: Nodes | None, code: Status) -> Solution:
     """The solution of a march that ended before its first step: the value it was to start from; NaN if not known."""
     value = np.full((1, *on.grid.shape), np.nan if start is None else np.asarray(start), on.dtype)
@@ -321,12 +306,12 @@ def _without_moving_target(problem: Problem) -> Problem:
 def _prepare(
     on: Discretisation, horizon: float, method: TimeMethod, step: float | None, inner: float | None, *, policy: bool
 ) -> March:
-    """The task of a march, all arrays in its type, with a given step held against the limit."""
+    """The task of a march, all arrays in its type, with a prescribed step checked against the limit."""
     on, dtype = cast(on, on.dtype), on.dtype
     problem, grid = on.problem, on.grid
     moving = problem.time_dependent
     limit: Scalar = jnp.asarray(jnp.inf, dtype)
-    method = method.filled(on, _evaluation(problem, grid, divided=on.mesh is not None))
+    method = method.filled(on, march_evaluation(problem, grid, divided=on.mesh is not None))
     if method.limited:
         # 1/(max Q + β) changes with the time if the functions do: a given step is held against the least of many, one
         # that is left open is found anew before every step
@@ -340,10 +325,11 @@ def _prepare(
             limit = own if step is None else stable
     looks = _checks(on, method)
     longest: Array | float = math.inf if step is None else step
+    left = 0.0
     if moving:
         found = time_probes.resolution(problem, grid, horizon, dtype)
         time_probes.report(found, horizon, step)
-        longest = found.lengths[:, None] if step is None else step
+        longest, left = (found.lengths[:, None], found.left) if step is None else (step, 0.0)
     elif step is None and (looks[0] or not method.limited):
         longest = horizon / FEWEST  # rates that are found on the way say nothing of the first steps
     obstacles = None if moving or not policy else _obstacles(on)
@@ -351,6 +337,7 @@ def _prepare(
         on, method, obstacles, None if moving and method.limited else limit, jnp.asarray(longest, dtype),
         jnp.asarray(horizon, dtype), _blow_up_nodes(on, inner),
         checks_rates=looks[0], checks_noise=looks[1], checks_gap=looks[2] and policy, bare=not policy,
+        missed=jnp.asarray(left, dtype),
     )  # fmt: skip
 
 
@@ -375,14 +362,6 @@ def _check_step(step: float | None, limit: float) -> None:
             f"march: step = {step:g} is above the stability limit 1/(max Q + β) = {limit:.6g} of explicit steps "
             "on this grid;\nleave step out, or use method=hjb.Implicit()"
         )
-
-
-def _evaluation(problem: Problem, grid: Grid, *, divided: bool = False) -> Evaluation:
-    """The evaluation of policies in an implicit step that suits the problem."""
-    if grid.sides("open"):
-        return choose_evaluation(problem, grid, traced=False, divided=divided)
-    # sweeps follow the drift and are slow where noise spreads news both ways
-    return Sweeps() if problem.noise is None else Krylov()
 
 
 def _blow_up_nodes(on: Discretisation, share: float | None) -> Mask | None:
@@ -416,7 +395,7 @@ def _march_traced(
             "most 1/(max Q + β) of every problem that comes"
         )
     kind, problem, grid = on.dtype, on.problem, on.grid
-    on, method = cast(on, kind), method.filled(on, _evaluation(problem, grid))
+    on, method = cast(on, kind), method.filled(on, march_evaluation(problem, grid))
     obstacles = None if problem.time_dependent else bellman.obstacles(on)
     checks_rates, checks_noise, _ = _checks(on, method)
     task = March(

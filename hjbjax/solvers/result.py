@@ -29,7 +29,9 @@ from hjbjax.solvers.nested import CoarserAnswer, Settled
 from hjbjax.solvers.setup import BOUNDING, Assumptions
 
 GAP = 0.05  # of what the actions matter; where Isaacs' condition holds, upwinding left up to .019 on 21 nodes
-COARSE = 0.1  # of the range of V: a larger error of the grid is worth a warning
+COARSE = 0.1  # of the range of V: a larger error of the grid is worth a warning ...
+NODES = 0.05  # ... at more than this share of the nodes
+FLAT = 0.1  # of max |V|: a smaller range is no scale for errors
 MOST = 2 / 3  # of an end's nodes: whatever has a velocity leaves by half of those where its position ends
 
 
@@ -117,14 +119,30 @@ def with_grid_error(solution: Solution, settled: Settled, coarser: CoarserAnswer
         chain=None if origin is None else np.asarray(origin.state.value),
         highest=_highest(settled),
     )
-    finite = np.isfinite(value)
-    found = np.where(finite, grid_error.estimate(answers) + _left(solution, settled), 0)
-    if finite.any() and (largest := np.max(found)) > COARSE * np.ptp(value[finite]):
-        warn(
-            f"the grid is coarse for this problem: its error is about {largest:.3g}, over a tenth of the range of the "
-            "value; take more nodes, or gather them where the value bends: Grid(..., stretch=)"
-        )
+    found = np.where(np.isfinite(value), grid_error.estimate(answers) + _left(solution, settled), 0)
+    warn_of_grid(found[None], value[None])
     return dataclasses.replace(solution, grid_error=found)
+
+
+def warn_of_grid(error: np.ndarray, value: np.ndarray, more: str = "nodes") -> None:
+    """Warn of a grid whose estimated error is above a tenth of the range of V at many nodes at some time.
+
+    Args:
+      error: the estimate, (k, *grid), with k = 1 for a stationary answer.
+      value: V, (k, *grid); infinite values do not count.
+      more: the things of which more reduce the error.
+    """
+    finite = np.isfinite(value)
+    if not finite.any():
+        return
+    scale = max(np.ptp(value[finite]), FLAT * np.max(np.abs(value[finite])))
+    large, nodes = finite & (error > COARSE * scale), tuple(range(1, value.ndim))
+    share = float(np.max(np.sum(large, axis=nodes) / np.maximum(np.sum(finite, axis=nodes), 1)))
+    if share > NODES:
+        warn(
+            f"the grid is coarse for this problem: its error is above a tenth of the range of V at {share:.0%} of the "
+            f"nodes (Solution.grid_error). Take more {more}, or gather nodes where V bends: Grid(..., stretch=)"
+        )
 
 
 def _highest(settled: Settled) -> float:

@@ -83,6 +83,14 @@ def choose_evaluation(problem: Problem, grid: Grid, *, traced: bool, divided: bo
     return Krylov() if traced or divided else linear_solve(grid)
 
 
+def march_evaluation(problem: Problem, grid: Grid, *, divided: bool = False) -> Evaluation:
+    """The evaluation of policies in an implicit step that suits the problem."""
+    if grid.sides("open"):
+        return choose_evaluation(problem, grid, traced=False, divided=divided)
+    # sweeps follow the drift and are slow where noise spreads news both ways
+    return Sweeps() if problem.noise is None else Krylov()
+
+
 def choose_scheme(on: Discretisation, method: Method) -> Scheme:
     """The scheme that suits a problem; host level.
 

@@ -263,6 +263,7 @@ def test_a_bound_that_is_felt_is_infeasible():
     assert len(str(e.value).splitlines()) <= 6
 
 
+@pytest.mark.filterwarnings("ignore:the grid is coarse")
 def test_a_march_goes_on_from_another():
     problem, grid = LAG.game()(0.9), cube(1, 21)
     options = {"scheme": hjb.Weno5(), "step": 1 / 256}

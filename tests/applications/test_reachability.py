@@ -42,6 +42,7 @@ def test_a_floating_boat_has_its_light_cone():
     assert tube.value.min() >= -1.1
 
 
+@pytest.mark.filterwarnings("ignore:the grid is coarse")
 def test_the_stationary_tube_is_the_limit_of_marching():
     grid = hjb.Grid([-3.0, -3.0], [3.0, 3.0], (31, 31))
     problem = hjb.reach(boat, UNIT, square)

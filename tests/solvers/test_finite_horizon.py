@@ -253,7 +253,7 @@ def test_implicit_games_agree_with_explicit_ones():
     assert np.max(np.abs(step - explicit)[inner(grid)]) < 0.01  # of first order in Δt
 
 
-@pytest.mark.filterwarnings("ignore:.*the Isaacs condition fails")
+@pytest.mark.filterwarnings("ignore:.*the Isaacs condition fails", "ignore:the grid is coarse")
 @pytest.mark.parametrize("isaacs", ["upper", "lower"])
 @pytest.mark.parametrize("split", [False, True])
 @pytest.mark.parametrize("method", [hjb.Explicit(), hjb.Implicit()])

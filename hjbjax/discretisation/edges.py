@@ -174,6 +174,28 @@ def cut(
     return counts, totals
 
 
+def count_leaving(on: Discretisation, value: jax.Array, u: list, d: list, acting: jax.Array) -> jax.Array:
+    """The nodes of each projected end where the drift under these actions is cut off, (n, 2); for use inside programs.
+
+    As ``cut`` counts them, but the sizes of the drift and of V are those at the end.
+    """
+    grid, shape = on.grid, on.grid.shape
+    f = [jnp.broadcast_to(entry, shape) for entry in on.drift(u, d)]
+    earning, eps = _actions_cost(on.problem, grid.ndim, on.dtype), float(jnp.finfo(on.dtype).eps)
+    counts = jnp.zeros((grid.ndim, 2), jnp.int32)
+    for axis, step in grid.sides("projected"):
+        last, side = (shape[axis] - 1 if step > 0 else 0), (step + 1) // 2
+        there, looked_at, own, inner = (
+            jax.lax.index_in_dim(array, place, axis, keepdims=False)
+            for array, place in ((f[axis], last), (acting, last), (value, last), (value, last - step))
+        )
+        change = jnp.abs(own - inner) * (shape[axis] - 1)
+        matters = earning | (change > math.sqrt(eps) * (jnp.max(jnp.abs(own)) + jnp.max(change)))
+        leaves = step * there > ROUNDINGS * eps * jnp.max(jnp.abs(there))
+        counts = counts.at[axis, side].set(jnp.sum(looked_at & leaves & matters, dtype=jnp.int32))
+    return counts
+
+
 def _in_blocks(
     drift: Callable[[np.ndarray], np.ndarray], parts: Sequence[Callable[[], np.ndarray]], count: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -5,9 +5,10 @@ separable and quadratic: each drift component contributes a gain with a kink whe
 minimise and −1 to maximise; all numbers are per-node scalars.
 """
 
+import functools
 import itertools
 from collections.abc import Callable, Sequence
-from typing import Generic, TypeAlias, TypeVar
+from typing import Any, Generic, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,9 @@ from hjbjax.discretisation.stencil import PerNode
 from hjbjax.hamiltonian.search import better
 
 Pair: TypeAlias = Sequence[PerNode]  # one number a node for each of two inputs
+Candidate: TypeAlias = tuple[list[jax.Array], jax.Array]  # an action and its value
 Slope = TypeVar("Slope")
+UNROLLED = 9  # cells up to which the candidates are written out, which is faster: two gains with two kinks each
 
 
 class Kinked(Generic[Slope]):
@@ -93,12 +96,10 @@ def piecewise_input(
             slope = linear + sum(piece.slope * d for piece, d in zip(pieces, choice, strict=True))
             candidates.append(jnp.clip(-slope * inverse(2 * square), lo, hi))
     # judged by the objective itself: which choice of pieces a candidate belongs to need not be known
-    best_u, best_value = jnp.asarray(candidates[0]), total(candidates[0])
+    best: Candidate = [jnp.asarray(candidates[0])], jnp.asarray(total(candidates[0]))
     for u in candidates[1:]:
-        value = total(u)
-        wins = better(sign, value, best_value)
-        best_u, best_value = jnp.where(wins, u, best_u), jnp.where(wins, value, best_value)
-    return best_u
+        best = _better_of(sign, ([u], total(u)), best)
+    return best[0][0]
 
 
 def piecewise_pair(
@@ -134,6 +135,8 @@ def piecewise_pair(
             (p.gain(p.offset + p.slope[0] * u[0] + p.slope[1] * u[1]) for p in pieces), start=terms[0] + terms[1]
         )
 
+    cells = list(itertools.product(*(piece.derivatives for piece in pieces))) if curved else []
+
     def best_on_line(
         point: Pair, direction: Pair, ends: tuple[PerNode, PerNode], others: Sequence[Kinked[Pair]]
     ) -> list[jax.Array]:
@@ -145,32 +148,71 @@ def piecewise_pair(
         # a kink's line may miss the box, and rounding may carry a point over a side: admissible in any case
         return clipped([x + t * v for x, v in zip(point, direction, strict=True)])
 
-    # the four sides of the box
-    candidates = [best_on_line((0.0, bound), (1.0, 0.0), (lo[0], hi[0]), pieces) for bound in (lo[1], hi[1])] + [
-        best_on_line((bound, 0.0), (0.0, 1.0), (lo[1], hi[1]), pieces) for bound in (lo[0], hi[0])
-    ]
-    # the kinks' lines; on its own line a gain is constant and drops out
-    for index, piece in enumerate(pieces):
+    def in_cell(derivatives: Sequence[PerNode]) -> list[jax.Array]:
+        slopes = [  # the inputs decouple within a cell, where the gains are linear and the cost is separable
+            b + sum(piece.slope[j] * d for piece, d in zip(pieces, derivatives, strict=True))
+            for j, b in enumerate(linear)
+        ]
+        return clipped([-s * inverse(2 * c) for s, c in zip(slopes, square, strict=True)])
+
+    def on_kink(index: int, kink: PerNode) -> list[jax.Array]:
+        # on its own line a gain is constant and drops out
         others = [other for k, other in enumerate(pieces) if k != index]
-        for kink in piece.kinks:
-            point, direction = _kink_line(piece, kink)
-            candidates.append(best_on_line(point, direction, _within(point, direction, lo, hi), others))
-    if curved:
-        for choice in itertools.product(*(piece.derivatives for piece in pieces)):
-            slopes = [  # the inputs decouple within a cell, where the gains are linear and the cost is separable
-                b + sum(piece.slope[j] * d for piece, d in zip(pieces, choice, strict=True))
-                for j, b in enumerate(linear)
-            ]
-            candidates.append(clipped([-s * inverse(2 * c) for s, c in zip(slopes, square, strict=True)]))
-    best_u, best_value = candidates[0], total(candidates[0])
-    for u in candidates[1:]:
-        value = total(u)
-        wins = better(sign, value, best_value)
-        best_u, best_value = (
-            [jnp.where(wins, new, old) for new, old in zip(u, best_u, strict=True)],
-            jnp.where(wins, value, best_value),
-        )
-    return best_u
+        point, direction = _kink_line(pieces[index], kink)
+        return best_on_line(point, direction, _within(point, direction, lo, hi), others)
+
+    def on_side(side: tuple) -> list[jax.Array]:
+        return best_on_line(*side, pieces)
+
+    # the four sides of the box, the kinks' lines, and the cells
+    sides = [((0.0, bound), (1.0, 0.0), (lo[0], hi[0])) for bound in (lo[1], hi[1])]
+    sides += [((bound, 0.0), (0.0, 1.0), (lo[1], hi[1])) for bound in (lo[0], hi[0])]
+    families: list[tuple[Callable, Sequence]] = [(on_side, sides)]
+    families += [(functools.partial(on_kink, index), piece.kinks) for index, piece in enumerate(pieces)]
+    families += [(in_cell, cells)]
+    if len(cells) > UNROLLED:
+        corner = clipped([lo[0], lo[1]])
+        best: Candidate = corner, jnp.asarray(total(corner))
+        # as on a side: a gain that is constant along its own line does no harm, and all lines are computed alike
+        lines = [_kink_line(piece, kink) for piece in pieces for kink in piece.kinks]
+        sides += [(tuple(point), tuple(way), _within(point, way, lo, hi)) for point, way in lines]
+        for candidate, entries in ((on_side, sides), (in_cell, cells)):
+            best = _best_in_loop(sign, total, candidate, entries, best)
+        return best[0]
+    found = [candidate(each) for candidate, entries in families for each in entries]
+    best = found[0], jnp.asarray(total(found[0]))
+    for u in found[1:]:
+        best = _better_of(sign, (u, total(u)), best)
+    return best[0]
+
+
+def _better_of(sign: int, new: tuple[list[jax.Array], PerNode], old: Candidate) -> Candidate:
+    """The better one of two candidates with their values, node by node."""
+    wins = better(sign, new[1], old[1])
+    return [jnp.where(wins, a, b) for a, b in zip(new[0], old[0], strict=True)], jnp.where(wins, new[1], old[1])
+
+
+def _best_in_loop(
+    sign: int, total: Callable[[list], PerNode], candidate: Callable, entries: Sequence, best: Candidate
+) -> Candidate:
+    """The best one of a candidate and of others that are computed alike, in a loop, so that one of them is compiled.
+
+    Central differences of two components have three kinks each, which makes 166 candidates. XLA takes minutes for a
+    program in which all of them are written out.
+    """
+    shape = jax.eval_shape(lambda: jnp.asarray(total(candidate(entries[0])))).shape
+    value = jnp.broadcast_to(best[1], shape)
+    u = [jnp.broadcast_to(each, value.shape).astype(value.dtype) for each in best[0]]
+
+    def wide(entry: PerNode) -> jax.Array:
+        return jnp.broadcast_to(jnp.asarray(entry, value.dtype), value.shape)
+
+    def turn(best: Candidate, entry: Any) -> tuple[Candidate, None]:
+        u = [wide(each) for each in candidate(entry)]
+        return _better_of(sign, (u, wide(total(u))), best), None
+
+    stacked = jax.tree.map(lambda *each: jnp.stack([wide(one) for one in each]), *entries)
+    return jax.lax.scan(turn, (u, value), stacked)[0]
 
 
 def _kink_line(piece: Kinked[Pair], kink: PerNode) -> tuple[Pair, Pair]:

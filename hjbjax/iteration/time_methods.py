@@ -95,8 +95,8 @@ class Marching(Protocol):
     def rate(self, value: Field, t: Number) -> tuple[Field, Any]:
         """F = min max H − β V, cost per unit time, and the rates and the noise under the optimal actions."""
 
-    def look(self, u: list, d: list, t: Number) -> Any:
-        """The fastest rate under these actions, and noise that the chain cannot represent."""
+    def look(self, value: Field, u: list, d: list, t: Number) -> Any:
+        """The fastest rate under these actions, noise that the chain cannot represent, and drift that is cut off."""
 
     def nothing_seen(self) -> Any:
         """The outcome before the first look."""
@@ -286,7 +286,7 @@ class Implicit:
         value, policy, ok = known.solve(start, self.evaluation, tol, self.max_steps)
         found = value, policy, known.equation(value, policy)
         value = adjoint.attach_step(question.on, question.obstacles, question.arriving, found, self.evaluation)
-        return value, ok, march.look(list(policy.controls), list(policy.disturbances), end)
+        return value, ok, march.look(value, list(policy.controls), list(policy.disturbances), end)
 
     def described(self) -> str:
         """The method as one would write it."""

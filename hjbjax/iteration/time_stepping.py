@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax.discretisation import correlated_noise
+from hjbjax.discretisation import correlated_noise, edges
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.rates import jump_rates, largest_rate
 from hjbjax.hamiltonian import discrete, optimum
@@ -32,7 +32,7 @@ TRIES = 30  # of a step that is shortened, at most; what its first stage sees do
 NEAR = 1e-3  # of a bound's distance: a disturbance so near its bound sits on it
 
 
-@pytree_dataclass(static=("checks_rates", "checks_noise", "checks_gap", "bare"))
+@pytree_dataclass(static=("checks_rates", "checks_noise", "checks_gap", "checks_cut", "bare"))
 class March:
     """The constants of a march: the problem on its grid, the method, and the limits of its steps.
 
@@ -48,6 +48,7 @@ class March:
       checks_rates: true if explicit steps look at Q under the actions that they chose.
       checks_noise: true if steps look for correlated noise that the chain cannot represent.
       checks_gap: true if the gap between min max and max min is looked at before every step.
+      checks_cut: true if steps count the nodes at which drift out of the box is cut off.
       bare: true if nothing but V is kept: what can be made of it is made where it is used.
       missed: the relative error of integrals over functions of the time with these steps, where they were made shorter
         for them; else zero.
@@ -63,6 +64,7 @@ class March:
     checks_rates: bool = False
     checks_noise: bool = False
     checks_gap: bool = False
+    checks_cut: bool = False
     bare: bool = False
     missed: Number = 0.0
 
@@ -100,12 +102,15 @@ class March:
     def rate(self, value: Field, t: Number) -> tuple[Field, "Seen"]:
         """F = min max H − β V, cost per unit time, and the rates and the noise under the optimal actions."""
         best, u, d = optimum.optimise(dataclasses.replace(discrete.around(self.on.at(t), value), bare=self.bare))
-        return best - self.problem.discount * value, self.look(u, d, t)
+        return best - self.problem.discount * value, self.look(value, u, d, t)
 
-    def look(self, u: Action, d: Action, t: Number) -> "Seen":
-        """The largest Q + β under these actions, and the first node whose noise the chain cannot represent."""
+    def look(self, value: Field, u: Action, d: Action, t: Number) -> "Seen":
+        """The largest Q + β under these actions, the first node whose noise has no chain, and what is cut off."""
         on, dtype = self.on.at(t), self.on.dtype
         seen = self.nothing_seen()
+        if self.checks_cut:
+            found = edges.count_leaving(on, value, u, d, self.obstacles_at(t).acting(value))
+            seen = dataclasses.replace(seen, cut=found)
         if self.checks_rates:  # a pass over all rates, which is spared where the limit of the step is known
             fastest = on.grid.largest(jump_rates(on, u, d).total()) + jnp.asarray(on.problem.discount, dtype)
             seen = dataclasses.replace(seen, fastest=fastest)
@@ -122,7 +127,8 @@ class March:
     def nothing_seen(self) -> "Seen":
         """No rate, and no node without a chain."""
         dtype = self.on.dtype
-        return Seen(jnp.zeros((), dtype), jnp.full((), -1, jnp.int32), jnp.zeros((), dtype))
+        zero = jnp.zeros((), dtype)
+        return Seen(zero, jnp.full((), -1, jnp.int32), zero, jnp.zeros((self.grid.ndim, 2), jnp.int32))
 
 
 @pytree_dataclass()
@@ -138,6 +144,7 @@ class Front:
       code: a Status number.
       seen: the rates and the noise that the last step saw.
       gap: the largest gap between min max and max min so far, and how much the actions mattered there, (2,).
+      cut: the largest numbers of nodes at each end where drift was cut off, since the last kept time, (n, 2).
     """
 
     value: Field
@@ -147,6 +154,7 @@ class Front:
     code: Scalar
     seen: "Seen"
     gap: jax.Array
+    cut: jax.Array
 
 
 @pytree_dataclass()
@@ -157,11 +165,13 @@ class Seen:
       fastest: the largest Q + β under the actions that were chosen, per unit time.
       lacking: the first node, counted flat, where noise is correlated more than the spacings allow, or −1.
       t: the time of that.
+      cut: the nodes at each end of the box where drift is cut off, (n, 2).
     """
 
     fastest: Scalar
     lacking: Scalar
     t: Scalar
+    cut: jax.Array
 
     def joined(self, other: "Seen") -> "Seen":
         """The larger rate of two looks, and the fault of the noise that was found first."""
@@ -170,6 +180,7 @@ class Seen:
             jnp.maximum(self.fastest, other.fastest),
             jnp.where(first, self.lacking, other.lacking),
             jnp.where(first, self.t, other.t),
+            jnp.maximum(self.cut, other.cut),
         )
 
 
@@ -197,7 +208,8 @@ def begin(march: March, value: Field, left: Number) -> Front:
     zero = jnp.zeros((), jnp.int32)
     t, none = jnp.asarray(march.horizon, value.dtype), jnp.zeros((2,), value.dtype)
     clock = jnp.asarray([left, 0], value.dtype)
-    return Front(value, t, clock, zero, zero + int(Status.RUNNING), march.nothing_seen(), none)
+    seen = march.nothing_seen()
+    return Front(value, t, clock, zero, zero + int(Status.RUNNING), seen, none, seen.cut)
 
 
 def run(march: March, front: Front, until: Number, most: Number) -> Front:
@@ -256,7 +268,8 @@ def advance(march: March, front: Front, until: Number) -> Front:
             jnp.where(taken, new, old) for new, old in ((value, front.value), (t, front.t), (left, front.left))
         )
         code = jnp.where(taken, code, Status.STALLED)
-    return Front(value, t, left, front.steps + 1, code.astype(jnp.int32), seen, gap)
+    cut = jnp.maximum(front.cut, seen.cut)
+    return Front(value, t, left, front.steps + 1, code.astype(jnp.int32), seen, gap, cut)
 
 
 def _larger_gap(march: March, front: Front) -> jax.Array:

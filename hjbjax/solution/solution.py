@@ -79,7 +79,8 @@ class Solution:
       monotone_error: of a value of second order the certified bound on the error of the monotone answer from which it
         started, against the exact solution of the monotone scheme; ``None`` without one.
       cut: at how many nodes of each end of the box the optimal drift is cut off, shape (n, 2), lower and upper; when
-        marched, at each kept time, (k, n, 2). Zero at ends that are not projected; ``None`` where it was not counted.
+        marched, the most in any step down to each kept time, (k, n, 2). Zero at ends that are not projected; ``None``
+        where it was not counted.
       discrete: whether the controls are enumerated, so that a mean of two need not be admissible.
       discrete_disturbance: whether the disturbances are enumerated.
       labels: names and units of the controls, and the side of the level set, for pictures.

@@ -336,7 +336,8 @@ def _prepare(
     return March(
         on, method, obstacles, None if moving and method.limited else limit, jnp.asarray(longest, dtype),
         jnp.asarray(horizon, dtype), _blow_up_nodes(on, inner),
-        checks_rates=looks[0], checks_noise=looks[1], checks_gap=looks[2] and policy, bare=not policy,
+        checks_rates=looks[0], checks_noise=looks[1], checks_gap=looks[2] and policy,
+        checks_cut=_checks_cut(on) and policy, bare=not policy,
         missed=jnp.asarray(left, dtype),
     )  # fmt: skip
 
@@ -352,6 +353,11 @@ def _checks(on: Discretisation, method: TimeMethod) -> tuple[bool, bool, bool]:
     # where the players act apart, min max is max min node by node
     gap = problem.is_game and not players.decoupled
     return rates, callable(problem.noise) and (moving or players.steers_noise), gap
+
+
+def _checks_cut(on: Discretisation) -> bool:
+    """True if drift that changes in time may leave between two kept times; ends that are divided are not looked at."""
+    return on.problem.time_dependent and on.mesh is None and bool(on.grid.sides("projected"))
 
 
 def _check_step(step: float | None, limit: float) -> None:

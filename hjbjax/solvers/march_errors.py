@@ -186,7 +186,7 @@ def _every_second(times: np.ndarray, horizon: float, steps: int) -> np.ndarray:
     count = len(times)
     lengths = np.diff([*times, horizon])
     lengths = lengths[lengths > 0]
-    if count < 2 or np.min(lengths) * steps >= FEW * (horizon - times[0]):
+    if count < 2 or not lengths.size or np.min(lengths) * steps >= FEW * (horizon - times[0]):
         return np.arange(count)
     return np.unique([*range(0, count, 2), *((count - 1,) if times[-1] >= horizon else ())])
 
@@ -195,7 +195,7 @@ def _longer(marched: Marched, times: np.ndarray) -> float:
     """How much longer steps become: two, and three for a few implicit ones, since two thirds of three is no half."""
     horizon = float(marched.task.horizon)
     lengths = np.diff([*times, horizon])
-    few = np.min(lengths[lengths > 0]) * marched.steps < 3 * FEW * (horizon - times[0])
+    few = np.min(lengths, where=lengths > 0, initial=np.inf) * marched.steps < 3 * FEW * (horizon - times[0])
     return 3.0 if few and not marched.task.method.limited else 2.0
 
 
@@ -211,7 +211,7 @@ def _again(
     again = dataclasses.replace(
         task, on=on, method=method, obstacles=None, watched=None, limit=_limit(task, on) if longer else task.limit,
         step=_steps(task, coarse.longer) if longer else task.step, checks_rates=longer and task.checks_rates,
-        checks_noise=False, checks_gap=False, bare=True,
+        checks_noise=False, checks_gap=False, checks_cut=False, bare=True,
     )  # fmt: skip
     kept = np.asarray(solution.times, float)[coarse.kept]
     slices, _, code = march_run.drive(again, float(task.horizon), kept, begin, clock.beside())
@@ -236,8 +236,7 @@ def _limit(task: March, on: Discretisation) -> jax.Array | None:
     tableau, beta = task.method.tableau, float(task.problem.discount)
     fine, coarse = task.grid, on.grid
     if task.problem.target is not None or any(a == b for a, b in zip(fine.shape, coarse.shape, strict=True)):
-        share = jnp.asarray(task.method.courant, on.dtype)
-        return _stable(on, tableau, share)
+        return _stable(on, tableau, jnp.asarray(task.method.courant, on.dtype))
     ratio, limit, share = nested_grids.ratio_of(fine, coarse), float(task.limit), float(task.method.courant)
     if beta == 0 or len(tableau.means) == 1:
         rate = share / limit  # Q + β, see ``longest_step``

@@ -272,6 +272,13 @@ class MarchRun:
         asked = feedback and not self.task.bare
         answer = jax.device_get(self._greedy(self.task, self.front.value, self.front.t)) if asked else None
         self.slices.keep(self.task, self.front.value, self.time, answer)
+        self._keep_cut(self.front)
+
+    def _keep_cut(self, front: Front) -> None:
+        """Take what was cut off since the kept time before, where that is more, and count anew."""
+        place = self.slices.first
+        np.maximum(self.slices.cut[place], np.asarray(front.cut), out=self.slices.cut[place])
+        self.front = altered(self.front, cut=jnp.zeros_like(front.cut))
 
     def saved(self) -> list[Any]:
         """The slices that are kept, and the front."""

@@ -92,6 +92,19 @@ def test_the_gap_is_the_largest_of_all_steps():
     assert solution.isaacs_gap == pytest.approx(2.0)
 
 
+@pytest.mark.filterwarnings("ignore:the grid is coarse", "ignore:the box decides")
+@pytest.mark.parametrize("method", [hjb.Explicit(), hjb.Implicit()])
+def test_what_is_cut_is_counted_in_all_steps(method):
+    """Drift that leaves the box from 0.3 to 0.6 only: nothing was cut off at the kept times."""
+    pulled = hjb.Problem(
+        lambda t, x, u: 0.1 * u + jnp.where((t > 0.3) & (t < 0.6), 2.0, 0.0), lambda t, x, u: x @ x, UNIT,
+        time_dependent=True,
+    )  # fmt: skip
+    assert hjb.march(pulled, LINE, 1.0, times=[0.0, 1.0], method=method).cut.tolist() == [[[0, 1]], [[0, 0]]]
+    kept = hjb.march(pulled, LINE, 1.0, times=[0.0, 0.2, 0.8, 1.0], method=method)
+    assert kept.cut[:, 0, 1].tolist() == [0, 1, 0, 0]
+
+
 def there(speed, step, **options):
     problem = hjb.Problem(lambda x, u: speed * u, lambda x, u: x @ x, UNIT)
     return hjb.march(problem, LINE, 1.0, step=step, **options).value_at(0.0, [0.5])

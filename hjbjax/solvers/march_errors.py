@@ -195,7 +195,7 @@ def _longer(marched: Marched, times: np.ndarray) -> float:
     """How much longer steps become: two, and three for a few implicit ones, since two thirds of three is no half."""
     horizon = float(marched.task.horizon)
     lengths = np.diff([*times, horizon])
-    few = np.min(lengths, where=lengths > 0, initial=np.inf) * marched.steps < 3 * FEW * (horizon - times[0])
+    few = np.min(lengths, where=lengths > 0, initial=horizon) * marched.steps < 3 * FEW * (horizon - times[0])
     return 3.0 if few and not marched.task.method.limited else 2.0
 
 

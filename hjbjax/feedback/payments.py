@@ -21,11 +21,12 @@ import numpy as np
 from hjbjax.feedback.path import Path, PathStatus
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import is_traced, pytree_dataclass
+from hjbjax.problem.pytree import cast, is_traced, pytree_dataclass
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Number, State
 from hjbjax.solution.interpolation import Samples, between, query
 from hjbjax.solution.solution import Solution
+from hjbjax.tracing.closures import settled
 from hjbjax.tracing.components import of_state
 
 MANY = 10  # estimated errors: a path that misses V by more breaks its promise
@@ -95,6 +96,8 @@ def surplus(problem: Problem, feedback: object) -> Lookup | None:
 def _surplus(problem: Problem, solution: Solution) -> jax.Array:
     """ψ − V at the nodes, and at all kept times; with noise its root."""
     value, grid = jnp.asarray(solution.value), solution.grid
+    # as in a solve: 1 + c in single precision is another number, and V is not ψ
+    problem = cast(settled(problem, grid.ndim, value.dtype), value.dtype)
     x = grid.components(value.dtype)
 
     def price(t: Number) -> jax.Array:

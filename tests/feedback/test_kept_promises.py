@@ -147,3 +147,11 @@ def test_paths_with_noise_cost_it_in_the_mean():
         promised = float(solution.value_at(0.0, x))
         spread = np.std(costs) / np.sqrt(count)
         assert abs(np.mean(costs) - promised) <= allowed(solution, x) + 4 * spread
+
+
+@pytest.mark.filterwarnings("ignore:the grid is coarse", "ignore:the box decides")
+def test_numbers_in_single_precision_do_not_hide_where_to_stop():
+    """1 + c in single precision is another number than in the solve: V was not ψ, and the path never stopped."""
+    problem = stopped(*jnp.asarray([0.4937225, 0.31637814, 0.33716197], jnp.float32))
+    path = hjb.simulate(problem, hjb.march(problem, LINE, 1.0, times=TIMES), [-0.408], 1.0)
+    assert path.cost == pytest.approx(path.promised, rel=0.02)

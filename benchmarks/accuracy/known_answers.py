@@ -515,7 +515,21 @@ def marches() -> list[Known]:
         lambda y, u: 0 * y + 0.06 - 0.02, None, noise=0.2, discount=0.06,
         stopping_cost=lambda y: jnp.minimum(jnp.exp(y[0]) - 1, 0.0),
     )  # fmt: skip
+    riccati = hjb.Problem(lambda x, u: u, lambda x, u: x @ x + u @ u, hjb.Box([-5.0], [5.0]))
+    heat = hjb.Problem(lambda x, u: 0 * x, None, noise=0.7, terminal_cost=lambda x: jnp.cos(2 * x[0]))
+    front = hjb.Problem(lambda x, u: 0 * x + 1, None, terminal_cost=lambda x: jnp.where(x[0] > 0.123, 1.0, 0.0))
+    waiting = hjb.Problem(
+        lambda t, x, u: 0 * x, lambda t, x, u: jnp.sin(3 * t) * (1 + x[0] ** 2), discount=2.0, time_dependent=True
+    )
+    paid = (3 - math.exp(-2) * (2 * math.sin(3) + 3 * math.cos(3))) / 13  # ∫ sin(3 t) e^(−2 t) dt from 0 to 1
     return [
+        *(Known("march", f"Riccati, {count} nodes", riccati, line(-2, 2, count),
+                lambda x: math.tanh(1) * x[:, 0] ** 2, horizon=1.0) for count in (21, 41)),
+        Known("march", "heat on a circle", heat, line(-math.pi, math.pi, 20, periodic=(True,)),
+              lambda x: np.cos(2 * x[:, 0]) * math.exp(-0.98), horizon=1.0),
+        Known("march", "a front", front, line(-2, 2, 81, edges="open"),
+              lambda x: np.where(x[:, 0] > -0.877, 1.0, 0.0), horizon=1.0),
+        Known("march", "cost of the time", waiting, line(-1, 1, 41), lambda x: paid * (1 + x[:, 0] ** 2), horizon=1.0),
         Known("march", "moving obstacle", evading, line(-6, 2, 81), nearest_approach, None, horizon=2.0),
         Known("march", "Hopf–Lax", lax, plane(31, 2.0), lambda x: np.sum(x**2, axis=1) / 4, within(1.0), horizon=1.0),
         Known("march", "Cole–Hopf", hopf, line(-4, 4, 81, edges="open"),

@@ -98,7 +98,7 @@ def piecewise_input(
     # judged by the objective itself: which choice of pieces a candidate belongs to need not be known
     best: Candidate = [jnp.asarray(candidates[0])], jnp.asarray(total(candidates[0]))
     for u in candidates[1:]:
-        best = _better_of(sign, ([u], total(u)), best)
+        best = _better_of(sign, ([jnp.asarray(u)], total(u)), best)
     return best[0][0]
 
 
@@ -162,10 +162,11 @@ def piecewise_pair(
         return best_on_line(point, direction, _within(point, direction, lo, hi), others)
 
     def on_side(side: tuple) -> list[jax.Array]:
-        return best_on_line(*side, pieces)
+        point, direction, ends = side
+        return best_on_line(point, direction, ends, pieces)
 
     # the four sides of the box, the kinks' lines, and the cells
-    sides = [((0.0, bound), (1.0, 0.0), (lo[0], hi[0])) for bound in (lo[1], hi[1])]
+    sides: list[tuple] = [((0.0, bound), (1.0, 0.0), (lo[0], hi[0])) for bound in (lo[1], hi[1])]
     sides += [((bound, 0.0), (0.0, 1.0), (lo[1], hi[1])) for bound in (lo[0], hi[0])]
     families: list[tuple[Callable, Sequence]] = [(on_side, sides)]
     families += [(functools.partial(on_kink, index), piece.kinks) for index, piece in enumerate(pieces)]

@@ -89,8 +89,8 @@ MUTANTS = (
     Mutant(
         "discount of a march",
         "iteration/time_stepping.py",
-        "return best - self.problem.discount * value, self.look(u, d, t)",
-        "return best, self.look(u, d, t)",
+        "return best - self.problem.discount * value, self.look(value, u, d, t)",
+        "return best, self.look(value, u, d, t)",
         ("tests/discretisation/test_schemes.py",),
     ),
     Mutant(

@@ -1,7 +1,5 @@
 """The default scheme: second order from a certified monotone answer, and how far that is from the exact value."""
 
-from contextlib import nullcontext
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -73,12 +71,8 @@ def test_the_estimate_is_of_the_size_of_the_error(name, count, share, parameters
     dim = entry.build(**parameters)[1].ndim
     problem, grid = entry.build(shape=(count,) * dim, **parameters)
     mask = mask_of(share, grid)
-    # the double integrator's optimal paths run along a kink, and its error is a tenth of the range on any such grid
-    coarse = (
-        pytest.warns(hjb.SolveWarning, match="the grid is coarse") if name == "double-integrator" else nullcontext()
-    )
-    with coarse:
-        solution = hjb.solve(problem, grid, tol=1e-6)
+    # the double integrator is off by a tenth of the range, but at the nodes of one kink only, which is no reason to warn
+    solution = hjb.solve(problem, grid, tol=1e-6)
     true = np.max(np.abs(solution.value - at_nodes_of(entry.exact(**parameters), grid, mask))[mask])
     assert solution.grid_error.shape == grid.shape
     assert true / 3 <= np.max(solution.grid_error[mask]) <= 5 * true

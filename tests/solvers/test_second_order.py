@@ -71,7 +71,7 @@ def test_the_estimate_is_of_the_size_of_the_error(name, count, share, parameters
     dim = entry.build(**parameters)[1].ndim
     problem, grid = entry.build(shape=(count,) * dim, **parameters)
     mask = mask_of(share, grid)
-    # the double integrator is off by a tenth of the range, but at the nodes of one kink only, which is no reason to warn
+    # the double integrator is off by a tenth of the range, but at the nodes of one kink only: no reason to warn
     solution = hjb.solve(problem, grid, tol=1e-6)
     true = np.max(np.abs(solution.value - at_nodes_of(entry.exact(**parameters), grid, mask))[mask])
     assert solution.grid_error.shape == grid.shape

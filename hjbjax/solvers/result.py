@@ -31,7 +31,7 @@ from hjbjax.solvers.setup import BOUNDING, Assumptions
 GAP = 0.05  # of what the actions matter; where Isaacs' condition holds, upwinding left up to .019 on 21 nodes
 COARSE = 0.1  # of the range of V: a larger error of the grid is worth a warning ...
 NODES = 0.05  # ... at more than this share of the nodes
-FLAT = 0.1  # of max |V|: a smaller range is no scale for errors
+FLAT = 1e-3  # of max |V|: a smaller range is no scale for errors
 MOST = 2 / 3  # of an end's nodes: whatever has a velocity leaves by half of those where its position ends
 
 

@@ -237,6 +237,7 @@ def swing(x, u):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the grid is coarse")
 def test_simulated_paths_arrive_as_often():
     """An oscillator under noise, x ≥ 1 within 2: 20000 Euler paths, three standard errors and the grid's own error."""
     problem, values = hjb.Problem(swing, noise=[0.0, 1.0]), []
@@ -300,6 +301,7 @@ def test_the_policy_attains_what_the_value_says():
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the grid is coarse")
 def test_a_policy_that_changes_with_the_time_attains_it_too():
     problem, grid = hjb.Problem(pushed, controls=UNIT, noise=SIGMA), interval(41)
     times = np.linspace(0, 0.2, 41)

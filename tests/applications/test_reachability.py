@@ -215,6 +215,7 @@ def halves(x):
 
 @pytest.mark.slow
 @pytest.mark.optimised
+@pytest.mark.filterwarnings("ignore:the grid is coarse")
 def test_two_integrators_apart_are_two_integrators():
     """The set of two decoupled systems at one time is the product of theirs: V₄ = max(V₂, V₂)."""
     lo, hi = [-4.0, -3.0], [4.0, 3.0]

@@ -173,7 +173,7 @@ def test_a_chain_of_ones_own_is_solved_and_certified(method, noise):
     np.testing.assert_allclose(lane.value, solution.value, atol=2e-8)
 
 
-@pytest.mark.filterwarnings("ignore:the optimal drift leaves the box", "ignore:the grid is coarse")  # a fifth of the range
+@pytest.mark.filterwarnings("ignore:the optimal drift leaves the box", "ignore:the grid is coarse")
 @pytest.mark.parametrize("method", [hjb.Explicit(), hjb.Implicit(hjb.Direct())])
 def test_it_marches_to_its_stationary_value(method):
     grid, scheme = hjb.Grid([-1.0], [1.0], (21,)), LaxFriedrichs(1.2)

@@ -141,6 +141,7 @@ def test_players_who_cannot_be_told_apart_are_upwinded_by_their_sum():
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the grid is coarse")
 def test_a_march_of_long_duration_comes_to_the_stationary_value():
     """By explicit and by implicit steps: one Hamiltonian in solve and in march."""
     problem = game()

@@ -92,6 +92,7 @@ def has_conjugate_point(circle, extremal, free):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the grid is coarse")  # the error is measured
 def test_no_extremal_is_below_the_value_or_past_a_conjugate_point():
     first = int.from_bytes(np.random.SeedSequence().entropy.to_bytes(16, "little")[:4], "little")
     print(f"seeds from {first}")

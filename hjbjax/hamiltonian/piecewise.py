@@ -5,7 +5,6 @@ separable and quadratic: each drift component contributes a gain with a kink whe
 minimise and −1 to maximise; all numbers are per-node scalars.
 """
 
-import functools
 import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, Generic, TypeAlias, TypeVar
@@ -168,9 +167,6 @@ def piecewise_pair(
     # the four sides of the box, the kinks' lines, and the cells
     sides: list[tuple] = [((0.0, bound), (1.0, 0.0), (lo[0], hi[0])) for bound in (lo[1], hi[1])]
     sides += [((bound, 0.0), (0.0, 1.0), (lo[1], hi[1])) for bound in (lo[0], hi[0])]
-    families: list[tuple[Callable, Sequence]] = [(on_side, sides)]
-    families += [(functools.partial(on_kink, index), piece.kinks) for index, piece in enumerate(pieces)]
-    families += [(in_cell, cells)]
     if len(cells) > UNROLLED:
         corner = clipped([lo[0], lo[1]])
         best: Candidate = corner, jnp.asarray(total(corner))
@@ -180,7 +176,9 @@ def piecewise_pair(
         for candidate, entries in ((on_side, sides), (in_cell, cells)):
             best = _best_in_loop(sign, total, candidate, entries, best)
         return best[0]
-    found = [candidate(each) for candidate, entries in families for each in entries]
+    found = [on_side(side) for side in sides]
+    found += [on_kink(index, kink) for index, piece in enumerate(pieces) for kink in piece.kinks]
+    found += [in_cell(cell) for cell in cells]
     best = found[0], jnp.asarray(total(found[0]))
     for u in found[1:]:
         best = _better_of(sign, (u, total(u)), best)

@@ -20,7 +20,7 @@ Action = list
 Objective = Callable[[Action], tuple[jax.Array, list]]
 Best: TypeAlias = tuple[jax.Array, Action, list]  # the best value so far, the action there, and the extra there
 
-UNROLL = 80  # of finitely many actions: written out in one fused kernel, which beyond compiles long and runs slowly
+UNROLL = 80  # actions of a finite set in one fused kernel; with more, it compiles slowly and runs slowly
 CHUNK = 20  # evaluations in one step of the scan that takes over
 WRITTEN = 2  # evaluations in one step of a loop that searches a continuum: with 80, programs take three times as long
 # to compile and nothing runs faster; with 4, the search of a long function (``zoo.merton``) takes twice as long

@@ -24,10 +24,10 @@ SAMPLES = 33  # actions of a continuum that are tried
 
 
 def control_samples(problem: Problem) -> tuple[Array, int]:
-    """Actions of the control, shape (count, m), and how many of them come first that may do without the others.
+    """Actions of the control, shape (count, m), and the number of those to try first, which are often enough.
 
-    Those are the actions of which every input is the least, the middle or the greatest. Without a control the only
-    action has no inputs.
+    In the first actions every input has its least, its middle or its greatest value. A problem without a control has
+    one action, without inputs.
     """
     if problem.controls is None:
         return np.zeros((1, 0)), 1
@@ -59,9 +59,9 @@ def with_kinks(on: Discretisation, player: Player, action: list) -> list[list]:
 
 
 def beside_samples(on: Discretisation, player: Player) -> list[list]:
-    """The actions that are tried beside the samples and do not depend on these; each input (*grid).
+    """The actions that are tried once, in addition to all samples; each input (*grid).
 
-    Of one input those at which a component of the drift vanishes; of a ball those of ``_of_a_ball``.
+    For one input they make a component of the drift vanish; for a ball see ``_of_a_ball``.
     """
     if not _knows_kinks(on, player):
         return []

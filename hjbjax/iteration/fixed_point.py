@@ -197,7 +197,7 @@ def begin(task: Task, guess: Nodes) -> State:
     bound = ErrorBound(xp.asarray(-infinite), infinite, xp.zeros((), dtype), infinite, infinite)
     counter, first = xp.zeros((), xp.int32), xp.full((), -1, xp.int32)
     history, best = xp.full(HISTORY, -1, dtype), xp.stack([infinite] * 2)  # no NaN, a fault to jax_debug_nans
-    moves = certificates.Moves(xp.stack([infinite] * 3), infinite, xp.ones((), dtype), counter)
+    moves = certificates.Moves(xp.stack([infinite] * 2), infinite, xp.ones((), dtype), counter)
     return State(value, policy, infinite, bound, first, best, moves, counter, code, history)
 
 
@@ -228,14 +228,16 @@ def advance(task: Task, state: State, start: Scalar) -> State:
         delta = state.moves.share * delta
     value = task.impose(state.value + delta)
     # a node that does not count may move for ever
-    moved = task.grid.largest(jnp.abs(jnp.where(task.counting, value - state.value, 0)))
+    change = jnp.where(task.counting, value - state.value, 0)
+    moved = task.grid.largest(jnp.abs(change))
     if task.certificate is Certificate.OPEN and not task.method.relaxes:
         moved = moved * methods.shift_factor(_shift(task, state), task.problem.discount)
     moves, distance = state.moves, moved
     if not task.scheme.monotone:
-        moves = certificates.moves_after(state, moved)
         distance = jnp.where(task.is_chain, moved, certificates.distance(task, moves, moved, value))
     policy, fastest, bound = _look(task, value, state.policy, moved=distance, first=state.step < 0)
+    if not task.scheme.monotone:
+        moves = certificates.moves_after(state, moved, certificates.turns_back(task.grid, change, policy.defect))
     bound = dataclasses.replace(bound, error=jnp.where(_lacks_measure(task, state), jnp.inf, bound.error))
     since = certificates.steps_since_best(state, bound)
     code = certificates.at_rest(task, state, moved, certificates.judged(task, value, bound, state.best, since))

@@ -78,6 +78,14 @@ def test_the_estimate_is_of_the_size_of_the_error(name, count, share, parameters
     assert true / 3 <= np.max(solution.grid_error[mask]) <= 5 * true
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [31, 41, 51])
+def test_a_slow_way_to_the_limit_is_not_halved(count):
+    """Next to the disc a few nodes go on by equal steps: halved, they took 135 steps on 41 nodes along each axis."""
+    problem, grid = zoo.dubins(shape=(count, count, count - 1))
+    assert hjb.solve(problem, grid).steps <= 40
+
+
 def test_each_grid_is_solved_once_by_each_scheme(iterations):
     hjb.solve(line(), hjb.Grid([-1.0], [1.0], (41,)))
     assert iterations == [("Upwind", (41,)), ("Limited", (41,)), ("Limited", (21,))]

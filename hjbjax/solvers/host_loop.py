@@ -132,6 +132,7 @@ def drive(run: Run, clock: Clock) -> Status:
         try:
             chunk = run.first_chunk(clock)
             clock.phase = f"compiling for {run.name}"
+            _suggest_cache(clock)
             run.compile()
             while (status := run.between(status, clock)) is Status.RUNNING:
                 chunk = clock.least_of_all(chunk)
@@ -159,6 +160,12 @@ def drive(run: Run, clock: Clock) -> Status:
             if journal is not None:
                 journal.leave(run, status)
     return status
+
+
+def _suggest_cache(clock: Clock) -> None:
+    """Say on the progress line, while a program is compiled, how later processes are spared that."""
+    if clock.tell is not None and setting("jax_compilation_cache_dir") is None:
+        clock.tell(f"{clock.phase} (hjb.keep_compiled() keeps compiled programs for later runs)")
 
 
 def _stop_status(run: Run, clock: Clock) -> Status:

@@ -244,6 +244,18 @@ def test_progress_when_asked_for_and_when_not(capfd):
     assert capfd.readouterr().err == ""
 
 
+def test_the_progress_line_suggests_to_keep_compiled_programs(capfd, tmp_path):
+    """Only where no folder is set."""
+    said = []
+    for folder in (None, str(tmp_path)):
+        jax.config.update("jax_compilation_cache_dir", folder)
+        hjb.solve(question(), GRID, tol=1e-2, scheme=hjb.Upwind(), progress=True)
+        said.append(capfd.readouterr().err)
+    jax.config.update("jax_compilation_cache_dir", None)
+    assert ["compiling for" in each for each in said] == [True, True]
+    assert ["hjb.keep_compiled()" in each for each in said] == [True, False]
+
+
 def test_dtype_and_host_arrays():
     for dtype, kind in [(None, np.float64), ("float64", np.float64), ("float32", np.float32), (np.float32, np.float32)]:
         solution = hjb.solve(question(), GRID, tol=1e-2, dtype=dtype, scheme=hjb.Upwind())

@@ -20,7 +20,7 @@ gc.set_threshold(100_000, 20, 20)
 settings.register_profile("hjbjax", deadline=None, print_blob=True)
 settings.load_profile("hjbjax")
 
-MAPS = 20_000  # of the 65 530 that Linux allows a process; every compiled kernel takes a few, and XLA crashes beyond
+MAPS = 32_000  # of the 65 530 that Linux allows a process; every compiled kernel takes a few, and XLA crashes beyond
 
 
 # Two thirds of a run are spent in XLA. Without its optimiser it takes half of the time, and jaxlib 0.10 takes half of

@@ -109,7 +109,7 @@ def test_certificates_hold_on_every_mesh(found, name):
 
 @pytest.mark.parametrize("name", slow_if_dear(["two_integrators", "three_integrators"]))
 def test_the_value_of_systems_side_by_side_is_the_sum_of_theirs(found, name):
-    """4096 nodes in four dimensions, 12^6 in six: at every node the sum of values in the plane (see ``decoupled``)."""
+    """4096 nodes in four dimensions, 8^6 in six: at every node the sum of values in the plane (see ``decoupled``)."""
     assert found["status"] == "CONVERGED"
     assert found["apart"] <= sum(found["errors"])
     assert max(found["errors"]) <= 1e-2

@@ -303,7 +303,7 @@ def two_integrators():
 
 @case
 def three_integrators():
-    return decoupled(PLANTS, 12, mesh_of(2, 2, 2), 10)
+    return decoupled(PLANTS, 8, mesh_of(2, 2, 2), 10)
 
 
 def within_certificates(problem, grid, method, *meshes):

@@ -1,13 +1,14 @@
-"""A problem on a grid by a scheme: what every step of the computation is asked about.
+"""A problem on a grid, discretised by a scheme; and the base classes of schemes.
 
-And what a scheme must offer, so that one of the user's own serves as well; ``schemes`` tells how to write one.
+``schemes`` shows how to write a scheme of your own.
 """
 
+import abc
 import dataclasses
 import functools
 import itertools
 from collections.abc import Sequence
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -26,62 +27,98 @@ from hjbjax.tracing import components, dependence
 T = TypeVar("T")
 
 
-@runtime_checkable
-class Scheme(Protocol):
-    """How derivatives are made, as a value: frozen, hashable, without numbers that are traced."""
+class Scheme(abc.ABC):
+    """The base class of schemes, which say what slopes the drift sees.
+
+    A scheme is a frozen, hashable value without traced numbers. It defines ``chain`` and ``slopes``; everything else
+    has a default, given here.
+    """
 
     @property
     def monotone(self) -> bool:
-        """Whether it is a chain: only then does a bound certify its answer, and only then is it implicit in time."""
+        """True if the scheme is a Markov chain (``Chain``): only then are its answers certified."""
+        return False
 
     @property
     def stationary(self) -> bool:
-        """Whether the residual with its slopes can be driven to zero by corrections with the matrix of ``chain``."""
+        """True if corrections with the matrix of ``chain`` can drive the residual with these slopes to zero."""
+        return True
 
     @property
     def even(self) -> bool:
-        """Whether it wants equal spacings along every axis."""
+        """True if the scheme needs equal spacings along every axis."""
+        return False
 
     @property
     def subcell(self) -> bool:
-        """Whether the boundary of a target is met between two nodes."""
+        """True if the boundary of a target is met between two nodes."""
+        return False
 
     @property
     def split(self) -> bool:
-        """Whether the drifts of two players who drive one component are upwinded apart, see ``Upwind``."""
+        """True if the drifts of two players who drive one component are upwinded separately, see ``Upwind``."""
+        return False
 
     @property
     def stages(self) -> int:
-        """The stages, and the order, of the explicit Runge–Kutta method that goes with it: 1, 2 or 3."""
+        """The number of stages, and the order, of the explicit Runge–Kutta method that suits it: 1, 2 or 3."""
+        return 2
 
     @property
     def points(self) -> int:
-        """The nodes that an axis must have."""
+        """The number of nodes that every axis must have."""
+        return 2
 
     @property
-    def chain(self) -> "Chain":
-        """The monotone chain that goes with it, as ``Upwind()``: it starts and corrects, and limits explicit steps."""
+    def blends(self) -> bool:
+        """True if ``slopes`` returns the one-sided differences itself where ``Differences.first_order`` says so."""
+        return False
 
+    @property
+    def in_parts(self) -> bool:
+        """True if ``slopes`` reads other nodes through ``stencil`` only, so that many devices can share the nodes."""
+        return False
+
+    @property
+    @abc.abstractmethod
+    def chain(self) -> "Chain":
+        """The monotone chain behind it, as ``Upwind()``: it starts and corrects, and limits explicit steps."""
+
+    @abc.abstractmethod
     def slopes(self, around: "Differences") -> Sequence[tuple[jax.Array, jax.Array]]:
         """The slopes P⁺ and P⁻ along every axis, each (*grid): drift f has the gain f⁺ P⁺ + f⁻ P⁻; zero at a wall."""
 
 
-class Chain(Scheme, Protocol):
-    """A scheme that is a Markov chain: along an axis the gain of drift f and diffusion a is
+class Chain(Scheme):
+    """The base class of monotone schemes, which are Markov chains: along an axis drift f and diffusion a gain
 
         [(e + h⁻ f) D⁺ − (e − h⁺ f) D⁻]/(h⁺ + h⁻),    e ≥ max(a, h⁺ f, −h⁻ f),
 
-    with distances h⁺ and h⁻ to the two neighbours; e(f) rises by at most h|f|. What a wall makes of it, and how to
-    write one, is told in ``schemes``.
+    with distances h⁺ and h⁻ to the two neighbours; e(f) rises by at most h|f|. A chain defines ``excess`` and
+    ``kinks``. ``schemes`` explains what happens at a wall, and shows an example.
     """
+
+    monotone, stages = True, 1
 
     @property
     def one_way(self) -> bool:
-        """Whether e = max(h⁺ f, −h⁻ f) without noise, so that of two opposite jumps one has no rate."""
+        """True if e = max(h⁺ f, −h⁻ f) without noise, so that one of two opposite jumps has rate zero."""
+        return False
 
+    @property
+    def chain(self) -> "Chain":
+        """The chain itself."""
+        return self
+
+    def slopes(self, around: "Differences") -> Sequence[tuple[jax.Array, jax.Array]]:
+        """The one-sided differences."""
+        return around.one_sided
+
+    @abc.abstractmethod
     def excess(self, f: Any, a: Any, link: Links) -> Any:
         """e, the diffusion along an axis."""
 
+    @abc.abstractmethod
     def kinks(self, a: Any, slopes: tuple[Any, Any], link: Links) -> tuple[Sequence[Any], Sequence[Any]]:
         """The drifts f, in order, at which the gain's derivative jumps, and the derivatives between them: one more.
 

@@ -1,17 +1,17 @@
 """Discretisations of the derivatives, as values, and how to write one of your own.
 
-A scheme says what slopes the drift sees. Anything with the attributes of ``Scheme`` will do: ``march`` steps with its
-slopes, and ``solve`` takes the answer of the monotone chain that goes with it and drives the residual with the new
-slopes to zero. A class of high order that limits slopes by minmod, on equal spacings:
+A scheme says what slopes the drift sees. A class derived from ``Scheme`` defines them: ``march`` steps with its slopes,
+and ``solve`` starts from the answer of its monotone ``chain`` and drives the residual with the new slopes to zero. A
+second-order scheme that limits slopes by minmod, on equal spacings:
 
     >>> import dataclasses
     >>> import jax.numpy as jnp
     >>> import hjbjax as hjb
     >>> from hjbjax.discretisation import stencil
+    >>> from hjbjax.discretisation.schemes import Chain, Scheme
     >>> @dataclasses.dataclass(frozen=True)
-    ... class Minmod:
-    ...     monotone, stationary, even, subcell, split = False, True, True, False, True
-    ...     stages, points, chain = 2, 3, hjb.Upwind()
+    ... class Minmod(Scheme):
+    ...     even, points, chain = True, 3, hjb.Upwind()
     ...
     ...     def slopes(self, around):
     ...         def least(a, b):
@@ -31,21 +31,13 @@ slopes to zero. A class of high order that limits slopes by minmod, on equal spa
     0.785
     0.762
 
-The exact value is tanh 1 = .762. A monotone scheme says how much diffusion e its chain has along an axis (``Chain``),
-and where the gain of a drift component has kinks; its answers are certified. One of Lax–Friedrichs:
+The exact value is tanh 1 = 0.762. A monotone scheme derives from ``Chain`` and says how much diffusion e it has along
+an axis, and where the gain of a drift component has kinks; its answers are certified. The Lax–Friedrichs scheme:
 
     >>> @dataclasses.dataclass(frozen=True)
-    ... class LaxFriedrichs:
+    ... class LaxFriedrichs(Chain):
     ...     speed: float
-    ...     monotone, stationary, even, subcell, split, one_way = True, True, True, False, False, False
-    ...     stages, points = 1, 2
-    ...
-    ...     @property
-    ...     def chain(self):
-    ...         return self
-    ...
-    ...     def slopes(self, around):
-    ...         return around.one_sided
+    ...     even = True
     ...
     ...     def excess(self, f, a, link):
     ...         return a + self.speed * link.up + 0 * f
@@ -57,14 +49,15 @@ and where the gain of a drift component has kinks; its answers are certified. On
     >>> solution.status.name, round(float(solution.value_at([0.5])), 2)
     ('CONVERGED', 0.17)
 
-The exact value is (√5 − 1)/8 = .155: so much diffusion is dear. It must be enough, e ≥ max(a, h⁺f, −h⁻f), here a
-``speed`` of at least |f|: a chain cannot jump with a negative probability, and with less carries a part of the drift
-alone, which is refused. Such a class must be hashable, for compiled programs are remembered by it, and its methods are
-traced: no branches on numbers. Under ``jit``, ``vmap`` and ``grad`` a solve wants a monotone one, and checks no values.
+The exact value is (√5 − 1)/8 = 0.155; the difference is the price of so much diffusion. There must be enough of it,
+e ≥ max(a, h⁺f, −h⁻f), here a ``speed`` of at least |f|: a probability cannot be negative, so with less diffusion the
+chain would carry only part of the drift, which is refused. The class must be hashable, since compiled programs are
+cached by it, and its methods are traced, so they must not branch on numbers. Under ``jit``, ``vmap`` and ``grad`` a
+solve needs a monotone scheme, and checks no values.
 
-A scheme that follows paths over many cells, in place of slopes, is of another kind: see ``semi_lagrangian``.
+A scheme that follows paths over many cells instead of using slopes is of another kind: see ``semi_lagrangian``.
 
-What happens at a wall is not the scheme's to say. The wall stands on the node, whose cell is half a cell. With noise a,
+The treatment of walls does not depend on the scheme. A wall stands on a node, whose cell is half a cell. With noise a,
 drift n out of the box (f at an upper end, −f at a lower one) and ∂V/∂n = 0 on the wall, the balance over that cell is
 
     (h/2)(βV − L) = −(a/2h − n/2)(V_N − V_{N−1}),      so that the chain leaves inwards at the rate (a − h n)/h²:
@@ -147,18 +140,18 @@ def check(scheme: Any, name: str, grid: Grid, *, stationary: bool = False, paths
       TypeError: another kind of thing.
       ValueError: a stretched grid where the scheme wants equal spacings.
     """
-    whole = not isinstance(scheme, type) and type(scheme).__hash__ is not None
-    if paths and whole and isinstance(scheme, PathScheme):
+    hashable = type(scheme).__hash__ is not None
+    if paths and hashable and not isinstance(scheme, type) and isinstance(scheme, PathScheme):
         return
-    if not (whole and isinstance(scheme, Scheme)) or (stationary and not scheme.stationary):
+    if not (hashable and isinstance(scheme, Scheme)) or (stationary and not scheme.stationary):
         others = "Eno2() " * (not stationary) + "SemiLagrangian() " * paths
         offered = f"hjb.Upwind(), Limited(), {others}or Weno5()"
-        own = "one of your own: hjbjax.discretisation.schemes tells how"
+        own = "one of your own, derived from hjbjax.discretisation.schemes.Scheme"
         raise TypeError(f"{name} is {arguments.shown(scheme)}; wanted {offered}, or {own}")
-    if missing := [each for each in ("one_way", "excess", "kinks", "subcell") if not hasattr(scheme.chain, each)]:
+    if not isinstance(scheme.chain, Chain):
         raise TypeError(
-            f"{name} is {arguments.shown(scheme)}, whose chain {arguments.shown(scheme.chain)} has no "
-            f"{', '.join(missing)}; hjbjax.discretisation.schemes tells how to write one"
+            f"{name} is {arguments.shown(scheme)}, whose chain {arguments.shown(scheme.chain)} is not derived from "
+            "hjbjax.discretisation.schemes.Chain; that module shows how to write one"
         )
     if scheme.even and any(each is not None for each in grid.stretch or ()):
         caller = name.partition(":")[0]
@@ -168,7 +161,7 @@ def check(scheme: Any, name: str, grid: Grid, *, stationary: bool = False, paths
 
 
 @pytree_dataclass(static=("central", "subcell", "split"))
-class Upwind:
+class Upwind(Chain):
     """First-order upwind differences: the Kushner–Dupuis chain, monotone on every grid.
 
     Order 1 where the drift rules. With ``central=True`` the artificial diffusion of upwinding is taken out as
@@ -194,17 +187,7 @@ class Upwind:
     central: bool = True
     subcell: bool = False
     split: bool = False
-    monotone, stationary, even, one_way, in_parts = True, True, False, True, True
-    stages, points = 1, 2
-
-    @property
-    def chain(self) -> "Upwind":
-        """The monotone chain that goes with the scheme: here the scheme itself."""
-        return self
-
-    def slopes(self, around: Differences) -> Slopes:
-        """The one-sided differences as they are."""
-        return around.one_sided
+    one_way, in_parts = True, True
 
     def excess(self, f: Any, a: Any, link: Links) -> Any:
         """a + h⁺ f⁺ + h⁻ f⁻, or as far as the chain stays monotone with central differences the larger of the two."""
@@ -221,7 +204,7 @@ class Upwind:
 
 
 @pytree_dataclass(static=("subcell", "split"))
-class Limited:
+class Limited(Scheme):
     """Second order where the solution is smooth: one-sided differences with limited slopes.
 
     With the second differences s_i along an axis the slopes are
@@ -241,8 +224,7 @@ class Limited:
 
     subcell: bool = True
     split: bool = False
-    monotone, stationary, even, in_parts = False, True, False, True
-    stages, points, blends = 2, 2, True  # it makes the one-sided differences itself, where they are asked for
+    blends, in_parts = True, True
 
     @property
     def chain(self) -> Upwind:
@@ -299,7 +281,7 @@ def calm(on: Discretisation, x: list, links: Sequence[Links]) -> list:
 
 
 @pytree_dataclass()
-class Eno2:
+class Eno2(Scheme):
     """Second order for ``march``: one-sided differences corrected by the smaller of two second differences.
 
         D⁺ − (h/2) m(s_i, s_{i+1}),   D⁻ + (h/2) m(s_i, s_{i−1}),   m(a, b) = a if |a| < |b| else b.
@@ -307,8 +289,7 @@ class Eno2:
     The smoother stencil, node by node, as C.-W. Shu and S. Osher choose it. Wants equal spacings.
     """
 
-    monotone, stationary, even, subcell, split, in_parts = False, False, True, False, True, True
-    stages, points = 2, 3
+    stationary, even, split, in_parts, points = False, True, True, True, 3
 
     @property
     def chain(self) -> Upwind:
@@ -321,7 +302,7 @@ class Eno2:
 
 
 @pytree_dataclass(static=("subcell", "split"))
-class Weno5:
+class Weno5(Scheme):
     """Fifth order where the value is smooth: weighted essentially non-oscillatory slopes.
 
     Each one-sided slope is a mean of three third-order ones with weights that favour the smoothest (see ``slopes``).
@@ -336,8 +317,7 @@ class Weno5:
 
     subcell: bool = True
     split: bool = True
-    monotone, stationary, even, in_parts = False, True, True, True
-    stages, points = 3, 7
+    even, in_parts, stages, points = True, True, 3, 7
 
     @property
     def chain(self) -> Upwind:

@@ -36,6 +36,10 @@ class PathScheme(Protocol):
     def points(self) -> int:
         """The nodes that an axis must have."""
 
+    @property
+    def in_parts(self) -> bool:
+        """True if many devices can share the nodes."""
+
     def check(self, problem: Problem, grid: Grid) -> None:
         """Refuse a problem, or a grid, that it is not for."""
 
@@ -81,7 +85,7 @@ class SemiLagrangian:
 
     cells: int = 16
     actions: int = 64
-    points = 2
+    points, in_parts = 2, False
 
     def __post_init__(self):
         arguments.count(self.cells, "SemiLagrangian: cells")

@@ -152,7 +152,7 @@ def around(
     differences = tuple(stencil.one_sided(value, grid, axis, link) for axis, link in enumerate(links))
     bends = tuple(stencil.bends(*pair, grid, axis) for axis, pair in enumerate(differences))
     slopes = on.scheme.slopes(Differences(on, x, value, links, differences, lost, first_order))
-    if first_order is not None and not getattr(on.scheme, "blends", False):
+    if first_order is not None and not on.scheme.blends:
         choose = functools.partial(jnp.where, first_order)
         slopes = jax.tree.map(choose, list(differences), list(slopes))
     up, down = (list(side) for side in zip(*slopes, strict=True))

@@ -1,17 +1,17 @@
 """Evaluating a policy, as values: solving δ = s + Σ_o w_o δ(x + o), and how to write an evaluation of your own.
 
-``PolicyIteration`` and ``Implicit`` take anything with the attributes of ``Evaluation``. One by GMRES:
+``PolicyIteration`` and ``Implicit`` take any object of a class derived from ``Evaluation``. Evaluation by GMRES:
 
     >>> import dataclasses
     >>> import jax
     >>> import jax.numpy as jnp
     >>> import hjbjax as hjb
-    >>> from hjbjax.iteration.evaluation import left_over
+    >>> from hjbjax.iteration.evaluation import Evaluation, left_over
     >>> @jax.tree_util.register_static
     ... @dataclasses.dataclass(frozen=True)
-    ... class Gmres:
+    ... class Gmres(Evaluation):
     ...     restart: int = 20
-    ...     rough, open_ends, calls_back = False, True, False
+    ...     open_ends = True
     ...
     ...     def solve(self, equation, grid):
     ...         zero = jnp.zeros_like(equation.source)
@@ -20,19 +20,16 @@
     ...             return equation.source - left_over(equation, grid, delta)
     ...
     ...         return jax.scipy.sparse.linalg.gmres(matvec, equation.source, zero, tol=1e-3, restart=self.restart)[0]
-    ...
-    ...     def bytes_per_node(self, weights, word):
-    ...         return word * (weights + self.restart + 6)
     >>> problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), noise=0.5, discount=1.0)
     >>> hjb.solve(problem, hjb.Grid([-1.0], [1.0], (41,)), method=hjb.PolicyIteration(Gmres())).status.name
     'CONVERGED'
 
-It goes into compiled programs as a pytree, here one without numbers, and what it does is traced.
+The object enters compiled programs as a pytree, here one without numbers, and ``solve`` is traced.
 """
 
+import abc
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -49,34 +46,47 @@ from hjbjax.problem.types import Field, Number, Scalar
 OPEN_FRACTION = 1e-8  # of the residual, to which a Krylov method goes with open ends
 
 
-@runtime_checkable
-class Evaluation(Protocol):
-    """A solver of the linear equation of a policy: a value that JAX knows as a pytree."""
+class Evaluation(abc.ABC):
+    """The base class of evaluations: solvers of the linear equation of a policy, registered with JAX as pytrees.
+
+    An evaluation defines ``solve``; everything else has a default, given here.
+    """
 
     @property
     def rough(self) -> bool:
-        """True if it only relaxes: a step is cheap, and the loop goes over to a linear solve where it comes to a halt.
+        """True if it only relaxes: a step is cheap, and the loop changes to a linear solve where it stalls.
 
-        One that is not rough is held against its residual, and relaxed where it fails, as for a policy without a value.
+        The residual of other evaluations is checked, and where they fail, as for a policy without a value, the
+        equation is relaxed.
         """
+        return False
 
     @property
     def open_ends(self) -> bool:
-        """True if it holds where a value is continued from inside beyond open ends."""
+        """True if it solves equations that continue a value beyond open ends from the nodes inside."""
+        return False
 
     @property
     def calls_back(self) -> bool:
         """True if it runs Python on the host in the middle of a compiled program."""
+        return False
 
+    @property
+    def in_parts(self) -> bool:
+        """True if it reads other nodes through ``stencil`` and reduces through the grid only, as many devices need."""
+        return False
+
+    @abc.abstractmethod
     def solve(self, equation: PolicyEquation, grid: Grid) -> jax.Array:
-        """δ with δ = s + Σ_o w_o δ(x + o), roughly or not, (*grid), in the type of the equation."""
+        """δ with δ = s + Σ_o w_o δ(x + o), exactly or roughly, (*grid), in the type of the equation."""
 
     def bytes_per_node(self, weights: int, word: int) -> int:
-        """The memory that it takes a node for ``weights`` jumps of ``word`` bytes each, its input included."""
+        """Its memory per node, input included, for ``weights`` jumps of ``word`` bytes each."""
+        return word * (2 * weights + 8)
 
 
 @pytree_dataclass(static=("count",))
-class Sweeps:
+class Sweeps(Evaluation):
     """Rough evaluation by Gauss–Seidel: in every order ``count`` times a forward and a backward sweep.
 
     The work is about that of ``count`` 2^n relaxations of every node. Runs in float32 on the correction. On a CPU whose
@@ -84,7 +94,7 @@ class Sweeps:
     """
 
     count: int = 3
-    rough, open_ends, calls_back, in_parts = True, False, False, True
+    rough, in_parts = True, True
 
     def __post_init__(self):
         arguments.count(self.count, "Sweeps: count")
@@ -101,7 +111,7 @@ class Sweeps:
 
 
 @pytree_dataclass(static=("max_steps",))
-class Krylov:
+class Krylov(Evaluation):
     """Evaluation by BiCGStab, preconditioned by one round of Gauss–Seidel, to a fraction of the residual.
 
     Args:
@@ -111,7 +121,7 @@ class Krylov:
 
     fraction: Number = 1e-3
     max_steps: int = 200
-    rough, open_ends, calls_back, in_parts = False, True, False, True
+    open_ends, in_parts = True, True
 
     def __post_init__(self):
         arguments.positive(self.fraction, "Krylov: fraction", most=1)
@@ -137,10 +147,10 @@ class Krylov:
 
 
 @pytree_dataclass()
-class Direct:
+class Direct(Evaluation):
     """Exact evaluation by a sparse LU factorisation (SciPy's SuperLU, on the host): small grids and oracles."""
 
-    rough, open_ends, calls_back = False, True, True
+    open_ends, calls_back = True, True
 
     def solve(self, equation: PolicyEquation, grid: Grid) -> jax.Array:
         """By factorisation."""
@@ -160,15 +170,15 @@ def check_evaluation(evaluation: object, name: str) -> None:
     check_choice(evaluation, Evaluation, name, "hjb.Sweeps(...), hjb.Krylov(...) or hjb.Direct()")
 
 
-def check_choice(value: object, protocol: type, name: str, wanted: str) -> None:
-    """Refuse, by ``name``, a value that lacks what a protocol asks for, or that JAX takes for a leaf.
+def check_choice(value: object, base: type, name: str, wanted: str) -> None:
+    """Refuse, by ``name``, a value of a class that is not derived from ``base``, or that JAX takes for a leaf.
 
     Raises:
       TypeError: with the choices that are ``wanted``, or how to make a pytree of a class.
     """
-    # a class has the attributes of its instances: PolicyIteration(Krylov) without brackets would pass the protocol
-    if isinstance(value, type) or not isinstance(value, protocol):
-        raise TypeError(f"{name} is {arguments.shown(value)}; wanted {wanted}")
+    if not isinstance(value, base):
+        own = f"an object of a class derived from {base.__module__}.{base.__name__}"
+        raise TypeError(f"{name} is {arguments.shown(value)}; wanted {wanted}, or {own}")
     check_pytree(value, name)
 
 

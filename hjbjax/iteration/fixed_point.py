@@ -116,9 +116,9 @@ class Task:
 
     @property
     def by_defect(self) -> bool:
-        """Whether neither a step nor its bound asks for actions: those at the last value are then found at the end."""
-        chosen = getattr(self.method, "by_defect", False)  # a method of the user's need not know of it
-        if not chosen or self.bare or self.certificate is not Certificate.ADDITIVE or self.first_order is not None:
+        """True if neither a step nor its bound needs the actions, so that they are found once, at the last value."""
+        additive = self.certificate is Certificate.ADDITIVE and self.first_order is None
+        if not (self.method.by_defect and additive) or self.bare:
             return False
         players = players_of(self.on)
         at_ends = players.control.fastest_at_ends and players.disturbance.fastest_at_ends

@@ -1,40 +1,30 @@
 """The methods of a stationary solve, as values, and how to write one of your own.
 
-Every method repeats one step: at V the greedy policy leaves a defect, and a correction δ is added. A method says which.
-One of damped Jacobi sweeps:
+Every method repeats one step: at V the greedy policy leaves a defect, and the method says which correction δ is added.
+A method of damped Jacobi sweeps:
 
     >>> import dataclasses
     >>> import jax
     >>> import hjbjax as hjb
+    >>> from hjbjax.iteration.evaluation import jacobi
+    >>> from hjbjax.iteration.methods import Method
     >>> @jax.tree_util.register_static
     ... @dataclasses.dataclass(frozen=True)
-    ... class Jacobi:
+    ... class Jacobi(Method):
     ...     sweeps: int = 8
-    ...     relaxes, evaluation, coarsest = False, hjb.Sweeps(), None
-    ...
-    ...     @property
-    ...     def inner(self):
-    ...         return self
-    ...
-    ...     def filled(self, evaluation):
-    ...         return self
+    ...     evaluation = hjb.Sweeps()  # for derivatives
     ...
     ...     def correct(self, step):
-    ...         from hjbjax.iteration.evaluation import jacobi
-    ...
     ...         return jacobi(step.equation(), step.grid, self.sweeps)
     ...
     ...     def patience(self, grid):
     ...         return 100_000
-    ...
-    ...     def described(self, game):
-    ...         return repr(self)
     >>> problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), discount=1.0)
     >>> hjb.solve(problem, hjb.Grid([-1.0], [1.0], (41,)), method=Jacobi()).status.name
     'CONVERGED'
 
-What it returns is traced, and the method goes into compiled programs as a pytree, here one without numbers. The loop
-looks after the rest: the certificate, the constraints, and steps that lead nowhere.
+``correct`` is traced, and the object enters compiled programs as a pytree, here one without numbers. The loop does the
+rest: the certificate, the constraints, and stopping where steps make no progress.
 
 In a game the value of a policy is that of the inner player's problem against it (``evaluated``): the inner player
 answers, the answer is evaluated, and so on until the residual of that problem is a tenth of the outer one's, or a
@@ -42,7 +32,8 @@ millionth once the outer one has risen; then the outer player improves. Improvin
 Hoffman and R. M. Karp.
 """
 
-from typing import Protocol, runtime_checkable
+import abc
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -80,41 +71,69 @@ class Step(Protocol):
         """The correction that makes V the value of its greedy policy, roughly; in a game of the outer player's."""
 
 
-@runtime_checkable
-class Method(Protocol):
-    """A method of a stationary solve, which corrects V; a value that JAX knows as a pytree."""
+class Method(abc.ABC):
+    """The base class of methods, which correct V in a stationary solve; registered with JAX as pytrees.
+
+    A method defines ``correct``; everything else has a default, given here.
+    """
 
     @property
     def relaxes(self) -> bool:
         """True if it takes the largest rate for the matrix: V climbs or falls to its fixed point step by step."""
+        return False
+
+    @property
+    def policy(self) -> bool:
+        """True if the solution holds the policy; without it a method that ``relaxes`` keeps nothing but V."""
+        return True
+
+    @property
+    def by_defect(self) -> bool:
+        """True if ``correct`` needs only the defect at V, so that the actions are found once, at the end."""
+        return False
 
     @property
     def evaluation(self) -> Evaluation | None:
-        """The solver of the equation of a policy, also for derivatives. None where it is never solved."""
+        """The solver of the equation of a policy, also for derivatives. None if that is never solved."""
+        return None
 
     @property
     def inner(self) -> "Method":
-        """The method that runs on one grid: itself, if it knows nothing of coarser grids."""
+        """The method that runs on one grid: the method itself, unless it uses coarser grids."""
+        return self
 
     @property
     def coarsest(self) -> int | None:
-        """The nodes of the coarsest grid; None for a method of one grid."""
+        """The number of nodes of the coarsest grid; None for a method of one grid."""
+        return None
+
+    @property
+    def in_parts(self) -> bool:
+        """True if ``correct`` reads other nodes through ``stencil`` only, as many devices need."""
+        return False
 
     def filled(self, evaluation: Evaluation) -> "Method":
-        """The method with the evaluation that suits the problem, where it has none and wants one; else itself."""
+        """The method with the evaluation that suits the problem, if it needs one and has none."""
+        return self
 
+    @abc.abstractmethod
     def correct(self, step: Step) -> jax.Array:
         """δ, (*grid), in cost units."""
 
     def patience(self, grid: Grid) -> int:
-        """The steps without progress after which the solve has stalled."""
+        """The number of steps without progress after which the solve has stalled.
+
+        A good policy moves one cell per improvement, and a wave may cross the box four times.
+        """
+        return 100 + 4 * sum(grid.shape)  # a hundred for grids so small that crossing them takes no time
 
     def described(self, game: bool) -> str:
         """The method as one would write it, without the numbers that only matter in a game."""
+        return repr(self)
 
 
 @pytree_dataclass(static=("policy",))
-class ValueIteration:
+class ValueIteration(Method):
     """V ← max(g, min(ψ, V + (min max H − β V)/(max_u Q + β))): monotone, converges from every guess.
 
     The error falls by 1/(1 + βΔt) a step: many cheap steps. For reference, for games, and where memory rules.
@@ -126,21 +145,11 @@ class ValueIteration:
     """
 
     policy: bool = True
-    # no fields: answers to the loop, no choices
-    relaxes, evaluation, coarsest, in_parts, by_defect = True, None, None, True, True
+    relaxes, in_parts, by_defect = True, True, True
 
     def __post_init__(self):
         if not isinstance(self.policy, bool):
             raise TypeError(f"ValueIteration: policy is {self.policy!r}; wanted True or False")
-
-    @property
-    def inner(self) -> "ValueIteration":
-        """The method itself."""
-        return self
-
-    def filled(self, evaluation: Evaluation) -> "ValueIteration":
-        """The method itself, which evaluates no policy."""
-        return self
 
     def correct(self, step: Step) -> jax.Array:
         """One relaxation of every node."""
@@ -156,7 +165,7 @@ class ValueIteration:
 
 
 @pytree_dataclass(static=("replies",))
-class PolicyIteration:
+class PolicyIteration(Method):
     """Improve the policy, evaluate it, repeat; the methods of this family differ in the evaluation.
 
     Args:
@@ -167,22 +176,16 @@ class PolicyIteration:
 
     evaluation: Evaluation | None = None
     replies: int = 20
-    relaxes, coarsest = False, None
 
     @property
     def in_parts(self) -> bool:
-        """As its evaluation."""
-        return getattr(self.evaluation, "in_parts", False)
+        """True if the evaluation runs in parts; an open choice is made among those that do."""
+        return self.evaluation is not None and self.evaluation.in_parts
 
     def __post_init__(self):
         if self.evaluation is not None:
             check_evaluation(self.evaluation, "PolicyIteration: evaluation")
         arguments.count(self.replies, "PolicyIteration: replies")
-
-    @property
-    def inner(self) -> "PolicyIteration":
-        """The method itself."""
-        return self
 
     def filled(self, evaluation: Evaluation) -> "PolicyIteration":
         """The method with an evaluation, if none was asked for."""
@@ -193,10 +196,6 @@ class PolicyIteration:
         assert self.evaluation is not None
         return step.evaluated(self.evaluation, self.replies)
 
-    def patience(self, grid: Grid) -> int:
-        """A good policy moves one cell an improvement, and a wave may cross the box four times."""
-        return 100 + 4 * sum(grid.shape)  # a hundred for grids so small that crossing them takes no time
-
     def described(self, game: bool) -> str:
         """As it is written, without the replies where there is no opponent."""
         chosen = [] if self.evaluation is None else [repr(self.evaluation)]
@@ -204,7 +203,7 @@ class PolicyIteration:
 
 
 @pytree_dataclass(static=("coarsest",))
-class Nested:
+class Nested(Method):
     """Solve on coarser grids first, and start each finer one from the interpolated answer.
 
     From a cold start the count of policy improvements grows with N, one cell of good policy an improvement; from
@@ -238,7 +237,7 @@ class Nested:
     @property
     def in_parts(self) -> bool:
         """As on every level."""
-        return getattr(self.inner, "in_parts", False)
+        return self.inner.in_parts
 
     def filled(self, evaluation: Evaluation) -> "Nested":
         """With an evaluation on every level."""

@@ -25,6 +25,7 @@ that is, with discount β + 1/S' and V/S' added to the running cost: any Δt, mo
 additive certificate of that problem is small enough, or the residual is rounding.
 """
 
+import abc
 import dataclasses
 import math
 from typing import Any, Protocol
@@ -150,37 +151,62 @@ TABLEAUX = {
 }
 
 
-class TimeMethod(Protocol):
-    """A method that carries V from t to t − Δt; a value that JAX knows as a pytree."""
+class TimeMethod(abc.ABC):
+    """The base class of methods that carry V from t to t − Δt; registered with JAX as pytrees.
+
+    A method defines ``step``; everything else has a default, given here.
+    """
 
     @property
     def limited(self) -> bool:
-        """True if steps longer than 1/(max Q + β) over ``courant`` are unstable."""
+        """True if steps longer than ``courant``/(max Q + β) are unstable."""
+        return False
 
     @property
     def courant(self) -> Number:
         """The length of its steps times max Q + β."""
+        return math.inf
 
     @property
     def tableau(self) -> Tableau:
-        """Its stages: the times within a step at which the rates are looked at."""
+        """Its stages: the times within a step at which the rates are evaluated."""
+        return TABLEAUX[1]
 
     @property
     def monotone_only(self) -> bool:
-        """True if it wants the matrix of a chain, and so a monotone scheme."""
+        """True if it needs the matrix of a chain, and so a monotone scheme."""
+        return False
+
+    @property
+    def evaluation(self) -> Evaluation | None:
+        """The solver of the equation of a policy; None if the method solves none, or if the problem decides."""
+        return None
+
+    @property
+    def tol(self) -> Number | None:
+        """A bound on what the steps of a march leave unsolved, in cost units; None for the default."""
+        return None
+
+    @property
+    def in_parts(self) -> bool:
+        """True if ``step`` reads other nodes through ``stencil`` only, as many devices need."""
+        return False
 
     def filled(self, on: Discretisation, evaluation: Evaluation | None = None) -> "TimeMethod":
         """The method with its open settings taken from the scheme and from the ``evaluation`` of the problem."""
+        return self
 
+    @abc.abstractmethod
     def step(self, march: Marching, value: Field, t: Number, end: Number, dt: Number) -> tuple[Field, Scalar, Any]:
         """V at ``end`` = t − Δt from V at t, true if the step came to its end, and the rates and the noise seen."""
 
     def described(self) -> str:
         """The method as one would write it."""
+        return repr(self)
 
 
 @pytree_dataclass(static=("stages",))
-class Explicit:
+class Explicit(TimeMethod):
     """Explicit steps by a strong-stability-preserving Runge–Kutta method.
 
     Args:
@@ -192,7 +218,7 @@ class Explicit:
 
     stages: int | Tableau | None = None
     fraction: Number = 0.9
-    limited, monotone_only, in_parts = True, False, True
+    limited, in_parts = True, True
 
     def __post_init__(self):
         # True is 1 to Python, and would be taken for Euler's method
@@ -246,7 +272,7 @@ class Explicit:
 
 
 @pytree_dataclass(static=("max_steps",))
-class Implicit:
+class Implicit(TimeMethod):
     """Implicit Euler steps, each by policy iteration: any length, first order in time.
 
     Args:
@@ -259,8 +285,7 @@ class Implicit:
     evaluation: Evaluation | None = None
     tol: Number | None = None
     max_steps: int = 100
-    limited, monotone_only, in_parts = False, True, True
-    courant, tableau = math.inf, TABLEAUX[1]  # any length; the rates are looked at once
+    monotone_only, in_parts = True, True
 
     def __post_init__(self):
         if self.evaluation is not None:

@@ -36,7 +36,7 @@ def estimate(problem: Problem, grid: Grid, method: Method, dtype: DType) -> int:
     """
     word, n, actions = np.dtype(dtype).itemsize, grid.ndim, _actions(problem)
     searched = _searched(problem, n, dtype)
-    if method.relaxes and not getattr(method, "policy", True):
+    if method.relaxes and not method.policy:
         # where V began, V, the step, and V as a chunk begins; and on few axes the neighbours along the last one
         return word * (4 + (n <= stencil.LONGER) + searched) * grid.size
     conditions = (problem.target, problem.stopping_cost, problem.running_max, problem.disturbances)
@@ -71,7 +71,7 @@ def of_march(on: Discretisation, kept: int, method: TimeMethod, *, policy: bool)
     actions = _actions(problem) if policy else 0
     one = word * (1 + actions)  # slice, whose memory is taken when it is filled
     if not method.limited:
-        inner = PolicyIteration(getattr(method, "evaluation", None) or Krylov())
+        inner = PolicyIteration(method.evaluation or Krylov())
         return kept * one * grid.size + estimate(problem, grid, inner, on.dtype)
     plain = scheme.even or (not any(grid.stretch or ()) and not (scheme.subcell and problem.target is not None))
     if scheme.monotone:

@@ -263,7 +263,7 @@ def check_count(shape: tuple[int, ...]) -> None:
         )
 
 
-def check_mesh(mesh: object, grid_shape: tuple[int, ...], caller: str, *choices: object) -> Mesh | None:
+def check_mesh(mesh: object, grid_shape: tuple[int, ...], caller: str, *choices: Any) -> Mesh | None:
     """The mesh, unless the nodes cannot be divided over it, or not by these ``choices``; None where it is one device.
 
     Raises:
@@ -283,7 +283,7 @@ def check_mesh(mesh: object, grid_shape: tuple[int, ...], caller: str, *choices:
                 f"part at least, and so at most {count // FEWEST} parts"
             )
     for choice in choices:
-        if not getattr(choice, "in_parts", False):
+        if not choice.in_parts:
             raise ValueError(
                 f"{caller}: {choice!r} runs on one device; leave out mesh. What reads other nodes by "
                 "hjbjax.discretisation.stencil alone, and reduces by grid.largest, may say in_parts = True"

@@ -172,7 +172,8 @@ def _over_lanes(mesh: object, lanes: Sequence[Problem], grid: Grid, method: Meth
     known = as_mesh(mesh, "solve_batch")
     if checkpoint is not None:
         raise ValueError("solve_batch: lanes over the devices of a mesh have no checkpoint; leave out one of them")
-    calls_back = getattr(method and method.inner.evaluation, "calls_back", False)
+    evaluation = None if method is None else method.inner.evaluation
+    calls_back = evaluation is not None and evaluation.calls_back
     if calls_back or any(checks.calls_back(problem, grid.ndim) for problem in lanes):
         called = repr(method) if calls_back else "a function of the problem"
         raise ValueError(f"solve_batch: {called} calls Python on the host; leave out mesh")

@@ -18,7 +18,7 @@ from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.schemes import Limited, Upwind
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import bellman, time_stepping
-from hjbjax.iteration.evaluation import check_pytree
+from hjbjax.iteration.evaluation import check_choice
 from hjbjax.iteration.time_methods import Explicit, TimeMethod
 from hjbjax.iteration.time_stepping import March
 from hjbjax.markov_chain import admissibility, memory, node_checks
@@ -128,7 +128,7 @@ def march(
     """
     method = Explicit() if method is None else method
     if scheme is None:
-        implicit = getattr(method, "monotone_only", False)  # what is no method is refused below
+        implicit = isinstance(method, TimeMethod) and method.monotone_only  # ``_check`` refuses everything else
         scheme = Upwind(split=True) if implicit else Limited(split=True)
     _check(problem, grid, scheme, method, step, time_limit)
     if not isinstance(policy, bool):
@@ -137,12 +137,8 @@ def march(
     horizon, kept = _times(horizon, times)
     traced = is_traced(problem, grid, method, start)
     if mesh is not None:
-        by = (
-            []
-            if method.limited
-            else [getattr(method, "evaluation", None) or march_evaluation(problem, grid, divided=True)]
-        )
-        mesh = checks.over_devices(mesh, "march", problem, grid, scheme, method, *by, traced=traced)
+        solved = () if method.limited else (method.evaluation or march_evaluation(problem, grid, divided=True),)
+        mesh = checks.over_devices(mesh, "march", problem, grid, scheme, method, *solved, traced=traced)
     if traced:
         on = Discretisation(problem, grid, scheme, arguments.traced_dtype(dtype, "march"))
         return _march_traced(on, horizon, kept, start, method, step, inner, throw)
@@ -258,11 +254,7 @@ def _check(problem: object, grid: object, scheme: Scheme, method: TimeMethod, st
     if not isinstance(problem, Problem) or not isinstance(grid, Grid):
         raise TypeError(f"march: got {type(problem).__name__}, {type(grid).__name__}; wanted a Problem and a Grid")
     schemes.check(scheme, "march: scheme", grid)
-    # a class has all these names as well: hjb.Explicit without its brackets
-    names = ("limited", "monotone_only", "filled", "step", "described")
-    if isinstance(method, type) or not all(hasattr(method, name) for name in names):
-        raise TypeError(f"march: method is {method!r}; wanted hjb.Explicit(...) or hjb.Implicit(...)")
-    check_pytree(method, "march: method")
+    check_choice(method, TimeMethod, "march: method", "hjb.Explicit(...) or hjb.Implicit(...)")
     if method.monotone_only and not scheme.monotone:
         raise ValueError(f"march: Implicit(...) solves with the matrix of a chain; got {scheme!r}, wanted Upwind(...)")
     if step is not None:

@@ -258,7 +258,7 @@ def _left(marched: Marched, value: np.ndarray) -> float:
     missed = float(marched.task.missed) * float(np.max(np.abs(value)))
     if marched.task.method.limited:
         return missed
-    tol = getattr(marched.method, "tol", None)
+    tol = marched.method.tol
     return missed + (TOL * min(1.0, float(np.ptp(value))) if tol is None else float(tol))
 
 

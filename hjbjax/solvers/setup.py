@@ -268,8 +268,8 @@ def prepare_on_host(
 
 
 def is_bare(method: Method) -> bool:
-    """True if the method keeps nothing but V; one of the user's own need not know of that."""
-    return method.relaxes and not getattr(method, "policy", True)
+    """True if the method keeps nothing but V."""
+    return method.relaxes and not method.policy
 
 
 def _bare(on: Discretisation, method: Method, tol: float, assumptions: Assumptions) -> tuple[Task, Assumptions]:

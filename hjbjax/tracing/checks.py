@@ -50,7 +50,7 @@ def cure(error: Exception) -> str | None:
     return next((advice for kind, advice in _ADVICE if isinstance(error, kind)), None)
 
 
-def shapes(problem: Problem, grid: Grid, scheme: object) -> None:
+def shapes(problem: Problem, grid: Grid, scheme: Any) -> None:
     """Refuse functions that cannot be traced on one state or return something else than they should.
 
     Args:
@@ -61,7 +61,7 @@ def shapes(problem: Problem, grid: Grid, scheme: object) -> None:
     Raises:
       ValueError: a result of the wrong shape or kind, a wrong number of arguments, code that JAX cannot trace.
     """
-    needed = getattr(scheme, "points", 2)  # a scheme of the user's need not have one
+    needed = scheme.points
     for axis, count in enumerate(grid.shape):
         if count < needed:
             raise ValueError(f"axis {axis} has {count} points; {type(scheme).__name__} needs at least {needed}")
@@ -325,7 +325,7 @@ def _check_arity(problem: Problem, name: str) -> None:
 
 
 def over_devices(
-    mesh: Mesh | None, caller: str, problem: Problem, grid: Grid, *choices: object, traced: bool
+    mesh: Mesh | None, caller: str, problem: Problem, grid: Grid, *choices: Any, traced: bool
 ) -> Mesh | None:
     """The mesh over which the nodes are to be divided, if they can be; None for one device.
 

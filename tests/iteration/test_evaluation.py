@@ -14,7 +14,7 @@ from systems import SEEDS
 import hjbjax as hjb
 from hjbjax.discretisation.rates import Rates
 from hjbjax.iteration.bellman import PolicyEquation
-from hjbjax.iteration.evaluation import Direct, Krylov, Sweeps, evaluate, jacobi, left_over, relaxed
+from hjbjax.iteration.evaluation import Direct, Evaluation, Krylov, Sweeps, evaluate, jacobi, left_over, relaxed
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -124,11 +124,11 @@ def test_a_batch_is_solved_lane_by_lane():
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class Gmres:
+class Gmres(Evaluation):
     """An evaluation of somebody else's."""
 
     restart: int = 20
-    rough, open_ends, calls_back = False, True, False
+    open_ends = True
 
     def solve(self, equation, grid):
         def matvec(delta):

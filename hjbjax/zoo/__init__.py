@@ -1,8 +1,8 @@
-"""Ready problems, with the exact or an independent answer beside each where one exists.
+"""Ready problems, most of them with an exact value to compare with.
 
-A ready problem is a function of its parameters that returns ``(problem, grid)``; the function of the same name
-with ``_exact`` takes the same keywords and returns the value as a function of one state. ``catalogue`` has them
-all under the names of the command line.
+A ready problem is a function that returns ``(problem, grid)``. The function of the same name with the suffix
+``_exact`` takes the same keywords and returns the value as a function of one state. ``catalogue`` lists all problems
+under the names that the command line uses.
 
     >>> from hjbjax import zoo
     >>> problem, grid = zoo.bang_bang(noise=0.5)
@@ -56,14 +56,14 @@ from hjbjax.zoo.stochastic import (
 )
 
 _ENTRIES = (
-    # not quite from hanging, θ = π, where both ways up are equally good and a path would have to choose
+    # slightly off the hanging position θ = π, where swinging up to the left and to the right cost the same
     Entry("pendulum", "swing a pendulum up and hold it upright", pendulum, start=(2.8, 0.0), duration=6.0),
     Entry(
         "double-integrator",
         "bring a mass to rest at the origin in the least time",
         double_integrator,
         double_integrator_exact,
-        # from rest at 1 the least time is 2, half of the picture
+        # from rest at 1 the least time is 2, half the duration of the picture
         start=(1.0, 0.0),
         duration=4.0,
     ),
@@ -108,14 +108,14 @@ _ENTRIES = (
         "steer a boat through a current in the least time",
         zermelo,
         zermelo_exact,
-        # downstream of the origin: the boat has to make its way against the current
+        # downstream of the origin, so the boat sails against the current
         start=(1.0, -1.0),
         duration=5.0,
     ),
-    # the time from there is the norm, less than 1
+    # the least time from this point is its norm, which is less than 1
     Entry("eikonal", "the shortest way to the origin", eikonal, eikonal_exact, start=(0.8, 0.5), duration=2.0),
     Entry("dubins", "drive a car that cannot turn on the spot to a disc", dubins, start=(-1.5, 0.5, 0.0), duration=8.0),
-    # from the limit cycle, whose amplitude is 2
+    # starts on the limit cycle, whose amplitude is 2
     Entry("van-der-pol", "quieten a Van der Pol oscillator", van_der_pol, start=(2.0, 0.0), duration=10.0),
     Entry("bang-bang", "hold a point near zero with a bounded speed", bang_bang, bang_bang_exact, start=(1.5,)),
     Entry(
@@ -123,7 +123,7 @@ _ENTRIES = (
         "consume and invest under constant relative risk aversion",
         merton,
         merton_exact,
-        # the logarithm of a wealth of 1
+        # wealth 1, whose logarithm is zero
         start=(0.0,),
         duration=10.0,
     ),
@@ -132,15 +132,15 @@ _ENTRIES = (
         "land a rocket with the least fuel: when to start the engine",
         moon_landing,
         moon_landing_exact,
-        # at rest at height 1 with the full mass: a coast, then the burn
+        # at rest at height 1 with full mass: a coast, then the burn
         start=(1.0, 0.0, 1.0),
         duration=2.0,
-        finish=moon_landing_burn,  # the grid's problem ends where the burn begins
+        finish=moon_landing_burn,  # the problem on the grid ends where the burn begins
     ),
     Entry("smooth", "a smooth nonlinear problem made for a known value", smooth, smooth_exact, start=(0.8, 0.5)),
 )
 
-# in the order in which `hjbjax list` prints them
+# in the order that `hjbjax list` prints
 catalogue: dict[str, Entry] = {entry.name: entry for entry in _ENTRIES}
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""One line of the catalogue: a ready problem, its answer where one is known, and a path worth drawing."""
+"""One entry of the catalogue: a ready problem, its exact value if known, and an initial state for a trajectory."""
 
 import dataclasses
 import inspect
@@ -12,19 +12,19 @@ from hjbjax.zoo.ingredients import Exact, Feedback
 
 @dataclasses.dataclass(frozen=True)
 class Entry:
-    """A ready problem under its name.
+    """A ready problem and its name.
 
     Args:
       name: the name on the command line, with hyphens.
       summary: one line.
       build: ``build(**parameters) -> (problem, grid)``.
-      exact: ``exact(**parameters) -> value``, a function of one state that ``jit`` and ``vmap`` accept; it takes
-        the keywords of ``build`` except ``shape``. ``None`` where no answer is known.
-      start: the initial state of the picture of a trajectory.
-      duration: its length, in units of time.
-      finish: ``finish(**parameters) -> (problem, feedback)``, with the keywords of ``exact``, where the target holds
-        the cost of what follows: the system with its true end, and the exact feedback until there. ``None`` where
-        nothing is to follow.
+      exact: ``exact(**parameters) -> value``, a function of one state that works under ``jit`` and ``vmap``. It takes
+        the keywords of ``build`` except ``shape``. ``None`` if no exact value is known.
+      start: the initial state of the trajectory in the gallery.
+      duration: the length of this trajectory, in units of time.
+      finish: ``finish(**parameters) -> (problem, feedback)`` with the keywords of ``exact``, for a problem whose target
+        prescribes the cost of a final phase. It returns the problem of the final phase, which ends where the full
+        problem ends, and its exact feedback. ``None`` if there is no final phase.
 
     Example:
       >>> from hjbjax import zoo
@@ -43,12 +43,12 @@ class Entry:
     finish: Callable[..., tuple[Problem, Feedback]] | None = None
 
     @property
-    def parameters(self) -> dict[str, Any]:  # numbers, tuples of them, truth values or None
+    def parameters(self) -> dict[str, Any]:  # numbers, tuples of numbers, booleans or None
         """The keywords of ``build`` with their defaults."""
-        # of the function itself: the command line offers exactly what it takes
+        # read from the signature, so the command line offers exactly the keywords that the function accepts
         return {name: argument.default for name, argument in inspect.signature(self.build).parameters.items()}
 
     def initial_state(self, ndim: int) -> tuple[float, ...]:
-        """``start`` in ``ndim`` dimensions: cut, or filled up with zeros, where a parameter chose another number."""
-        # zero is the target, or the middle of the box, in the entries whose dimension a parameter chooses
+        """``start`` in ``ndim`` dimensions, truncated or padded with zeros if a parameter changed the dimension."""
+        # in every entry with a variable dimension, zero is the target or the centre of the box
         return (self.start + (0.0,) * ndim)[:ndim]

@@ -1,8 +1,8 @@
-"""Problems of finance whose value is known.
+"""Finance problems with a known value.
 
     Merton          consumption and investment with constant relative risk aversion
 
-A utility to be maximised is minus a cost.
+A utility to be maximised enters as a cost with the opposite sign.
 """
 
 import jax
@@ -16,25 +16,25 @@ from hjbjax.problem.sets import Box
 from hjbjax.problem.types import Control, Number, State
 from hjbjax.zoo.ingredients import Exact, OutsideCube, Scalar, admissible, answer, positive
 
-SHARES = 0.0, 1.0  # no short sale, no credit
-RATES = 0.01, 0.1  # of consumption; at k = 0 the cost is infinite for γ > 1
+SHARES = 0.0, 1.0  # no short selling, no borrowing
+RATES = 0.01, 0.1  # bounds of the consumption rate k; at k = 0 the cost is infinite for γ > 1
 
 
 @pytree_dataclass()
 class Merton:
-    """Consume and invest for ever with the utility C^{1−γ}/(1−γ); the cost is minus the utility.
+    """Consume and invest over an infinite horizon with the utility C^{1−γ}/(1−γ); the cost is minus the utility.
 
-    The state is the logarithm z of wealth, the controls are the share π in the risky asset and the rate of
-    consumption k = C/W:
+    The state is the logarithm z of the wealth W. The controls are the share π in the risky asset and the consumption
+    rate k = C/W.
 
         dz = (r + π(μ − r) − k − ½π²σ²) dt + πσ dw,     V = −k*^{−γ} e^{(1−γ)z}/(1−γ)
         π* = (μ − r)/(γσ²),  k* = (ρ − (1−γ)(r + (μ−r)²/(2γσ²)))/γ
 
-    so that the noise is controlled, and noise and value are scale-free where wealth itself would span decades.
+    The noise depends on the control. In the logarithm of wealth the noise does not depend on the state.
 
     Args:
       interest: r.
-      growth: μ, of the risky asset.
+      growth: μ, the growth rate of the risky asset.
       volatility: σ.
       aversion: γ > 0, not 1.
       discount: ρ.
@@ -48,57 +48,57 @@ class Merton:
 
     def __post_init__(self):
         positive("merton", volatility=self.volatility, aversion=self.aversion, discount=self.discount)
-        # C^{1−γ}/(1−γ) divides by zero there; its limit, less a constant, is log C, another problem
+        # C^{1−γ}/(1−γ) divides by zero at γ = 1; its limit up to a constant, log C, is a different problem
         if not is_traced(self.aversion) and np.any(np.asarray(self.aversion) == 1):
             raise ValueError("merton: got aversion = 1 (logarithmic utility), wanted another number > 0")
 
     def drift(self, x: State, u: Control) -> State:
-        """The mean growth of the logarithm of wealth."""
+        """The mean growth rate of the logarithm of wealth."""
         spread = u[0] * self.volatility  # πσ
-        # −½π²σ² is Itô's correction of the logarithm: it makes growth concave in π, though wealth's is linear
+        # −½π²σ² is the Itô correction of the logarithm; it makes the growth concave in π
         growth = self.interest + u[0] * (self.growth - self.interest) - u[1] - 0.5 * spread * spread
         return jnp.stack([growth])
 
     def noise(self, x: State, u: Control) -> State:
         """πσ."""
-        return jnp.stack([u[0] * self.volatility])  # (n,): the diagonal of σ
+        return jnp.stack([u[0] * self.volatility])  # shape (n,), the diagonal of σ
 
     def cost(self, x: State, u: Control) -> Number:
         """Minus the utility of the consumption k·e^z."""
         power = 1 - self.aversion
-        # (k·e^z)^{1−γ} by its logarithm: one exponential in place of a power of a product
+        # (k·e^z)^{1−γ} through the logarithm, so that one exponential replaces the power of a product
         return -jnp.exp(power * (x[0] + jnp.log(u[1]))) / power
 
     @property
     def share(self) -> Number:
-        """π*, the best share in the risky asset."""
-        # Merton's share: it depends neither on wealth nor on the discount
+        """π*, the optimal share in the risky asset."""
+        # independent of wealth and of the discount
         return (self.growth - self.interest) / (self.aversion * self.volatility * self.volatility)
 
     @property
     def consumption(self) -> Number:
-        """k*, the best consumption per unit of wealth and time."""
+        """k*, the optimal consumption per unit of wealth and time."""
         premium = self.growth - self.interest
-        # the riskless rate that is worth as much as the best portfolio: r + (μ−r)²/(2γσ²)
+        # the riskless rate that is equivalent to the optimal portfolio: r + (μ−r)²/(2γσ²)
         certain = self.interest + premium * premium / (2 * self.aversion * self.volatility * self.volatility)
-        # k* ≤ 0 means that the utility of waiting outgrows the discount: the value is not finite
+        # k* ≤ 0 means that the utility of waiting grows faster than the discount; the value is then not finite
         return (self.discount - (1 - self.aversion) * certain) / self.aversion
 
     def value(self, x: State) -> Scalar:
-        """The value at one state, while the best controls are admissible and k* > 0."""
+        """The value at one state, valid if the optimal controls are admissible and k* > 0."""
         power = 1 - self.aversion
-        # homogeneous of degree 1 − γ in wealth, as the utility is, hence the exponential in its logarithm
+        # homogeneous of degree 1 − γ in wealth, like the utility, so exponential in the logarithm of wealth
         return -(self.consumption**-self.aversion) * jnp.exp(power * jnp.asarray(x)[0]) / power
 
     def check(self) -> None:
-        """Refuse parameters for which ``value`` is not that of the box of controls.
+        """Check that the optimal controls are in the box of controls, so that ``value`` is the value of the problem.
 
         Raises:
-          ValueError: the best share or the best consumption lies outside of it.
+          ValueError: the optimal share or the optimal consumption is outside the box.
         """
         if is_traced(self):
             return
-        with jax.ensure_compile_time_eval():  # known numbers are looked at within somebody's jit, too
+        with jax.ensure_compile_time_eval():  # concrete numbers can be checked inside a jit of the caller, too
             admissible("merton", *SHARES, share=self.share)
             admissible("merton", *RATES, consumption=self.consumption)
 
@@ -113,32 +113,32 @@ def merton(
     discount: Number = 0.05,
     shape: tuple[int, ...] = (101,),
 ) -> tuple[Problem, Grid]:
-    """Consume and invest: log-wealth on [−1, 1], share in [0, 1], consumption rate in [.01, .1].
+    """Consume and invest: log-wealth in [−1, 1], share in [0, 1], consumption rate in [0.01, 0.1].
 
-    The ends are held at the exact value: the noise would carry the effect of a wall into the whole box.
+    The exact value is prescribed at both ends. Otherwise the noise would spread the effect of the boundary.
 
     Args:
-      interest: r, of the safe asset, per unit of time.
+      interest: r, the rate of the safe asset, per unit of time.
       growth: μ, the mean rate of the risky asset.
-      volatility: σ, of the risky asset.
-      aversion: γ, to risk, relative to wealth; not 1.
-      discount: ρ, of later consumption.
-      shape: nodes.
+      volatility: σ of the risky asset.
+      aversion: γ, the relative risk aversion; not 1.
+      discount: ρ, the discount rate of later consumption.
+      shape: number of nodes.
 
     Raises:
-      ValueError: the best share or consumption lies outside the box, so that the ends have no exact value.
+      ValueError: the optimal share or consumption is outside the box, so the value at the ends is unknown.
     """
     system = Merton(interest, growth, volatility, aversion, discount)
     system.check()
     problem = Problem(
         system.drift,
         system.cost,
-        # with the defaults π* = .5 and k* = .045, both inside: the bounds are slack
+        # with the defaults π* = 0.5 and k* = 0.045 are inside, so the bounds are not active
         Box(*zip(SHARES, RATES, strict=True)),
         noise=system.noise,
         discount=discount,
         target=OutsideCube(1.0).level,
-        # at the ends the value of going on without the box, which the exact answer knows
+        # the value of continuing on the whole line, known from the closed form
         exit_cost=system.value,
         control_names=("share at risk", "consumption"),
     )
@@ -154,7 +154,7 @@ def merton_exact(
     aversion: Number = 2.0,
     discount: Number = 0.05,
 ) -> Exact:
-    """The value as a function of log-wealth, any of it; 493.8271605 at wealth 1 with the defaults.
+    """The value as a function of log-wealth, on the whole line; 493.8271605 at wealth 1 with the defaults.
 
     Args:
       interest: r.
@@ -164,7 +164,7 @@ def merton_exact(
       discount: ρ.
 
     Raises:
-      ValueError: the best share lies outside [0, 1], or the best consumption outside [.01, .1].
+      ValueError: the optimal share is outside [0, 1], or the optimal consumption is outside [0.01, 0.1].
     """
     system = Merton(interest, growth, volatility, aversion, discount)
     system.check()

@@ -1,7 +1,7 @@
 """Costs, targets and small helpers that several ready problems share.
 
-Everything that a Problem holds is a module-level function or a bound method of a registered dataclass, so that
-its numbers are leaves: changing one recompiles nothing, and a tracer may stand in for any of them.
+Every function stored in a Problem is a module-level function or a bound method of a registered dataclass, so its
+numbers are leaves of the pytree. Changing one does not recompile, and any of them may be a tracer.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,12 +19,12 @@ Scalar: TypeAlias = Num[Array, ""]
 Exact: TypeAlias = Callable[[State | Sequence[float]], Scalar]  # V at one state, an array or a plain list
 Feedback: TypeAlias = Callable[[State], Control]
 
-ROUNDING = 1e-6  # relative, of a best control that was computed in float32: one on its bound is admissible
+ROUNDING = 1e-6  # relative rounding of a best control computed in float32; a control on its bound is admissible
 
 
 def unit_cost(x: State, u: Control) -> Number:
-    """One per unit time: the cost is the time."""
-    return jnp.ones((), jnp.result_type(x))  # in the state's precision, or float32 solves would be promoted
+    """One per unit time, so the total cost is the elapsed time."""
+    return jnp.ones((), jnp.result_type(x))  # the state's dtype, otherwise float32 solves would be promoted
 
 
 @pytree_dataclass()
@@ -32,8 +32,8 @@ class QuadraticCost:
     """The running cost q·|x|² + r·|u|².
 
     Args:
-      state: q, a number or one weight a state.
-      control: r, a number or one weight an input.
+      state: q, one number or one weight per state.
+      control: r, one number or one weight per input.
 
     Example:
       >>> import numpy as np
@@ -46,46 +46,46 @@ class QuadraticCost:
 
     def rate(self, x: State, u: Control) -> Number:
         """Cost per unit time."""
-        # x*x and no x'Qx: elementwise, so that a solver squares each coordinate once per node of its own axis
+        # elementwise x*x instead of x'Qx, so that a solver squares each coordinate only once per node of its axis
         return jnp.sum(self.state * (x * x)) + jnp.sum(self.control * (u * u))
 
 
 @pytree_dataclass()
 class QuadraticValue:
-    """x'Px + c."""
+    """The function x'Px + c."""
 
     matrix: Array
     constant: Number = 0.0
 
     def value(self, x: State) -> Scalar:
         """The value at one state."""
-        x = jnp.asarray(x)  # an answer may be asked with a plain list
+        x = jnp.asarray(x)  # x may be a plain list
         return x @ jnp.asarray(self.matrix) @ x + self.constant
 
 
 @pytree_dataclass(static=("dim",))
 class Disc:
-    """The Euclidean ball around the origin in the first ``dim`` states; radius 0 is the origin alone."""
+    """The Euclidean ball around the origin in the first ``dim`` states; radius 0 is the origin only."""
 
     radius: Number
     dim: int
 
     def level(self, x: State) -> Number:
         """|x|² − r²: ≤ 0 inside."""
-        place = x[: self.dim]  # a Dubins car arrives in any heading, which comes after them
-        # squares, no root: at the origin, which is all there is for radius 0, the root's derivative is NaN
+        place = x[: self.dim]  # the position; a Dubins car may arrive with any heading
+        # squared distances, because the derivative of the distance is NaN at the origin
         return jnp.sum(place * place) - self.radius * self.radius
 
 
 @pytree_dataclass()
 class OutsideCube:
-    """The complement of the open cube |x_i| < half_width: the faces of a box of that size, and beyond."""
+    """The complement of the open cube |x_i| < half_width, which contains the faces of a box of that size."""
 
     half_width: Number
 
     def level(self, x: State) -> Number:
         """Half width − max |x_i|: ≤ 0 on the faces."""
-        # The faces are nodes up to the last bit only; a millionth is below any spacing and above any rounding.
+        # nodes on the faces are exact only up to rounding; 1e-6 is below any grid spacing and above any rounding
         return self.half_width * (1 - 1e-6) - jnp.max(jnp.abs(x))
 
 
@@ -97,7 +97,7 @@ class OutsideBall:
 
     def level(self, x: State) -> Number:
         """r − |x|: ≤ 0 outside."""
-        # as of the cube: nodes of the box's faces lie on the sphere up to their last bit
+        # as for the cube: nodes where the sphere touches the box are exact only up to rounding
         return self.radius * (1 - 1e-6) - root(jnp.sum(x * x))
 
 
@@ -105,13 +105,13 @@ class Traveller(Protocol):
     """A system whose least time to the target is known."""
 
     def arrival_time(self, x: State) -> Scalar:
-        """T from one state; infinite where the target is out of reach."""
+        """The least time T from one state; infinite if the target is unreachable."""
         ...
 
 
 @pytree_dataclass()
 class Arrival:
-    """(1 − e^{−βT})/β for the time T = ``system.arrival_time``: S of (8.14) for β = 1, T itself for β = 0."""
+    """(1 − e^{−βT})/β for the time T = ``system.arrival_time``: S of (8.14) if β = 1, T itself if β = 0."""
 
     system: Traveller
     discount: Number = 1.0
@@ -122,40 +122,40 @@ class Arrival:
 
 
 def discounted_time(time: Number, discount: Number) -> Scalar:
-    """∫₀ᵀ e^{−βs} ds = (1 − e^{−βT})/β, and T where β = 0."""
-    # a divisor that is never zero: the branch not taken is evaluated too, and 0/0 there would make derivatives NaN
+    """∫₀ᵀ e^{−βs} ds = (1 − e^{−βT})/β, and T if β = 0."""
+    # the divisor is never zero: JAX differentiates both branches of a where, and 0/0 would make the derivative NaN
     rate = jnp.where(discount == 0, 1.0, discount)
-    # expm1 keeps the digits that 1 − e^{−βT} would lose for small β, down to β = 1e-9
+    # expm1 keeps the digits that 1 − e^{−βT} would lose to cancellation for small β; tested down to β = 1e-9
     return jnp.where(discount == 0, time, -jnp.expm1(-rate * time) / rate)
 
 
 def root(square: Number) -> Scalar:
-    """√max(s, 0), with the derivative 0 where the root is 0: at a corner of a distance no number moves it."""
+    """√max(s, 0), with the derivative 0 where s ≤ 0, for distances with a corner."""
     inside = square > 0
-    # the derivative of √s at 0 is infinite, and times what is not asked for it would be NaN
+    # √s has an infinite derivative at 0, which turns into NaN when the chain rule multiplies it by 0
     return jnp.where(inside, jnp.sqrt(jnp.where(inside, square, 1.0)), 0 * square)
 
 
 def answer(method: Callable[..., T]) -> Callable[..., T]:
-    """A bound method as a function of one state that carries its parameters through ``jit``."""
-    return as_partial(method)  # type: ignore[return-value]  # None comes of None alone
+    """Return a bound method as a function of one state whose parameters are pytree leaves under ``jit``."""
+    return as_partial(method)  # type: ignore[return-value]  # as_partial returns None only for None
 
 
 def noise_or_none(noise: Number) -> Number | None:
-    """``None`` for a plain zero, so that the problem counts as deterministic."""
-    # a tracer may be zero for all we know, so it stays, and with it the second derivatives
+    """Return ``None`` for a concrete zero, so that the problem counts as deterministic."""
+    # the value of a tracer is unknown, so a traced noise keeps its second derivatives
     return noise if is_traced(noise) or np.any(np.asarray(noise) != 0) else None
 
 
 def positive(owner: str, **numbers: object) -> None:
-    """Refuse parameters that are not positive, while they are known.
+    """Check that parameters are positive; traced parameters are not checked.
 
     Raises:
-      ValueError: a number that is zero, negative or not finite.
+      ValueError: a parameter is zero, negative or not finite.
     """
     for name, value in numbers.items():
         if is_traced(value):
-            continue  # under jit and grad no value can be looked at
+            continue  # values are unknown under jit and grad
         try:
             array = np.asarray(value, np.float64)
         except (TypeError, ValueError):
@@ -165,17 +165,17 @@ def positive(owner: str, **numbers: object) -> None:
 
 
 def admissible(owner: str, lo: Number, hi: Number, where: str = "", **best: Number) -> None:
-    """Refuse a closed form whose best control lies outside its set, while the numbers are known.
+    """Check that the best control of a closed form is admissible; traced numbers are not checked.
 
     Args:
       owner: the name of the problem.
-      lo: the lower bound of the set.
-      hi: the upper one.
-      where: the states at which the control is the best one, for the message.
-      **best: the control that the closed form rests on.
+      lo: the lower bound of the control set.
+      hi: the upper bound.
+      where: the states at which this control is the best one, for the message.
+      **best: the best controls according to the closed form.
 
     Raises:
-      ValueError: a number outside of [lo, hi], or NaN.
+      ValueError: a control is outside [lo, hi] or NaN.
     """
     if is_traced(lo, hi, best):
         return
@@ -186,7 +186,7 @@ def admissible(owner: str, lo: Number, hi: Number, where: str = "", **best: Numb
         if not np.all((array >= low - slack) & (array <= high + slack)):
             raise ValueError(
                 f"{owner}: got parameters whose best {name} is {array:.6g}{where}, wanted one within "
-                f"[{low:.6g}, {high:.6g}], the set of controls: beyond it the closed form is not the value"
+                f"[{low:.6g}, {high:.6g}], the set of controls; the closed form is the value only inside it"
                 if array.ndim == 0
                 else f"{owner}: got parameters whose best {name} lies outside the set of controls{where}"
             )

@@ -1,13 +1,14 @@
 """The Moon landing with the least fuel: ḣ = v, v̇ = −g + u/m, ṁ = −ku, 0 ≤ u ≤ U, from (h, v, m) to h = v = 0.
 
-The best thrust is none, then all. On a coast neither the mass nor the energy E = ½v² + gh changes, so the burn that
-starts at mass m and brings E to zero is all there is to find. With e^{−q} the share of the mass that is left,
+The optimal thrust is zero, then full. A coast changes neither the mass nor the energy E = ½v² + gh, so the landing
+is determined by the burn that starts at mass m and brings E to zero. Let e^{−q} be the fraction of the mass that is
+left after the burn. Its duration, initial velocity and initial height, and the equation for q, are
 
     τ = m(1 − e^{−q})/(kU),   v₁ = gτ − q/k,   h₁ = −v₁τ + ½gτ² − (m/(k²U))(1 − e^{−q}(1 + q)),   ½v₁² + g h₁ = E
 
-are its duration, its first velocity and height, and the equation for q; the fuel is m(1 − e^{−q}). Who falls faster
-than v₁ crashes. On a grid the value is held there, at the number that the same formula gives: a path that lands meets
-the edge of that region where its burn begins, so the value elsewhere does not change.
+and the fuel is m(1 − e^{−q}). A rocket that falls faster than v₁ crashes. The problem on a grid prescribes the value
+of this formula in the region v ≤ v₁. A path that lands enters the region where its burn begins, so the value outside
+the region does not change.
 """
 
 import jax
@@ -20,16 +21,16 @@ from hjbjax.problem.sets import Box
 from hjbjax.problem.types import Control, Number, State
 from hjbjax.zoo.ingredients import Exact, Feedback, Scalar, answer, positive
 
-NEWTON = 6  # steps for the square root of E, which is nearly linear in q: quadratic from the first on
-EXACT = 2  # of them, the last ones, carry derivatives: the first and the second
+NEWTON = 6  # Newton steps for √E, which is nearly linear in q, so convergence is quadratic from the first step
+EXACT = 2  # the last steps carry derivatives: one for the first derivative, two for the second
 
 
 @pytree_dataclass()
 class Lander:
-    """A rocket above the ground, state (h, v, m), its thrust u upwards.
+    """A rocket above the ground, state (h, v, m), control the upward thrust u.
 
     Args:
-      thrust: U, above g·m or it cannot hold itself.
+      thrust: U, larger than g·m, otherwise the rocket cannot hover.
       consumption: k, mass per unit of thrust and time.
       gravity: g.
 
@@ -54,56 +55,55 @@ class Lander:
         return self.consumption * u[0]
 
     def _ignition_point(self, q: Number, mass: Number) -> tuple[Number, Number, Number]:
-        """Duration, first velocity and first height of the burn that leaves the share e^{−q} of a mass."""
+        """Duration, initial velocity and initial height of the burn that leaves the fraction e^{−q} of the mass."""
         left, k = jnp.exp(-q), self.consumption
         duration = mass * (1 - left) / (k * self.thrust)
-        # the rocket equation: a burn to the share e^{−q} gives q/k, with 1/k the speed of the exhaust
+        # rocket equation: the exhaust speed is 1/k, so burning down to the fraction e^{−q} adds the velocity q/k
         velocity = self.gravity * duration - q / k
-        # ∫(τ − s)·U/m(s) ds: what thrust alone would lift the rocket by, from rest
+        # ∫(τ − s)·U/m(s) ds: the height gained by the thrust without gravity, from rest
         climbed = mass * (1 - left * (1 + q)) / (k * k * self.thrust)
         return duration, velocity, -velocity * duration + 0.5 * self.gravity * duration * duration - climbed
 
     def _log_ratio(self, x: State) -> Number:
-        """q; zero at rest on the ground."""
+        """The exponent q; zero at rest on the ground."""
         height, velocity, mass = x[0], x[1], x[2]
         energy = 0.5 * velocity * velocity + self.gravity * height
         resting = energy <= 0
-        energy = jnp.where(resting, 1.0, energy)  # √0 has no derivative, and the branch not taken is differentiated too
+        energy = jnp.where(resting, 1.0, energy)  # √0 has no derivative, and JAX differentiates both branches
         pull = self.thrust / mass
-        # with a constant mass E = v²/2 · U/(U − gm), and a lighter rocket needs less; where full thrust hardly holds
-        # its weight the divisor stays a tenth of the thrust, or the first guess would be infinite
+        # with constant mass E = v²/2 · U/(U − gm); a lighter rocket needs less. The divisor is at least a tenth of
+        # the thrust, otherwise the initial guess is infinite when full thrust barely carries the weight
         q = self.consumption * jnp.sqrt(2 * energy * pull / jnp.maximum(pull - self.gravity, 0.1 * pull))
-        for step in range(NEWTON):  # a fixed number: a loop until convergence would have no reverse derivative
+        for step in range(NEWTON):  # fixed count: a loop until convergence has no reverse-mode derivative
             if step == NEWTON - EXACT:
-                # at the solution one step of Newton's carries the implicit function's derivative, a second the next one
+                # at the solution, one Newton step carries the first derivative of the implicit function, two the second
                 q = jax.lax.stop_gradient(q)
             duration, first, start = self._ignition_point(q, mass)
             needed = 0.5 * first * first + self.gravity * start
-            # ∂E/∂q = v₁ ∂v₁/∂q + g ∂h₁/∂q
-            # ∂τ/∂q, ∂v₁/∂q and ∂h₁/∂q in turn
+            # ∂E/∂q = v₁ ∂v₁/∂q + g ∂h₁/∂q, with ∂τ/∂q, ∂v₁/∂q and ∂h₁/∂q in this order
             longer = mass * jnp.exp(-q) / (self.consumption * self.thrust)
             faster = self.gravity * longer - 1 / self.consumption
             higher = (
                 -faster * duration - first * longer + self.gravity * duration * longer - q * longer / self.consumption
             )
             slope = first * faster + self.gravity * higher
-            # Newton's step for √needed − √energy, times √needed above and below: √E is nearly linear in q, E is not
+            # Newton step for √needed − √energy, expanded by √needed: √E is nearly linear in q, E is not
             q = q - 2 * (needed - jnp.sqrt(needed * energy)) / slope
         return jnp.where(resting, 0.0, q)
 
     def fuel(self, x: State) -> Scalar:
-        """The least fuel to land, m(1 − e^{−q}); for a rocket that falls too fast the number that the formula gives."""
+        """The least fuel to land, m(1 − e^{−q}); not meaningful for a rocket that falls too fast to land."""
         x = jnp.asarray(x)
         return x[2] * (1 - jnp.exp(-self._log_ratio(x)))
 
     def margin(self, x: State) -> Number:
-        """v − v₁: how much faster it may yet fall; 0 where the burn has to begin, below it crashes."""
+        """v − v₁: positive while coasting, 0 where the burn must begin, negative if the rocket will crash."""
         return x[1] - self._ignition_point(self._log_ratio(x), x[2])[1]
 
     def least_fuel(self, x: State) -> Scalar:
-        """The least fuel to land; infinite for a state that crashes, or is below the ground already."""
+        """The least fuel to land; infinite if the rocket will crash or is below the ground."""
         x = jnp.asarray(x)
-        # rounding, in units of the exhaust's speed 1/k: a state where the burn begins lands, and so does one at rest
+        # rounding, in units of the exhaust speed 1/k: states where the burn begins and states at rest can land
         slack = 64 * jnp.finfo(jnp.result_type(x, jnp.float32)).eps
         exhaust = 1 / self.consumption
         late = self.margin(x) < -slack * (jnp.abs(x[1]) + exhaust)
@@ -111,7 +111,7 @@ class Lander:
         return jnp.where(late | below, jnp.inf, self.fuel(x))
 
     def sinking(self, x: State) -> Number:
-        """−v: 0 where the rocket stands still, at the end of the burn."""
+        """−v: reaches 0 at the end of the burn, where the rocket stands still."""
         return -x[1]
 
     def burn(self, x: State) -> Control:
@@ -119,9 +119,9 @@ class Lander:
         return jnp.full(1, self.thrust, jnp.result_type(x))  # in the state's precision
 
     def ignition(self, x: State) -> tuple[Number, Number]:
-        """When the engine starts, and how long it burns."""
+        """The time until the engine starts, and the duration of the burn."""
         x = jnp.asarray(x)
-        # a coast changes v at the rate −g, and neither mass nor energy, so that v₁ waits where it is
+        # a coast changes v at the rate −g but neither mass nor energy, so v₁ stays the same
         return self.margin(x) / self.gravity, self._ignition_point(self._log_ratio(x), x[2])[0]
 
 
@@ -135,23 +135,23 @@ def moon_landing(
 ) -> tuple[Problem, Grid]:
     """Land on the Moon with the least fuel, on [0, 1.5] × [−2, 0.5] × [0.3, 1]; 0 ≤ u ≤ thrust.
 
-    The value is held where a soft landing takes full thrust or more; the grid has to find the coast, and a path on it
-    ends where the engine starts: ``moon_landing_burn`` goes on from there to the ground. Give ``pontryagin`` the
-    problem without its target, ``dataclasses.replace(problem, target=None, exit_cost=None)``, and the end
-    ``terminal=[0, 0, nan]``, and it finds the burn as well; that one knows no ground, so look at h ≥ 0 along the path.
-    Close to the ceiling, rising, the box is left.
+    The target is the set where a soft landing takes full thrust or more, with the value prescribed. The solver finds
+    the coast; a path ends where the engine starts, and ``moon_landing_burn`` continues it to the ground. To find the
+    burn with ``pontryagin``, remove the target, ``dataclasses.replace(problem, target=None, exit_cost=None)``, and pass
+    ``terminal=[0, 0, nan]``. ``pontryagin`` does not know about the ground, so check h ≥ 0 along the path. States that
+    rise close to the upper boundary h = 1.5 leave the box.
 
     Args:
-      thrust: U, the largest.
+      thrust: U, the maximal thrust.
       consumption: k.
       gravity: g.
-      shape: nodes in height, velocity and mass.
+      shape: number of nodes in height, velocity and mass.
     """
     lander = Lander(thrust, consumption, gravity)
     problem = Problem(
         lander.drift,
         lander.fuel_rate,
-        Box([0.0], [thrust]),  # all between as well: that none or all is best, the solver has to find
+        Box([0.0], [thrust]),  # the solver has to find that only the two extremes are optimal
         target=lander.margin,
         exit_cost=answer(lander.fuel),
         control_names=("thrust",),
@@ -163,7 +163,7 @@ def moon_landing(
 def moon_landing_burn(
     *, thrust: Number = 2.0, consumption: Number = 0.3, gravity: Number = 1.0
 ) -> tuple[Problem, Feedback]:
-    """The burn that follows where the grid's problem ends: full thrust until the rocket stands, on the ground.
+    """Build the final burn, which starts where the problem on the grid ends: full thrust until the rocket stands still.
 
     Args:
       thrust: U.
@@ -171,7 +171,7 @@ def moon_landing_burn(
       gravity: g.
 
     Returns:
-      The problem, which ends where v = 0, and the feedback.
+      The problem, whose target is v = 0, and the feedback.
     """
     lander = Lander(thrust, consumption, gravity)
     problem = Problem(
@@ -182,9 +182,9 @@ def moon_landing_burn(
 
 @front_door
 def moon_landing_exact(*, thrust: Number = 2.0, consumption: Number = 0.3, gravity: Number = 1.0) -> Exact:
-    """m(1 − e^{−q}), with q of the burn that takes away the energy ½v² + gh; infinite where no landing is possible.
+    """m(1 − e^{−q}) for the burn that dissipates the energy ½v² + gh; infinite where no landing is possible.
 
-    There, where ``Lander.margin`` is negative, ``moon_landing`` holds the number of ``Lander.fuel``, no answer.
+    In these states ``Lander.margin`` is negative, and ``moon_landing`` prescribes the number ``Lander.fuel`` instead.
 
     Args:
       thrust: U.

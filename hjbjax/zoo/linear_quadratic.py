@@ -1,11 +1,11 @@
-"""Linear systems with quadratic costs: the Riccati equation knows the answer.
+"""Linear systems with quadratic costs, whose value solves a Riccati equation.
 
     double integrator   ẍ = u/m,              cost |x|² + u²,           V = x'Px + tr(σσ'P)/β
     stochastic          dx = (ax + u)dt + σ dw, cost qx² + ru², β > 0,  V = px² + σ²p/β
     game                ẋ = ax + u + d,       cost x² + u² − γ²d²,      V = px²
 
-A discount β acts on the quadratic part like the drift A − ½βI. The answers hold on the whole space: where the box
-is left, compare on its inner half, unless the problem holds its ends at the exact value.
+A discount β acts on the quadratic part like the drift A − ½βI. The values hold on the whole space. If trajectories
+can leave the box, compare on its inner half, unless the problem prescribes the exact value at its ends.
 """
 
 import jax
@@ -34,7 +34,7 @@ from hjbjax.zoo.minimum_time import DoubleIntegrator
 
 @pytree_dataclass()
 class LinearScalar:
-    """The scalar system ẋ = ax + u, or ẋ = ax + u + d with an opponent.
+    """The scalar system ẋ = ax + u, or ẋ = ax + u + d with a disturbance.
 
     Args:
       rate: a, per unit time.
@@ -48,25 +48,25 @@ class LinearScalar:
 
     def contested_drift(self, x: State, u: Control, d: Disturbance) -> State:
         """ax + u + d."""
-        # u and d enter alike: in the Riccati equation they combine to the one weight 1 − γ⁻²
+        # u and d enter in the same way, so they combine to the weight 1 − γ⁻² in the Riccati equation
         return self.rate * x + u + d
 
 
 @pytree_dataclass()
 class GameCost:
-    """The cost x² + u² − γ²d² of the attenuation level γ."""
+    """The cost x² + u² − γ²d² for the attenuation level γ."""
 
     gamma: Number
 
     def rate(self, x: State, u: Control, d: Disturbance) -> Number:
         """Cost per unit time."""
-        # what the disturbance spends is counted against it: V is finite if and only if the gain is below γ
+        # the disturbance pays for its energy, so V is finite if and only if the L2 gain is below γ
         return jnp.sum(x * x) + jnp.sum(u * u) - self.gamma * self.gamma * jnp.sum(d * d)
 
 
 @pytree_dataclass()
 class ScalarQuadratic:
-    """The value p|x|² + c, with p the stabilising root of state + (2a − β)p − (weight)p² = 0 and c = σ²p/β.
+    """The value p|x|² + c: p is the stabilising root of state + (2a − β)p − (weight)p² = 0, and c = σ²p/β.
 
     Args:
       state: the weight q of x².
@@ -84,18 +84,18 @@ class ScalarQuadratic:
 
     @property
     def curvature(self) -> Scalar:
-        """The root p, written so that it stays finite where the weight vanishes."""
-        # βp on the left takes β/2 from the drift on the right, 2ap − βp = 2(a − β/2)p
+        """The root p, in a form that stays finite when the weight is zero."""
+        # the discount is a shift of the drift: 2ap − βp = 2(a − β/2)p
         shifted = self.rate - 0.5 * self.discount
-        # q/(√(s² + wq) − s) in place of (√(s² + wq) + s)/w: the game's weight 1 − γ⁻² is zero at γ = 1
+        # q/(√(s² + wq) − s) instead of (√(s² + wq) + s)/w, because the game's weight 1 − γ⁻² is zero at γ = 1
         return self.state / (jnp.sqrt(shifted * shifted + self.weight * self.state) - shifted)
 
     def value(self, x: State) -> Scalar:
         """The value at one state."""
         x, p = jnp.asarray(x), self.curvature
-        # no divisor is ever zero: derivatives pass through both branches of a where, and 0/0 makes them NaN
+        # divisors are never zero: JAX differentiates both branches of a where, and 0/0 would make the derivative NaN
         beta = jnp.where(self.discount == 0, 1.0, self.discount)
-        # ½σ²V″ = σ²p is paid per unit time for ever, worth σ²p/β now; none without noise, whatever β is
+        # the noise adds ½σ²V″ = σ²p per unit time, which is σ²p/β in total; without noise it is zero for every β
         constant = jnp.where(jnp.asarray(self.noise) == 0, 0.0, self.noise * self.noise * p / beta)
         return p * jnp.sum(x * x) + constant
 
@@ -110,22 +110,22 @@ def double_integrator_lq(
     bound: Number = 8.0,
     shape: tuple[int, ...] = (101, 101),
 ) -> tuple[Problem, Grid]:
-    """Bring a mass to rest at the cost |x|² + r u², on [−2, 2]²; its answer holds where the bound on u is slack.
+    """Bring a mass to rest at the cost |x|² + r u², on [−2, 2]²; the exact value holds if the bound on u is not active.
 
-    Undiscounted by default: rest at the origin costs nothing. With noise it needs a discount.
+    There is no discount by default, because rest at the origin costs nothing. With noise a discount is necessary.
 
     Args:
       mass: m.
       control_weight: r.
-      noise: σ, on position and velocity alike.
+      noise: σ of both position and velocity.
       discount: β.
-      bound: on |u|.
-      shape: nodes; odd numbers put one at the origin.
+      bound: the bound on |u|.
+      shape: number of nodes per axis; odd numbers put a node at the origin.
     """
     problem = Problem(
         DoubleIntegrator(mass).drift,
         QuadraticCost(1.0, control_weight).rate,
-        Box([-bound], [bound]),  # with the defaults the best force is −x₁ − √3x₂, at most 5.5 on the box
+        Box([-bound], [bound]),  # with the defaults the optimal force is −x₁ − √3x₂, at most 5.5 on the box
         noise=noise_or_none(noise),  # σ times the identity
         discount=discount,
         control_names=("force",),
@@ -138,7 +138,7 @@ def double_integrator_lq(
 def double_integrator_lq_exact(
     *, mass: float = 1.0, control_weight: float = 1.0, noise: float = 0.0, discount: float = 0.0, bound: float = 8.0
 ) -> Exact:
-    """x'Px + σ² tr(P)/β where |u| stays below the bound, at least on [−2, 2]², by SciPy's Riccati solver; host level.
+    """x'Px + σ² tr(P)/β, where |u| stays below the bound; computed by SciPy's Riccati solver, so not traceable.
 
     With the defaults P = [[√3, 1], [1, √3]].
 
@@ -146,21 +146,21 @@ def double_integrator_lq_exact(
       mass: m.
       control_weight: r.
       noise: σ.
-      discount: β, positive where there is noise.
-      bound: on |u|.
+      discount: β; positive if there is noise.
+      bound: the bound on |u|.
 
     Raises:
-      ValueError: noise without a discount, or a bound that binds on the box.
+      ValueError: noise without a discount, or the bound is active on [−2, 2]².
     """
-    # here: no other answer of this file needs it
+    # imported here, because nothing else in this file needs SciPy
     from scipy.linalg import solve_continuous_are
 
-    a = np.array([[0.0, 1.0], [0.0, 0.0]]) - 0.5 * discount * np.eye(2)  # SciPy's equation knows no discount
+    a = np.array([[0.0, 1.0], [0.0, 0.0]]) - 0.5 * discount * np.eye(2)  # SciPy's equation has no discount
     b = np.array([[0.0], [1.0 / mass]])  # (2, 1), the force acts on the velocity
     matrix = solve_continuous_are(a, b, np.eye(2), control_weight * np.eye(1))
-    constant = 0.0  # of V = x'Px + c the noise changes c alone: ½ tr(σσ'·2P) = βc
+    constant = 0.0  # the noise changes only the constant c of V = x'Px + c: ½ tr(σσ'·2P) = βc
     if noise:
-        # undiscounted, noise would cost ½ tr(σσ'·2P) per unit time for ever
+        # without a discount the noise costs ½ tr(σσ'·2P) per unit time indefinitely
         positive("double_integrator_lq with noise", discount=discount)
         constant = noise**2 * np.trace(matrix) / discount
     # u = −b'Px/r, largest at two corners of the box
@@ -182,7 +182,7 @@ def stochastic_lq(
 ) -> tuple[Problem, Grid]:
     """Hold dx = (ax + u)dt + σ dw near zero at the cost qx² + ru², on [−2, 2].
 
-    The ends are held at the exact value: noise would otherwise carry the effect of a wall into the box.
+    The exact value is prescribed at both ends. Otherwise the noise would spread the effect of the boundary.
 
     Args:
       rate: a.
@@ -190,11 +190,11 @@ def stochastic_lq(
       control_weight: r.
       noise: σ.
       discount: β > 0.
-      bound: on |u|, slack on the box.
-      shape: nodes.
+      bound: the bound on |u|, not active on the box.
+      shape: number of nodes.
 
     Raises:
-      ValueError: a weight or a discount that is not positive; a bound that binds, so that the ends have no exact value.
+      ValueError: a weight or the discount is not positive, or the bound is active, so the value at the ends is unknown.
     """
     exact = stochastic_lq_exact(
         rate=rate, state_weight=state_weight, control_weight=control_weight, noise=noise, discount=discount, bound=bound
@@ -205,7 +205,7 @@ def stochastic_lq(
         Box([-bound], [bound]),  # with the defaults |u| = p|x| is at most 1.3
         noise=noise_or_none(noise),
         discount=discount,
-        # the ends of the box alone; there the run ends, and pays what it would cost to go on
+        # the ends of the box: the run stops there and pays the cost of continuing on the whole line
         target=OutsideCube(2.0).level,
         exit_cost=exact,
     )
@@ -222,7 +222,7 @@ def stochastic_lq_exact(
     discount: Number = 1.0,
     bound: Number = 8.0,
 ) -> Exact:
-    """px² + σ²p/β on [−2, 2], whose ends hold it, where u = −px/r is admissible; with the defaults p = (√5 − 1)/2.
+    """px² + σ²p/β on [−2, 2], where u = −px/r is admissible; with the defaults p = (√5 − 1)/2.
 
     Args:
       rate: a.
@@ -230,16 +230,16 @@ def stochastic_lq_exact(
       control_weight: r > 0.
       noise: σ.
       discount: β > 0.
-      bound: on |u|.
+      bound: the bound on |u|.
 
     Raises:
-      ValueError: a weight or a discount that is not positive, or a bound that binds on the box.
+      ValueError: a weight or the discount is not positive, or the bound is active on [−2, 2].
     """
-    # 1/r weighs p², and c = σ²p/β is infinite without a discount; without q rest costs nothing and p is 0/0 for 2a > β
+    # without a discount c = σ²p/β is infinite; without q rest costs nothing, and p is 0/0 for 2a > β
     positive("stochastic_lq", state_weight=state_weight, control_weight=control_weight, discount=discount)
     quadratic = ScalarQuadratic(state_weight, 1.0 / control_weight, rate, discount, noise)
     if not is_traced(quadratic, bound):
-        with jax.ensure_compile_time_eval():  # known numbers are looked at within somebody's jit, too
+        with jax.ensure_compile_time_eval():  # concrete numbers can be checked inside a jit of the caller, too
             push = 2.0 * quadratic.curvature / control_weight
             admissible("stochastic_lq", -bound, bound, " at the ends of the box", control=push)
     return answer(quadratic.value)
@@ -256,23 +256,23 @@ def lq_game(
 ) -> tuple[Problem, Grid]:
     """Attenuate a disturbance to the level γ: ẋ = ax + u + d, cost x² + u² − γ²d², on [−1, 1].
 
-    The run ends at the origin, where both players rest; undiscounted, that is what makes the answer unique.
+    The run ends at the origin, where both players rest. Without a discount this makes the value unique.
 
     Args:
-      gamma: the level γ; at or below the least attainable one (1 for a ≥ 0) the value is infinite.
+      gamma: the level γ; at or below the least attainable level (1 for a ≥ 0) the value is infinite.
       rate: a.
       discount: β.
-      bound: on |u| and |d|, to be slack.
-      shape: nodes; an odd number puts one at the origin.
+      bound: the bound on |u| and |d|; it should not be active.
+      shape: number of nodes; an odd number puts a node at the origin.
     """
     problem = Problem(
         LinearScalar(rate).contested_drift,
         GameCost(gamma).rate,
-        Box([-bound], [bound]),  # with the defaults u = −px and d = px/γ² are at most 1.2 and .3
+        Box([-bound], [bound]),  # with the defaults u = −px and d = px/γ² are at most 1.2 and 0.3
         disturbances=Box([-bound], [bound]),
         discount=discount,
-        # no exit cost: V(0) = 0, and of all the solutions V + constant that one is singled out
-        target=Disc(0.0, 1).level,  # the node at the origin alone
+        # V(0) = 0 selects the value among the solutions V + constant
+        target=Disc(0.0, 1).level,  # the node at the origin only
     )
     return problem, Grid([-1.0], [1.0], shape, names=("x",))
 
@@ -285,24 +285,24 @@ def lq_game_exact(*, gamma: Number = 2.0, rate: Number = 0.0, discount: Number =
       gamma: the level γ.
       rate: a.
       discount: β.
-      bound: on |u| and |d|.
+      bound: the bound on |u| and |d|.
 
     Raises:
-      ValueError: the level is at or below the least one that can be attained, so there is no finite value; or u = −px
-        or d = px/γ² is beyond the bound.
+      ValueError: the level is at or below the least attainable level, so the value is infinite; or u = −px or
+        d = px/γ² exceeds the bound.
     """
     positive("lq_game", gamma=gamma)
-    # of traced numbers no sign is known: below the level the formula then gives NaN or a wrong root
+    # traced numbers are not checked; at or below the least attainable level the formula then gives NaN or a wrong root
     if not is_traced(gamma, rate, discount):
-        # the coefficients of the equation of ``ScalarQuadratic`` with q = 1: 1 + 2·shifted·p − weight·p² = 0
+        # coefficients of the equation in ``ScalarQuadratic`` with q = 1: 1 + 2·shifted·p − weight·p² = 0
         shifted, weight = rate - 0.5 * discount, 1 - gamma**-2
-        # no real root, or one that does not stabilise: the Riccati equation loses its solution at this level
+        # no real root, or no stabilising root
         if shifted**2 + weight < 0 or (weight <= 0 and shifted >= 0):
             raise ValueError(
                 f"lq_game_exact: got gamma = {gamma:g}, wanted a level above the least attainable one "
-                f"(1 where rate ≥ discount/2): below it the disturbance makes the cost infinite"
+                f"(1 if rate ≥ discount/2); below it the disturbance makes the cost infinite"
             )
-    # no noise, hence no constant: V = px²
+    # no noise, so V = px² without a constant
     quadratic = ScalarQuadratic(1.0, 1 - gamma**-2, rate, discount)
     if not is_traced(quadratic, gamma, bound):
         with jax.ensure_compile_time_eval():

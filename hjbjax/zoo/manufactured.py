@@ -1,9 +1,9 @@
-"""Problems made for a value chosen beforehand, to measure orders of convergence.
+"""Problems constructed from a chosen value, to measure orders of convergence.
 
     smooth   ẋ₁ = −x₁ + x₂,  ẋ₂ = −½x₁ − ½x₂(1 − c²) + c·u,  c = 2 + cos 2x₁,  |u| ≤ 6,  cost q(x) + u²
 
-With f₀ the drift at u = 0, the choice q = βV − f₀·DV + ¼c²V₂² makes V the value, and u = −½cV₂ the control. A
-linear-quadratic problem is no such test: schemes that limit slopes are exact on a quadratic.
+Let f₀ be the drift at u = 0. The choice q = βV − f₀·DV + ¼c²V₂² makes V the value, with the control u = −½cV₂. A
+linear-quadratic problem cannot measure orders, because schemes with slope limiters are exact on quadratics.
 """
 
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ class Smooth:
 
     def drift(self, x: State, u: Control) -> State:
         """The drift above."""
-        gain = self.gain(x)  # between 1 and 3: the control acts at every state
+        gain = self.gain(x)  # between 1 and 3, so the control acts at every state
         return jnp.stack([x[1] - x[0], -0.5 * x[0] - 0.5 * x[1] * (1 - gain * gain) + gain * u[0]])
 
     def gain(self, x: State) -> Number:
@@ -38,10 +38,10 @@ class Smooth:
     def cost(self, x: State, u: Control) -> Number:
         """The cost q(x) + u² that makes V the value."""
         free, slope = self.drift(x, jnp.zeros_like(u)), self.slope(x)
-        # u² + c V₂ u is least at u = −½cV₂ and −¼c²V₂² there, which the cost has to make up for
+        # u² + cV₂u has its minimum −¼c²V₂² at u = −½cV₂; q compensates for it
         best = self.gain(x) * slope[1]
         return (
-            # βV = q + f₀·DV − ¼c²V₂² solved for q
+            # βV = q + f₀·DV − ¼c²V₂², solved for q
             self.discount * self.value(x) - (free[0] * slope[0] + free[1] * slope[1]) + 0.25 * best * best + u[0] * u[0]
         )
 
@@ -49,7 +49,7 @@ class Smooth:
         """The chosen value."""
         x = jnp.asarray(x)
         product = x[0] * x[1]
-        # cosh has derivatives of every order, so that no scheme is exact by chance; zero and least at the origin
+        # cosh is not a polynomial, so no scheme is exact by chance; the minimum of V is 0 at the origin
         return jnp.cosh(x[0]) - 1 + x[1] * x[1] + 0.25 * product * product
 
     def slope(self, x: State) -> tuple[Scalar, Scalar]:
@@ -59,19 +59,19 @@ class Smooth:
 
 @front_door
 def smooth(*, discount: Number = 0.5, shape: tuple[int, ...] = (81, 81)) -> tuple[Problem, Grid]:
-    """A smooth nonlinear problem on [−1, 1]² whose value is known; compare on |x₁| ≤ .5, |x₂| ≤ .45.
+    """Build a smooth nonlinear problem on [−1, 1]² with a known value; compare on |x₁| ≤ 0.5, |x₂| ≤ 0.45.
 
     Args:
       discount: β.
-      shape: nodes.
+      shape: number of nodes per axis.
     """
     system = Smooth(discount)
-    # |½cV₂| is at most 3 on the box: the bound is slack, or V would not be the value
+    # |½cV₂| is at most 3 on the box, so the bound on u is never active and V is the value
     problem = Problem(system.drift, system.cost, Box([-6.0], [6.0]), discount=discount)
     return problem, Grid([-1.0, -1.0], [1.0, 1.0], shape)
 
 
 @front_door
 def smooth_exact(*, discount: Number = 0.5) -> Exact:
-    """The value cosh x₁ − 1 + x₂² + ¼x₁²x₂², whatever the discount, where |½cV₂| ≤ 6: on [−1, 1]²."""
+    """The value cosh x₁ − 1 + x₂² + ¼x₁²x₂² for any discount, valid where |½cV₂| ≤ 6, for example on [−1, 1]²."""
     return answer(Smooth(discount).value)

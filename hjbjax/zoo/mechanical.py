@@ -1,4 +1,4 @@
-"""Mechanical systems with one degree of freedom to three, and the problems of bringing them to rest.
+"""Mechanical systems with one to three degrees of freedom, and the problems of bringing them to rest.
 
     pendulum         θ̈ = g sin θ + τ/m           θ from upright, on S¹ × R
     Van der Pol      ẍ = μ(1 − x²)ẋ − x + u
@@ -6,8 +6,8 @@
     flexible joint   I q̈₁ + M g L sin q₁ + k(q₁ − q₂) = 0, J q̈₂ + k(q₂ − q₁) = u
     quadrotor        m ẍ = −T sin θ, m z̈ = T cos θ − m g, I θ̈ = τ, in a vertical plane
 
-The pendulum follows from mθ̈ − mg sin θ = τ; (9.4) of the chapter prints the input gain g/m, kept as
-``as_printed=True`` since figures 10 to 12 may come from it.
+The pendulum follows from mθ̈ − mg sin θ = τ. Equation (9.4) of the chapter prints the input gain g/m, which
+``as_printed=True`` reproduces, because figures 10 to 12 may use it.
 """
 
 import math
@@ -30,7 +30,7 @@ class Pendulum:
     Args:
       mass: m, at unit length.
       g: gravity; 9.81 m/s².
-      as_printed: input gain g/m as (9.4) prints it, instead of 1/m.
+      as_printed: use the input gain g/m printed in (9.4), instead of 1/m.
 
     Example:
       >>> Pendulum(mass=2.0).drift(jnp.zeros(2), jnp.ones(1)).tolist()
@@ -52,23 +52,23 @@ class Pendulum:
 
     def drift(self, x: State, u: Control) -> State:
         """(θ̇, g sin θ + gain·τ)."""
-        # gravity pulls away from upright, which makes it the unstable rest
+        # gravity accelerates away from upright, so upright is the unstable equilibrium
         return jnp.stack([x[1], self.g * jnp.sin(x[0]) + self.gain * u[0]])
 
     def linearising_torque(self, x: State) -> Control:
-        """(2.8), τ = −mg sin θ − 3mθ̇ − 2mθ: the loop is θ̈ + 3θ̇ + 2θ = 0, however large the angle."""
-        # the first term takes gravity out; θ̈ + 3θ̇ + 2θ has the roots −1 and −2
+        """(2.8), τ = −mg sin θ − 3mθ̇ − 2mθ: the closed loop is θ̈ + 3θ̇ + 2θ = 0 for any angle."""
+        # the first term cancels gravity; θ̈ + 3θ̇ + 2θ has the roots −1 and −2
         return jnp.stack([-(self.g * jnp.sin(x[0]) + 3 * x[1] + 2 * x[0]) / self.gain])
 
     def linear_torque(self, x: State) -> Control:
-        """The design of (2.8) for the pendulum linearised upright, τ = −mgθ − 3mθ̇ − 2mθ."""
-        # leaves g(sin θ − θ) in the loop, of third order: good near upright only
+        """The design of (2.8) for the pendulum linearised at upright, τ = −mgθ − 3mθ̇ − 2mθ."""
+        # g(sin θ − θ), of third order, remains in the closed loop, so it is good only near upright
         return jnp.stack([-(self.g * x[0] + 3 * x[1] + 2 * x[0]) / self.gain])
 
 
 @pytree_dataclass()
 class VanDerPol:
-    """The Van der Pol oscillator, state (x, ẋ): a limit cycle that the control has to leave.
+    """The Van der Pol oscillator, state (x, ẋ), with a stable limit cycle.
 
     Args:
       stiffness: μ ≥ 0; at zero the oscillator is harmonic.
@@ -78,7 +78,7 @@ class VanDerPol:
 
     def drift(self, x: State, u: Control) -> State:
         """(ẋ, μ(1 − x²)ẋ − x + u)."""
-        # μ(1 − x²)ẋ drives the oscillator within |x| < 1 and damps it outside: hence the limit cycle
+        # μ(1 − x²)ẋ drives the oscillator for |x| < 1 and damps it outside, which creates the limit cycle
         return jnp.stack([x[1], self.stiffness * (1 - x[0] * x[0]) * x[1] - x[0] + u[0]])
 
 
@@ -86,38 +86,38 @@ class VanDerPol:
 class BallAndBeam:
     """A ball that rolls on a beam, state (r, ṙ, θ, θ̇), control θ̈; the model of Hauser, Sastry and Kokotović (1992).
 
-    Its output r has no relative degree where r θ̇ = 0, in particular at rest, and feedback cannot linearise it.
+    The output r has no relative degree where r θ̇ = 0, in particular at rest, so feedback cannot linearise it.
 
     Args:
-      inertia: B, of the ball; 5/7 for a solid one.
+      inertia: B, a factor that depends on the ball; 5/7 for a solid ball.
       g: gravity; 9.81 m/s².
     """
 
-    # 5/7 = 1/(1 + 2/5), from the moment of inertia ⅖·mass·radius² that a rolling solid ball has to overcome
+    # 5/7 = 1/(1 + 2/5); a rolling solid ball has the moment of inertia ⅖·mass·radius²
     inertia: Number = 5 / 7
     g: Number = 9.81
 
     def drift(self, x: State, u: Control) -> State:
         """(ṙ, B(r θ̇² − g sin θ), θ̇, u)."""
-        # r θ̇² is the centrifugal push outwards, g sin θ the slope of the beam
+        # r θ̇² is the centrifugal acceleration, g sin θ the effect of the slope
         return jnp.stack([x[1], self.inertia * (x[0] * x[3] * x[3] - self.g * jnp.sin(x[2])), x[3], u[0]])
 
     def output(self, x: State) -> Number:
-        """r, the place of the ball."""
+        """r, the position of the ball."""
         return x[0]
 
 
 @pytree_dataclass()
 class FlexibleJoint:
-    """A link driven through a spring, state (q₁, q̇₁, q₂, q̇₂), q₁ of the link from hanging, q₂ of the motor.
+    """A link driven through a spring, state (q₁, q̇₁, q₂, q̇₂): link angle q₁ from hanging, motor angle q₂.
 
-    Feedback linearises it as long as k > 0; the angle of the link has relative degree 4.
+    Feedback linearises it for k > 0. The link angle has relative degree 4.
 
     Args:
       link: I, the inertia of the link.
       motor: J, the inertia of the motor.
-      weight: M g L, the torque of gravity on the level link.
-      stiffness: k, of the spring.
+      weight: M g L, the torque of gravity on the horizontal link.
+      stiffness: k, the stiffness of the spring.
     """
 
     link: Number = 1.0
@@ -126,14 +126,14 @@ class FlexibleJoint:
     stiffness: Number = 10.0
 
     def __post_init__(self):
-        # the inertias are divided by; no weight is an arm that moves in a level plane, and is allowed
+        # the drift divides by the inertias; zero weight is allowed and describes an arm in a horizontal plane
         positive("FlexibleJoint", link=self.link, motor=self.motor)
 
     def drift(self, x: State, u: Control) -> State:
         """(q̇₁, −(MgL sin q₁ + k(q₁ − q₂))/I, q̇₂, (k(q₁ − q₂) + u)/J)."""
         spring = self.stiffness * (x[0] - x[2])  # the torque that slows the link and turns the motor
         return jnp.stack(
-            # the spring acts on both with opposite signs, the control on the motor alone
+            # the spring acts on link and motor with opposite signs, the control only on the motor
             [x[1], -(self.weight * jnp.sin(x[0]) + spring) / self.link, x[3], (spring + u[0]) / self.motor]
         )
 
@@ -144,13 +144,13 @@ class FlexibleJoint:
 
 @pytree_dataclass()
 class PlanarQuadrotor:
-    """A quadrotor in a vertical plane, state (x, z, θ, ẋ, ż, θ̇), control (T, τ): thrust along its axis, and torque.
+    """A quadrotor in a vertical plane, state (x, z, θ, ẋ, ż, θ̇), control (T, τ): thrust along its axis and torque.
 
-    Six states: a grid of 21 nodes an axis has 8.6e7, whose value alone is .34 GB in single precision.
+    A grid for six states with 21 nodes per axis has 8.6e7 nodes; the value takes 0.34 GB in single precision.
 
     Args:
       mass: m.
-      inertia: I, about the axis that stands on the plane.
+      inertia: I, about the axis perpendicular to the plane.
       g: gravity; 9.81 m/s².
 
     Example:
@@ -168,12 +168,12 @@ class PlanarQuadrotor:
 
     @property
     def hover(self) -> Number:
-        """m g, the thrust that carries the weight."""
+        """m g, the thrust that balances the weight."""
         return self.mass * self.g
 
     def drift(self, x: State, u: Control) -> State:
         """(ẋ, ż, θ̇, −T sin θ/m, T cos θ/m − g, τ/I)."""
-        # θ turns the thrust against x: it leans to the side of negative x for θ > 0
+        # for θ > 0 the thrust points towards negative x
         lift = u[0] / self.mass
         return jnp.stack([x[3], x[4], x[5], -lift * jnp.sin(x[2]), lift * jnp.cos(x[2]) - self.g, u[1] / self.inertia])
 
@@ -190,21 +190,21 @@ def pendulum(
 ) -> tuple[Problem, Grid]:
     """Swing a pendulum up and hold it there, at the cost ½(|x|² + τ²).
 
-    Undiscounted by default: upright at rest costs nothing, and an even number of angles with an odd number of
-    velocities puts a node exactly there.
+    There is no discount by default, because rest at upright costs nothing. An even number of angles and an odd number
+    of velocities put a node exactly there.
 
     Args:
       mass: m.
-      as_printed: input gain g/m as (9.4) prints it, instead of 1/m.
+      as_printed: use the input gain g/m printed in (9.4), instead of 1/m.
       g: gravity.
-      torque: the bound on |τ|; ``None`` is 30, or 6 as printed.
+      torque: the bound on |τ|; ``None`` is 30, or 6 with ``as_printed``.
       discount: β.
-      shape: nodes in angle (even) and velocity (odd), on [−π, π) × [−8, 8].
+      shape: number of nodes in angle (even) and velocity (odd), on [−π, π) × [−8, 8].
     """
-    # for m = 1 either bound raises the pendulum without swinging: 30 > g, and printed, with the gain g/m, 6g > g
+    # for m = 1 both bounds raise the pendulum without swinging: 30 > g, and as printed, with the gain g/m, 6g > g
     bound = (6.0 if as_printed else 30.0) if torque is None else torque
     system = Pendulum(mass=mass, g=g, as_printed=as_printed)
-    # the cost does not see that θ is periodic: θ² has its kink at hanging, where both ways up are equal
+    # the cost θ² is not periodic: it has a kink at hanging, where both directions cost the same
     problem = Problem(
         system.drift,
         QuadraticCost(0.5, 0.5).rate,
@@ -213,8 +213,7 @@ def pendulum(
         control_names=("torque",),
         control_units=("N m",),
     )
-    # the angle omits π, which is −π: hanging is one node
-    # 8: a free fall from upright reaches 2√g = 6.3 at the bottom
+    # hanging is one node, because the nodes include −π but not π; a free fall reaches the speed 2√g = 6.3 < 8
     names, units = ("angle", "velocity"), ("rad", "rad/s")
     return problem, Grid([-math.pi, -8.0], [math.pi, 8.0], shape, periodic=(True, False), names=names, units=units)
 
@@ -223,42 +222,42 @@ def pendulum(
 def pendulum_near_upright(
     *, mass: float = 1.0, as_printed: bool = False, g: float = 9.81, discount: float = 0.0
 ) -> QuadraticValue:
-    """The leading term ½x'Px of the pendulum's value at the upright rest, by the Riccati equation; host level.
+    """The leading term ½x'Px of the pendulum's value at upright, from SciPy's Riccati solver; not traceable.
 
-    sin θ is odd, so what it leaves out is of fourth order in the state.
+    sin θ is odd, so the next term of the value is of fourth order in the state.
 
     Args:
       mass: m.
-      as_printed: input gain g/m instead of 1/m.
+      as_printed: use the input gain g/m printed in (9.4), instead of 1/m.
       g: gravity.
       discount: β.
     """
-    # here: only this answer needs it
+    # imported here, because nothing else in this file needs SciPy
     from scipy.linalg import solve_continuous_are
 
-    gain = Pendulum(mass, g, as_printed).gain  # refuses a mass ≤ 0 as the problem does
-    # sin θ ≈ θ upright; βV in the equation acts like the drift A − ½βI
+    gain = Pendulum(mass, g, as_printed).gain  # raises for a mass ≤ 0, as the problem does
+    # sin θ ≈ θ at upright; βV in the equation acts like the drift A − ½βI
     a = np.array([[0.0, 1.0], [g, 0.0]]) - 0.5 * discount * np.eye(2)
     matrix = solve_continuous_are(a, np.array([[0.0], [gain]]), np.eye(2), np.eye(1))
-    return QuadraticValue(0.5 * matrix)  # the running cost is ½(|x|² + τ²), SciPy's is |x|² + τ²
+    return QuadraticValue(0.5 * matrix)  # the running cost is ½(|x|² + τ²), SciPy's cost is |x|² + τ²
 
 
 @front_door
 def van_der_pol(
     *, stiffness: Number = 1.0, bound: Number = 1.0, discount: Number = 0.5, shape: tuple[int, ...] = (121, 121)
 ) -> tuple[Problem, Grid]:
-    """Quieten a Van der Pol oscillator at the cost ½(|x|² + u²), |u| ≤ bound, on [−3, 3]².
+    """Damp a Van der Pol oscillator at the cost ½(|x|² + u²), |u| ≤ bound, on [−3, 3]².
 
-    Where the bound is too weak to leave the limit cycle, the discount keeps the value finite.
+    The discount keeps the value finite even if the bound is too small to leave the limit cycle.
 
     Args:
       stiffness: μ ≥ 0.
-      bound: on |u|.
+      bound: the bound on |u|.
       discount: β.
-      shape: nodes in position and velocity; odd numbers put one at rest.
+      shape: number of nodes in position and velocity; odd numbers put a node at rest.
     """
     problem = Problem(
         VanDerPol(stiffness).drift, QuadraticCost(0.5, 0.5).rate, Box([-bound], [bound]), discount=discount
     )
-    # wide enough for the limit cycle, whose amplitude in position is 2
+    # the box contains the limit cycle, whose amplitude in position is 2
     return problem, Grid([-3.0, -3.0], [3.0, 3.0], shape, names=("position", "velocity"))

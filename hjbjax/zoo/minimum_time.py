@@ -1,13 +1,13 @@
-"""Minimum time, in the discounted form of Kružkov.
+"""Minimum-time problems in Kružkov's discounted form.
 
-    1 discounted at the rate β until the target: V = (1 − e^{−βT})/β        (8.14) for β = 1, T itself for β = 0
+    running cost 1, discount β: V = (1 − e^{−βT})/β        (8.14) for β = 1, T itself for β = 0
 
-    double integrator   ẍ = u/m, |u| ≤ 1         T in closed form, switching on x₁ = −½m x₂|x₂|
-    Zermelo             ẋ = c + s·u, |u| ≤ 1      the boat in a current
+    double integrator   ẍ = u/m, |u| ≤ 1         T in closed form, switching curve x₁ = −½m x₂|x₂|
+    Zermelo             ẋ = c + s·u, |u| ≤ 1      a boat in a current
 
-The target is the origin. A single node resolves it poorly (the value is only Hölder there), so the exact value is
-held within ``radius``: by the dynamic programming principle the value elsewhere does not change. ``radius=0``
-leaves the origin alone as the target.
+The target is the origin. One node resolves it poorly, because the value is only Hölder continuous there, so the
+exact value is prescribed within ``radius``. By the dynamic programming principle the value elsewhere does not change.
+With ``radius=0`` the target is the origin only.
 """
 
 from collections.abc import Sequence
@@ -41,17 +41,17 @@ class DoubleIntegrator:
 
     def arrival_time(self, x: State) -> Scalar:
         """The least time to rest at the origin under |u| ≤ 1."""
-        # in the coordinates m·x₁ and m·x₂ the mass is one
+        # the coordinates m·x₁ and m·x₂ make the mass one
         position, velocity = self.mass * x[0], self.mass * x[1]
-        # ≥ 0 right of the switching curve: first −1 until the curve is met, then +1 along it
+        # ≥ 0 right of the switching curve: u = −1 until the curve is reached, then u = +1 along it
         side = position + 0.5 * velocity * jnp.abs(velocity)
-        sign = jnp.where(side >= 0, 1.0, -1.0)  # left of the curve the plane is mirrored; no jnp.sign, which is 0 on it
-        # On the switching curve the root is |velocity|; rounding must not make its argument negative.
-        # x₂ + 2√(x₁ + ½x₂²), the two arcs together, with the 2 under the root
+        sign = jnp.where(side >= 0, 1.0, -1.0)  # left of the curve, mirror the plane; jnp.sign would be 0 on the curve
+        # x₂ + 2√(x₁ + ½x₂²), the time of both arcs, with the 2 moved under the root. On the switching curve the root
+        # is |velocity|, and ``root`` protects against an argument that rounding makes negative.
         return sign * velocity + root(4 * sign * position + 2 * velocity * velocity)
 
     def switching_position(self, velocity: Number) -> Number:
-        """x₁ on the switching curve x₁ = −½m x₂|x₂|; to its right the best force is −1, to its left +1."""
+        """x₁ on the switching curve x₁ = −½m x₂|x₂|; the optimal force is −1 to its right and +1 to its left."""
         return -0.5 * self.mass * velocity * jnp.abs(velocity)
 
 
@@ -60,15 +60,15 @@ class Boat:
     """A boat in a constant current, state (x₁, x₂), control a velocity in the unit disc.
 
     Args:
-      speed: s, of the boat through the water.
-      current: c, of the water, two numbers.
+      speed: s, the speed of the boat through the water.
+      current: c, the velocity of the water, two numbers.
     """
 
     speed: Number = 1.0
     current: Sequence[Number] | Array = (0.5, 0.0)
 
     def __post_init__(self):
-        # of the current nothing is asked: it may be zero, or stronger than the boat
+        # the current is not checked: it may be zero or stronger than the boat
         positive("Boat", speed=self.speed)
 
     def drift(self, x: State, u: Control) -> State:
@@ -76,19 +76,19 @@ class Boat:
         return jnp.stack([self.current[0] + self.speed * u[0], self.current[1] + self.speed * u[1]])
 
     def arrival_time(self, x: State) -> Scalar:
-        """The least T with |x + cT| = sT; infinite where a current stronger than the boat carries it past."""
-        # the roots of (s² − |c|²)T² − 2(x·c)T − |x|² = 0, the least positive one, written without that leading term,
-        # which is zero where boat and current are equally fast
+        """The least T with |x + cT| = sT; infinite if a current stronger than the boat carries it past the origin."""
+        # the least positive root of (s² − |c|²)T² − 2(x·c)T − |x|² = 0, in the form that does not divide by the
+        # leading coefficient, which is zero if boat and current are equally fast
         along = x[0] * self.current[0] + x[1] * self.current[1]
         square = x[0] * x[0] + x[1] * x[1]
         current = self.current[0] * self.current[0] + self.current[1] * self.current[1]
         inside = along * along + (self.speed * self.speed - current) * square
         below = root(inside) - along
-        # inside < 0: the disc of radius sT around the drifting boat never holds the origin; below ≤ 0: only in the past
+        # inside < 0: the disc of radius sT around the drifting boat never contains the origin; below ≤ 0: T is negative
         reachable = (inside >= 0) & (below > 0)
-        # a divisor of 1 where out of reach: the branch not taken is differentiated too
+        # the divisor is 1 where unreachable, because JAX differentiates both branches of a where
         time = jnp.where(reachable, square / jnp.where(reachable, below, 1.0), jnp.inf)
-        return jnp.where(square == 0, 0.0, time)  # at the origin both are 0, which reads as out of reach above
+        return jnp.where(square == 0, 0.0, time)  # at the origin square = below = 0, which looks unreachable above
 
 
 @front_door
@@ -97,20 +97,20 @@ def double_integrator(
 ) -> tuple[Problem, Grid]:
     """Bring a mass to rest at the origin in the least time, |u| ≤ 1, on [−2, 2]²; figures 8 and 9 of the chapter.
 
-    For ``pontryagin`` all the way to the origin leave the target out,
-    ``dataclasses.replace(problem, target=None, exit_cost=None)``, and give ``terminal=[0, 0]``.
+    To solve with ``pontryagin`` all the way to the origin, remove the target,
+    ``dataclasses.replace(problem, target=None, exit_cost=None)``, and pass ``terminal=[0, 0]``.
 
     Args:
       mass: m.
-      discount: β; 1 is S = 1 − e^{−T} of (8.14), 0 is T itself.
-      radius: the exact value is held within it; 0 leaves the node at the origin alone.
-      shape: nodes; odd numbers put one at the origin.
+      discount: β; 1 gives S = 1 − e^{−T} of (8.14), 0 gives T itself.
+      radius: the exact value is prescribed within this radius; with 0 only the node at the origin is the target.
+      shape: number of nodes per axis; odd numbers put a node at the origin.
     """
     exact = double_integrator_exact(mass=mass, discount=discount, radius=radius)
     problem = Problem(
         DoubleIntegrator(mass).drift,
         unit_cost,
-        # the closed form is for |u| ≤ 1: a stronger force is a smaller mass
+        # the closed form is for |u| ≤ 1; a stronger force is equivalent to a smaller mass
         Box([-1.0], [1.0]),
         discount=discount,
         target=Disc(radius, 2).level,
@@ -123,12 +123,12 @@ def double_integrator(
 
 @front_door
 def double_integrator_exact(*, mass: Number = 1.0, discount: Number = 1.0, radius: Number = 0.2) -> Exact:
-    """(1 − e^{−βT})/β with x₂ + √(4x₁ + 2x₂²) for T to the right of the switching curve, mirrored to its left.
+    """(1 − e^{−βT})/β with T = x₂ + √(4x₁ + 2x₂²) right of the switching curve, mirrored left of it (mass 1).
 
     Args:
       mass: m.
       discount: β.
-      radius: where the problem holds the value; the answer does not depend on it.
+      radius: accepted because ``double_integrator`` takes it; the value does not depend on it.
     """
     return answer(Arrival(DoubleIntegrator(mass), discount).value)
 
@@ -145,13 +145,13 @@ def zermelo(
     """Steer a boat through a constant current to the origin in the least time, on [−2, 2]².
 
     Args:
-      speed: s, of the boat through the water.
-      current: c, of the water, two numbers; where it is the stronger, states downstream never arrive.
+      speed: s, the speed of the boat through the water.
+      current: c, the velocity of the water, two numbers; if it exceeds s, states downstream never arrive.
       discount: β.
-      radius: the exact value is held within it; 0 leaves the node at the origin alone.
-      shape: nodes; odd numbers put one at the origin.
+      radius: the exact value is prescribed within this radius; with 0 only the node at the origin is the target.
+      shape: number of nodes per axis; odd numbers put a node at the origin.
     """
-    # the exit cost as well, which does not depend on the radius
+    # also the exit cost; it does not depend on the radius
     exact = zermelo_exact(speed=speed, current=current, discount=discount, radius=radius)
     problem = Problem(
         Boat(speed, current).drift,
@@ -174,7 +174,7 @@ def zermelo_exact(
     Args:
       speed: s.
       current: c.
-      discount: β; where T is infinite the value is 1/β.
-      radius: where the problem holds the value; the answer does not depend on it.
+      discount: β; where T is infinite, the value is 1/β.
+      radius: accepted because ``zermelo`` takes it; the value does not depend on it.
     """
     return answer(Arrival(Boat(speed, current), discount).value)

@@ -1,9 +1,9 @@
-"""Problems with noise whose value is known.
+"""Stochastic problems with a known value.
 
     Brownian exit   dx = σ dw until it leaves a cube or a ball, cost 1
     bang-bang       dx = u dt + ε dw, |u| ≤ 1, cost x²
 
-Both are held at the exact value where the box ends, so that the answer is exact at every node.
+The exact value is prescribed on the boundary of the box, so the closed form holds at every node.
 """
 
 import jax.numpy as jnp
@@ -16,20 +16,20 @@ from hjbjax.problem.sets import Box
 from hjbjax.problem.types import Control, Number, State
 from hjbjax.zoo.ingredients import Exact, OutsideBall, OutsideCube, Scalar, answer, noise_or_none, positive, unit_cost
 
-TERMS = 200  # of the series for the square, whose tail falls like k⁻³ at the worst place: 1e-6 there, 1e-15 inside
+TERMS = 200  # of the series for the square; the remainder is 1e-15 inside and at most 1e-6, where terms fall like k⁻³
 
 
 def no_drift(x: State, u: Control) -> State:
-    """Zero: only the noise moves the state."""
+    """Zero drift; only the noise moves the state."""
     return jnp.zeros_like(x)  # the solver passes a u of shape (0,)
 
 
 @pytree_dataclass(static=("dim",))
 class CubeExit:
-    """The discounted time for which σ dw stays in the cube |x_i| < R; one and two dimensions.
+    """The discounted time during which σ dw stays in the cube |x_i| < R, in one or two dimensions.
 
-    On the interval V = (1 − cosh κx/cosh κR)/β with κ = √(2β)/σ, and (R² − x²)/σ² for β = 0. On the square the
-    difference from the interval's value is expanded in cosines along the longer coordinate.
+    On the interval V = (1 − cosh κx/cosh κR)/β with κ = √(2β)/σ, and V = (R² − x²)/σ² for β = 0. On the square, the
+    difference from this value is a cosine series along the larger coordinate.
     """
 
     noise: Number
@@ -38,52 +38,52 @@ class CubeExit:
     dim: int
 
     def __post_init__(self):
-        # of the discount nothing is asked: 0 is the mean exit time itself
+        # the discount is not checked: 0 gives the mean exit time
         positive("brownian_exit", noise=self.noise, half_width=self.half_width)
 
     def value(self, x: State) -> Scalar:
         """The value at one state; zero outside the cube, where the run has ended."""
-        scaled = jnp.abs(jnp.asarray(x)) / self.half_width  # even in every coordinate, so on [0, 1]
+        scaled = jnp.abs(jnp.asarray(x)) / self.half_width  # V is even in every coordinate, so [0, 1] suffices
         outside = jnp.max(scaled) > 1
-        # outside the formula of the interval is negative and that of the square overflows, so it is asked inside alone
+        # evaluate inside only: outside, the formula is negative on the interval and overflows on the square
         return jnp.where(outside, 0.0, self._inside(jnp.where(outside, 0.0, scaled)))
 
     def _inside(self, scaled: State) -> Scalar:
         """The value at the coordinates |x_i|/R ≤ 1."""
-        # with R as the length and R²/σ² as the time one number κ is left
+        # with R as unit of length and R²/σ² as unit of time, one parameter κ remains
         time = (self.half_width / self.noise) ** 2
         kappa = jnp.sqrt(2 * self.discount * time)
         if self.dim == 1:
             return time * _interval(scaled[0], kappa)
-        # Along y = max the factor cosh μy/cosh μ would not decay; along the smaller coordinate it does.
+        # the factor cosh(rate·y)/cosh(rate) decays along the smaller coordinate, but not along the larger one
         across, along = jnp.max(scaled), jnp.min(scaled)
         odd = np.arange(1, 2 * TERMS, 2)  # cos(½πk x) vanishes at ±1 for odd k
-        wave = 0.5 * np.pi * odd  # (TERMS,), as all that follows
+        wave = 0.5 * np.pi * odd  # (TERMS,), like everything below
         sign = np.where(odd % 4 == 1, 1.0, -1.0)
         rate = jnp.sqrt(wave**2 + kappa**2)
-        # the interval's value in cosines: 1 = Σ 2·sign/wave·cos, divided by ½(wave² + κ²) of the operator
+        # cosine coefficients of the interval's value: 1 = Σ 2·sign/wave·cos, divided by the operator's ½(wave² + κ²)
         amplitude = 4 * sign / (wave * (wave**2 + kappa**2))
-        # cosh(rate·along)/cosh(rate) by decaying exponentials: the largest rate is 627, and float32 ends at e^88
+        # cosh(rate·along)/cosh(rate) from decaying exponentials: rate reaches 627, and float32 overflows at e^88
         decay = jnp.exp(rate * (along - 1)) * (1 + jnp.exp(-2 * rate * along)) / (1 + jnp.exp(-2 * rate))
         return time * (_interval(across, kappa) - jnp.sum(amplitude * jnp.cos(wave * across) * decay))
 
 
 def _interval(x: Number, kappa: Number) -> Scalar:
-    """2(1 − cosh κx/cosh κ)/κ², as (1 − x²) times factors that are 1 at κ = 0 and never cancel or overflow."""
+    """2(1 − cosh κx/cosh κ)/κ² as (1 − x²) times factors that are 1 at κ = 0 and neither cancel nor overflow."""
     near, far = 0.5 * kappa * (1 - x), 0.5 * kappa * (1 + x)  # their sum is κ
-    # cosh κ − cosh κx = 2 sinh near · sinh far, and 1/cosh κ brings the e^{−κ} that the factors share
+    # cosh κ − cosh κx = 2 sinh near · sinh far, and 1/cosh κ = 2e^{−κ}/(1 + e^{−2κ}) scales both factors
     return (1 - x * x) * _sinhc(near) * _sinhc(far) * 2 / (1 + jnp.exp(-2 * kappa))
 
 
 def _sinhc(z: Number) -> Scalar:
     """e^{−z} sinh(z)/z."""
-    small = jnp.where(z == 0, 1.0, z)  # any divisor but zero: the branch not taken is differentiated too
+    small = jnp.where(z == 0, 1.0, z)  # nonzero, because JAX differentiates both branches of a where
     return jnp.where(z == 0, 1.0, -jnp.expm1(-2 * small) / (2 * small))
 
 
 @pytree_dataclass(static=("dim",))
 class BallExit:
-    """The mean time for which σ dw stays in the ball |x| < R: (R² − |x|²)/(nσ²)."""
+    """The mean time during which σ dw stays in the ball |x| < R: (R² − |x|²)/(nσ²)."""
 
     noise: Number
     radius: Number
@@ -93,7 +93,7 @@ class BallExit:
         positive("brownian_ball", noise=self.noise, radius=self.radius)
 
     def value(self, x: State) -> Scalar:
-        """The value at one state; outside the ball the formula goes on and is negative."""
+        """The value at one state; outside the ball the same formula, which is negative there."""
         x = jnp.asarray(x)
         # ½σ²ΔV = −1, since Δ|x|² = 2n
         return (self.radius * self.radius - jnp.sum(x * x)) / (self.dim * self.noise * self.noise)
@@ -108,16 +108,16 @@ def brownian_exit(
     half_width: Number = 1.0,
     shape: tuple[int, ...] | None = None,
 ) -> tuple[Problem, Grid]:
-    """How long a Brownian motion stays in the cube |x_i| < half_width: no control, cost 1.
+    """The mean exit time of a Brownian motion from the cube |x_i| < half_width: no control, cost 1.
 
     Args:
       dim: the number of states.
       noise: σ.
-      discount: β; 0 is the mean exit time.
+      discount: β; 0 gives the mean exit time.
       half_width: R.
-      shape: nodes; ``None`` is 101 in one dimension, 41 an axis in more.
+      shape: number of nodes per axis; ``None`` is 101 in one dimension, 41 per axis otherwise.
     """
-    # first: of a half width ≤ 0 the grid would complain of its corners
+    # check first, otherwise a half width ≤ 0 would be reported as a wrong corner of the grid
     positive("brownian_exit", noise=noise, half_width=half_width)
     problem = Problem(no_drift, unit_cost, noise=noise, discount=discount, target=OutsideCube(half_width).level)
     # odd numbers put a node at the centre
@@ -129,7 +129,7 @@ def brownian_exit(
 def brownian_exit_exact(
     *, dim: int = 1, noise: Number = 1.0, discount: Number = 0.0, half_width: Number = 1.0
 ) -> Exact:
-    """(1 − x²)/σ² on the interval (−1, 1), .58937083 at the centre of the square for σ = 1; zero outside.
+    """(1 − x²)/σ² on the interval (−1, 1), 0.58937083 at the centre of the square for σ = 1; zero outside.
 
     Args:
       dim: the number of states, 1 or 2.
@@ -138,10 +138,12 @@ def brownian_exit_exact(
       half_width: R.
 
     Raises:
-      ValueError: more than two dimensions.
+      ValueError: ``dim`` is larger than 2.
     """
     if dim not in (1, 2):
-        raise ValueError(f"brownian_exit_exact: got dim = {dim}, wanted 1 or 2; brownian_ball is known in any")
+        raise ValueError(
+            f"brownian_exit_exact: got dim = {dim}, wanted 1 or 2 (brownian_ball: any)"
+        )
     return answer(CubeExit(noise, discount, half_width, dim).value)
 
 
@@ -149,22 +151,22 @@ def brownian_exit_exact(
 def brownian_ball(
     *, dim: int = 2, noise: Number = 1.0, radius: Number = 1.0, shape: tuple[int, ...] | None = None
 ) -> tuple[Problem, Grid]:
-    """How long on average a Brownian motion stays in the ball |x| < radius: no control, cost 1.
+    """The mean exit time of a Brownian motion from the ball |x| < radius: no control, cost 1.
 
-    Nodes outside the ball are held at the answer's continuation, so that the sphere needs not pass through nodes.
+    Nodes outside the ball have the continuation of the formula as value, so the sphere need not pass through nodes.
 
     Args:
       dim: the number n of states.
       noise: σ.
       radius: R.
-      shape: nodes; ``None`` is 41 an axis.
+      shape: number of nodes per axis; ``None`` is 41 per axis.
     """
     problem = Problem(
         no_drift,
         unit_cost,
         noise=noise,
-        target=OutsideBall(radius).level,  # the corners of the box, too
-        # no discount: with one the answer would be a Bessel function
+        target=OutsideBall(radius).level,  # includes the corners of the box
+        # no discount: with a discount the value would be a Bessel function
         exit_cost=brownian_ball_exact(dim=dim, noise=noise, radius=radius),
     )
     return problem, Grid([-radius] * dim, [radius] * dim, (41,) * dim if shape is None else shape, units=("m",) * dim)
@@ -172,7 +174,7 @@ def brownian_ball(
 
 @front_door
 def brownian_ball_exact(*, dim: int = 2, noise: Number = 1.0, radius: Number = 1.0) -> Exact:
-    """(R² − |x|²)/(nσ²) in the ball; outside it goes on, negative, as ``brownian_ball`` holds it there.
+    """(R² − |x|²)/(nσ²) in the ball, continued outside it with negative values, as in ``brownian_ball``.
 
     Args:
       dim: the number n of states.
@@ -184,7 +186,7 @@ def brownian_ball_exact(*, dim: int = 2, noise: Number = 1.0, radius: Number = 1
 
 @pytree_dataclass()
 class BangBang:
-    """Hold dx = u dt + ε dw, |u| ≤ 1, near zero at the cost x² discounted at the rate λ: u = −sgn x.
+    """Hold dx = u dt + ε dw, |u| ≤ 1, near zero at the cost x², discounted at the rate λ; the optimum is u = −sgn x.
 
         V = x²/λ − 2|x|/λ² + 2/λ³ + ε²/λ² − (2/(λ²μ)) e^{−μ|x|},   μ = 2λ/(1 + √(1 + 2ε²λ))
 
@@ -206,29 +208,29 @@ class BangBang:
 
     def cost(self, x: State, u: Control) -> Number:
         """x²."""
-        # nothing is paid for u: the equation is linear in it, and its best value is at an end of the set
+        # no cost of u, so the equation is linear in u and the optimum is at an end of the interval
         return jnp.sum(x * x)
 
     def value(self, x: State) -> Scalar:
-        """The value at one state of the whole line."""
+        """The value at one state, on the whole line."""
         rate, variance = self.discount, self.noise * self.noise
-        # the positive root of ½ε²μ² + μ − λ = 0, in the form that has the limit λ at ε = 0
+        # the positive root of ½ε²μ² + μ − λ = 0, in the form with the limit λ at ε = 0
         mu = 2 * rate / (1 + jnp.sqrt(1 + 2 * variance * rate))
         distance = jnp.abs(jnp.asarray(x)[0])
-        # what u = −sgn x would cost if it went straight on through zero
+        # the cost if u = −sgn x continued straight through zero
         parabola = distance * distance / rate - 2 * distance / rate**2 + 2 / rate**3 + variance / rate**2
-        # the exponential makes the slope vanish at zero, where the control changes sign
+        # the exponential makes the slope zero at x = 0, where the control switches
         return parabola - 2 / (rate**2 * mu) * jnp.exp(-mu * distance)
 
 
 @front_door
 def bang_bang(*, discount: Number = 1.0, noise: Number = 0.0, shape: tuple[int, ...] = (81,)) -> tuple[Problem, Grid]:
-    """Hold a point near zero with |u| ≤ 1 at the cost x², on [−2, 2] with the ends held at the exact value.
+    """Hold a point near zero with |u| ≤ 1 at the cost x², on [−2, 2] with the exact value prescribed at both ends.
 
     Args:
       discount: λ > 0.
       noise: ε.
-      shape: nodes.
+      shape: number of nodes.
     """
     system = BangBang(discount, noise)
     problem = Problem(
@@ -245,7 +247,7 @@ def bang_bang(*, discount: Number = 1.0, noise: Number = 0.0, shape: tuple[int, 
 
 @front_door
 def bang_bang_exact(*, discount: Number = 1.0, noise: Number = 0.0) -> Exact:
-    """The value on the whole line, with noise or without; see ``BangBang``.
+    """The value on the whole line, with or without noise; see ``BangBang``.
 
     Args:
       discount: λ > 0.

@@ -1,7 +1,7 @@
-"""Vector fields of control systems: brackets, what they span, linearisation by feedback, stability.
+"""Geometric control: Lie brackets, reachability and observability ranks, feedback linearisation, stability.
 
-Read ``brackets`` and ``distributions`` first, then ``feedback_linearisation`` and ``linearisability``; ``lyapunov``
-searches against Lyapunov functions, and ``stability`` has Brockett's condition.
+Read ``brackets`` and ``distributions`` first, then ``feedback_linearisation`` and ``linearisability``. ``lyapunov``
+searches for violations of a Lyapunov function, and ``stability`` has Brockett's condition.
 """
 
 from hjbjax.geometry.brackets import ad, affine_fields, lie_bracket, lie_derivative

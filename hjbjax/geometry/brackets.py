@@ -4,9 +4,9 @@
     [f, g] = (∂g/∂x) f − (∂f/∂x) g                                         (4.4)
     ad_f⁰ g = g,   ad_f^k g = [f, ad_f^{k−1} g]
 
-A vector field is a function of one state that returns shape (n,). Derivatives are exact up to rounding, and follow
-the dtype of their argument. What decides something from them (``decide``) does so in float64 and returns NumPy
-arrays; under a tracer it is traced like anything else.
+A vector field is a function of one state that returns shape (n,). Derivatives are exact up to rounding and have the
+dtype of the state. Functions that decide something (``decide``) use float64 and return NumPy arrays; under a tracer
+they are traced like any other function.
 """
 
 import functools
@@ -43,7 +43,7 @@ def lie_derivative(f: Field, h: Callable) -> Callable:
     """
 
     def derivative(x):
-        # forward mode, one pass through h whatever its shape: its Jacobian is never formed
+        # forward mode: one pass through h, without forming its Jacobian
         with own_settings():
             return jax.jvp(in_state_dtype(h), (as_state(x),), (velocity(f)(as_state(x)),))[1]
 
@@ -80,7 +80,7 @@ def ad(f: Field, g: Field, k: int) -> Field:
     Args:
       f: a vector field.
       g: a vector field.
-      k: how many brackets, at least 0.
+      k: the number of brackets, at least 0.
 
     Raises:
       ValueError: k is not an integer ≥ 0.
@@ -91,8 +91,8 @@ def ad(f: Field, g: Field, k: int) -> Field:
       [1.0, 0.0, 0.0]
     """
     arguments.count(k, "ad: k", least=0)
-    # each bracket evaluates the one inside it and differentiates it: on the ball and beam the program has 25 operations
-    # for k = 0, 1677 for k = 3 and 5695 for k = 4; ``along`` shares the inner evaluation and is half as long
+    # each bracket evaluates and differentiates the one inside it: for the ball and beam it has 25 operations
+    # for k = 0, 1677 for k = 3 and 5695 for k = 4; ``along`` shares the inner evaluation and needs half as many
     for _ in range(k):
         g = lie_bracket(f, g)
     return g
@@ -103,7 +103,7 @@ def affine_fields(drift: Callable, inputs: int) -> tuple[Field, Sequence[Field]]
     """The fields f and g_1, …, g_m of a drift f(x) + Σ g_j(x) u_j, such as ``Problem.drift``.
 
     Args:
-      drift: a function (x, u), affine in u; that it is affine is not checked.
+      drift: a function (x, u) that is affine in u; affinity is not checked.
       inputs: m.
 
     Example:
@@ -118,7 +118,7 @@ def affine_fields(drift: Callable, inputs: int) -> tuple[Field, Sequence[Field]]
 
 @pytree_dataclass(static=("inputs", "j"))
 class _Affine:
-    """x ↦ f(x, 0), or with j the rate of f(x, u) with u_j; the drift's numbers stay leaves."""
+    """x ↦ f(x, 0) if j is None, otherwise x ↦ ∂f/∂u_j; the drift's numbers are leaves."""
 
     drift: Callable[[State, Control], State]
     inputs: int
@@ -130,28 +130,28 @@ class _Affine:
             zero = jnp.zeros(self.inputs, x.dtype)
             if self.j is None:
                 return self.drift(x, zero)
-            # a derivative, exact for an affine drift: f(x, e_j) − f(x, 0) would lose g_j to rounding in a large f(x, 0)
+            # exact for an affine drift, while f(x, e_j) − f(x, 0) would lose g_j to rounding if f(x, 0) is large
             return jax.jvp(functools.partial(self.drift, x), (zero,), (zero.at[self.j].set(1),))[1]
 
 
 def along(function: Callable[[State], T], x: State, directions: Array) -> tuple[T, T]:
-    """The value at x, and the derivatives along directions, shape (p, n), with a leading axis of length p.
+    """The value at x, and the derivatives along p directions of shape (p, n), with a leading axis of length p.
 
-    One evaluation gives both, so that the program of k nested ones grows like 2^k and no faster.
+    One evaluation gives both, so the program of k nested calls grows only like 2^k.
     """
-    # out_axes None: the value does not depend on the direction, so that it is computed once and not p times
+    # out_axes None: the value does not depend on the direction, so it is computed once instead of p times
     return jax.vmap(lambda v: jax.jvp(function, (x,), (v,)), out_axes=(None, 0))(directions)
 
 
 def velocity(field: Field) -> Field:
-    """The field in the dtype of the state; another shape than that of the state is refused."""
+    """The field in the dtype of the state; raises ValueError if it does not return the shape of the state."""
 
     def call(x):
         rates = in_state_dtype(field)(x)
-        # a number or (n, 1) would broadcast to brackets of the right shape with the wrong entries
+        # a number or shape (n, 1) would broadcast to brackets of the right shape with wrong entries
         if rates.shape != x.shape:
             raise ValueError(
-                f"a vector field returned shape {rates.shape}, expected {x.shape}: one rate a state, for one state"
+                f"a vector field returned shape {rates.shape}, expected {x.shape}: one rate per state, for one state"
             )
         return rates
 
@@ -159,19 +159,19 @@ def velocity(field: Field) -> Field:
 
 
 def stack_fields(fields: Sequence[Field]) -> Callable[[State], jax.Array]:
-    """Several fields as one function that returns shape (m, n)."""
+    """Combine several fields into one function that returns shape (m, n)."""
     return lambda x: jnp.stack([velocity(field)(x) for field in fields])
 
 
 def root_eps(dtype: DType) -> float:
-    """The tolerance unless one is given: √eps, 1.5e-8 in float64."""
-    # above what rounding leaves of a bracket, 1e-12, below clear ranks, 0.1 for a car with trailers
+    """The default tolerance of ranks, √eps: 1.5e-8 in float64."""
+    # above the rounding of a bracket (1e-12) and below clear ranks (0.1 for a car with trailers)
     return float(jnp.finfo(dtype).eps) ** 0.5
 
 
 def rounding_of_terms(dtype: DType) -> float:
-    """What counts as zero relative to its terms unless a tolerance is given: 2e-13 in float64."""
-    # what rounding leaves of five derivatives is below 100 eps; a true feedthrough of 1e-8 is to count
+    """The default tolerance relative to terms, 1024 eps: 2e-13 in float64."""
+    # five derivatives leave rounding below 100 eps, and a true feedthrough of 1e-8 should count
     return 1024 * float(jnp.finfo(dtype).eps)
 
 
@@ -184,23 +184,23 @@ def decide(
     default: Callable[[DType], float] = root_eps,
     **static: int | bool,
 ) -> S:
-    """The verdict on derivatives: in float64 at the host, in the dtype of the state under a tracer.
+    """Evaluate a verdict on derivatives, in float64 on the host, or in the dtype of the state under a tracer.
 
     Args:
-      derive: ``derive(functions, x, tolerance, **static)``, compiled anew for every system.
-      judge: ``judge(derivatives, x, tolerance)``, a program that systems with as many states and inputs share: scales
-        and singular values take as long to compile as the derivatives of four states.
+      derive: ``derive(functions, x, tolerance, **static)``, compiled again for every system.
+      judge: ``judge(derivatives, x, tolerance)``, compiled once for all systems with the same number of states and
+        inputs, because scales and singular values take as long to compile as the derivatives for four states.
       functions: a pytree of functions of one state.
       x: the state, shape (n,).
-      tolerance: what counts as zero.
-      default: the tolerance unless one is given.
-      static: what the programs depend on.
+      tolerance: numbers below it count as zero; ``None`` is the default.
+      default: the default tolerance as a function of the dtype.
+      static: the static arguments of ``derive``.
     """
     if is_traced(functions, x, tolerance):
         x = as_state(x)
         allowed = default(x.dtype) if tolerance is None else tolerance
         return judge(derive(functions, x, allowed, **static), x, allowed)
-    # float64 whatever the session has: in float32 √eps is 3.5e-4, and that would decide ranks
+    # always float64: in float32 √eps is 3.5e-4, which would change ranks
     with own_settings(x64=True):
         state = np.asarray(x, np.float64)
         if state.ndim != 1 or not np.all(np.isfinite(state)):
@@ -211,27 +211,27 @@ def decide(
         try:
             found = _compiled(derive, tuple(static.items()))(cast(functions, np.float64), state, allowed)
         except jax.errors.JAXTypeError as error:
-            # an ``if`` on a state, or a NumPy function of one
+            # for example an ``if`` on a state, or a NumPy function of a state
             raise ValueError("a field cannot be traced: use jnp.where instead of if, jnp instead of numpy") from error
         answer = _compiled(judge, ())(found, state, allowed)
-        # what a field closes over may be traced though neither field nor state is; such answers stay in their trace
+        # a field may close over a traced value although field and state are concrete; the answer then stays traced
         answer = jax.tree.map(lambda leaf: leaf if is_traced(leaf) else np.asarray(leaf), answer)
     numbers = [leaf for leaf in jax.tree.leaves((found, answer)) if not is_traced(leaf)]
     if not all(np.all(np.isfinite(leaf)) for leaf in numbers):
         raise ValueError(
-            f"a derivative of the fields is not finite at or near x = {state.tolist()}: they must be smooth there"
+            f"a derivative of the fields is not finite at or near x = {state.tolist()}; the fields must be smooth there"
         )
     return answer
 
 
 @functools.lru_cache(maxsize=256)
 def _compiled(rule: Callable[..., T], static: tuple[tuple[str, int | bool], ...]) -> Callable[..., T]:
-    # jit knows its programs by the identity of the function, and a new partial in every call would compile anew
+    # jit caches programs by the identity of the function, and a new partial in every call would compile again
     return jax.jit(functools.partial(rule, **dict(static)))
 
 
 def as_pytree(function: Callable, name: str = "function") -> jax.tree_util.Partial:
-    """A function as a pytree, with the numbers of the object that it is a method of as leaves."""
+    """A function as a pytree; if it is a bound method, the numbers of its object are leaves."""
     held = as_partial(function, name)
     if held is None:
         raise TypeError(f"{name}: got None, wanted a function of one state")
@@ -239,20 +239,20 @@ def as_pytree(function: Callable, name: str = "function") -> jax.tree_util.Parti
 
 
 def as_fields(f: Field | None, gs: Field | Sequence[Field]) -> tuple[jax.tree_util.Partial, ...]:
-    """The drift, if any, and one or several input fields, as pytrees."""
+    """The drift (if any) and the input fields as pytrees."""
     drift = () if f is None else (f,)
     return tuple(as_pytree(field) for field in (*drift, *([gs] if callable(gs) else gs)))
 
 
 def stack_outputs(h: Callable[[State], Array | Number]) -> Callable[[State], jax.Array]:
-    """The outputs with shape (outputs,), one or several."""
+    """The outputs as a function that returns shape (outputs,)."""
     return lambda x: jnp.atleast_1d(in_state_dtype(h)(x))
 
 
 def output_derivatives(
     drifts: Sequence[Callable[[State], jax.Array]], h: Callable[[State], jax.Array]
 ) -> Callable[[State], tuple[jax.Array, ...]]:
-    """x ↦ (h, L_f h, L_f L_f h, …), each of shape (outputs,): one derivative for every f, each of shape (1, n)."""
+    """x ↦ (h, L_f h, L_f L_f h, …), each of shape (outputs,), with one derivative per drift f of shape (1, n)."""
 
     def ladder(x):
         return (h(x),)
@@ -260,7 +260,7 @@ def output_derivatives(
     def longer(shorter, f):
         def step(x):
             found, changes = along(shorter, x, f(x))
-            return (*found, changes[-1][0])  # [0]: the one direction, f
+            return (*found, changes[-1][0])  # [0] selects the only direction, f
 
         return step
 
@@ -270,7 +270,7 @@ def output_derivatives(
 
 
 def as_half_widths(radius: float | Array, states: int, name: str) -> np.ndarray:
-    """The half widths of the cube that is near, shape (n,)."""
+    """The half widths of the neighbourhood, shape (n,)."""
     widths = np.asarray(radius, np.float64)
     if widths.shape not in ((), (states,)) or not np.all(np.isfinite(widths) & (widths >= 0)):
         raise ValueError(f"{name}: got radius = {radius!r}, wanted a finite number ≥ 0, or {states} of them")
@@ -279,26 +279,26 @@ def as_half_widths(radius: float | Array, states: int, name: str) -> np.ndarray:
 
 def near(x: State, radius: Array, samples: int) -> jax.Array:
     """The state and points around it, shape (samples + 1, n)."""
-    # a fixed seed: a verdict must not change from call to call, nor between a trace and the host
+    # fixed seed, so that the verdict is the same in every call, traced or not
     spread = np.random.default_rng(0).uniform(-1.0, 1.0, (samples, x.shape[0]))
     spread = np.concatenate([np.zeros((1, x.shape[0])), spread])
     return jnp.asarray(x) + jnp.asarray(spread, x.dtype) * jnp.asarray(radius, x.dtype)
 
 
 def as_bool(verdict: bool | Array) -> bool | jax.Array:
-    """A verdict as a bool; inside a trace as it is."""
+    """A verdict as a bool, unless it is traced."""
     return verdict if isinstance(verdict, jax.core.Tracer) else bool(verdict)
 
 
 def as_state(x: State | Sequence[float]) -> jax.Array:
-    """A state as a floating-point array."""
-    # JAX differentiates nothing along integers, and [0, 1] is a state like any other
+    """The state as a floating-point array."""
+    # JAX does not differentiate with respect to integers, but [0, 1] is a valid state
     x = jnp.asarray(x)
     return x if jnp.issubdtype(x.dtype, jnp.inexact) else x.astype(float)
 
 
 def in_state_dtype(function: Callable[[State], Array | Number]) -> Callable[[State], jax.Array]:
-    """The function with its answer as an array in the dtype of the state, be it a list, an integer or a constant."""
+    """The function with its result as an array in the dtype of the state."""
 
     def call(x):
         try:
@@ -308,7 +308,7 @@ def in_state_dtype(function: Callable[[State], Array | Number]) -> Callable[[Sta
             if said is None:
                 raise
             raise ValueError(
-                f"a function of the state {said}.\nIt is differentiated, with x of shape {x.shape}"
+                f"a function of the state {said}.\nIt is differentiated with respect to x of shape {x.shape}"
             ) from error
 
     return call

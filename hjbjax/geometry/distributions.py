@@ -1,12 +1,11 @@
-"""Distributions: what vector fields and their brackets, or outputs and their derivatives, span at a state.
+"""Distributions: the span of vector fields and their brackets, or of outputs and their derivatives, at a state.
 
     reachability       span of the fields and their brackets [X_k, [… [X_2, X_1]]]           (4.5)
     observability      span of d(L_{X_1} … L_{X_k} h_j)                                      (4.11)
 
-with X_i out of f, g_1, …, g_m. Right-nested brackets are enough: they span the whole Lie algebra. A rank is decided by
-singular values in units in which vectors and states compare (``scaling``), without what is rounding: those above
-``tolerance`` times the largest count, and the tolerance is √eps of the dtype (1.5e-8 in float64) unless given. It is
-the rank at one state.
+with X_i among f, g_1, …, g_m. Right-nested brackets are enough, because they span the whole Lie algebra. The rank at
+one state is the number of singular values above ``tolerance`` times the largest one, √eps of the dtype by default
+(1.5e-8 in float64). Rounding is removed and units are balanced before (see ``scaling``).
 
 Cost: the program of depth k holds 2^k derivatives, and the number of brackets grows like (number of fields)^k.
 """
@@ -24,7 +23,7 @@ from hjbjax.problem import arguments
 from hjbjax.problem.pytree import front_door, is_traced, pytree_dataclass
 from hjbjax.problem.types import Array, Number, State
 
-Generations: TypeAlias = tuple[Sequence[Array], Sequence[Array]]  # vectors of each, (members, n), and their terms
+Generations: TypeAlias = tuple[Sequence[Array], Sequence[Array]]  # vectors (members, n) and terms, per generation
 
 
 @pytree_dataclass()
@@ -32,11 +31,10 @@ class Distribution:
     """The span of vectors at one point, and how clear its rank is.
 
     Args:
-      vectors: what spans it, shape (p, n).
-      directions: orthonormal; the first k span what the k largest singular values belong to, shape (n, min(n, p)).
-      singular_values: of the directions of ``vectors``, each scaled to length 1 in units in which the states compare;
-        falling, shape (min(n, p),).
-      tolerance: what counts, as a part of the largest singular value.
+      vectors: the spanning vectors, shape (p, n).
+      directions: orthonormal columns, shape (n, min(n, p)); the first k belong to the k largest singular values.
+      singular_values: the singular values of ``vectors`` in balanced units, in decreasing order, shape (min(n, p),).
+      tolerance: singular values above this fraction of the largest one count.
     """
 
     vectors: Array
@@ -48,21 +46,21 @@ class Distribution:
     @front_door
     def counted(self) -> Array:
         """A mask of the singular values that count towards the rank, shape (min(n, p),)."""
-        # strictly above, so that fields that all vanish have rank 0
+        # strictly above, so that the rank is 0 if all fields are zero
         return self.singular_values > self.tolerance * self.singular_values[0]
 
     @property
     @front_door
     def rank(self) -> int | jax.Array:
-        """The number of singular values that count; an int outside of a trace."""
+        """The number of singular values that count; an int outside a trace."""
         rank = self.counted.sum()
         return rank if is_traced(rank) else int(rank)
 
     @property
     @front_door
     def basis(self) -> Array:
-        """An orthonormal basis in columns, shape (n, rank); under a tracer all directions, with zeros past the rank."""
-        # a traced rank is no shape, and a projection B Bᵀ is the same with columns of zeros
+        """An orthonormal basis in columns, shape (n, rank); under a tracer all columns, zero beyond the rank."""
+        # a traced rank cannot be a shape, and the projection B Bᵀ is the same with columns of zeros
         if is_traced(self.singular_values):
             return self.directions * self.counted
         return self.directions[:, : self.rank]
@@ -70,19 +68,19 @@ class Distribution:
     @property
     @front_door
     def margin(self) -> Number:
-        """The smallest singular value that counts over the largest; compare with ``tolerance``."""
+        """The ratio of the smallest singular value that counts to the largest; compare with ``tolerance``."""
         return self._largest_ratio(jnp.where(self.counted, self.singular_values, jnp.inf).min())
 
     @property
     @front_door
     def residue(self) -> Number:
-        """The largest singular value that does not count over the largest; compare with ``tolerance``."""
+        """The ratio of the largest singular value that does not count to the largest; compare with ``tolerance``."""
         return self._largest_ratio(jnp.where(self.counted, 0.0, self.singular_values).max())
 
     def _largest_ratio(self, value: Array) -> Number:
         largest = self.singular_values[0]
-        # over a safe 1 where all fields vanish: a ``where`` after 0/0 keeps NaN out of the value and not of a gradient;
-        # ``value`` is infinite where it is the least of no singular values at all
+        # divide by 1 if all fields are zero, because a ``where`` after 0/0 keeps NaN out of the value but not out of
+        # the gradient; ``value`` is infinite if no singular value counts
         ratio = jnp.where((largest > 0) & jnp.isfinite(value), value / jnp.where(largest > 0, largest, 1.0), 0.0)
         return ratio if is_traced(ratio) else float(ratio)
 
@@ -98,24 +96,24 @@ def reachability_distribution(
 ) -> Distribution:
     """The span of f, the g_j and their brackets at a state (4.5).
 
-    The first generation holds the brackets of two fields, generation k those of a field with one of generation
-    k − 1. Rank n says that the states reachable from x in any time fill an open set (accessibility), and without
-    drift that x is locally controllable. It never falls with the depth.
+    Generation 1 consists of the brackets of two fields, and generation k of the brackets of a field with a member of
+    generation k − 1. Rank n means that the states reachable from x contain an open set (accessibility). Without drift
+    it also means that x is locally controllable. The rank never decreases with the depth.
 
     Args:
       f: the drift; ``None`` for a system without drift.
       gs: the input fields, a sequence of functions or one function.
       x: the state, shape (n,).
-      depth: generations of brackets, 0 for the fields alone.
+      depth: number of generations of brackets; 0 for the fields only.
 
     Keyword Args:
-      tolerance: which part of the largest singular value counts; ``None`` is √eps.
+      tolerance: singular values above this fraction of the largest one count; ``None`` is √eps.
 
     Returns:
       A Distribution, with ``rank``, ``basis``, ``margin`` and ``residue``.
 
     Raises:
-      ValueError: a depth that is no integer ≥ 0, a field of the wrong shape, or a number that is not finite.
+      ValueError: the depth is not an integer ≥ 0, a field has the wrong shape, or a number is not finite.
 
     Example:
       >>> parabola = lambda x: jnp.stack([0.0, x[0] ** 2])      # with the input field below: Example 4.1
@@ -140,24 +138,24 @@ def observability_codistribution(
 ) -> Distribution:
     """The span of the differentials of the outputs and of their Lie derivatives at a state (4.11).
 
-    Rank n says that states near x are told apart by their outputs under suitable inputs (local observability);
-    it says nothing of states far from each other.
+    Rank n means that suitable inputs distinguish x from nearby states by their outputs (local observability). It says
+    nothing about states that are far apart.
 
     Args:
       f: the drift; ``None`` for a system without drift.
       gs: the input fields, a sequence of functions or one function; empty without inputs.
       h: the output, a function of one state that returns one number or shape (outputs,).
       x: the state, shape (n,).
-      depth: how many Lie derivatives, 0 for the outputs alone; n − 1 is enough for a rank that is constant near x.
+      depth: number of Lie derivatives; 0 for the outputs only. n − 1 is enough if the rank is constant near x.
 
     Keyword Args:
-      tolerance: which part of the largest singular value counts; ``None`` is √eps.
+      tolerance: singular values above this fraction of the largest one count; ``None`` is √eps.
 
     Returns:
       A Distribution of covectors.
 
     Raises:
-      ValueError: a depth that is no integer ≥ 0, a field of the wrong shape, or a number that is not finite.
+      ValueError: the depth is not an integer ≥ 0, a field has the wrong shape, or a number is not finite.
 
     Example:
       >>> swing = lambda x: jnp.stack([x[1], jnp.sin(x[0])])
@@ -188,7 +186,7 @@ def _reach(fields: tuple[Field, ...], x: State, tolerance: Number, *, depth: int
 def _with_brackets(
     fields: Callable[[State], jax.Array], generations: Callable[[State], tuple[jax.Array, ...]]
 ) -> Callable[[State], tuple[jax.Array, ...]]:
-    """The generations and one more: the brackets of every field with every member of the last one."""
+    """Append one generation: the brackets of every field with every member of the last generation."""
 
     def longer(x):
         found, changes = along(generations, x, fields(x))  # (∂Y/∂x) X is changes[-1], shape (fields, members, n)
@@ -212,7 +210,7 @@ def _observe(functions: tuple[tuple[Field, ...], Callable], x: State, tolerance:
 
         for field in others[0][:depth] if others else ():
             generations = _with_derivatives(field, generations)
-        # one Jacobian of all generations, each (members, n): taken of each alone it would evaluate the shorter again
+        # one Jacobian of all generations, because separate Jacobians would evaluate the shorter ones again
         return jax.jacfwd(generations)(y)
 
     stacked = [stack_outputs(h), stack_fields(fields)] if fields else [stack_outputs(h)]
@@ -222,7 +220,7 @@ def _observe(functions: tuple[tuple[Field, ...], Callable], x: State, tolerance:
 def _with_derivatives(
     fields: Callable[[State], jax.Array], generations: Callable[[State], tuple[jax.Array, ...]]
 ) -> Callable[[State], tuple[jax.Array, ...]]:
-    """The generations and one more: the derivatives of the last one along every field."""
+    """Append one generation: the derivatives of the last generation along every field."""
 
     def longer(x):
         found, changes = along(generations, x, fields(x))
@@ -232,16 +230,16 @@ def _with_derivatives(
 
 
 def _span_of_generations(generations: Generations, x: State, tolerance: Number) -> Distribution:
-    """The Distribution of all generations, with the directions of the first ones that have the highest rank."""
+    """The Distribution of all generations, with the directions of the first generations that reach the highest rank."""
     values, terms = generations
     vectors, sizes = jnp.concatenate(values), jnp.concatenate(terms)
-    # Many long brackets near one direction make the others small beside it: what shorter ones span stays spanned.
+    # many long brackets near one direction make other vectors relatively small; keep the span of the shorter brackets
     ends = np.cumsum([len(generation) for generation in values])
     first = jnp.asarray(np.arange(ends[-1]) < ends[:, None])
     spans = jax.vmap(lambda kept: span(jnp.where(kept[:, None], vectors, 0), tolerance, sizes))(first)
     counted = jax.vmap(lambda one: one.counted)(spans)
     best = jnp.argmax(jnp.sum(counted, axis=-1))
-    # what any of them shows beside that rank, and does not count, is the residue of the verdict
+    # the residue of the verdict is the largest singular value in any of the spans that does not count
     shares = spans.singular_values / jnp.where(spans.singular_values[:, :1] > 0, spans.singular_values[:, :1], 1)
     chosen = spans.singular_values[best]
     beside = jnp.where(counted, 0, shares).max(axis=0) * chosen[0]
@@ -252,11 +250,11 @@ def _span_of_generations(generations: Generations, x: State, tolerance: Number) 
 
 
 def span(vectors: Array, tolerance: Number, terms: Array) -> Distribution:
-    """The Distribution of row vectors made of terms of the sizes given, both of shape (p, n)."""
+    """The Distribution of row vectors and the sizes of their terms, both of shape (p, n)."""
     kept = without_rounding(vectors, terms)
     rows, columns = balance(kept)
-    # singular values and not a QR decomposition: they say how far the rank is from another one
+    # singular values instead of a QR decomposition, because they show how clear the rank is
     scaled, values, _ = jnp.linalg.svd((rows[:, None] * kept * columns).T, full_matrices=False)
-    # Back in the units of the states: QR keeps the span of the first columns, however many of them count.
+    # return to the units of the states; QR preserves the span of the first k columns for every k
     directions, _ = jnp.linalg.qr(scaled / columns[:, None])
     return Distribution(vectors, directions, values, jnp.asarray(tolerance, vectors.dtype))

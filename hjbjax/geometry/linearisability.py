@@ -1,14 +1,12 @@
-"""Geometry of control systems ẋ = f(x) + Σ g_j(x) u_j: brackets, ranks, and exact linearisation by feedback.
+"""Feedback linearisability of control systems ẋ = f(x) + Σ g_j(x) u_j.
 
-Lie derivatives and brackets, reachability and observability, relative degree and linearising feedback are defined in
-``brackets``, ``distributions`` and ``feedback_linearisation``, and are all found here. With G_k(x) the span of ad_f^i
-g_j(x), i ≤ k, the system is linearised at x by a change of coordinates and a feedback exactly when (§5 with one
-input)
+Let G_k(x) be the span of ad_f^i g_j(x) for i ≤ k. The system can be linearised at x by a change of coordinates and a
+feedback if and only if (§5 for one input)
 
     G_{n−1}(x) has dimension n,     G_k is involutive near x for k ≤ n − 2,     G_k has constant dimension near x
 
-With one input the first condition implies the third, and the second is needed for k = n − 2 alone. "Near x" is as in
-``feedback_linearisation``, ranks and units are as in ``distributions``; each condition comes with its margin.
+With one input the first condition implies the third, and the second is needed only for k = n − 2. "Near x" is defined
+in ``feedback_linearisation``, ranks and units in ``distributions``. Each condition is reported with its margin.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,21 +32,21 @@ from hjbjax.problem import arguments
 from hjbjax.problem.pytree import front_door, is_traced, pytree_dataclass
 from hjbjax.problem.types import Array, Number, State
 
-Ladders: TypeAlias = tuple[tuple[Array, Array], tuple[Array, Array]]  # members and slopes, and the terms of both
+Ladders: TypeAlias = tuple[tuple[Array, Array], tuple[Array, Array]]  # members and slopes, and the terms of each
 
 
 @pytree_dataclass()
 class Linearisability:
-    """The verdict on linearisation by feedback, with the conditions it follows from.
+    """The result of ``is_feedback_linearisable``: the three conditions and their margins.
 
     Args:
-      ranks: the dimensions of G_0, G_1, … at the state, up to the first that is n or to G_{n−1}.
-      independence: the n-th singular value of the last of them over the first, in balanced units; above
-        ``tolerance`` where it has rank n.
-      involutivity: the largest part of a bracket of two fields of a G_k that lies outside G_k, relative to the
-        terms the bracket is made of; below ``tolerance`` where all are involutive.
-      regular: whether every G_k has the same dimension at all points looked at.
-      tolerance: what the margins are compared with.
+      ranks: the dimensions of G_0, G_1, … at the state, up to the first one of dimension n, or up to G_{n−1}.
+      independence: the ratio of the n-th to the first singular value of the last G_k, in balanced units; above
+        ``tolerance`` if it has rank n.
+      involutivity: the largest part of a bracket of two fields of a G_k that is outside G_k, relative to the terms of
+        the bracket; at most ``tolerance`` if all G_k are involutive.
+      regular: True if every G_k has the same dimension at all sampled points.
+      tolerance: compare the margins with it.
     """
 
     ranks: Array
@@ -60,20 +58,20 @@ class Linearisability:
     @property
     @front_door
     def independent(self) -> bool | jax.Array:
-        """The first condition: G_{n−1} has dimension n; with one input, {ad_f^k g, k ≤ n − 1} is independent."""
+        """The first condition: G_{n−1} has dimension n. With one input: the ad_f^k g, k ≤ n − 1, are independent."""
         return as_bool(self.independence > self.tolerance)
 
     @property
     @front_door
     def involutive(self) -> bool | jax.Array:
-        """The second condition: G_k is involutive, k ≤ n − 2."""
+        """The second condition: G_k is involutive for k ≤ n − 2."""
         return as_bool(self.involutivity <= self.tolerance)
 
     @property
     @front_door
     def linearisable(self) -> bool | jax.Array:
-        """Whether the system is independent, involutive and regular."""
-        # with & on arrays: ``and`` would ask a tracer for its truth
+        """True if the system is independent, involutive and regular."""
+        # & works for traced arrays, ``and`` does not
         return as_bool(
             (self.independence > self.tolerance) & (self.involutivity <= self.tolerance) & jnp.asarray(self.regular)
         )
@@ -89,7 +87,7 @@ def is_feedback_linearisable(
     samples: int = 16,
     tolerance: Number | None = None,
 ) -> Linearisability:
-    """Linearisability near a state: ẋ = f + g u made linear and controllable by coordinates and a feedback (§5).
+    """Check whether coordinates and a feedback make ẋ = f + g u linear and controllable near a state (§5).
 
     Args:
       f: the drift.
@@ -97,15 +95,15 @@ def is_feedback_linearisable(
       x: the state, shape (n,).
 
     Keyword Args:
-      radius: how far from x is near, in the units of the state; one number, or one a state, shape (n,).
-      samples: how many points near x are looked at.
-      tolerance: what counts as zero, relative to what it is made of; ``None`` is √eps.
+      radius: half width of the neighbourhood of x, in the units of the state; one number, or shape (n,).
+      samples: number of points sampled near x.
+      tolerance: numbers below it, relative to their terms, count as zero; ``None`` is √eps.
 
     Returns:
       A Linearisability, with ``linearisable``, the conditions and their margins.
 
     Raises:
-      ValueError: a field or a radius of the wrong shape, or a derivative that is not finite near x.
+      ValueError: a field or the radius has the wrong shape, or a derivative is not finite near x.
 
     Example:
       >>> pendulum = lambda x: jnp.stack([x[1], jnp.sin(x[0])])
@@ -122,7 +120,7 @@ def is_feedback_linearisable(
             _ladders_near, _linearisability, (fields, half_widths), x, tolerance, samples=int(samples), depth=depth
         )
 
-    # Where G_k is everything the longer brackets add nothing, and with m inputs that can be from k = n/m − 1 on.
+    # once G_k has dimension n, longer brackets add nothing; with m inputs this is possible from k = n/m − 1 on
     enough = states if is_traced(fields, x, tolerance) else -(-states // max(len(fields) - 1, 1))
     for depth in range(enough, states):
         answer = rule(depth)
@@ -134,7 +132,7 @@ def is_feedback_linearisable(
 def _ladders_near(
     functions: tuple[tuple[Field, ...], Array], x: State, tolerance: Number, *, samples: int, depth: int
 ) -> Ladders:
-    """The members of G_0, …, G_{depth − 1} at points near x, and their slopes, and the terms of both."""
+    """The members of G_0, …, G_{depth − 1} at points near x, their slopes, and the terms of both."""
     fields, radius = functions
     stacked = [stack_fields(fields[:1]), stack_fields(fields[1:])]
 
@@ -145,14 +143,14 @@ def _ladders_near(
 
 
 def _linearisability(ladders: Ladders, x: State, tolerance: Number) -> Linearisability:
-    """The conditions as far as G_0, …, G_{depth − 1} show them."""
+    """Evaluate the conditions on G_0, …, G_{depth − 1}."""
     n, depth = x.shape[0], ladders[0][0].shape[1]
-    up_to = jnp.asarray(np.tril(np.ones((depth, depth), bool)))  # which generations are in G_k, k the row
+    up_to = jnp.asarray(np.tril(np.ones((depth, depth), bool)))  # row k: the generations contained in G_k
 
     def at(found, terms):
         # members (depth, m, n), slopes (depth − 1, m, n, n)
         (members, slopes), (_, sizes) = _in_common_units(found, terms)
-        # All G_k in one program, with zeros for the later generations: one singular value decomposition to compile.
+        # all G_k in one program, with zeros for later generations, so that only one SVD is compiled
         spans = jax.vmap(lambda kept: _span_of_some(members, kept, tolerance))(up_to)
         ranks = jnp.sum(jax.vmap(lambda one: one.counted)(spans), axis=-1)
         if depth == 1:
@@ -162,7 +160,7 @@ def _linearisability(ladders: Ladders, x: State, tolerance: Number) -> Linearisa
         return ranks, jnp.max(outside(shorter, up_to[:-1, :-1])), spans.singular_values[-1]
 
     ranks, outside, values = jax.vmap(at)(*ladders)
-    # at the state itself, which ``near`` puts first; fewer than n rows have fewer than n singular values
+    # values at the state itself, which ``near`` puts first; fewer than n rows have fewer than n singular values
     largest, smallest = values[0, 0], values[0, -1]
     full = values.shape[1] == n
     independence = jnp.where((largest > 0) & full, smallest / jnp.where(largest > 0, largest, 1), 0)
@@ -170,7 +168,7 @@ def _linearisability(ladders: Ladders, x: State, tolerance: Number) -> Linearisa
 
 
 def _span_of_some(members: Array, kept: Array, tolerance: Number) -> Distribution:
-    """The span of the generations that are kept, a mask of shape (depth,)."""
+    """The span of the generations selected by a mask of shape (depth,)."""
     vectors = jnp.where(kept[:, None, None], members, 0).reshape(-1, members.shape[-1])
     return span(vectors, tolerance, jnp.zeros_like(vectors))
 
@@ -178,12 +176,12 @@ def _span_of_some(members: Array, kept: Array, tolerance: Number) -> Distributio
 def _in_common_units(
     found: tuple[Array, Array], terms: tuple[Array, Array]
 ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Members and slopes without rounding, and their terms, in units in which members have length 1."""
+    """Members and slopes without rounding, and their terms, in units that give members length 1."""
     members = without_rounding(found[0], terms[0])
     slopes = without_rounding(found[1], terms[1])
     rows, columns = balance(members.reshape(-1, members.shape[-1]))
     rows = rows.reshape(members.shape[:-1])
-    scale = rows[..., None] * columns  # of w; of ∂w/∂x
+    scale = rows[..., None] * columns  # the scale of members; the next line has the scale of slopes
     bend = scale[: slopes.shape[0], ..., None] / columns
     return (members * scale, slopes * bend), (terms[0] * scale, terms[1] * bend)
 
@@ -191,11 +189,11 @@ def _in_common_units(
 def _ad_ladder(
     drifts: Sequence[Callable[[State], jax.Array]], inputs: Sequence[Callable[[State], jax.Array]], x: State
 ) -> tuple[jax.Array, jax.Array]:
-    """ad_f^k g_j(x) for k < count, shape (count, m, n), and their slopes for k < count − 1, with one more axis.
+    """ad_f^k g_j(x), k < count, shape (count, m, n), and their slopes for k < count − 1, (count − 1, m, n, n).
 
     Args:
-      drifts: f, shape (1, n), ``count`` times.
-      inputs: the fields g, shape (m, n), the first of which is used.
+      drifts: ``count`` copies of f, which returns shape (1, n).
+      inputs: copies of the fields g, which return shape (m, n); only the first is used.
       x: the state.
     """
     gs = inputs[0]
@@ -216,7 +214,7 @@ def _ad_ladder(
 
     for f in drifts[2:]:
         ladder = longer(ladder, f)
-    # The slopes of the last one give the next one, without differentiating once more.
+    # the slopes of the last member give the next member without another derivative
     found, slopes = along(ladder, x, jnp.eye(x.shape[0], dtype=x.dtype))
     slopes = jnp.moveaxis(jnp.stack(slopes), 1, -1)  # (count − 1, m, n, n)
     last = drifts[1]
@@ -226,24 +224,24 @@ def _ad_ladder(
 
 
 def _bracket_residue(spanned: Distribution, kept: Array, members: Array, slopes: Array, terms: Array) -> jax.Array:
-    """The largest part outside of the span of a bracket of two members, relative to the terms of the brackets.
+    """The largest part of a bracket of two members outside the span, relative to the terms of this bracket.
 
     Args:
-      spanned: the span of the generations that are kept.
+      spanned: the span of the selected generations.
       kept: a mask of generations, shape (k,).
       members: shape (k, m, n), of length 1.
       slopes: shape (k, m, n, n).
-      terms: of the slopes.
+      terms: the terms of the slopes.
     """
     n = members.shape[-1]
-    v, dv, made_of = members.reshape(-1, n), slopes.reshape(-1, n, n), terms.reshape(-1, n, n)  # one member a row
+    v, dv, made_of = members.reshape(-1, n), slopes.reshape(-1, n, n), terms.reshape(-1, n, n)  # one member per row
     counts = jnp.repeat(kept, members.shape[1], total_repeat_length=len(v))
     products = jnp.einsum("bij,aj->abi", dv, v)  # (∂w/∂x) v
     brackets = products - products.swapaxes(0, 1)
-    # zeros past the rank instead of fewer columns: the rank differs from point to point, and this is vmapped over them
+    # zeros beyond the rank instead of fewer columns, because this is vmapped over points whose ranks differ
     basis = spanned.directions * spanned.counted
     rest = brackets - brackets @ basis @ basis.T
-    # what this very bracket is made of: one steep pair must not hide another; slopes that are rounding count as none
+    # terms per bracket, so that one steep pair does not hide another; slopes that are rounding add little
     steep = jnp.abs(dv) + ROUNDING * jnp.finfo(v.dtype).eps ** 0.5 * made_of
     parts = jnp.einsum("bij,aj->abi", steep, jnp.abs(v))
     scale, left = (jnp.sqrt(jnp.sum(part * part, axis=-1)) for part in (parts + parts.swapaxes(0, 1), rest))

@@ -1,10 +1,10 @@
-"""Stability: Lyapunov functions, and Brockett's necessary condition.
+"""Stability: Lyapunov functions and Brockett's necessary condition.
 
-``lyapunov_check`` searches a region for what contradicts a Lyapunov function; it is defined in ``lyapunov``.
+``lyapunov_check`` searches a region for violations of a Lyapunov function; it is defined in ``lyapunov``.
 
-Brockett's condition: if a continuous feedback of the state makes x_e asymptotically stable, then the image of
-(x, u) ↦ f(x, u) holds a neighbourhood of zero. A system without drift whose m < n fields are independent at x_e fails
-it: in coordinates in which the first m rows of the fields are invertible, (0, ε) is not in the image. Source: M. D.
+Brockett's condition: if a continuous state feedback makes x_e asymptotically stable, then the image of (x, u) ↦ f(x, u)
+contains a neighbourhood of zero. A driftless system with m < n fields that are independent at x_e violates it: in
+coordinates in which the first m rows of the fields are invertible, (0, ε) is not in the image. Source: M. D.
 Kvalheim and D. E. Koditschek, Necessary conditions for feedback stabilization and safety, arXiv:2106.00215, which
 states Brockett's theorem of 1983.
 """
@@ -27,12 +27,13 @@ __all__ = ["BrockettVerdict", "LyapunovReport", "brockett_check", "lyapunov_chec
 
 @pytree_dataclass(static=("message",))
 class BrockettVerdict:
-    """The verdict of Brockett's necessary condition for a continuous stabilising feedback of the state.
+    """The result of ``brockett_check``.
 
     Args:
-      satisfied: ``False`` rules such a feedback out, ``True`` does not promise one; ``None`` is undecided.
-      rank: of (∂f/∂x, ∂f/∂u) at the state.
-      margin: the smallest singular value that counts towards the rank, over the largest.
+      satisfied: ``False`` excludes a continuous stabilising state feedback, ``True`` does not guarantee one, ``None``
+        is undecided.
+      rank: the rank of (∂f/∂x, ∂f/∂u) at the state.
+      margin: the ratio of the smallest singular value that counts towards the rank to the largest one.
       message: the reason in words.
     """
 
@@ -46,11 +47,10 @@ class BrockettVerdict:
 def brockett_check(
     f: Field | None, gs: Field | Sequence[Field], x: State | Sequence[float], *, tolerance: Number | None = None
 ) -> BrockettVerdict:
-    """Brockett's necessary condition for a continuous feedback u(x) that makes a rest point asymptotically stable.
+    """Check Brockett's necessary condition for a continuous feedback u(x) that stabilises a rest point asymptotically.
 
-    Decided where it can be from first derivatives at x: without drift, or with one that is zero at all points near
-    x, by the fields themselves; with drift by the rank of the linearisation (∂f/∂x, ∂f/∂u), which satisfies it
-    where it is n.
+    The check uses first derivatives at x, so it can be undecided. If there is no drift, or if the drift is zero near x,
+    it uses the fields themselves. Otherwise it uses the rank of (∂f/∂x, ∂f/∂u): rank n satisfies the condition.
 
     Args:
       f: the drift; ``None`` for a system without drift.
@@ -58,13 +58,13 @@ def brockett_check(
       x: the state to be stabilised, shape (n,), where some input keeps the system at rest.
 
     Keyword Args:
-      tolerance: which part of the largest singular value counts; ``None`` is √eps.
+      tolerance: singular values above this fraction of the largest one count; ``None`` is √eps.
 
     Returns:
       A BrockettVerdict, with ``satisfied`` and a ``message``.
 
     Raises:
-      ValueError: no input keeps the system at rest at x, or a field is of the wrong shape or not finite there.
+      ValueError: no input keeps the system at rest at x, or a field has the wrong shape or is not finite there.
 
     Example:
       >>> drive = lambda x: jnp.stack([jnp.cos(x[2]), jnp.sin(x[2]), 0.0])
@@ -75,17 +75,17 @@ def brockett_check(
     fields = as_fields(f, gs)
     linear, unbalanced, driftless = decide(_linearisation, _rank_and_rest, fields, x, tolerance, drift=f is not None)
     n, m, rank = linear.vectors.shape[1], len(fields) - (f is not None), int(linear.rank)
-    # about √eps of float64: a rest point is known to rounding of the root finder or the formula it comes from
+    # about √eps of float64, because x often comes from a root finder or a rounded formula
     if unbalanced > 1e-8:
         raise ValueError(
             f"brockett_check: no input keeps the system at rest at x = {np.asarray(x).tolist()}: "
-            f"the drift there leaves the span of the fields by {unbalanced:.2g} of its size"
+            f"the part of the drift outside the span of the fields is {unbalanced:.2g} of its size"
         )
     satisfied: bool | None
-    # where the linearisation is onto, so is f near (x, u) by the inverse function theorem: a neighbourhood is covered
+    # if the linearisation is onto, the inverse function theorem gives a neighbourhood of zero in the image of f
     if rank == n:
         satisfied, reason = True, "satisfied: the linearisation moves the state in every direction"
-    # the module's docstring has the argument; with dependent fields it says nothing, for they may span more nearby
+    # see the module's docstring; fields that are dependent at x may be independent nearby, so they decide nothing
     elif driftless and rank == m:
         fields_and_states = f"{m} independent fields move {n} states without drift"
         satisfied, reason = False, f"violated: {fields_and_states}; no continuous u(x) makes this state stable"
@@ -97,9 +97,9 @@ def brockett_check(
 def _linearisation(
     fields: tuple[Field, ...], x: State, tolerance: Number, *, drift: bool
 ) -> tuple[tuple[Array, Array], tuple[Array, Array] | None, jax.Array]:
-    """The fields and the ∂f_k/∂x at x, each with its terms, the latter for a drift alone, and whether that is zero."""
+    """The fields and the ∂f_k/∂x at x, each with the size of its terms, and whether the drift is zero near x."""
     field = stack_fields(fields)
-    # without drift u = 0 keeps every state at rest, where ∂f/∂x = Σ u_j ∂g_j/∂x is zero: the fields are all there is
+    # without drift, u = 0 keeps every state at rest, and then ∂f/∂x = Σ u_j ∂g_j/∂x is zero
     if not drift:
         return with_terms(lambda copies, y: copies[0][0](y), [field], x, 1), None, jnp.asarray(True)
 
@@ -114,12 +114,12 @@ def _linearisation(
 def _rank_and_rest(
     found: tuple[tuple[Array, Array], tuple[Array, Array] | None, Array], x: State, tolerance: Number
 ) -> tuple[Distribution, Array, Array]:
-    """(∂f/∂x, ∂f/∂u) at x and the input that balances the drift best, the share of the drift left, whether it is 0."""
+    """(∂f/∂x, ∂f/∂u) at x for the best balancing input, the unbalanced fraction of the drift, and ``driftless``."""
     (values, sizes), derivatives, driftless = found
     if derivatives is None:
         return span(values, tolerance, sizes), jnp.zeros((), x.dtype), driftless
     u, left = _balancing_input(without_rounding(values, sizes))
-    # ∂f/∂x + Σ u_j ∂g_j/∂x; its columns and the fields are the rows of which the span is taken
+    # the rows are the columns of ∂f/∂x + Σ u_j ∂g_j/∂x, then the fields
     inputs = jnp.append(1.0, u).astype(x.dtype)
     slopes = jnp.einsum("k,kij->ji", inputs, derivatives[0])
     bends = jnp.einsum("k,kij->ji", jnp.abs(inputs), derivatives[1])
@@ -128,10 +128,10 @@ def _rank_and_rest(
 
 
 def _balancing_input(vectors: Array) -> tuple[jax.Array, jax.Array]:
-    """The input that balances the drift, the first vector, best, shape (m,), and the share of it that is left."""
+    """The input that best balances the drift ``vectors[0]``, shape (m,), and the unbalanced fraction of the drift."""
     rows, columns = balance(vectors)
-    scaled = rows[:, None] * vectors * columns  # of length 1: neither states nor fields are small by their units
+    scaled = rows[:, None] * vectors * columns  # length 1, so the units of states and fields do not matter
     f, gs = scaled[0], scaled[1:].T
-    # least squares: the balancing input need not be unique, and where there is none its residual says so
+    # least squares, because the balancing input may not be unique; the residual shows if there is none
     u, *_ = jnp.linalg.lstsq(gs, -f)
     return u * rows[1:] / rows[0], jnp.sqrt(jnp.sum((f + gs @ u) ** 2))

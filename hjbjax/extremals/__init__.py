@@ -1,8 +1,7 @@
 """Pontryagin's equations as a boundary-value problem: extremals without a grid.
 
-Read ``indirect_method`` for ``pontryagin`` (``arguments``: what it refuses), ``boundary_value`` for the equations,
-which ``collocation`` solves, with arcs between the seams of an angle, ``initial_guess`` and ``equilibria`` for where it
-starts, ``continuation`` for its solve, ``switching`` for controls that jump, ``necessary_conditions`` for how well they
-are met, where the path meets the target and what to do about a failure, and ``second_order`` for extremals that are no
-minima.
+``indirect_method`` has ``pontryagin``; read it first, then ``boundary_value`` for the equations, which ``collocation``
+solves. ``arguments`` checks the arguments. ``initial_guess`` and ``equilibria`` construct the initial guess,
+``continuation`` solves from it, and ``switching`` does so for controls that jump. ``necessary_conditions`` reports how
+well the conditions are met and gives advice after a failure. ``second_order`` detects extremals that are not minima.
 """

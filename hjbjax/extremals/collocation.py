@@ -1,11 +1,11 @@
-"""Collocation of a boundary-value problem by SciPy, in units of its own, and the exact slopes of its equations.
+"""Collocation of a boundary-value problem by SciPy in scaled units, with exact derivatives of its equations.
 
-Its tolerances are absolute: a length of 1e-9 is below every one, and one of 1e9 has no digits left for it. Sizes near
-one keep their unit; others are measured along the guess, in powers of two, which round nothing.
+SciPy's tolerances are absolute: a length of 1e-9 is below every tolerance, and a length of 1e9 cannot meet any. Sizes
+near one keep their unit. Other sizes are measured along the guess and rounded to powers of two, which are exact.
 
-A cost such as θ² on [−π, π) is continuous at the seam, and so are the costate and H, but ṗ jumps there; a collocation
-across it crowds its mesh at that place and comes no further. With an arc for every turn, each in the coordinates of the
-box, and the times of crossing sought (x_i = its end of the axis), everything is smooth on an arc again.
+A cost such as θ² on [−π, π) is continuous at the seam of the axis, and so are the costate and H, but ṗ jumps. A
+collocation across the seam refines its mesh there without end. The remedy is one arc per turn, in the coordinates of
+the box, with unknown crossing times and the condition x_i = end of the axis. Every arc is then smooth.
 """
 
 import dataclasses
@@ -24,15 +24,15 @@ from hjbjax.solution.clock import Stopped
 if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
 
-FEWEST = 64  # columns to which meshes are padded, and twice as many from there on: few shapes, few compilations
-ORDINARY = 1e3  # a size up to so far from one, on either side, has the tolerance as it is
-ROUNDING = 1e-12  # a state that moves so little, relative to how far it could, is at rest up to rounding
-BUDGET = 16  # controls that tell what moves, and costs, where the guess stands still
-FINE = 4001  # samples in which a guess is looked through for crossings
-NODES = 33  # of an arc's first mesh
+FEWEST = 64  # width to which meshes are padded; wider meshes double it, so that few shapes are compiled
+ORDINARY = 1e3  # sizes between 1/ORDINARY and ORDINARY are not scaled
+ROUNDING = 1e-12  # relative motion of a state that counts as rest
+BUDGET = 16  # number of controls that show the size of motion and cost if the guess does not move
+FINE = 4001  # number of samples in which a guess is searched for crossings
+NODES = 33  # initial number of mesh nodes per arc
 
-# Exact slopes: SciPy's differences take k·(2n+1) evaluations of the right-hand side, and have half of the digits.
-# vmapped over the nodes of the mesh, the last axis of y.
+# Exact derivatives, because SciPy's finite differences take k·(2n+1) evaluations and have half of the digits. The
+# functions are vmapped over the nodes of the mesh, the last axis of y.
 _rates = jax.jit(jax.vmap(rates, (None, 0, 1, None), 1))
 _slopes = jax.jit(jax.vmap(jax.jacfwd(rates, (2, 3)), (None, 0, 1, None), 2))
 _conditions = jax.jit(conditions)
@@ -42,21 +42,21 @@ _condition_slopes = jax.jit(jax.jacfwd(conditions, (1, 2, 3)))
 def on_mesh(
     bvp: BoundaryValueProblem, s: np.ndarray, y: np.ndarray, theta: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """dy/ds at every node, shape (k·(2n+1), len(s)), and its slopes in y and in theta, with the nodes last."""
+    """dy/ds at every node, shape (k·(2n+1), len(s)), and its derivatives by y and by theta, with the nodes last."""
     padded = (bvp, *pad_mesh(s, y), theta)
     value, (by_state, by_theta) = np.asarray(_rates(*padded)), map(np.asarray, _slopes(*padded))
     return value[..., : len(s)], by_state[..., : len(s)], by_theta[..., : len(s)]
 
 
 def at_ends(bvp: BoundaryValueProblem, y: np.ndarray, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Slopes of the conditions in the first column, the last one and theta."""
+    """Derivatives of the conditions by the first column, the last column and theta."""
     by_first, by_last, by_theta = map(np.asarray, _condition_slopes(bvp, y[:, 0], y[:, -1], theta))
     return by_first, by_last, by_theta
 
 
 def pad_mesh(s: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The mesh and its columns with the last one repeated, up to the next width that is compiled for."""
-    # repeated and not zero: drift and cost need not be defined at the origin
+    """The mesh and its columns, padded by repeating the last column to the next compiled width."""
+    # repeated instead of zero, because drift and cost may be undefined at the origin
     width = FEWEST
     while width < len(s):
         width *= 2
@@ -65,23 +65,23 @@ def pad_mesh(s: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def collocate(bvp: BoundaryValueProblem, s: Array, y: Array, theta: Array, limits: Limits) -> "OptimizeResult":
-    """SciPy's answer from a first guess, with the ``units`` of its rows; float64 has to be on.
+    """SciPy's result from an initial guess, with the ``units`` of its rows; requires float64 mode.
 
-    Every call of the right-hand side looks at the clock; ``Stopped`` brings the last iterate along, (s, y, theta).
+    Every evaluation checks the clock. ``Stopped`` carries the last iterate (s, y, theta).
 
     Args:
       bvp: the boundary-value problem.
-      s: the first mesh on [0, 1].
-      y: the first guess on it, shape (k·(2n+1), len(s)).
-      theta: the first guess of what else is sought.
-      limits: how far to go.
+      s: the initial mesh on [0, 1].
+      y: the initial guess on it, shape (k·(2n+1), len(s)).
+      theta: the initial guess of the unknown parameters.
+      limits: the limits of the solve.
     """
     from scipy.integrate import solve_bvp
 
-    arrays = jax.tree.map(jnp.asarray, bvp)  # once, and not in every call: leaves that are NumPy's are copied each time
+    arrays = jax.tree.map(jnp.asarray, bvp)  # once, because NumPy leaves are copied to the device in every call
     nothing = np.zeros(0)
     last = (np.asarray(s), np.asarray(y), np.asarray(theta))
-    with np.errstate(all="ignore"):  # a guess may lie where drift and cost are not defined
+    with np.errstate(all="ignore"):  # drift and cost may be undefined along the guess
         mesh, guess, sought = last
         slopes = np.asarray(_rates(arrays, *pad_mesh(mesh, guess), sought))[:, : len(mesh)]
         missed = np.asarray(_conditions(arrays, guess[:, 0], guess[:, -1], sought))
@@ -91,14 +91,14 @@ def collocate(bvp: BoundaryValueProblem, s: Array, y: Array, theta: Array, limit
     def function(s, y, theta=nothing):
         nonlocal last
         y = y * column
-        if s[0] == 0 and s[-1] == 1:  # else between the nodes of the mesh
+        if s[0] == 0 and s[-1] == 1:  # the mesh itself, not the points between its nodes
             last = (np.array(s), np.array(y), np.array(theta))
         limits.clock.look()
         return np.asarray(_rates(arrays, *pad_mesh(s, y), theta))[:, : len(s)] / column
 
     def function_slopes(s, y, theta=nothing):
         limits.clock.look()
-        # copies: SciPy adds to the slopes at the middles of the mesh in place, and arrays of JAX are read-only
+        # copies, because SciPy modifies the derivatives in place, and JAX arrays are read-only
         by_state, by_theta = _slopes(arrays, *pad_mesh(s, y * column), theta)
         by_state = np.array(by_state)[..., : len(s)] * (unit / column)[..., None]
         by_theta = np.array(by_theta)[..., : len(s)] / column[..., None]
@@ -114,7 +114,7 @@ def collocate(bvp: BoundaryValueProblem, s: Array, y: Array, theta: Array, limit
         return parts if len(theta) else parts[:2]
 
     try:
-        with np.errstate(all="ignore"):  # what is not finite is looked for in the answer
+        with np.errstate(all="ignore"):  # attempt() checks the result for NaN and infinity
             result = solve_bvp(
                 function, ends, s, y / column, p=theta if len(theta) else None, fun_jac=function_slopes,
                 bc_jac=end_slopes, tol=limits.tol, max_nodes=limits.max_nodes,
@@ -133,8 +133,8 @@ def units_of(
     Args:
       bvp: the boundary-value problem.
       y: the guess.
-      slopes: its dy/ds.
-      missed: the residuals of its conditions.
+      slopes: dy/ds of the guess.
+      missed: the residuals of the conditions.
       theta: the guess of the durations and ν.
     """
     n, arrays = bvp.n, jax.tree.map(jnp.asarray, bvp)
@@ -143,12 +143,12 @@ def units_of(
     given = [bvp.start, np.where(bvp.held, bvp.ends, 0)] + ([] if bvp.rest is None else [bvp.rest.state])
     lengths, cost = np.max(np.abs([seen[:n], *given]), axis=0), seen[-1]
     target, timed = bvp.closing is Closing.TARGET, bvp.free or bvp.count > 1
-    # before l, and H or the time: what the guess lacks of the cost at the end
+    # the residual of the end cost; the residuals of l, and of H or the time, come after it
     cost = max(cost, abs(missed[len(missed) - 1 - target - timed]))
     if min(np.min(lengths), cost) < 1 / ORDINARY:
         moved, spent = (horizon * np.asarray(part) for part in _reach(arrays))
         lengths = np.where(lengths > ROUNDING * moved, lengths, moved)
-        cost = cost if cost > ROUNDING**2 * spent else spent  # costs are squares of what moves
+        cost = cost if cost > ROUNDING**2 * spent else spent  # squared, because costs are quadratic in the motion
     x, c, t = (_unit(part) for part in (lengths, cost, horizon))
     column = np.concatenate([x, c / x, c[None]])
     closing = np.where(bvp.held, x, c / x) if bvp.closing is Closing.STATE else c / x
@@ -156,7 +156,7 @@ def units_of(
     joints += [x[list(bvp.seams)]] if bvp.places is not None else [np.full(bvp.count - 1, c / t)]
     ends = [closing, c[None]]
     if target:
-        # at the start: a guess may end on the edge to the last digit
+        # l at the start, because a guess may end exactly on the boundary
         ends.append(_unit(abs(float(arrays.level(0.0, arrays.start))))[None])
     if timed:
         ends.append(np.asarray(c / t if bvp.free else t)[None])
@@ -164,7 +164,7 @@ def units_of(
 
 
 def _unit(size: np.ndarray | float) -> np.ndarray:
-    """One for an ordinary size, or none; else the size, to a power of two."""
+    """One for an ordinary or unknown size, otherwise the size rounded to a power of two."""
     ordinary = (np.asarray(size) >= 1 / ORDINARY) & (np.asarray(size) <= ORDINARY)
     known = np.isfinite(size) & (np.asarray(size) > 0) & ~ordinary
     return np.asarray(2.0 ** np.round(np.log2(np.where(known, size, 1.0))))
@@ -184,10 +184,10 @@ def _reach(bvp: BoundaryValueProblem) -> tuple[Array, Array]:
 def split_at_seams(
     bvp: BoundaryValueProblem, times: np.ndarray, columns: np.ndarray
 ) -> tuple[BoundaryValueProblem, np.ndarray, np.ndarray, np.ndarray] | None:
-    """The boundary-value problem in arcs, their mesh, the guess on it, and their durations; None without a crossing.
+    """Split the problem into arcs at the seams: problem, mesh, guess and durations; None if there is no crossing.
 
     Args:
-      bvp: with one arc, and a grid where it has periodic axes.
+      bvp: a problem with one arc, and a grid if it has periodic axes.
       times: increasing from 0.
       columns: the guess (x, p, w) at these times.
     """
@@ -196,11 +196,11 @@ def split_at_seams(
     cyclic, fine = np.array(bvp.grid.periodic), np.linspace(0, times[-1], FINE)
     lo, period = np.asarray(bvp.grid.lo), np.asarray(bvp.grid.hi) - np.asarray(bvp.grid.lo)
     states = np.stack([np.interp(fine, times, row) for row in columns[: bvp.n]], axis=-1)
-    # the number of whole periods that each unwound state is away from the box, shape (FINE, n)
+    # the number of periods by which each unwound state is outside the box, shape (FINE, n)
     turns = np.where(cyclic, np.floor((states - lo) / period), 0)
     at = 1 + np.flatnonzero(np.any(np.diff(turns, axis=0) != 0, axis=1))
     steps = turns[at] - turns[at - 1]
-    # two seams within one sample, or a seam jumped over twice, have no order that the guess could tell
+    # the order of crossings is unknown if a sample crosses two seams, or one seam twice
     if not len(at) or np.any(np.sum(np.abs(steps), axis=1) != 1):
         return None
     axes = np.argmax(np.abs(steps), axis=1)
@@ -212,13 +212,13 @@ def split_at_seams(
         np.stack([np.interp(begin + s * length, times, row) for row in columns])
         for begin, length in zip(starts, lengths, strict=True)
     ]
-    # into the box: costates and cost to go are the same in every period, states are shifted
+    # shift the states into the box; costates and cost to go are the same in every period
     for piece, shift in zip(pieces, shifts, strict=True):
         piece[: bvp.n] -= shift[:, None]
     rest = bvp.rest and dataclasses.replace(bvp.rest, state=bvp.rest.state - shifts[-1])
     apart = dataclasses.replace(
         bvp,
-        grid=None,  # an iterate may overshoot the seam a little: there the drift goes on smoothly, unwrapped
+        grid=None,  # an iterate may overshoot the seam slightly, and the unwrapped drift is smooth there
         start=bvp.start - shifts[0],
         ends=bvp.ends - np.where(bvp.held, shifts[-1], 0),
         rest=rest,

@@ -1,9 +1,9 @@
-"""Solving the boundary-value problem of an extremal whose control is continuous: at once, or by continuation.
+"""Solve the boundary-value problem of an extremal with a continuous control, directly or by continuation.
 
-The collocation starts from the guess; if that fails, from easier problems on the way: starts nearer to the rest of an
-infinite horizon, shorter horizons, or given final times where one is sought; and then from the path under a constant
-control. An infinite horizon is lengthened until the path has settled. What comes back is held against the necessary
-conditions before it counts as converged.
+The collocation starts from the initial guess. If it fails, it starts from the solution of easier problems: a start
+closer to the rest point of an infinite horizon, a shorter horizon, or a prescribed final time instead of a free one.
+The last attempt starts from the path under a constant control. An infinite horizon is extended until the path has
+settled. A solution is checked against the necessary conditions before it counts as converged.
 """
 
 import dataclasses
@@ -20,33 +20,33 @@ from hjbjax.problem.types import Array, Number, State
 from hjbjax.solution.clock import CUT, Stopped
 from hjbjax.solution.status import Status
 
-SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)  # of the way, in a continuation
-SPANS = (1.0, 2.0, 0.5, 4.0)  # given final times over the guess of a free one
-HUGE = 1e6  # times the guess: what grows so much has no limit
-SETTLED = 1e-3  # how far from a rest its quadratic value is trusted, relative to x₀; what is left is its cube
-STILL = 1e-10  # the square of a distance from a rest, over that of x₀ and x̄ from 0, that is none
-LONGER, EXTENSIONS = 1.5, 6  # factor, and how often, an infinite horizon is lengthened
-GAP = 1e-6  # by how much the Hamiltonian may miss its minimum, relative to its terms
+SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)  # steps of the continuation
+SPANS = (1.0, 2.0, 0.5, 4.0)  # prescribed final times over the guess of a free one
+HUGE = 1e6  # times the guess: a solution that grows so much has diverged
+SETTLED = 1e-3  # distance to rest relative to x₀ at which the quadratic value is trusted; its error is cubic
+STILL = 1e-10  # squared distance to rest, relative to |x₀|² and |x̄|², that counts as zero
+LONGER, EXTENSIONS = 1.5, 6  # factor and maximal number of extensions of an infinite horizon
+GAP = 1e-6  # tolerance for the excess of the Hamiltonian over its minimum, relative to its terms
 ENDINGS = {1: Status.MAX_STEPS, 2: Status.DIVERGED, 3: Status.STALLED}
 ADVICE = {
     Status.MAX_STEPS: "the mesh reached max_nodes; raise max_nodes, loosen tol, or give a better guess",
-    Status.DIVERGED: "its Jacobian became singular: no extremal near the guess, or none that meets the end conditions",
+    Status.DIVERGED: "its Jacobian became singular: there is no extremal near the guess that meets the end conditions",
     Status.STALLED: "the end conditions cannot be met to tol; give another guess",
-    Status.NONFINITE: "NaN or infinity on the way; look at drift, cost and terminal there, or give a better guess",
+    Status.NONFINITE: "NaN or infinity occurred; check drift, cost and terminal there, or give a better guess",
 }
 
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """The last iterate of a boundary-value problem and how its solve ended.
+    """The last iterate of a boundary-value problem, and how its solve ended.
 
     Args:
       bvp: the boundary-value problem.
       s: the mesh on [0, 1].
-      y: (x, p, w) of all arcs on it, shape (k·(2n+1), len(s)).
-      theta: the durations, if they are sought, and ν.
-      code: how it ended.
-      trouble: why it was not solved, in words; empty where it was.
+      y: (x, p, w) of all arcs on the mesh, shape (k·(2n+1), len(s)).
+      theta: the unknown parameters: durations, and ν.
+      code: the status.
+      trouble: the reason for a failure, in words; empty if solved.
     """
 
     bvp: BoundaryValueProblem
@@ -58,12 +58,12 @@ class Outcome:
 
     @property
     def solved(self) -> bool:
-        """Whether the collocation converged."""
+        """True if the collocation converged."""
         return self.code is Status.CONVERGED
 
     @property
     def times(self) -> np.ndarray:
-        """The mesh in units of time, of one arc."""
+        """The mesh in units of time, for one arc."""
         return self.s * self.horizon
 
     @property
@@ -78,23 +78,23 @@ class Outcome:
 
 
 def attempt(bvp: BoundaryValueProblem, s: Array, y: Array, theta: Array, limits: Limits) -> Outcome:
-    """One collocation, its ending in our words; ``Stopped`` brings along what was found by then."""
+    """Run one collocation and translate its status; ``Stopped`` carries the last iterate."""
     guess = np.asarray(theta, float)
     try:
         result = collocate(bvp, s, y, guess, limits)
     except Stopped as stop:
         mesh, last, sought = stop.reached
         raise Stopped(stop.status, Outcome(bvp, mesh, last, sought, stop.status)) from None
-    # None is SciPy's answer where no number is sought
+    # SciPy returns None if there are no unknown parameters
     sought = np.zeros(0) if result.p is None else result.p
     code = Status.CONVERGED if result.success else ENDINGS[result.status]
     if not (np.all(np.isfinite(result.y)) and np.all(np.isfinite(sought))):
         code = Status.NONFINITE
     elif np.max(np.abs(result.y / result.units)) > HUGE * (1 + np.max(np.abs(y / result.units))):
-        code = Status.DIVERGED  # a jump sharper than the mesh can look like a solution
+        code = Status.DIVERGED  # a jump that the mesh cannot resolve may look like a solution
     trouble = "" if code is Status.CONVERGED else f"the boundary-value problem was not solved: {ADVICE[code]}"
     found = Outcome(bvp, result.x, result.y, sought, code, trouble)
-    # run backwards, an extremal may meet its end conditions as well; ``not >`` refuses NaN, too
+    # an extremal with negative time may meet its end conditions as well; ``not >`` catches NaN, too
     if found.solved and not found.horizon > 0:
         return dataclasses.replace(
             found, code=Status.DIVERGED, trouble=f"the final time came out as {found.horizon:.3g}; give a better guess"
@@ -103,7 +103,7 @@ def attempt(bvp: BoundaryValueProblem, s: Array, y: Array, theta: Array, limits:
 
 
 def carry_on(found: Outcome, limits: Limits) -> None:
-    """Look at the clock with something to hand back: between two programs that have to be compiled."""
+    """Check the clock between two programs that need compilation; ``Stopped`` carries the outcome."""
     code = limits.clock.over()
     if code is not None:
         raise Stopped(code, dataclasses.replace(found, code=code))
@@ -112,22 +112,22 @@ def carry_on(found: Outcome, limits: Limits) -> None:
 def smooth(
     bvp: BoundaryValueProblem, times: np.ndarray, columns: np.ndarray, limits: Limits, *, trusted: bool
 ) -> Outcome:
-    """The extremal of a Hamiltonian whose minimiser is continuous.
+    """Solve for the extremal of a Hamiltonian whose minimiser is continuous.
 
     Args:
       bvp: the boundary-value problem.
       times: increasing from 0.
       columns: the guess at these times, shape (2n+1, len(times)).
-      limits: how far to go.
-      trusted: whether the guess is of the very problem, so that easier ones would lead away from it.
+      limits: the limits of the solve.
+      trusted: True if the user gave the guess, so that easier problems would lead away from it.
     """
     apart = split_at_seams(bvp, times, columns)
     if apart is not None:
-        # ν alone: in place of one final time, if it is sought, there are the durations of all arcs
+        # keep only ν, because the durations of all arcs replace a free final time
         multiplier = unknowns(bvp, times, columns)[int(bvp.timed) :]
         return _refuse_unsettled(attempt(*apart[:3], np.append(apart[3], multiplier), limits))
     found = _attempt_by_times(bvp, times, columns, limits, trusted=trusted)
-    # the direct attempt first: a continuation costs up to five solves
+    # the direct attempt comes first, because a continuation costs up to five solves
     if not found.solved and not trusted:
         found = _by_continuation(found, limits)
     reaching = bvp.closing in (Closing.STATE, Closing.TARGET) and not trusted
@@ -144,10 +144,10 @@ def smooth(
 def _attempt_by_times(
     bvp: BoundaryValueProblem, times: np.ndarray, columns: np.ndarray, limits: Limits, *, trusted: bool
 ) -> Outcome:
-    """One collocation from a guess; if it fails with an end to be met, from those with other, given final times.
+    """Run one collocation from a guess; if it fails, start from solutions with prescribed final times.
 
-    With a given time the costate is determined even where it is far off, as in linear equations; the condition of a
-    free one has no slope under a costate of zero.
+    With a prescribed time the costate is determined even from a bad guess, as in linear equations. The condition of a
+    free time has no slope at a zero costate.
     """
     s, failed = times / times[-1], attempt(bvp, times / times[-1], columns, unknowns(bvp, times, columns), limits)
     if failed.solved or trusted or not (bvp.free or bvp.closing is Closing.STATE):
@@ -165,7 +165,7 @@ def _attempt_by_times(
 
 
 def unknowns(bvp: BoundaryValueProblem, times: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """First guesses of the final time and of ν, whatever the guess makes of p(T) = ψ_x + ν l_x."""
+    """Initial guesses of the final time and of ν; ν fits p(T) = ψ_x + ν l_x to the guess."""
     theta = [times[-1]] * bvp.timed
     if bvp.closing is Closing.TARGET:
         theta.append(float(_multiplier(bvp, times[-1], columns[:, -1])))
@@ -174,31 +174,31 @@ def unknowns(bvp: BoundaryValueProblem, times: np.ndarray, columns: np.ndarray) 
 
 @jax.jit
 def _multiplier(bvp: BoundaryValueProblem, t: Number, z: Array) -> jax.Array:
-    """The ν by which p − ψ_x − ν l_x is least at the end of a guess."""
+    """The ν that minimises |p − ψ_x − ν l_x| at the end of a guess."""
     x, p, _ = bvp.split(z)
     slope, normal = jax.grad(bvp.psi, 1)(t, x), jax.grad(bvp.level, 1)(t, x)
-    # a target's function may be flat, or not differentiable, at an end that is not on its edge: then ν = 0
+    # at an end off the boundary of the target, l may be flat or not differentiable: then ν = 0
     return jnp.nan_to_num((p - slope) @ normal / jnp.maximum(normal @ normal, 1e-300))
 
 
 def _by_continuation(failed: Outcome, limits: Limits) -> Outcome:
-    """The problem's solution by way of easier ones; the failure itself where there are none, or they fail, too."""
+    """Solve the problem through a sequence of easier ones; return the failure if there are none or if they fail."""
     bvp = failed.bvp
-    # given end states and targets have no easier problem that surely has a solution: less time may be too little
+    # prescribed end states and targets have no easier problem that always has a solution: less time may be too little
     if bvp.closing not in (Closing.REST, Closing.COST) or bvp.free:
         return failed
     found = None
     for share in SHARES:
         last = share == 1
-        if bvp.closing is Closing.REST:  # near the rest the Riccati costate is right up to the square of the distance
+        if bvp.closing is Closing.REST:  # near rest the error of the Riccati costate is quadratic in the distance
             assert bvp.rest is not None
             start = bvp.rest.state + share * (bvp.start - bvp.rest.state)
             easier = dataclasses.replace(bvp, start=start)
             times, columns = initial_guess.into_rest(easier, start, float(bvp.horizon), limits.clock)
-        else:  # over a short horizon the costate hardly leaves ψ_x, of which the line's is made
+        else:  # over a short horizon the costate stays close to ψ_x, the costate of the line
             easier = dataclasses.replace(bvp, horizon=share * bvp.horizon)
             times, columns = initial_guess.straight_line(easier, float(easier.horizon))
-        # on s ∈ [0, 1] the last solution is a guess of the next one as it is
+        # on s ∈ [0, 1] the last solution is directly a guess for the next one
         s, y = (times / times[-1], columns) if found is None else (found.s, found.y)
         found = attempt(easier, s, y, np.zeros(0), limits if last else limits.rough)
         if not found.solved:
@@ -207,51 +207,51 @@ def _by_continuation(failed: Outcome, limits: Limits) -> Outcome:
 
 
 def _refuse_unsettled(found: Outcome) -> Outcome:
-    """The outcome, as a failure where an infinite horizon has not come near its rest."""
+    """Turn the outcome into a failure if an infinite horizon has not settled at its rest point."""
     bvp = found.bvp
     last = found.y.reshape(bvp.count, -1, len(found.s))[-1, : bvp.n, -1]
     if bvp.closing is not Closing.REST or not found.solved or _is_near_rest(bvp, last):
         return found
-    trouble = f"the path has not settled at its rest by t = {found.horizon:.3g}; give another guess"
+    trouble = f"the path has not settled at its rest point by t = {found.horizon:.3g}; give another guess"
     return dataclasses.replace(found, code=Status.STALLED, trouble=trouble)
 
 
 def _is_near_rest(bvp: BoundaryValueProblem, last: State) -> bool:
-    """Whether the last state is so near to the rest that its quadratic value may be trusted."""
+    """True if the last state is so near the rest point that its quadratic value can be trusted."""
     rest = bvp.rest
     assert rest is not None
-    # distances by the value itself: lengths and speeds have no common unit, and what does not cost does not matter
+    # measure distances by the value, because states have different units, and states without cost do not matter
     begun, left, far = bvp.start - rest.state, last - rest.state, np.abs(bvp.start) + np.abs(rest.state)
     size = abs(begun @ rest.matrix @ begun) + STILL * (far @ np.abs(rest.matrix) @ far)
     return bool(abs(left @ rest.matrix @ left) <= SETTLED**2 * size)
 
 
 def _lengthen(found: Outcome, limits: Limits) -> Outcome:
-    """The outcome of an infinite horizon, lengthened until the path is near enough to its rest."""
+    """Extend an infinite horizon until the path is near its rest point."""
     for _ in range(EXTENSIONS):
         bvp = found.bvp
         last = found.y[: bvp.n, -1]
         if _is_near_rest(bvp, last) or not found.solved:
             return found
         more = float(bvp.horizon) * (LONGER - 1)
-        # the path so far, and from its end the loop under the Riccati costate
+        # append the closed loop under the Riccati costate to the path
         times, columns = initial_guess.into_rest(bvp, last, more, limits.clock)
         longer = dataclasses.replace(bvp, horizon=float(bvp.horizon) * LONGER)
         t = np.concatenate([found.times, float(bvp.horizon) + times[1:]])
         found = attempt(longer, t / t[-1], np.concatenate([found.y, columns[:, 1:]], 1), np.zeros(0), limits)
-    trouble = f"the path has not settled at its rest by t = {found.horizon:.3g}; give horizon, or rest="
+    trouble = f"the path has not settled at its rest point by t = {found.horizon:.3g}; give horizon=, or rest="
     return found if not found.solved else dataclasses.replace(found, code=Status.STALLED, trouble=trouble)
 
 
 def report(found: Outcome) -> Extremal:
-    """The extremal, held against the necessary conditions; not so the last iterate of a run that was cut short."""
+    """The extremal, checked against the necessary conditions unless the run was cut short."""
     if found.code in CUT:
         return last_iterate(found.bvp, found.s, found.y, found.lengths, found.code)
     extremal = assemble(found.bvp, found.s, found.y, found.theta, found.code, found.trouble)
     check = extremal.optimality_check
     if not found.solved:
         return dataclasses.replace(extremal, message=found.trouble + necessary_conditions.way_out(found.bvp))
-    # durations are sought without a sign, and an arc run backwards meets all equations
+    # durations have no sign constraint, and an arc with negative duration meets all equations
     if np.min(found.lengths) < -GAP * found.horizon:
         missed = "an arc came out with a negative duration; give another guess"
         return dataclasses.replace(extremal, code=int(Status.STALLED), message=missed)
@@ -259,12 +259,12 @@ def report(found: Outcome) -> Extremal:
     if entered is not None:
         missed = _entry(found.bvp, entered)
         return dataclasses.replace(extremal, code=int(Status.STALLED), message=missed)
-    # Pontryagin's principle wants the global minimum, and a search may have followed a local one
+    # Pontryagin's principle requires the global minimum, but a search may have found a local one
     if not check.gap <= GAP * check.scale:
-        missed = f"the Hamiltonian misses its minimum by {check.gap:.3g}: no extremal; give another guess"
+        missed = f"the Hamiltonian exceeds its minimum by {check.gap:.3g}, so it is not an extremal; give another guess"
         return dataclasses.replace(extremal, code=int(Status.STALLED), message=missed)
     if found.bvp.closing is Closing.TARGET and only_touches(found.bvp, found.s, found.y, np.asarray(found.theta)):
-        grazed = "an extremal, not a minimum: it touches the edge of the target and does not enter; give another guess"
+        grazed = "an extremal, not a minimum: it touches the target without entering it; give another guess"
         return dataclasses.replace(extremal, code=int(Status.STALLED), message=grazed)
     worse = second_order.verdict(found.bvp, found.s, found.y, np.asarray(found.theta), float(check.scale))
     if worse:
@@ -276,7 +276,7 @@ def report(found: Outcome) -> Extremal:
 
 
 def _entry(bvp: BoundaryValueProblem, time: float) -> str:
-    """The verdict on a path that enters the target before its end."""
+    """The message for a path that enters the target before its end."""
     if bvp.closing is Closing.TARGET:
         return (
             f"the path crosses the target before its end, at t = {time:.4g}, where it would have stopped; "
@@ -284,5 +284,5 @@ def _entry(bvp: BoundaryValueProblem, time: float) -> str:
         )
     return (
         f"the path enters the problem's target at t = {time:.4g}, where it would have stopped; give another guess, or "
-        "leave the target out: dataclasses.replace(problem, target=None, exit_cost=None)"
+        "remove the target: dataclasses.replace(problem, target=None, exit_cost=None)"
     )

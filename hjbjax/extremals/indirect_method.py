@@ -1,10 +1,10 @@
-"""Extremals: paths that meet Pontryagin's necessary conditions, by ``pontryagin``.
+"""Extremals, paths that meet Pontryagin's necessary conditions, by ``pontryagin``.
 
-The boundary-value problem and what closes it are in ``boundary_value``, the pointwise minimum in ``pointwise``, the
-rest of an infinite horizon in ``equilibria``. SciPy's ``solve_bvp`` solves it by collocation of order 4 on a mesh of
-its own, to a relative residual below ``tol``. An extremal is a candidate: its path is admissible, so its cost bounds
-the value from above, and the value is that of the best one. A path that enters the problem's target on its way would
-have stopped there and is no answer: for the problem without its target give
+``boundary_value`` has the boundary-value problem and its end conditions, ``pointwise`` the minimum over u, and
+``equilibria`` the rest point of an infinite horizon. SciPy's ``solve_bvp`` solves the problem by collocation of order 4
+on an adaptive mesh, to a relative residual below ``tol``. An extremal is a candidate. Its path is admissible, so its
+cost is an upper bound of the value; the value is the cost of the best extremal. A path that enters the problem's target
+before its end is rejected, because the run would have stopped there. To solve the problem without its target, pass
 ``dataclasses.replace(problem, target=None, exit_cost=None)``.
 """
 
@@ -28,21 +28,21 @@ from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
 from hjbjax.tracing import checks, closures
 
-SETTLED = 12.0  # time constants of the loop near a rest that an infinite horizon is followed: what is left is e⁻¹²
-WAYS = 4  # ends that are tried where angles can go to rest on either side
-AT_REST = 1e-6  # of a period: an angle no further from its rest has one way there
-LONGEST = 20.0  # units of time that the loop of a solution is followed to a target without a guess of the time
+SETTLED = 12.0  # length of an infinite horizon in time constants of the loop near rest; the remainder is e⁻¹²
+WAYS = 4  # maximal number of ends that are tried if angles can come to rest on either side
+AT_REST = 1e-6  # fraction of a period: an angle closer to rest has only one way there
+LONGEST = 20.0  # units of time for simulating the guess to a target if no time is given
 
 
 @pytree_dataclass()
 class FreeTime:
-    """A final time that is sought.
+    """A free final time, determined by ``pontryagin``.
 
     Args:
-      guess: where the search starts, in units of time.
+      guess: the initial guess, in units of time.
 
     Raises:
-      ValueError: the guess is not a positive number.
+      ValueError: the guess is not a positive finite number.
     """
 
     guess: Number = 1.0
@@ -66,40 +66,41 @@ def pontryagin(
     max_nodes: int = 5000,
     throw: bool = True,
 ) -> Extremal:
-    """The extremal from ``x0`` near a first guess, in float64.
+    """Solve for the extremal from ``x0`` near an initial guess, in float64.
 
         ẋ = f(t, x, u),  ṗ = βp − H_x(t, x, p, u),  u = argmin of H = L + f·p over the admissible set
 
-    Collocation of order 4. Where H is affine in an input of a box, or the controls are enumerated, u jumps: the order
-    of its values is found with smoothed jumps, and the switching times then like any other unknown.
+    The method is collocation of order 4. If H is affine in an input of a box, or if the controls are enumerated, then u
+    jumps. In this case smoothing finds the order of the values, and the switching times are additional unknowns.
 
     Args:
-      problem: deterministic, with one player, and neither ``stopping_cost`` nor ``running_max``.
-      x0: the state at time 0, shape (n,), outside of the target.
+      problem: deterministic, with one player, and without ``stopping_cost`` and ``running_max``.
+      x0: the state at time 0, shape (n,), outside the target.
 
     Keyword Args:
-      horizon: the final time; ``FreeTime(guess)`` where it is sought. ``None``: free if the problem has a target or
-        ``terminal`` gives states, otherwise infinite, closed by the Riccati costate of a rest.
-      terminal: how the path ends: an array (n,) of end states, NaN for those that are free; or a function ψ, paid at
-        the end in place of ``terminal_cost``. ``None``: without a horizon on the target, with ``exit_cost``. The
-        problem's target ends the path all the same: end states within it need a problem without.
-      guess: a Solution, whose closed loop and DV are the first guess, or another extremal. ``None``: a line to the end
-        states or to the target, the loop under the Riccati costate, or a path under a constant control.
-      rest: a state near the rest of an infinite horizon; ``None``: the least node of a Solution, else the origin.
-      grid: its periodic axes are wrapped before the problem sees a state; a Solution brings its own. Without a guess
-        and without ``rest`` an angle is brought to rest either way round, and the cheaper one is the answer.
-      tol: on the relative residual of the differential equations, and on the conditions at the ends.
-      max_nodes: of the mesh; each iteration of the solver costs as much as it has.
-      throw: whether a failure raises.
+      horizon: the final time, or ``FreeTime(guess)`` to determine it. With ``None`` it is free if the problem has a
+        target or ``terminal`` prescribes states, and infinite otherwise, with the Riccati costate of a rest point.
+      terminal: the end of the path: an array (n,) of end states, NaN for free states, or a function ψ that replaces
+        ``terminal_cost``. With ``None`` and without a horizon the path ends on the target and pays ``exit_cost``.
+        The target ends the path in any case, so end states inside it require a problem without a target.
+      guess: a Solution, whose closed loop and DV are the initial guess, or another extremal. ``None``: a line to the
+        end states or to the target, the closed loop under the Riccati costate, or a path under a constant control.
+      rest: a state near the rest point of an infinite horizon. ``None``: the minimum of a Solution, or the origin.
+      grid: a grid whose periodic axes are wrapped before the problem sees a state; a Solution brings its own grid.
+        Without ``guess`` and ``rest``, angles are brought to rest in both directions and the cheaper path is returned.
+      tol: bound on the relative residual of the differential equations and of the conditions at the ends.
+      max_nodes: maximal number of mesh nodes; the cost per iteration is proportional to the number of nodes.
+      throw: raise an error after a failure.
 
     Returns:
-      An Extremal; with ``throw=False`` its ``status`` and ``message`` tell how a failed solve ended.
+      An Extremal. With ``throw=False``, ``status`` and ``message`` report how a failed solve ended.
 
     Raises:
-      SolveError: the boundary-value problem was not solved; ``.solution`` is the Extremal so far. After Ctrl-C that
-        is the last iterate, without controls; None, whatever ``throw`` says, on the way to a first guess.
-      ValueError: an argument that is not admissible.
-      TypeError: a guess, a horizon or a terminal condition of another kind.
+      SolveError: the boundary-value problem was not solved; ``.solution`` is the last Extremal. After Ctrl-C it is the
+        last iterate, without controls. If Ctrl-C comes before the initial guess is ready, ``.solution`` is None and the
+        error is raised even with ``throw=False``.
+      ValueError: an argument is not admissible.
+      TypeError: a guess, a horizon or a terminal condition has the wrong type.
 
     Example:
       >>> import jax.numpy as jnp
@@ -110,10 +111,10 @@ def pontryagin(
       (1.0, [2.0])
     """
     if is_traced(problem, x0, guess, terminal):
-        raise ValueError("pontryagin: got traced values; it runs at the host: call it outside of jit, vmap and grad")
+        raise ValueError("pontryagin: got traced values, but it runs on the host: call it outside jit, vmap and grad")
     arguments.check_problem(problem, tol, max_nodes)
     start = arguments.state_of_numbers(x0, "x0")
-    # checked with ψ in place of the terminal cost, so that a ψ of the wrong shape is refused before anything compiles
+    # check with ψ as the terminal cost, so that a ψ of the wrong shape is refused before anything compiles
     paid = dataclasses.replace(problem, terminal_cost=terminal) if callable(terminal) else problem
     checks.of_one_state(paid, len(start), "the length of x0")
     arguments.check_guess(guess, len(start), horizon)
@@ -123,31 +124,31 @@ def pontryagin(
         terminal = closures.settled_function(terminal, (len(start),))
     clock = Clock()
     limits = Limits(tol, max_nodes, clock)
-    # float64 whatever the session has: a residual of 1e-8 is below the rounding of float32
+    # always float64: a residual of 1e-8 is below the rounding of float32
     with noting_interrupts(clock), own_settings(x64=True):
         try:
             bvp = _pose(problem, start, horizon, terminal, guess.grid if isinstance(guess, Solution) else grid)
             arguments.check_start(bvp)
             if bvp.closing is Closing.REST:
                 begun = [_to_rest(bvp, guess, rest, clock)]
-                if guess is None and rest is None:  # a rest that is given is the one on its side of the circle
+                if guess is None and rest is None:  # a prescribed rest point also prescribes the direction
                     begun = _ways_round(*begun[0], clock)
             else:
                 times, columns = _guess(bvp, guess, horizon)
-                if not bvp.free:  # a loop that reached its end sooner, or an extremal of another horizon
+                if not bvp.free:  # stretch a loop that reached its end sooner, or an extremal of another horizon
                     times = times * (float(bvp.horizon) / times[-1])
                 begun = [(bvp, times, columns)]
             found = _cheapest(begun, limits, trusted=guess is not None)
-            # Ctrl-C after the last evaluation, which is where the clock is looked at
+            # Ctrl-C after the last check of the clock
             if clock.interrupted:
                 raise Stopped(Status.INTERRUPTED, dataclasses.replace(found, code=Status.INTERRUPTED))
             extremal = continuation.report(found)
-            # the report compiles, too: an interrupt meanwhile is told, and the extremal is whole
+            # report compiles as well: an interrupt meanwhile sets the status, but the extremal is complete
             if clock.interrupted:
                 extremal = dataclasses.replace(extremal, code=int(Status.INTERRUPTED))
         except Stopped as stop:
             if stop.reached is None:
-                raise SolveError(f"pontryagin: {stop.status}: on the way to a first guess; there is no path") from None
+                raise SolveError(f"pontryagin: {stop.status} before there was an initial guess or a path") from None
             extremal = continuation.report(stop.reached)
     if throw and extremal.status is not Status.CONVERGED:
         raise SolveError(f"pontryagin: {extremal.status}: {extremal.message}", extremal)
@@ -161,40 +162,40 @@ def _pose(
     terminal: Callable | Array | Sequence[float] | None,
     grid: Grid | None,
 ) -> BoundaryValueProblem:
-    """The boundary-value problem that the arguments of ``pontryagin`` pose, all but its rest."""
+    """The boundary-value problem for the arguments of ``pontryagin``, without its rest point."""
     n = len(start)
     rule = rule_of(problem, n)
     held, ends, final = arguments.end_states(terminal, n)
     closing = Closing.STATE if any(held) else Closing.COST
-    # where the call says neither when nor how the path ends, the problem does: on its target, or never
+    # if the call gives neither horizon nor terminal, the path ends on the target, or never
     if horizon is None and terminal is None:
         closing = Closing.REST if problem.target is None else Closing.TARGET
     free = isinstance(horizon, FreeTime) or (horizon is None and closing is not Closing.REST)
     if free and horizon is None and closing is Closing.COST:
         raise ValueError(
-            "pontryagin: got a terminal cost and no horizon; give horizon=T, or FreeTime(guess) to seek it"
+            "pontryagin: got a terminal cost and no horizon; pass horizon=T, or FreeTime(guess) to determine it"
         )
     if isinstance(horizon, FreeTime) and terminal is None and problem.target is not None:
         closing = Closing.TARGET
     if final is None:
         final = problem.exit_cost if closing is Closing.TARGET else problem.terminal_cost
-    # a rest is one of an autonomous flow, and the Riccati equation divides by H_uu, which is 0 where the control jumps
+    # a rest point needs an autonomous flow, and the Riccati equation divides by H_uu, which is 0 if the control jumps
     if closing is Closing.REST and (problem.time_dependent or rule.jumps):
         why = "depends on time" if problem.time_dependent else "has controls that jump, without a Riccati equation"
-        raise ValueError(f"pontryagin: got no horizon, and the problem {why}; give horizon=, or terminal= end states")
+        raise ValueError(f"pontryagin: got no horizon, and the problem {why}; pass horizon=, or terminal= end states")
     assert problem.controls is not None
     given = None if isinstance(horizon, FreeTime) else horizon
     return BoundaryValueProblem(
         problem=problem,
-        # wrapping is traced into every evaluation, and does nothing without a periodic axis
+        # wrapping is traced into every evaluation, so leave the grid out if no axis is periodic
         grid=grid if grid is not None and any(grid.periodic or ()) else None,
         start=start,
         horizon=0.0 if given is None else arguments.fixed_horizon(given),
         final=final,
         ends=ends,
         rest=None,
-        arcs=np.full((1, problem.controls.dim), np.nan),  # one arc that prescribes no value
-        epsilon=1.0,  # of no meaning before there is a mixture, whose first ε is the size of H
+        arcs=np.full((1, problem.controls.dim), np.nan),  # one arc without a prescribed value
+        epsilon=1.0,  # unused until there is a mixture, whose initial ε is the size of H
         rule=rule,
         law=Law.MINIMUM,
         closing=closing,
@@ -206,14 +207,14 @@ def _pose(
 def _guess(
     bvp: BoundaryValueProblem, guess: Solution | Extremal | None, horizon: Number | FreeTime | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Times and columns (x, p, w) where the solver starts, for a horizon that ends."""
+    """Times and columns (x, p, w) of the initial guess, for a finite horizon."""
     if isinstance(guess, Extremal):
         return initial_guess.from_extremal(bvp, guess)
     long = float(horizon.guess) if isinstance(horizon, FreeTime) else float(bvp.horizon)
-    # a free horizon is 0 in the problem, and without a guess of it the loop says how long it takes
+    # a free horizon without a guess is 0 here; simulate the loop for LONGEST then
     if guess is not None:
         return initial_guess.along_loop(bvp, guess, long or LONGEST)
-    # where the control jumps no costate is to prefer a value
+    # if the control jumps, a zero costate is better because it does not prefer any value
     if bvp.closing is Closing.TARGET and not bvp.rule.jumps:
         found = initial_guess.toward_target(bvp, long or 1.0)
         if found is not None:
@@ -224,13 +225,13 @@ def _guess(
 def _ways_round(
     bvp: BoundaryValueProblem, times: np.ndarray, columns: np.ndarray, clock: Clock
 ) -> list[tuple[BoundaryValueProblem, np.ndarray, np.ndarray]]:
-    """The problem with its rest on either side of x₀ along periodic axes, and where the solver starts for each."""
+    """Problems with the rest point on either side of x₀ along periodic axes, each with its initial guess."""
     rest = bvp.rest
     if bvp.grid is None or rest is None:
         return [(bvp, times, columns)]
     period = np.where(np.array(bvp.grid.periodic), np.asarray(bvp.grid.hi) - np.asarray(bvp.grid.lo), 0)
     turns = (bvp.start - rest.state) / np.where(period > 0, period, 1)
-    # the nearest rest, and the one on the other side; an x₀ at rest in an axis has no other
+    # the nearest rest point and the one on the other side, unless x₀ is at rest on this axis
     nearest = np.where(period > 0, np.round(turns), 0)
     other = np.where(np.abs(turns - nearest) > AT_REST, nearest + np.sign(turns - nearest), nearest)
     sides = np.stack([nearest, np.where(period > 0, other, nearest)], axis=1)
@@ -246,7 +247,7 @@ def _ways_round(
 def _cheapest(
     begun: Sequence[tuple[BoundaryValueProblem, np.ndarray, np.ndarray]], limits: Limits, *, trusted: bool
 ) -> continuation.Outcome:
-    """The solution that costs least of all that are solved; the first failure where none is."""
+    """The cheapest of the solved problems, or the first failure if none is solved."""
     solve = switching.switching if begun[0][0].rule.jumps else continuation.smooth
     answers: list[continuation.Outcome] = []
     for bvp, times, columns in begun:
@@ -256,7 +257,7 @@ def _cheapest(
     if len(answers) == 1:
         return answers[0]
     solved = [answer for answer in answers if continuation.report(answer).status is Status.CONVERGED]
-    # the cost to go is the last row of an arc, and the first arc's comes first
+    # the cost to go is the last of the 2n+1 rows of the first arc
     return min(solved, key=lambda answer: answer.y[2 * answer.bvp.n, 0]) if solved else answers[0]
 
 
@@ -266,18 +267,18 @@ def _to_rest(
     rest: State | Sequence[float] | None,
     clock: Clock,
 ) -> tuple[BoundaryValueProblem, np.ndarray, np.ndarray]:
-    """The boundary-value problem with its rest, and where the solver starts."""
+    """The boundary-value problem with its rest point, and the initial guess."""
     n = bvp.n
     near: State = np.zeros(n) if rest is None else arguments.state_of_numbers(rest, "rest")
     if len(near) != n:
-        raise ValueError(f"pontryagin: got rest = {near.tolist()}, wanted shape ({n},), like x0: a state near the rest")
-    if isinstance(guess, Solution) and rest is None:  # from the least node no path has much left to pay
+        raise ValueError(f"pontryagin: got rest = {near.tolist()}, wanted shape ({n},), like x0: a state near rest")
+    if isinstance(guess, Solution) and rest is None:  # the value is smallest near the rest point
         least = np.unravel_index(np.nanargmin(guess.value), guess.grid.shape)
         near = guess.grid.state([int(index) for index in least])
     if isinstance(guess, Extremal) and rest is None:
         near = guess.states[-1]
     found, slowest = equilibria.find(bvp, near, np.zeros(n))
-    clock.look()  # the search for the rest compiles, and SciPy's root finder looks at no clock
+    clock.look()  # the search for the rest point compiles, and SciPy's root finder does not check the clock
     bvp = dataclasses.replace(bvp, rest=found, horizon=SETTLED / slowest)
     if guess is None:
         return bvp, *initial_guess.into_rest(bvp, bvp.start, float(bvp.horizon), clock)
@@ -285,6 +286,6 @@ def _to_rest(
         times, columns = initial_guess.from_extremal(bvp, guess)
     else:
         times, columns = initial_guess.along_loop(bvp, guess, 2 * float(bvp.horizon))
-        # a periodic state may come to rest a period away; the costate of the rest is the same there
+        # a periodic state may come to rest a period away, with the same costate
         found, _ = equilibria.find(bvp, columns[:n, -1], found.costate)
     return dataclasses.replace(bvp, rest=found, horizon=float(times[-1])), times, columns

@@ -1,13 +1,13 @@
-"""First guesses of extremals: where a boundary-value solver starts decides whether and where it arrives.
+"""Initial guesses of extremals, on which the success of the boundary-value solver depends.
 
-From a solution on a grid: its closed loop, with the interpolated DV as the costate. Into a rest: the loop under the
-Riccati costate, whose control is clipped where it has to be. Otherwise a line between the ends, or a path that comes
-to its end: straight at the edge of a target, or under the best constant control.
+The guess from a solution on a grid is its closed loop, with the interpolated DV as the costate. The guess into a rest
+point is the closed loop under the Riccati costate, whose control is clipped to the admissible set. Otherwise the guess
+is a line between the ends, a line to the boundary of the target, or a path under the best constant control.
 
-A costate of zero is the worst of guesses: where effort costs u is zero under it, nothing moves, and whatever the final
-time is, the equations say the same: their Jacobian is singular. At the edge of a target p = ψ_x + ν l_x, and H = βψ −
-ψ_t − ν l_t has at most two roots ν, since H is a minimum of functions that are affine in p, so concave in ν. The first
-positive one is the costate of a path that comes from outside.
+A zero costate is a bad guess. If effort has a cost, u is zero under it and nothing moves. The equations then do not
+depend on the final time, so their Jacobian is singular. On the boundary of a target p = ψ_x + ν l_x, and the condition
+H = βψ − ψ_t − ν l_t has at most two roots ν, because H is a minimum of functions that are affine in p and therefore
+concave in ν. The first positive root gives the costate of a path that arrives from outside.
 """
 
 import warnings
@@ -26,21 +26,21 @@ from hjbjax.solution.clock import Clock, Stopped
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
 
-COLUMNS = 101  # of a guess; the solver adds nodes where it wants them
-SAMPLES = 400  # intervals in which the control of a simulated guess is held: a feedback may jump
-FAR = 1e3  # times 1 + |x₀|: a loop that gets there has left for good
-NEWTON = 50  # steps to the edge of a target, on which a distance needs one, and its square some ten
-POWERS = np.arange(-80.0, 81.0)  # of two: values of ν, whose units are those of cost over those of l
-FINER = np.linspace(0.0, 1.0, 65)  # between two of them, to two digits
-BUDGET = 16  # constant controls that are tried
+COLUMNS = 101  # of a guess; the solver adds nodes where necessary
+SAMPLES = 400  # number of intervals in which a simulated guess keeps its control constant, because a feedback may jump
+FAR = 1e3  # times 1 + |x₀|: a simulation that gets there has diverged
+NEWTON = 50  # steps to the boundary of a target; a distance takes one, a squared distance about ten
+POWERS = np.arange(-80.0, 81.0)  # exponents of two for ν, which has the units of cost over those of l
+FINER = np.linspace(0.0, 1.0, 65)  # between two powers, for two digits
+BUDGET = 16  # number of constant controls to try
 
 
 class PathWithCostates(Protocol):
-    """A path with its costates and its cost to go, such as an ``Extremal``."""
+    """A path with costates and cost to go, such as an ``Extremal``."""
 
     @property
     def times(self) -> Array:
-        """Increasing, shape (k+1,)."""
+        """Increasing times, shape (k+1,)."""
 
     @property
     def states(self) -> Array:
@@ -52,20 +52,20 @@ class PathWithCostates(Protocol):
 
     @property
     def values(self) -> Array:
-        """The cost to go from these times on, shape (k+1,)."""
+        """The cost to go at these times, shape (k+1,)."""
 
 
 @jax.jit
 def _rest_loop(bvp: BoundaryValueProblem, x: State) -> jax.Array:
     """ẋ under the costate p̄ + P(x − x̄)."""
     assert bvp.rest is not None
-    # by the flow of the problem and not as a linear feedback: its control is clipped where the set ends
+    # the flow of the problem instead of a linear feedback, so that the control is clipped to the admissible set
     p = bvp.rest.costate + bvp.rest.matrix @ (x - bvp.rest.state)
     return bvp.flow(0.0, jnp.concatenate([x, p, jnp.zeros(1, x.dtype)]), bvp.arcs[0])[: bvp.n]
 
 
 def into_rest(bvp: BoundaryValueProblem, start: State, duration: float, clock: Clock) -> tuple[np.ndarray, np.ndarray]:
-    """Times and columns (x, p, w) under the Riccati costate; a line to the rest where that loop runs away."""
+    """Times and columns (x, p, w) under the Riccati costate, or of a line to the rest point if this loop diverges."""
     from scipy.integrate import solve_ivp
 
     arrays, rest = jax.tree.map(jnp.asarray, bvp), bvp.rest
@@ -82,11 +82,11 @@ def into_rest(bvp: BoundaryValueProblem, start: State, duration: float, clock: C
     away.terminal = True  # type: ignore[attr-defined]
     with np.errstate(all="ignore"):
         path = solve_ivp(flow, (0, duration), start, t_eval=times, events=away, rtol=1e-5)
-    states = path.y  # (n, COLUMNS), or fewer where the loop ran away
+    states = path.y  # (n, COLUMNS), or fewer columns if the loop diverged
     if states.shape[1] < len(times) or not np.all(np.isfinite(states)):
-        decay = np.exp(-5 * times / duration)  # to e⁻⁵, 0.7 % of the way, at the end
+        decay = np.exp(-5 * times / duration)  # e⁻⁵ at the end, 0.7 % of the distance
         states = rest.state[:, None] + (start - rest.state)[:, None] * decay
-    # p̄ + P(x − x̄) and w̄ + p̄·y + ½ y'Py along the path, as the end condition has them
+    # p̄ + P(x − x̄) and w̄ + p̄·y + ½ y'Py along the path, as in the end condition
     off = states - rest.state[:, None]
     bent = rest.matrix @ off
     value = rest.value + rest.costate @ off + 0.5 * np.sum(off * bent, axis=0)
@@ -94,42 +94,42 @@ def into_rest(bvp: BoundaryValueProblem, start: State, duration: float, clock: C
 
 
 def along_loop(bvp: BoundaryValueProblem, solution: Solution, duration: float) -> tuple[np.ndarray, np.ndarray]:
-    """Times and columns (x, p, w) of the closed loop of a solution, as far as it gets; a line where it gets nowhere."""
+    """Times and columns (x, p, w) of the closed loop of a solution, or of a line if the closed loop does not move."""
     grid, marched = solution.grid, solution.times is not None
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # where a guess ends is seen from its times
-        # clamped: off the grid the control of its nearest point is a guess, too
+        warnings.simplefilter("ignore", UserWarning)  # the times already show an early end
+        # clamped, because off the grid the control of the nearest point is still a usable guess
         try:
             path = simulate(bvp.problem, solution, bvp.start, duration, hold=duration / SAMPLES, clamp=True)
         except KeyboardInterrupt:
             raise Stopped(Status.INTERRUPTED) from None
     times, states = path.times, path.states
-    # with given end states and a free time the loop does not stop by itself: cut where it comes nearest to them
+    # with prescribed end states and a free time the loop does not stop: truncate it where it is closest to them
     if not bvp.problem.target and bvp.free and any(bvp.held):
         nearest = int(np.argmin(np.linalg.norm((states - bvp.ends)[:, np.array(bvp.held)], axis=1)))
-        if nearest:  # else it starts where it ends, though only in the states that are given there
+        if nearest:  # otherwise the prescribed states are closest at the start
             times, states = times[: nearest + 1], states[: nearest + 1]
-    if len(times) == 1:  # in the target from the first
+    if len(times) == 1:  # the path starts in the target
         return straight_line(bvp, duration)
-    # of the 400 intervals every second or so: a first mesh that is too fine is never made coarser
+    # keep about half of the 400 intervals, because the solver never coarsens a mesh
     kept = np.unique(np.linspace(0, len(times) - 1, 2 * COLUMNS).astype(int))
     times, states = times[kept], states[kept]
-    inside = np.asarray(grid.wrap(states))  # the path is unwound, the nodes are not
+    inside = np.asarray(grid.wrap(states))  # the path is unwound, the grid is not
     where = (times, inside) if marched else (inside,)
     costates, values = solution.costate_at(*where, clamp=True), solution.value_at(*where, clamp=True)
-    # V is infinite, and DV undefined, at nodes from where the target is out of reach
+    # V is infinite and DV undefined at nodes from which the target is unreachable
     return times, np.nan_to_num(np.concatenate([states, costates, values[:, None]], axis=1).T, posinf=0.0, neginf=0.0)
 
 
 def straight_line(bvp: BoundaryValueProblem, duration: float) -> tuple[np.ndarray, np.ndarray]:
-    """Times and columns (x, p, w) along a line to the given end states; at rest in x₀ without any."""
+    """Times and columns (x, p, w) along a line to the prescribed end states; at rest in x₀ if there are none."""
     times = np.linspace(0, duration, COLUMNS)
     held = np.array(bvp.held)
-    # from the end to x₀ in the given states alone; the others stay
+    # the vector from the end to x₀ in the prescribed states; the other states stay constant
     gap = np.where(held, bvp.start - np.where(held, bvp.ends, 0), 0) if held.any() else np.zeros(bvp.n)
     length = np.linalg.norm(gap)
     states = bvp.start[:, None] - gap[:, None] * times / duration
-    # along the line and p·ẋ = −1, as H = 1 + p·ẋ = 0 has it for least time
+    # along the line, with p·ẋ = −1, as in H = 1 + p·ẋ = 0 for least time
     if held.any():
         costate = gap * duration / length**2 if length else gap
     else:
@@ -139,13 +139,13 @@ def straight_line(bvp: BoundaryValueProblem, duration: float) -> tuple[np.ndarra
 
 
 def from_extremal(bvp: BoundaryValueProblem, extremal: PathWithCostates) -> tuple[np.ndarray, np.ndarray]:
-    """Times and columns (x, p, w) of another extremal, its start moved to x₀."""
+    """Times and columns (x, p, w) of another extremal, with its start moved to x₀."""
     if np.shape(extremal.states)[1] != bvp.n:
         raise ValueError(f"pontryagin: the guess has {np.shape(extremal.states)[1]} states, wanted {bvp.n}")
-    # empty arcs leave a time twice, and a mesh has to rise
+    # empty arcs repeat a time, but a mesh must increase
     times, kept = np.unique(extremal.times, return_index=True)
     states, costates, values = (part[kept].T for part in (extremal.states, extremal.costates, extremal.values[:, None]))
-    # the shift of the start fades out linearly, so that the end stays where it met its conditions
+    # the shift of the start decays linearly, so that the end still meets its conditions
     moved = (bvp.start - states[:, 0])[:, None] * (1 - times / times[-1]) if times[-1] > 0 else 0.0
     return times, np.concatenate([states + moved, costates, values])
 
@@ -153,21 +153,21 @@ def from_extremal(bvp: BoundaryValueProblem, extremal: PathWithCostates) -> tupl
 def arc_order(
     bvp: BoundaryValueProblem, times: np.ndarray, columns: np.ndarray, least: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The values of the jumping inputs in the order met, shape (k, m), and when each sets in, shape (k,).
+    """The values of the jumping inputs in order along the path, shape (k, m), and their start times, shape (k,).
 
     Args:
       bvp: the boundary-value problem of a mixture.
       times: increasing.
       columns: (x, p, w) at these times.
-      least: the share of the time that an arc must last; the one before goes on in place of a shorter one.
+      least: the fraction of the time that an arc must last; a shorter arc is replaced by the arc before it.
     """
     which = np.asarray(_dominant_value(bvp, times, columns))
-    # runs of one value; then without the short ones, and neighbours that have become alike made one run
+    # runs of one value; remove short runs, then merge neighbours with equal values
     begins = np.flatnonzero(np.append(True, which[1:] != which[:-1]))
     lasting = np.diff(np.append(times[begins], times[-1])) >= least * (times[-1] - times[0])
     begins = begins[lasting]
     begins = begins[np.append(True, which[begins[1:]] != which[begins[:-1]])] if len(begins) else np.zeros(1, int)
-    # a switch lies between the last sample of one value and the first of the next: half way
+    # a switch is between the last sample of one value and the first sample of the next; take the middle
     starts = np.append(times[0], 0.5 * (times[begins[1:]] + times[begins[1:] - 1]))
     return values(bvp)[which[begins]], starts
 
@@ -194,14 +194,14 @@ def _dominant_value(bvp: BoundaryValueProblem, times: Array, columns: Array) -> 
 
 
 def hamiltonian_size(bvp: BoundaryValueProblem, times: np.ndarray, columns: np.ndarray) -> float:
-    """The typical size of the Hamiltonian's terms along a guess, which is the first ε of a smoothing."""
-    # 1 where all are zero: ε = 0 would divide by zero
+    """The typical size of the terms of the Hamiltonian along a guess, the initial ε of the smoothing."""
+    # 1 if all terms are zero, because the mixture divides by ε
     return float(np.mean(_sizes(bvp, times, columns))) or 1.0
 
 
 @jax.jit
 def _sizes(bvp: BoundaryValueProblem, times: Array, columns: Array) -> jax.Array:
-    """The larger of spread and mean size of H over the values of the jumping inputs, at every time."""
+    """The larger of the spread and the mean size of H over the values of the jumping inputs, at every time."""
 
     def one(t, z):
         x, p, _ = bvp.split(z)
@@ -215,17 +215,17 @@ def _sizes(bvp: BoundaryValueProblem, times: Array, columns: Array) -> jax.Array
 
 
 def toward_target(bvp: BoundaryValueProblem, duration: float) -> tuple[np.ndarray, np.ndarray] | None:
-    """Times and columns (x, p, w) straight to the edge of the target; None where no ν is found.
+    """Times and columns (x, p, w) along a line to the boundary of the target; None if no ν is found.
 
     Args:
-      bvp: closed by a target, with the law of the minimum.
-      duration: of the path.
+      bvp: a problem that ends at a target, with the law of the minimum.
+      duration: the duration of the path.
     """
     arrays = jax.tree.map(jnp.asarray, bvp)
     edge = _edge(arrays, bvp.start, duration)
     at = _conditions_of_nu(arrays, edge, duration, np.exp2(POWERS))
     below = np.flatnonzero((at[:-1] > 0) & (at[1:] <= 0))
-    if not len(below):  # no input reaches l directly, say; nothing is known of ν
+    if not len(below):  # for example if no input affects l directly
         return None
     between = np.exp2(POWERS[below[0]]) * (1 + FINER)
     nu = between[np.argmin(np.abs(_conditions_of_nu(arrays, edge, duration, between)))]
@@ -237,13 +237,13 @@ def toward_target(bvp: BoundaryValueProblem, duration: float) -> tuple[np.ndarra
 
 
 def under_constant_control(bvp: BoundaryValueProblem, duration: float) -> tuple[np.ndarray, np.ndarray]:
-    """Times and columns (x, p, w) under the constant control that comes nearest to the end, with the line's costates.
+    """Times and columns (x, p, w) under the constant control that comes closest to the end, with the line's costates.
 
-    From rest a line need not be a path at all: a body without speed stays where it is, whatever its heading.
+    A line may be far from any path: a body at rest cannot move along it without first gaining speed.
 
     Args:
-      bvp: closed by end states or a target.
-      duration: the longest that the path may take. It stops where it is nearest, and is slowed down if T is given.
+      bvp: a problem that ends at prescribed states or at a target.
+      duration: the longest duration of the path. It stops where it is closest, and is stretched in time if T is fixed.
     """
     assert bvp.problem.controls is not None
     arrays, times = jax.tree.map(jnp.asarray, bvp), np.linspace(0, duration, COLUMNS)
@@ -252,12 +252,12 @@ def under_constant_control(bvp: BoundaryValueProblem, duration: float) -> tuple[
     if bvp.closing is Closing.TARGET:
         away = np.abs(levels)
     else:
-        # a speed and a length: each in units of how far it gets at all
+        # every state in units of its largest deviation, because speeds and lengths have different units
         off = (paths - bvp.ends)[..., np.array(bvp.held)]
         size = np.nanmax(np.where(np.isfinite(off), np.abs(off), 0), axis=(0, 1))
         away = np.linalg.norm(off / np.where(size > 0, size, 1), axis=-1)
     away = np.where(np.isfinite(away), away, np.inf)
-    away[:, 0] = np.inf  # a path takes time
+    away[:, 0] = np.inf  # exclude the start
     which, last = np.unravel_index(np.argmin(away), away.shape)
     if not np.isfinite(away[which, last]):
         return straight_line(bvp, duration)
@@ -267,7 +267,7 @@ def under_constant_control(bvp: BoundaryValueProblem, duration: float) -> tuple[
 
 
 def _edge(bvp: BoundaryValueProblem, start: State, duration: float) -> np.ndarray:
-    """A state where l = 0, by Newton's method along the slopes of l; the last one that is finite."""
+    """A state with l = 0 by Newton's method along the gradient of l, or the last finite iterate."""
     x = np.asarray(start, float)
     for _ in range(NEWTON):
         level, slope = (np.asarray(part) for part in _level(bvp, x, duration))
@@ -281,7 +281,7 @@ def _edge(bvp: BoundaryValueProblem, start: State, duration: float) -> np.ndarra
 
 @jax.jit
 def _level(bvp: BoundaryValueProblem, x: State, t: Array) -> tuple[jax.Array, jax.Array]:
-    """l and its slope."""
+    """The target function l and its gradient."""
     return jax.value_and_grad(bvp.level, 1)(t, x)
 
 
@@ -312,7 +312,7 @@ def _free_time(bvp: BoundaryValueProblem, x: State, t: Array, nu: Array) -> jax.
 
 @jax.jit
 def _paths(bvp: BoundaryValueProblem, tried: Array, times: Array) -> tuple[jax.Array, jax.Array]:
-    """States under constant controls by the Runge–Kutta method of order 4, and l along them; zeros without a target."""
+    """States under constant controls by the classical Runge–Kutta method, and l along them (zero without a target)."""
 
     def drift(t: Array, x: State, u: Control) -> jax.Array:
         return jnp.asarray(bvp.problem.drift(*bvp.problem.arguments(bvp.wrap(x), u, t=t)), x.dtype)

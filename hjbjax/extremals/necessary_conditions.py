@@ -1,9 +1,9 @@
-"""The answer of ``pontryagin``: the extremal, how its solve ended, and how well it meets the necessary conditions.
+"""The result of ``pontryagin``: the extremal, how its solve ended, and how well it meets the necessary conditions.
 
-Also where the path meets the problem's target: the equations know only its end, and a run stops at the first entry.
-And what stands in the way of the method where it failed, in words, looked for in the problem itself: a start at which
-the equations have no slope, such as the √y of a body at rest; a cost with kinks in u, such as |u|, under which u jumps
-where the method expects it to bend; and ends on the edge of a target.
+This includes the points where the path meets the problem's target, because the equations contain only its end, while a
+run stops at the first entry. After a failure ``way_out`` looks for causes in the problem: a start at which the
+equations have no derivative (such as √y for a body at rest), a cost with kinks in u (such as |u|), under which u jumps
+although the method expects a smooth minimum, and ends on the boundary of a target.
 """
 
 import jax
@@ -19,13 +19,13 @@ from hjbjax.problem.streams import encodable
 from hjbjax.problem.types import Array, Number
 from hjbjax.solution.status import Status
 
-EMPTY = 1e-9  # share of the time below which an arc is left out of the path
-BUDGET = 200  # controls with which the minimiser is compared
-PARTS = 8  # samples in an interval of the mesh, which is wide where the path is smooth, whatever the target
-ROUNDING = 1e-6  # depth in the target that counts as its edge, relative to the largest |l| along the path
-FLAT = 1e-5  # −l̇ times the final time below which a path ends along the edge, relative to the largest |l|
-KINKS = 64  # controls at which H is differentiated
-STRAIGHT = 1e-9  # |H_uu u²| over the spread of H that counts as no curvature
+EMPTY = 1e-9  # fraction of the time below which an arc is removed from the path
+BUDGET = 200  # number of controls with which the minimiser is compared
+PARTS = 8  # samples per mesh interval, because the mesh is coarse where the path is smooth
+ROUNDING = 1e-6  # depth in the target that counts as its boundary, relative to the largest |l| along the path
+FLAT = 1e-5  # −l̇ times the final time, relative to the largest |l|: below, the path ends along the boundary
+KINKS = 64  # number of controls at which H is differentiated
+STRAIGHT = 1e-9  # |H_uu u²| relative to the spread of H that counts as zero curvature
 
 
 @pytree_dataclass()
@@ -33,11 +33,11 @@ class Optimality:
     """Residuals of the necessary conditions along an extremal, in cost units per unit time.
 
     Args:
-      hamiltonian: e^{−βt}(H − βw) less what ∂H/∂t makes of it, at every time, shape (k+1,): a constant, which is
-        zero for an infinite horizon, and for a free final time unless the end itself, ψ or the target, depends on time.
-      drift: how much it varies, largest less least.
+      hamiltonian: e^{−βt}(H − βw) minus the contribution of ∂H/∂t, at every time, shape (k+1,). It is constant. It is
+        zero for an infinite horizon, and for a free final time unless ψ or the target depends on time.
+      drift: the variation of ``hamiltonian``, largest minus least.
       gap: the largest excess of H(u) over the least H among many admissible controls, over all times.
-      scale: the largest size of the terms of H, which both are to be compared with.
+      scale: the largest term of H; compare ``drift`` and ``gap`` with it.
     """
 
     hamiltonian: Array
@@ -48,20 +48,20 @@ class Optimality:
 
 @pytree_dataclass(host=("message",))
 class Extremal:
-    """A path with its costates that meets Pontryagin's conditions; ``plotting`` draws it like any path.
+    """A path with costates that meets Pontryagin's conditions; ``plotting`` draws it like any path.
 
     Args:
-      times: shape (k+1,), increasing, as close as the solver wanted them.
+      times: shape (k+1,), increasing; the mesh of the solver.
       states: shape (k+1, n), periodic states unwound.
       controls: shape (k, m), at the start of each interval.
-      costates: p, shape (k+1, n): current-value, to be compared with DV along the path.
+      costates: p, shape (k+1, n); current-value, so compare with DV along the path.
       values: the cost to go along the path, discounted to each time, shape (k+1,).
       switches: the times at which the control jumps.
-      cost: of the path from x₀, with what is paid at the end or after it.
-      horizon: the final time; where an infinite horizon was cut, that time.
+      cost: the total cost from x₀, including the cost at the end or after it.
+      horizon: the final time; for an infinite horizon, the time at which it was truncated.
       optimality_check: an ``Optimality``.
       code: a ``Status`` number.
-      message: how the solve ended, in a sentence; host level.
+      message: a sentence on how the solve ended; not traceable.
     """
 
     times: Array
@@ -90,7 +90,7 @@ class Extremal:
 
 @jax.jit
 def measure(bvp: BoundaryValueProblem, t: Array, z: Array, corner: Array) -> dict[str, jax.Array]:
-    """Control, H and its excess over the least at all times of one arc; ``z`` has shape (2n+1, k+1)."""
+    """Control, H, and its excess over the minimum at all times of one arc; ``z`` has shape (2n+1, k+1)."""
     controls = bvp.problem.controls
     assert controls is not None
     tried = jnp.asarray(samples(controls, BUDGET), z.dtype)
@@ -100,12 +100,12 @@ def measure(bvp: BoundaryValueProblem, t: Array, z: Array, corner: Array) -> dic
         at, weights = bvp.mixture(t, x, p, corner)
         u = weights @ at
         energy = weights @ jax.vmap(lambda u: bvp.hamiltonian(t, x, p, u))(at)
-        # samples of the whole set, which no local search can miss, and the minimiser, which is finer than they are
+        # samples of the whole set, which cannot miss the global minimum, and the minimiser, which is more accurate
         least = jnp.min(jax.vmap(lambda u: bvp.hamiltonian(t, x, p, u))(tried))
         least = jnp.minimum(
             least, bvp.hamiltonian(t, x, p, pointwise.minimiser(bvp.problem, bvp.rule, t, bvp.wrap(x), p))
         )
-        # what H is made of: near a rest or a free end H itself cancels to 0, and nothing could be relative to it
+        # the terms of H, because H itself cancels to 0 near rest or at a free end
         terms = bvp.problem.drift(*bvp.problem.arguments(bvp.wrap(x), u, t=t)) * p
         cost = pointwise.running_cost(bvp.problem, t, bvp.wrap(x), u)
         now = jnp.exp(-bvp.problem.discount * t)
@@ -121,10 +121,10 @@ def measure(bvp: BoundaryValueProblem, t: Array, z: Array, corner: Array) -> dic
 def assemble(
     bvp: BoundaryValueProblem, s: np.ndarray, y: np.ndarray, theta: np.ndarray, code: Status, message: str
 ) -> Extremal:
-    """The extremal from the functions on [0, 1] that solve ``bvp``; float64 has to be on."""
+    """Assemble the extremal from the functions on [0, 1] that solve ``bvp``; requires float64 mode."""
     from scipy.integrate import cumulative_simpson
 
-    arrays = jax.tree.map(jnp.asarray, bvp)  # NumPy's leaves would be copied to the device in every call
+    arrays = jax.tree.map(jnp.asarray, bvp)  # NumPy leaves would be copied to the device in every call
     lengths = np.asarray(bvp.durations(jnp.asarray(theta)))
     begins, stacked = np.cumsum(lengths) - lengths, y.reshape(bvp.count, -1, len(s))
     parts, moved = [], 0.0  # moved: the integral of e^{−βt} ∂H/∂t over the arcs so far
@@ -134,24 +134,24 @@ def assemble(
         t = begin + s * length
         part = {name: np.asarray(each) for name, each in measure(arrays, t, z, corner).items()}
         gone = np.full(len(s), moved)
-        if bvp.problem.time_dependent:  # a mesh that crowds may repeat a node
+        if bvp.problem.time_dependent:  # a crowded mesh may repeat a node
             once, back = np.unique(s, return_index=True, return_inverse=True)[1:]
-            # Simpson's rule, of order 4 like the collocation: a cruder one would be all that the check sees
+            # Simpson's rule, of order 4 like the collocation; a less accurate rule would dominate the check
             gone += length * cumulative_simpson(part["moving"][once], x=s[once], initial=0.0)[back]
-        # each arc goes on from what the arcs before it have gathered
+        # continue from the integral over the arcs before
         part["constant"], moved = part["constant"] - gone, gone[-1]
-        if code is Status.CONVERGED and length <= EMPTY * lengths.sum():  # an arc that begins where it ends
+        if code is Status.CONVERGED and length <= EMPTY * lengths.sum():  # skip an empty arc
             continue
         states = z[: bvp.n].T + (0.0 if bvp.shifts is None else bvp.shifts[number])
         parts.append({**part, "t": t, "z": np.concatenate([states, z[bvp.n :].T], 1)})
 
     def join(name: str, last: bool = True) -> np.ndarray:
-        """A quantity over all arcs; at a switch the next arc's, and without ``last`` one entry an interval."""
+        """Join a quantity over all arcs, with the next arc's entry at a switch; without ``last``, one per interval."""
         rows = [part[name][:-1] for part in parts]
         return np.concatenate([*rows, parts[-1][name][-1:]] if last else rows)
 
     n, z = bvp.n, join("z")
-    # both sides of every switch, of which the arrays of the answer keep one: a jump of H there is a failure
+    # both sides of every switch, so that the check sees a jump of H there
     every = np.concatenate([part["constant"] for part in parts])
     check = Optimality(
         hamiltonian=join("constant"),
@@ -177,13 +177,13 @@ def assemble(
 def last_iterate(
     bvp: BoundaryValueProblem, s: np.ndarray, y: np.ndarray, lengths: np.ndarray, code: Status
 ) -> Extremal:
-    """A path with its costates as far as a solve came, without controls, which would have to be compiled for."""
+    """The last iterate of an interrupted solve, without controls, which would require compilation."""
     begins, n = np.cumsum(lengths) - lengths, bvp.n
-    # from (k, 2n+1, nodes) to (k, nodes, 2n+1); a copy, for ``y`` is the solver's
+    # from (k, 2n+1, nodes) to (k, nodes, 2n+1); a copy, because the solver owns ``y``
     z = np.moveaxis(y.reshape(bvp.count, -1, len(s)), 1, 2).copy()
     if bvp.shifts is not None:
         z[..., :n] += np.asarray(bvp.shifts)[:, None]
-    inner = np.append(np.tile(np.arange(len(s)) < len(s) - 1, bvp.count)[:-1], True)  # at a switch the next arc's
+    inner = np.append(np.tile(np.arange(len(s)) < len(s) - 1, bvp.count)[:-1], True)  # the next arc's at a switch
     times, z = (begins[:, None] + s * lengths[:, None]).ravel()[inner], z.reshape(-1, z.shape[-1])[inner]
     return Extremal(
         times=times,
@@ -196,22 +196,22 @@ def last_iterate(
         horizon=float(lengths.sum()),
         optimality_check=Optimality(np.full(len(times), np.nan), np.nan, np.nan, np.nan),
         code=int(code),
-        message="this is the last iterate, without controls; nothing says how well it meets the conditions",
+        message="this is the last iterate, without controls; the conditions have not been checked",
     )
 
 
 def only_touches(bvp: BoundaryValueProblem, s: np.ndarray, y: np.ndarray, theta: np.ndarray) -> bool:
-    """Whether the path ends along the edge of the target, or on its way out of it: l̇ ≥ 0 up to rounding.
+    """True if the path ends along the boundary of the target or on its way out, l̇ ≥ 0 up to rounding.
 
-    A path enters because waiting costs; where H = βψ − ψ_t − ν l_t holds with l̇ = 0 it does for every ν, and to end is
-    worth as much as to go on: the condition of a free time says nothing.
+    If l̇ = 0 at the end, the condition H = βψ − ψ_t − ν l_t does not depend on ν, so ending and continuing cost the same
+    and the free-time condition does not select an entry.
     """
     arrays = jax.tree.map(jnp.asarray, bvp)
     lengths = np.asarray(bvp.durations(theta))
     begins = np.cumsum(lengths) - lengths
     states, rates = (z.reshape(bvp.count, -1, len(s))[:, : bvp.n] for z in (y, on_mesh(arrays, s, y, theta)[0]))
     levels = _levels(arrays, *pad_mesh(s, y), theta)
-    # the last arc that takes any time
+    # the last arc that is not empty
     last = np.flatnonzero(lengths > ROUNDING * lengths.sum())[-1]
     velocity = rates[last, :, -1] / lengths[last]
     time = jnp.asarray(begins[last] + lengths[last])
@@ -222,7 +222,7 @@ def only_touches(bvp: BoundaryValueProblem, s: np.ndarray, y: np.ndarray, theta:
 
 
 def entry_time(bvp: BoundaryValueProblem, s: np.ndarray, y: np.ndarray, theta: np.ndarray) -> float | None:
-    """The time at which the path enters the interior of the target, to a sample; None where it stays outside."""
+    """The time at which the path enters the interior of the target, accurate to a sample; None if it does not."""
     if bvp.problem.target is None:
         return None
     arrays = jax.tree.map(jnp.asarray, bvp)
@@ -230,16 +230,16 @@ def entry_time(bvp: BoundaryValueProblem, s: np.ndarray, y: np.ndarray, theta: n
     levels = np.asarray(_levels(arrays, *pad_mesh(fine, dense), theta))[:, : len(fine)]
     lengths = np.asarray(bvp.durations(theta))
     times = (np.cumsum(lengths) - lengths)[:, None] + fine * lengths[:, None]
-    # the edge itself is no entry: paths end on it, and may follow it
+    # the boundary itself is not an entry, because paths end on it and may follow it
     inside = np.flatnonzero(levels.ravel() < -ROUNDING * np.max(np.abs(levels)))
     return float(times.ravel()[inside[0]]) if len(inside) else None
 
 
 def _interpolate(s: np.ndarray, y: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A finer mesh and the cubic of the collocation on it, from values and slopes at the nodes."""
+    """A finer mesh, and the cubic of the collocation on it from values and slopes at the nodes."""
     r, h = np.arange(PARTS) / PARTS, np.diff(s)[:, None]
     first, last = y[:, :-1, None], y[:, 1:, None]
-    # Hermite's four polynomials on [0, 1]
+    # the four Hermite polynomials on [0, 1]
     dense = first * (1 + 2 * r) * (1 - r) ** 2 + last * r * r * (3 - 2 * r)
     dense += h * r * (1 - r) * (slopes[:, :-1, None] * (1 - r) - slopes[:, 1:, None] * r)
     fine = np.append((s[:-1, None] + h * r).ravel(), s[-1])
@@ -248,7 +248,7 @@ def _interpolate(s: np.ndarray, y: np.ndarray, slopes: np.ndarray) -> tuple[np.n
 
 @jax.jit
 def _levels(bvp: BoundaryValueProblem, s: Array, y: Array, theta: Array) -> jax.Array:
-    """The target's function along every arc, each in its own coordinates: the target knows no unwound angles."""
+    """The target function along every arc, in the arc's own coordinates, because l may not accept unwound angles."""
     lengths = bvp.durations(theta)
     begins = jnp.cumsum(lengths) - lengths
     states = y.reshape(bvp.count, -1, len(s))[:, : bvp.n]
@@ -257,38 +257,38 @@ def _levels(bvp: BoundaryValueProblem, s: Array, y: Array, theta: Array) -> jax.
 
 
 def way_out(bvp: BoundaryValueProblem) -> str:
-    """What to do about a problem that was not solved, as the rest of a sentence; empty where nothing is known."""
+    """Advice after a failure, as the rest of a sentence; empty if no cause is known."""
     arrays = jax.tree.map(jnp.asarray, bvp)
     if not is_smooth_at_start(bvp):
         return (
-            f"; at x0 = {np.asarray(bvp.start).tolist()} drift or cost has no finite slope: start a little off, or "
-            "write it in states in which it has one (a speed as a state instead of √(2gy))"
+            f"; at x0 = {np.asarray(bvp.start).tolist()} drift or cost has no finite derivative: start slightly off, "
+            "or choose states in which it has one (a speed as a state instead of √(2gy))"
         )
     if not bvp.rule.jumps and not bvp.rule.exact and (kinked := _kinked(arrays)):
         return kinked
-    # sought from 1 on without a guess, whatever the unit of time
+    # without a guess the search starts from 1, in any unit of time
     sought = "; give horizon=FreeTime(guess) with the size of the final time" if bvp.free else ""
     if bvp.closing is Closing.TARGET:
         return sought + (
-            "; where the end in the target is known give it as terminal=, without the target: "
+            "; if the end in the target is known, pass it as terminal= without the target: "
             "dataclasses.replace(problem, target=None, exit_cost=None)"
         )
     return sought
 
 
 def is_smooth_at_start(bvp: BoundaryValueProblem) -> bool:
-    """Whether the equations are finite at x₀, where every path has to begin."""
+    """True if the equations have finite derivatives at x₀, where every path starts."""
     return bool(np.all(np.isfinite(_slopes_at_start(jax.tree.map(jnp.asarray, bvp)))))
 
 
 def _kinked(bvp: BoundaryValueProblem) -> str:
-    """Advice for inputs in which H is piecewise affine; empty where it bends in all of them."""
+    """Advice for inputs in which H is piecewise affine; empty if H is curved in all of them."""
     bends, along, spread = (np.asarray(part) for part in _curvature(bvp))
     if isinstance(bvp.problem.controls, Ball) and len(bends) > 1:
         if along > STRAIGHT * spread:
             return ""
         return (
-            "; the cost is a multiple of |u|, and u jumps between nothing and the sphere: write u as a size times a "
+            "; the cost is a multiple of |u|, and u jumps between zero and the sphere: write u as a size times a "
             "direction, two inputs of a Box, or enumerate the controls with Finite"
         )
     straight = np.flatnonzero(bends <= STRAIGHT * spread)
@@ -296,14 +296,14 @@ def _kinked(bvp: BoundaryValueProblem) -> str:
         return ""
     names = ", ".join(f"u[{j}]" for j in straight)
     return (
-        f"; in {names} cost and drift are pieces of straight lines, as |u| is, and u jumps between their ends: write "
-        "u = u⁺ − u⁻ with two inputs ≥ 0 and the cost u⁺ + u⁻, or enumerate ends and kinks with Finite"
+        f"; in {names} cost and drift are piecewise linear, like |u|, so u jumps: write u = u⁺ − u⁻ with two inputs "
+        "≥ 0 and the cost u⁺ + u⁻, or enumerate ends and kinks with Finite"
     )
 
 
 @jax.jit
 def _slopes_at_start(bvp: BoundaryValueProblem) -> jax.Array:
-    """The slopes of H in the state at x₀ under a few controls, with a costate of ones."""
+    """The derivatives of H with respect to the state at x₀, for a few controls and a costate of ones."""
     assert bvp.problem.controls is not None
     x = jnp.asarray(bvp.start)
     tried = jnp.asarray(samples(bvp.problem.controls, KINKS), x.dtype)
@@ -312,13 +312,13 @@ def _slopes_at_start(bvp: BoundaryValueProblem) -> jax.Array:
 
 @jax.jit
 def _curvature(bvp: BoundaryValueProblem) -> tuple[Array, Array, Array]:
-    """The largest |H_uu| of every input times its width squared, (m,); that of u'H_uu u; and the spread of H."""
+    """The largest |H_uu| of every input times its squared width, (m,); the largest |u'H_uu u|; the spread of H."""
     assert bvp.problem.controls is not None
     x = jnp.asarray(bvp.start)
     tried = jnp.asarray(samples(bvp.problem.controls, KINKS), x.dtype)
     middle = (jnp.max(tried, axis=0) + jnp.min(tried, axis=0)) / 2
     width = jnp.max(tried, axis=0) - jnp.min(tried, axis=0)
-    # off the grid of the samples, which holds the kinks: zero and the middle of the set
+    # shift the samples, because kinks are likely at zero and at the middle of the set
     tried = middle + (tried - middle) * 0.917 + 0.0123 * width
 
     def energy(u):

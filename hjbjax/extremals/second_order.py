@@ -1,13 +1,13 @@
-"""Second-order conditions: an extremal that meets all of the first order may still be a saddle, or the worst of all.
+"""Second-order conditions, which detect extremals that are saddle points or maxima.
 
-With A = ∂(ẋ, ṗ)/∂(x, p) along a path whose control is continuous, the neighbours that meet the end conditions are the
-frames (X, P)' = A (X, P), run backward from the end. Where X is singular on the way they cross, and from earlier on the
-path is no minimum: a conjugate point (Jacobi). With W = P X⁻¹, the D²V of the neighbours, one step of the midpoint rule
-backward, (a, b; c, d), which is symplectic, is W ← (c + dW)(a + bW)⁻¹, and passes as many conjugate points as I + a⁻¹bW
-has negative eigenvalues: a⁻¹b is B H_uu⁻¹ B' times the step, and semidefinite.
+Let A = ∂(ẋ, ṗ)/∂(x, p) along a path with a continuous control. The neighbouring extremals that meet the end conditions
+are the frames (X, P)' = A (X, P), integrated backward from the end. Where X becomes singular they cross, and the path
+is not a minimum from earlier times on: this is a conjugate point (Jacobi). W = P X⁻¹ is the D²V of the neighbours. A
+backward step (a, b; c, d) of the midpoint rule is symplectic and maps W to (c + dW)(a + bW)⁻¹. It passes one conjugate
+point per negative eigenvalue of I + a⁻¹bW, where a⁻¹b is B H_uu⁻¹ B' times the step and semidefinite.
 
-Where the final time is free, J(T) of the extremals with given T is stationary, and its second derivative is the slope
-of that condition along them, which the linearised equations have. Where J falls on either side, T is the worst.
+With a free final time, the cost J(T) of the extremals with prescribed T is stationary. Its second derivative is the
+slope of the free-time condition along them, from the linearised equations. If it is negative, T is a maximum of J.
 """
 
 import warnings
@@ -19,32 +19,32 @@ import numpy as np
 from hjbjax.extremals.boundary_value import BoundaryValueProblem, Closing, Law
 from hjbjax.extremals.collocation import at_ends, on_mesh
 
-SINGULAR = 1e-6  # share of X's largest singular value below which W = P X⁻¹ would have lost its digits
-FLAT, STEEP = 1e-4, 1e4  # T² J'' over T times H's terms: less is rounding, more a T that the others do not allow
+SINGULAR = 1e-6  # relative singular value of X below which W = P X⁻¹ would have no correct digits
+FLAT, STEEP = 1e-4, 1e4  # for T J'' relative to the terms of H: less is rounding, more means that T cannot change
 
 
 def verdict(bvp: BoundaryValueProblem, s: np.ndarray, y: np.ndarray, theta: np.ndarray, scale: float) -> str:
-    """Why the extremal is no minimum, in words; empty where nothing says so, and where the control jumps.
+    """The reason why the extremal is not a minimum; empty if none is found, or if the control jumps.
 
     Args:
       bvp: the boundary-value problem.
       s: the mesh of its solution.
-      y: (x, p, w) on it.
-      theta: the final time, if it is sought, and ν.
+      y: (x, p, w) on the mesh.
+      theta: the final time, if it is free, and ν.
       scale: the size of the terms of H, in cost units per unit time.
     """
     if bvp.law is not Law.MINIMUM or bvp.rule.jumps or bvp.count > 1:
         return ""
     arrays = jax.tree.map(jnp.asarray, bvp)
-    kept = np.append(True, np.diff(s) > 0)  # a mesh that crowds may repeat a node
-    both = slice(2 * bvp.n)  # the cost to go drives nothing
+    kept = np.append(True, np.diff(s) > 0)  # a crowded mesh may repeat a node
+    both = slice(2 * bvp.n)  # the rows of x and p; no rate depends on the cost to go except its own
     _, by_state, by_theta = on_mesh(arrays, s, y, theta)
     matrices = np.moveaxis(by_state[both, both], -1, 0)[kept]
     _, by_last, ends_by_theta = at_ends(arrays, y, theta)
     closing, sliding = by_last[bvp.n :, both], ends_by_theta[bvp.n :]
     if not all(np.all(np.isfinite(part)) for part in (matrices, by_theta, closing, sliding)):
         return ""
-    # the rows of the cost to go, and of a free time, say nothing of the neighbours that end in the same time
+    # neighbours have the same final time, so the conditions on the cost to go and on a free time do not restrict them
     rows = [*range(bvp.n)] + [bvp.n + 1] * (bvp.closing is Closing.TARGET)
     multiplier = sliding[rows, -1:] if bvp.closing is Closing.TARGET else np.zeros((len(rows), 0))
     horizon = float(np.sum(bvp.durations(theta)))
@@ -64,17 +64,17 @@ def verdict(bvp: BoundaryValueProblem, s: np.ndarray, y: np.ndarray, theta: np.n
 
 
 def _conjugate_point(matrices: np.ndarray, s: np.ndarray, end: np.ndarray) -> float | None:
-    """The last s in (0, 1) at which neighbours cross; None without, or where it stays undecided.
+    """The last s in (0, 1) at which neighbours cross; None if they do not cross or if it is undecided.
 
     Args:
       matrices: ∂(ẋ, ṗ)/∂(x, p) at the nodes, per unit of s, shape (N, 2n, 2n).
       s: the nodes, increasing.
-      end: the rows of the end conditions, in (δx, δp) and perhaps δν.
+      end: the rows of the end conditions in (δx, δp), and δν if there is a target.
     """
     identity, n = np.eye(matrices.shape[1]), matrices.shape[1] // 2
     half = 0.25 * np.diff(s)[:, None, None] * (matrices[1:] + matrices[:-1])
     back = np.linalg.solve(identity + half, identity - half)
-    # what the conditions leave: n directions
+    # the n directions that the end conditions leave free
     frame, curvature = np.linalg.svd(end)[2][len(end) :].T[: 2 * n], None
     for k in range(len(back), -1, -1):
         if k < len(back):
@@ -85,7 +85,7 @@ def _conjugate_point(matrices: np.ndarray, s: np.ndarray, end: np.ndarray) -> fl
                 frame = np.concatenate([a + b @ curvature, c + d @ curvature])
             else:
                 frame = np.linalg.qr(back[k] @ frame)[0]
-        # given end states leave no δx at first, and states that no control reaches never have any
+        # prescribed end states give δx = 0 at first, and states that no control reaches always have δx = 0
         sizes = np.linalg.svd(frame[:n], compute_uv=False)
         if curvature is not None or sizes[-1] > SINGULAR * np.linalg.norm(frame, 2):
             curvature = np.linalg.solve(frame[:n].T, frame[n:].T)
@@ -101,14 +101,14 @@ def _slope_in_time(
     sliding: np.ndarray,
     rows: list[int],
 ) -> float:
-    """The derivative in T of the last condition, that of a free time, while the others hold.
+    """The derivative with respect to T of the free-time condition, while the other conditions hold.
 
     Args:
       matrices: ∂(ẋ, ṗ)/∂(x, p) at the nodes, per unit of s, shape (N, 2n, 2n).
-      driven: ∂(ẋ, ṗ)/∂T there, shape (N, 2n).
+      driven: ∂(ẋ, ṗ)/∂T at the nodes, shape (N, 2n).
       s: the nodes, increasing.
-      closing: slopes of the end conditions in (x, p), shape (k, 2n).
-      sliding: slopes of the end conditions in T and perhaps ν, shape (k, 1 or 2).
+      closing: slopes of the end conditions with respect to (x, p), shape (k, 2n).
+      sliding: slopes of the end conditions with respect to T, and ν if there is a target, shape (k, 1 or 2).
       rows: the end conditions that determine (x, p) and ν.
     """
     from scipy import sparse
@@ -116,7 +116,7 @@ def _slope_in_time(
 
     count, m = matrices.shape[:2]
     half, identity = 0.5 * np.diff(s)[:, None, None], np.eye(m)
-    # the trapezoidal rule: −(I + ½hA) δz_k + (I − ½hA) δz_{k+1} = ½h (b_k + b_{k+1}) δT
+    # trapezoidal rule: −(I + ½hA) δz_k + (I − ½hA) δz_{k+1} = ½h (b_k + b_{k+1}) δT
     left, right = -identity - half * matrices[:-1], identity - half * matrices[1:]
     steps = sparse.hstack([sparse.block_diag(left), sparse.csr_matrix(((count - 1) * m, m))])
     steps = steps + sparse.hstack([sparse.csr_matrix(((count - 1) * m, m)), sparse.block_diag(right)])
@@ -132,7 +132,7 @@ def _slope_in_time(
     ).tocsc()
     load = np.concatenate([np.zeros(m // 2), (half[:, 0] * (driven[1:] + driven[:-1])).ravel(), -sliding[rows, 0]])
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", MatrixRankWarning)  # infinite then, as where no other T has an extremal
+        warnings.simplefilter("ignore", MatrixRankWarning)  # the slope is then infinite: no other T has an extremal
         answer = spsolve(system, load)
     last = answer[(count - 1) * m : count * m]
     return float(closing[-1] @ last + sliding[-1, 0] + sliding[-1, 1:] @ answer[count * m :])

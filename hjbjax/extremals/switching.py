@@ -1,11 +1,11 @@
-"""Extremals whose control jumps: the order of its values by smoothing, the switching times by the arcs themselves.
+"""Extremals whose control jumps: smoothing finds the order of the values, then the switching times are solved for.
 
-Mixtures with smaller and smaller ε (see ``boundary_value``) show in which order the values come; then all arcs are
-solved at once. Where the final time is free, a smoothed problem need not have a solution: effort is charged that the
-true one does not know, and discounted away by waiting. So there the mixtures have given final times, first one that
-is long enough to get to the end, then nearer and nearer to the time at which H fits. An arc may come out empty; one
-that comes out negative is left out. A start on a switching curve needs an empty arc in front, whose condition fixes
-the costate.
+Mixtures with decreasing ε (see ``boundary_value``) show the order of the values. Then all arcs are solved at once.
+With a free final time a smoothed problem need not have a solution, because smoothing adds a cost that waiting can
+discount away. In this case the mixtures have prescribed final times: first one that is long enough to reach the end,
+then times closer and closer to the one at which the condition on H holds. An arc may be empty, and an arc with a
+negative duration is removed. A start on a switching curve needs an empty first arc, whose condition determines the
+costate.
 """
 
 import dataclasses
@@ -20,41 +20,41 @@ from hjbjax.extremals.continuation import Outcome, attempt, carry_on, report, un
 from hjbjax.extremals.necessary_conditions import EMPTY
 from hjbjax.solution.status import Status
 
-SMOOTHING = (1.0, 0.3, 0.1, 0.03, 0.01)  # ε over the size of the Hamiltonian, so far that the order of arcs shows
-FASTER = 0.3  # the factor of ε on a walk through given final times
-BRIDGES = (1.3, 2.5, 4.7, 8.9, 17.0)  # first final times over the guess; a round guess is often the least time itself
-STRIDE, WALK = 1.2, 16  # from the first that is long enough, by which factor and how often it is changed
-MOST_ARCS = 12  # more switches than that are chattering, or an arc on which the Hamiltonian is singular
-SHORT = 1e-3  # share of the time of arcs that are left out when all arcs together find no solution
-TRUSTED = 0.02  # share of the time that an arc of an interpolated guess must last: along a kink its costates blur
-NODES = 17  # of an arc's first mesh
+SMOOTHING = (1.0, 0.3, 0.1, 0.03, 0.01)  # ε relative to the size of H; the last one shows the order of the arcs
+FASTER = 0.3  # factor of ε in the search over prescribed final times
+BRIDGES = (1.3, 2.5, 4.7, 8.9, 17.0)  # initial final times over the guess; not 1, which may be the least time itself
+STRIDE, WALK = 1.2, 16  # factor and number of the changes of the final time after the initial one
+MOST_ARCS = 12  # more arcs mean that the control chatters, or that an arc is singular
+SHORT = 1e-3  # fraction of the time: shorter arcs are removed if the arcs together have no solution
+TRUSTED = 0.02  # fraction of the time: shorter arcs of an interpolated guess come from blurred costates at a kink
+NODES = 17  # initial number of mesh nodes per arc
 
 
 def switching(
     bvp: BoundaryValueProblem, times: np.ndarray, columns: np.ndarray, limits: Limits, *, trusted: bool
 ) -> Outcome:
-    """The extremal of a Hamiltonian whose minimiser jumps, from a guess of one arc.
+    """Solve for the extremal of a Hamiltonian whose minimiser jumps, from a guess with one arc.
 
     Args:
       bvp: the boundary-value problem with the law of the minimum.
       times: increasing from 0.
       columns: the guess at these times, shape (2n+1, len(times)).
-      limits: how far to go.
-      trusted: whether the costates of the guess are worth to be asked for the order of the arcs.
+      limits: the limits of the solve.
+      trusted: True if the costates of the guess are good enough to show the order of the arcs.
     """
     mixture = dataclasses.replace(bvp, law=Law.MIXTURE)
     failure = None
-    # a trusted guess stands in for a mixture: it has costates, and these have an order of arcs
+    # the costates of a trusted guess show an order of arcs, so the guess can replace a mixture
     known = Outcome(mixture, times / times[-1], columns, unknowns(bvp, times, columns), Status.CONVERGED)
     for blurred in itertools.chain([known] * trusted, _mixtures(mixture, times, columns, limits.rough)):
-        # a check of the clock after each stage, since the next one compiles for other shapes and that cannot be cut
+        # check the clock after each stage, because the next one compiles and compilation cannot be interrupted
         least = TRUSTED if blurred is known else 0.0
         carry_on(blurred, limits)
         found = _with_arcs(bvp, blurred, limits, least) if blurred.solved else blurred
         carry_on(found, limits)
         if found.solved and report(found).status is Status.CONVERGED:
             return found
-        # a mixture that was solved and did not sharpen tells more than one that was not
+        # report a solved mixture whose arcs failed rather than a mixture that was not solved
         if failure is None or (blurred.solved and not failure.solved):
             failure = found
     assert failure is not None
@@ -62,14 +62,14 @@ def switching(
 
 
 def _mixtures(bvp: BoundaryValueProblem, times: np.ndarray, columns: np.ndarray, rough: Limits) -> Iterator[Outcome]:
-    """Smoothed extremals, the likeliest first; a failure where there are no more."""
-    # ε has the units of H, cost per time: relative to its size, the same problem in other units has the same mixtures
+    """Smoothed extremals, the most promising first; the last one may be a failure."""
+    # ε has the units of H, so it is relative to the size of H and does not depend on the units of the problem
     size, found = initial_guess.hamiltonian_size(bvp, times, columns), None
     if bvp.free:
         yield from _walk(dataclasses.replace(bvp, epsilon=size), times, columns, rough)
         return
     start = (times / times[-1], columns, unknowns(bvp, times, columns))
-    # each from the one before: the smaller ε, the sharper the jumps, and the nearer a guess has to be
+    # start each solve from the one before: the smaller ε, the sharper the jumps and the better the guess must be
     for share in SMOOTHING:
         tried = attempt(dataclasses.replace(bvp, epsilon=share * size), *start, rough)
         if not tried.solved:
@@ -79,19 +79,19 @@ def _mixtures(bvp: BoundaryValueProblem, times: np.ndarray, columns: np.ndarray,
 
 
 def _walk(bvp: BoundaryValueProblem, times: np.ndarray, columns: np.ndarray, rough: Limits) -> Iterator[Outcome]:
-    """Mixtures with given final times, from one that is long enough to where H fits a free one."""
-    columns = np.concatenate([columns[: bvp.n], 0 * columns[bvp.n :]])  # no costate prefers a control
+    """Mixtures with prescribed final times, from one that is long enough towards the free final time."""
+    columns = np.concatenate([columns[: bvp.n], 0 * columns[bvp.n :]])  # zero costates do not prefer any control
     for factor in BRIDGES:
         fixed = dataclasses.replace(bvp, free=False, horizon=factor * times[-1])
         found = attempt(fixed, times / times[-1], columns, unknowns(fixed, times, columns), rough)
         if found.solved:
             break
-    yield found  # also if it failed, for the caller to report
+    yield found  # also after a failure, so that the caller can report it
     stride, least = STRIDE, SMOOTHING[-1] * float(bvp.epsilon)
     for _ in range(WALK * found.solved):
-        # the last condition of the problem with a free time: H − βψ + ψ_t + ν l_t, negative where a longer time pays
+        # the condition of a free final time, H − βψ + ψ_t + ν l_t; negative if a longer time reduces the cost
         last = conditions(bvp, found.y[:, 0], found.y[:, -1], np.append(found.horizon, found.theta))[-1]
-        # Where a longer time pays, that is as often the price of smoothing as the truth.
+        # a longer time may reduce only the cost of smoothing, so reduce ε first
         if last < 0 and found.bvp.epsilon > least:
             nearer = dataclasses.replace(found.bvp, epsilon=FASTER * found.bvp.epsilon)
         else:
@@ -100,26 +100,26 @@ def _walk(bvp: BoundaryValueProblem, times: np.ndarray, columns: np.ndarray, rou
         if moved.solved:
             found = moved
             yield found
-        else:  # too long a step: half of it on a logarithmic scale
+        else:  # the step was too long: halve it on a logarithmic scale
             stride = stride**0.5
 
 
 def _with_arcs(bvp: BoundaryValueProblem, blurred: Outcome, limits: Limits, least: float) -> Outcome:
-    """The outcome with one arc for every value, in the order that a mixture shows."""
-    # finer than its mesh: a switch is found to half a sample, 1/4000 of the time
+    """The outcome with one arc per value, in the order that a mixture shows."""
+    # finer than the mesh, so a switch is located to half a sample, 1/4000 of the time
     fine = np.linspace(0, 1, 2001)
     y = np.stack([np.interp(fine, blurred.s, row) for row in blurred.y])
     order, starts = initial_guess.arc_order(blurred.bvp, fine * blurred.horizon, y, least)
     carry_on(blurred, limits)
     if len(order) > MOST_ARCS:
-        trouble = f"{len(order) - 1} switches: the control chatters, or an arc is singular; this is a smoothed extremal"
+        trouble = f"{len(order) - 1} switches: the control chatters or an arc is singular; this is a smoothed extremal"
         return dataclasses.replace(blurred, code=Status.STALLED, trouble=trouble)
-    # every round leaves out at least one arc, so that MOST_ARCS of them are enough
+    # every round removes at least one arc, so MOST_ARCS rounds are enough
     first = found = _arcs(bvp, blurred, order, starts, limits)
     for _ in range(MOST_ARCS):
         lengths = found.lengths
         kept = lengths > (-EMPTY if found.solved else SHORT) * max(lengths.sum(), 0.0)
-        # solved, arcs that came out negative go; unsolved, all short ones, for any of them may stand in the way
+        # if solved, remove arcs with negative durations; otherwise remove all short arcs, any of which may be the cause
         if kept.all() or not kept.any():
             break
         order, starts = _merge_equal_neighbours(order[kept], (np.cumsum(lengths) - lengths)[kept])
@@ -135,7 +135,7 @@ def _with_arcs(bvp: BoundaryValueProblem, blurred: Outcome, limits: Limits, leas
 def _with_an_empty_arc(
     bvp: BoundaryValueProblem, blurred: Outcome, order: np.ndarray, starts: np.ndarray, limits: Limits
 ) -> Outcome | None:
-    """The outcome after an arc of another value that may stay empty; None where none of these is solved."""
+    """The outcome with an additional first arc that may be empty; None if no value of this arc gives a solution."""
     for value in initial_guess.values(blurred.bvp):
         if not np.array_equal(value, order[0], equal_nan=True):
             found = _arcs(bvp, blurred, np.concatenate([value[None], order]), np.append(0.0, starts), limits)
@@ -145,8 +145,8 @@ def _with_an_empty_arc(
 
 
 def _merge_equal_neighbours(order: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Neighbouring arcs of one value made one."""
-    # NaN, in inputs that do not jump, equals NaN here
+    """Merge neighbouring arcs of the same value."""
+    # inputs that do not jump are NaN, which counts as equal here
     new = [True] + [not np.array_equal(a, b, equal_nan=True) for a, b in itertools.pairwise(order)]
     return order[new], np.append(0.0, starts[new][1:])
 
@@ -154,7 +154,7 @@ def _merge_equal_neighbours(order: np.ndarray, starts: np.ndarray) -> tuple[np.n
 def _arcs(
     bvp: BoundaryValueProblem, blurred: Outcome, order: np.ndarray, starts: np.ndarray, limits: Limits
 ) -> Outcome:
-    """All arcs at once, from a mixture; roughly first, since a failure is cheap on few nodes."""
+    """Solve for all arcs at once, from a mixture; first with rough limits, so that failures are cheap."""
     bvp = dataclasses.replace(bvp, law=Law.ARCS, arcs=order)
     lengths = np.diff(np.append(starts, blurred.horizon))
     s = np.linspace(0, 1, NODES)
@@ -162,7 +162,7 @@ def _arcs(
         [np.interp(begin + s * length, blurred.times, row) for row in blurred.y]
         for begin, length in zip(starts, lengths, strict=True)
     ]
-    # ν alone from the mixture; its durations, if any, give way to those of the arcs
+    # keep only ν of the mixture; its durations are replaced by those of the arcs
     nu = blurred.theta[len(blurred.theta) - (bvp.closing is Closing.TARGET) :]
     theta = np.concatenate([lengths if bvp.timed else [], nu])
     found = attempt(bvp, s, np.concatenate(pieces), theta, limits.rough)

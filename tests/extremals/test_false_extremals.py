@@ -126,7 +126,7 @@ def test_a_gap_is_one_in_every_unit_of_cost(unit):
 @pytest.mark.parametrize("unit", [1.0, 1e-9])
 def test_a_rest_that_costs_is_refused_in_every_unit_of_cost(unit):
     problem = hjb.Problem(lambda x, u: u, lambda x, u: unit * (1 + x @ x + u @ u), hjb.Box([-9.0], [9.0]))
-    with pytest.raises(ValueError, match="per unit time, without discount"):
+    with pytest.raises(ValueError, match="per unit time without a discount"):
         hjb.pontryagin(problem, [1.0])
 
 
@@ -175,5 +175,5 @@ def test_a_rest_in_any_units(units):
     held = hjb.pontryagin(problem, sizes * np.array([0.2, 0.0]), rest=near)
     assert abs(held.cost) < 1e-20 * cost
     falling = dataclasses.replace(problem, drift=lambda x, u: drift(x, u, 9.0))
-    with pytest.raises(ValueError, match="no rest of the Hamiltonian flow"):
+    with pytest.raises(ValueError, match="no rest point of the Hamiltonian flow"):
         hjb.pontryagin(falling, sizes * np.array([1.5, 0.0]))

@@ -74,7 +74,7 @@ def test_a_cost_with_kinks_names_the_way_out_which_works():
     kinked = hjb.Problem(integrator, lambda x, u: jnp.abs(u[0]), hjb.Box([-1.0], [1.0]))
     failed = hjb.pontryagin(kinked, [1.0, 0.0], **FUEL)
     assert failed.status is not CONVERGED
-    assert "in u[0] cost and drift are pieces of straight lines" in failed.message
+    assert "in u[0] cost and drift are piecewise linear" in failed.message
     assert "u = u⁺ − u⁻" in failed.message
     split = hjb.Problem(
         lambda x, u: integrator(x, u[:1] - u[1:]), lambda x, u: jnp.sum(u), hjb.Box([0.0, 0.0], [1.0, 1.0])
@@ -97,7 +97,7 @@ def test_a_start_without_slopes_is_named():
     problem = hjb.Problem(lambda x, u: u * jnp.sqrt(x), lambda x, u: 1 + u @ u, hjb.Box([0.1], [3.0]))
     failed = hjb.pontryagin(problem, [0.0], terminal=[1.0], throw=False)
     assert failed.status is not CONVERGED
-    assert "at x0 = [0.0] drift or cost has no finite slope" in failed.message
+    assert "at x0 = [0.0] drift or cost has no finite derivative" in failed.message
 
 
 @pytest.mark.slow
@@ -106,5 +106,5 @@ def test_an_end_on_a_kink_of_the_exit_cost_names_the_way_out():
     problem, _ = zoo.double_integrator()
     failed = hjb.pontryagin(problem, [1.0, 0.0], throw=False)
     assert failed.status is not CONVERGED
-    assert "give it as terminal=" in failed.message
+    assert "pass it as terminal=" in failed.message
     assert "replace(problem, target=None, exit_cost=None)" in failed.message

@@ -316,8 +316,8 @@ MARCHED = hjb.Solution(LINE, np.zeros((3, 5)), np.zeros((3, 5, 1)), code=1, time
     [
         (lambda: hjb.pontryagin(GAME, [1.0]), ValueError, "with disturbances, wanted one without"),
         (lambda: hjb.pontryagin(NOISY, [1.0]), ValueError, "with noise, wanted one without"),
-        (lambda: hjb.pontryagin(RIDER, [[1.0]]), ValueError, "one finite number a state"),
-        (lambda: hjb.pontryagin(RIDER, ["a"]), TypeError, "one number a state"),
+        (lambda: hjb.pontryagin(RIDER, [[1.0]]), ValueError, "one finite number per state"),
+        (lambda: hjb.pontryagin(RIDER, ["a"]), TypeError, "one number per state"),
         (lambda: hjb.pontryagin(RIDER, [1.0, 2.0]), ValueError, r"shape \(1,\), .*: n = 2 is the length of x0"),
         (lambda: hjb.pontryagin(DOUBLED, [1.0]), ValueError, r"drift\(x, u\) returned shape \(2,\), expected \(1,\)"),
         (lambda: hjb.pontryagin(RIDER, [1.0], horizon=1.0, terminal=lambda x: x), ValueError, r"returned shape \(1,\)"),
@@ -326,17 +326,17 @@ MARCHED = hjb.Solution(LINE, np.zeros((3, 5)), np.zeros((3, 5, 1)), code=1, time
         (lambda: hjb.pontryagin(RIDER, [1.0], grid=PLANE), ValueError, "a grid of 2 axes, wanted 1, the length of x0"),
         (lambda: hjb.pontryagin(RIDER, [1.0], grid=3), TypeError, "grid = 3, wanted a Grid or None"),
         (lambda: hjb.pontryagin(RIDER, [1.0], guess=FLAT), ValueError, "on a grid of 2 axes, wanted 1, the length of"),
-        (lambda: hjb.pontryagin(RIDER, [1.0], guess=MARCHED), ValueError, "marched Solution as the guess, and no"),
-        (lambda: hjb.pontryagin(RIDER, [1.0], guess=MARCHED, terminal=[0.0]), ValueError, "known up to t = 2 only;\n"),
+        (lambda: hjb.pontryagin(RIDER, [1.0], guess=MARCHED), ValueError, "Solution as the guess and no horizon"),
+        (lambda: hjb.pontryagin(RIDER, [1.0], guess=MARCHED, terminal=[0.0]), ValueError, "ends at t = 2;\n"),
         (lambda: hjb.pontryagin(RIDER, [1.0], horizon=-1.0), ValueError, "horizon = -1.0, wanted"),
-        (lambda: hjb.pontryagin(RIDER, [1.0], terminal=[np.nan]), ValueError, "at least one that is not"),
+        (lambda: hjb.pontryagin(RIDER, [1.0], terminal=[np.nan]), ValueError, "at least one state that is prescribed"),
         (lambda: hjb.pontryagin(RIDER, [1.0], terminal=lambda x: x @ x), ValueError, "a terminal cost and no horizon"),
         (lambda: hjb.pontryagin(RIDER, [1.0], guess=3), TypeError, "guess = 3, wanted a Solution"),
         (lambda: hjb.pontryagin(RIDER, [1.0], tol=0.0), ValueError, "tol = 0.0"),
         (lambda: hjb.pontryagin(RIDER, [1.0], max_nodes=0), ValueError, "max_nodes = 0"),
-        (lambda: hjb.pontryagin(PUSHED, [1.0]), ValueError, "costs 1 per unit time, without discount"),
-        (lambda: hjb.pontryagin(HELD, [1.0]), ValueError, "at its bound, and the Riccati equation needs room"),
-        (lambda: hjb.pontryagin(ADRIFT, [1.0]), ValueError, "no rest of the Hamiltonian flow near x = .0.0."),
+        (lambda: hjb.pontryagin(PUSHED, [1.0]), ValueError, "costs 1 per unit time without a discount"),
+        (lambda: hjb.pontryagin(HELD, [1.0]), ValueError, "at its bound, where the Riccati equation does not"),
+        (lambda: hjb.pontryagin(ADRIFT, [1.0]), ValueError, "no rest point of the Hamiltonian flow near x = .0.0."),
         (lambda: hjb.pontryagin(IDLE, [1.0]), ValueError, "controls that jump, without a Riccati equation"),
         (lambda: hjb.FreeTime(0.0), ValueError, "guess = 0.0, wanted a finite number > 0"),
     ],
@@ -347,7 +347,7 @@ def test_refusals(call, error, message):
 
 
 def test_tracers_are_refused():
-    with pytest.raises(ValueError, match="it runs at the host"):
+    with pytest.raises(ValueError, match="it runs on the host"):
         jax.jit(lambda x: hjb.pontryagin(RIDER, x).cost)(jnp.ones(1))
 
 

@@ -730,7 +730,7 @@ def test_a_last_iterate_is_a_guess_to_go_on_from(slopes):
 def test_an_extremal_interrupted_on_the_way_to_a_first_guess(monkeypatch):
     find = equilibria.find
     monkeypatch.setattr(equilibria, "find", lambda *a: (signal.raise_signal(signal.SIGINT), find(*a))[1])
-    with pytest.raises(hjb.SolveError, match="pontryagin: INTERRUPTED: on the way to a first guess") as caught:
+    with pytest.raises(hjb.SolveError, match="pontryagin: INTERRUPTED before there was an initial guess") as caught:
         hjb.pontryagin(LQ, [1.0], throw=False)
     assert caught.value.solution is None
 
@@ -805,7 +805,7 @@ def test_ctrl_c_after_the_last_chunk_of_a_simulation_is_not_lost(monkeypatch):
 def test_an_extremal_whose_guess_is_being_simulated(monkeypatch):
     solution = hjb.solve(to_rest(), GRID, scheme=hjb.Upwind())
     pressing(monkeypatch, 1)
-    with pytest.raises(hjb.SolveError, match="pontryagin: INTERRUPTED: on the way to a first guess"):
+    with pytest.raises(hjb.SolveError, match="pontryagin: INTERRUPTED before there was an initial guess"):
         hjb.pontryagin(to_rest(), [0.8], guess=solution)
 
 

@@ -1,14 +1,14 @@
-"""Pictures of values, feedbacks and closed loops.
+"""Plots of values, feedbacks and closed loops.
 
-Every function draws on the ``ax`` it is given, or else on pyplot's current axes, and returns a ``Picture``: the list
-of the artists it drew, the main one first, with ``.figure`` and ``.save(path)``. Nothing is shown, no rcParams are
-touched, and where axes are given pyplot is not even imported.
+Every function draws on the ``ax`` argument, by default pyplot's current axes, and returns a ``Picture``: the list of
+its artists, the main one first, with ``.figure`` and ``.save(path)``. The functions do not show figures and do not
+change rcParams. If axes are given, pyplot is not imported.
 
-A picture has one or two axes. Fields over more states are cut by ``fixed={axis or name: coordinate}``,
-linearly between nodes as ``value_at`` does. Entries that are not finite are never drawn as
-numbers: they are hatched, with a line in the legend. A periodic axis is closed at its seam. Names and units come
-from ``Grid(names=, units=)`` and ``Problem(control_names=, control_units=)``; two axes with one unit of length have
-one scale, and angles have ticks at multiples of π. A solution that remembers its problem has its target outlined.
+A plot has one or two axes. Fields over more states are cut by ``fixed={axis or name: coordinate}``, with linear
+interpolation between nodes as in ``value_at``. Entries that are not finite are hatched and explained in the legend. A
+periodic axis is closed at its seam. Names and units come from ``Grid(names=, units=)`` and
+``Problem(control_names=, control_units=)``. Two axes with the same unit of length have the same scale, and angles have
+ticks at multiples of π. If a solution carries its problem, its target is outlined.
 """
 
 from hjbjax.plotting.estimates import density, estimates

@@ -1,4 +1,4 @@
-"""Pictures of output feedback: states beside their estimates over time, and the law of the state on a grid."""
+"""Plots of output feedback: states and their estimates over time, and the density of the state on a grid."""
 
 from __future__ import annotations
 
@@ -31,23 +31,23 @@ def estimates(
     ax: Axes | None = None,
     names: Sequence[str] | None = None,
 ) -> Picture:
-    """The states of a path over time, drawn, and their estimates, broken, each pair in one colour.
+    """Plot the states of a path over time as solid lines, and their estimates as dashed lines of the same colour.
 
     Args:
-      path: one path of ``simulate_output``; of a batch choose one, ``jax.tree.map(lambda a: a[0], paths)``.
+      path: one path of ``simulate_output``; for a batch select one, ``jax.tree.map(lambda a: a[0], paths)``.
 
     Keyword Args:
-      components: which states, from 0; ``None`` for all.
-      measurements: whether the mean rates of the record, dy/dt over each interval, are drawn as dots.
-      grid: whose periodic axes the estimates are turned about until they are next to the state; names the states.
-      ax: matplotlib axes to draw on; ``None`` takes pyplot's current ones.
-      names: of the states, in place of the grid's.
+      components: indices of the states to plot; ``None`` for all.
+      measurements: plot the mean rates of the measurement record, dy/dt over each interval, as dots.
+      grid: a grid with the names of the states; along its periodic axes the estimates are shifted next to the state.
+      ax: matplotlib axes to draw on; ``None`` uses pyplot's current axes.
+      names: names of the states, instead of the grid's.
 
     Returns:
-      The picture: for each state its line and that of its estimate, then the dots, then the legend.
+      The picture: for each state its line and the line of its estimate, then the dots, then the legend.
 
     Raises:
-      ValueError: a batch of paths, or states that the path does not have.
+      ValueError: the path is a batch of paths, or does not have these states.
 
     Example:
       >>> from types import SimpleNamespace
@@ -58,7 +58,7 @@ def estimates(
     times, states, guessed = (np.asarray(array) for array in (path.times, path.states, path.estimates))
     if states.ndim != 2:
         raise ValueError(
-            f"estimates: got states of shape {states.shape}, wanted one path, (k+1, n): of a batch choose one, "
+            f"estimates: got states of shape {states.shape}, wanted one path, (k+1, n): for a batch select one, "
             "jax.tree.map(lambda a: a[0], paths)"
         )
     count = states.shape[1]
@@ -71,14 +71,14 @@ def estimates(
     for k, i in enumerate(shown):
         colour, estimate = COLOURS[k % len(COLOURS)], guessed[:, i]
         if grid is not None and grid.periodic[i]:  # type: ignore[index]
-            # the states run on round the circle, while a law on a grid has its mean in the box
+            # the states of a path are unwound, while the mean of a density on a grid is inside the box
             period = float(grid.hi[i] - grid.lo[i])
             estimate = estimate + period * np.round((states[:, i] - estimate) / period)
         artists += ax.plot(times, states[:, i], color=colour, linewidth=1.4, label=names[i])
         artists += ax.plot(times, estimate, "--", color=colour, linewidth=1.4, label=f"{names[i]}, estimated")
     if measurements:
         lengths = np.diff(times)[:, None]
-        # intervals of no length follow the end of a path
+        # intervals of length zero follow the end of a path
         rates = np.ma.masked_invalid(
             np.where(lengths > 0, path.measurements / np.where(lengths > 0, lengths, 1), np.nan)
         )
@@ -103,24 +103,24 @@ def density(
     ax: Axes | None = None,
     colorbar: bool = True,
 ) -> Picture:
-    """A density on a grid over one or two of its axes, integrated over the others, with the true state in it.
+    """Plot a density on a grid over one or two of its axes, integrated over the others, with the true state.
 
     Args:
-      values: at the nodes, (*grid), as of an ``InformationState`` at one time.
-      grid: the nodes.
+      values: the density at the nodes, (*grid), as in an ``InformationState`` at one time.
+      grid: the grid.
 
     Keyword Args:
-      axes: one or two axes, by number; ``None`` for the first two, or the only one.
-      state: the true state, shape (n,), a ring over two axes and a line over one.
-      estimate: of it, likewise, a cross and a broken line.
-      ax: matplotlib axes to draw on; ``None`` takes pyplot's current ones.
-      colorbar: whether a colour scale is drawn beside two-dimensional pictures.
+      axes: indices of one or two axes; ``None`` for the first two, or the only one.
+      state: the true state, shape (n,), drawn as a circle over two axes and as a line over one.
+      estimate: the estimated state, shape (n,), drawn as a cross over two axes and as a dashed line over one.
+      ax: matplotlib axes to draw on; ``None`` uses pyplot's current axes.
+      colorbar: draw a colour bar next to a two-dimensional plot.
 
     Returns:
-      The picture: the line or the mesh first, then the marks.
+      The picture: the line or the mesh first, then the markers.
 
     Raises:
-      ValueError: a density of another shape than the grid, or axes that it does not have.
+      ValueError: the density does not have the shape of the grid, or the grid does not have these axes.
 
     Example:
       >>> grid = Grid([-1.0, 0.0], [1.0, 2.0], (3, 5), names=("x", "parameter"))

@@ -1,4 +1,4 @@
-"""Pictures over time: the controls of a path; Pontryagin's λ, and DV of a solution on a grid along the same path."""
+"""Plots over time: the controls of a path, and the costates of an extremal next to DV of a grid solution."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ if TYPE_CHECKING:
     from hjbjax.feedback.path import Path
     from hjbjax.solution.solution import Solution
 
-JUMPS = 60  # of one control to and fro: more of them fill a picture of ten centimetres
-WINDOW = 0.04  # of the duration, over which means of such a control are taken
+JUMPS = 60  # jumps of one control back and forth; more would fill a plot 10 cm wide
+WINDOW = 0.04  # fraction of the duration, the width of the running mean for such a control
 
 
 @drawing
 def costates(
     extremal: Extremal, *, solution: Solution | None = None, ax: Axes | None = None, names: Sequence[str] | None = None
 ) -> Picture:
-    """The costates of an extremal over time, and DV of a solution along its path: two roads to one curve.
+    """Plot the costates of an extremal over time, and DV of a grid solution along its path to compare with.
 
     Args:
       extremal: the extremal of ``pontryagin``.
 
     Keyword Args:
-      solution: of the same problem on a grid, or ``None``; its DV is drawn broken, where the path is inside the grid.
-      ax: matplotlib axes to draw on; ``None`` takes pyplot's current ones.
-      names: of the states, in place of the grid's.
+      solution: a grid solution of the same problem, or ``None``; its DV is a broad dashed line, drawn inside the grid.
+      ax: matplotlib axes to draw on; ``None`` uses pyplot's current axes.
+      names: names of the states, instead of the grid's.
 
     Returns:
-      The picture: one line a state, then those of DV, then the legend.
+      The picture: one line per state, then the lines of DV, then the legend.
 
     Example:
       >>> from types import SimpleNamespace
@@ -58,12 +58,12 @@ def costates(
         ax.plot(times, costates[:, i], color=colours[i], linewidth=1.4, label=f"λ, {names[i]}")[0] for i in range(count)
     ]
     if solution is not None:
-        # a marched V has the time as its first argument; angles of an extremal run on, those of the grid do not
+        # time is the first argument of a marched V; the angles of an extremal are unwound, those of the grid are not
         where = (times,) * (solution.times is not None) + (np.asarray(solution.grid.wrap(extremal.states)),)
-        with warnings.catch_warnings(action="ignore"):  # NaN outside the grid: there the line is interrupted
+        with warnings.catch_warnings(action="ignore"):  # outside the grid DV is NaN, which interrupts the line
             slopes = np.ma.masked_invalid(solution.costate_at(*where))
         for i in range(count):
-            # broad and pale: the line λ stays to be seen where the two agree
+            # broad and pale, so that λ remains visible where the two agree
             style: dict[str, Any] = {"color": colours[i], "linewidth": 3.6, "alpha": 0.4, "linestyle": "--"}
             artists += ax.plot(times, slopes[:, i], label=f"DV, {names[i]}", **style)
     label_axes(ax, "t", "costate")
@@ -76,32 +76,32 @@ def costates(
 def controls(
     path: Path, *, ax: Axes | None = None, names: Sequence[str] | None = None, solution: Solution | None = None
 ) -> Picture:
-    """The inputs of a path over time: lines, or steps where each was held through its interval.
+    """Plot the inputs of a path over time as lines, or as steps if they are constant in each interval.
 
-    ``path.controls`` has shape (k, m), the controls at the start of each interval: a line ends where the last begins,
-    and a step goes through it. One that jumps to and fro more often than a picture can show is drawn pale, with its
-    running mean.
+    ``path.controls`` has shape (k, m), the controls at the start of each interval. A line therefore ends at the start
+    of the last interval, and a step at its end. A control that jumps back and forth too often for a plot is drawn pale,
+    with its running mean.
 
     Args:
       path: the path of ``simulate``.
 
     Keyword Args:
-      ax: matplotlib axes to draw on; ``None`` takes pyplot's current ones.
-      names: of the inputs.
-      solution: gives the names, and the range beside which a variation counts as none.
+      ax: matplotlib axes to draw on; ``None`` uses pyplot's current axes.
+      names: names of the inputs.
+      solution: gives the names, and the ranges of the controls, so that tiny variations are drawn as constant.
 
     Returns:
-      The picture: one line an input, then the means, then the legend.
+      The picture: one line per input, then the running means, then the legend.
     """
     times, inputs = np.asarray(path.times), np.asarray(path.controls)
     count = inputs.shape[1]
     words = getattr(solution, "labels", Labels())
     names = tuple(names or (words.control(i, count) for i in range(count)))
     ax = axes_of(ax, wide=True)
-    # the control at the end is not known: a step holds through the last interval, a line that went on level would bend
+    # a step continues through the last interval; a line stops before it, because the control at the end is unknown
     held = getattr(path, "held", True) or len(inputs) == 1
     drawing = "steps-post" if held else "default"
-    # a path that ends at once has no control at all
+    # a path that ends at once has no controls
     shown = np.concatenate([inputs, inputs[-1:] if held else np.full((1, count), np.nan)])
     shown = shown if len(inputs) else np.full((len(times), count), np.nan)
     lines: list[Artist] = []
@@ -120,13 +120,13 @@ def controls(
     set_ticks(ax.xaxis, False)
     set_ticks(ax.yaxis, False)
     span = max((span_of(solution, i) for i in range(count)), default=0.0) if solution is not None else 0.0
-    if inputs.size and is_level(inputs, span):  # or the axis would show its rounding
+    if inputs.size and is_level(inputs, span):  # otherwise the axis would show rounding errors
         ax.set_ylim(*around(float(np.mean(inputs)), span))
     return Picture([*lines, *means, *([legend(ax)] if count > 1 or means else [])], ax)
 
 
 def _running_mean(times: np.ndarray, held: np.ndarray, width: float) -> np.ndarray:
-    """Means, (k+1,), of a step function with values (k,) over a window around each time, whole at both ends."""
+    """Means, (k+1,), of a step function with values (k,) over a window around each time, moved inward at the ends."""
     integral = np.concatenate([[0.0], np.cumsum(held * np.diff(times))])
     begin = np.clip(times - width / 2, times[0], times[-1] - width)
     return (np.interp(begin + width, times, integral) - np.interp(begin, times, integral)) / width

@@ -1,7 +1,7 @@
-"""Zero level sets of values, in two and in three dimensions, as slices or as projections; and pictures that move.
+"""Zero level sets of values in two and three dimensions, as slices or projections, and animations.
 
-A set {V ≤ 0} of more states than are drawn is cut by ``fixed`` or projected: a point belongs to the projection if
-some state above it belongs to the set, so that the value is minimised over the axes that go (maximised for {V ≥ 0}).
+A set {V ≤ 0} in more states than are drawn is cut by ``fixed`` or projected. A point belongs to the projection if some
+state above it belongs to the set, so the value is minimised over the removed axes (maximised for {V ≥ 0}).
 """
 
 from __future__ import annotations
@@ -41,19 +41,19 @@ if TYPE_CHECKING:
 
     from hjbjax.solution.solution import Solution
 
-OPACITY = 0.55  # of a surface: what lies behind it is seen
+OPACITY = 0.55  # of a surface, so that objects behind it are visible
 
 
 @dataclasses.dataclass(frozen=True)
 class Field:
-    """Numbers at the nodes of a grid, (*grid), and the caption that names their time."""
+    """Values at the nodes of a grid, (*grid), and a caption with their time."""
 
     values: np.ndarray
     grid: Grid
     caption: str
 
     def section(self, fixed: Mapping[str, float]) -> Section:
-        """The field cut at the coordinates of the axes named."""
+        """Cut the field at the coordinates of the named axes."""
         return section_of("zero_level_set", self.values, self.grid, fixed, self.caption)
 
 
@@ -70,27 +70,27 @@ def zero_level_set(
     label: str | None = None,
     fill: bool = True,
 ) -> Picture:
-    """The boundary of {V ≤ 0}: a curve over two axes, a lit surface that can be seen through over three.
+    """Plot the boundary of {V ≤ 0}: a curve over two axes, or a lit, translucent surface over three.
 
     Args:
       solution: the solution of ``solve`` or ``march``.
 
     Keyword Args:
-      ax: matplotlib axes to draw on, three-dimensional for three free axes; ``None`` takes pyplot's current ones.
-      fixed: coordinates of axes to cut at, by number or name.
+      ax: matplotlib axes to draw on, three-dimensional for three free axes; ``None`` uses pyplot's current axes.
+      fixed: coordinates at which axes are cut, by number or name.
       project: axes, by number or name, along which the set is projected.
-      inside: ``"below"`` for {V ≤ 0}, as of ``reach``; ``"above"`` for {V ≥ 0}, as of ``avoid``; ``None`` asks the
-        problem that was solved.
-      time: for a marched solution, which stored time to draw (the nearest one; ``None`` is the earliest).
-      color: of the curve.
-      label: of the curve in the legend; ``None`` leaves it out.
-      fill: whether the set is shaded, over two axes.
+      inside: ``"below"`` for {V ≤ 0}, as in ``reach``, ``"above"`` for {V ≥ 0}, as in ``avoid``; ``None`` follows the
+        solved problem.
+      time: for a solution of ``march``, the time to draw. The nearest stored time is used; ``None`` is the earliest.
+      color: the colour of the curve.
+      label: the label of the curve in the legend; ``None`` omits it.
+      fill: shade the set, over two axes.
 
     Returns:
-      The picture: the curve or the surface first; without artists where the set is empty.
+      The picture: the curve or the surface first; without artists if the set is empty.
 
     Raises:
-      ValueError: fewer than two or more than three axes are free, or an axis that does not exist.
+      ValueError: fewer than two or more than three axes are free, or an axis does not exist.
 
     Example:
       >>> from types import SimpleNamespace
@@ -100,18 +100,18 @@ def zero_level_set(
       1
     """
     field = _projection(_field(solution, inside, time), project)
-    # by name: a projection has taken axes out, and the numbers of the others have changed
+    # by name, because a projection removes axes and renumbers the others
     cuts = {field.grid.names[axis_number(key, field.grid)]: place for key, place in dict(fixed or {}).items()}
     if field.grid.ndim - len(cuts) == 3:
         return _surface(field, cuts, solid_axes(ax), color, label)
     section = field.section(cuts)
     if len(section.axes) != 2:
-        raise ValueError("zero_level_set: one axis is free; a level set is drawn over two or three")
+        raise ValueError("zero_level_set: one axis is free; a level set needs two or three free axes")
     ax = axes_of(ax)
     artists = _curve(ax, section, color, fill)
     frame(ax, section)
     artists += _outlines(ax, solution, section, time, bool(project))
-    if label and artists:  # contours take no label: an empty line stands for them in the legend
+    if label and artists:  # contours cannot have a label, so an empty line stands for them in the legend
         ax.plot([], [], color=color, linewidth=1.6, label=label)
     if label or ax.get_legend_handles_labels()[1]:
         legend(ax)
@@ -128,21 +128,21 @@ def turning_surface(
     time: float | None = None,
     color: str = COLOURS[0],
 ) -> Scene:
-    """The boundary of {V ≤ 0} over three axes as a page of plotly's, to be turned and zoomed with the mouse.
+    """Make a web page with the boundary of {V ≤ 0} over three axes, which the mouse can turn and zoom.
 
-    Needs plotly, ``pip install 'hjbjax[plot3d]'``.
+    This requires plotly, ``pip install 'hjbjax[plot3d]'``.
 
     Args:
       solution: the solution of ``solve`` or ``march``.
 
     Keyword Args:
-      fixed, project, inside, time, color: as for :func:`zero_level_set`.
+      fixed, project, inside, time, color: as in :func:`zero_level_set`.
 
     Returns:
-      The scene: ``.figure`` is plotly's, ``.save("tube.html")`` writes a page that needs no other file.
+      The scene: ``.figure`` is the plotly figure, and ``.save("tube.html")`` writes a self-contained page.
 
     Raises:
-      ValueError: not three axes are free.
+      ValueError: the number of free axes is not three.
       ImportError: plotly is not installed.
     """
     from matplotlib.colors import to_hex
@@ -151,21 +151,21 @@ def turning_surface(
         from plotly import graph_objects
     except ImportError as error:
         raise ImportError(
-            "turning_surface: plotly is not installed: pip install 'hjbjax[plot3d]'; zero_level_set does without"
+            "turning_surface: plotly is not installed: pip install 'hjbjax[plot3d]'; zero_level_set works without it"
         ) from error
     field = _projection(_field(solution, inside, time), project)
     cuts = {field.grid.names[axis_number(key, field.grid)]: place for key, place in dict(fixed or {}).items()}
     count = field.grid.ndim - len(cuts)
     if count != 3:
-        raise ValueError(f"turning_surface: {count} axes are free, wanted three: fixed= cuts, project= casts a shadow")
+        raise ValueError(f"turning_surface: {count} axes are free, wanted three: cut with fixed= or use project=")
     free, values, lines = _cube(field, cuts)
     triangles = level_surface(values, lines)
     corners = triangles.reshape(-1, 3)
-    # corners that triangles share are one vertex, but for rounding
+    # merge the corners that triangles share, up to rounding
     spans = np.array([line[-1] - line[0] for line in lines])
     _, first, index = np.unique(np.round(corners / spans, 9), axis=0, return_index=True, return_inverse=True)
     (x, y, z), (i, j, k) = corners[first].T, index.reshape(-1, 3).T
-    # in our light: plotly's goes by the order of corners, which tells nothing of where the inside is
+    # use our lighting, because plotly's depends on the order of corners, which is arbitrary here
     faces = [to_hex(shade) for shade in lit(triangles, values, lines, color)]
     light = {"ambient": 1.0, "diffuse": 0.0, "specular": 0.0, "fresnel": 0.0}
     mesh = graph_objects.Mesh3d(x=x, y=y, z=z, i=i, j=j, k=k, facecolor=faces, opacity=OPACITY, lighting=light)
@@ -185,17 +185,17 @@ def turning_surface(
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """A figure of plotly's."""
+    """A plotly figure."""
 
     figure: Any
 
     def save(self, path: str | os.PathLike) -> None:
-        """Write a page that needs no other file and no network: 5 MB, most of them plotly itself."""
+        """Write a self-contained page of about 5 MB, most of it plotly itself."""
         self.figure.write_html(os.fspath(path), include_plotlyjs=True)
 
 
 def _field(solution: Solution, inside: str | None, time: float | None) -> Field:
-    """The value at one time, with the sign by which the set is {V ≤ 0} whatever the problem is about."""
+    """The value at one time, with its sign flipped if the set is {V ≥ 0}."""
     if inside is None:
         inside = getattr(solution, "labels", Labels()).inside
     if inside not in SIDES:
@@ -205,7 +205,7 @@ def _field(solution: Solution, inside: str | None, time: float | None) -> Field:
 
 
 def _projection(field: Field, project: int | str | Sequence[int | str]) -> Field:
-    """The least value over the axes that go, on the grid of those that stay."""
+    """The minimum of the value over the removed axes, on the grid of the remaining axes."""
     grid = field.grid
     if isinstance(project, (str, int)):
         project = (project,)
@@ -223,26 +223,26 @@ def _projection(field: Field, project: int | str | Sequence[int | str]) -> Field
         np.asarray(grid.lo)[stay], np.asarray(grid.hi)[stay], pick(grid.shape), pick(grid.periodic), pick(grid.names),
         pick(grid.stretch), units=pick(grid.units),
     )  # fmt: skip
-    # a NaN above a point makes its minimum NaN, which is masked: nothing is said where something is unknown
+    # the minimum is NaN, and so masked, if any value above the point is NaN
     return Field(np.min(field.values, axis=tuple(gone)), smaller, field.caption)
 
 
 def _curve(ax: Axes, section: Section, color: str, fill: bool) -> list[Artist]:
-    """The curve V = 0 over two axes, and the shade of V ≤ 0; nothing where the set is empty."""
+    """Draw the curve V = 0 over two axes and shade V ≤ 0; draws nothing if the set is empty."""
     known = section.values.compressed()
     if known.size == 0 or known.min() > 0:
         return []
     x, y = section.coordinates
     artists: list[Artist] = []
-    if known.max() > 0:  # a set that is the whole box has no boundary in it, and matplotlib would warn
+    if known.max() > 0:  # otherwise the set is the whole box, and matplotlib would warn about an empty contour
         artists.append(ax.contour(x, y, section.values.T, levels=[0.0], colors=color, linewidths=1.6))
-    if fill:  # matplotlib wants two levels: the lower one is below all values
+    if fill:  # matplotlib requires two levels; the lower one is below all values
         artists.append(ax.contourf(x, y, section.values.T, levels=[known.min() - 1, 0.0], colors=color, alpha=0.15))
     return artists
 
 
 def _outlines(ax: Axes, solution: Solution, section: Section, time: float | None, projected: bool) -> list[Artist]:
-    """The outlines of the sets that the problem is about, where they are known and not projected."""
+    """Draw the outlines of the sets of the problem if they are known; not for projections."""
     if projected:
         return []
     regions = (region_of(function, section, name) for name, function in sets_of(solution, time).items())
@@ -250,7 +250,7 @@ def _outlines(ax: Axes, solution: Solution, section: Section, time: float | None
 
 
 def _cube(field: Field, fixed: Mapping[str, float]) -> tuple[list[int], np.ndarray, list[np.ndarray]]:
-    """The three axes that are not fixed, by number, the field over them, and their coordinates."""
+    """The numbers of the three free axes, the field over them, and their coordinates."""
     grid = field.grid
     free = [axis for axis in range(grid.ndim) if grid.names[axis] not in fixed]
     cuts = {grid.names.index(name): float(place) for name, place in fixed.items()}
@@ -259,7 +259,7 @@ def _cube(field: Field, fixed: Mapping[str, float]) -> tuple[list[int], np.ndarr
 
 
 def _surface(field: Field, fixed: Mapping[str, float], ax: Any, color: str, label: str | None) -> Picture:
-    """The surface V = 0 over the three axes that are not fixed."""
+    """Draw the surface V = 0 over the three free axes."""
     from matplotlib.ticker import MaxNLocator
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-untyped]
 
@@ -270,16 +270,16 @@ def _surface(field: Field, fixed: Mapping[str, float], ax: Any, color: str, labe
     if len(triangles):
         colours = np.column_stack([lit(triangles, closed, lines, color), np.full(len(triangles), OPACITY)])
         surface = Poly3DCollection(triangles, facecolors=colours, edgecolors="none", linewidths=0, antialiased=True)
-        surface.set(rasterized=True)  # as vectors, each triangle would show its edge
+        surface.set(rasterized=True)  # as vectors the edge of each triangle would be visible
         artists.append(ax.add_collection3d(surface))
     ends = [(float(line[0]), float(line[-1])) for line in lines]
     ax.set(xlim=ends[0], ylim=ends[1], zlim=ends[2])
     for axis, number, text in zip((ax.xaxis, ax.yaxis, ax.zaxis), free, "xyz", strict=True):
-        # seen from the side, more would run into each other, and so would the last of x and the first of y
+        # few ticks, because from the side more would overlap, as would the last one of x and the first one of y
         axis.set_major_locator(MaxNLocator(4, prune="upper" if text == "x" else None))
         set_ticks(axis, is_angle(grid, number))
         getattr(ax, f"set_{text}label")(grid.labels[number], labelpad=8)
-    # smaller than its frame, or the label on the right would be cut
+    # smaller than its frame, otherwise the label on the right would be cut off
     ax.set_box_aspect(box_sides(grid, free), zoom=0.86)
     if field.caption:
         ax.set_title(field.caption, loc="right", fontsize=9)
@@ -298,50 +298,50 @@ def animation(
     interval: float = 100.0,
     **options: Any,
 ) -> FuncAnimation:
-    """A marched solution over time, from the horizon backwards as it was found.
+    """Animate a solution of ``march`` over time, backward from the horizon.
 
     Args:
-      solution: the solution of ``march``, with the times that become the frames.
-      draw: what draws one frame: ``zero_level_set``, ``value`` or ``policy`` of this module, or a function that
-        takes the solution, ``ax=`` and ``time=``.
+      solution: the solution of ``march``, whose stored times become the frames.
+      draw: draws one frame: ``zero_level_set``, ``value`` or ``policy`` of this module, or a function that takes the
+        solution, ``ax=`` and ``time=``.
 
     Keyword Args:
-      ax: matplotlib axes to draw on, wiped for every frame; ``None`` takes pyplot's current ones.
-      interval: milliseconds a frame.
-      options: for ``draw``.
+      ax: matplotlib axes to draw on, cleared for every frame; ``None`` uses pyplot's current axes.
+      interval: milliseconds per frame.
+      options: passed to ``draw``.
 
     Returns:
-      A matplotlib ``FuncAnimation`` with its ``.figure``; keep it, and ``.save("tube.gif", writer="pillow")`` it.
+      A matplotlib ``FuncAnimation`` with a ``.figure``. Keep a reference; ``.save("tube.gif", writer="pillow")`` saves.
 
     Raises:
-      ValueError: a stationary solution.
+      ValueError: the solution is stationary.
     """
     from matplotlib.animation import FuncAnimation
 
     if getattr(solution, "times", None) is None:
-        raise ValueError("animation: the solution is stationary; march(..., times=np.linspace(0, horizon, 41)) moves")
+        raise ValueError("animation: the solution is stationary; use march(..., times=np.linspace(0, horizon, 41))")
     if not callable(draw):
-        raise TypeError(f"animation: got draw = {draw!r}, wanted a function, as hjb.plotting.value")
-    # now: the frames are drawn later, and may be drawn by nobody
+        raise TypeError(f"animation: got draw = {draw!r}, wanted a function such as hjb.plotting.value")
+    # check now, because the frames are drawn later or never
     refuse_misspelt(options, {*(keywords(draw) or options), "interval"}, "animation")
     axes = _moving_axes(solution, draw, ax, options)
 
     def frame_at(time: float) -> list[Artist]:
-        axes.clear()  # contours have no data that could be replaced: every frame is drawn anew
+        axes.clear()  # contours cannot be updated, so every frame is drawn again
         draw(solution, ax=axes, time=float(time), **options)
-        if not axes.get_title(loc="right"):  # where a function of the user's names no time
+        if not axes.get_title(loc="right"):  # if a custom function does not show the time
             axes.set_title(f"t = {time:.3g}", loc="right", fontsize=9)
         return axes.get_children()
 
-    # backwards: the horizon, where the march began, comes first
+    # backward, because march starts at the horizon
     frames = np.asarray(solution.times)[::-1]
     moving = FuncAnimation(cast("Figure", axes.get_figure()), frame_at, frames=frames, interval=interval)
-    setattr(moving, "figure", axes.get_figure())  # noqa: B010, as with every other picture; matplotlib has no name for it
+    setattr(moving, "figure", axes.get_figure())  # noqa: B010, as for every other picture; FuncAnimation has no figure
     return moving
 
 
 def _moving_axes(solution: Solution, draw: Callable[..., Any], ax: Axes | None, options: Mapping[str, Any]) -> Axes:
-    """The axes of an animation: three-dimensional ones where a surface is to be drawn."""
+    """The axes of an animation, three-dimensional for a surface."""
     gone = options.get("project") or ()
     gone = [gone] if isinstance(gone, (str, int)) else gone
     free = solution.grid.ndim - len(options.get("fixed") or ()) - len(gone)

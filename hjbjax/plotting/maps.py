@@ -1,4 +1,4 @@
-"""Pictures over one or two axes of a value, a feedback and its switching curve; and of paths."""
+"""Plots of a value, a feedback and its switching curve over one or two axes, and of paths."""
 
 from __future__ import annotations
 
@@ -50,25 +50,25 @@ def value(
     colorbar: bool = True,
     target: Callable[[State], Number] | None = None,
 ) -> Picture:
-    """The value function: a line over one axis, colours with contour lines over two.
+    """Plot the value function: a line over one axis, colours with contour lines over two axes.
 
     Args:
       solution: the solution of ``solve`` or ``march``.
 
     Keyword Args:
-      ax: matplotlib axes to draw on; ``None`` takes pyplot's current ones.
-      fixed: coordinates of the axes to cut at, by number or name, until at most two are free.
-      time: for a marched solution, which stored time to draw (the nearest one; ``None`` is the earliest).
-      levels: how many contour lines, or their values; 0 for none.
-      colorbar: whether a colour scale is drawn beside two-dimensional pictures.
-      target: a function of the state, ≤ 0 inside, to be outlined and hatched over two axes, since what is held there
-        need not be a value; ``None`` takes that of the problem that was solved.
+      ax: matplotlib axes to draw on; ``None`` uses pyplot's current axes.
+      fixed: coordinates at which axes are cut, by number or name; at most two axes may remain free.
+      time: for a solution of ``march``, the time to draw. The nearest stored time is used; ``None`` is the earliest.
+      levels: the number of contour lines, or their values; 0 for none.
+      colorbar: draw a colour bar next to a two-dimensional plot.
+      target: a function of the state, ≤ 0 inside a set that is outlined and hatched over two axes, because the numbers
+        there need not be values; ``None`` uses the target of the solved problem.
 
     Returns:
       The picture: the line or the mesh first, with ``.figure`` and ``.save(path)``.
 
     Raises:
-      ValueError: more than two axes are free, or ``fixed`` names an axis or a place that does not exist.
+      ValueError: more than two axes are free, or ``fixed`` has an axis or a coordinate that does not exist.
 
     Example:
       >>> from types import SimpleNamespace
@@ -82,7 +82,7 @@ def value(
     field, caption = at_time(solution, solution.value, time)
     section = section_of("value", field, solution.grid, fixed, caption)
     ax = axes_of(ax)
-    # .data is what the mask hides: infinity is out of reach, NaN is something else and must not be called so
+    # .data has the masked numbers: infinity means unreachable, NaN must not be labelled so
     hidden = "V = ∞" if np.all(np.isposinf(section.values.data[section.values.mask])) else "V not finite"
     section, regions = _without(section, target_of(solution, time) if target is None else target)
     artists = draw(ax, section, Look("V", hidden, colorbar), regions)
@@ -95,7 +95,7 @@ def value(
 
 
 def _without(section: Section, target: Callable[[State], Number] | None) -> tuple[Section, tuple[Region, ...]]:
-    """The section with the nodes of the target masked, and the target to be outlined; over two axes alone."""
+    """Mask the nodes of the target and return its outline, over two axes only."""
     if target is None or len(section.axes) != 2:
         return section, ()
     region = region_of(target, section, "target")
@@ -113,17 +113,17 @@ def policy(
     time: float | None = None,
     colorbar: bool = True,
 ) -> Picture:
-    """One input of the feedback u(x): a line over one axis, over two colours that part at zero where the sign changes.
+    """Plot one input of the feedback u(x): a line over one axis, colours over two axes.
 
-    A feedback that jumps, or is enumerated, is drawn as cells, any other one smoothly. Where no control is defined or
-    the value is not finite the picture is hatched.
+    If the input changes sign, the colours diverge at zero. A feedback that jumps or is enumerated is drawn as cells,
+    any other feedback smoothly. Nodes without a control or without a finite value are hatched.
 
     Args:
       solution: the solution of ``solve`` or ``march``.
 
     Keyword Args:
-      input: which of the m inputs, from 0.
-      ax, fixed, time, colorbar: as for :func:`value`, with its result and its refusals.
+      input: index of the input.
+      ax, fixed, time, colorbar: as in :func:`value`, which also describes the result and the errors.
     """
     section, label = feedback(solution, input, fixed, time)
     ax = axes_of(ax)
@@ -131,7 +131,7 @@ def policy(
     cells = getattr(solution, "discrete", False) or jumps(section.values.compressed())
     span = span_of(solution, input)
     inner = (slice(1, -1),) if len(section.axes) == 1 else ()
-    # the run ends at the two ends of a line: a hatch half a cell wide would tell nothing
+    # skip the two ends of a line, where the run ends, because hatches half a cell wide show nothing
     lost = np.ma.getmaskarray(section.values)[inner]
     hidden = "no control" if lost.any() or len(section.axes) == 2 else ""
     target = target_of(solution, time)
@@ -153,28 +153,28 @@ def switching_curve(
     color: str = "black",
     label: str | None = "switching curve",
 ) -> Picture:
-    """The curve on which one input changes sign: the zero level of the feedback, linear between nodes.
+    """Plot the curve on which one input changes sign: the zero level of the feedback, linear between nodes.
 
-    A bang-bang feedback jumps between two nodes, so its curve is known to half a cell, as it is drawn. Over
-    one axis the places are vertical lines.
+    A bang-bang feedback jumps between two nodes, so the curve is accurate to half a cell. Over one axis the zeros are
+    drawn as vertical lines.
 
     Args:
       solution: the solution of ``solve`` or ``march``.
 
     Keyword Args:
-      input, ax, fixed, time: as for :func:`policy`.
-      color: of the curve.
-      label: of the curve in the legend; ``None`` leaves it out.
+      input, ax, fixed, time: as in :func:`policy`.
+      color: the colour of the curve.
+      label: the label of the curve in the legend; ``None`` omits it.
 
     Raises:
-      ValueError: the input keeps its sign, or as for :func:`value`.
+      ValueError: the input does not change sign; otherwise as in :func:`value`.
     """
     section, name = feedback(solution, input, fixed, time)
     known = section.values.compressed()
-    # refused here: matplotlib would warn of a contour that does not exist and draw nothing
+    # otherwise matplotlib warns about an empty contour and draws nothing
     if known.size == 0 or known.min() >= 0 or known.max() <= 0:
         between = f"{known.min():g} and {known.max():g}" if known.size else "no finite values"
-        raise ValueError(f"switching_curve: {name} stays between {between}; there is no change of sign to draw")
+        raise ValueError(f"switching_curve: {name} stays between {between}, so it does not change sign")
     ax = axes_of(ax)
     style: dict[str, Any] = {"color": color, "linewidth": 1.6}
     if len(section.axes) == 1:
@@ -183,7 +183,7 @@ def switching_curve(
         x, y = section.coordinates
         artists = [ax.contour(x, y, section.values.T, levels=[0.0], colors=color, linewidths=1.6)]
     frame(ax, section)
-    if label:  # on an empty line: contours take none
+    if label:  # on an empty line, because contours cannot have a label
         artists += ax.plot([], [], label=label, **style)
         legend(ax)
     return Picture(artists, ax)
@@ -200,26 +200,26 @@ def trajectory(
     color: str | None = None,
     label: str | None = None,
 ) -> Picture:
-    """A path in the plane of two states, or its states over time.
+    """Plot a path in the plane of two states, or its states over time.
 
-    Works on top of :func:`value` or :func:`policy`: pass their ``ax``. A ring marks the start, a dot the end.
+    To draw on top of :func:`value` or :func:`policy`, pass the same ``ax``. A circle marks the start and a dot the end.
 
     Args:
       path: the path of ``simulate``: ``times`` (k+1,) and ``states`` (k+1, n).
 
     Keyword Args:
-      ax: matplotlib axes to draw on; ``None`` takes pyplot's current ones.
-      axes: the two states of the plane; ``None``, or a path with one state, draws all states over time.
-      grid: gives the names, and where periodic states are wrapped: the line is broken at the seam.
-      names: names of the states, in place of the grid's.
-      color: of the line, ``None`` chooses.
-      label: of the line in the legend.
+      ax: matplotlib axes to draw on; ``None`` uses pyplot's current axes.
+      axes: the two states of the plane; ``None``, or a path with one state, plots all states over time.
+      grid: a grid with the names, whose periodic axes are wrapped; the line is broken at the seam.
+      names: names of the states, instead of the grid's.
+      color: the colour of the line; ``None`` chooses one.
+      label: the label of the line in the legend.
 
     Returns:
-      The picture: the line first, or one line a state.
+      The picture: the line first, or one line per state.
 
     Raises:
-      ValueError: ``axes`` asks for states that the path does not have.
+      ValueError: the path does not have the states in ``axes``.
     """
     from matplotlib.patheffects import Normal, Stroke
 
@@ -240,11 +240,11 @@ def trajectory(
     if len(axes) != 2 or not all(0 <= i < count for i in axes):
         raise ValueError(f"trajectory: got axes={axes!r}; the path has {count} states, wanted two of 0 to {count - 1}")
     ax = axes_of(ax)
-    # the ends each for themselves: the rows of the folded path may begin or end with a cut at the seam
+    # the end points separately, because the folded path may begin or end with a cut at the seam
     first, last = line_in_box(states[:1], axes, grid)[0], line_in_box(states[-1:], axes, grid)[0]
     plane = line_in_box(states, axes, grid)
     color = color or COLOURS[1]
-    casing = [Stroke(linewidth=3.4, foreground="white"), Normal()]  # a white edge: it reads on any colour
+    casing = [Stroke(linewidth=3.4, foreground="white"), Normal()]  # a white border, visible on any colour
     artists = [*ax.plot(*plane.T, color=color, linewidth=1.8, label=label, path_effects=casing, zorder=4)]
     marks: dict[str, Any] = {"linestyle": "none", "marker": "o", "markeredgecolor": color, "markersize": 6, "zorder": 5}
     artists += ax.plot(*first, markerfacecolor="white", markeredgewidth=1.6, **marks)
@@ -267,17 +267,17 @@ def closed_loop(
     target: Callable[[State], Number] | None = None,
     figure: Figure | SubFigure | None = None,
 ) -> Picture:
-    """One figure: the path on the value function, and its states and inputs over time.
+    """Plot the path on the value function, and its states and inputs over time, in one figure.
 
     Args:
       solution: the solution of ``solve``.
-      path: the path of ``simulate`` for it.
+      path: the path of ``simulate`` for this solution.
 
     Keyword Args:
-      axes: the two states of the plane on the left; left out for one state.
-      fixed: where the other axes are cut, by default at the path's start.
-      target: as for :func:`value`.
-      figure: matplotlib figure to draw on; ``None`` makes one of pyplot's.
+      axes: the two states of the plane on the left; there is no plane for one state.
+      fixed: the coordinates at which the other axes are cut; the default is the start of the path.
+      target: as in :func:`value`.
+      figure: matplotlib figure to draw on; ``None`` makes a pyplot figure.
 
     Returns:
       The picture: the artists of the value first.
@@ -289,7 +289,7 @@ def closed_loop(
     columns = figure.add_gridspec(1 + driven, 1 + plane, width_ratios=(1.25, 1.0)[: 1 + plane])
     if plane:
         start = np.asarray(path.states)[0]
-        # the path leaves this plane in its other states: it is its shadow that is drawn on the section
+        # the path may leave this plane in its other states; its projection is drawn on the section
         cut: Cuts = {axis: float(start[axis]) for axis in range(grid.ndim) if axis not in axes}
         ax = styled(figure.add_subplot(columns[:, 0]))
         artists += value(solution, ax=ax, fixed=cut if fixed is None else fixed, target=target)
@@ -298,7 +298,7 @@ def closed_loop(
     upper = styled(figure.add_subplot(columns[0, -1]))
     artists += trajectory(path, ax=upper, axes=None, grid=grid)
     if driven:
-        upper.set_xlabel("")  # time is written once, below
+        upper.set_xlabel("")  # the lower axes have the label of the time
         lower = styled(figure.add_subplot(columns[1, -1], sharex=upper))
         artists += controls(path, ax=lower, solution=solution)
         upper.tick_params(labelbottom=False)
@@ -306,15 +306,15 @@ def closed_loop(
 
 
 def closed_loop_size(grid: Grid) -> tuple[float, float]:
-    """The size of a closed loop's figure in inches: a plane beside the lines over time where there is one."""
+    """The size of the figure of a closed loop in inches, with room for a plane if there are two states or more."""
     return (9.6 if grid.ndim > 1 else 5.4), 4.2
 
 
 def _levels(values: np.ma.MaskedArray, levels: int | Sequence[float]) -> np.ndarray:
-    """Contour levels strictly between the extremes, so that none is empty."""
+    """Contour levels strictly between the extremes, so that no contour is empty."""
     known = values.compressed()
     if known.size == 0 or is_level(known):
         return known[:0]
-    # two more than wanted: those at the extremes are dropped, where a contour is a point or a speck of rounding
+    # two more than requested, because those at the extremes, a point or a speck of rounding, are dropped
     places = np.linspace(known.min(), known.max(), levels + 2) if isinstance(levels, int) else np.sort(levels)
     return places[(places > known.min()) & (places < known.max())]

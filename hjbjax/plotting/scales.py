@@ -1,4 +1,4 @@
-"""Ticks and numbers: multiples of π on angles, figures without an offset, one scale for positions on both axes."""
+"""Ticks and scales: multiples of π for angles, numbers without an offset, equal scales for positions on both axes."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ if TYPE_CHECKING:
 
 LENGTHS = ("m", "km", "cm", "mm", "µm", "um", "nm", "ft", "in", "mi", "nmi", "nautical miles", "au", "AU")
 ANGLES = ("rad", "radian", "radians")
-FEWEST, MOST = 3, 7  # ticks of an angle; below the fewest, decimals tell more than fractions of π
-STEPS = [Fraction(1, 4), Fraction(1, 2), *(Fraction(2**k) for k in range(12))]  # multiples of π between two ticks
+FEWEST, MOST = 3, 7  # ticks of an angle; with fewer, decimals are better than fractions of π
+STEPS = [Fraction(1, 4), Fraction(1, 2), *(Fraction(2**k) for k in range(12))]  # tick spacings, in multiples of π
 
 
 def number_text(value: float, _position: int | None = None) -> str:
-    """A number as a tick is labelled: no offset, no trailing zeros, a true minus, 2·10⁶ for a large one.
+    """The label of a tick: no offset, no trailing zeros, a true minus, and 2·10⁶ for a large number.
 
     Example:
       >>> number_text(0.1 + 0.2), number_text(-2.0), number_text(3e-7), number_text(-0.0)
@@ -33,7 +33,7 @@ def number_text(value: float, _position: int | None = None) -> str:
 
 
 def angle_text(value: float, _position: int | None = None) -> str:
-    """A multiple of π as a tick is labelled.
+    """The label of a tick at a multiple of π.
 
     Example:
       >>> [angle_text(k * math.pi / 4) for k in (-4, -1, 0, 2, 3, 8)]
@@ -48,16 +48,16 @@ def angle_text(value: float, _position: int | None = None) -> str:
 
 
 def is_angle(grid: Grid, axis: int) -> bool:
-    """True for an axis in radians: by its unit, or, without one, where it is periodic with the period 2π."""
+    """True for an axis in radians, by its unit, or if it has no unit and the period 2π."""
     unit = grid.units[axis]
     if unit or not grid.periodic[axis]:  # type: ignore[index]
         return unit in ANGLES
-    # to a millionth, as periods come from float32 as well
+    # to 1e-6, because periods may come from float32
     return math.isclose(float(grid.hi[axis]) - float(grid.lo[axis]), 2 * math.pi, rel_tol=1e-6)
 
 
 def place_text(grid: Grid, axis: int, place: float) -> str:
-    """A coordinate with its unit, as a caption says it; of an angle the simple multiples of π.
+    """A coordinate with its unit, for a caption; simple fractions of π are written as such.
 
     Example:
       >>> place_text(Grid([0.0], [math.tau], (4,), (True,), units=("rad",)), 0, math.pi / 2)
@@ -70,13 +70,13 @@ def place_text(grid: Grid, axis: int, place: float) -> str:
 
 
 def are_positions(grid: Grid, axes: Sequence[int]) -> bool:
-    """True for two axes with one and the same unit of length: only then is a circle to look round."""
+    """True for two axes with the same unit of length, on which a circle must look round."""
     units = {grid.units[axis] for axis in axes}
     return len(axes) == 2 and len(units) == 1 and units <= set(LENGTHS)
 
 
 def box_sides(grid: Grid, axes: Sequence[int]) -> tuple[float, ...]:
-    """The sides on which three axes are drawn: those with one and the same unit of length have one scale.
+    """The side lengths of a box for three axes; axes with the same unit of length have the same scale.
 
     Example:
       >>> box_sides(Grid([0.0] * 3, [4.0, 2.0, 9.0], (2, 2, 2), units=("m", "m", "rad")), (0, 1, 2))
@@ -92,7 +92,7 @@ def box_sides(grid: Grid, axes: Sequence[int]) -> tuple[float, ...]:
 
 
 def set_ticks(axis: Any, angle: bool) -> None:
-    """Numbers without an offset on a matplotlib axis; multiples of π where it is an angle and long enough."""
+    """Format a matplotlib axis with numbers without an offset, or multiples of π if it is an angle and long enough."""
     from matplotlib.ticker import FuncFormatter, MultipleLocator
 
     axis.set_major_formatter(FuncFormatter(number_text))
@@ -103,7 +103,7 @@ def set_ticks(axis: Any, angle: bool) -> None:
 
 
 def angle_step(lo: float, hi: float) -> float | None:
-    """The multiple of π between two ticks of an angle; ``None`` where there would be too few of them, or too many.
+    """The spacing of the ticks of an angle, a multiple of π; ``None`` if there would be too few or too many ticks.
 
     Example:
       >>> angle_step(-math.pi, math.pi) == math.pi / 2
@@ -115,7 +115,7 @@ def angle_step(lo: float, hi: float) -> float | None:
 
 
 def scale_axes(ax: Axes, grid: Grid, axes: Sequence[int]) -> None:
-    """Ticks for the axes of a grid on the axes of a picture, and one scale for both where they are positions."""
+    """Set the ticks for the axes of a grid, and equal scales if both are positions."""
     for axis, number in zip((ax.xaxis, ax.yaxis), axes, strict=False):
         set_ticks(axis, is_angle(grid, number))
     if len(axes) == 1:

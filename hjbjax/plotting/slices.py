@@ -1,7 +1,7 @@
-"""What a picture draws, as plain arrays: fields cut to one or two axes, and paths folded at periodic seams.
+"""The data of a plot as plain arrays: fields cut to one or two axes, and paths folded at periodic seams.
 
-Nothing here knows about matplotlib. Cuts are linear between nodes, as ``Solution.value_at`` is; fields of
-enumerated controls are cut at the nearest node. Entries that are not finite are masked.
+This file does not use matplotlib. Cuts are linear between nodes, like ``Solution.value_at``; fields of enumerated
+controls are cut at the nearest node. Entries that are not finite are masked.
 """
 
 import difflib
@@ -24,16 +24,16 @@ from hjbjax.tracing import checks
 if TYPE_CHECKING:
     from hjbjax.solution.solution import Solution
 
-# where axes are cut, by their numbers or names; three times, since a type checker takes no {0: 1.0} for the last
+# coordinates by axis number or name; three types, because a type checker does not accept {0: 1.0} for the last one
 Cuts: TypeAlias = Mapping[int, float] | Mapping[str, float] | Mapping[int | str, float]
-CHUNK = 1 << 16  # states for which a function is evaluated at once, which bounds the memory of its intermediate arrays
-RASTER = 301  # points an axis on which a set is outlined: a disc of a tenth of the picture has 30 across
-ON_NODE = 1e-9  # of a cell: a coordinate this near to a node is meant to be it, 0.1 + 0.2 as well as 0.3
+CHUNK = 1 << 16  # number of states evaluated at once, to bound the memory of intermediate arrays
+RASTER = 301  # points per axis for the outline of a set; a disc a tenth of the plot wide has 30 across
+ON_NODE = 1e-9  # fraction of a cell: a coordinate this close to a node means the node, so 0.1 + 0.2 means 0.3
 COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight")
 
 
 class Section(NamedTuple):
-    """A field cut down to one or two axes: the axes, their labels and coordinates, masked values, where it was cut."""
+    """A field cut to one or two axes: the axes, their labels and coordinates, masked values, and the cuts."""
 
     axes: tuple[int, ...]
     labels: tuple[str, ...]
@@ -44,7 +44,7 @@ class Section(NamedTuple):
     cuts: dict[int, float]  # by axis number
 
     def states(self, coordinates: Sequence[np.ndarray]) -> np.ndarray:
-        """The states over a raster of the free axes, shape (*raster, n), the others where they are cut."""
+        """The states on a raster of the free axes, shape (*raster, n), with the other states at their cuts."""
         raster = np.meshgrid(*coordinates, indexing="ij")
         columns = dict(zip(self.axes, raster, strict=True))
         return np.stack(
@@ -54,7 +54,7 @@ class Section(NamedTuple):
 
 
 class Region(NamedTuple):
-    """A set in the plane of a section: its name, a fine raster with its function, ≤ 0 inside, the nodes within."""
+    """A set in the plane of a section: its name, a fine raster with its function, ≤ 0 inside, and the nodes inside."""
 
     label: str
     coordinates: tuple[np.ndarray, ...]
@@ -63,7 +63,7 @@ class Region(NamedTuple):
 
     @property
     def visible(self) -> bool:
-        """True where there is something to be seen: a single point has no inside."""
+        """True if the set has an interior; a single point is not drawn."""
         return bool(np.min(self.level) < 0)
 
 
@@ -71,7 +71,7 @@ def region_of(function: Callable[[State], Number], section: Section, label: str)
     """The set where a function of one state is ≤ 0, in the plane of a section over two axes.
 
     Raises:
-      ValueError: the function cannot be traced, or returns no number.
+      ValueError: the function cannot be traced, or does not return a number.
     """
     checks.function_of(function, label, (), x=(section.grid.ndim,))
     fine = tuple(np.linspace(line[0], line[-1], RASTER) for line in section.coordinates)
@@ -80,8 +80,8 @@ def region_of(function: Callable[[State], Number], section: Section, label: str)
 
 
 def at_time(solution: "Solution", field: Array, time: float | None) -> tuple[np.ndarray, str]:
-    """The field at one stored time, and the caption that names it."""
-    # solutions of reachability and stand-ins of a user's own may carry no times at all
+    """The field at the stored time closest to ``time``, and a caption with this time."""
+    # reachability solutions and stand-ins defined by a user may not have times
     field, times = np.asarray(field), getattr(solution, "times", None)
     if times is None:
         if time is not None:
@@ -93,7 +93,7 @@ def at_time(solution: "Solution", field: Array, time: float | None) -> tuple[np.
 
 
 def target_of(solution: "Solution", time: float | None = None) -> Callable[[State], Number] | None:
-    """The target of the problem that a solution answers, at the time that is drawn; ``None`` where none is known."""
+    """The target of the solution's problem at the time of the plot; ``None`` if unknown."""
     problem = getattr(solution, "problem", None)
     if problem is None or problem.target is None:
         return None
@@ -104,7 +104,7 @@ def target_of(solution: "Solution", time: float | None = None) -> Callable[[Stat
 
 
 def sets_of(solution: "Solution", time: float | None = None) -> dict[str, Callable[[State], Number]]:
-    """The sets whose signed distances a problem of reachability is made of, by name, as functions ≤ 0 inside."""
+    """The sets whose signed distances define a reachability problem, by name, as functions ≤ 0 inside."""
     problem = getattr(solution, "problem", None)
     if problem is None or problem.target is not None or problem.cost is not None:
         return {}
@@ -117,18 +117,18 @@ def sets_of(solution: "Solution", time: float | None = None) -> dict[str, Callab
     end = problem.terminal_cost if callable(problem.terminal_cost) else None
     least = problem.stopping_cost if callable(problem.stopping_cost) else None if above else end
     most = problem.running_max if problem.running_max is not None else end if above else None
-    sets = {"target": (least, 1), "obstacle": (most, -1)}  # V ≥ −o: the obstacle is where the maximum is ≥ 0
+    sets = {"target": (least, 1), "obstacle": (most, -1)}  # the running maximum is −o, ≥ 0 inside the obstacle
     return {name: at(function, sign) for name, (function, sign) in sets.items() if function is not None}
 
 
 def _moment(solution: "Solution", time: float | None) -> float:
-    """The stored time that is drawn."""
+    """The stored time closest to ``time``, or the earliest."""
     times = np.asarray(solution.times, float)
     return float(times[np.argmin(times if time is None else np.abs(times - time))])
 
 
 def span_of(solution: "Solution", input: int) -> float:
-    """The length of the range of one control; 0 where it is not known."""
+    """The length of the range of one control; 0 if unknown."""
     controls = getattr(getattr(solution, "problem", None), "controls", None)
     if isinstance(controls, Box):
         return float(controls.hi[input] - controls.lo[input])
@@ -136,27 +136,27 @@ def span_of(solution: "Solution", input: int) -> float:
 
 
 def at_states(function: Callable[[State], Number], states: np.ndarray) -> np.ndarray:
-    """A function of one state at states of shape (..., n), as one program, shape (...)."""
-    # the states are float64; in float32 a level at a face of the box would round either way
+    """Evaluate a function of one state at states of shape (..., n), in one program; shape (...)."""
+    # in float64, because in float32 a level at a face of the box would be rounded to either side
     with own_settings(x64=True):
         every = jax.jit(lambda states: jax.lax.map(function, states, batch_size=CHUNK))
         return np.asarray(every(states.reshape(-1, states.shape[-1]))).reshape(states.shape[:-1])
 
 
 def feedback(solution: "Solution", input: int, fixed: Cuts | None, time: float | None) -> tuple[Section, str]:
-    """One input's section, masked where no control is defined or the value is not finite, and its name."""
+    """The section and the name of one input, masked where no control is defined or the value is not finite."""
     if solution.policy is None:
         raise ValueError("policy: this solution has no policy")
     inputs, caption = at_time(solution, solution.policy, time)
     count = inputs.shape[-1]
-    # True would be the input 1
+    # bool is a subclass of int, so True would mean input 1
     if isinstance(input, bool) or not isinstance(input, (int, np.integer)) or not 0 <= input < count:
         allowed = f"0 to {count - 1}" if count else "none: the problem has no control"
         raise ValueError(f"policy: got input={input!r}, wanted one of {allowed}")
-    # where V is infinite the greedy control is one of many that are as bad, and says nothing
+    # where V is infinite all controls are equally bad, so the greedy control is meaningless
     known = np.isfinite(at_time(solution, solution.value, time)[0])
     field = np.where(known, inputs[..., input], np.nan)
-    nearest = getattr(solution, "discrete", False)  # the mean of two enumerated controls need not be admissible
+    nearest = getattr(solution, "discrete", False)  # the mean of two enumerated controls may not be admissible
     label = getattr(solution, "labels", Labels()).control(input, count)
     return section_of("policy", field, solution.grid, fixed, caption, nearest), label
 
@@ -169,12 +169,12 @@ def section_of(
     caption: str,
     nearest: bool = False,
 ) -> Section:
-    """The field cut at the fixed coordinates, closed along periodic axes, masked where it is not finite."""
+    """Cut the field at the fixed coordinates, close it along periodic axes, and mask entries that are not finite."""
     if field.shape != grid.shape:
         raise ValueError(
             f"{what}: got a field of shape {field.shape} on a grid of shape {grid.shape}; draw one lane at a time"
         )
-    cuts: dict[int, float] = {}  # by number: an axis may be given by its name and its number at once
+    cuts: dict[int, float] = {}  # by number, because an axis may be given both by name and by number
     for key, place in dict(fixed or {}).items():
         axis = axis_number(key, grid)
         if axis in cuts:
@@ -196,7 +196,7 @@ def section_of(
 
 
 def _how_many(grid: Grid, free: tuple[int, ...]) -> str:
-    """How to come from the free axes to two: what a refusal advises."""
+    """The error message if the number of free axes is not one or two."""
     if not free:
         return "every axis is fixed; leave one or two of them free"
     rest = grid.ndim - 2
@@ -209,7 +209,7 @@ def _how_many(grid: Grid, free: tuple[int, ...]) -> str:
 
 
 def axis_number(key: object, grid: Grid) -> int:
-    """The axis that a number or a name means."""
+    """The number of the axis with this number or name."""
     if isinstance(key, str) and key in grid.names:
         return grid.names.index(key)
     if isinstance(key, (int, np.integer)) and not isinstance(key, bool) and 0 <= key < grid.ndim:
@@ -220,14 +220,14 @@ def axis_number(key: object, grid: Grid) -> int:
 
 
 def cut_field(what: str, field: np.ndarray, grid: Grid, cuts: Mapping[int, float], nearest: bool = False) -> np.ndarray:
-    """A field at the nodes over the axes that are left where the others are cut, by axis number."""
-    for axis in sorted(cuts, reverse=True):  # the last first: a cut takes its axis out, and those behind move up
+    """Cut a field at the nodes at the coordinates in ``cuts``, by axis number."""
+    for axis in sorted(cuts, reverse=True):  # last axis first, because a cut renumbers the axes behind it
         field = _cut(what, field, grid, axis, cuts[axis], nearest)
     return field
 
 
 def closed_field(field: np.ndarray, grid: Grid, free: Sequence[int]) -> np.ndarray:
-    """A field over the free axes with the first row once more at the upper end of each periodic one: no gap is left."""
+    """Repeat the first row of a field at the upper end of each periodic free axis, so that no gap remains."""
     for position, axis in enumerate(free):
         if grid.periodic[axis]:  # type: ignore[index]
             field = np.concatenate([field, np.take(field, [0], position)], position)
@@ -235,39 +235,39 @@ def closed_field(field: np.ndarray, grid: Grid, free: Sequence[int]) -> np.ndarr
 
 
 def _cut(what: str, field: np.ndarray, grid: Grid, axis: int, place: float, nearest: bool) -> np.ndarray:
-    """Linear interpolation along one axis; a neighbour of weight zero, infinite or not, does not count."""
+    """Interpolate linearly along one axis; a neighbour with weight zero does not contribute, even if infinite."""
     lo, hi, last = float(grid.lo[axis]), float(grid.hi[axis]), grid.intervals(axis)
     if grid.periodic[axis] and math.isfinite(place):  # type: ignore[index]
         place = lo + (place - lo) % (hi - lo)
     slack = ON_NODE * (hi - lo) / last
-    if not lo - slack <= place <= hi + slack:  # written so that NaN is refused
+    if not lo - slack <= place <= hi + slack:  # in this form NaN is refused
         raise ValueError(f"{what}: got {grid.names[axis]} = {place:g}, which is outside the grid, [{lo:g}, {hi:g}]")
-    nodes = closed_axis(grid, axis)  # where an axis is stretched cells are not of one width
+    nodes = closed_axis(grid, axis)  # cells have different widths on a stretched axis
     position = float(np.interp(place, nodes, np.arange(len(nodes))))
-    # on a node but for rounding; otherwise 0·∞ of the neighbour without weight would grey out a whole slice
+    # on a node up to rounding; otherwise 0·∞ of a neighbour without weight would mask the whole slice
     if nearest or abs(position - round(position)) < ON_NODE:
         return np.take(field, round(position) % grid.shape[axis], axis)
     cell = math.floor(position)
     left, right = np.take(field, cell, axis), np.take(field, (cell + 1) % grid.shape[axis], axis)
-    with np.errstate(invalid="ignore"):  # ∞ − ∞ is NaN, and masked
+    with np.errstate(invalid="ignore"):  # ∞ − ∞ is NaN, which is masked
         return (cell + 1 - position) * left + (position - cell) * right
 
 
 def closed_axis(grid: Grid, axis: int) -> np.ndarray:
-    """The coordinates of an axis; a periodic one gets its upper end as well."""
+    """The coordinates of an axis, including the upper end of a periodic axis."""
     nodes = np.asarray(grid.axis(axis))
     return np.append(nodes, grid.hi[axis]) if grid.periodic[axis] else nodes  # type: ignore[index]
 
 
 def zeros(x: np.ndarray, values: np.ma.MaskedArray) -> list[float]:
-    """Places where a sampled function changes sign, linear between nodes; the middle of a run of zeros."""
-    samples = values.filled(np.nan)  # NaN ≠ 0, so that a masked node ends a run of zeros and makes no crossing
+    """The places where a sampled function changes sign, linear between nodes; the middle of a run of zeros."""
+    samples = values.filled(np.nan)  # NaN ≠ 0, so a masked node ends a run of zeros and does not cross
     signed = np.flatnonzero(samples != 0).tolist()
     crossings = []
     for left, right in itertools.pairwise(signed):
         if samples[left] * samples[right] >= 0 or np.isnan(samples[left] * samples[right]):
             continue
-        # the mean over a run of zeros: a control that rests in between switches nowhere in particular
+        # the middle of a run of zeros, because a control that rests in between has no unique switching point
         share = samples[left] / (samples[left] - samples[right])
         place = x[left] + share * (x[right] - x[left]) if right == left + 1 else np.mean(x[left + 1 : right])
         crossings.append(float(place))
@@ -275,7 +275,7 @@ def zeros(x: np.ndarray, values: np.ma.MaskedArray) -> list[float]:
 
 
 def without_jumps(states: np.ndarray, grid: Grid | None) -> np.ndarray:
-    """States (k, n) with the jumps of periodic ones at their seam taken out, continuous in time."""
+    """States (k, n) made continuous in time, without the jumps of periodic states at their seam."""
     states = np.array(states, dtype=float)
     for axis in range(0 if grid is None else grid.ndim):
         if grid.periodic[axis]:  # type: ignore[union-attr, index]
@@ -284,35 +284,35 @@ def without_jumps(states: np.ndarray, grid: Grid | None) -> np.ndarray:
 
 
 def line_in_box(states: np.ndarray, axes: tuple[int, int], grid: Grid | None) -> np.ndarray:
-    """Two columns with periodic states brought into the box, the line cut (a row of NaN) where it crosses a seam."""
+    """Two columns with periodic states wrapped into the box; a row of NaN cuts the line where it crosses a seam."""
     points = states[:, list(axes)]  # (k, 2)
-    # an endless period stands for an axis that is not periodic, so that both columns take one way
+    # the period of an axis that is not periodic is infinite, so both columns use the same code
     lo, period = np.zeros(2), np.full(2, np.inf)
     for column, axis in enumerate(axes):
         if grid is not None and grid.periodic[axis]:  # type: ignore[index]
             lo[column], period[column] = grid.lo[axis], grid.hi[axis] - grid.lo[axis]
 
-    def turns(point: np.ndarray) -> np.ndarray:  # how many periods the point is away from the box, (2,)
+    def turns(point: np.ndarray) -> np.ndarray:  # the number of periods between the point and the box, (2,)
         return np.where(np.isinf(period), 0.0, np.floor((point - lo) / period))
 
-    def shift(count: np.ndarray) -> np.ndarray:  # that many periods as a length; 0·∞ would be NaN
+    def shift(count: np.ndarray) -> np.ndarray:  # the length of this number of periods; 0·∞ would be NaN
         return np.where(np.isinf(period), 0.0, count * np.where(np.isinf(period), 0.0, period))
 
     here = turns(points[0])
     rows = [points[0] - shift(here)]
     for start, end in itertools.pairwise(points):
-        cuts: set[float] = {0.0, 1.0}  # shares of the piece from start to end at which it crosses a seam
+        cuts: set[float] = {0.0, 1.0}  # the fractions at which the piece from start to end crosses a seam
         for column in np.flatnonzero(turns(start) != turns(end)).tolist():
             low, high = sorted((turns(start)[column], turns(end)[column]))
             edges = lo[column] + np.arange(low + 1, high + 1) * period[column]
             shares = (edges - start[column]) / (end[column] - start[column])
             cuts.update(np.round(shares, 12).tolist())  # rounded, so that a corner is one cut
         for a, b in itertools.pairwise(sorted(cuts)):
-            # by its middle: its ends lie on seams, where rounding decides the side
+            # use the middle of the piece, because its ends are on seams, where rounding decides the side
             piece = turns(start + (a + b) / 2 * (end - start))
             if np.any(piece != here):
                 rows += [np.full(2, np.nan), start + a * (end - start) - shift(piece)]
                 here = piece
-            # the end itself and not start + 1·(end − start), which rounds
+            # the end itself, because start + 1·(end − start) is rounded
             rows.append((end if b == 1 else start + b * (end - start)) - shift(here))
     return np.array(rows)

@@ -1,4 +1,4 @@
-"""Pictures of how a solve went and of studies: residuals, errors over spacings, changes over noise, fitted orders."""
+"""Plots of residuals, convergence studies and perturbation studies."""
 
 from __future__ import annotations
 
@@ -31,29 +31,29 @@ if TYPE_CHECKING:
 
 @drawing
 def convergence(study: Study, *, ax: Axes | Sequence[Axes] | np.ndarray | None = None) -> Picture:
-    """The errors of a convergence study over the spacing and over the seconds, with the fitted orders.
+    """Plot the errors of a convergence study against the spacing and the run time, with the fitted orders.
 
-    Full marks are the largest errors, rings the mean ones; the thin line beside the full marks has the fitted
-    slope. Errors of zero have no logarithm and are left out; an estimate is called one in the label of the axis.
+    Filled markers are the largest errors and open markers the mean errors. The grey line next to the filled markers has
+    the fitted slope. Zero errors are omitted. Estimated errors are labelled as such on the axis.
 
     Args:
       study: the result of ``convergence_study``.
 
     Keyword Args:
-      ax: matplotlib axes to draw on: one for the errors over the spacing, or two, the second for the seconds;
-        ``None`` makes a figure of pyplot's with both.
+      ax: matplotlib axes to draw on: one for the errors against the spacing, or two, the second against the seconds;
+        ``None`` makes a pyplot figure with both.
 
     Returns:
-      The artists: the line of the largest errors over the spacing first.
+      The artists, first the line of the largest errors against the spacing.
 
     Raises:
       ValueError: no error is positive and finite.
     """
     if not np.any((study.errors > 0) & np.isfinite(study.errors)):
-        raise ValueError(f"convergence: the errors are {study.errors}; there is none with a logarithm to draw")
+        raise ValueError(f"convergence: got the errors {study.errors}, wanted a positive finite one")
     axes: list[Axes] = pair_of_axes() if ax is None else list(np.ravel(cast(Any, ax)))
     quality = "estimated error" if study.estimated else "error"
-    own = ax is None  # of a figure of our own the second axes share the first one's scale, and its label
+    own = ax is None  # in a new figure the second axes share the scale and the label of the first
     artists: list[Artist] = []
     for place, x, name in zip(axes, (study.h, study.seconds), ("h", "seconds"), strict=False):
         for y, order, kind, fill in (
@@ -66,7 +66,7 @@ def convergence(study: Study, *, ax: Axes | Sequence[Axes] | np.ndarray | None =
             artists += place.plot(x, shown, marker="o", label=label, **style)
         fitted = study.fitted & np.isfinite(study.errors) & (study.errors > 0)
         if name == "h" and np.isfinite(study.order) and fitted.any():
-            # log E = log C + p log h: with the slope p known, the mean of the logarithms gives C
+            # log E = log C + p log h: for the fitted slope p, the mean of the logarithms gives C
             middle = np.exp(np.mean(np.log(study.errors[fitted])) - study.order * np.mean(np.log(x[fitted])))
             artists += place.plot(x[fitted], middle * x[fitted] ** study.order, color=GREY, linewidth=3, zorder=0)
         logarithmic(place, study.h if name == "h" else None)
@@ -77,18 +77,18 @@ def convergence(study: Study, *, ax: Axes | Sequence[Axes] | np.ndarray | None =
 
 @drawing
 def perturbation(study: Perturbation, *, ax: Axes | None = None) -> Picture:
-    """The changes of value and feedback over ε and over 1/γ in one picture, with the fitted orders.
+    """Plot the changes of value and feedback against ε and against 1/γ, with the fitted orders.
 
-    Full marks are values, rings feedbacks; the thin grey line beside the full marks has the fitted slope.
+    Filled markers are values and open markers feedbacks. The grey line next to the filled markers has the fitted slope.
 
     Args:
       study: the result of ``perturbation_study``.
 
     Keyword Args:
-      ax: matplotlib axes to draw on; ``None`` takes pyplot's current ones.
+      ax: matplotlib axes to draw on; ``None`` uses pyplot's current axes.
 
     Returns:
-      The artists: the line of the values over ε first.
+      The artists, first the line of the values against ε.
 
     Raises:
       ValueError: no change is positive and finite.
@@ -97,7 +97,7 @@ def perturbation(study: Perturbation, *, ax: Axes | None = None) -> Picture:
     ax = axes_of(ax)
     for series, color in ((study.noise, COLOURS[0]), (study.gain, COLOURS[1])):
         if not np.any((series.errors > 0) & np.isfinite(series.errors)):
-            raise ValueError(f"perturbation: the changes over {series.name} are {series.errors}; none has a logarithm")
+            raise ValueError(f"perturbation: got changes {series.errors} over {series.name}, wanted a positive one")
         for what, y, order, fill in (
             ("V", series.errors, series.order, color),
             ("u", series.feedback_errors, series.feedback_order, "white"),
@@ -112,36 +112,36 @@ def perturbation(study: Perturbation, *, ax: Axes | None = None) -> Picture:
             artists += ax.plot(x, middle * x**series.order, color=GREY, linewidth=3, zorder=0)
     logarithmic(ax)
     label_axes(ax, "ε, 1/γ", "largest change")
-    # lines that rise leave this corner free
+    # the lines rise, so this corner is free
     artists.append(ax.legend(loc="upper left", fontsize=8, frameon=False, borderaxespad=0.2, handlelength=1.4))
     return Picture(artists, ax)
 
 
 @drawing
 def residuals(solution: Solution, *, ax: Axes | None = None, label: str | None = None) -> Picture:
-    """The residual after each step on a logarithmic scale; steps where it is not finite are marked grey.
+    """Plot the residual after each step on a logarithmic scale; steps with a residual that is not finite are hatched.
 
     Args:
-      solution: the solution of ``solve``; its history lives on the host and is kept by neither ``jit`` nor ``vmap``.
+      solution: the solution of ``solve``. Its history is stored on the host, and ``jit`` and ``vmap`` drop it.
 
     Keyword Args:
-      ax: matplotlib axes to draw on; ``None`` takes pyplot's current ones.
-      label: of the line in the legend, to compare several.
+      ax: matplotlib axes to draw on; ``None`` uses pyplot's current axes.
+      label: label of the line in the legend, to compare several solutions.
 
     Raises:
-      ValueError: the solution carries no history.
+      ValueError: the solution has no history.
     """
     history = np.asarray(solution.residuals if solution.residuals is not None else (), dtype=float).ravel()
     if history.size == 0:
         raise ValueError(
-            "residuals: the solution carries no history; it stays behind under jit and vmap: use solve directly"
+            "residuals: the solution has no history, because jit and vmap drop it; call solve outside of them"
         )
     ax = axes_of(ax, wide=True)
     steps = np.arange(1, history.size + 1)
-    drawable = np.isfinite(history) & (history > 0)  # an exact zero has no logarithm
+    drawable = np.isfinite(history) & (history > 0)  # zero has no logarithm
     shown = np.ma.masked_where(~drawable, history)
     line = ax.plot(steps, shown, color=None if label else COLOURS[0], label=label)[0]
-    if history.size < 60:  # more marks than that would run together
+    if history.size < 60:  # more markers would overlap
         line.set(marker="o", markersize=3)
     ax.set_yscale("log")
     artists: list[Artist] = [line, *bands(ax, steps, ~np.isfinite(history), "not finite")]

@@ -1,6 +1,6 @@
-"""What every picture stands on: the picture that is returned, its axes, one theme, labels and the legend.
+"""The basis of every plot: the returned ``Picture``, its axes, one theme, labels and the legend.
 
-Nothing here knows what the numbers mean. Only functions import matplotlib, and pyplot only where no axes are given.
+Only functions import matplotlib, and they import pyplot only if no axes are given.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ COLOURS = (
     "#e69f00",
     "#56b4e9",
     "#000000",
-)  # Okabe and Ito: safe for all eyes
-NARROW, WIDE, SOLID = (5.4, 4.2), (5.4, 3.2), (5.4, 4.8)  # inches: of planes, of lines over time, of surfaces
-DPI = 200  # of saved pictures, unless given
-# what is drawn, by the name of the argument, maybe of one function: the attributes that it must have, and what has them
+)  # Okabe and Ito: distinguishable with colour blindness
+NARROW, WIDE, SOLID = (5.4, 4.2), (5.4, 3.2), (5.4, 4.8)  # inches, for planes, for lines over time, for surfaces
+DPI = 200  # default resolution of saved pictures
+# for an argument name, or function.argument: the attributes that the argument must have, and a description of it
 DRAWN: dict[str, tuple[tuple[str, ...], str]] = {
     "solution": (("grid", "value"), "the Solution of solve or march"),
     "path": (("times", "states"), "the Path of simulate"),
@@ -46,17 +46,17 @@ DRAWN: dict[str, tuple[tuple[str, ...], str]] = {
     "convergence.study": (("errors", "fitted"), "the result of convergence_study"),
     "perturbation.study": (("nominal", "noise"), "the result of perturbation_study"),
 }
-PAIRS = ("convergence",)  # functions that draw on two axes, where these are given
+PAIRS = ("convergence",)  # functions that accept two axes
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
 
 def drawing(function: Callable[P, T]) -> Callable[P, T]:
-    """Decorator of the functions that draw: what is no solution, no path or no axes is refused in their words.
+    """Decorate a function that draws, so that it refuses arguments of the wrong kind.
 
     Raises:
-      TypeError: with what was got, what was wanted, and how to come to it.
+      TypeError: with the argument, the expected kind, and how to get it.
     """
     names = list(inspect.signature(function).parameters)
     checked = front_door(function)
@@ -65,7 +65,7 @@ def drawing(function: Callable[P, T]) -> Callable[P, T]:
     def drawn(*arguments: P.args, **options: P.kwargs) -> T:
         for number, (name, thing) in enumerate((*zip(names, arguments, strict=False), *options.items())):
             attributes, words = DRAWN.get(f"{function.__name__}.{name}") or DRAWN.get(name, ((), ""))
-            # an argument that may be left out is None then
+            # optional arguments may be None
             if not all(hasattr(thing, attribute) for attribute in attributes) and (thing is not None or number == 0):
                 raise TypeError(f"{function.__name__}: got {name} = {shown(thing)}, wanted {words}")
         ax = options.get("ax")
@@ -79,11 +79,11 @@ def drawing(function: Callable[P, T]) -> Callable[P, T]:
 
 
 class Picture(list):
-    """The artists that a function drew, the main one first, with the figure that they are on.
+    """The artists that a function drew, the main one first, and their figure.
 
     Args:
-      artists: in the order in which they were drawn.
-      ax: the axes drawn on, the first of them where there are several.
+      artists: in the order of drawing.
+      ax: the axes drawn on, or the first of several axes.
     """
 
     def __init__(self, artists: Iterable[Artist], ax: Axes):
@@ -92,11 +92,11 @@ class Picture(list):
 
     @property
     def figure(self) -> Figure:
-        """The whole figure, also where the axes are on a part of it."""
+        """The whole figure, even if the axes are on a subfigure."""
         return cast("Figure", self.ax.get_figure(root=True))
 
     def save(self, path: str | os.PathLike, **options: Any) -> None:
-        """Write the figure to ``path``; the ending says the format, and ``options`` are those of ``savefig``."""
+        """Write the figure to ``path``; the suffix selects the format, and ``options`` go to ``savefig``."""
         self.figure.savefig(path, **{"dpi": DPI, **options})
 
     def __repr__(self) -> str:
@@ -104,7 +104,7 @@ class Picture(list):
 
 
 def axes_of(ax: Axes | None, *, wide: bool = False) -> Axes:
-    """The axes given, or pyplot's current ones; where there are none, a new figure of pyplot's."""
+    """The given axes, or pyplot's current axes, or the axes of a new pyplot figure."""
     if ax is not None:
         return ax
     from matplotlib import pyplot
@@ -115,16 +115,16 @@ def axes_of(ax: Axes | None, *, wide: bool = False) -> Axes:
 
 
 def solid_axes(ax: Axes | None) -> Any:
-    """The three-dimensional axes given or pyplot's current ones; a new figure where the current ones are flat.
+    """The given three-dimensional axes, or pyplot's current ones, or those of a new figure if these are flat.
 
     Raises:
-      ValueError: flat axes were given.
+      ValueError: the given axes are flat.
     """
     if ax is not None:
         if ax.name != "3d":
             raise ValueError(
-                "zero_level_set: got flat axes for three free states; give axes of projection='3d', or cut one state "
-                "by fixed={...}"
+                "zero_level_set: got flat axes for three free states; pass axes of projection='3d', or cut one state "
+                "with fixed={...}"
             )
         return ax
     from matplotlib import pyplot
@@ -132,13 +132,13 @@ def solid_axes(ax: Axes | None) -> Any:
     figure = pyplot.gcf() if pyplot.get_fignums() else pyplot.figure(figsize=SOLID, layout="constrained")
     if figure.axes and figure.gca().name == "3d":
         return figure.gca()
-    if figure.axes:  # something flat was drawn there
+    if figure.axes:  # it already has flat axes
         figure = pyplot.figure(figsize=SOLID, layout="constrained")
     return figure.add_subplot(projection="3d")
 
 
 def new_figure(size: tuple[float, float]) -> Figure:
-    """Pyplot's current figure as long as it is empty, else a new one."""
+    """Pyplot's current figure if it is empty, otherwise a new one."""
     from matplotlib import pyplot
 
     if pyplot.get_fignums() and not pyplot.gcf().axes and not pyplot.gcf().subfigs:
@@ -147,34 +147,34 @@ def new_figure(size: tuple[float, float]) -> Figure:
 
 
 def pair_of_axes() -> list[Axes]:
-    """Two axes side by side on a new figure, with one vertical scale."""
+    """Two axes side by side with a common vertical scale, on a new figure."""
     return [styled(ax) for ax in new_figure((8.0, 3.6)).subplots(1, 2, sharey=True)]
 
 
 def logarithmic(ax: Axes, places: np.ndarray | None = None) -> None:
-    """Two logarithmic scales around what is drawn, with few ticks so that none overlap; those of x at ``places``."""
+    """Set two logarithmic scales with few ticks, so that none overlap; the ticks of x are at ``places``."""
     from matplotlib.ticker import NullFormatter
 
     ax.set(xscale="log", yscale="log")
     for axis, given in ((ax.xaxis, places), (ax.yaxis, None)):
-        # matplotlib's own ticks are decades: a study over one octave would show one, or none
+        # matplotlib's ticks are decades, so a study over one octave would have at most one
         ticks: Sequence[float] | np.ndarray = few(*axis.get_view_interval()) if given is None else given
         axis.set_ticks(ticks, labels=[f"{tick:.3g}" for tick in ticks])
         axis.set_minor_formatter(NullFormatter())
 
 
 def few(lo: float, hi: float) -> list[float]:
-    """Two to seven round numbers between the ends of a logarithmic scale; the ends where there are not two."""
+    """Two to seven round numbers between the ends of a logarithmic scale, or the ends if there are fewer than two."""
     powers = 10.0 ** np.arange(np.floor(np.log10(lo)), np.ceil(np.log10(hi)) + 1)
     for digits in ((1.0,), (1.0, 3.0), (1.0, 2.0, 5.0), (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)):
         found = [tick for tick in np.outer(powers, digits).ravel().tolist() if lo <= tick <= hi]
         if len(found) >= 2:
-            return found[:: -(-len(found) // 7)]  # rounded up: every so many that seven are left at most
+            return found[:: -(-len(found) // 7)]  # rounded up, so that at most seven remain
     return [lo, hi]
 
 
 def styled(ax: Axes) -> Axes:
-    """The theme of the figures made here, on ``ax``: no upper and right frame, thin ticks, a paper's text sizes."""
+    """Apply the theme to ``ax``: no upper and right spine, thin ticks, small text."""
     ax.spines[["top", "right"]].set_visible(False)
     ax.spines[["left", "bottom"]].set_linewidth(0.8)
     ax.tick_params(width=0.8, length=3, labelsize=9)
@@ -184,7 +184,7 @@ def styled(ax: Axes) -> Axes:
 
 
 def label_axes(ax: Axes, x: str, y: str) -> None:
-    """Labels, where the axes have none yet: a path on top of a value keeps the value's."""
+    """Label the axes unless they have labels, so that a path drawn on top of a value keeps the value's labels."""
     if not ax.get_xlabel():
         ax.set_xlabel(x)
     if not ax.get_ylabel():
@@ -192,9 +192,9 @@ def label_axes(ax: Axes, x: str, y: str) -> None:
 
 
 def legend(ax: Axes) -> Legend:
-    """The legend, with all that has a label so far, above the axes, where it hides nothing.
+    """Draw the legend of all labelled artists above the axes, where it hides nothing.
 
-    It stands above the caption where there is one: both would share a line.
+    If there is a caption, the legend is above it, because both would share a line.
     """
     height = 1.07 if ax.get_title(loc="right") else 1.0
     style: dict[str, Any] = {"fontsize": 8, "edgecolor": "none", "handlelength": 1.6, "columnspacing": 1.2}

@@ -1,8 +1,8 @@
-"""Level surfaces in three dimensions, as triangles: marching tetrahedra, in NumPy.
+"""Level surfaces in three dimensions as triangles, by marching tetrahedra in NumPy.
 
-Every cell is parted into the six tetrahedra around its diagonal, one for each order of the axes. On each of them the
-field is taken as linear, and its zero is a triangle or a quadrilateral: no case is ambiguous, and the surface has no
-hole. Source: A. Doi and A. Koide, An efficient method of triangulating equi-valued surfaces by using tetrahedral
+Every cell is divided into the six tetrahedra around its diagonal, one for each order of the axes. The field is linear
+on each tetrahedron, so its zero set is a triangle or a quadrilateral. No case is ambiguous, and the surface has no
+holes. Source: A. Doi and A. Koide, An efficient method of triangulating equi-valued surfaces by using tetrahedral
 cells, IEICE Trans. E74 (1991).
 """
 
@@ -14,17 +14,17 @@ from typing import Any
 
 import numpy as np
 
-FINEST = 40  # nodes an axis; 40³ make up to 30,000 triangles, which matplotlib draws in about two seconds
-LIGHT = np.array([-0.4, -0.55, 0.73])  # where the light stands, in units of the box
-AMBIENT = 0.45  # of the colour that is left in the shade
+FINEST = 40  # nodes per axis; 40³ give up to 30,000 triangles, which matplotlib draws in about two seconds
+LIGHT = np.array([-0.4, -0.55, 0.73])  # direction of the light, in units of the box
+AMBIENT = 0.45  # fraction of the colour in the shade
 
 
 def level_surface(field: np.ndarray, coordinates: Sequence[np.ndarray]) -> np.ndarray:
     """The triangles of the surface where a field is zero, shape (k, 3 corners, 3 coordinates).
 
     Args:
-      field: at the points of a raster, (M₁, M₂, M₃); cells with a number that is not finite are left out.
-      coordinates: three lines of coordinates, of lengths M₁, M₂ and M₃.
+      field: values on a raster, (M₁, M₂, M₃); cells with a value that is not finite are skipped.
+      coordinates: three arrays of coordinates, of lengths M₁, M₂ and M₃.
 
     Example:
       >>> x = np.linspace(-1, 1, 21)
@@ -55,7 +55,7 @@ def level_surface(field: np.ndarray, coordinates: Sequence[np.ndarray]) -> np.nd
 
 def _within(values: np.ndarray, points: np.ndarray) -> np.ndarray:
     """The triangles in tetrahedra with values (k, 4) at their corners (k, 4, 3)."""
-    order = np.argsort(values, axis=1)  # those inside come first
+    order = np.argsort(values, axis=1)  # corners inside come first
     values, points = np.take_along_axis(values, order, 1), np.take_along_axis(points, order[..., None], 1)
     count = np.sum(values <= 0, axis=1)
 
@@ -65,7 +65,7 @@ def _within(values: np.ndarray, points: np.ndarray) -> np.ndarray:
         return points[chosen, a] + share * (points[chosen, b] - points[chosen, a])
 
     found = []
-    # edges that cross: one corner inside, three, or two, where the quadrilateral makes two triangles
+    # the edges that cross for one and three corners inside; for two, the quadrilateral gives two triangles
     for number, triangle in (
         (1, ((0, 1), (0, 2), (0, 3))),
         (3, ((0, 3), (1, 3), (2, 3))),
@@ -78,14 +78,14 @@ def _within(values: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def lit(triangles: np.ndarray, field: np.ndarray, coordinates: Sequence[np.ndarray], color: Any) -> np.ndarray:
-    """The colours of triangles in the light, (k, 3): by the slope of the field, which turns smoothly across them."""
+    """The colours of lit triangles, (k, 3), with the gradient of the field as a smooth normal vector."""
     from matplotlib.colors import to_rgb
     from scipy.interpolate import RegularGridInterpolator
 
     lengths = np.array([line[-1] - line[0] for line in coordinates])
     gradient: Any = np.gradient(np.where(np.isfinite(field), field, 0.0), *coordinates)
     slopes = np.stack(gradient, axis=-1) * lengths
-    # by indices, as a periodic axis closed at its seam may have coordinates that differ by rounding
+    # evaluate at the centres of the triangles
     normal = RegularGridInterpolator(tuple(coordinates), slopes, bounds_error=False, fill_value=None)(
         triangles.mean(axis=1)
     )
@@ -95,7 +95,7 @@ def lit(triangles: np.ndarray, field: np.ndarray, coordinates: Sequence[np.ndarr
 
 
 def thinned(field: np.ndarray, coordinates: Sequence[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
-    """A field on at most ``FINEST`` points an axis, linear between its own: more triangles would take minutes."""
+    """Interpolate a field to at most ``FINEST`` points per axis, because more triangles would take minutes."""
     lines = [np.asarray(line) for line in coordinates]
     for axis, line in enumerate(lines):
         if len(line) <= FINEST:

@@ -268,7 +268,7 @@ def test_the_picture_on_axes_of_the_caller():
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("h", "estimated error")
     pair = Figure().subplots(1, 2)
     assert plotting.convergence(made([0.4, 0.1]), ax=pair)[-1].axes is pair[1]
-    with pytest.raises(ValueError, match="there is none with a logarithm to draw"):
+    with pytest.raises(ValueError, match="a logarithmic plot needs a positive finite one"):
         plotting.convergence(made([np.nan, 0.0]))
 
 

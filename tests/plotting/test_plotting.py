@@ -494,7 +494,7 @@ def test_residuals_on_a_logarithmic_scale():
 
 
 def test_without_a_history_there_are_no_residuals():
-    with pytest.raises(ValueError, match="carries no history"):
+    with pytest.raises(ValueError, match="has no history"):
         plotting.residuals(line())
 
 

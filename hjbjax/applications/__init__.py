@@ -1,5 +1,5 @@
-"""Questions that are posed with solve and march: sets, chances, robustness, and studies.
+"""Applications of solve and march: reachable sets, probabilities, robustness, and studies.
 
-``reachability`` and ``exit_problems`` make problems, ``probabilities``, ``l2_gain`` and ``hinf`` solve them;
-``convergence`` and ``perturbations`` are studies, ``reference`` what errors are measured against.
+``reachability`` and ``exit_problems`` construct problems; ``probabilities``, ``l2_gain`` and ``hinf`` solve them.
+``convergence`` and ``perturbations`` are studies, and ``reference`` has the reference values of their errors.
 """

@@ -1,37 +1,37 @@
-"""Robust control: the L₂-gain problem, and the least gain that a feedback can hold (H∞).
+"""Robust control: the L₂-gain problem, and the least gain that a feedback can guarantee (H∞).
 
     ẋ = f(x, u) + E d,  cost L(x, u) − ½γ²|d|²,  L = ½|z|²:   0 = min_u max_d [ L − ½γ²|d|² + (f + E d)·DV ]
 
-has a finite value V ≥ 0 exactly where some feedback keeps ∫|z|² ≤ γ²∫|d|² + 2V(x₀) for every d: the available
-storage. The H∞ level is the least such γ. For a linear plant with z = (C x, u) and (C, A) detectable it is the least γ
-with a stabilising P ≥ 0 of A'P + PA − P(BB' − EE'/γ²)P + C'C = 0, and V = ½x'Px. An unstable mode that z does not see
-costs nothing to leave alone: V is then finite at levels that no stabilising feedback holds. So at the end the loop is
-run with d = 0 from the corners of the inner box, and the answer says where it does not come back.
+has a finite value V ≥ 0 if and only if some feedback keeps ∫|z|² ≤ γ²∫|d|² + 2V(x₀) for every d. V is the available
+storage. The H∞ level is the least such γ. For a linear plant with z = (C x, u) and (C, A) detectable, it is the least γ
+with a stabilising P ≥ 0 of A'P + PA − P(BB' − EE'/γ²)P + C'C = 0, and V = ½x'Px. An unstable mode that does not appear
+in z costs nothing, so V may be finite at levels that no stabilising feedback attains. Therefore the closed loop is
+simulated with d = 0 from the corners of the inner box at the end, and the result reports whether it comes back.
 
-A bounded set of disturbances makes every γ finite, so infeasible levels are recognised by growth. March from V = 0: the
-value V_T of the problem over the time T grows with T, since d = 0 is allowed and costs nothing, and its limit is V. So
-γ is feasible if and only if V_T stays bounded. One of three things happens:
+A bounded set of disturbances makes V finite for every γ, so infeasible levels are recognised by growth. The march
+starts from V = 0. Its value V_T for the horizon T increases with T, because d = 0 is allowed and costs nothing, and its
+limit is V. So γ is feasible if and only if V_T stays bounded. There are three outcomes:
 
-* V_T settles in an inner box and in the whole box, and no d of the inner box sits on its bound: feasible. Settled means
-  that from T to 2T it grows by less than a small fraction, or by less than ten times that fraction and by less than a
-  third of the growth before.
-* The worst disturbance comes to its bound in the inner box: the set cuts off what would be unbounded. Infeasible.
-* V_T still grows at the horizon. The worst disturbance may take the state to a place where it gains at a constant rate,
-  or growth is slow near the level. Not shown to be feasible.
+* V_T settles in an inner box and in the whole box, and no d in the inner box is at its bound: feasible. Settled means
+  that the growth from T to 2T is below a small fraction, or below ten times this fraction and a third of the growth
+  before.
+* The worst disturbance reaches its bound in the inner box. The set then hides growth without bound: infeasible.
+* V_T still grows at the horizon, because the worst disturbance keeps the state where it gains at a constant rate, or
+  because growth is slow near the level. This γ is not shown to be feasible.
 
-The whole box counts because a nonlinear plant may have its largest gain away from the rest point. Near the rest point V
-then stays on a plateau until the worst path has crept out to that place, and nothing on the plateau shows for how long.
-The level is that of the box: take a smaller box for a local level. A plateau may also end late. So the march of the
-reported γ, and of a ``lo`` that has settled, goes on to the horizon.
+The whole box counts because a nonlinear plant may have its largest gain away from the rest point. V near the rest point
+then stays on a plateau until the worst path has reached that place, and the plateau does not show for how long. The
+level therefore depends on the box; use a smaller box for a local level. Because a plateau may end late, the marches for
+the reported γ, and for a ``lo`` that has settled, continue to the horizon.
 
-Doubling T has no scale: a constant rate makes growth one half, in any unit. At the level itself a P that stays finite
-is approached like 1/T, so that the gain halves with each doubling. Above the level it falls faster each time. Below it,
-behind a bottleneck, it falls more slowly and then rises. A third separates the two sooner than waiting until all has
-settled: for a time constant τ of the closed loop a level that is off by the fraction e shows at T of about τ/√e.
-Narrow sets of controls or disturbances, a small grid and a short horizon make the level too high. So do coarse grids
-where P grows without bound at the level. ``Weno5()`` is exact on quadratics and depends least on the edge of the grid.
-Source: A. van der Schaft, L₂-gain and passivity techniques in nonlinear control; T. Başar and P. Bernhard,
-H∞-optimal control and related minimax design problems.
+Doubling T makes the rule independent of the unit of time: a constant rate gives a growth of one half. At the level
+itself V_T approaches a finite P like 1/T, so the growth halves per doubling. Above the level it falls faster. Below the
+level, behind a bottleneck, it falls more slowly and then rises. The factor of a third separates the cases earlier than
+waiting until V has settled: with a time constant τ of the closed loop, a relative error e of the level shows at a T of
+about τ/√e. Narrow sets of controls or disturbances, a small grid and a short horizon make the level too high, and so do
+coarse grids if P grows without bound at the level. ``Weno5()`` is exact on quadratics and depends least on the boundary
+of the grid. Sources: A. van der Schaft, L₂-gain and passivity techniques in nonlinear control; T. Başar and
+P. Bernhard, H∞-optimal control and related minimax design problems.
 """
 
 import dataclasses
@@ -56,22 +56,22 @@ from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status, keeping_warnings, warn
 from hjbjax.solvers.finite_horizon import march_part
 
-DOUBLINGS = 6  # of the time marched, at most: the first look is at a 64th of the horizon
-SOON = 1e-6  # seconds: a limit that ends a march after its first look
+DOUBLINGS = 6  # at most, so the first march covers a 64th of the horizon
+SOON = 1e-6  # seconds: a time limit that ends a march after its initial evaluation
 CUTS = {Status.INTERRUPTED: "interrupted", Status.TIME_LIMIT: "out of time"}
-CLOSE, FALL = 10.0, 1 / 3  # growth so near settle counts as settled if it falls by this factor; at the level it halves
+CLOSE, FALL = 10.0, 1 / 3  # growth below CLOSE * settle counts as settled if it fell by FALL; at the level it halves
 
 
 @dataclasses.dataclass(frozen=True)
 class Settling:
-    """Where, how far and until when V must settle, and the march that shows it.
+    """The rule by which V must settle, and the march that checks it.
 
     Args:
-      inner: the share of the grid's box around its middle in which no disturbance may saturate.
-      settle: growth over a doubling of the time below which V has settled.
+      inner: the fraction of the grid's box around its centre in which no disturbance may saturate.
+      settle: growth per doubling of the time below which V has settled.
       horizon: the longest time to march.
-      scheme: of the march.
-      time_limit: seconds for one γ, or None.
+      scheme: the scheme of the march.
+      time_limit: seconds per γ, or None.
     """
 
     inner: float
@@ -95,37 +95,37 @@ def hinf_level(
     scheme: Scheme = Weno5(),
     time_limit: float | None = None,
 ) -> Level:
-    """The least γ that a feedback can hold in the box, by bisection; the rule is in the module's docstring.
+    """Find the least γ that a feedback can guarantee in the box, by bisection; see the module docstring for the rule.
 
-    Each γ takes one march, which stops as soon as it is decided. The march of the reported γ goes on to the horizon. V
-    must settle over the whole box, so the level of a nonlinear plant depends on the box. It comes out too high if a set
-    of controls or disturbances is too narrow, if worst paths leave the grid, or if the horizon is short; the table says
-    how the marches below it ended. For a level with stability every unstable mode must be seen in L (detectability).
-    ``Level.stabilises`` is False where a run without a disturbance shows one that is not.
+    Each γ takes one march, which stops as soon as it is decided. The march of the reported γ continues to the horizon.
+    V must settle over the whole box, so the level of a nonlinear plant depends on the box. The level is too high if a
+    set of controls or disturbances is too narrow, if worst paths leave the grid, or if the horizon is short. The table
+    shows how the marches below the level ended. The level of a stabilising feedback requires that L detects every
+    unstable mode; ``Level.stabilises`` is False if a simulation without a disturbance shows that it does not.
 
     Args:
-      problem_of_gamma: γ to the game with cost L − ½γ²|d|², as ``lambda gamma: hjb.attenuation(plant, gamma, set)``.
-        Where γ is a leaf, as there, nothing is compiled again.
-      grid: the nodes, around the rest point.
-      lo: a γ that is infeasible.
-      hi: a γ that is feasible.
-      tol: how close the bracket is to be, relative to γ.
-      inner: the share of the grid's box, around its middle, where V must settle without saturation. In the rest of the
-        box V must settle, too, but disturbances may sit on their bound.
-      settle: growth of V over a doubling of the time below which it has settled.
-      horizon: the longest time to march, in units of time: many times the slowest of the closed loop.
-      scheme: as for ``march``.
-      time_limit: seconds for one γ, all of its marches together.
+      problem_of_gamma: a function of γ that returns the game with cost L − ½γ²|d|², for example
+        ``lambda gamma: hjb.attenuation(plant, gamma, set)``. If γ is a leaf, as there, nothing is compiled again.
+      grid: a grid around the rest point.
+      lo: an infeasible γ.
+      hi: a feasible γ.
+      tol: relative width of the final bracket.
+      inner: the fraction of the grid's box, around its centre, where V must settle without saturation. In the rest of
+        the box V must settle as well, but disturbances may be at their bound.
+      settle: growth of V per doubling of the time below which it has settled.
+      horizon: the longest time to march, in units of time; use many times the slowest time constant of the closed loop.
+      scheme: as in ``march``.
+      time_limit: seconds per γ, for all of its marches together.
 
     Returns:
-      The level with its bracket, and what was found at every γ.
+      The level with its bracket, and the result at every γ.
 
     Raises:
-      ValueError: not 0 < lo < hi; feasible at lo, infeasible at hi; a problem without disturbances, or with a discount,
-        a target or anything else with which V tells no gain.
-      TypeError: something that makes no problem.
-      SolveError: it was interrupted, or a march ran out of time; ``.solution`` is the Level so far, with the bracket
-        and all trials, that of the unfinished march among them.
+      ValueError: not 0 < lo < hi; ``lo`` is feasible or ``hi`` infeasible; the problem has no disturbances, or has a
+        discount, a target or another part with which V does not show a gain.
+      TypeError: ``problem_of_gamma`` does not return a problem.
+      SolveError: the search was interrupted, or a march ran out of time; ``.solution`` is the Level so far, with the
+        bracket and all trials, including the one of the unfinished march.
 
     Example:
       >>> import hjbjax as hjb
@@ -145,7 +145,7 @@ def hinf_level(
     def at(gamma: float, before: Trial | None = None) -> Trial:
         problem = problem_of_gamma(gamma)
         _check_problem(problem, gamma)
-        # an infeasible V has no limit: what its march warns of says nothing about the level
+        # V has no limit at an infeasible γ, so warnings of its march do not concern the level
         with keeping_warnings() as said[gamma]:
             trial = _try(problem, grid, float(gamma), settling, before)
         trials[gamma] = trial
@@ -162,28 +162,27 @@ def hinf_level(
             level = dataclasses.replace(level, stabilises=stabilises)
         if clock.interrupted:
             level = dataclasses.replace(level, status=Status.INTERRUPTED)
-            raise SolveError(f"hinf_level: interrupted after it had come to its end: {level!r}", level)
+            raise SolveError(f"hinf_level: interrupted after the search had finished: {level!r}", level)
     for message in dict.fromkeys(said[level.gamma]):
         warn(message)
     return level
 
 
 def _bisect(at: Callable[..., Trial], lo: float, hi: float, tol: float, settle: float) -> None:
-    """Try γ after γ until the bracket is narrow enough and its upper end is feasible up to the horizon."""
-    feasible: tuple[Trial, ...] = (
-        at(hi),
-    )  # first: if even hi fails, sets, grid or horizon are at fault, and lo adds nothing
+    """Try values of γ until the bracket is narrow enough and its upper end is feasible up to the horizon."""
+    # hi first: if even hi fails, the sets, the grid or the horizon are the cause, and lo is irrelevant
+    feasible: tuple[Trial, ...] = (at(hi),)
     if not feasible[0].feasible:
         raise ValueError(f"hinf_level: hi = {hi:g} is not feasible: {_why(feasible[0], settle)}")
     bottom = at(lo)
     if bottom.feasible and (bottom := at(lo, bottom)).feasible:
         raise ValueError(
             f"hinf_level: lo = {lo:g} is feasible: V settles at {bottom.value:.3g} after t = {bottom.time:g}; "
-            "give a smaller lo"
+            "use a smaller lo"
         )
     while feasible:
         bottom, feasible = _narrowed(at, bottom, feasible, tol)
-        # V may have been on a plateau when its march stopped
+        # continue to the horizon, because V may have been on a plateau
         bottom = at(feasible[-1].gamma, feasible[-1])
         if bottom.feasible:
             return
@@ -194,9 +193,9 @@ def _bisect(at: Callable[..., Trial], lo: float, hi: float, tol: float, settle: 
 def _narrowed(
     at: Callable[..., Trial], bottom: Trial, feasible: tuple[Trial, ...], tol: float
 ) -> tuple[Trial, tuple[Trial, ...]]:
-    """The bracket after bisection: its lower end, and all feasible trials with the least γ at the end."""
+    """Bisect the bracket: return its lower end, and all feasible trials with the least γ last."""
     while feasible[-1].gamma > bottom.gamma * (1 + tol):
-        # the geometric mean: tol is relative, and each trial halves the logarithm of the ratio
+        # the geometric mean, because tol is relative
         middle = at(math.sqrt(bottom.gamma * feasible[-1].gamma))
         if middle.feasible:
             feasible = (*feasible, middle)
@@ -206,28 +205,28 @@ def _narrowed(
 
 
 def _level(trials: list[Trial], cut: Trial | None = None) -> Level:
-    """The level by the trials so far, of which ``cut`` came to no verdict."""
+    """The level from the trials so far; the trial ``cut`` has no verdict."""
     top = min((trial.gamma for trial in trials if trial.feasible), default=math.inf)
     bottom = max((trial.gamma for trial in trials if not trial.feasible and trial is not cut), default=0.0)
-    # a trial that was cut has shown nothing: it is listed, and bounds the bracket on neither side
+    # a trial that was cut is listed but does not bound the bracket
     status = Status.CONVERGED if cut is None else cut.solution.status
     return Level(top, (bottom, top), tuple(sorted(trials, key=lambda trial: trial.gamma)), status)
 
 
 def _try(problem: Problem, grid: Grid, gamma: float, settling: Settling, before: Trial | None) -> Trial:
-    """The verdict on one γ: double the time marched until V settles or d saturates, or until the horizon.
+    """Decide one γ: double the time of the march until V settles, until d saturates, or up to the horizon.
 
     Args:
       problem: the game at γ.
-      grid: the nodes.
+      grid: the grid.
       gamma: γ.
       settling: the rule.
-      before: a trial of the same γ that has settled. Its march goes on to the horizon.
+      before: a settled trial of the same γ, whose march continues to the horizon.
     """
     going_on = ("growing",) if before is None else ("growing", "settled")
     trial = before
     so_far = Growth((np.zeros(grid.shape),)) if before is None else before.march
-    # the time is a sum of spans, by rounding
+    # the sum of the spans equals the horizon only up to rounding
     while trial is None or (trial.reason in going_on and so_far.time < settling.horizon * (1 - 1e-9)):
         trial = _longer(problem, grid, gamma, so_far, settling)
         so_far = trial.march
@@ -235,18 +234,18 @@ def _try(problem: Problem, grid: Grid, gamma: float, settling: Settling, before:
 
 
 def _longer(problem: Problem, grid: Grid, gamma: float, so_far: Growth, settling: Settling) -> Trial:
-    """The verdict on one γ after a march over twice the time."""
+    """Decide one γ after a march over twice the time."""
     began, inner, inside = perf_counter(), settling.inner, _inner_nodes(grid, settling.inner)
-    # a march stops early if the worst case comes to the bound of a Box; of a Ball only the end is checked
+    # the march stops early if the worst disturbance reaches the bound of a Box; for a Ball only the end is checked
     watch = inner if isinstance(problem.disturbances, Box) else 0.0
     span = so_far.time or settling.horizon / 2**DOUBLINGS
-    # never 0 or less: march requires a positive limit, and returns what there is after its initial evaluation
+    # never ≤ 0: march requires a positive limit, and returns after its initial evaluation
     left = settling.time_limit and max(settling.time_limit - so_far.seconds, SOON)
-    # V_T goes on from its last value: the march from V = 0 over 2T is one over T from V_T
+    # the march from V = 0 over 2T equals a march from V_T over T
     solution = march_part(
         problem, grid, span, start=so_far.values[-1], inner=watch, scheme=settling.scheme, time_limit=left
     )
-    # a march that stopped early is at times[0] > 0, and less than the span has passed
+    # a march that stopped early ends at times[0] > 0, so less than the span has passed
     time = so_far.time + span - float(solution.times[0])
     if solution.status in CUTS:
         return _no_verdict(solution, gamma, so_far, time, inner)
@@ -261,16 +260,16 @@ def _longer(problem: Problem, grid: Grid, gamma: float, so_far: Growth, settling
 
 
 def _grew(values: tuple[np.ndarray, ...], nodes: np.ndarray, settle: float) -> tuple[float, bool]:
-    """The growth of V over the last doubling relative to its size in a part of the box, and True if V has settled."""
+    """The relative growth of V over the last doubling in a part of the box, and True if V has settled there."""
     size = float(np.max(np.abs(values[-1][nodes])))
-    # the first doubling has none before it
+    # there is no growth before the first doubling
     gains = [math.inf, *(float(np.max(np.abs(after - before)[nodes])) for before, after in itertools.pairwise(values))]
     growth = gains[-1] / size if size else 0.0
     return growth, growth <= settle or (growth <= CLOSE * settle and gains[-1] <= FALL * gains[-2])
 
 
 def _no_verdict(solution: Solution, gamma: float, so_far: Growth, time: float, inner: float) -> Trial:
-    """A trial without a verdict, from a march that was cut short."""
+    """A trial without a verdict, for a march that was cut short."""
     kept = _as_stationary(solution, time)
     size = float(np.max(np.abs(kept.value[kept.grid.inner(inner)])))
     unknown = Saturation(math.nan, math.nan, np.full(kept.grid.ndim, math.nan), inner)
@@ -278,16 +277,16 @@ def _no_verdict(solution: Solution, gamma: float, so_far: Growth, time: float, i
 
 
 def _as_stationary(solution: Solution, total: float) -> Solution:
-    """The last slice of a march over the time ``total`` as a stationary solution."""
-    # of the kept times, the leading axis, the first is the last that was marched
+    """The last slice of a march over the time ``total``, as a stationary solution."""
+    # the first of the stored times is the last one that was marched
     first = {name: getattr(solution, name)[0] for name in ("value", "policy", "disturbance")}
     return dataclasses.replace(solution, times=None, stats={**solution.stats, "horizon": total}, **first)
 
 
 def _reason(status: Status, bound: Saturation, settled: bool) -> str:
-    """The verdict after a march, as ``Trial.reason`` has it."""
-    # DIVERGED is what the march calls a disturbance that came to its bound while it watched
-    # first of all: where d is cut off V settles too, at a value that is the set's and no gain
+    """The value of ``Trial.reason`` after a march."""
+    # the march reports DIVERGED if a watched disturbance reached its bound; check saturation first, because with
+    # saturated d V also settles, at a value determined by the set
     if status is Status.DIVERGED or bound.share > 0:
         return "saturated"
     if status is not Status.CONVERGED:
@@ -296,23 +295,23 @@ def _reason(status: Status, bound: Saturation, settled: bool) -> str:
 
 
 def _why(trial: Trial, settle: float) -> str:
-    """The end of a trial that is not feasible and advice, in words."""
+    """Explain the end of an infeasible trial, with advice."""
     if trial.reason == "saturated":
-        return f"{trial.saturation};\ngive a larger hi, wider sets of controls and disturbances, or a smaller inner"
+        return f"{trial.saturation};\nuse a larger hi, wider sets of controls and disturbances, or a smaller inner"
     if trial.reason == "growing":
         return (
             f"V still grew by {trial.growth:.2g} of itself over the last doubling of the time to {trial.time:g}, "
-            f"settle = {settle:g};\ngive a larger hi or a longer horizon, a larger grid if worst paths leave it, or a "
+            f"settle = {settle:g};\nuse a larger hi or a longer horizon, a larger grid if worst paths leave it, or a "
             "smaller one if the gain is large only far from the rest point"
         )
-    return f"{trial.solution.message}\nLook at drift and cost, or give a larger hi"
+    return f"{trial.solution.message}\nCheck drift and cost, or use a larger hi"
 
 
 def _inner_nodes(grid: Grid, inner: float) -> np.ndarray:
-    """The nodes of the inner box, bool (*grid); refused where no node has both of its neighbours in it."""
+    """The nodes of the inner box, bool (*grid); raises ValueError if an axis has fewer than 3 of them."""
     inside = grid.inner(inner)
     if not np.all([np.sum(np.any(inside, axis=_others(grid, k))) >= 3 for k in range(grid.ndim)]):
-        raise ValueError(f"hinf_level: inner = {inner:g} of {grid.shape} nodes holds fewer than 3 along an axis")
+        raise ValueError(f"hinf_level: inner = {inner:g} of {grid.shape} nodes contains fewer than 3 along an axis")
     return inside
 
 
@@ -322,7 +321,7 @@ def _others(grid: Grid, axis: int) -> tuple[int, ...]:
 
 
 def _check_rule(make: object, lo: float, hi: float, tol: float, settling: Settling) -> None:
-    """Refuse numbers by which nothing can be bisected."""
+    """Raise if the numbers do not allow a bisection."""
     if not callable(make):
         raise TypeError(f"hinf_level: problem_of_gamma is {make!r}, wanted a function of gamma that returns a Problem")
     for name, number, most in (
@@ -330,7 +329,7 @@ def _check_rule(make: object, lo: float, hi: float, tol: float, settling: Settli
         ("hi", hi, math.inf),
         ("tol", tol, 1),
         ("inner", settling.inner, 1),
-        ("settle", settling.settle, 0.5),  # a constant rate makes one half of growth, at any T
+        ("settle", settling.settle, 0.5),  # growth at a constant rate is one half for every T
         ("horizon", settling.horizon, math.inf),
     ):
         arguments.positive(number, f"hinf_level: {name}", most=most)
@@ -339,21 +338,21 @@ def _check_rule(make: object, lo: float, hi: float, tol: float, settling: Settli
 
 
 def _check_problem(problem: object, gamma: float) -> None:
-    """Refuse a problem whose V tells no gain."""
+    """Raise if V of the problem does not show a gain."""
     if not isinstance(problem, Problem):
         raise TypeError(f"hinf_level: problem_of_gamma({gamma:g}) returned {problem!r:.60}, wanted a Problem")
     if not isinstance(problem.disturbances, (Box, Ball)):
         raise ValueError(
             f"hinf_level: problem_of_gamma({gamma:g}) has disturbances {problem.disturbances!r:.60}; wanted a Box or a "
-            "Ball, as hjb.attenuation(plant, gamma, hjb.Box(...)) makes one"
+            "Ball, as in hjb.attenuation(plant, gamma, hjb.Box(...))"
         )
     for name in ("noise", "terminal_cost", "stopping_cost", "running_max", "target"):
         if getattr(problem, name) is not None:
-            raise ValueError(f"hinf_level: the problem has a {name}, with which V no longer tells a gain; leave it out")
+            raise ValueError(f"hinf_level: the problem has a {name}, with which V does not show a gain; remove it")
     if is_discounted(problem) is not False:
         raise ValueError(
-            f"hinf_level: the problem has discount = {problem.discount}, with which V settles also where the gain is "
-            "violated; leave it out"
+            f"hinf_level: the problem has discount = {problem.discount}, with which V settles even if the gain is "
+            "violated; remove it"
         )
     if problem.time_dependent or problem.cost is None:
-        raise ValueError("hinf_level: wanted a problem that has a cost and does not depend on the time")
+        raise ValueError("hinf_level: wanted a problem that has a cost and does not depend on time")

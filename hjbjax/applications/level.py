@@ -1,6 +1,6 @@
-"""The answer of ``hinf_level``: the least gain, what was tried for it, and whether its feedback stabilises.
+"""The result of ``hinf_level``: the least gain, all trials, and a check that the feedback stabilises.
 
-It does where the loop without a disturbance comes back from the corners of an inner box.
+The check simulates the closed loop without a disturbance from the corners of an inner box.
 """
 
 import dataclasses
@@ -22,19 +22,19 @@ from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
 from hjbjax.tracing.closures import settled
 
-LOOKS = 8  # output intervals: only the last state counts
-RTOL, ATOL = 1e-4, 1e-6  # of the paths: a mode that grows does so at any tolerance
-NEARER = 0.5  # the ends over the starts, in their spread along each axis; a mode that rests keeps 1
+LOOKS = 8  # output intervals of a path, of which only the last state is used
+RTOL, ATOL = 1e-4, 1e-6  # tolerances of the paths; an unstable mode grows at any tolerance
+NEARER = 0.5  # largest ratio of final to initial spread along each axis; a mode at rest has the ratio 1
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Growth:
-    """A march from V = 0, whose time is doubled again and again.
+    """A march from V = 0 whose time is doubled repeatedly.
 
     Args:
-      values: V_T at the last three times at most, the latest at the end, each shape (*grid).
+      values: V_T at up to three times, the latest last, each of shape (*grid).
       time: the last T.
-      seconds: the wall clock that it took.
+      seconds: the wall time so far.
     """
 
     values: tuple[np.ndarray, ...]
@@ -44,19 +44,18 @@ class Growth:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Trial:
-    """The verdict on one γ, and what it rests on.
+    """The result for one γ.
 
     Args:
       gamma: γ.
-      feasible: True where the value settled.
-      reason: "settled", "saturated", "growing" or "not finite"; "interrupted" or "out of time" is no verdict.
-      time: the time T that was marched.
-      growth: the growth of V over the last doubling of T relative to its size, in the inner box or in the whole box,
-        whichever is larger.
+      feasible: True if the value settled.
+      reason: "settled", "saturated", "growing" or "not finite"; "interrupted" and "out of time" are not verdicts.
+      time: the time T of the march.
+      growth: the relative growth of V over the last doubling of T, the larger one of the inner box and the whole box.
       value: the largest V in the inner box.
-      saturation: how near the worst disturbance came to its bound at the end.
-      solution: V_T and both feedbacks, as a stationary solution; its status is that of the last march.
-      march: the values of the march, from which it can go on.
+      saturation: the distance of the worst disturbance from its bound at the end.
+      solution: V_T and both feedbacks as a stationary solution, with the status of the last march.
+      march: the values of the march, from which it can continue.
     """
 
     gamma: float
@@ -72,16 +71,16 @@ class Trial:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Level:
-    """The least γ found feasible, and all that was tried; ``print`` shows the table.
+    """The least γ found feasible, and all trials; ``print`` shows the table.
 
     Args:
       gamma: γ, the upper end of the bracket.
-      bracket: the largest γ not shown to be feasible, and the least that is; 0 and infinity before there is one.
-      trials: everything tried, by γ.
-      status: CONVERGED; of a search that was cut short, INTERRUPTED or TIME_LIMIT.
-      stabilises: False where the feedback at ``gamma`` does not bring the state back without a disturbance: an unstable
-        mode that the cost does not see. The level of a stabilising feedback is then higher, or there is none. None
-        where this was not looked at.
+      bracket: the largest γ not shown to be feasible, and the least feasible γ; 0 and infinity if there is none.
+      trials: all trials, ordered by γ.
+      status: CONVERGED, or INTERRUPTED or TIME_LIMIT if the search was cut short.
+      stabilises: False if the feedback at ``gamma`` does not bring the state back without a disturbance. The plant then
+        has an unstable mode that the cost does not detect, and the level of a stabilising feedback is higher or does
+        not exist. None if this was not checked.
     """
 
     gamma: float
@@ -92,15 +91,15 @@ class Level:
 
     @property
     def solution(self) -> Solution:
-        """The value and the feedbacks at ``gamma``; without a feasible γ those of the last trial."""
+        """The value and the feedbacks at ``gamma``; without a feasible γ, the solution of the last trial."""
         return next((trial for trial in self.trials if trial.gamma == self.gamma), self.trials[-1]).solution
 
     @property
     def saturated(self) -> float:
-        """The largest γ at which a disturbance on its bound decided, and not growth; 0 where none did.
+        """The largest γ that is infeasible because a disturbance reached its bound, not because V grew; 0 if none.
 
-        As the lower end of the bracket it leaves open whether the level is that of the plant or that of the sets: where
-        V grows without bound at the level, disturbances of any size saturate just above it.
+        If it is the lower end of the bracket, the level may be a property of the plant or of the sets: where V grows
+        without bound at the level, disturbances of any size saturate just above it.
         """
         return max((trial.gamma for trial in self.trials if trial.reason == "saturated"), default=0.0)
 
@@ -125,21 +124,21 @@ class Level:
 def comes_back(problem: Problem, solution: Solution, inner: float, duration: float) -> bool:
     """True if all paths from the corners of the inner box stay in the box and end closer together than they began.
 
-    No rest point is asked for. In a box around one, a mode that grows leaves the box or keeps the paths apart, and one
-    that neither grows nor decays keeps them apart as they were.
+    No rest point is needed. If the box contains one, an unstable mode leaves the box or keeps the paths apart, and a
+    neutral mode keeps their distance constant.
 
     Args:
-      problem: the game, whose disturbance is left at zero.
+      problem: the game; its disturbance is set to zero.
       solution: its stationary solution with the feedback.
-      inner: the share of the grid's box, around its middle.
-      duration: of the paths, in units of time.
+      inner: the fraction of the grid's box, around its centre.
+      duration: the duration of the paths, in units of time.
     """
     grid = solution.grid
     signs = np.array(list(itertools.product((-1.0, 1.0), repeat=grid.ndim)))
     half = 0.5 * (np.asarray(grid.hi) - np.asarray(grid.lo))
     starts = np.asarray(grid.lo) + half + inner * half * signs  # (2^n, n)
     times = np.linspace(0.0, duration, LOOKS + 1)
-    # in float64 and with the marks by which ``jit`` knows the functions of an earlier call
+    # float64, and functions marked so that ``jit`` reuses the programs of an earlier call
     with own_settings(x64=True):
         found = _ends(*cast((settled(problem, grid.ndim), solution, starts, times), np.float64))
     codes, ends = map(np.asarray, found)
@@ -150,7 +149,7 @@ def comes_back(problem: Problem, solution: Solution, inner: float, duration: flo
 
 @jax.jit
 def _ends(problem: Problem, solution: Solution, starts: Array, times: Array) -> tuple[Array, Array]:
-    """How the undisturbed paths from states (k, n) end: their codes and last states."""
+    """Simulate the undisturbed paths from states (k, n) and return their codes and last states."""
     assert problem.disturbances is not None
     nothing = jnp.zeros(problem.disturbances.dim, starts.dtype)
 
@@ -162,7 +161,7 @@ def _ends(problem: Problem, solution: Solution, starts: Array, times: Array) -> 
 
 
 def _spread(grid: Grid, states: np.ndarray) -> np.ndarray:
-    """The largest distance along each axis from the first of the states, shape (n,); the short way round a circle."""
+    """The largest distance from the first state along each axis, shape (n,), the short way round a periodic axis."""
     width = np.asarray(grid.hi) - np.asarray(grid.lo)
     apart = states - states[0]
     turns = np.where(np.array(grid.periodic), np.round(apart / width), 0)

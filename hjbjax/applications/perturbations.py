@@ -1,13 +1,14 @@
-"""How noise that vanishes, and disturbances that become expensive, change a value: both by second order.
+"""The second-order effects of vanishing noise and of expensive disturbances on a value.
 
     ε: dx = f dt + ε dw, the equation with ½ε² Δ V;      γ: dx = (f + E d) dt, cost L − ½γ²|d|²
 
-    |V^ε − V| = O(ε²),   |V^γ − V| = O(γ⁻²),   and the same of the feedbacks, where V is smooth;
+    |V^ε − V| = O(ε²),   |V^γ − V| = O(γ⁻²),   and the same for the feedbacks, where V is smooth.
 
-to first order ε² times the integral of ½ΔV, and γ⁻² times that of ½|E'DV|², along the optimal path. At a kink of V the
-change is of lower order: choose the region without one. All problems are solved on one grid by one scheme, so that the
-grid's own error cancels but for its product with the change; with ``Limited()`` no numerical diffusion hides ε. The
-orders are slopes of log error over log ε and log 1/γ by least squares, of errors that rise above the tolerance.
+To leading order the changes are ε² times the integral of ½ΔV, and γ⁻² times the integral of ½|E'DV|², along the optimal
+path. At a kink of V the change is of lower order, so the region must not contain one. All problems are solved on one
+grid by one scheme, so the discretisation error cancels up to its product with the change. ``Limited()`` avoids
+numerical diffusion, which would hide ε. The orders are least-squares slopes of log error over log ε and log 1/γ, for
+errors above the tolerance.
 """
 
 import dataclasses
@@ -36,16 +37,16 @@ from hjbjax.tracing import checks
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Series:
-    """One way to perturb a problem, entry by entry of a parameter that goes to zero.
+    """One perturbation of a problem, with one entry per value of a parameter that goes to zero.
 
     Args:
       name: "ε" or "1/γ".
-      parameters: the values of it, increasing.
+      parameters: the values of the parameter, increasing.
       errors: the largest |V' − V| over the nodes of the region.
-      feedback_errors: the largest |u' − u| there.
+      feedback_errors: the largest |u' − u| over these nodes.
       solutions: the perturbed solutions.
-      fitted: which entries count for the order of V: converged, and with a change that rises above the tolerance.
-      feedback_fitted: which count for that of u: of these, where |u' − u| rises above the tolerance over the spacing.
+      fitted: a mask of the entries for the order of V: converged, with a change above the tolerance.
+      feedback_fitted: a mask of the entries for the order of u: also |u' − u| above the tolerance over the spacing.
     """
 
     name: str
@@ -70,23 +71,23 @@ class Series:
         lines = [f"{self.name:>9} {'value':>10} {'feedback':>10}  status"]
         rows = zip(self.parameters, self.errors, self.feedback_errors, self.fitted, self.solutions, strict=True)
         for parameter, value, feedback, counts, solution in rows:
-            # the mark is that of the value: an order of the feedback may use fewer entries still
+            # the mark concerns the value; the order of the feedback may use fewer entries
             mark = " " if counts else "*"
             lines.append(f"{parameter:>9.4g} {value:>10.3e}{mark}{feedback:>10.3e}  {solution.status.name}")
         lines.append(f"{'order':>9} {self.order:>10.2f} {self.feedback_order:>10.2f}")
         return "\n".join(lines)
 
 
-# no ==: the fields are arrays
+# eq=False, because the fields are arrays
 @dataclasses.dataclass(frozen=True, eq=False)
 class Perturbation:
-    """A value beside those with noise and with disturbances; ``print`` shows the tables.
+    """The effects of noise and of disturbances on a value; ``print`` shows the tables.
 
     Args:
-      nominal: the solution without either.
-      noise: the changes by the noises ε.
-      gain: the changes by the disturbances at the levels γ, over 1/γ.
-      scheme: the scheme's text.
+      nominal: the solution without noise and disturbances.
+      noise: the changes for the noises ε.
+      gain: the changes for the disturbances at the levels γ, against 1/γ.
+      scheme: the scheme as text.
       tol: the tolerance of every solve.
     """
 
@@ -100,7 +101,7 @@ class Perturbation:
         head = f"{self.scheme}, tol {self.tol:g}; largest changes in the region"
         lines = [head, *(str(each) for each in (self.noise, self.gain))]
         if not (self.noise.fitted.all() and self.gain.fitted.all()):
-            lines.append("* not fitted: the solve did not converge, or the change does not rise above the tolerance")
+            lines.append("* not fitted: the solve did not converge, or the change is not above the tolerance")
         return "\n".join(lines)
 
 
@@ -118,27 +119,27 @@ def perturbation_study(
     method: Method | None = None,
     tol: float = 1e-6,
 ) -> Perturbation:
-    """Solve a problem with noises that vanish and with disturbances that become expensive, and fit the orders.
+    """Solve a problem with vanishing noise and with expensive disturbances, and fit the orders of the changes.
 
     Args:
-      problem: the question, without noise or disturbances; without discount noise would cost without end.
-      grid: the nodes, on which all of them are solved.
+      problem: a problem without noise and disturbances, and with a discount, because noise costs without end.
+      grid: the grid of all solves.
       noises: ε, at least two numbers > 0.
       gammas: γ, at least two feasible levels.
       disturbances: the set of d, not saturated in the region.
-      enters: E, as for ``attenuation``.
-      region: where changes are measured, without a kink of V: a function of one state, or a share of the box.
-      scheme: as for ``solve``.
-      method: as for ``solve``.
-      tol: as for ``solve``, and small beside the smallest change.
+      enters: E, as in ``attenuation``.
+      region: where changes are measured, without a kink of V: a boolean function of one state or a fraction of the box.
+      scheme: as in ``solve``.
+      method: as in ``solve``.
+      tol: as in ``solve``, small compared with the smallest change.
 
     Returns:
-      The study; ``hjb.plotting.perturbation(study)`` draws both lines in one picture.
+      The study; ``hjb.plotting.perturbation(study)`` draws both lines in one plot.
 
     Raises:
-      ValueError: fewer than two noises or levels; a problem that has noise or disturbances already, or no discount; a
-        set of disturbances that is felt in the region; and what ``solve`` refuses.
-      SolveError: it was interrupted; ``.solution`` is the study so far, or the unperturbed solution.
+      ValueError: there are fewer than two noises or levels; the problem has noise or disturbances, or no discount; the
+        set of disturbances is saturated in the region; or ``solve`` refuses.
+      SolveError: the study was interrupted; ``.solution`` is the study so far, or the unperturbed solution.
 
     Example:
       >>> import hjbjax as hjb
@@ -151,41 +152,41 @@ def perturbation_study(
     check_arguments(problem, grid, method, scheme, tol)
     levels = _parameters("noises", noises), _parameters("gammas", gammas)
     if problem.is_game or problem.noise is not None:
-        raise ValueError("perturbation_study: the problem has noise or disturbances already; leave them out")
-    # noise leaves no state at rest: the running cost goes on for ever, and only a discount sums it
+        raise ValueError("perturbation_study: the problem already has noise or disturbances; remove them")
+    # noise never lets the state rest, so the running cost continues indefinitely and only a discount makes it finite
     if not np.asarray(problem.discount) > 0:
-        raise ValueError("perturbation_study: with noise and no discount the cost has no end; give a discount > 0")
+        raise ValueError("perturbation_study: without a discount the cost with noise is infinite; give a discount > 0")
     mask = mask_of(region, grid, "perturbation_study")
-    # from the highest level, the weakest disturbance, on: like the noises in the order of their effect
+    # from the highest level, the weakest disturbance, so that effects increase as for the noises
     games = [attenuation(problem, gamma, disturbances, enters=enters) for gamma in levels[1][::-1]]
-    # ``saturation`` at the end knows no other sets: better refused before the solves than after them
+    # ``saturation`` at the end requires a Box or a Ball, so check before the solves
     if not isinstance(disturbances, (Box, Ball)):
         raise ValueError(f"perturbation_study: the disturbances are {disturbances!r:.60}; wanted a Box or a Ball")
-    # before the first solve, which may take long: E and the set of d are met by the games alone
+    # check E and the set of d before the first solve, which may take long and does not use them
     with own_settings(x64=True):
         checks.shapes(games[0], grid, scheme)
 
-    # no raise for a perturbed one: it keeps its row and stays out of the fit
+    # throw=False for a perturbed problem: it keeps its row and is not fitted
     def solution_of(which: Problem, throw: bool = False) -> Solution:
         return solve(which, grid, scheme=scheme, method=method, tol=tol, throw=throw)
 
     clock, found = Clock(), []
-    # a number is ε I; as a leaf it compiles once for all of them
+    # a number means ε I; it is a leaf, so one program serves all noises
     noisy = [dataclasses.replace(problem, noise=epsilon) for epsilon in levels[0]]
     with noting_interrupts(clock):
-        nominal = solution_of(problem, throw=True)  # without it there is nothing to compare with
+        nominal = solution_of(problem, throw=True)  # everything else is compared with it
         for perturbed in (*noisy, *games):
             if not clock.interrupted:
                 found.append(solution_of(perturbed))
     noise = _series("ε", levels[0], found[: len(noisy)], nominal, mask, tol)
-    # over 1/γ, so that both parameters go to zero and both slopes are to be 2
+    # against 1/γ, so that both parameters go to zero and both slopes should be 2
     gain = _series("1/γ", 1 / levels[1][::-1], found[len(noisy) :], nominal, mask, tol)
     study = Perturbation(nominal, noise, gain, str(scheme), tol)
     if clock.interrupted:
         came = f"{len(found)} of {len(noisy) + len(games)} perturbed problems"
         raise SolveError(f"perturbation_study: interrupted after {came}; .solution is the study so far", study)
-    # the lowest level has the strongest worst case: if that does not come to its bound, none does
-    # the share of all nodes of the region, which need not be a box: inner=1 over a disturbance cut to it
+    # if the strongest worst case, at the lowest level, does not reach its bound, none does; the region need not be a
+    # box, so the disturbance is masked outside it and inner=1
     watched = dataclasses.replace(found[-1], disturbance=_disturbance_within(found[-1], mask))
     felt = saturation(watched, games[-1], inner=1.0)
     if felt.share > 0:
@@ -194,8 +195,8 @@ def perturbation_study(
 
 
 def _parameters(name: str, numbers: Sequence[float]) -> np.ndarray:
-    """The parameters in increasing order, each once."""
-    # unique sorts; a number given twice would weigh twice in the fit
+    """The parameters in increasing order without duplicates."""
+    # np.unique sorts; duplicates would count twice in the fit
     values = np.unique(np.asarray(numbers, np.float64))
     if values.size < 2 or not np.all(np.isfinite(values) & (values > 0)):
         raise ValueError(f"perturbation_study: got {name} = {numbers!r}, wanted at least two finite numbers > 0")
@@ -204,25 +205,25 @@ def _parameters(name: str, numbers: Sequence[float]) -> np.ndarray:
 
 def _disturbance_within(solution: Solution, mask: Mask) -> np.ndarray:
     """The disturbance in the region, NaN outside."""
-    # (*grid, l); ``saturation`` passes over nodes of NaN
+    # (*grid, l); ``saturation`` skips nodes with NaN
     return np.where(mask[..., None], solution.disturbance, np.nan)
 
 
 def _series(
     name: str, parameters: np.ndarray, solutions: Sequence[Solution], nominal: Solution, mask: Mask, tol: float
 ) -> Series:
-    """The changes against the unperturbed solution, and which of them count for the orders."""
-    parameters = parameters[: len(solutions)]  # fewer where the study was interrupted
-    # one grid and one scheme: the grid's own error cancels but for its product with the change
+    """The changes relative to the unperturbed solution, and masks of those that count for the orders."""
+    parameters = parameters[: len(solutions)]  # fewer if the study was interrupted
+    # on one grid with one scheme the discretisation error cancels up to its product with the change
     values = [np.abs(each.value - nominal.value)[mask] for each in solutions]
-    # a NaN goes through the maxima, and what it touches is not fitted
+    # NaN propagates through the maxima and is not fitted
     inputs = [np.abs(each.policy - nominal.policy)[mask] for each in solutions]
     errors = np.array([np.max(each) for each in values])
-    feedback = np.array([np.max(each, initial=0.0) for each in inputs])  # initial: without controls u is empty
+    feedback = np.array([np.max(each, initial=0.0) for each in inputs])  # initial, because u may be empty
     converged = np.array([each.status is Status.CONVERGED for each in solutions], bool)
-    # a change within the tolerance may be the iteration's
+    # a smaller change may come from the iteration
     fitted = converged & np.isfinite(errors) & (errors > tol)
-    # over the smallest spacing: there an error of V makes the largest one of its slope
+    # the smallest spacing, where an error of V causes the largest error of its slope
     finest = min(float(nominal.grid.spacing(axis)) for axis in range(nominal.grid.ndim))
-    seen = fitted & (feedback > tol / finest)  # a slope of V is known no better than that
+    seen = fitted & (feedback > tol / finest)  # a slope of V is not more accurate than this
     return Series(name, parameters, errors, feedback, tuple(solutions), fitted, seen)

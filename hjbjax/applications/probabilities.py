@@ -1,9 +1,9 @@
-"""Front doors of probabilities and exit times: ``reach_probability``, ``stay_probability``, ``expected_exit_time``.
+"""Probabilities and exit times: ``reach_probability``, ``stay_probability``, ``expected_exit_time``.
 
-The equations are those of ``solve`` and ``march`` with the exit costs of ``exit_problems``; nothing is solved here.
-For all times without discount a chain that may stay away for ever has more than one solution: there value iteration
-from zero finds the least one, which is the probability; where every pair of actions must end, any method does. The
-chain tells at host level; inside jit, vmap and grad it is taken for granted that every pair must end.
+They call ``solve`` and ``march`` with the problems of ``exit_problems``. Over all times without a discount the equation
+has several solutions if the chain may stay away indefinitely. Value iteration from zero then finds the least solution,
+which is the probability. If every pair of actions must end, any method finds it. On the host the chain is checked for
+this. Inside jit, vmap and grad it is not checked, and every pair is assumed to end.
 """
 
 import contextlib
@@ -34,7 +34,7 @@ from hjbjax.solvers.stationary import check_arguments, solve
 from hjbjax.tracing import checks
 from hjbjax.tracing.interpreter import FallbackWarning
 
-TOL = 1e-6  # the 1e-3 of ``solve`` would show in the third digit of a probability
+TOL = 1e-6  # the default 1e-3 of ``solve`` would show in the third digit of a probability
 
 
 @front_door
@@ -49,40 +49,42 @@ def reach_probability(
     feedback: GridFeedback | Callable | None = None,
     **options: Any,
 ) -> Solution:
-    """The greatest probability with which the control can bring the state into the target.
+    """Compute the greatest probability with which the control can bring the state into the target.
 
-    V(x) = sup_u inf_d P(x(τ) in the target, τ ≤ horizon), τ the first time in the target or in the obstacle, from
-    min max (V_t + f·DV + ½ tr σσᵀD²V) = 0 with V = 1 on the target and 0 on the obstacle. Order and cost are those
-    of ``march``, and of ``solve`` without a horizon. There is no certificate. Where for all times the state may stay
-    away from both, value iteration from zero finds the probability among several solutions, which is slower. It stops
-    at a step of at most 1e-9 (4e-6 in float32), which bounds nothing: where steps shrink slowly more is left.
+    V(x) = sup_u inf_d P(x(τ) in the target, τ ≤ horizon), where τ is the first time in the target or in the obstacle.
+    It solves min max (V_t + f·DV + ½ tr σσᵀD²V) = 0 with V = 1 on the target and 0 on the obstacle. The order of
+    accuracy and the cost are those of ``march``, or of ``solve`` without a horizon. There is no certificate. If the
+    state may stay away from both sets indefinitely, the equation has several solutions, and value iteration from zero
+    finds the probability, which is slower. It stops at a step of at most 1e-9 (4e-6 in float32); the error may be
+    larger if steps shrink slowly.
 
-    Without noise the probability is 0 or 1, and is read from a minimum time or from a tube. Not so if ``scheme`` or
-    ``method`` is passed, or ``least`` together with ``obstacle``: then it is the probability of the Markov chain, which
-    moves at random by about a cell.
+    Without noise the probability is 0 or 1, and is derived from a minimum time or from a tube. If ``scheme`` or
+    ``method`` is passed, or ``least`` together with ``obstacle``, it is instead the probability of the Markov chain,
+    which moves at random by about a cell.
 
     Inside ``jit``, ``vmap`` and ``grad`` a problem with noise is not searched for states that may stay away
-    indefinitely. If there are any, the answer may be wrong.
+    indefinitely. If there are any, the result may be wrong.
 
     Args:
-      problem: the system; its costs and its discount play no part.
-      grid: the nodes.
-      target: a function ≤ 0 inside; ``None`` is the problem's own target.
-      obstacle: likewise: a path that comes there first has failed, also where the two overlap.
-      horizon: until when, in units of time; ``None`` is for all times.
-      least: the least probability instead: the control keeps away.
-      feedback: a Solution or a function of the state that acts in place of the control; then nothing is optimised.
-        Where a Solution has no action the state stays for ever. A marched one must have been kept at times that
-        are dense enough up to the horizon.
-      options: anything else that ``march`` takes, or ``solve`` without a horizon: times, scheme, method, ...; tol is
-        that of ``solve``, 1e-6 by default: a bound on the residual and the last step. By default ``Upwind()``, whose
-        answers are probabilities of a chain.
+      problem: the system; its costs and its discount are ignored.
+      grid: the grid.
+      target: a function ≤ 0 inside; ``None`` is the problem's target.
+      obstacle: a function ≤ 0 inside; a path that meets it first has failed, also where the two sets overlap.
+      horizon: the time limit, in units of time; ``None`` is for all times.
+      least: compute the least probability instead; the control tries to avoid the target.
+      feedback: a Solution or a function of the state that replaces the control; then nothing is optimised. Where a
+        Solution has no action the state does not move. A marched one must be stored at sufficiently dense times up to
+        the horizon.
+      options: other arguments of ``march``, or of ``solve`` without a horizon: times, scheme, method, ...; ``tol``, a
+        bound on the residual and the last step of ``solve``, is 1e-6 by default. The default scheme ``Upwind()`` gives
+        the probabilities of a chain.
 
     Returns:
-      A Solution whose value is the probability, and whose policy attains it.
+      A Solution whose value is the probability and whose policy attains it.
 
     Raises:
-      ValueError: no target; open ends; a feedback without controls; and what ``march`` and ``solve`` refuse.
+      ValueError: there is no target, the grid has open ends, a feedback is given for a problem without controls, or
+        ``march`` or ``solve`` refuse.
       SolveError: no convergence, with the partial solution.
 
     Example:
@@ -94,18 +96,18 @@ def reach_probability(
     """
     name = "reach_probability"
     _refuse_open(grid, name)
-    # a path that ends on the target gets 1, one that ends in the obstacle 0, one that never ends 0
+    # a path pays 1 if it ends on the target, 0 if it ends in the obstacle or never ends
     problem, inside, hit = _system(problem, target, obstacle, feedback, horizon, name)
     if _has_no_chance(problem, options):
         decides = least and (problem.is_game or problem.controls is not None)
-        # to be kept out of the target by an obstacle is no tube
+        # avoiding the target with an obstacle is not a tube
         if not (decides and hit is not None):
             with _no_fallback_warning(feedback):
                 return _yes_or_no(problem, grid, (inside, hit), horizon, options, least=decides)
-    sign = 1.0 if least else -1.0  # the control minimises: the greatest probability is minus the least of −P
-    question = exit_problems.exit_problem(problem, inside, hit, 0.0, sign)  # no running cost: V is the exit cost alone
+    sign = 1.0 if least else -1.0  # the control minimises, and the greatest P is minus the least −P
+    question = exit_problems.exit_problem(problem, inside, hit, 0.0, sign)  # no running cost, only the exit cost
     with _no_fallback_warning(feedback):
-        # over a horizon every path ends: the solution is unique, and no chain has to be surveyed
+        # over a horizon the solution is unique, so the chain need not be checked
         if horizon is None:
             question, options = _without_end(question, grid, least, options)
         return _answer(question, grid, horizon, options, sign)
@@ -122,24 +124,24 @@ def stay_probability(
     feedback: GridFeedback | Callable | None = None,
     **options: Any,
 ) -> Solution:
-    """The greatest probability with which the control can keep the state in a region.
+    """Compute the greatest probability with which the control can keep the state in a region.
 
     V(x) = sup_u inf_d P(x(s) in the region for all s ≤ horizon), one minus the least probability of leaving it.
 
     Args:
-      problem: the system; its costs, its discount and its target play no part.
-      grid: the nodes; the region must not cover all of them, since at the edge of the box noise reflects.
+      problem: the system; its costs, its discount and its target are ignored.
+      grid: the grid; the region must not cover all of it, because noise reflects at the boundary of the box.
       region: a function ≤ 0 inside; its boundary counts as outside.
       horizon: as in ``reach_probability``.
-      least: the least probability instead: the control wants to get out.
+      least: compute the least probability instead; the control tries to leave.
       feedback: as in ``reach_probability``.
       options: as in ``reach_probability``.
 
     Returns:
-      A Solution whose value is the probability, and whose policy attains it.
+      A Solution whose value is the probability and whose policy attains it.
 
     Raises:
-      ValueError: as ``reach_probability``.
+      ValueError: as in ``reach_probability``.
       SolveError: no convergence, with the partial solution.
 
     Example:
@@ -150,12 +152,12 @@ def stay_probability(
       >>> round(float(kept.value_at(0.0, [0.0])), 2)  # (4/π) e^{−π²/8} − ...
       0.37
     """
-    # r ≤ 0 inside becomes −r ≤ 0 outside; both hold on the boundary, which so counts as left
+    # r ≤ 0 inside becomes −r ≤ 0 outside; both hold on the boundary, so it counts as outside
     leaving = jax.tree_util.Partial(exit_problems.complement, as_partial(region, "stay_probability: region"))
-    # P(stays) = 1 − P(leaves), also of a partial solution; the least probability of leaving is the greatest of staying
+    # P(stays) = 1 − P(leaves), also for a partial solution; the least P(leaves) is the greatest P(stays)
     with _map_errors(1.0, -1.0):
         left = reach_probability(problem, grid, leaving, horizon=horizon, least=not least, feedback=feedback, **options)
-    # the policy needs no change: what makes leaving least likely makes staying most likely
+    # the policy is the same, because it minimises P(leaves) exactly when it maximises P(stays)
     return _affine(left, 1.0, -1.0)
 
 
@@ -170,28 +172,28 @@ def expected_exit_time(
     feedback: GridFeedback | Callable | None = None,
     **options: Any,
 ) -> Solution:
-    """The least expected time in which the control can bring the state into the target.
+    """Compute the least expected time in which the control can bring the state into the target.
 
-    V(x) = inf_u sup_d E τ, τ the first time in the target: min max (1 + f·DV + ½ tr σσᵀD²V) = 0, V = 0 there. The
-    bound on |V − V_h| is certified, except for the greatest time. Without noise and disturbance the scheme and the
+    V(x) = inf_u sup_d E τ, where τ is the first time in the target: min max (1 + f·DV + ½ tr σσᵀD²V) = 0, V = 0 on the
+    target. The bound on |V − V_h| is certified, except for the greatest time. Without noise and disturbance, scheme and
     certificate are those of ``solve``, unless ``scheme`` or ``method`` is passed.
 
     Args:
-      problem: the system; its costs and its discount play no part.
-      grid: the nodes.
-      target: a function ≤ 0 inside; ``None`` is the problem's own. To leave a region r ≤ 0 give −r.
-      horizon: E min(τ, horizon) instead, by ``march``.
-      greatest: the greatest expected time instead: the control stays as long as it can.
+      problem: the system; its costs and its discount are ignored.
+      grid: the grid.
+      target: a function ≤ 0 inside; ``None`` is the problem's target. For the exit from a region r ≤ 0 pass −r.
+      horizon: compute E min(τ, horizon) instead, by ``march``.
+      greatest: compute the greatest expected time instead; the control stays as long as it can.
       feedback: as in ``reach_probability``.
-      options: anything else that ``solve`` takes, or ``march`` with a horizon.
+      options: other arguments of ``solve``, or of ``march`` with a horizon.
 
     Returns:
-      A Solution whose value is the time, inf where the target is not reached for certain.
+      A Solution whose value is the time, inf where the target is not reached with certainty.
 
     Raises:
-      ValueError: no target; open ends; asked for the greatest time, a control that may stay away for ever, in a game
-        also if it needs the disturbance's help, which is not looked for inside ``jit``; and what ``solve`` and
-        ``march`` refuse.
+      ValueError: there is no target, the grid has open ends, or ``solve`` or ``march`` refuse. With ``greatest``: the
+        control can stay away indefinitely, in a game possibly with the help of the disturbance; this is not checked
+        inside ``jit``.
       SolveError: no convergence, with the partial solution.
 
     Example:
@@ -205,28 +207,28 @@ def expected_exit_time(
     name = "expected_exit_time"
     _refuse_open(grid, name)
     problem, inside, _ = _system(problem, target, None, feedback, horizon, name)
-    sign = -1.0 if greatest else 1.0  # max E τ = −min E(−τ): a cost of −1 per unit time
-    question = exit_problems.exit_problem(problem, inside, None, sign, 0.0)  # no exit cost: V is the time alone
+    sign = -1.0 if greatest else 1.0  # max E τ = −min E(−τ), with a cost of −1 per unit time
+    question = exit_problems.exit_problem(problem, inside, None, sign, 0.0)  # no exit cost, only the time
     with _no_fallback_warning(feedback):
         if horizon is None:
-            # what the user gives wins; a march has no tolerance
+            # the user's options take precedence; march has no tolerance
             options = {"tol": TOL} | options
-            # the least time is inf where the target is out of reach, and is found; the greatest would grow without end
+            # an infinite least time is found; the greatest time would grow without end
             if greatest:
                 _refuse_staying(question, grid, options)
             elif _has_no_chance(problem, options) and not problem.is_game:
-                options = {"scheme": None} | options  # the one that suits a path, as the chain may miss the target
+                options = {"scheme": None} | options  # a scheme for deterministic paths; the chain may miss the target
         return _answer(question, grid, horizon, options, sign)
 
 
 def _refuse_open(grid: object, name: str) -> None:
-    """Refuse a grid with open ends; what is no grid is refused by ``solve``."""
+    """Raise if a grid has open ends; ``solve`` refuses other objects."""
     if isinstance(grid, Grid):
         grid.refuse_prescribed(name, "which prescribe V and not a probability or a time")
     if isinstance(grid, Grid) and grid.sides("open"):
         raise ValueError(
-            f"{name}: beyond an open end a value is continued from inside, which makes no probability and no time of "
-            "it;\nuse edges='projected' or 'constrained', or a box whose ends lie in the target or in the obstacle"
+            f"{name}: an open end extrapolates the value from inside, so it is not a probability or a time;\n"
+            "use edges='projected' or 'constrained', or a box whose ends are in the target or in the obstacle"
         )
 
 
@@ -238,26 +240,26 @@ def _system(
     horizon: float | None,
     name: str,
 ) -> tuple[Problem, Callable, Callable | None]:
-    """The system that runs, with its loop closed if there is a feedback, its target and its obstacle."""
-    # here, since its target is read before ``solve`` would look at it
+    """The system, with a closed loop if there is a feedback, its target and its obstacle."""
+    # check here, because its target is read before ``solve`` checks the problem
     if not isinstance(problem, Problem):
         raise TypeError(f"{name}: got {type(problem).__name__}, wanted a Problem")
     inside = problem.target if target is None else as_partial(target, f"{name}: target")
     if inside is None:
-        raise ValueError(f"{name}: there is nothing to reach: give target=, a function ≤ 0 inside, or problem.target")
-    hit = as_partial(obstacle, f"{name}: obstacle")  # the problem has no obstacle of its own
+        raise ValueError(f"{name}: there is nothing to reach: pass target=, a function ≤ 0 inside, or problem.target")
+    hit = as_partial(obstacle, f"{name}: obstacle")  # a problem has no obstacle
     if feedback is None:
         return problem, inside, hit
     loop = exit_problems.close_loop(problem, feedback, horizon, name)
-    # a marched feedback makes the loop depend on the time, which the user's sets do not know of
+    # a marched feedback makes the loop depend on time, but the user's sets do not
     needs_time = loop.time_dependent and not problem.time_dependent
     return loop, exit_problems.with_time(inside, needs_time), exit_problems.with_time(hit, needs_time)
 
 
 @contextlib.contextmanager
 def _no_fallback_warning(feedback: GridFeedback | Callable | None) -> Iterator[None]:
-    """No warning while a Solution closes the loop: its lookup node by node is no fault of the user's functions."""
-    if not is_grid_feedback(feedback):  # filters of warnings belong to the whole process: not touched without need
+    """Suppress the fallback warning if a Solution closes the loop, because its lookup per node is expected."""
+    if not is_grid_feedback(feedback):  # warning filters are global, so change them only if necessary
         yield
         return
     with warnings.catch_warnings():
@@ -266,23 +268,23 @@ def _no_fallback_warning(feedback: GridFeedback | Callable | None) -> Iterator[N
 
 
 def _without_end(question: Problem, grid: Grid, least: bool, options: dict) -> tuple[Problem, dict]:
-    """The question for all times, and options by which the least of its solutions is found where it has several.
+    """The problem for all times, with options that find the least solution if there are several.
 
-    Zero, a bound of the value, is given as a running maximum, or for the greatest probability, which comes with its
-    sign changed, as a stopping cost: so that the iteration starts there, and no node is taken for one without a value.
+    Zero bounds the value. It is passed as a running maximum, or as a stopping cost for the greatest probability, whose
+    sign is changed. The iteration then starts from zero, and no node counts as having no value.
     """
     options = {"tol": TOL} | options
     if not _count_staying(question, grid, options):
-        # no node can stay away: the equation has one solution, and the user's or the default method finds it
+        # no node can stay away, so the solution is unique and any method finds it
         return question, options
-    # +P is never below zero and −P never above it: neither bound changes the value
+    # P is never below zero and −P never above zero, so the bound does not change the value
     bound: dict[str, Any] = {"running_max" if least else "stopping_cost": jax.tree_util.Partial(_zero)}
-    # another method may find another of the solutions; who asks for one by name gets it
+    # another method may find another solution; a method that the caller passes is used all the same
     return dataclasses.replace(question, **bound), {"method": ValueIteration()} | options
 
 
 def _has_no_chance(problem: Problem, options: dict) -> bool:
-    """True if the system has no noise, and the caller left scheme and method to the package."""
+    """True if the system has no noise, and the caller passed neither scheme nor method."""
     return problem.noise is None and options.get("scheme") is None and options.get("method") is None
 
 
@@ -290,10 +292,10 @@ def _yes_or_no(
     problem: Problem, grid: Grid, sets: tuple[Callable, Callable | None], horizon: float | None, options: dict,
     *, least: bool,
 ) -> Solution:  # fmt: skip
-    """The probability, 0 or 1, with which a system without noise comes into the target and not into the obstacle.
+    """The probability, 0 or 1, with which a system without noise reaches the target and not the obstacle.
 
-    The chain of such a system moves at random all the same, and would give a probability of its own. A minimum time is
-    finite, or a tube has the sign, where the answer is yes.
+    The Markov chain of the scheme moves at random even without noise, so it is not used. The probability is 1 where a
+    minimum time is finite, or where a tube contains the state.
     """
     if horizon is None and not (problem.is_game or least):
         question, is_one = exit_problems.arrival(problem, *sets), _is_finite
@@ -306,7 +308,7 @@ def _yes_or_no(
 
 
 def _decided(solution: Solution, is_one: Callable[[Any], Any]) -> Solution:
-    """The solution with 1 where its value says so and 0 elsewhere; nothing said of the value holds of these."""
+    """The solution with 1 where ``is_one`` and 0 elsewhere; error bounds of the old value are removed."""
     value: Any = solution.value
     xp: Any = jnp if is_traced(value) else np
     one = xp.asarray(is_one(value), value.dtype)
@@ -317,84 +319,84 @@ def _decided(solution: Solution, is_one: Callable[[Any], Any]) -> Solution:
 
 
 def _is_finite(value: Any) -> Any:
-    """Where a time is finite."""
+    """True where a time is finite."""
     return value < np.inf
 
 
 def _below(value: Any) -> Any:
-    """The tube of what is reached."""
+    """True in the tube of states that reach the target."""
     return value <= 0
 
 
 def _above(value: Any) -> Any:
-    """The tube of what cannot be avoided."""
+    """True in the tube of states that cannot avoid the target."""
     return value >= 0
 
 
 def _zero(*where: Place) -> jax.Array:
-    """Zero, a bound of every probability."""
+    """Zero, a lower bound of every probability."""
     return jnp.zeros(())
 
 
 def _count_staying(question: Problem, grid: Grid, options: dict) -> int:
-    """The number of nodes at which some actions keep the state away from every end for ever; 0 while traced."""
-    # the checks of ``solve``, in its order: the survey of all nodes must not be the first to meet a bad argument
+    """The number of nodes at which some actions keep the state away from every end indefinitely; 0 while traced."""
+    # the checks of ``solve`` in the same order, so that bad arguments are reported before all nodes are evaluated
     scheme, kind = options.get("scheme", Upwind()), arguments.as_dtype(options.get("dtype"))
     check_arguments(question, grid, options.get("method"), scheme, options["tol"])
-    # as the docstring of the module says: then it is taken for granted that every pair must end
-    if is_traced(question, grid):  # values of the problem's functions are needed, which there are none of
+    # the values of traced functions are unknown; see the module docstring
+    if is_traced(question, grid):
         return 0
-    method = options.get("method") or ValueIteration()  # needs the least; solve asks again for what it takes
+    method = options.get("method") or ValueIteration()  # takes the least memory; solve checks its own method again
     with own_settings(x64=kind == np.float64):
         memory.require(question, grid, method, kind, options.get("max_memory"))
         checks.shapes(question, grid, scheme)
         on = Discretisation(question, grid, scheme, kind)
         node_checks.values(on)
-        # of the chain beneath the scheme: slopes of higher order make no transition probabilities
+        # the monotone chain of the scheme, because slopes of higher order have no transition probabilities
         kept = attainability.refuge(on.chain)
         return int(np.sum(np.asarray(kept)))
 
 
 def _refuse_staying(question: Problem, grid: Grid, options: dict) -> None:
-    """Refuse to ask for the greatest time where it may be infinite, which no iteration would find."""
+    """Raise if the greatest time may be infinite, because no iteration would find it."""
     count = _count_staying(question, grid, options)
     if count:
-        # in a game the players may have to help each other to stay: then the time need not be infinite
+        # in a game staying may need both players, so the time may be finite
         how, who = ("may be", "actions of both players keep") if question.is_game else ("is", "action keeps")
         raise ValueError(
             f"expected_exit_time: the greatest time {how} infinite: at {count} of {grid.size} nodes some {who} the "
-            "state away from the target for ever;\ngive horizon= for E min(τ, horizon), or noise that drives it out"
+            "state away from the target indefinitely;\ngive horizon= for E min(τ, horizon), or noise that drives it out"
         )
 
 
 def _answer(question: Problem, grid: Grid, horizon: float | None, options: dict, sign: float) -> Solution:
-    """sign · V of the question, also for a partial solution."""
-    # the chain's, unless it is asked for: slopes of high order may leave the range of a probability by a little
+    """sign · V of the problem, also for a partial solution."""
+    # the chain by default, because slopes of higher order may slightly leave the range of a probability
     options = {"scheme": Upwind(split=horizon is not None)} | options
-    # a partial solution is handed to the user, who must not see the changed sign of the question
+    # undo the change of sign in partial solutions, too
     with _map_errors(0.0, sign):
         found = solve(question, grid, **options) if horizon is None else march(question, grid, horizon, **options)
     return _affine(found, 0.0, sign)
 
 
 def _map_errors(offset: float, sign: float) -> contextlib.AbstractContextManager[None]:
-    """An error raised inside has offset + sign · V for V in its partial solution."""
+    """Replace V by offset + sign · V in the partial solution of an error raised inside."""
     return _map_partial(lambda partial: _affine(partial, offset, sign))
 
 
 @contextlib.contextmanager
 def _map_partial(change: Callable[[Solution], Solution]) -> Iterator[None]:
-    """An error raised inside leaves with its partial solution changed."""
+    """Apply ``change`` to the partial solution of an error raised inside."""
     try:
         yield
     except SolveError as error:
         if error.solution is not None:
-            error.solution = change(error.solution)  # in place: the traceback stays what it is
+            error.solution = change(error.solution)  # in place, so that the traceback stays the same
         raise
 
 
 def _affine(solution: Solution, offset: float, sign: float) -> Solution:
-    """The solution with offset + sign · V for V; no certificate holds for a cost that is negative."""
+    """Replace V by offset + sign · V; certificates do not hold for a negative cost and are removed."""
     if sign > 0:
         return dataclasses.replace(solution, value=offset + solution.value)
     return dataclasses.replace(solution, value=offset - solution.value, enclosure=None)

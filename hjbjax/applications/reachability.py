@@ -1,14 +1,14 @@
 """Reachable sets and tubes, as problems whose cost is a signed distance l (≤ 0 inside).
 
-    reach:        V = min_u max_d min_s l(x(s)),                      the controller gets there from {V ≤ 0}
-    avoid:        V = min_u max_d max_s −l(x(s)),                     the disturbance gets it there from {V ≥ 0}
-    reach-avoid:  V = min_u max_d min_s max{l(x(s)), max_{r ≤ s} −o(x(r))},  there and never in the obstacle: {V ≤ 0}
+    reach:        V = min_u max_d min_s l(x(s)),                      the control can reach the target from {V ≤ 0}
+    avoid:        V = min_u max_d max_s −l(x(s)),                     the disturbance can force a hit from {V ≥ 0}
+    reach-avoid:  V = min_u max_d min_s max{l(x(s)), max_{r ≤ s} −o(x(r))},  reach without touching o from {V ≤ 0}
 
-with s over [0, T] for a tube and s = T for a set. The control minimises and the disturbance maximises, as everywhere;
-these constructors alone know the vocabulary. Where an obstacle covers a part of the target, that part is no success.
-The value inherits the range of l, and its zero level does not depend on how l is scaled. ``march`` solves them over a
-horizon, ``solve`` for all times (tubes). Source: I. M. Mitchell, A. M. Bayen and C. J. Tomlin, A time-dependent
-Hamilton–Jacobi formulation of reachable sets for continuous dynamic games, IEEE Trans. Automat. Contr. 50.
+with s over [0, T] for a tube and s = T for a set. As everywhere, the control minimises and the disturbance maximises.
+The part of a target that an obstacle covers does not count. The value inherits the range of l, and its zero level does
+not depend on the scale of l. ``march`` solves the problems over a horizon, ``solve`` for all times (tubes only).
+Source: I. M. Mitchell, A. M. Bayen and C. J. Tomlin, A time-dependent Hamilton–Jacobi formulation of reachable sets
+for continuous dynamic games, IEEE Trans. Automat. Contr. 50.
 """
 
 from collections.abc import Callable
@@ -33,23 +33,23 @@ def reach(
     disturbances: AdmissibleSet | None = None,
     tube: bool = True,
     forward: bool = False,
-    isaacs: str = "upper",  # the disturbance sees the control: no set is larger than the control can guarantee
+    isaacs: str = "upper",  # the disturbance knows the control, so the set is what the control can guarantee
     time_dependent: bool = False,
 ) -> Problem:
-    """From where the control can bring the state into the target, whatever the disturbance: {V ≤ 0}.
+    """Construct the problem whose {V ≤ 0} contains the states that the control can bring into the target.
 
     Args:
       drift: f, as in ``Problem``.
-      controls: the admissible set of u, which wants to get there.
-      target: the signed distance l(x), ≤ 0 inside; l(t, x) where the problem depends on the time.
-      disturbances: the admissible set of d, which wants to keep the state out.
-      tube: at some time within the horizon; otherwise exactly at its end.
-      forward: where the system can be when it starts in the target: the drift runs backwards.
+      controls: the admissible set of u, which tries to reach the target.
+      target: the signed distance l(x), ≤ 0 inside; l(t, x) if the problem depends on time.
+      disturbances: the admissible set of d, which tries to prevent it.
+      tube: reach the target at some time within the horizon; otherwise exactly at its end.
+      forward: the states that the system can reach from the target instead; the drift runs backward.
       isaacs: as in ``Problem``.
       time_dependent: as in ``Problem``; not with ``forward``.
 
     Returns:
-      The problem; V is in the units of l.
+      The problem; V has the units of l.
 
     Example:
       >>> import hjbjax as hjb
@@ -59,10 +59,10 @@ def reach(
       (True, False)
     """
     inside = as_partial(target, "reach: target")
-    # a tube may stop at any s and pays l there, V ≤ l; a set pays l at the end alone
+    # for a tube, stopping at any s pays l, so V ≤ l; for a set only the end pays l
     stop, end = (inside, None) if tube else (None, inside)
     return Problem(
-        # no running cost and no discount: V takes no values but those of l
+        # without running cost and discount V is always a value of l
         _drift(drift, forward, time_dependent), None, controls, disturbances=disturbances, stopping_cost=stop,
         terminal_cost=end, isaacs=isaacs, time_dependent=time_dependent,
     )  # fmt: skip
@@ -80,14 +80,14 @@ def avoid(
     isaacs: str = "upper",
     time_dependent: bool = False,
 ) -> Problem:
-    """From where the control cannot keep the state out of the obstacle, for some disturbance: {V ≥ 0}.
+    """Construct the problem whose {V ≥ 0} contains the states that some disturbance can force into the obstacle.
 
     Args:
       drift: f, as in ``Problem``.
-      controls: the admissible set of u, which keeps away.
-      obstacle: the signed distance l(x), ≤ 0 inside; l(t, x) where the problem depends on the time.
-      disturbances: the admissible set of d, which pursues.
-      tube: at no time within the horizon; otherwise not at its end.
+      controls: the admissible set of u, which tries to avoid the obstacle.
+      obstacle: the signed distance l(x), ≤ 0 inside; l(t, x) if the problem depends on time.
+      disturbances: the admissible set of d, which tries to hit it.
+      tube: a hit at any time within the horizon counts; otherwise only at its end.
       forward: as in ``reach``.
       isaacs: as in ``Problem``.
       time_dependent: as in ``Problem``; not with ``forward``.
@@ -96,8 +96,8 @@ def avoid(
       The problem; −V is the least distance that the control can guarantee.
     """
     depth = jax.tree_util.Partial(_negative, as_partial(obstacle, "avoid: obstacle"))
-    # −l is largest where the path is deepest in the obstacle: the running maximum keeps it, V ≥ −l
-    # a set looks at the end alone: what the path touched on the way does not count
+    # −l is largest where the path is deepest in the obstacle, and the running maximum stores it, so V ≥ −l; for a set
+    # only the end counts
     most, end = (depth, None) if tube else (None, depth)
     return Problem(
         _drift(drift, forward, time_dependent), None, controls, disturbances=disturbances, running_max=most,
@@ -118,27 +118,27 @@ def reach_avoid(
     isaacs: str = "upper",
     time_dependent: bool = False,
 ) -> Problem:
-    """From where the control can bring the state into the target without ever touching the obstacle: {V ≤ 0}.
+    """Construct the problem whose {V ≤ 0} contains the states that can reach the target without touching the obstacle.
 
     Args:
       drift: f, as in ``Problem``.
       controls: the admissible set of u.
       target: the signed distance of the target, ≤ 0 inside.
-      obstacle: the signed distance of the obstacle, ≤ 0 inside; it wins where the two overlap.
-      disturbances: the admissible set of d, which wants the opposite.
-      tube: at some time within the horizon; otherwise exactly at its end.
+      obstacle: the signed distance of the obstacle, ≤ 0 inside; it takes precedence where the two overlap.
+      disturbances: the admissible set of d, which tries to prevent it.
+      tube: reach the target at some time within the horizon; otherwise exactly at its end.
       forward: as in ``reach``.
       isaacs: as in ``Problem``.
       time_dependent: as in ``Problem``; not with ``forward``.
 
     Returns:
-      The problem; V is in the units of the distances.
+      The problem; V has the units of the distances.
     """
-    # Partials: numbers in the distances are leaves, and another radius compiles nothing
+    # Partials keep the numbers of the distances as leaves, so that another radius does not recompile
     inside, hit = as_partial(target, "reach_avoid: target"), as_partial(obstacle, "reach_avoid: obstacle")
     depth = jax.tree_util.Partial(_negative, hit)
-    # both at once: max{·, −o} is outermost, so that l ≤ 0 inside the obstacle is no success
-    # the running maximum stays for a set as well: the obstacle counts at all times, the target at the end
+    # max{·, −o} is the outer operation, so l ≤ 0 inside the obstacle does not count; it is a running maximum for a set
+    # as well, because the obstacle counts at all times
     stop, end = (inside, None) if tube else (None, inside)
     return Problem(
         _drift(drift, forward, time_dependent), None, controls, disturbances=disturbances, stopping_cost=stop,
@@ -148,24 +148,25 @@ def reach_avoid(
 
 @front_door
 def from_hj_reachability(dynamics: Any, distance: Callable, *, tube: bool = True) -> Problem:
-    """The reachability problem of a ``Dynamics`` object of the package hj_reachability, by its modes.
+    """Convert a ``Dynamics`` object of the package hj_reachability to a reachability problem, according to its modes.
 
-    A control that minimises gets ``reach``, one that maximises ``avoid``, whose V is minus theirs. A disturbance of one
-    point is a number; one that helps the control becomes a part of it.
+    A control that minimises gives ``reach``. A control that maximises gives ``avoid``, whose V has the opposite sign of
+    theirs. A disturbance set with one point becomes a constant. A disturbance that helps the control becomes a part
+    of the control.
 
     Args:
-      dynamics: called with (state, control, disturbance, time); with ``control_mode``, ``disturbance_mode``,
-        ``control_space`` and ``disturbance_space``, boxes or balls about zero. It must not depend on the time.
+      dynamics: called with (state, control, disturbance, time); it has ``control_mode``, ``disturbance_mode``,
+        ``control_space`` and ``disturbance_space``, boxes or balls around zero. It must not depend on time.
       distance: the signed distance l(x), a function of one state, ≤ 0 inside.
-      tube: at some time within the horizon, as their ``backwards_reachable_tube``; otherwise exactly at its end.
+      tube: reach at some time within the horizon, like their ``backwards_reachable_tube``; otherwise only at its end.
 
     Returns:
-      The problem, for ``march``; V at time 0 is theirs, or minus theirs, at minus the horizon.
+      The problem, for ``march``; V at time 0 is their value, or minus their value, at minus the horizon.
 
     Raises:
-      TypeError: an object that lacks one of these.
-      ValueError: a mode that is neither "min" nor "max", a set that is no box and no ball about zero, a ball of a
-        disturbance that helps the control.
+      TypeError: the object lacks one of these attributes.
+      ValueError: a mode is neither "min" nor "max", a set is neither a box nor a ball around zero, or a disturbance
+        that helps the control has a ball.
 
     Example:
       >>> import hjbjax as hjb
@@ -195,8 +196,8 @@ def from_hj_reachability(dynamics: Any, distance: Callable, *, tube: bool = True
     helping = modes[0] == modes[1] and not resting
     if helping and not (isinstance(controls, Box) and isinstance(others, Box)):
         raise ValueError(
-            f"{name}: control and disturbance both {modes[0]}imise, over sets that are not both boxes; turn one mode "
-            "round"
+            f"{name}: control and disturbance both {modes[0]}imise, over sets that are not both boxes; reverse one "
+            "mode, or use two boxes"
         )
 
     def drift(x: State, u: Control, d: Array | None = None) -> Array:
@@ -210,7 +211,7 @@ def from_hj_reachability(dynamics: Any, distance: Callable, *, tube: bool = True
 
 
 def _admissible(space: Any, name: str) -> Box | Ball:
-    """A bounded set of hj_reachability as one of ours."""
+    """Convert a bounded set of hj_reachability."""
     if hasattr(space, "radius") and hasattr(space, "center"):
         center = np.asarray(space.center)
         if np.any(center):
@@ -224,24 +225,24 @@ def _admissible(space: Any, name: str) -> Box | Ball:
 
 
 def _drift(drift: Callable, forward: bool, time_dependent: bool) -> Callable:
-    """The drift, backwards for a forward set."""
+    """The drift, reversed for a forward set."""
     if not forward:
-        return drift  # a backward set: V at x tells of paths that start there
-    # x(T) is reached from the target exactly if the target is reached from x(T) with time running backwards
+        return drift  # a backward set: V at x concerns paths that start at x
+    # x(T) can be reached from the target if and only if the target can be reached from x(T) with reversed time
     if time_dependent:
         raise ValueError(
-            "forward=True turns the time round, which it cannot do for functions of the time; write drift(T - t, x, u) "
-            "and the distances of T - t yourself, with forward=False and the drift's sign changed"
+            "forward=True reverses time, which is not possible for time-dependent functions; write drift(T - t, x, u) "
+            "with the opposite sign and the distances of T - t yourself, and use forward=False"
         )
     return jax.tree_util.Partial(_backwards, as_partial(drift, "drift"))
 
 
 def _backwards(drift: Callable, *arguments: Array) -> jax.Array:
     """The drift with its sign changed."""
-    # jnp first: a drift may return a list, which has no minus
+    # asarray first, because a drift may return a list
     return -jnp.asarray(drift(*arguments))
 
 
 def _negative(distance: Callable, *arguments: Array) -> Array:
-    """A signed distance with its sign changed: ≥ 0 inside."""
+    """A signed distance with the opposite sign: ≥ 0 inside."""
     return -distance(*arguments)

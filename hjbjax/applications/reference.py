@@ -1,11 +1,11 @@
-"""What the errors of a study are measured against: a function, a finer solution, or Richardson's extrapolation.
+"""The reference for the errors of a study: a function, a finer solution, or Richardson extrapolation.
 
 From V_h = V + c h^p + o(h^p) on three grids,
 
     (h₁^p − h₂^p)/(h₂^p − h₃^p) = |V₁ − V₂|/|V₂ − V₃|   (means over the nodes),
     V ≈ V₃ + (V₃ − V₂) h₃^p/(h₂^p − h₃^p)
 
-which is an estimate, and is called one wherever it shows.
+which is an estimate and is labelled as such.
 """
 
 import math
@@ -20,41 +20,41 @@ from hjbjax.problem.types import Mask, Nodes
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
 
-FLATTEST, STEEPEST = 1e-3, 16.0  # orders between which Richardson's is sought; the highest of a scheme is 5
+FLATTEST, STEEPEST = 1e-3, 16.0  # range of orders for Richardson extrapolation; the highest order of a scheme is 5
 
 
 def mean_spacing(grid: Grid) -> float:
-    """The geometric mean of the axes' mean spacings: a change of units changes no ratio of two of them."""
+    """The geometric mean of the mean spacings of the axes; ratios of two of them do not depend on the units."""
     return float(np.prod(spacings(grid)) ** (1 / grid.ndim))  # n-th root of the cell's volume
 
 
 def spacings(grid: Grid) -> np.ndarray:
     """The mean spacing along every axis, shape (n,)."""
-    # of a stretched axis the mean; on a finer grid all of its spacings shrink by about the factor of the mean
+    # the mean for a stretched axis; refinement shrinks all of its spacings by about the same factor
     counts = np.array([grid.intervals(axis) for axis in range(grid.ndim)])
     return (np.asarray(grid.hi) - np.asarray(grid.lo)) / counts
 
 
 def check_box(what: str, first: Grid, second: Grid) -> None:
-    """Refuse two grids of different boxes."""
-    # a periodic axis joins its ends: of equal corners it makes another box
+    """Raise if two grids have different boxes."""
+    # with the same corners, a periodic axis still makes a different box
     alike = first.periodic == second.periodic
     if not (alike and np.array_equal(first.lo, second.lo) and np.array_equal(first.hi, second.hi)):
         boxes = [f"{grid.lo} to {grid.hi}, periodic {grid.periodic}" for grid in (first, second)]
-        raise ValueError(f"convergence_study: got {what}: {boxes[0]} and {boxes[1]}; wanted one box")
+        raise ValueError(f"convergence_study: got {what}: {boxes[0]} and {boxes[1]}; wanted the same box")
 
 
 def check_reference(reference: object, grids: tuple[Grid, ...]) -> None:
-    """Refuse a reference against which no error can be measured, before anything is solved."""
+    """Raise before anything is solved if no error can be measured against the reference."""
     if reference is None:
         if len(grids) < 3:
             raise ValueError(
                 f"convergence_study: got {len(grids)} grids and no reference; Richardson's estimate needs three"
             )
         for grid in grids[1:]:
-            strides(grid, grids[0])  # for its refusal alone
+            strides(grid, grids[0])  # raises if the grids are not nested
     elif isinstance(reference, Solution):
-        # a marched value has a time axis in front
+        # the value of a marched solution has a leading time axis
         if reference.times is not None or np.shape(reference.value) != reference.grid.shape:
             raise ValueError(
                 f"convergence_study: the reference has values of shape {np.shape(reference.value)} on a grid of shape "
@@ -65,7 +65,7 @@ def check_reference(reference: object, grids: tuple[Grid, ...]) -> None:
                 f"convergence_study: the reference is {reference.status.name}; wanted a converged solution"
             )
         check_box("a reference of another box", grids[0], reference.grid)
-        # its own error must be smaller than those it is to measure, along every axis
+        # the reference must be finer along every axis, so that its own error is smaller
         if not np.all(spacings(reference.grid) < spacings(grids[-1])):
             raise ValueError(
                 f"convergence_study: the reference is on {reference.grid.shape} nodes and the finest grid has "
@@ -78,7 +78,7 @@ def check_reference(reference: object, grids: tuple[Grid, ...]) -> None:
 
 
 def words_for(reference: object, grids: tuple[Grid, ...]) -> str:
-    """The reference in a few words, for the head of the table."""
+    """A short description of the reference, for the head of the table."""
     if not isinstance(reference, Solution):
         return "the function given"
     shape = " x ".join(map(str, reference.grid.shape))
@@ -89,25 +89,25 @@ def words_for(reference: object, grids: tuple[Grid, ...]) -> str:
 def at_nodes_of(reference: Solution | Callable, grid: Grid, mask: Mask) -> np.ndarray:
     """The reference at the nodes of a grid."""
     if isinstance(reference, Solution):
-        # clamped: a node on the edge may lie outside of the other grid by rounding
+        # clamped, because rounding may put a node of the boundary outside the other grid
         values = np.asarray(reference.value_at(grid.nodes(), clamp=True))
     else:
         values = evaluate(reference, grid, "the reference")
-    # only where it counts: outside of the region the reference need not be known; inf is a value
+    # NaN outside the region is harmless, and inf is a value
     missing = np.isnan(values) & mask
     if missing.any():
         index = tuple(int(i) for i in np.argwhere(missing)[0])
         raise ValueError(
             f"convergence_study: the reference is NaN at {int(missing.sum())} nodes, first at x = {grid.state(index)}; "
-            "leave them out by region="
+            "exclude them with region="
         )
     return values
 
 
 def evaluate(function: Callable, grid: Grid, what: str, name: str = "convergence_study") -> np.ndarray:
-    """A function of one state at all nodes, in float64; ``name`` is who asks, for refusals."""
-    with own_settings(x64=True):  # the reference must not be what limits the errors seen
-        # abstractly: a wrong shape is refused before anything is compiled
+    """Evaluate a function of one state at all nodes in float64; ``name`` is the caller in error messages."""
+    with own_settings(x64=True):  # the accuracy of the reference must not limit the errors
+        # check the shape before compiling
         got = jax.eval_shape(function, jax.ShapeDtypeStruct((grid.ndim,), np.float64))
         if getattr(got, "shape", None) != ():
             shape = getattr(got, "shape", got)
@@ -117,13 +117,13 @@ def evaluate(function: Callable, grid: Grid, what: str, name: str = "convergence
 
 
 def mask_of(region: Callable | float | None, grid: Grid, name: str = "convergence_study") -> np.ndarray:
-    """The nodes that count, bool (*grid); ``name`` is who asks, for refusals."""
+    """The nodes that count, bool (*grid); ``name`` is the caller in error messages."""
     if region is None:
         return np.ones(grid.shape, bool)
     if callable(region):
         inside = evaluate(region, grid, "the region", name).astype(bool)
     elif isinstance(region, (int, float)) and not isinstance(region, bool):
-        # a truth value, which is an int as well, has been kept out: True would be the whole box
+        # bool is excluded, because True would mean the whole box
         if not 0 < region <= 1:
             raise ValueError(f"{name}: got region = {region!r}; wanted a share of the box in (0, 1]")
         inside = grid.inner(region)
@@ -135,14 +135,14 @@ def mask_of(region: Callable | float | None, grid: Grid, name: str = "convergenc
 
 
 def is_nested(fine: Grid, coarse: Grid) -> bool:
-    """True if every node of the coarse grid is a node of the fine one, in grids of one box."""
-    # intervals, not nodes: so the rule is the same for periodic axes, which have as many of both
+    """True if every node of the coarse grid is a node of the fine grid; both have the same box."""
+    # intervals instead of nodes, so that the rule also holds for periodic axes, which have the same number of both
     multiple = all(fine.intervals(axis) % coarse.intervals(axis) == 0 for axis in range(coarse.ndim))
     return multiple and repr(fine.stretch) == repr(coarse.stretch)
 
 
 def strides(fine: Grid, coarse: Grid) -> tuple[slice, ...]:
-    """The slices of the fine grid that pick the nodes of the coarse one."""
+    """The slices of the fine grid that select the nodes of the coarse grid."""
     if not is_nested(fine, coarse):
         raise ValueError(
             f"convergence_study: without a reference the nodes of {coarse.shape} must be nodes of {fine.shape}; wanted "
@@ -152,39 +152,39 @@ def strides(fine: Grid, coarse: Grid) -> tuple[slice, ...]:
 
 
 def restrict(value: np.ndarray, fine: Grid, coarse: Grid) -> np.ndarray:
-    """The values at the nodes that both grids have."""
-    # no interpolation: it would add an error of its own, of the order that is to be measured
+    """The values at the nodes that both grids share."""
+    # no interpolation, which would add an error of the order to be measured
     return value[strides(fine, coarse)]
 
 
 def distance(value: Nodes, exact: Nodes) -> np.ndarray:
-    """|V − W|; two equal infinities are no distance apart."""
-    # ∞ − ∞ is NaN and warns, though `where` does not take it
+    """|V − W|, which is 0 for two equal infinities."""
+    # ∞ − ∞ warns even in the branch that `where` discards
     with np.errstate(invalid="ignore"):
         return np.where(value == exact, 0.0, np.abs(value - exact))
 
 
 def richardson(values: list[np.ndarray], h: np.ndarray, mask: np.ndarray, tol: float) -> tuple[np.ndarray | None, str]:
-    """The extrapolated value from three grids, or ``None`` where they show no order, and its name in the table."""
-    (coarse, middle, fine), h = values, h / h[0]  # spacings over the coarsest: powers of order 16 stay in range
+    """The value extrapolated from three grids, or ``None`` if they show no order, and a description for the table."""
+    (coarse, middle, fine), h = values, h / h[0]  # relative spacings, so that powers of order 16 do not overflow
     wide, narrow = (float(np.mean(distance(a, b)[mask])) for a, b in ((coarse, middle), (middle, fine)))
 
     def excess(order: float) -> float:
-        """The first line of the module's, left side less right side, times h₂^p − h₃^p: its zero is the order."""
+        """The first equation of the module docstring, left minus right, times h₂^p − h₃^p; its zero is the order."""
         return (h[0] ** order - h[1] ** order) - wide / narrow * (h[1] ** order - h[2] ** order)
 
     if not (math.isfinite(wide) and narrow > tol and excess(FLATTEST) < 0 < excess(STEEPEST)):
-        # a change below the tolerance is the iteration's; without a change of sign no order explains the two changes
+        # a change below the tolerance comes from the iteration; without a change of sign no order fits the two changes
         return None, (
             "nothing: no Richardson estimate, since from grid to grid the mean "
             f"changes by {wide:.3g} and {narrow:.3g}, which shows no order"
         )
-    # here: only a study without a reference needs it
+    # imported here, because only a study without a reference needs it
     from scipy.optimize import brentq
 
     order = brentq(excess, FLATTEST, STEEPEST)
-    with np.errstate(invalid="ignore"):  # nodes that are infinite on all grids stay so
+    with np.errstate(invalid="ignore"):  # nodes that are infinite on both grids remain infinite
         step = np.where(fine == middle, 0.0, fine - middle)
-    # the second line of the module's; h is over the coarsest spacing, which cancels in the quotient
+    # the second equation of the module docstring; the common factor of h cancels
     extrapolated = fine + step * h[2] ** order / (h[1] ** order - h[2] ** order)
     return extrapolated, f"Richardson's estimate from the three finest grids, which show order {order:.2f}"

@@ -1,4 +1,4 @@
-"""What a solve will take: bytes by a count of arrays; steps and seconds by two small grids of the same box."""
+"""Estimates of a solve: bytes by counting arrays, steps and seconds by solving on two small grids of the same box."""
 
 import dataclasses
 import math
@@ -24,24 +24,24 @@ from hjbjax.solvers.nested import below
 from hjbjax.solvers.setup import check_on_one_state, choose
 from hjbjax.solvers.stationary import check_arguments, solve
 
-SMALL = 12_000  # nodes of the larger grid that is tried: a second or so, beside the compilation
-FEWEST = 4  # intervals that an axis keeps
+SMALL = 12_000  # nodes of the larger trial grid: about a second, plus compilation
+FEWEST = 4  # minimal number of intervals per axis
 
 
 @dataclasses.dataclass(frozen=True)
 class Estimate:
-    """What a solve will take, about.
+    """Estimated resources of a solve.
 
     Attributes:
-      shape: the nodes along each axis.
-      bytes: of memory at the peak, on the device.
-      free: bytes that are free there now; ``None`` where nobody says.
-      largest: the points along each axis of the largest grid of this many axes that fits; ``None`` likewise.
-      programs: compiled loops, one a grid and scheme.
-      steps: improvements on the finest grid; ``None`` where the small grids had no answer.
-      seconds: of all steps; within a factor of three as a rule.
-      compile_seconds: of checks and compilation, from what the small grid took.
-      note: why steps and seconds are not known.
+      shape: the number of nodes per axis.
+      bytes: peak memory on the device.
+      free: free bytes on the device; ``None`` if unknown.
+      largest: points per axis of the largest grid with this number of axes that fits; ``None`` if unknown.
+      programs: the number of compiled loops, one per grid and scheme.
+      steps: improvements on the finest grid; ``None`` if the small grids could not be solved.
+      seconds: the time of all steps, usually within a factor of three.
+      compile_seconds: the time of checks and compilation, measured on the small grids.
+      note: the reason if steps and seconds are unknown.
     """
 
     shape: tuple[int, ...]
@@ -56,17 +56,17 @@ class Estimate:
 
     @property
     def numbered(self) -> bool:
-        """Whether 32-bit indices can number the nodes."""
+        """True if 32-bit indices can number the nodes."""
         return math.prod(self.shape) < INDEXABLE
 
     @property
     def fits(self) -> bool:
-        """Whether there is as much memory, and the nodes can be numbered."""
+        """True if there is enough memory, and 32-bit indices can number the nodes."""
         return self.numbered and (self.free is None or self.bytes <= self.free)
 
     def __str__(self) -> str:
         free = "" if self.free is None else f", {self.free / 1e9:.3g} GB are free"
-        most = "" if self.largest is None else f"; at most {self.largest} points an axis fit"
+        most = "" if self.largest is None else f"; at most {self.largest} points per axis fit"
         lines = [
             f"nodes     {' x '.join(map(str, self.shape))} = {math.prod(self.shape):,}"
             + ("" if self.numbered else f": 32-bit indices number fewer than {INDEXABLE:,}"),
@@ -95,22 +95,22 @@ def estimate(
     dtype: DType | None = None,
     measure: bool = True,
 ) -> Estimate:
-    """What ``solve`` will take, before anything of the size of the grid is allocated.
+    """Estimate the memory and time of ``solve`` without allocating arrays of the size of the grid.
 
     Args:
-      problem: the question.
-      grid: the nodes.
+      problem: the problem.
+      grid: the grid.
       method: as in ``solve``.
       scheme: as in ``solve``.
       tol: as in ``solve``.
       dtype: as in ``solve``.
-      measure: solve on two small grids of the same box, in a few seconds, for steps and seconds; else bytes alone.
+      measure: solve on two small grids to estimate steps and seconds, which takes a few seconds; otherwise only bytes.
 
     Returns:
-      The estimate. Steps and seconds are carried on from the two grids by the power of the nodes that they show.
+      The estimate. Steps and seconds are extrapolated from the two grids by a power law in the number of nodes.
 
     Raises:
-      ValueError: a bad argument.
+      ValueError: an argument is not admissible.
 
     Example:
       >>> import hjbjax as hjb
@@ -143,7 +143,7 @@ def estimate(
             return dataclasses.replace(about, note=f"on {memory.counts(small)} nodes: {str(refusal).splitlines()[0]}")
     coarse, fine = found
     ratio, beyond = max(tried[1].size / tried[0].size, 1 + 1e-9), grid.size / tried[1].size
-    most = 2 / grid.ndim  # a front passes a cell a step, and noise a cell in as many steps as there are cells
+    most = 2 / grid.ndim  # per step a front moves one cell, and noise needs N steps to spread over √N cells
     seconds = [max(each.stats["seconds"], 1e-4) for each in found]
     growth = 1 + np.clip(np.log(seconds[1] / seconds[0]) / np.log(ratio) - 1, 0, most)
     climb = np.clip(np.log(max(fine.steps, 1) / max(coarse.steps, 1)) / np.log(ratio), 0, most)
@@ -156,16 +156,16 @@ def estimate(
 
 
 def _largest(needed: int, free: int | None, grid: Grid) -> int | None:
-    """The points along each axis of the largest grid of as many axes that fits."""
+    """The points per axis of the largest grid with the same number of axes that fits."""
     if free is None:
         return None
     nodes = min(free / needed * grid.size, INDEXABLE - 1)
-    # a root that is whole may come out just below
+    # an exact root may be rounded down
     return math.floor(nodes ** (1 / grid.ndim) * (1 + 1e-12))
 
 
 def _programs(grid: Grid, method: Method, scheme: Scheme | None) -> int:
-    """Loops to compile: one per grid, and without a scheme one for the coarser grid that tells the error."""
+    """The loops to compile: one per grid, and without a scheme one for the coarser grid that estimates the error."""
     count, smaller = 1, below(grid, method)
     while smaller is not None:
         count, smaller = count + 1, below(smaller, method)
@@ -179,7 +179,7 @@ def _tried(grid: Grid) -> tuple[Grid, Grid]:
 
 
 def _smaller(grid: Grid, nodes: float) -> Grid:
-    """The grid with about so many nodes; an axis with a node in its middle keeps it."""
+    """The grid with about this number of nodes; an axis with a node in its middle keeps it."""
     share, shape = (nodes / grid.size) ** (1 / grid.ndim), []
     for axis, count in enumerate(grid.shape):
         intervals = grid.intervals(axis)
@@ -190,7 +190,7 @@ def _smaller(grid: Grid, nodes: float) -> Grid:
 
 
 def _alike(method: Method, small: Grid, grid: Grid) -> Method:
-    """The method, with as many levels on the small grid as on the large one."""
+    """The method with the same number of levels on the small grid as on the large one."""
     if method.coarsest is None:
         return method
     return Nested(method.inner, max(round(method.coarsest * small.size / grid.size), 50))

@@ -172,7 +172,7 @@ FINE = Solution(line(81)[0], np.zeros(81), None, code=Status.CONVERGED)
         (line(21, 21), EXACT, {}, "wanted each one once"),
         (plane((21, 21), (41, 21)), EXACT, {}, "refined by the factors 2, 1; wanted one factor"),
         (line(21, 41), lambda x: x, {}, r"the reference returned shape \(1,\) for one state; wanted a scalar"),
-        (line(21, 41), lambda x: x[0] * jnp.nan, {}, r"NaN at 21 nodes, first at x = \[-2\.\]; leave them out"),
+        (line(21, 41), lambda x: x[0] * jnp.nan, {}, r"NaN at 21 nodes, first at x = \[-2\.\]; exclude them"),
         (line(21, 161), FINE, {}, r"on \(81,\) nodes and the finest grid has \(161,\); wanted a finer reference"),
         (line(21, 41, lo=-1.0), FINE, {}, "a reference of another box"),
         (line(21, 41), Solution(FINE.grid, np.zeros(80), None), {}, r"values of shape \(80,\)"),
@@ -268,7 +268,7 @@ def test_the_picture_on_axes_of_the_caller():
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("h", "estimated error")
     pair = Figure().subplots(1, 2)
     assert plotting.convergence(made([0.4, 0.1]), ax=pair)[-1].axes is pair[1]
-    with pytest.raises(ValueError, match="a logarithmic plot needs a positive finite one"):
+    with pytest.raises(ValueError, match="wanted a positive finite one"):
         plotting.convergence(made([np.nan, 0.0]))
 
 

@@ -257,7 +257,7 @@ def test_a_bound_that_is_felt_is_infeasible():
     """At γ = 1.01 the worst disturbance is 7.1 x: with a bound of 1 it saturates within the inner quarter."""
     narrow = dataclasses.replace(INTEGRATOR, bound=1.0)
     with pytest.raises(
-        ValueError, match=r"(?s)hi = 1.01 is not feasible: the worst .* sits on its bound at .*wider sets"
+        ValueError, match=r"(?s)hi = 1.01 is not feasible: the worst .* is at its bound at .*wider sets"
     ) as e:
         hjb.hinf_level(narrow.game(), cube(1, 41), 0.5, 1.01)
     assert len(str(e.value).splitlines()) <= 6
@@ -283,7 +283,7 @@ def test_a_march_goes_on_from_another():
         ({"hi": np.inf}, ValueError, r"hi = inf"),
         ({"tol": 0.0}, ValueError, r"tol = 0.0; wanted a number > 0 and at most 1"),
         ({"inner": 2.0}, ValueError, r"inner = 2.0"),
-        ({"inner": 0.05}, ValueError, r"inner = 0.05 of \(21,\) nodes holds fewer than 3 along an axis"),
+        ({"inner": 0.05}, ValueError, r"inner = 0.05 of \(21,\) nodes contains fewer than 3 along an axis"),
         ({"settle": 0.7}, ValueError, r"settle = 0.7"),
         ({"horizon": "long"}, ValueError, r"horizon = 'long'"),
         ({"problem_of_gamma": 3}, TypeError, r"problem_of_gamma is 3, wanted a function"),
@@ -292,17 +292,17 @@ def test_a_march_goes_on_from_another():
         (
             {"problem_of_gamma": lambda gamma: dataclasses.replace(LAG.game()(gamma), noise=0.1)},
             ValueError,
-            r"the problem has a noise, with which V no longer tells a gain",
+            r"the problem has a noise, with which V does not show a gain",
         ),
         (
             {"problem_of_gamma": lambda gamma: dataclasses.replace(LAG.game()(gamma), discount=0.5)},
             ValueError,
-            r"the problem has discount = 0.5, with which V settles also where the gain is violated",
+            r"the problem has discount = 0.5, with which V settles even if the gain is violated",
         ),
         (
             {"problem_of_gamma": lambda gamma: dataclasses.replace(LAG.game()(gamma), target=lambda x: x @ x - 0.1)},
             ValueError,
-            r"the problem has a target, with which V no longer tells a gain",
+            r"the problem has a target, with which V does not show a gain",
         ),
     ],
 )
@@ -317,7 +317,7 @@ def test_brackets_that_do_not_hold_the_level():
     game, grid = LAG.game(), cube(1, 21)
     with pytest.raises(ValueError, match=r"(?s)hi = 0.6 is not feasible: V still grew by 0.5.* longer horizon"):
         hjb.hinf_level(game, grid, 0.5, 0.6, horizon=32.0)
-    with pytest.raises(ValueError, match=r"lo = 0.8 is feasible: V settles at .* give a smaller lo"):
+    with pytest.raises(ValueError, match=r"lo = 0.8 is feasible: V settles at .* use a smaller lo"):
         hjb.hinf_level(game, grid, 0.8, 0.9, horizon=32.0)
 
 

@@ -73,7 +73,7 @@ def test_changes_below_the_tolerance_are_not_fitted(line):
     assert noise.order == pytest.approx(2, abs=0.01)
     nothing = dataclasses.replace(noise, errors=np.zeros(3), fitted=np.zeros(3, bool))
     assert np.isnan(nothing.order)
-    with pytest.raises(ValueError, match=r"got the changes .* over ε; a logarithmic plot needs"):
+    with pytest.raises(ValueError, match=r"got changes .* over ε, wanted a positive one"):
         plotting.perturbation(dataclasses.replace(study, noise=nothing))
     assert isinstance(nothing, Series)
 
@@ -93,7 +93,7 @@ def unsolved(monkeypatch):
     [
         ({"noises": [0.1]}, r"got noises = \[0.1\], wanted at least two finite numbers > 0"),
         ({"gammas": [1.0, -2.0]}, r"got gammas = \[1.0, -2.0\]"),
-        ({"problem": dataclasses.replace(PLANT, noise=0.1)}, r"has noise or disturbances already"),
+        ({"problem": dataclasses.replace(PLANT, noise=0.1)}, r"already has noise or disturbances"),
         ({"problem": dataclasses.replace(PLANT, discount=0.0)}, r"give a discount > 0"),
         ({"region": 2.0}, r"perturbation_study: got region = 2.0; wanted a share of the box"),
         ({"region": lambda x: x}, r"perturbation_study: the region returned shape \(1,\)"),
@@ -123,7 +123,7 @@ def test_what_is_no_problem_or_grid_is_refused(changes, got):
 @pytest.mark.slow
 def test_a_set_that_is_felt_is_refused():
     """At γ = 5 the worst disturbance is p x/25, .0125 at x = ½."""
-    with pytest.raises(ValueError, match=r"at gamma = 5 the worst disturbance sits on its bound at .* widen the set"):
+    with pytest.raises(ValueError, match=r"at gamma = 5 the worst disturbance is at its bound at .* widen the set"):
         hjb.perturbation_study(PLANT, GRID, **(SETS | {"disturbances": Box([-0.01], [0.01])}))
 
 

@@ -428,7 +428,7 @@ def test_a_probability_can_be_compiled_and_differentiated():
 @pytest.mark.parametrize(
     ("changes", "error", "reason"),
     [
-        ({"target": None}, ValueError, r"reach_probability: there is nothing to reach: give target="),
+        ({"target": None}, ValueError, r"reach_probability: there is nothing to reach: pass target="),
         ({"target": 1.0}, TypeError, r"reach_probability: target: got 1.0, wanted a function"),
         ({"target": lambda x: x[0] + 9}, ValueError, r"target: no node lies in the target"),
         ({"problem": 1}, TypeError, r"got int, wanted a Problem"),

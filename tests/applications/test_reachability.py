@@ -129,7 +129,7 @@ def test_a_goal_inside_an_obstacle_is_not_reached():
 
 
 def test_forward_sets_of_time_dependent_systems_are_refused():
-    with pytest.raises(ValueError, match=r"forward=True turns the time round"):
+    with pytest.raises(ValueError, match=r"forward=True reverses time"):
         hjb.reach(lambda t, x, u: u, UNIT, lambda t, x: gap(x), forward=True, time_dependent=True)
 
 

@@ -535,7 +535,7 @@ def test_open_ends_have_no_chain(ask):
     with pytest.raises(ValueError, match="open ends has no chain"):
         getattr(chain, ask)(problem, hjb.Grid([-1.0], [1.0], (9,), edges="open"))
     for probability in (hjb.reach_probability, hjb.expected_exit_time):
-        with pytest.raises(ValueError, match="beyond an open end"):
+        with pytest.raises(ValueError, match="an open end extrapolates the value"):
             probability(problem, hjb.Grid([-1.0], [1.0], (9,), edges="open"), lambda x: x[0] - 0.5)
 
 

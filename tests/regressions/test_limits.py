@@ -604,7 +604,7 @@ def test_an_interrupted_search_for_a_level_keeps_its_bracket_and_its_trials():
 def test_ctrl_c_after_the_last_trial_is_not_lost(monkeypatch, last):
     usual = getattr(hinf, last)
     monkeypatch.setattr(hinf, last, lambda *a: (usual(*a), signal.raise_signal(signal.SIGINT))[0])
-    with pytest.raises(hjb.SolveError, match="hinf_level: interrupted after it had come to its end") as caught:
+    with pytest.raises(hjb.SolveError, match="hinf_level: interrupted after the search had finished") as caught:
         level_of(attenuated)
     level = caught.value.solution
     assert level.status is INTERRUPTED

@@ -1,21 +1,21 @@
 """Child processes that end when their launcher ends, and a record of how each of them ended.
 
-The launcher handles one event at a time. Signals and ends of children are put into one queue, so no exception of a
-signal can fall between the start of a child and the note that it runs:
+The launcher handles one event at a time. Signals and ends of children go through one queue, so a signal cannot
+interrupt the launcher between the start of a child and the record of it:
 
     a signal (SIGINT, SIGTERM, SIGHUP)   ask every child to end; a second signal kills them
     a child dies                         ask the others to end
-    a child fails and says why           ask the others to end after ``SETTLE`` seconds
-    the first child ends                 the same, as it speaks for all
+    a child fails with a reason          ask the others to end after ``SETTLE`` seconds
+    the first child ends                 the same, because its result counts
     another one ends without a farewell  ask the others to end
-    a child has been stopped for long    ask all of them, and continue it
+    a child stays stopped                ask all of them to end, and continue it
     ``GRACE`` seconds after any of them  kill the children that still run
 
-Asking is SIGTERM, with SIGCONT for a child that is stopped. A launcher that is killed cannot ask. Children that were
-started by ``followed`` notice it on their own: their standard input is a pipe that ends with the launcher.
+A request to end is SIGTERM, and also SIGCONT for a stopped child. A launcher that is killed cannot send it, but
+children started by ``followed`` notice this: their standard input is a pipe that closes with the launcher.
 
-The file imports the standard library only and runs as the script of a child, which follows its launcher from its first
-milliseconds on. Importing JAX takes seconds.
+This file imports only the standard library and also runs as the script of a child. A child therefore follows its
+launcher within milliseconds, although importing JAX takes seconds.
 """
 
 import collections
@@ -34,12 +34,12 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from types import FrameType
 from typing import IO, Any
 
-GRACE = 7.0  # seconds from a request to end until SIGKILL, so that all is over within 10
-SETTLE = 2.0  # seconds in which children that fail together may each say why
-BOUNCE = 0.3  # seconds within which a second signal is the first one again, as when a terminal and its shell close
-TICK = 0.5  # seconds between two looks at the clock
-LINES = 20  # of standard output among which a farewell is looked for
-LINGER = 0.5  # seconds to wait for the last words of a child that has ended
+GRACE = 7.0  # seconds between a request to end and SIGKILL, so that everything ends within 10 s
+SETTLE = 2.0  # seconds for children that fail together to print their reasons
+BOUNCE = 0.3  # seconds within which a second signal counts as the first one, as when a terminal and its shell close
+TICK = 0.5  # seconds between two checks of the clock
+LINES = 20  # number of last lines of standard output that are searched for a farewell
+LINGER = 0.5  # seconds to wait for the last output of a child that has ended
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 REQUEST = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGCONT") if hasattr(signal, name))
 SHARED = (signal.SIGTERM, signal.SIGABRT)  # signals by which a child also ends because of another child
@@ -47,7 +47,7 @@ SHARED = (signal.SIGTERM, signal.SIGABRT)  # signals by which a child also ends 
 
 @dataclasses.dataclass(frozen=True)
 class Command:
-    """The words of a command, and the environment in which it runs."""
+    """A command and its environment."""
 
     words: Sequence[str]
     environment: Mapping[str, str]
@@ -58,7 +58,7 @@ class End:
     """The end of a child.
 
     Args:
-      number: of the child.
+      number: the number of the child.
       code: its exit code; minus the number of the signal that ended it.
       words: the last line that it wrote on standard error.
       early: True if it ended with exit code 0, but without its farewell.
@@ -72,7 +72,7 @@ class End:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """How the children ended.
+    """The ends of all children.
 
     Args:
       ends: one per child, in the order in which they ended.
@@ -80,7 +80,7 @@ class Outcome:
       hurried: True if a second signal killed the children.
       stopped: numbers of the children that were stopped (SIGSTOP) when they were asked to end.
       killed: numbers of the children that were killed.
-      unwritten: the error with which output of the first child could not be passed on.
+      unwritten: the error that prevented output of the first child from being passed on.
     """
 
     ends: tuple[End, ...]
@@ -98,7 +98,7 @@ class Outcome:
     def culprit(self) -> End | None:
         """The child that brought the others down; None if all ended with exit code 0 and a farewell.
 
-        Killing or stopping one child makes the others fail, and they may be seen to fail first.
+        If a child is killed or stopped, the others fail as well, possibly before it ends.
         """
         alone = [end for end in self.ends if end.number not in self.killed]
         crashed = [end for end in alone if end.code < 0 and -end.code not in SHARED]
@@ -111,7 +111,7 @@ class Outcome:
 def followed(module: str, words: Sequence[str], environment: Mapping[str, str]) -> Command:
     """The command ``python -m module words`` in a process that ends when its launcher ends, even by ``kill -9``.
 
-    It imports from where the launcher imports: a file ``random.py`` in the working directory is in nobody's way.
+    It imports from the same folders as the launcher, so a file ``random.py`` in the working directory has no effect.
     """
     path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
     return Command([sys.executable, "-P", __file__, module, *words], {**environment, "PYTHONPATH": path})
@@ -124,18 +124,18 @@ def run(
     patience: float = math.inf,
     farewell: bytes = b"",
 ) -> Outcome:
-    """Run commands side by side until all of them have ended; pass on what the first one writes.
+    """Run commands in parallel until all of them have ended; pass on the output of the first one.
 
     Args:
       commands: one per child.
-      explained: exit codes of a child that said why it failed.
-      muted: parts of lines that are not passed on.
-      patience: seconds for which a child may be stopped.
-      farewell: words on standard output with which a child, other than the first, says that the others can do without
-        it; empty if exit code 0 says so.
+      explained: exit codes of a child that has printed its reason.
+      muted: lines that contain any of these are not passed on.
+      patience: seconds for which a child may stay stopped.
+      farewell: text on standard output by which a child other than the first reports that the others no longer need it;
+        if empty, exit code 0 means this.
 
     Raises:
-      OSError: a child could not be started. No child is left running.
+      OSError: a child could not be started; no child is left running.
     """
     launcher = _Launcher(explained, muted, patience, farewell)
     with _signals_into(launcher.events):
@@ -149,7 +149,7 @@ def run(
 
 
 class _Launcher:
-    """The children that run, the ends of the others, and when the next request is due."""
+    """The running children, the ends of the others, and the time of the next request."""
 
     def __init__(self, explained: Collection[int], muted: Collection[bytes], patience: float, farewell: bytes):
         self.explained, self.muted, self.patience, self.farewell = explained, muted, patience, farewell
@@ -163,11 +163,11 @@ class _Launcher:
         self.standing: dict[int, float] = {}  # the seconds for which a child has been stopped
         self.stopped: tuple[int, ...] = ()
         self.killed: tuple[int, ...] = ()
-        self.quiet = threading.Event()  # from here on the first child only says that it misses the others
+        self.quiet = threading.Event()  # if set, the first child's output only concerns the missing others
         self.unwritten: list[OSError] = []
 
     def start(self, command: Command) -> None:
-        """Start a child in a process group of its own, so that Ctrl-C reaches it through the launcher only."""
+        """Start a child in a separate process group, so that Ctrl-C reaches it only through the launcher."""
         number = len(self.running) + len(self.ends)
         first = number == 0
         options: dict[str, Any] = {
@@ -196,7 +196,7 @@ class _Launcher:
         threading.Thread(target=report_end, daemon=True).start()
 
     def _listen(self, stream: IO[bytes] | None, out: Any, last: collections.deque[bytes]) -> threading.Thread:
-        """A thread that reads what a child writes, keeps the last lines and passes all of it on."""
+        """Start a thread that reads the output of a child, keeps the last lines and passes all lines on."""
 
         def listen() -> None:
             assert stream is not None
@@ -209,7 +209,7 @@ class _Launcher:
                         continue
                     try:
                         _write(line, sink)
-                    except OSError as error:  # from here on lines are dropped, so that the child can go on writing
+                    except OSError as error:  # drop further lines, so that the child can continue to write
                         self.unwritten.append(error)
                         sink = None
 
@@ -237,7 +237,7 @@ class _Launcher:
                 self._ask()
 
     def _note_end(self, end: End) -> None:
-        """Record an end, and ask the others to end where it means that they are not needed or cannot go on."""
+        """Record an end, and ask the other children to end if they are no longer needed or cannot continue."""
         self._close(self.running.pop(end.number))
         self.ends.append(end)
         if self.asked_at is not None or (end.number > 0 and end.code == 0 and not end.early):
@@ -257,8 +257,8 @@ class _Launcher:
             self.kill_at, self.hurried = now, True
 
     def _note_stopped(self) -> None:
-        """Ask the children to end if one of them has been stopped for too long: the others wait for it."""
-        # counted in looks: a launcher that was stopped as well must not blame its children for that time
+        """Ask the children to end if one of them has been stopped for too long, because the others wait for it."""
+        # count checks instead of time, because the launcher may have been stopped as well
         self.standing = {number: self.standing.get(number, 0.0) + TICK for number in self._stopped_now()}
         if self.asked_at is None and any(seconds > self.patience for seconds in self.standing.values()):
             self.ask_at = min(self.ask_at, time.monotonic())
@@ -286,7 +286,7 @@ class _Launcher:
             process.kill()
 
     def clear(self) -> None:
-        """Kill the children that still run, as after an error of the launcher, and let go of the pipes."""
+        """Kill the children that still run, for example after an error of the launcher, and close the pipes."""
         for process in self.running.values():
             process.kill()
         for process in self.running.values():
@@ -298,18 +298,18 @@ class _Launcher:
 
     @staticmethod
     def _close(process: subprocess.Popen) -> None:
-        """Close the pipe by which a child follows its launcher."""
+        """Close the pipe through which a child follows its launcher."""
         assert process.stdin is not None
         process.stdin.close()
 
     def outcome(self) -> Outcome:
-        """How the children ended."""
+        """The ends of all children."""
         unwritten = next(iter(self.unwritten), None)
         return Outcome(tuple(self.ends), self.interrupted, self.hurried, self.stopped, self.killed, unwritten)
 
 
 def _write(line: bytes, out: Any) -> None:
-    """Write a line as it is, at once."""
+    """Write a line unchanged, and flush it."""
     if hasattr(out, "buffer"):
         out.buffer.write(line)
     else:
@@ -319,7 +319,7 @@ def _write(line: bytes, out: Any) -> None:
 
 @contextlib.contextmanager
 def _signals_into(events: "queue.SimpleQueue[Any]") -> Iterator[None]:
-    """Context in which signals are events; one that is ignored, as by ``nohup``, stays ignored."""
+    """Context in which signals are put into a queue; ignored signals, as under ``nohup``, stay ignored."""
     if threading.current_thread() is not threading.main_thread():  # Python hands signals to the main thread only
         yield
         return
@@ -333,7 +333,7 @@ def _signals_into(events: "queue.SimpleQueue[Any]") -> Iterator[None]:
             if signal.getsignal(number) not in (signal.SIG_IGN, None):
                 usual[number] = signal.signal(number, note)
         if hasattr(signal, "SIGCHLD") and signal.getsignal(signal.SIGCHLD) is signal.SIG_IGN:
-            # some parents leave it ignored; then the system drops exit codes, and every child seems to end well
+            # some parents leave it ignored, and then the system drops exit codes and every child seems to succeed
             usual[signal.SIGCHLD] = signal.signal(signal.SIGCHLD, signal.SIG_DFL)
         yield
     finally:
@@ -342,10 +342,10 @@ def _signals_into(events: "queue.SimpleQueue[Any]") -> Iterator[None]:
 
 
 def _is_stopped(process: subprocess.Popen) -> bool:
-    """True if a child is stopped now, as by SIGSTOP; False where the system does not say."""
+    """True if a child is stopped now, for example by SIGSTOP; False if the system does not report it."""
     if not hasattr(os, "waitid"):
         return False
-    try:  # nothing is taken away from the thread that waits for the end
+    try:  # WNOWAIT leaves the event to the thread that waits for the end
         return os.waitid(os.P_PID, process.pid, os.WSTOPPED | os.WNOHANG | os.WNOWAIT) is not None
     except OSError:
         return False
@@ -355,7 +355,7 @@ def _is_stopped(process: subprocess.Popen) -> bool:
 
 
 def _follow(lifeline: int) -> None:
-    """End this process when the pipe ends: as on SIGTERM, which keeps what it has, and after ``GRACE`` for certain."""
+    """End this process when the pipe closes: by SIGTERM, which saves its work, and for certain after ``GRACE``."""
     while os.read(lifeline, 1):
         pass
     os.kill(os.getpid(), signal.SIGTERM)
@@ -368,7 +368,7 @@ def _main(module: str) -> None:
     lifeline, nothing = os.dup(0), os.open(os.devnull, os.O_RDONLY)
     os.dup2(nothing, 0)
     os.close(nothing)
-    # the launcher sends SIGTERM; SIGINT comes from somebody who signals every process by name, the launcher among them
+    # the launcher sends SIGTERM; SIGINT may come from a signal to all processes by name, including the launcher
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_follow, args=(lifeline,), daemon=True).start()
     runpy.run_module(module, run_name="__main__")

@@ -1,4 +1,4 @@
-"""What the command says in one line, and the words that it takes: numbers, shapes, names."""
+"""One-line messages of the command, and the types of its arguments: numbers, shapes, names."""
 
 import contextlib
 import difflib
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from hjbjax.zoo.entry import Entry
 
 
-UNREAD = 141  # 128 + SIGPIPE, the exit code that shells report for a program whose reader has gone
+UNREAD = 141  # 128 + SIGPIPE, by convention of shells the exit code of a program whose reader has closed the pipe
 
 
 class Failure(click.ClickException):
-    """A refusal or a fault: one line and an exit code."""
+    """An error with one line and an exit code."""
 
     def __init__(self, message: str | Exception, exit_code: int = 2):
         super().__init__(str(message))
@@ -33,7 +33,7 @@ class OneLineGroup(click.Group):
     """A group whose errors are one line on stderr, without the usage block."""
 
     def make_context(self, *arguments: Any, **options: Any) -> click.Context:
-        """Parse the words of the group, which may print its help."""
+        """Parse the arguments of the group, which may print its help."""
         with _own_endings():
             return super().make_context(*arguments, **options)
 
@@ -50,11 +50,11 @@ class OneLineGroup(click.Group):
         standalone_mode: bool = True,
         **extra: Any,
     ) -> Any:
-        """Run a command and, unless ``standalone_mode`` is off, end the process with its exit code."""
+        """Run a command, and end the process with its exit code unless ``standalone_mode`` is off."""
         if not standalone_mode:
             return super().main(args, prog_name, complete_var, False, **extra)
         try:
-            # not standalone, click raises instead of printing a usage block and ending the process itself
+            # in standalone mode click would print a usage block and end the process itself
             code = super().main(args, prog_name, complete_var, False, **extra)
         except _Unread:
             code = UNREAD
@@ -63,27 +63,27 @@ class OneLineGroup(click.Group):
             say(_for_a_parameter(error) or error.format_message())
             code = error.exit_code
         except (click.Abort, KeyboardInterrupt):
-            say("interrupted", after="\n" * streams.is_terminal(sys.stderr))  # which shows ^C on the line
+            say("interrupted", after="\n" * streams.is_terminal(sys.stderr))  # ends the line with ^C
             code = interrupts.CODE
-        except OSError as error:  # the commands handle errors of their files: this is standard output on a full disk
+        except OSError as error:  # standard output on a full disk; the commands handle errors of their own files
             code = 5
             streams.let_go(sys.stdout)
             say(f"the output could not be written: {error.strerror or error}")
-        if code == interrupts.CODE and sys.stdout is sys.__stdout__:  # a process of our own
-            # os._exit loses what is in a buffer
+        if code == interrupts.CODE and sys.stdout is sys.__stdout__:  # not inside a test or another program
+            # os._exit does not flush
             for stream in (sys.stdout, sys.stderr):
                 streams.Expendable(stream).flush()
-            os._exit(code)  # JAX may still be at work, which the usual exit waits for, or crashes on
+            os._exit(code)  # JAX may still be at work, and a normal exit would wait for it or crash
         sys.exit(code if isinstance(code, int) else 0)  # a command that ends well returns None
 
 
 class _Unread(click.ClickException):
-    """The reader of standard output has closed the pipe, as ``head`` does when it has enough."""
+    """The reader of standard output has closed the pipe, as ``head`` does."""
 
 
 @contextlib.contextmanager
 def _own_endings() -> Iterator[None]:
-    """Turn two exceptions into others before click sees them: it would print an empty line, or exit with code 1."""
+    """Replace two exceptions that click would handle badly, with an empty line or with exit code 1."""
     try:
         yield
     except KeyboardInterrupt as error:
@@ -93,7 +93,7 @@ def _own_endings() -> Iterator[None]:
 
 
 def _for_a_parameter(error: click.ClickException) -> str | None:
-    """The message for a parameter of a problem that was given as an option of the command; None for other errors."""
+    """The message if a parameter of a problem was given as an option of the command; None for other errors."""
     if not isinstance(error, click.NoSuchOption):
         return None
     name = error.option_name.lstrip("-").replace("-", "_")
@@ -103,36 +103,34 @@ def _for_a_parameter(error: click.ClickException) -> str | None:
         return None
     if not known:
         return None
-    return (
-        f"No such option '{error.option_name}'. A parameter of a problem is given by --set, as in --set {name}=VALUE."
-    )
+    return f"No such option '{error.option_name}'. Set a parameter of a problem with --set, as in --set {name}=VALUE."
 
 
 def say(line: str, *, after: str = "") -> None:
-    """Write one line on standard error, if anybody can read it."""
+    """Write one line on standard error, if it is open."""
     stream = streams.Expendable(sys.stderr)
-    # an exception's text may have several lines; a script that reads stderr is promised one
+    # join the lines of an exception's text, because scripts rely on one line
     stream.write(f"{after}{streams.encodable(streams.plain(f'hjbjax: {line}'), sys.stderr)}\n")
     stream.flush()
 
 
 def show(text: str, *, newline: bool = True) -> None:
-    """Write a text on standard output, if there is one, in the letters that it has.
+    """Write a text on standard output, if it is open, in the characters of its encoding.
 
     Raises:
-      OSError: the disk is full, or the reader has gone.
+      OSError: the disk is full, or the reader has closed the pipe.
     """
     if streams.is_open(sys.stdout):
         click.echo(streams.encodable(text), nl=newline)
 
 
 def text_of(path: str | os.PathLike[str]) -> str:
-    """A path as text of one line, whatever is in it."""
+    """A path as text of one line, with unprintable characters escaped."""
     return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in os.fspath(path))
 
 
 class Place(click.Path):
-    """A path; one that no system takes is refused as a word is."""
+    """A path; null bytes and empty paths are usage errors."""
 
     def __init__(self) -> None:
         super().__init__(path_type=Path)
@@ -140,14 +138,14 @@ class Place(click.Path):
     def convert(self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """The path."""
         if "\0" in os.fspath(value):
-            self.fail(f"{os.fspath(value)!r} holds a null byte, which is no part of a name", param, ctx)
-        if not os.fspath(value):  # an unset variable of a script; "." names the current folder
+            self.fail(f"{os.fspath(value)!r} contains a null byte, which is not allowed in a path", param, ctx)
+        if not os.fspath(value):  # from an unset variable in a script; "." is the current folder
             self.fail("got an empty path, wanted a name", param, ctx)
         return super().convert(value, param, ctx)
 
 
 class Number(click.ParamType):
-    """A finite number above zero; click's own types let NaN and infinity through."""
+    """A finite number above zero; click's types accept NaN and infinity."""
 
     name = "number"
 
@@ -156,14 +154,14 @@ class Number(click.ParamType):
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """The number, or a usage error."""
-        number = finite(str(value), self.kind)  # click converts defaults, too, which are numbers already
+        number = finite(str(value), self.kind)  # click also converts defaults, which are numbers
         if number is None or number <= 0:
             self.fail(f"got {value!r}, wanted a {'whole' if self.kind is int else 'finite'} number > 0", param, ctx)
         return number
 
 
 class Shape(click.ParamType):
-    """Numbers of nodes, or of devices, with an x between them, as in 200x201."""
+    """Numbers of nodes or of devices separated by x, as in 200x201."""
 
     name = "NxN"
 
@@ -171,16 +169,16 @@ class Shape(click.ParamType):
         self.least, self.example = least, "200x201" if least > 1 else "4x2"
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
-        """One integer an axis, or a usage error."""
+        """One integer per axis, or a usage error."""
         counts = [finite(part, int) for part in str(value).lower().split("x")]
         if any(count is None or count < self.least for count in counts):
-            wanted = f"whole numbers of at least {self.least}, one an axis, as in {self.example}"
+            wanted = f"whole numbers of at least {self.least}, one per axis, as in {self.example}"
             self.fail(f"got {value!r}, wanted {wanted}", param, ctx)
-        return tuple(count for count in counts if count is not None)  # for the type alone: None has failed above
+        return tuple(count for count in counts if count is not None)  # the filter is for the type checker
 
 
 class Name(click.ParamType):
-    """One of some names; an unknown one gets the list and the nearest."""
+    """One of several names; the error for an unknown name lists them and suggests the closest."""
 
     name = "name"
 
@@ -199,19 +197,19 @@ def finite(text: str, kind: type[int]) -> int | None: ...
 @overload
 def finite(text: str, kind: type[float]) -> float | None: ...
 def finite(text: str, kind: type[float]) -> float | None:
-    """``text`` as a finite number of a kind; ``None`` if it is none."""
+    """Parse ``text`` as a finite number of the given kind; ``None`` if it is not one."""
     try:
         number = kind(text)
     except ValueError:
         return None
-    # an integer of 400 digits is finite, and math.isfinite would overflow on its way to a float
+    # an integer of 400 digits is finite, but math.isfinite would overflow when it converts it to a float
     return number if kind is int or math.isfinite(number) else None
 
 
 def unknown(what: str, got: str, allowed: Iterable[str]) -> str:
-    """A refusal of a name, with those that there are and the nearest of them."""
+    """The message for an unknown name, with the allowed names and the closest one."""
     names = list(allowed)
-    # hyphens first, for who writes a name as in Python; then as it is, for parameters, which have underscores
+    # with hyphens first, for problem names in Python spelling, then as given, for parameters, which have underscores
     near = difflib.get_close_matches(got.lower().replace("_", "-"), names, 1) or difflib.get_close_matches(
         got, names, 1
     )
@@ -220,7 +218,7 @@ def unknown(what: str, got: str, allowed: Iterable[str]) -> str:
 
 
 def parameters_of(entry: "Entry", settings: tuple[str, ...]) -> dict[str, Any]:
-    """The values of --set, each of the kind of its default."""
+    """Parse the values of --set, each to the type of its default."""
     defaults = {key: value for key, value in entry.parameters.items() if key != "shape"}
     chosen: dict[str, Any] = {}
     for setting in settings:
@@ -228,18 +226,18 @@ def parameters_of(entry: "Entry", settings: tuple[str, ...]) -> dict[str, Any]:
         if not equals or not key or not text:
             raise Failure(f"--set: got {setting!r}, wanted NAME=VALUE, as in --set {next(iter(defaults))}=2")
         if key == "shape":
-            raise Failure("--set: the shape has an option of its own: --shape 200x201")
+            raise Failure("--set: the shape has its own option, --shape 200x201")
         if key not in defaults:
             raise Failure("--set: " + unknown(f"parameter of {entry.name}", key, defaults))
         if key in chosen:
-            raise Failure(f"--set: {key} is given twice")
+            raise Failure(f"--set: {key} was given twice")
         chosen[key] = _value_of(key, text, defaults[key])
     return chosen
 
 
 def _value_of(key: str, text: str, default: object) -> bool | float | tuple[float, ...]:
-    """The text of one --set as a value of its default's kind."""
-    if isinstance(default, bool):  # before int, of which bool is a subclass
+    """Parse the text of one --set to the type of its default."""
+    if isinstance(default, bool):  # before int, because bool is a subclass of int
         if text.lower() not in ("true", "false"):
             raise Failure(f"--set: got {key}={text}, wanted true or false")
         return text.lower() == "true"
@@ -247,20 +245,20 @@ def _value_of(key: str, text: str, default: object) -> bool | float | tuple[floa
     kind = int if isinstance(default, int) else float
     numbers = tuple(finite(part, kind) for part in parts)
     if default is None and len(parts) == 1 and (whole := finite(text, int)) is not None:
-        numbers = (whole,)  # what has no default may be a count
+        numbers = (whole,)  # a parameter without a default may be a count
     if None in numbers or (isinstance(default, tuple) and len(parts) != len(default)):
         wanted = "a whole number" if kind is int else "a finite number"
         if isinstance(default, tuple):
-            wanted = f"{len(default)} finite numbers with commas between them"
+            wanted = f"{len(default)} finite numbers separated by commas"
         raise Failure(f"--set: got {key}={text}, wanted {wanted}")
     if len(parts) > 1 and isinstance(default, (int, float)):
         raise Failure(f"--set: got {key}={text}, wanted one number")
-    known = cast(tuple[float, ...], numbers)  # None has been refused
+    known = cast(tuple[float, ...], numbers)  # None was handled above
     return known if len(parts) > 1 else known[0]
 
 
 def catalogue() -> "dict[str, Entry]":
-    """The ready problems by name; a function, so that they are looked up only when a name is checked.
+    """The ready problems by name; a function, so that the zoo is imported only when a name is checked.
 
     Raises:
       Failure: JAX cannot be imported.
@@ -274,7 +272,7 @@ def check_jax() -> None:
     """Start JAX.
 
     Raises:
-      Failure: it finds no device.
+      Failure: JAX finds no device.
     """
     with starting_jax():
         import jax
@@ -284,10 +282,10 @@ def check_jax() -> None:
 
 @contextlib.contextmanager
 def starting_jax() -> Iterator[None]:
-    """Context in which JAX starts: a fault of the installation or of a variable of the environment is one line.
+    """Context in which JAX starts; a broken installation or a bad environment variable gives a one-line error.
 
     Raises:
-      Failure: with the reason that JAX gives.
+      Failure: with JAX's reason.
     """
     try:
         yield
@@ -296,7 +294,7 @@ def starting_jax() -> Iterator[None]:
 
 
 def names_of(table: dict[str, str]) -> Callable[[], Iterable[str]]:
-    """The names in a table of choices that this version has."""
+    """The names in a table of choices that this version of the package has."""
 
     def names() -> Iterable[str]:
         import hjbjax

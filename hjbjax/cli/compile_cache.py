@@ -1,18 +1,18 @@
-"""Compiled programs, kept on disk from process to process by JAX's persistent compilation cache."""
+"""Compiled programs on disk, shared between processes through JAX's persistent compilation cache."""
 
 import os
 import sys
 from pathlib import Path
 
-SETTINGS = {  # JAX's own keep nothing that took less than a second, and a solve is many programs that do
+SETTINGS = {  # JAX's defaults skip programs that compile in less than a second, and a solve has many of these
     "jax_persistent_cache_min_compile_time_secs": 0.0,
     "jax_persistent_cache_min_entry_size_bytes": -1,
 }
-CHOICES = ("JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE")  # a user who sets one has chosen already
+CHOICES = ("JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE")  # if one is set, the user has decided
 
 
 def user_folder() -> Path:
-    """Where this user's caches are, by the custom of the platform."""
+    """The folder for this user's caches on this platform."""
     if sys.platform == "win32":
         return Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local") / "hjbjax" / "Cache"
     if sys.platform == "darwin":
@@ -21,21 +21,21 @@ def user_folder() -> Path:
 
 
 def keep_compiled(folder: str | os.PathLike | None = None) -> Path:
-    """Keep what JAX compiles from now on, and find there what earlier processes compiled.
+    """Store compiled programs on disk, and reuse those that earlier processes stored.
 
-    One line at the start of a script or notebook, for problems that are solved again tomorrow. The options are JAX's
-    own and hold for the whole process, which is why no solve sets them by itself. A program is found again where
-    problem, shapes, options, versions and processor are the same; numbers may differ. Entries are never removed or
-    mended: one that is damaged warns, and what it held is compiled anew; delete the folder then, or when it has grown.
+    Call it once at the start of a script or notebook whose problems are solved again later. It sets options of JAX that
+    hold for the whole process, so no solve sets them on its own. A program is reused if problem, shapes, options,
+    versions and processor are the same; numbers may differ. Entries are never removed or repaired. A damaged entry
+    causes a warning and is compiled again; delete the folder then, or when it has become too large.
 
     Args:
-      folder: where; ``None`` is the user's folder for caches, ``~/.cache/hjbjax`` on Linux.
+      folder: the folder; ``None`` is the user's cache folder, ``~/.cache/hjbjax`` on Linux.
 
     Returns:
       The folder.
 
     Raises:
-      OSError: it cannot be made, or not be written.
+      OSError: the folder cannot be created or written.
 
     Example:
       >>> import hjbjax as hjb
@@ -54,10 +54,10 @@ def keep_compiled(folder: str | os.PathLike | None = None) -> Path:
 
 
 def keep_for_the_command() -> None:
-    """As ``keep_compiled``, unless the environment says otherwise; without a folder nothing is kept."""
+    """Call ``keep_compiled`` unless the environment disables it; without a usable folder nothing is stored."""
     if any(name in os.environ for name in CHOICES):
         return
     try:
         keep_compiled()
-    except (OSError, RuntimeError):  # RuntimeError: a user without a home
+    except (OSError, RuntimeError):  # RuntimeError: the user has no home folder
         return

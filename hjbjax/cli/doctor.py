@@ -1,4 +1,4 @@
-"""What ``hjbjax doctor`` looks at: versions, devices, float64, a tiny solve, memory, pictures, the folder."""
+"""The checks of ``hjbjax doctor``: versions, devices, float64, a tiny solve, memory, pictures, the folder."""
 
 import functools
 import importlib.metadata
@@ -19,8 +19,8 @@ PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "diffrax", "optax", "matplotlib",
 
 
 def examine() -> Iterator[tuple[str, bool, str]]:
-    """The checks, run one by one: the name of each, True where it is well, and what was found."""
-    # each imports what it needs by itself: one that is broken is a line of the report and not its end
+    """Run the checks one by one: the name of each, True if it passed, and the finding."""
+    # each check imports what it needs, so that a broken package is one line of the report
     checks: dict[str, Callable[[], str]] = {
         "python": lambda: f"{sys.version.split()[0]} at {sys.executable}",
         "hjbjax": lambda: f"{__version__} at {Path(__file__).parent}",
@@ -35,7 +35,7 @@ def examine() -> Iterator[tuple[str, bool, str]]:
     for name, check in checks.items():
         try:
             yield name, True, check()
-        except Exception as error:  # whatever is wrong is what was asked for
+        except Exception as error:  # report any failure
             yield name, False, f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
@@ -49,9 +49,9 @@ def _float64() -> str:
     import jax
     import jax.numpy as jnp
 
-    with jax.enable_x64(True):  # compiled, as a solve is: that is where a device without float64 shows
+    with jax.enable_x64(True):  # compiled like a solve, because a device without float64 fails only then
         third = jax.jit(lambda x: x / 3)(jnp.asarray(1.0))
-        # 1/3 has no finite expansion: computed in float32 it would differ in the eighth digit
+        # 1/3 has no finite binary expansion, so float32 would differ in the eighth digit
         if float(third) != 1 / 3 or third.dtype != np.float64:
             raise ArithmeticError(f"1/3 is {float(third)!r} in {third.dtype}")
     return "works, inside jax.enable_x64(True)"
@@ -60,7 +60,7 @@ def _float64() -> str:
 def _solve() -> str:
     import hjbjax as hjb
 
-    # the smallest problem that goes through tracing, compiling and certification
+    # the smallest problem that uses tracing, compiling and certification
     problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x + u @ u, hjb.Box([-3.0], [3.0]), discount=1.0)
     begun = time.perf_counter()
     solution = hjb.solve(problem, hjb.Grid([-1.0], [1.0], (41,)))
@@ -68,7 +68,7 @@ def _solve() -> str:
 
 
 def _memory() -> str:
-    # on Linux alone: elsewhere the name is unknown, and the line says so
+    # works on Linux only; elsewhere the name is unknown, and the line says so
     free, total = (os.sysconf("SC_PAGE_SIZE") * os.sysconf(f"SC_{which}_PAGES") / 2**30 for which in ("AVPHYS", "PHYS"))
     return f"{free:.1f} GiB free of {total:.1f} GiB"
 
@@ -77,16 +77,16 @@ def _pictures() -> str:
     import matplotlib
     from matplotlib.figure import Figure
 
-    # into memory, by the renderer that savefig would choose: no display, no file
+    # into memory with the renderer of savefig, so that no display and no file is needed
     Figure(figsize=(1, 1)).savefig(io.BytesIO(), format="png")
-    backend = matplotlib.get_backend(auto_select=False)  # to ask otherwise would choose one, and import pyplot
+    backend = matplotlib.get_backend(auto_select=False)  # auto-selection would choose one and import pyplot
     return f"PNG works without a display; matplotlib's backend is {backend or 'not chosen yet'}"
 
 
 def _folder() -> str:
     here = Path(placement.current_folder())
-    placement.sweep(here)  # what a killed command left here
-    # made and removed again, as by a solve: permission bits do not show a full or read-only disk
+    placement.sweep(here)  # remove leftovers of a killed command
+    # create and remove a folder, as a solve does, because permission bits do not show a full or read-only disk
     folder = here / placement.hidden_name("doctor")
     folder.mkdir()
     folder.rmdir()

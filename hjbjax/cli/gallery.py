@@ -1,7 +1,7 @@
-"""Every ready problem on one page: pictures, numbers, and the error where the exact answer is known.
+"""The gallery, a page of all ready problems: pictures, numbers, and the error if the exact answer is known.
 
-A problem is solved on a small grid and becomes a ``Card``; ``page`` makes one HTML file of the cards, with the
-pictures inside it, so that it can be sent and opened without anything beside it.
+Each problem is solved on a small grid and becomes a ``Card``. ``page`` builds one self-contained HTML file of the
+cards, with embedded pictures.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ if TYPE_CHECKING:
     from hjbjax.zoo.entry import Entry
 
 PAGE = "index.html"
-NODES = 20_000  # of a problem at most: 141 x 141, tenths of a second once compiled; on 62 x 63 the pendulum is 3 % off
-DPI = 72  # 9.6 inches are 690 pixels, the width of a card
-QUALITY = 85  # of WebP: 12 kB a picture; at 60 they have 8, and the edges of shaded fields fray into the paper
+NODES = 20_000  # maximum per problem: tenths of a second once compiled; with 62 x 63 the pendulum is 3 % off
+DPI = 72  # 9.6 inches give 690 pixels, the width of a card
+QUALITY = 85  # of WebP: 12 kB per picture; 60 gives 8 kB but frayed edges of shaded fields
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,8 +50,8 @@ class Card:
       name: as in the catalogue.
       summary: one line.
       status: the name of a ``Status``, or of the error that ended the solve.
-      facts: pairs of words and figures, as text.
-      pictures: pairs of a caption and a WebP file.
+      facts: pairs of label and text.
+      pictures: pairs of caption and WebP file.
     """
 
     name: str
@@ -62,43 +62,43 @@ class Card:
 
 
 def check_folder(out: Path, force: bool = False) -> None:
-    """Refuse a folder that holds anything, unless by ``force`` and only its page is replaced.
+    """Raise if a folder is not empty; with ``force`` its page may be replaced.
 
     Raises:
-      OSError: with a line on the way out.
+      OSError: with advice in one line.
     """
-    placement.current_folder()  # without one JAX raises FileNotFoundError where it filters a traceback
+    placement.current_folder()  # otherwise JAX raises FileNotFoundError when it filters a traceback
     if os.path.lexists(out) and not out.is_dir():
-        raise NotADirectoryError(f"{out} is there and is no folder; give another name")
-    placement.check_place(out / PAGE, force=True)  # a folder of that name is refused even by force
-    # a hidden folder of a command, maybe of this one, is not a result
+        raise NotADirectoryError(f"{out} exists but is not a folder; give another name")
+    placement.check_place(out / PAGE, force=True)  # refuse a folder named index.html even with force
+    # ignore hidden folders of this command
     found = sorted(name for name in os.listdir(out) if not placement.OWN.fullmatch(name)) if out.is_dir() else []
     if not force and PAGE in found:
-        raise FileExistsError(f"{out} holds {PAGE} already; give another --out, or --force to replace it")
+        raise FileExistsError(f"{out} contains {PAGE} already; give another --out, or --force to replace it")
     if not force and found:
         shown = ", ".join(map(text_of, found[:3])) + (", ..." if len(found) > 3 else "")
-        raise FileExistsError(f"{out} is not empty: {shown}; give another --out, or --force to put {PAGE} beside them")
+        raise FileExistsError(f"{out} is not empty: {shown}; give another --out, or --force to add {PAGE} to them")
 
 
 def small_shape(shape: Sequence[int], nodes: int = NODES) -> tuple[int, ...]:
-    """The shape of a grid with about ``nodes`` nodes and the proportions of ``shape``, or ``shape`` if it has fewer.
+    """The shape of a grid with about ``nodes`` nodes and the proportions of ``shape``, or ``shape`` if it is smaller.
 
-    A count keeps its parity: zero is a node of an odd one, and a periodic axis of an even one has its antipode.
+    The parity of each count is kept: an odd count has a node at zero, and an even periodic axis has antipodal nodes.
 
     Example:
       >>> small_shape((200, 201), 4000), small_shape((41, 51, 9), 4000), small_shape((81,), 4000)
       ((64, 63), (25, 31, 5), (81,))
     """
-    # moved to fewer nodes only: what a problem asks for by default is what its author found to be enough
+    # never more nodes than the default, which is fine enough
     share = min(1.0, (nodes / math.prod(shape)) ** (1 / len(shape)))
     return tuple(count - 2 * round(count * (1 - share) / 2) for count in shape)
 
 
 def card(entry: Entry, *, options: dict[str, Any] | None = None) -> Card:
-    """One problem solved on its small grid and drawn, whatever comes of it: a refusal is a card as well.
+    """Solve one problem on its small grid and plot it; an error gives a card as well.
 
     Args:
-      entry: of the catalogue.
+      entry: an entry of the catalogue.
 
     Keyword Args:
       options: more keywords of ``hjbjax.solve``.
@@ -111,7 +111,7 @@ def card(entry: Entry, *, options: dict[str, Any] | None = None) -> Card:
     _, grid = entry.build()
     problem, grid = entry.build(shape=small_shape(grid.shape))
     try:
-        # on the card in place of the screen, which shows one line a problem
+        # put warnings on the card instead of the terminal, which shows one line per problem
         with warnings.catch_warnings(record=True) as heard:
             warnings.simplefilter("always", SolveWarning)
             solution = hjb.solve(problem, grid, throw=False, **(options or {}))
@@ -130,16 +130,16 @@ def card(entry: Entry, *, options: dict[str, Any] | None = None) -> Card:
 
 
 def _figures(problem: Problem, solution: Solution, entry: Entry) -> tuple[list[tuple[str, Figure]], Trajectory | None]:
-    """Captions and drawings: value and closed loop in one where there is a path, then the feedback; and the path."""
+    """Captions and figures, and the path: value and closed loop in one figure if there is a path, then the feedback."""
     start = entry.initial_state(solution.grid.ndim)
-    fixed = dict(enumerate(start[2:], 2))  # axes from the third on, cut where the path starts
+    fixed = dict(enumerate(start[2:], 2))  # cut all axes from the third on at the start of the path
     jumps = run_folder.is_bang_bang(problem, solution)
     finish = None if entry.finish is None else entry.finish()
     path = None
     if solution.status == Status.CONVERGED:
         path = run_folder.closed_path(problem, solution, start, entry.duration, jumps, finish)
     drawn: list[tuple[str, Figure]] = []
-    if path is None or solution.grid.ndim == 1:  # over one axis the picture of the loop has no room for the value
+    if path is None or solution.grid.ndim == 1:  # the figure of a loop with one state does not show the value
         value = plotting.value(solution, ax=run_folder.axes(), fixed=fixed, target=problem.target)
         drawn.append(("the value", run_folder.with_curve(value, solution, fixed, jumps).figure))
     if path is not None:
@@ -159,7 +159,7 @@ def webp(figure: Figure, dpi: int = DPI) -> bytes:
 
 
 def _facts(solution: Solution) -> list[tuple[str, str]]:
-    """Figures of the solve: nodes, steps, both errors, seconds."""
+    """Facts about the solve: nodes, steps, errors, seconds."""
     stats = solution.stats
     facts = [
         ("grid", " x ".join(map(str, solution.grid.shape)) + f" = {solution.grid.size:,} nodes"),
@@ -177,7 +177,7 @@ def _facts(solution: Solution) -> list[tuple[str, str]]:
 
 
 def _exact(entry: Entry, solution: Solution) -> list[tuple[str, str]]:
-    """The exact value at the start of the path, and the largest difference from it; nothing where none is known."""
+    """The exact value at the start of the path, and the largest difference, if the exact value is known."""
     if entry.exact is None:
         return [("exact answer", "not known")]
     exact = entry.exact()
@@ -209,12 +209,12 @@ table { border-collapse: collapse; font-size: .9rem } td { padding: .1rem 1.2rem
 
 
 def page(cards: Sequence[Card]) -> str:
-    """One HTML page of the cards that needs no other file."""
+    """One self-contained HTML page of the cards."""
     links = "".join(f'<a href="#{card.name}">{html.escape(card.name)}</a>' for card in cards)
     good = sum(card.status == Status.CONVERGED.name for card in cards)
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>hjbjax gallery</title>'
-        # a picture of no bytes: or a browser asks for /favicon.ico, which a page of one file does not have
+        # an empty icon, otherwise a browser requests /favicon.ico
         '<link rel="icon" href="data:,"><meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<style>{STYLE}</style></head>\n<body><h1>The ready problems of hjbjax</h1>\n"
         f"<p>{good} of {len(cards)} converged, by hjbjax {__version__} on {html.escape(_device())}, at most about "
@@ -224,7 +224,7 @@ def page(cards: Sequence[Card]) -> str:
 
 
 def _section(card: Card) -> str:
-    """The part of the page that one card has."""
+    """The HTML of one card."""
     rows = "".join(
         f"<tr><td>{html.escape(word)}</td><td>{html.escape(figure)}</td></tr>" for word, figure in card.facts
     )
@@ -243,26 +243,26 @@ def _section(card: Card) -> str:
 
 
 def _device() -> str:
-    """The device that JAX computes on, in words."""
+    """The name of the device that JAX uses."""
     device = jax.devices()[0]
     return device.platform if device.platform == "cpu" else device.device_kind
 
 
 def publish(cards: Sequence[Card], staging: Path, out: Path, force: bool = False) -> Path:
-    """The page of the cards in ``out``, whole or not at all: made in ``staging``, on the same file system, and moved.
+    """Write the page of the cards to ``out`` atomically: write to ``staging`` on the same file system, then move.
 
     Raises:
-      OSError: ``out`` cannot be written, or holds something by now.
+      OSError: ``out`` cannot be written, or is no longer empty.
     """
     made = write(cards, staging)
     out.mkdir(parents=True, exist_ok=True)
-    check_folder(out, force)  # again: the solves may have taken long
+    check_folder(out, force)  # check again, because the solves may have taken long
     placement.place(made, out / PAGE, force)
     return out / PAGE
 
 
 def write(cards: Sequence[Card], folder: Path) -> Path:
-    """Write the page of the cards into a folder; the file."""
+    """Write the page of the cards into a folder and return the file."""
     made = folder / PAGE
     made.write_text(page(cards), encoding="utf-8")
     return made

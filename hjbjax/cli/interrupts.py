@@ -1,8 +1,8 @@
-"""Ctrl-C before and while the command has something to keep.
+"""Ctrl-C handling of the command.
 
-The command starts by importing JAX for a second. An exception from a signal that arrives inside these imports may come
-out as another one or be dropped by an extension module. So the command handles Ctrl-C by ending the process at once,
-except where it writes files or owns other processes: there Ctrl-C raises ``KeyboardInterrupt``, as usual.
+The command starts by importing JAX, which takes about a second. An exception that a signal raises inside these imports
+may be replaced by another one, or be dropped by an extension module. So Ctrl-C ends the process at once, except while
+the command writes files or owns other processes. Then Ctrl-C raises ``KeyboardInterrupt`` as usual.
 """
 
 import contextlib
@@ -12,18 +12,18 @@ import threading
 from collections.abc import Iterator
 from types import FrameType
 
-CODE = 130  # 128 + SIGINT, the exit code that shells report
+CODE = 130  # 128 + SIGINT, the exit code by convention of shells
 
 
 def end(number: int, frame: FrameType | None) -> None:
-    """End the process at once; the buffers of its streams are lost, and nothing is in them that anybody awaits."""
-    with contextlib.suppress(OSError):  # not by way of Python's stream, in which the signal may have come
-        os.write(2, b"\n" * os.isatty(2) + b"hjbjax: interrupted\n")  # a terminal shows ^C on the line
+    """End the process at once, without flushing its streams, which hold nothing of interest then."""
+    with contextlib.suppress(OSError):  # not through Python's stream, which the signal may have interrupted
+        os.write(2, b"\n" * os.isatty(2) + b"hjbjax: interrupted\n")  # the newline ends the line with ^C on a terminal
     os._exit(CODE)
 
 
 def end_at_once() -> None:
-    """Let Ctrl-C end this process at once; a shell starts background jobs with the signal ignored, which stays so."""
+    """Let Ctrl-C end this process at once, unless the signal is ignored, as in background jobs of a shell."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, end)
 
@@ -31,7 +31,7 @@ def end_at_once() -> None:
 @contextlib.contextmanager
 def raised() -> Iterator[None]:
     """Context in which Ctrl-C raises ``KeyboardInterrupt`` instead of ending the process at once."""
-    # Python allows only the main thread to set handlers; a program that runs the command itself has its own
+    # only the main thread may set handlers, and a program that calls the command keeps its own handler
     if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) is not end:
         yield
         return

@@ -1,8 +1,8 @@
-"""One solve in many processes and on many devices, as by ``hjbjax launch`` and ``hjbjax solve --devices``.
+"""One solve in several processes or on several devices, for ``hjbjax launch`` and ``hjbjax solve --devices``.
 
-Every process runs the same command and reads its number from the environment. The processes find each other by
-``jax.distributed`` and exchange values on CPUs by gloo. All of them compute the same answer, and the first one writes
-it. ``hjbjax.cli.children`` starts them, ends them and reports how they ended.
+Every process runs the same command and reads its rank from the environment. The processes find each other through
+``jax.distributed`` and exchange values through gloo on CPUs. All of them compute the same result, and the first one
+writes it. ``hjbjax.cli.children`` starts and ends the processes and reports how they ended.
 """
 
 import contextlib
@@ -28,15 +28,15 @@ if TYPE_CHECKING:
 VARIABLES = RANK, PROCESSES, COORDINATOR, HEARTBEAT = (
     "HJBJAX_RANK", "HJBJAX_PROCESSES", "HJBJAX_COORDINATOR", "HJBJAX_HEARTBEAT",
 )  # fmt: skip
-EXPLAINED = (2, 3, 4, 5, 6, 130)  # exit codes of a command that said why
-SOLVED = (0, 3)  # exit codes of a command that all processes have taken to its end
+EXPLAINED = (2, 3, 4, 5, 6, 130)  # exit codes of a command that has printed its reason
+SOLVED = (0, 3)  # exit codes of a command that all processes have finished
 DIED, INTERRUPTED = 7, 130  # exit codes of a launch
-MOST = 256  # processes of a launch, and devices of a process: each takes threads
+MOST = 256  # maximal number of processes per launch and of devices per process, because each takes threads
 LONGEST = 86_400  # seconds of a heartbeat
 _ADVICE = "'hjbjax launch' sets these variables; unset all of them to solve in one process"
-WITHOUT_PROXY = {"no_grpc_proxy": "127.0.0.1"}  # gRPC would look for processes of this host behind a proxy
-FAREWELL = "hjbjax: parted"  # of a process that the others can do without
-GREETING = (b"[Gloo]", b"connected peer ranks")  # in lines of gloo, which threads may write into one another
+WITHOUT_PROXY = {"no_grpc_proxy": "127.0.0.1"}  # otherwise gRPC uses a proxy even for processes of this host
+FAREWELL = "hjbjax: parted"  # printed by a process that the others no longer need
+GREETING = (b"[Gloo]", b"connected peer ranks")  # in messages of gloo, which several threads may mix in one line
 
 
 # --- in each process ---
@@ -60,7 +60,7 @@ class Member:
 
 
 def member() -> Member | None:
-    """This process as a member of a launch, by its environment; None outside a launch.
+    """This process as a member of a launch according to its environment; None outside a launch.
 
     Raises:
       Failure: a variable is missing or has an unusable value.
@@ -93,7 +93,7 @@ def rank() -> int:
 
 
 def check_devices(counts: tuple[int, ...] | None, processes: int) -> None:
-    """Refuse numbers of devices along the axes that the processes cannot have.
+    """Raise if the processes cannot have these numbers of devices along the axes.
 
     Raises:
       Failure: the devices are too many, or not the same number in each process.
@@ -102,14 +102,14 @@ def check_devices(counts: tuple[int, ...] | None, processes: int) -> None:
     if wanted % processes:
         raise Failure(f"--devices: {wanted} devices cannot be the same number in each of {processes} processes")
     if wanted > MOST * processes:
-        raise Failure(f"--devices: {wanted} devices were asked for; of a process {MOST} are the most")
+        raise Failure(f"--devices: got {wanted} devices, wanted at most {MOST} per process")
 
 
 def mesh_of(counts: tuple[int, ...] | None) -> "Mesh | None":
     """The mesh with ``counts`` devices along its axes; by default one device per process, and None for one process.
 
-    Joins the other processes of a launch. Call it before JAX computes anything: later the number of CPU devices is
-    fixed.
+    It joins the other processes of a launch. Call it before JAX computes anything, because the number of CPU devices is
+    fixed afterwards.
 
     Raises:
       Failure: there are not enough devices, or the processes cannot meet.
@@ -125,7 +125,7 @@ def mesh_of(counts: tuple[int, ...] | None) -> "Mesh | None":
     counts = counts or (processes,)
     check_devices(counts, processes)
     wanted = math.prod(counts)
-    # JAX refuses a new number of devices once it has computed something
+    # JAX refuses a new number of devices after its first computation
     with contextlib.suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", wanted // processes)
     if this is not None and processes > 1:
@@ -133,7 +133,7 @@ def mesh_of(counts: tuple[int, ...] | None) -> "Mesh | None":
     with starting_jax():
         devices = jax.devices()
     if len(devices) < wanted:
-        raise Failure(f"--devices: {wanted} devices were asked for, and {len(devices)} are there")
+        raise Failure(f"--devices: got {wanted} devices, but only {len(devices)} are available")
     return Mesh(np.array(devices[:wanted]).reshape(counts), tuple(f"axis{k}" for k in range(len(counts))))
 
 
@@ -145,15 +145,15 @@ def _join(this: Member) -> None:
         if this.rank == 0:
             _check_port(this.coordinator)  # JAX's own error does not name the port
         jax.config.update("jax_cpu_collectives_implementation", "gloo")
-        # its handler of SIGTERM would swallow a request to end that comes before the solve
+        # JAX's handler of SIGTERM would swallow a request to end that comes before the solve
         jax.config.update("jax_enable_preemption_service", False)
-        jax.config.update("jax_check_proxy_envs", False)  # a warning, see WITHOUT_PROXY
+        jax.config.update("jax_check_proxy_envs", False)  # disable a warning, see WITHOUT_PROXY
         jax.distributed.initialize(
             this.coordinator,
             this.processes,
             this.rank,
             heartbeat_timeout_seconds=this.heartbeat,
-            coordinator_bind_address=this.coordinator,  # by default the whole network could connect
+            coordinator_bind_address=this.coordinator,  # the default accepts connections from the whole network
         )
     except (OSError, jax.errors.JaxRuntimeError) as error:
         why = getattr(error, "strerror", None) or error
@@ -164,21 +164,21 @@ def _join(this: Member) -> None:
 
 
 def _check_port(coordinator: str) -> None:
-    """Raise OSError if the service at which the processes meet cannot have its port."""
+    """Raise OSError if the port of the coordinator is not available."""
     host, _, port = coordinator.rpartition(":")
     with _shared_socket() as probe:
         probe.bind((host, int(port)))
 
 
 def leave() -> None:
-    """Part from the other processes of a launch when all have solved; they would take one that just ends for dead."""
+    """Leave the launch after the solve; the other processes would regard a process that just ends as dead."""
     this = member()
     if this is None:
         return
     import jax
 
     jax.distributed.shutdown()
-    if this.rank > 0:  # the first process goes on and speaks for all
+    if this.rank > 0:  # the first process continues and prints for all
         out = streams.Expendable(sys.stdout)
         out.write(f"{FAREWELL}\n")
         out.flush()
@@ -188,23 +188,23 @@ def leave() -> None:
 
 
 def check(words: Sequence[str], processes: int, heartbeat: int) -> None:
-    """Refuse what cannot be launched.
+    """Raise if the command or a number cannot be launched.
 
     Raises:
-      Failure: another command than ``solve``, or an unusable number.
+      Failure: the command is not ``solve``, or a number is too large.
     """
     if words[0].startswith("-"):
         near = difflib.get_close_matches(words[0], ("--processes", "--heartbeat"), 1)
         raise Failure(f"launch: no such option {words[0]!r}{f'; did you mean {near[0]!r}?' if near else ''}")
     if words[0] != "solve":
-        raise Failure(f"launch: got {words[0]!r}, wanted solve, the only command that can divide its nodes")
+        raise Failure(f"launch: got {words[0]!r}, wanted solve, the only command that can split its nodes")
     for option, number, most in (("--processes", processes, MOST), ("--heartbeat", heartbeat, LONGEST)):
         if number > most:
             raise Failure(f"launch: got {option} {number}, wanted at most {most}")
 
 
 def start(words: Sequence[str], processes: int, heartbeat: int, result: Path) -> int:
-    """Run a command of ``hjbjax`` in several processes on this host; its exit code.
+    """Run a command of ``hjbjax`` in several processes on this host, and return its exit code.
 
     Args:
       words: the command, as in ``("solve", "pendulum")``.
@@ -213,7 +213,7 @@ def start(words: Sequence[str], processes: int, heartbeat: int, result: Path) ->
       result: the file that the command writes.
 
     Raises:
-      Failure: a process died, did not end when it was asked to, or could not be started.
+      Failure: a process died, did not end on request, or could not be started.
       OSError: the output of the first process could not be written.
     """
     try:
@@ -228,7 +228,7 @@ def start(words: Sequence[str], processes: int, heartbeat: int, result: Path) ->
                 children.followed("hjbjax", words, {**os.environ, **shared, RANK: str(number)})
                 for number in range(processes)
             ]
-            # earlier than the others lose patience: they keep what they have if the stopped one goes on to its end
+            # less than the heartbeat, so that the others can save their work even if the stopped one continues
             outcome = children.run(commands, EXPLAINED, GREETING, heartbeat / 2, FAREWELL.encode())
     except (OSError, RuntimeError) as error:  # RuntimeError: no thread can be started
         raise Failure(f"launch: {processes} processes could not be started: {error}", DIED) from error
@@ -242,13 +242,13 @@ def _verdict(outcome: children.Outcome, way_on: str) -> int:
     """The exit code of a launch.
 
     Raises:
-      Failure: with a line on the process that brought the others down, and on how to go on.
+      Failure: the process that brought the others down, and how to continue.
     """
     processes, first, culprit = len(outcome.ends), outcome.end_of(0), outcome.culprit
     if first.code in SOLVED or culprit is None:
         return first.code
     if outcome.interrupted:
-        # the first process has kept everything, whatever became of the others
+        # the first process has saved everything, so the others do not matter
         if first.code == INTERRUPTED or (first.code in EXPLAINED and not outcome.killed):
             return first.code
         killed = f"; {_killed(outcome)}; {way_on}" if outcome.killed else ""
@@ -266,12 +266,12 @@ def _verdict(outcome: children.Outcome, way_on: str) -> int:
         said = f": {culprit.words}" if culprit.words else ""
         raise Failure(f"{name} ended with exit code {culprit.code}{said}; {way_on}", DIED)
     if culprit.code == first.code:
-        return first.code  # the first process has said it
+        return first.code  # the first process has printed the reason
     raise Failure(f"{name}: {culprit.words.removeprefix('hjbjax: ')}", culprit.code)
 
 
 def _killed(outcome: children.Outcome) -> str:
-    """The processes that were killed, and why."""
+    """Describe which processes were killed, and why."""
     numbers = [number for number in outcome.killed if number in outcome.stopped] or outcome.killed
     which, were = ("process", "was") if len(numbers) == 1 else ("processes", "were")
     name = f"{which} {', '.join(map(str, numbers))} of {len(outcome.ends)} {were} killed"
@@ -279,7 +279,7 @@ def _killed(outcome: children.Outcome) -> str:
 
 
 def _way_on(words: Sequence[str], processes: int, result: Path) -> str:
-    """The command that resumes a run, or the advice to make a run resumable."""
+    """The command that resumes a run, or the advice to use a checkpoint."""
     if not any(word.split("=")[0] == "--checkpoint" for word in words):
         return "with --checkpoint FILE a run can be resumed"
     wanted = ["--resume", *(["--force"] if os.path.lexists(result) else [])]
@@ -289,12 +289,12 @@ def _way_on(words: Sequence[str], processes: int, result: Path) -> str:
 
 @contextlib.contextmanager
 def reserved_port() -> Iterator[int]:
-    """A free port of this host that no other program gets meanwhile; the service of the first process shares it.
+    """Context with a free port of this host that no other program gets; the coordinator shares it.
 
-    Where the system cannot share a port it is let go of at once.
+    If the system cannot share ports, the port is released at once.
 
     Raises:
-      OSError: there is none.
+      OSError: there is no free port.
     """
     with _shared_socket() as keeper:
         keeper.bind(("127.0.0.1", 0))
@@ -308,7 +308,7 @@ _CAN_SHARE = hasattr(socket, "SO_REUSEPORT")
 
 
 def _shared_socket() -> socket.socket:
-    """A socket whose port other sockets of this user may have too, if all of them agree, as gRPC's do."""
+    """A socket whose port other sockets of this user may share if all of them request it, as gRPC does."""
     made = socket.socket()
     if _CAN_SHARE:
         made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)

@@ -1,4 +1,4 @@
-"""What ``hjbjax list`` prints: the ready problems, or all that there is to say of one."""
+"""The output of ``hjbjax list``: all ready problems, or the details of one."""
 
 import inspect
 import re
@@ -13,12 +13,12 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box
 from hjbjax.zoo.entry import Entry
 
-WIDTH = 100  # columns; a terminal that is narrower breaks the lines itself
-ARGUMENT = re.compile(r"  (\w+): (.*)")  # of a docstring's Args, whose further lines are indented more
+WIDTH = 100  # columns; narrower terminals wrap the lines
+ARGUMENT = re.compile(r"  (\w+): (.*)")  # an entry of Args in a docstring, whose continuation lines are indented more
 
 
 def overview() -> Iterator[str]:
-    """Two lines a problem: name and summary; states with their units, grid, and if an exact answer is known."""
+    """Two lines per problem: name and summary; states with units, grid, and a note if an exact answer is known."""
     width = max(map(len, zoo.catalogue))
     for entry in zoo.catalogue.values():
         _, grid = entry.build()
@@ -28,7 +28,7 @@ def overview() -> Iterator[str]:
 
 
 def details(entry: Entry) -> Iterator[str]:
-    """Summary, states, actions, grid and answer of one problem, and its parameters with their values and meanings."""
+    """Summary, states, actions, grid and exact answer of one problem, and its parameters with defaults and meanings."""
     problem, grid = entry.build()
     yield f"{entry.name}: {entry.summary}"
     yield ""
@@ -40,7 +40,7 @@ def details(entry: Entry) -> Iterator[str]:
     width = max(map(len, settings.values()))
     yield ""
     for key, setting in settings.items():
-        # a default is one word that can be pasted, whatever the width
+        # never wrap a default, so that it can be copied
         indent = f"  {setting:<{width}}  "
         lines = textwrap.wrap(meanings.get(key, ""), WIDTH - len(indent)) or [""]
         yield (indent + lines[0]).rstrip()
@@ -48,7 +48,7 @@ def details(entry: Entry) -> Iterator[str]:
 
 
 def _facts(entry: Entry, problem: Problem, grid: Grid) -> Iterator[tuple[str, str]]:
-    """What the problem is made of, by labels."""
+    """The facts of a problem, as pairs of label and text."""
     ends = zip(_with_units(grid.names, grid.units), grid.lo, grid.hi, grid.periodic or (), strict=True)
     states = (f"{name} from {lo:.4g} to {hi:.4g}{', periodic' * bool(round_)}" for name, lo, hi, round_ in ends)
     yield "states", "; ".join(states)
@@ -76,17 +76,17 @@ def _actions(admissible: AdmissibleSet | None, names: tuple[str, ...], units: tu
 
 
 def _with_units(names: tuple[str, ...], units: tuple[str, ...]) -> list[str]:
-    """Names with their units behind them, as in "angle [rad]"."""
+    """Names followed by their units, as in "angle [rad]"."""
     return [f"{name} [{unit}]" if unit else name for name, unit in zip(names, units, strict=True)]
 
 
 def _sizes(grid: Grid, between: str = " x ") -> str:
-    """The nodes along all axes, as in "41 x 81"."""
+    """The number of nodes per axis, as in "41 x 81"."""
     return between.join(map(str, grid.shape))
 
 
 def _meanings(entry: Entry) -> dict[str, str]:
-    """What the parameters mean, from the section Args of the docstring."""
+    """The meanings of the parameters, from the section Args of the docstring."""
     found: dict[str, str] = {}
     key = None
     for line in (inspect.getdoc(entry.build) or "").partition("Args:\n")[2].splitlines():
@@ -101,7 +101,7 @@ def _meanings(entry: Entry) -> dict[str, str]:
 
 
 def _as_setting(value: object) -> str:
-    """A parameter's value as --set takes it; three dots where it follows from others."""
+    """A parameter's value in the form that --set accepts; three dots if it depends on other parameters."""
     if isinstance(value, bool):
         return str(value).lower()
     return "..." if value is None else ",".join(map(str, value)) if isinstance(value, tuple) else str(value)

@@ -1,12 +1,12 @@
-"""The command ``hjbjax``: solve a ready problem, list them, show all of them on a page, look at the machine.
+"""The command ``hjbjax``: solve a ready problem, list the problems, show all of them on a page, check the installation.
 
-``solve`` writes ``solution.npz``, ``value.png``, ``policy.png`` and ``trajectory.png`` into a folder and prints
-one screen. What can be refused is refused in one line before anything is compiled. Files are made in a hidden folder
-next to the old ones and moved over them when they are whole. If the folder cannot take them after the solve, they go
-into a new one, which the last line names.
+``solve`` writes ``solution.npz``, ``value.png``, ``policy.png`` and ``trajectory.png`` into a folder and prints a
+summary. Invalid arguments are refused in one line before anything is compiled. Files are written to a hidden folder
+next to the old ones, and moved over them when they are complete. If the folder cannot be written after the solve, the
+files go to a new folder, which the last line names.
 
 Exit codes: 0 done, 1 a check of ``doctor`` failed, 2 usage, 3 not converged, 4 diverged or not finite, 5 file,
-6 memory, 7 a process of ``launch`` died, 130 interrupted (Ctrl-C or SIGTERM), 141 the reader of a pipe had enough.
+6 memory, 7 a process of ``launch`` died, 130 interrupted (Ctrl-C or SIGTERM), 141 the reader closed the pipe.
 """
 
 import contextlib
@@ -42,7 +42,7 @@ from hjbjax.cli.command_line import (
 from hjbjax.problem import streams
 from hjbjax.solution.clock import interruptible
 
-if TYPE_CHECKING:  # for annotations alone: what is heavy is imported by the command that needs it
+if TYPE_CHECKING:  # heavy modules are imported by the command that needs them
     from hjbjax.cli.gallery import Card
     from hjbjax.feedback.path import Path as Trajectory
     from hjbjax.problem.grid import Grid
@@ -51,7 +51,7 @@ if TYPE_CHECKING:  # for annotations alone: what is heavy is imported by the com
     from hjbjax.zoo.entry import Entry
 
 FILES = ("solution.npz", "value.png", "policy.png", "trajectory.png")
-CODES = {"CONVERGED": 0, "DIVERGED": 4, "NONFINITE": 4, "INTERRUPTED": 130}  # any other status: 3, not converged
+CODES = {"CONVERGED": 0, "DIVERGED": 4, "NONFINITE": 4, "INTERRUPTED": 130}  # 3, not converged, for any other status
 METHODS = {"value-iteration": "ValueIteration", "policy-iteration": "PolicyIteration"}
 SCHEMES = {"upwind": "Upwind", "limited": "Limited", "weno5": "Weno5", "semi-lagrangian": "SemiLagrangian"}
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "diffrax", "optax", "matplotlib", "tqdm", "click")
@@ -66,10 +66,10 @@ def main(context: click.Context) -> None:
         click.echo(context.get_help())
 
 
-@main.command("list", short_help="The ready problems; all about one.")
+@main.command("list", short_help="List the ready problems, or the details of one.")
 @click.argument("name", required=False, type=Name("problem", catalogue))
 def list_problems(name: str | None) -> None:
-    """List the ready problems, with their states; or all there is to say of NAME, its parameters among it."""
+    """List the ready problems with their states, or the details of NAME with its parameters."""
     known = catalogue()
     check_jax()
     from hjbjax.cli import listing
@@ -78,23 +78,23 @@ def list_problems(name: str | None) -> None:
         show(line)
 
 
-@main.command(short_help="Solve a problem, draw the answer.")
+@main.command(short_help="Solve a problem and plot the result.")
 @click.argument("name", type=Name("problem", catalogue))
-@click.option("--shape", type=Shape(), help="Nodes along each axis, as in 200x201.")
-@click.option("--set", "settings", multiple=True, metavar="NAME=VALUE", help="A parameter; may be given several times.")
-@click.option("--method", type=Name("method", names_of(METHODS)), help=f"{' or '.join(METHODS)}; chosen if not given.")
-@click.option("--scheme", type=Name("scheme", names_of(SCHEMES)), help="The discretisation; second order if not given.")
+@click.option("--shape", type=Shape(), help="Nodes per axis, as in 200x201.")
+@click.option("--set", "settings", multiple=True, metavar="NAME=VALUE", help="Set a parameter; can be repeated.")
+@click.option("--method", type=Name("method", names_of(METHODS)), help=f"{' or '.join(METHODS)}; default: automatic.")
+@click.option("--scheme", type=Name("scheme", names_of(SCHEMES)), help="The discretisation; default: second order.")
 @click.option("--tol", type=Number(), help="Certified bound on the algebraic error, in cost units.")
-@click.option("--max-steps", type=Number(int), help="Stop after so many steps.")
-@click.option("--time-limit", type=Number(), help="Stop after so many seconds.")
-@click.option("--checkpoint", type=Place(), help="A file that keeps what is done, every minute.")
-@click.option("--resume", is_flag=True, help="Go on from the checkpoint, if it is there.")
-@click.option("--devices", type=Shape(least=1), help="Divide the nodes: devices along each axis, as in 2 or 4x2.")
-@click.option("--dry-run", is_flag=True, help="Say what it will take: bytes, programs, steps, seconds; solve nothing.")
-@click.option("--out", type=Place(), help="Folder of the results; the problem's name if not given.")
-@click.option("--force", is_flag=True, help="Replace results that are there already.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of the screen.")
-@click.option("--no-cache", is_flag=True, help="Keep no compiled programs in the user's folder for caches.")
+@click.option("--max-steps", type=Number(int), help="Maximal number of steps.")
+@click.option("--time-limit", type=Number(), help="Time limit in seconds.")
+@click.option("--checkpoint", type=Place(), help="File that stores the progress every minute.")
+@click.option("--resume", is_flag=True, help="Continue from the checkpoint if it exists.")
+@click.option("--devices", type=Shape(least=1), help="Split the nodes: devices along each axis, as in 2 or 4x2.")
+@click.option("--dry-run", is_flag=True, help="Only estimate bytes, programs, steps and seconds.")
+@click.option("--out", type=Place(), help="Folder of the results; default: the problem's name.")
+@click.option("--force", is_flag=True, help="Replace existing results.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of the summary.")
+@click.option("--no-cache", is_flag=True, help="Do not store compiled programs in the user's cache folder.")
 def solve(
     name: str,
     shape: tuple[int, ...] | None,
@@ -119,16 +119,16 @@ def solve(
         return
     options["mesh"] = processes_of.mesh_of(devices)
     check_jax()
-    if processes_of.rank() > 0:  # the first process of a launch writes, and speaks for all
+    if processes_of.rank() > 0:  # only the first process of a launch writes files and prints
         with interrupts.raised(), interruptible():
             _solve(*_build(entry, parameters, shape), options)
             processes_of.leave()
         return
     out = Path(name) if out is None else out
-    # refusals in the order of what they cost: words, places, problem; the solve comes after all of them
+    # check arguments and places first, because they cost least, then the problem, then solve
     _check_places(out, force, options["checkpoint"], options["resume"])
     problem, grid = _build(entry, parameters, shape)
-    with contextlib.ExitStack() as stack:  # the hidden folder is removed late: after an interrupt, too
+    with contextlib.ExitStack() as stack:  # removes the hidden folder at the end, even after an interrupt
         stack.enter_context(interrupts.raised())
         with _one_line_error(OSError, 2, "--out: "):
             staging = stack.enter_context(run_folder.staging(out))
@@ -137,10 +137,10 @@ def solve(
         if not no_cache:
             compile_cache.keep_for_the_command()
         solution = _solve(problem, grid, options)
-        processes_of.leave()  # pictures may take longer than JAX lets the other processes wait
+        processes_of.leave()  # drawing may take longer than JAX lets the other processes wait
         files, path = _write(entry, parameters, problem, solution, staging, out, force)
     off = None
-    with contextlib.suppress(ValueError), _one_line_warnings():  # no answer is known for these parameters
+    with contextlib.suppress(ValueError), _one_line_warnings():  # ValueError: no exact value for these parameters
         off = None if entry.exact is None else run_folder.difference(entry.exact(**parameters), solution)
     if as_json:
         about = {"problem": name, "parameters": parameters, "exact_difference": off}
@@ -159,19 +159,19 @@ def solve(
 
 
 def _raise_unless_converged(solution: "Solution") -> None:
-    """Raise a failure with its exit code for a status that is not CONVERGED."""
+    """Raise a Failure with the exit code of the status unless it is CONVERGED."""
     if code := CODES.get(solution.status.name, 3):
         raise Failure(f"{solution.status.name}: {solution.message or solution.status.message}", code)
 
 
-@main.command(short_help="Run a command in many processes.", context_settings={"ignore_unknown_options": True})
-@click.option("--processes", type=Number(int), default=2, show_default=True, help="How many, on this host.")
+@main.command(short_help="Run a command in several processes.", context_settings={"ignore_unknown_options": True})
+@click.option("--processes", type=Number(int), default=2, show_default=True, help="Number of processes on this host.")
 @click.option("--heartbeat", type=Number(int), default=10, show_default=True, help="Seconds until one counts as dead.")
 @click.argument("words", nargs=-1, required=True, metavar="-- COMMAND")
 def launch(processes: int, heartbeat: int, words: tuple[str, ...]) -> None:
-    """Run a command, as in "hjbjax launch --processes 2 -- solve pendulum", in processes that divide its nodes."""
+    """Run a command in processes that split its nodes, as in "hjbjax launch --processes 2 -- solve pendulum"."""
     processes_of.check(words, processes, heartbeat)
-    # a process takes ten seconds to start: what each of them would refuse is refused here
+    # a process takes ten seconds to start, so check here what each of them would refuse
     given = solve.make_context("solve", list(words[1:]), parent=click.get_current_context().parent).params
     from hjbjax.cli import run_folder
 
@@ -201,7 +201,7 @@ def _try_checkpoint(checkpoint: Path) -> None:
 
 
 def _check_places(out: Path, force: bool, checkpoint: Path | None, resume: bool) -> None:
-    """Refuse in one line a folder of results and a checkpoint that must not be replaced."""
+    """Raise Failure if the folder of results or the checkpoint must not be replaced."""
     from hjbjax.cli import run_folder
     from hjbjax.solution import files
     from hjbjax.solution.placement import FileError, check_place
@@ -209,19 +209,19 @@ def _check_places(out: Path, force: bool, checkpoint: Path | None, resume: bool)
     with _one_line_error(OSError, 2, "--out: "):
         run_folder.check_folder(out, force)
     if resume and checkpoint is None:
-        raise Failure("--resume goes on from a checkpoint; add --checkpoint FILE")
+        raise Failure("--resume continues from a checkpoint; add --checkpoint FILE")
     if checkpoint is None or resume or not os.path.lexists(place := files.with_suffix(os.fspath(checkpoint))):
         return
     with _one_line_error(FileError, 5, "--checkpoint: "):
         check_place(place, force=True)
-    raise Failure(f"--checkpoint: {place} is there already; --resume goes on from it")
+    raise Failure(f"--checkpoint: {place} already exists; add --resume to continue from it")
 
 
 @contextlib.contextmanager
 def _one_line_error(
     kind: type[Exception] | tuple[type[Exception], ...], exit_code: int, prefix: str = ""
 ) -> Iterator[None]:
-    """An error of one kind, or of some, turned into one line and an exit code."""
+    """Turn errors of the given kinds into one line and an exit code."""
     try:
         yield
     except kind as error:
@@ -232,16 +232,16 @@ def _one_line_error(
 
 
 def _build(entry: "Entry", parameters: dict[str, Any], shape: tuple[int, ...] | None) -> tuple["Problem", "Grid"]:
-    """The problem and its grid; refusals of either in one line."""
+    """The problem and its grid; errors give one line."""
     try:
-        problem, grid = entry.build(**parameters)  # its own shape first: it knows how many axes there are
+        problem, grid = entry.build(**parameters)  # with the default shape first, to know the number of axes
         if shape is None:
             return problem, grid
         if len(shape) != grid.ndim:
             example = "x".join(map(str, grid.shape))
             raise ValueError(
                 f"--shape: got {len(shape)} sizes, but {entry.name} has {grid.ndim} axes "
-                f"({', '.join(grid.names)}); give one size an axis, as in {example}"
+                f"({', '.join(grid.names)}); give one size per axis, as in {example}"
             )
         return entry.build(**parameters, shape=shape)
     except (ValueError, TypeError) as error:
@@ -252,7 +252,7 @@ def _build(entry: "Entry", parameters: dict[str, Any], shape: tuple[int, ...] | 
 
 @contextlib.contextmanager
 def _one_line_warnings() -> Iterator[None]:
-    """Warnings of the user's concern as one line each, without the source line that Python adds."""
+    """Show warnings as one line each, without the source line that Python adds."""
 
     def show(
         message: Warning | str,
@@ -265,7 +265,7 @@ def _one_line_warnings() -> Iterator[None]:
         say(f"warning: {' '.join(str(message).split())}")
 
     with warnings.catch_warnings():
-        # by default a warning is shown once a place, and PYTHONWARNINGS may hide it or make an error of it
+        # always, because by default a warning is shown once per line of code, and PYTHONWARNINGS may change that
         warnings.simplefilter("always", UserWarning)
         warnings.showwarning = show
         yield
@@ -275,10 +275,10 @@ def _one_line_warnings() -> Iterator[None]:
 
 
 def _given(options: dict[str, Any]) -> dict[str, Any]:
-    """The arguments of ``solve`` that the options name."""
+    """The arguments of ``solve`` for the given options."""
     import hjbjax as hjb
 
-    # an option that was not given must not reach solve as None: its own default stands
+    # leave out options that were not given, so that the defaults of solve apply
     given = {key: value for key, value in options.items() if value is not None and value is not False}
     for key, table in (("method", METHODS), ("scheme", SCHEMES)):
         if key in given:
@@ -287,7 +287,7 @@ def _given(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def _estimate(problem: "Problem", grid: "Grid", options: dict[str, Any], *, as_json: bool) -> None:
-    """Say what a solve will take; exit 6 where it does not fit."""
+    """Show an estimate of the solve; exit code 6 if it does not fit."""
     import hjbjax as hjb
 
     asked = {key: value for key, value in _given(options).items() if key in ("method", "scheme", "tol")}
@@ -295,19 +295,19 @@ def _estimate(problem: "Problem", grid: "Grid", options: dict[str, Any], *, as_j
         found = hjb.estimate(problem, grid, **asked)
     show(json.dumps(dataclasses.asdict(found)) if as_json else str(found))
     if not found.fits:
-        what = "the memory that is free" if found.numbered else "32-bit indices"
+        what = "the free memory" if found.numbered else "32-bit indices"
         raise Failure(f"the solve does not fit into {what}", 6)
 
 
 def _solve(problem: "Problem", grid: "Grid", options: dict[str, Any]) -> "Solution":
-    """The solution, converged or not; what the solver refuses or breaks on as one line and an exit code."""
+    """The solution, converged or not; errors of the solver give one line and an exit code."""
     import jax
 
     import hjbjax as hjb
 
     given = _given(options)
     try:
-        # no throw: what there is is saved and drawn also where it has not converged, and the exit code says so
+        # throw=False, so that a result that has not converged is saved and drawn as well; the exit code shows it
         return hjb.solve(problem, grid, throw=False, **given)
     except (ValueError, TypeError, FileExistsError) as error:
         raise Failure(error) from error
@@ -315,7 +315,7 @@ def _solve(problem: "Problem", grid: "Grid", options: dict[str, Any]) -> "Soluti
         raise Failure(error, 5) from error
     except MemoryError as error:
         raise Failure(error, 6) from error
-    except jax.errors.JaxRuntimeError as error:  # XLA has one type for all its faults, and the word in the text
+    except jax.errors.JaxRuntimeError as error:  # XLA has one type for all errors, and a code in the text
         raise Failure(error, 6 if "RESOURCE_EXHAUSTED" in str(error) else 4) from error
 
 
@@ -328,10 +328,10 @@ def _write(
     out: Path,
     force: bool,
 ) -> tuple[list[Path], "Trajectory | None"]:
-    """Draw a solution and write all files into a folder, or into a new one if that folder no longer takes them.
+    """Draw a solution and write all files into a folder, or into a new folder if this one can no longer be written.
 
     Returns:
-      The files, and the trajectory in the last of them, if there is one.
+      The files, and the trajectory if there is one.
 
     Raises:
       Failure: a file could not be written.
@@ -345,10 +345,10 @@ def _write(
     try:
         try:
             pictures = run_folder.make(problem, solution, staging, start=start, duration=entry.duration, finish=finish)
-            for file, drawn in pictures:  # a generator: each file is whole before the next one is begun
+            for file, drawn in pictures:  # a generator: each file is complete before the next one starts
                 made.append(file)
                 path = drawn
-        finally:  # what is whole is kept
+        finally:  # keep the complete files
             run_folder.publish(staging, out, made, force)
             published = bool(made)
     except OSError as error:
@@ -359,13 +359,13 @@ def _write(
     return [out / file for file in made], path
 
 
-@main.command(short_help="All ready problems on a page.")
-@click.option("--out", type=Place(), required=True, help="Folder of the page, index.html.")
-@click.option("--only", multiple=True, type=Name("problem", catalogue), help="One problem; may be given several times.")
-@click.option("--force", is_flag=True, help="Replace a page that is there already.")
-@click.option("--no-cache", is_flag=True, help="Keep no compiled programs in the user's folder for caches.")
+@main.command(short_help="Show all ready problems on a page.")
+@click.option("--out", type=Place(), required=True, help="Folder of the page index.html.")
+@click.option("--only", multiple=True, type=Name("problem", catalogue), help="Only this problem; can be repeated.")
+@click.option("--force", is_flag=True, help="Replace an existing page.")
+@click.option("--no-cache", is_flag=True, help="Do not store compiled programs in the user's cache folder.")
 def gallery(out: Path, only: tuple[str, ...], force: bool, no_cache: bool) -> None:
-    """Solve every ready problem on a small grid; write one page with pictures, figures and errors."""
+    """Solve every ready problem on a small grid and write one page with plots, numbers and errors."""
     known = catalogue()
     check_jax()
     from hjbjax.cli import compile_cache, run_folder
@@ -388,9 +388,9 @@ def gallery(out: Path, only: tuple[str, ...], force: bool, no_cache: bool) -> No
                 line = f"{number:>2}/{len(names)}  {name:<20}  "
                 show(line, newline=False)
                 cards.append(pages.card(known[name]))
-                # on a terminal the phases of the solve have been written over the line
+                # on a terminal the progress of the solve has overwritten the line
                 show((f"\r{line}" if streams.is_terminal(sys.stdout) else "") + cards[-1].status)
-        finally:  # what is done is kept, after an interrupt, too
+        finally:  # keep the finished cards, even after an interrupt
             if cards:
                 _publish_page(cards, staging, out, force)
     show(f"wrote {text_of(out / pages.PAGE)}")
@@ -399,7 +399,7 @@ def gallery(out: Path, only: tuple[str, ...], force: bool, no_cache: bool) -> No
 
 
 def _publish_page(cards: "list[Card]", staging: Path, out: Path, force: bool) -> None:
-    """Write the page of the cards into a folder, or into a new one if that folder no longer takes it."""
+    """Write the page of the cards into a folder, or into a new folder if this one can no longer be written."""
     from hjbjax.cli import gallery as pages
     from hjbjax.cli import run_folder
 
@@ -410,7 +410,7 @@ def _publish_page(cards: "list[Card]", staging: Path, out: Path, force: bool) ->
         raise Failure(f"the page could not be written: {error}; {kept}", 5) from error
 
 
-@main.command(short_help="Look at versions and devices.")
+@main.command(short_help="Check versions and devices.")
 def doctor() -> None:
     """Check versions, devices, float64, a tiny solve, memory, pictures and the current folder."""
     from hjbjax.cli.doctor import examine

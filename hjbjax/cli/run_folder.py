@@ -1,12 +1,12 @@
-"""The files of a solved problem, and its report for programs.
+"""The files of a solved problem, and its report as JSON.
 
     solution.npz    the Solution
-    value.png       the value; with the switching curve where the feedback is bang-bang
-    policy.png      every input of the feedback; not where there is none
-    trajectory.png  a closed loop on the value, and over time
+    value.png       the value, with the switching curve if the feedback is bang-bang
+    policy.png      every input of the feedback, if there are any
+    trajectory.png  a closed loop on the value and over time
 
-Files are made in a hidden folder beside the old ones and moved over them when they are whole. States of more
-than two dimensions are drawn on the plane of the first two axes through the start of the trajectory.
+Files are written to a hidden folder next to the old ones and moved over them when they are complete. Problems with more
+than two states are plotted on the plane of the first two axes through the start of the trajectory.
 """
 
 import contextlib
@@ -42,32 +42,32 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FILES = ("solution.npz", "value.png", "policy.png", "trajectory.png")
-Plain: TypeAlias = "dict[str, Plain] | list[Plain] | str | float | bool | None"  # what JSON has
-SAMPLES = 400  # of a bang-bang feedback along its trajectory
+Plain: TypeAlias = "dict[str, Plain] | list[Plain] | str | float | bool | None"  # the types of JSON
+SAMPLES = 400  # samples of a bang-bang feedback along its trajectory
 DPI = 160
-NAME = 40  # characters of a folder's name that a folder next to it repeats
+NAME = 40  # number of characters of a folder's name that a folder next to it repeats
 
 
 def check_folder(out: Path, force: bool = False) -> None:
-    """Refuse a folder that holds results, unless by ``force``, and a path that is no folder.
+    """Raise if a folder contains results, unless ``force``, or if the path is not a folder.
 
     Raises:
-      OSError: with a line on what to do.
+      OSError: with advice in one line.
     """
-    placement.current_folder()  # without one JAX raises FileNotFoundError where it filters a traceback
-    # lexists: a link that leads nowhere is there as well, and writing would go through it
+    placement.current_folder()  # otherwise JAX raises FileNotFoundError when it filters a traceback
+    # lexists also finds a broken link, through which files would be written
     if os.path.lexists(out) and not out.is_dir():
-        raise NotADirectoryError(f"{out} is there and is no folder; give another name")
-    for file in FILES:  # a folder or a device of such a name is refused even by force
+        raise NotADirectoryError(f"{out} exists but is not a folder; give another name")
+    for file in FILES:  # refuse folders and devices with these names even with force
         placement.check_place(out / file, force=True)
     old = [file for file in FILES if os.path.lexists(out / file)]
     if old and not force:
-        raise FileExistsError(f"{out} holds {', '.join(old)} already; give another --out, or --force to replace them")
+        raise FileExistsError(f"{out} contains {', '.join(old)} already; give another --out, or --force to replace")
 
 
 @contextlib.contextmanager
 def staging(out: Path) -> Iterator[Path]:
-    """A hidden folder on the file system of ``out``, gone at the end; making it shows that one can write there.
+    """Create a hidden folder on the file system of ``out``, to check that it can be written; remove it at the end.
 
     A killed command leaves the folder behind, and the next command removes it.
 
@@ -75,15 +75,15 @@ def staging(out: Path) -> Iterator[Path]:
       OSError: ``out`` cannot be written.
     """
     whole = Path(placement.absolute(os.fspath(out)))
-    # in the nearest folder that exists: moving files is atomic only on one file system, and /tmp may be another
+    # in the nearest existing folder, because moving files is atomic only on one file system, and /tmp may be another
     place = next(folder for folder in (whole, *whole.parents) if os.path.lexists(folder))
     placement.sweep(place)
     folder = place / placement.hidden_name(out.name)
     try:
         try:
-            folder.mkdir(mode=0o700)  # nobody else looks into it before it is whole
+            folder.mkdir(mode=0o700)  # private until it is complete
             missing = whole.relative_to(place).parts
-            folder.joinpath(*missing).mkdir(parents=True, exist_ok=True)  # or a name that is too long shows at the end
+            folder.joinpath(*missing).mkdir(parents=True, exist_ok=True)  # detects names that are too long now
         except OSError as error:
             raise OSError(f"{out} cannot be written: {error.strerror}; give another folder") from error
         if missing:
@@ -91,38 +91,38 @@ def staging(out: Path) -> Iterator[Path]:
         with placement.claim(folder):
             yield folder
     finally:
-        shutil.rmtree(folder, ignore_errors=True)  # the next command's sweep takes what could not be removed
+        shutil.rmtree(folder, ignore_errors=True)  # the sweep of the next command removes the rest
 
 
 def check_writable(out: Path) -> None:
-    """Check that files can be written into a folder, which need not exist yet.
+    """Check that a folder, which need not exist yet, can be written.
 
     Raises:
-      OSError: they cannot.
+      OSError: it cannot be written.
     """
     with staging(out):
         pass
 
 
 def publish(folder: Path, out: Path, made: Sequence[str], force: bool = False) -> None:
-    """Move whole files into ``out``; an older file that has no successor goes with the result it belonged to.
+    """Move complete files into ``out``, and remove old files that have no successor.
 
     Raises:
-      OSError: ``out`` cannot be written, or holds results by now.
+      OSError: ``out`` cannot be written, or contains results by now.
     """
     if not made:
         return
     out.mkdir(parents=True, exist_ok=True)
-    check_folder(out, force)  # again: the solve may have taken long
+    check_folder(out, force)  # check again, because the solve may have taken long
     for file in FILES:
-        if file in made:  # the first is always there: of two commands at once, one is refused before it moves anything
+        if file in made:  # the first file is always made, so of two concurrent commands one fails before it moves any
             placement.place(folder / file, out / file, force)
         else:
             (out / file).unlink(missing_ok=True)
 
 
 def copy(solution: Solution, staging: Path, folder: Path) -> None:
-    """Write a solution into a folder, and what had been drawn of it."""
+    """Write a solution and its finished plots into a folder."""
     solution.save(folder / FILES[0])
     for file in FILES[1:]:
         with contextlib.suppress(OSError):
@@ -130,11 +130,11 @@ def copy(solution: Solution, staging: Path, folder: Path) -> None:
 
 
 def rescue(out: Path, fill: Callable[[Path], object]) -> str:
-    """Put results that ``out`` does not take into a new folder next to it, else among temporary files; where, in words.
+    """Save results in a new folder next to ``out``, or in the temporary folder, and return a message with its name.
 
     Args:
-      out: the folder that was to hold them.
-      fill: writes them into a folder.
+      out: the folder that could not be written.
+      fill: a function that writes the results into a folder.
     """
     for parent in (lambda: placement.absolute(os.fspath(out.parent)), tempfile.gettempdir):
         with contextlib.suppress(OSError):
@@ -157,22 +157,22 @@ def make(
     duration: float,
     finish: tuple[Problem, Feedback] | None = None,
 ) -> Iterator[tuple[str, Trajectory | None]]:
-    """The files, made one by one: the name of each and, with the last, the trajectory that it shows.
+    """Write the files one by one; yield the name of each file, and the trajectory with the last one.
 
-    An interrupted solve is saved and not drawn; one that did not converge gets no trajectory. ``finish`` is the
-    problem and the feedback by which a trajectory goes on from the target, where that holds the rest of the cost.
+    An interrupted solve is saved but not plotted, and a solve that has not converged has no trajectory. ``finish`` is
+    the problem and the feedback of the final phase, if the target prescribes the cost of this phase.
 
     Raises:
       OSError: a file cannot be written.
     """
 
-    solution.save(folder / "solution.npz")  # first: what took the longest is safe before anything is drawn
+    solution.save(folder / "solution.npz")  # first, because the solution is the most expensive result
     yield "solution.npz", None
     if solution.status == Status.INTERRUPTED:
         return
-    fixed = dict(enumerate(start[2:], 2))  # axes from the third on, cut where the trajectory starts
+    fixed = dict(enumerate(start[2:], 2))  # cut all axes from the third on at the start of the trajectory
     jumps = is_bang_bang(problem, solution)
-    # figures of our own, which pyplot would keep, and would have to be imported for
+    # figures of our own, because pyplot is slow to import and would keep them
     value = plotting.value(solution, ax=axes(), fixed=fixed, target=problem.target)
     with_curve(value, solution, fixed, jumps).save(folder / "value.png", dpi=DPI)
     yield "value.png", None
@@ -180,7 +180,7 @@ def make(
         policies(solution, fixed, jumps).savefig(folder / "policy.png", dpi=DPI)
         yield "policy.png", None
     path = None
-    if solution.status == Status.CONVERGED:  # a loop closed with a half-done feedback would be taken for the answer
+    if solution.status == Status.CONVERGED:  # a closed loop with an unfinished feedback would be misleading
         path = closed_path(problem, solution, start, duration, jumps, finish)
     if path is not None:
         figure = figure_of(closed_loop_size(solution.grid))
@@ -190,29 +190,29 @@ def make(
 
 
 def figure_of(size: tuple[float, float]) -> "Figure":
-    """A figure that no global registry knows."""
+    """A figure outside pyplot's registry."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=size, layout="constrained")
 
 
 def axes() -> "Axes":
-    """Axes on such a figure."""
+    """Axes on a new figure outside pyplot's registry."""
     return plotting.styled(figure_of(NARROW).add_subplot())
 
 
 def is_bang_bang(problem: Problem, solution: Solution) -> bool:
-    """True where the feedback jumps: it is enumerated, or nine of ten of its entries lie on a bound."""
+    """True if the feedback jumps: it is enumerated, or 90 % of its entries are at a bound."""
     lo, hi = getattr(problem.controls, "lo", None), getattr(problem.controls, "hi", None)
     if solution.discrete or lo is None or hi is None:
         return solution.discrete
-    # nine of ten: nodes at rest and on the switching curve itself may hold anything between
+    # 90 %, because nodes at rest and on the switching curve may have any value
     policy, near = _finite_controls(solution), 1e-6 * (hi - lo)
     return policy.size > 0 and bool(np.mean((policy <= lo + near) | (policy >= hi - near)) > 0.9)
 
 
 def _is_direction(problem: Problem, solution: Solution) -> bool:
-    """True where the feedback is a direction: nine of ten of its controls lie on the sphere around a ball."""
+    """True if the feedback is a direction: 90 % of its controls are on the sphere of a ball."""
     if not isinstance(problem.controls, Ball):
         return False
     policy = _finite_controls(solution)
@@ -220,7 +220,7 @@ def _is_direction(problem: Problem, solution: Solution) -> bool:
 
 
 def _finite_controls(solution: Solution) -> np.ndarray:
-    """The controls of the nodes where there is one, (k, m)."""
+    """The controls of the nodes that have one, (k, m)."""
     policy = np.asarray(solution.policy)
     return policy[np.all(np.isfinite(policy), axis=-1)]
 
@@ -233,18 +233,18 @@ def closed_path(
     jumps: bool,
     finish: tuple[Problem, Feedback] | None,
 ) -> Trajectory | None:
-    """The path of the closed loop, with the stretch that follows inside the target.
+    """The path of the closed loop, followed by the final phase inside the target.
 
-    Where the control jumps or is a direction, the mean of two is optimal for neither: there the Hamiltonian is
-    minimised at the state. One that jumps is sampled: an adaptive stepper crawls along its switching curve.
+    If the control jumps or is a direction, the mean of two controls is not optimal, so the Hamiltonian is minimised at
+    every state. A control that jumps is sampled, because an adaptive integrator is very slow along a switching curve.
     """
-    # one key for ever: the command draws the same path twice, and a picture can be reproduced
+    # a fixed key, so that the same path is drawn every time
     options: dict[str, Any] = {} if problem.noise is None else {"key": 0}
     if jumps:
         options["hold"] = duration / SAMPLES
     sharp = jumps or _is_direction(problem, solution)
     feedback = greedy_feedback(problem, solution) if sharp else solution
-    if finish is not None:  # or the cost of the rest would be paid twice, as exit cost and on the way
+    if finish is not None:  # otherwise the cost of the final phase would be paid twice
         problem = dataclasses.replace(problem, exit_cost=None)
     try:
         path = simulate(problem, feedback, start, duration, **options)
@@ -253,13 +253,13 @@ def closed_path(
         rest_problem, rest_feedback = finish
         rest = simulate(rest_problem, rest_feedback, path.states[-1], duration)
         return joined(path, rest, float(np.asarray(problem.discount)))
-    except ValueError as error:  # a start outside the box that parameters made smaller: no reason to lose the rest
+    except ValueError as error:  # for example a start outside a box that parameters made smaller
         streams.warn(f"no trajectory.png: {error}", UserWarning, stacklevel=2)
         return None
 
 
 def policies(solution: Solution, fixed: dict[int, float], jumps: bool) -> "Figure":
-    """One picture an input, side by side."""
+    """One plot per input, side by side."""
     count = solution.policy.shape[-1]
     figure = figure_of((NARROW[0] * max(1, count), NARROW[1]))
     if count == 0:
@@ -274,43 +274,43 @@ def policies(solution: Solution, fixed: dict[int, float], jumps: bool) -> "Figur
 def with_curve(
     picture: plotting.Picture, solution: Solution, fixed: dict[int, float], jumps: bool, input: int = 0
 ) -> plotting.Picture:
-    """A picture with the switching curve, where there is one."""
-    # an enumerated control is no number that changes its sign; over one axis the jump is in the line itself
+    """Add the switching curve to a plot, if there is one."""
+    # enumerated controls have no sign, and over one axis the jump is visible in the line
     if jumps and not solution.discrete and solution.grid.ndim > 1:
-        with contextlib.suppress(ValueError):  # the control keeps its sign
+        with contextlib.suppress(ValueError):  # the control does not change sign
             plotting.switching_curve(solution, input=input, fixed=fixed, ax=picture.ax)
     return picture
 
 
 def difference(exact: Exact, solution: Solution) -> float | None:
-    """The largest |V − exact| on the inner half of the box, where its edge is not felt.
+    """The largest |V − exact| on the inner half of the box, away from the effect of its boundary.
 
     Args:
       exact: the value as a function of one state.
       solution: the solution of ``solve``.
 
     Returns:
-      The difference in cost units; ``None`` if nothing there is finite.
+      The difference in cost units; ``None`` if no difference there is finite.
     """
     grid = solution.grid
     index = []
     for axis in range(grid.ndim):
         lo, hi, nodes = grid.lo[axis], grid.hi[axis], np.asarray(grid.axis(axis))
-        # the half around the middle; a periodic axis has no edge, and all of it counts
+        # the half around the centre; all of a periodic axis, which has no boundary
         inner = np.abs(nodes - (lo + hi) / 2) <= (hi - lo) / 4
         index.append(np.arange(len(nodes)) if grid.periodic[axis] else np.flatnonzero(inner))  # type: ignore[index]
     corner = np.ix_(*index)
     states = grid.nodes()[corner]  # (k₁, …, k_n, n)
-    # in chunks, as series and Newton's steps at every node at once would need many times the memory of the value
+    # in chunks, because evaluating the series or Newton steps at all nodes at once takes much memory
     wanted = at_states(exact, states)
-    with np.errstate(invalid="ignore"):  # ∞ − ∞ where neither reaches the target
+    with np.errstate(invalid="ignore"):  # ∞ − ∞ where both are unreachable
         off = np.abs(np.asarray(solution.value)[corner] - wanted)
-    off = off[np.isfinite(off)]  # ∞ − ∞ where both say out of reach
+    off = off[np.isfinite(off)]  # drop ∞ − ∞
     return float(off.max()) if off.size else None
 
 
 def report(solution: Solution, path: Trajectory | None, files: Sequence[Path], **about: Any) -> dict[str, Any]:
-    """The answer as JSON has it: without arrays of nodes, and null for infinity and NaN, which JSON lacks."""
+    """The result for JSON: without arrays over the nodes, and with null for infinity and NaN."""
     numbers = ("steps", "residual", "error", "monotone_error", "isaacs_gap", "stats")
     off = None if solution.grid_error is None else float(np.nanmax(solution.grid_error))
     trajectory = path and {
@@ -337,7 +337,7 @@ def report(solution: Solution, path: Trajectory | None, files: Sequence[Path], *
 
 
 def _plain(value: object) -> Plain:
-    """Numbers, arrays and names as JSON has them."""
+    """Convert numbers, arrays and names to JSON types."""
     if isinstance(value, dict):
         return {str(key): _plain(entry) for key, entry in value.items()}
     if isinstance(value, np.ndarray | np.generic) or hasattr(value, "tolist"):

@@ -141,9 +141,7 @@ def brownian_exit_exact(
       ValueError: ``dim`` is larger than 2.
     """
     if dim not in (1, 2):
-        raise ValueError(
-            f"brownian_exit_exact: got dim = {dim}, wanted 1 or 2 (brownian_ball: any)"
-        )
+        raise ValueError(f"brownian_exit_exact: got dim = {dim}, wanted 1 or 2 (brownian_ball: any)")
     return answer(CubeExit(noise, discount, half_width, dim).value)
 
 

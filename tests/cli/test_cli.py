@@ -134,7 +134,7 @@ BAD_WORDS = [
     (["pendulum", "--set", "shape=20"], "--shape"),
     (["pendulum", "--set", "discount=-1"], "discount"),
     (["manipulator", "--set", "links=1.5"], "whole number"),
-    (["zermelo", "--set", "current=1"], "2 finite numbers with commas"),
+    (["zermelo", "--set", "current=1"], "2 finite numbers separated by commas"),
     (
         ["pendulum", "--method", "policy-iterations"],
         "unknown method",
@@ -797,7 +797,7 @@ def test_a_dry_run_says_what_a_solve_will_take_and_writes_nothing(folder):
     told = run("solve", "pendulum", "--shape", "46000x46001", "--scheme", "upwind", "--dry-run", "--json")
     assert told.exit_code == 6
     assert json.loads(told.stdout)["shape"] == [46000, 46001]
-    assert told.stderr == "hjbjax: the solve does not fit into the memory that is free\n"
+    assert told.stderr == "hjbjax: the solve does not fit into the free memory\n"
 
 
 @pytest.mark.slow

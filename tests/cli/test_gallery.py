@@ -69,7 +69,7 @@ def test_all_of_the_catalogue_is_on_one_page_that_needs_no_other_file(cards, fol
 @pytest.mark.parametrize(
     ("held", "words", "parts"),
     [
-        ("index.html", (), ("holds index.html already", "--force")),
+        ("index.html", (), ("contains index.html already", "--force")),
         ("thesis.tex", (), ("not empty", "thesis.tex", "--force")),
         ("index.html/", ("--force",), ("is a folder",)),
     ],
@@ -100,7 +100,7 @@ def test_force_replaces_the_page_and_leaves_what_is_beside_it(cards, folder):
 
 def test_a_path_that_is_no_folder_and_an_unknown_problem_are_refused(cards, folder):
     (folder / "page").write_text("mine")
-    assert "is no folder" in run("--out", "page").stderr
+    assert "is not a folder" in run("--out", "page").stderr
     result = run("--out", "other", "--only", "pendulm")
     assert (result.exit_code, "did you mean 'pendulum'?" in result.stderr) == (2, True)
     assert os.listdir(folder) == ["page"]

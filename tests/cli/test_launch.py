@@ -72,11 +72,14 @@ def _no_child(monkeypatch):
         (("--", "solve", "pendulm"), "did you mean 'pendulum'?"),
         (("--", "solve", "pendulum", "--tol", "nan"), "got 'nan', wanted a finite number > 0"),
         (("--", "solve"), "Missing argument 'NAME'"),
-        (("--", "solve", "pendulum", "--resume"), "--resume goes on from a checkpoint; add --checkpoint FILE"),
-        (("--", "solve", "pendulum", "--out", "old"), "old holds value.png already"),
-        (("--", "solve", "pendulum", "--out", "run.npz"), "run.npz is there and is no folder"),
+        (("--", "solve", "pendulum", "--resume"), "--resume continues from a checkpoint; add --checkpoint FILE"),
+        (("--", "solve", "pendulum", "--out", "old"), "old contains value.png already"),
+        (("--", "solve", "pendulum", "--out", "run.npz"), "run.npz exists but is not a folder"),
         (("--", "solve", "pendulum", "--out", "run.npz/out"), "run.npz/out cannot be written"),
-        (("--", "solve", "pendulum", "--checkpoint", "run"), "run.npz is there already; --resume goes on from it"),
+        (
+            ("--", "solve", "pendulum", "--checkpoint", "run"),
+            "run.npz already exists; add --resume to continue from it",
+        ),
     ],
 )
 def test_a_launch_that_is_refused_starts_no_process(words, part, tmp_path, monkeypatch):
@@ -112,9 +115,9 @@ def test_a_launch_in_a_folder_that_is_allowed_starts(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("devices", "part"),
     [
-        ("1000x1000", "1000000 devices were asked for; of a process 256 are the most"),
-        ("7", "7 devices were asked for, and "),
-        ("0x2", "whole numbers of at least 1, one an axis, as in 4x2"),
+        ("1000x1000", "got 1000000 devices, wanted at most 256 per process"),
+        ("7", "got 7 devices, but only "),
+        ("0x2", "whole numbers of at least 1, one per axis, as in 4x2"),
     ],
 )
 def test_devices_that_are_not_there(devices, part, tmp_path, monkeypatch):

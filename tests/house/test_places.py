@@ -31,7 +31,7 @@ def nothing_is_computed(monkeypatch):
     ("words", "part"),
     [
         (["biuld"], "got 'biuld', wanted build [FOLDER], pictures"),
-        (["build", "{}/file"], "is no folder"),
+        (["build", "{}/file"], "is not a folder"),
         (["build", "{}/file/below"], "cannot be written"),
         (["build", "{}/" + "x" * 256], "too long"),
         (["pictures", "pendulum", "pendulm"], "did you mean 'pendulum'?"),

@@ -20,7 +20,7 @@ from hjbjax.problem.types import DType
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import keeping_warnings
 from hjbjax.solvers import semi_lagrangian
-from hjbjax.solvers.nested import below
+from hjbjax.solvers.coarse_levels import below
 from hjbjax.solvers.setup import check_on_one_state, choose
 from hjbjax.solvers.stationary import check_arguments, solve
 

@@ -353,7 +353,7 @@ class Look:
         if task.problem.is_game:
             outer, goal = (state.value, state.policy), methods.inner_goal(state.bound.residual, state.best[1])
             return methods.evaluated(task, *outer, evaluation, goal=goal, replies=replies) - state.value
-        if task.shift is not None:  # a step in time of length 1/κ: see ``nested.sharpened``
+        if task.shift is not None:  # a step in time of length 1/κ: see ``solvers.order.sharpened``
             later = altered(task.problem, discount=task.problem.discount + task.shift)
             return evaluate(
                 evaluation, task.asking(later).equation(state.value, state.policy, state.fastest), task.grid

@@ -44,12 +44,15 @@ from hjbjax.solution.clock import CUT, Clock, Stopped, noting_interrupts
 from hjbjax.solution.placement import Path
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status, keeping_warnings, warn
-from hjbjax.solvers import host_loop, nested
+from hjbjax.solvers import host_loop, vanishing_discounts
 from hjbjax.solvers.box_error import with_box_error
+from hjbjax.solvers.coarser_answer import coarser_answer
 from hjbjax.solvers.host_solve import Choices, solve_on_host
-from hjbjax.solvers.nested import Settled
+from hjbjax.solvers.order import raised
 from hjbjax.solvers.result import finish, solution_at_start, with_grid_error, with_last_phase
+from hjbjax.solvers.second_order import better_of
 from hjbjax.solvers.semi_lagrangian import finish_replacement, replace_chain
+from hjbjax.solvers.settle import Settled, may_go_on, settle
 from hjbjax.solvers.setup import (
     Assumptions,
     check_on_one_state,
@@ -314,16 +317,16 @@ def _solve_chains(
         for i, each in enumerate(settled)
         if not asked[i].scheme.monotone and each.code not in CUT and (each.code is Status.CONVERGED or not sharpen)
     ]
-    raised = [nested.raised(settled[i].task, settled[i].assumptions, asked[i].scheme) for i in further]
+    sharp_tasks = [raised(settled[i].task, settled[i].assumptions, asked[i].scheme) for i in further]
     guesses, further_names = [settled[i].state.value for i in further], [names[i] for i in further]
-    better = _iterate([task for task, _ in raised], guesses, further_names, clock, over)
-    for i, (task, assumptions), end in zip(further, raised, better, strict=True):
+    better = _iterate([task for task, _ in sharp_tasks], guesses, further_names, clock, over)
+    for i, (task, assumptions), end in zip(further, sharp_tasks, better, strict=True):
         sharp = Settled(task, assumptions, settled[i].reached, *end, settled[i])
-        settled[i] = nested.better_of(settled[i], sharp, clock, sharpen=sharpen)
+        settled[i] = better_of(settled[i], sharp, clock, sharpen=sharpen)
     solutions = [finish(each, on.grid, cut=clock.over() is not None) for each, on in zip(settled, asked, strict=True)]
     for i, each in enumerate(settled):
         if sharpen and asked[i].scheme.subcell and solutions[i].status is Status.CONVERGED:
-            solutions[i] = with_grid_error(solutions[i], each, nested.coarser_answer(each, clock))
+            solutions[i] = with_grid_error(solutions[i], each, coarser_answer(each, clock))
         if solutions[i].status is Status.CONVERGED:
             solutions[i] = with_box_error(solutions[i], each, clock)
     about = {"seconds": clock.elapsed() - began, "lanes": len(lanes), "tol": tol}
@@ -335,10 +338,10 @@ def _solve_chains(
 def _starts(tasks: Sequence[Task], names: Sequence[int], clock: Clock, over: Lanes) -> list[Nodes]:
     """Where the lanes start: zero, the constraint of a tube, or the answer for a discount that vanishes."""
     starts: list[Nodes] = [task.start() for task in tasks]
-    led = [i for i, task in enumerate(tasks) if nested.needs_a_way(task)]
-    for discount in nested.VANISHING if led else ():
-        on_the_way = [nested.under(tasks[i], discount) for i in led]
-        most = nested.WARM_STEPS
+    led = [i for i, task in enumerate(tasks) if vanishing_discounts.needs_a_way(task)]
+    for discount in vanishing_discounts.VANISHING if led else ():
+        on_the_way = [vanishing_discounts.under(tasks[i], discount) for i in led]
+        most = vanishing_discounts.WARM_STEPS
         ended = _iterate(on_the_way, [starts[i] for i in led], [names[i] for i in led], clock, over, most)
         for i, (state, _, _) in zip(led, ended, strict=True):
             starts[i] = state.value
@@ -366,10 +369,10 @@ def _iterate(
 def _settled(settled: Settled, clock: Clock) -> Settled:
     """The end of one lane, which may go on by itself: off a node where it rests, or by vanishing discounts."""
     task, assumptions, reached, state, code, history, *_ = settled
-    if code in CUT or not nested.may_go_on(task, assumptions, state, code):
+    if code in CUT or not may_go_on(task, assumptions, state, code):
         return settled
     # an answer, and a game that failed, go on from where they are; whoever was caught at rest starts anew, by the
     # answers for vanishing discounts
     onwards = code is Status.CONVERGED or task.problem.is_game
-    settled = nested.settle(task, assumptions, reached, state.value if onwards else None, clock)
+    settled = settle(task, assumptions, reached, state.value if onwards else None, clock)
     return settled._replace(residuals=np.concatenate([history, settled.residuals])) if onwards else settled

@@ -39,9 +39,9 @@ from hjbjax.solution import nested_grids
 from hjbjax.solution.clock import Clock
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import warn
-from hjbjax.solvers import nested
-from hjbjax.solvers.nested import Settled
+from hjbjax.solvers.coarse_levels import on_coarser
 from hjbjax.solvers.result import warn_of_cuts
+from hjbjax.solvers.settle import Settled
 
 SHARE, FEWEST, MOST = 16, 600, 3000  # nodes of the coarse grid: one in 16, but at least and at most this number
 MARCHED = 20_000  # most nodes of a coarse grid of marches for the box error only
@@ -156,7 +156,7 @@ def _coarse_task(task: Task) -> Task | None:
     wanted = int(np.clip(task.grid.size // SHARE, FEWEST, MOST))
     while level.grid.size > wanted:
         coarse = nested_grids.coarser(level.grid, INTERVALS)
-        smaller = None if coarse is None else nested.on_coarser(level, coarse)
+        smaller = None if coarse is None else on_coarser(level, coarse)
         if smaller is None:
             break
         level = smaller

@@ -15,11 +15,14 @@ from hjbjax.problem.types import Nodes
 from hjbjax.solution.clock import Clock, Stopped
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
-from hjbjax.solvers import nested, semi_lagrangian
+from hjbjax.solvers import coarse_levels, semi_lagrangian
 from hjbjax.solvers.box_error import with_box_error
-from hjbjax.solvers.nested import Settled
+from hjbjax.solvers.coarser_answer import coarser_answer
+from hjbjax.solvers.order import staged
 from hjbjax.solvers.result import finish, solution_at_start, with_grid_error
+from hjbjax.solvers.second_order import better_of, second_order
 from hjbjax.solvers.semi_lagrangian import Followed
+from hjbjax.solvers.settle import Settled, settle
 from hjbjax.solvers.setup import COARSEST, choose_scheme, prepare_on_host, warn_unreached
 
 
@@ -59,7 +62,7 @@ def solve_on_host(
     solution = finish(settled, on.grid)
     # value iteration and tubes, whose targets are nodes, have no estimate
     if choices.scheme and settled.task.scheme.subcell and solution.status is Status.CONVERGED:
-        solution = with_grid_error(solution, settled, nested.coarser_answer(settled, clock))
+        solution = with_grid_error(solution, settled, coarser_answer(settled, clock))
     if solution.status is Status.CONVERGED:
         solution = with_box_error(solution, settled, clock)
     solution.stats.update(about)
@@ -102,12 +105,12 @@ def settled_on_host(
         warn_unreached(reach, undiscounted=bool(problem.discount == 0))
     reached = None if reach is None else reach.surely
     asked_again = sharpen and choices.levels and grid.size > COARSEST and not grid.sides("open")
-    start, shapes = nested.start(task, on.scheme, method, start, clock, asked_again=asked_again)
-    settled = nested.settle(nested.staged(task, on.scheme), assumptions, reached, start, clock)
+    start, shapes = coarse_levels.start(task, on.scheme, method, start, clock, asked_again=asked_again)
+    settled = settle(staged(task, on.scheme), assumptions, reached, start, clock)
     about: dict[str, Any] = {"levels": [*shapes, grid.shape]}
     if not on.scheme.monotone and (settled.code is Status.CONVERGED or not sharpen):
-        sharp = nested.second_order(settled, on.scheme, clock)
-        settled = nested.better_of(settled, sharp, clock, sharpen=sharpen)
+        sharp = second_order(settled, on.scheme, clock)
+        settled = better_of(settled, sharp, clock, sharpen=sharpen)
     if type(settled.task.method.evaluation) is not type(method.evaluation):
         about["method"] = settled.task.method.described(problem.is_game)
-    return nested.plainly(settled), about
+    return settled.of_chain(), about

@@ -30,7 +30,7 @@ from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
 from hjbjax.solvers import box_error, march_run, time_probes
 from hjbjax.solvers.box_error import BoxError
-from hjbjax.solvers.nested import LOSES, OVER, TOO_FEW
+from hjbjax.solvers.coarser_answer import LOSES, OVER, TOO_FEW
 from hjbjax.solvers.result import warn_of_grid
 from hjbjax.solvers.setup import march_evaluation
 

@@ -25,7 +25,8 @@ from hjbjax.solution.clock import CUT, Clock
 from hjbjax.solution.solution import Solution, question
 from hjbjax.solution.status import Status, warn
 from hjbjax.solvers.arrival import warn_of_no_arrival
-from hjbjax.solvers.nested import CoarserAnswer, Settled
+from hjbjax.solvers.coarser_answer import CoarserAnswer
+from hjbjax.solvers.settle import Settled
 from hjbjax.solvers.setup import BOUNDING, Assumptions
 
 GAP = 0.05  # of what the actions matter; where Isaacs' condition holds, upwinding left up to .019 on 21 nodes

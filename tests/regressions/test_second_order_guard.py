@@ -8,7 +8,7 @@ import pytest
 
 import hjbjax as hjb
 from hjbjax import zoo
-from hjbjax.solvers import nested
+from hjbjax.solvers import host_solve
 
 HANGING = [np.pi - 1e-9, 0.0]
 # torque, nodes, V(hanging); the monotone scheme on 1600 x 1601 nodes gives 43.4 for the torque 2, and falls
@@ -42,7 +42,7 @@ def test_units_of_time_and_cost_do_not_matter(time, cost):
 
 @pytest.mark.filterwarnings("ignore::hjbjax.SolveWarning")
 def test_an_answer_that_contradicts_the_certified_one_is_not_returned(monkeypatch):
-    second_order = nested.second_order
+    second_order = host_solve.second_order
 
     def slid(settled, scheme, clock):
         sharp = second_order(settled, scheme, clock)
@@ -50,7 +50,7 @@ def test_an_answer_that_contradicts_the_certified_one_is_not_returned(monkeypatc
 
     problem, grid = zoo.pendulum(torque=2.0, shape=(60, 61))
     monotone = hjb.solve(problem, grid, scheme=hjb.Upwind(subcell=True))
-    monkeypatch.setattr(nested, "second_order", slid)
+    monkeypatch.setattr(host_solve, "second_order", slid)
     solution = hjb.solve(problem, grid)
     assert "It is of first order: the second-order answer differs from this certified one by up to" in solution.message
     np.testing.assert_allclose(solution.value, monotone.value, atol=2e-3)

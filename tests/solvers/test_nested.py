@@ -10,8 +10,9 @@ import pytest
 import hjbjax as hjb
 from hjbjax import zoo
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.solution import nested_grids
 from hjbjax.solution.clock import Clock
-from hjbjax.solvers import nested
+from hjbjax.solvers import coarse_levels
 from hjbjax.solvers.setup import prepare_on_host
 
 METHOD = hjb.PolicyIteration(hjb.Sweeps())
@@ -57,8 +58,8 @@ PROBLEMS = {
 def test_what_is_known_of_every_second_node_is_what_a_preparation_finds_there(name):
     problem, grid = PROBLEMS[name]()
     task = task_of(problem, grid)
-    coarse = nested.nested_grids.coarser(grid)
-    found, made = nested.on_coarser(task, coarse), task_of(problem, coarse)
+    coarse = nested_grids.coarser(grid)
+    found, made = coarse_levels.on_coarser(task, coarse), task_of(problem, coarse)
     assert found.grid.shape == made.grid.shape == tuple((n + 1) // 2 for n in grid.shape)
     for part in ("obstacles", "counted", "least_cost", "on"):
         mine, theirs = (jax.tree.leaves(getattr(each, part)) for each in (found, made))
@@ -70,7 +71,7 @@ def test_the_fastest_rate_is_asked_for_on_every_grid():
     problem, grid = zoo.pendulum(discount=0.1, shape=(40, 41))
     on = Discretisation(problem, grid, SCHEME, KIND)
     task = prepare_on_host(on, method=hjb.ValueIteration(), tol=1e-3)[0]
-    found = nested.on_coarser(task, nested.nested_grids.coarser(grid))
+    found = coarse_levels.on_coarser(task, nested_grids.coarser(grid))
     assert found.outflow.shape == (20, 21)
     assert float(np.max(found.outflow)) < 0.6 * float(np.max(task.outflow))  # half as many jumps per unit time
 
@@ -78,15 +79,15 @@ def test_the_fastest_rate_is_asked_for_on_every_grid():
 def test_a_coarser_grid_that_loses_the_target_is_none():
     problem = hjb.Problem(drift, lambda x, u: 1.0, hjb.Box([-1.0], [1.0]), target=lambda x: abs(x[0] - 0.05) - 0.01)
     task = task_of(problem, hjb.Grid([-1.0], [1.0], (41,)))  # the node at .05 is an odd one
-    assert nested.on_coarser(task, hjb.Grid([-1.0], [1.0], (21,))) is None
+    assert coarse_levels.on_coarser(task, hjb.Grid([-1.0], [1.0], (21,))) is None
 
 
 def test_odd_intervals_are_prepared_anew_unless_nodes_are_lost():
     problem, grid = zoo.double_integrator(shape=(42, 42))
-    task, coarse = task_of(problem, grid), nested.nested_grids.coarser(grid)
-    found = nested.on_coarser(task, coarse)
+    task, coarse = task_of(problem, grid), nested_grids.coarser(grid)
+    found = coarse_levels.on_coarser(task, coarse)
     assert found.counted.shape == coarse.shape == (22, 22)
-    assert nested.on_coarser(dataclasses.replace(task, has_lost=True), coarse) is None
+    assert coarse_levels.on_coarser(dataclasses.replace(task, has_lost=True), coarse) is None
 
 
 @pytest.mark.slow
@@ -107,9 +108,9 @@ def test_levels_end_at_the_nodes_that_the_method_names():
     problem, grid = zoo.pendulum(discount=0.1, shape=(100, 101))
     task = task_of(problem, grid)
     for coarsest, wanted in ((300, [(25, 26), (50, 51)]), (2000, [(50, 51)]), (9000, [])):
-        found = nested.levels(task, hjb.Nested(METHOD, coarsest), Clock(), asked_again=False)
+        found = coarse_levels.levels(task, hjb.Nested(METHOD, coarsest), Clock(), asked_again=False)
         assert [level.grid.shape for level in found] == wanted
-    told = nested.levels(task, METHOD, Clock(), asked_again=True)
+    told = coarse_levels.levels(task, METHOD, Clock(), asked_again=True)
     assert [level.grid.shape for level in told] == [(50, 51)]
 
 

@@ -8,7 +8,7 @@ import pytest
 import hjbjax as hjb
 from hjbjax import zoo
 from hjbjax.applications.reference import at_nodes_of, mask_of
-from hjbjax.solvers import nested
+from hjbjax.solvers import second_order
 from tests.support.compilation import compiling
 
 U = hjb.Box([-1.0], [1.0])
@@ -139,13 +139,13 @@ def test_transformations_give_the_answer_of_the_host():
 @pytest.fixture
 def failing(monkeypatch):
     """A second-order iteration that ends STALLED."""
-    iterate = nested.iterate
+    iterate = second_order.iterate
 
     def stalled(task, *rest, **options):
         state, code, residuals = iterate(task, *rest, **options)
         return state, code if task.is_chain else hjb.Status.STALLED, residuals
 
-    monkeypatch.setattr(nested, "iterate", stalled)
+    monkeypatch.setattr(second_order, "iterate", stalled)
 
 
 def test_where_the_second_order_does_not_converge_the_monotone_answer_stands(failing):

@@ -1,0 +1,121 @@
+"""Coarser grids: their tasks, and the guess that their answers give for the finest grid."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import numpy as np
+
+from hjbjax.discretisation import cut_cells
+from hjbjax.discretisation.discretisation import Scheme
+from hjbjax.iteration.fixed_point import State, Task
+from hjbjax.iteration.methods import Method
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.types import Nodes
+from hjbjax.solution import nested_grids
+from hjbjax.solution.clock import Clock
+from hjbjax.solvers.order import at_order, sharpened, staged
+from hjbjax.solvers.setup import assumptions_of, prepared
+from hjbjax.solvers.stationary_run import iterate
+from hjbjax.solvers.vanishing_discounts import warm
+
+
+def start(
+    task: Task, scheme: Scheme, method: Method, guess: Nodes | None, clock: Clock, *, asked_again: bool
+) -> tuple[Nodes | None, list[tuple[int, ...]]]:
+    """The guess for the finest grid: the user's, or the answer of coarser grids; and the shapes of those grids.
+
+    If the clock stops the solve meanwhile: the answer so far, on the finest grid; None if there is none.
+
+    Args:
+      task: the task of the chain on the finest grid.
+      scheme: the scheme of the answer on that grid.
+      method: the method that was chosen, which may be nested.
+      guess: the user's guess, or None.
+      clock: the limits.
+      asked_again: true if the next coarser grid will be solved again to estimate the error of the grid, so that its
+        program is compiled in any case.
+    """
+    # an undiscounted tube has many fixed points; from its constraint the iteration finds the right one
+    if guess is not None or (task.constrained and not np.asarray(task.problem.discount) > 0):
+        return guess, []
+    value: Nodes | None = None
+    # with noise, or without a certificate, the schemes have programs of their own
+    asked_again &= scheme.monotone or staged(task, scheme) is not task
+    coarser = levels(task, method, clock, asked_again=asked_again)
+    if coarser:
+        coarser[-1] = staged(coarser[-1], scheme)  # the one that is asked again
+    grids = [*(level.grid for level in coarser), task.grid]
+    for level, finer in zip(coarser, grids[1:], strict=True):
+        state, _, _ = iterate(level, warm(level, value, clock), clock)
+        if clock.over() is not None:
+            return nested_grids.prolong(finite(level, state), level.grid, task.grid), []
+        value = nested_grids.prolong(finite(level, state), level.grid, finer)
+    return value, [grid.shape for grid in grids[:-1]]
+
+
+def finite(task: Task, state: State) -> np.ndarray:
+    """The value, with the largest of the others at lost nodes, whose huge values would spoil an interpolation."""
+    value, counted = np.asarray(state.value), np.asarray(task.counted)
+    return np.where(counted, value, np.max(value[counted])) if task.has_lost else value
+
+
+def levels(task: Task, method: Method, clock: Clock, *, asked_again: bool) -> list[Task]:
+    """The tasks on coarser grids, coarsest first, down to the number of nodes that the method names.
+
+    With ``asked_again`` the next coarser grid is there in any case, if it can tell the error of the grid.
+    """
+    found: list[Task] = []
+    smaller = (telling(task) if asked_again else None) or below(task.grid, method)
+    while smaller is not None and clock.over() is None:
+        clock.phase = f"the preparation of {' x '.join(map(str, smaller.shape))} nodes"
+        level = on_coarser(task, smaller)
+        if level is None:
+            break
+        found.insert(0, level)
+        smaller = below(smaller, method)
+    return found
+
+
+def below(grid: Grid, method: Method) -> Grid | None:
+    """The next coarser grid, if it has at least as many nodes as the method demands of the coarsest."""
+    smaller = nested_grids.coarser(grid)
+    return None if smaller is None or method.coarsest is None or smaller.size < method.coarsest else smaller
+
+
+def telling(task: Task) -> Grid | None:
+    """The coarser grid whose answer tells the error of the task's grid; None if there is none."""
+    # only for nodes of the finer grid is it known which of them cannot reach the target
+    fixed = np.broadcast_to(np.asarray(task.obstacles.fixed), task.grid.shape)
+    return nested_grids.telling(task.grid, fixed, nested=task.has_lost)
+
+
+def on_coarser(task: Task, coarse: Grid) -> Task | None:
+    """The task on a coarser grid; None if that grid would change the question."""
+    fine = task.grid
+    strides = [divmod(fine.intervals(axis), coarse.intervals(axis)) for axis in range(fine.ndim)]
+    # ``outflow``, the rate of the fastest action, depends on the spacings
+    if task.outflow is None and not any(rest for _, rest in strides):
+        # what is known of all nodes is known of every second one
+        every = tuple(slice(None, None, stride) for stride, _ in strides)
+        # leave out problem and grid, whose leaves may have the shape of the nodes by chance
+        bare: Any = dataclasses.replace(task, on=None)  # type: ignore[arg-type]
+        known = jax.tree.map(lambda leaf: np.asarray(leaf)[every] if np.shape(leaf) == fine.shape else leaf, bare)
+        on = task.on.on_grid(coarse)
+        made = dataclasses.replace(known, on=_kept(on) if cut_cells.keeps(on) else on)
+    elif task.has_lost:  # of nodes in between it is not known whether they reach the target
+        return None
+    else:
+        level = task.on.chain.on_grid(coarse)
+        made = prepared(level, method=task.method, tol=task.tol, assumptions=assumptions_of(level))
+        on = dataclasses.replace(task.on.on_grid(coarse), cut=made.on.cut)
+        made = dataclasses.replace(made, on=on, certificate=task.certificate)
+        if task.first_order is not None:
+            made = at_order(made, first=bool(np.asarray(task.first_order)))
+        elif not task.scheme.monotone:
+            made = sharpened(made)
+    held, kept = (bool(np.any(np.asarray(each.obstacles.fixed))) for each in (task, made))
+    return None if held and not kept else made
+
+
+_kept = jax.jit(cut_cells.kept)

@@ -1,0 +1,54 @@
+"""The tasks of schemes of high order, and how they share a program with the task of their chain."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.discretisation.discretisation import Scheme
+from hjbjax.iteration.certificates import Certificate
+from hjbjax.iteration.fixed_point import Task
+from hjbjax.solvers.setup import Assumptions
+
+AHEAD = 2.0  # a corrective step in time lasts one over this of the time that crossing the box takes
+
+
+def staged(task: Task, scheme: Scheme) -> Task:
+    """The task of the chain, in the program of the scheme where both can share one: without noise, certified."""
+    fits = task.problem.noise is None and min(task.grid.shape) >= scheme.points
+    certified = task.certificate in (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE)
+    if scheme.monotone or not (fits and certified):
+        return task
+    return at_order(dataclasses.replace(task, on=dataclasses.replace(task.on, scheme=scheme)), first=True)
+
+
+def at_order(task: Task, *, first: bool) -> Task:
+    """The task of a scheme of high order, or of its chain (``first``) in the same program: only numbers differ."""
+    return dataclasses.replace(sharpened(task, first=first), first_order=np.asarray(first))
+
+
+def sharpened(task: Task, *, first: bool = False) -> Task:
+    """The task with what slopes of high order need for their iteration, and their chain (``first``) does not.
+
+    Without a discount these slopes have false solutions, because the artificial diffusion with which upwinding reaches
+    rest nodes is missing. Where the slopes overshoot, a policy circles a rest node and pays nothing, or less than that:
+    V + c with c < 0 then solves the equation at all nodes except the rest node and its neighbours. A floor prevents
+    that: it is zero where costs are not negative, and V is small next to a rest node. Corrections overshoot as well,
+    since their error is carried along a whole path, so each is an implicit step in time of length 1/κ, half of what
+    crossing the box takes. With noise errors are not carried far, and whole corrections need fewer steps.
+    """
+    obstacles, shift = task.obstacles, None
+    if task.floor is not None:
+        floor = jnp.finfo(task.tol.dtype).min / 8 if first else task.floor
+        obstacles = dataclasses.replace(obstacles, lower=jnp.asarray(floor, task.tol.dtype))
+    if task.crossing is not None and task.problem.noise is None and not task.problem.is_game:
+        shift = jnp.asarray(0 if first else AHEAD / task.crossing, task.tol.dtype)
+    return dataclasses.replace(task, obstacles=obstacles, shift=shift)
+
+
+def raised(task: Task, assumptions: Assumptions, scheme: Scheme) -> tuple[Task, Assumptions]:
+    """The task and the assumptions of a scheme of high order, which has no certificate, from those of its chain."""
+    # defect correction: the matrix of the chain, the residual of the better slopes
+    on = dataclasses.replace(task.on, scheme=scheme)
+    task = dataclasses.replace(task, certificate=Certificate.RESIDUAL, on=on, first_order=None)
+    return sharpened(task), dataclasses.replace(assumptions, certificate=Certificate.RESIDUAL)

@@ -1,0 +1,72 @@
+"""From the monotone answer to the second-order one, and the choice between the two."""
+
+import numpy as np
+
+from hjbjax.discretisation.discretisation import Scheme
+from hjbjax.solution import grid_error, nested_grids
+from hjbjax.solution.clock import Clock
+from hjbjax.solution.status import Status
+from hjbjax.solvers.coarse_levels import finite
+from hjbjax.solvers.coarser_answer import coarser_answer
+from hjbjax.solvers.order import raised
+from hjbjax.solvers.settle import Settled
+from hjbjax.solvers.stationary_run import iterate
+
+LITTLE = 0.1  # of the range of V: the second order may change V by so much without being questioned
+
+
+def second_order(settled: Settled, scheme: Scheme, clock: Clock) -> Settled:
+    """The answer by a scheme of high order, from the monotone one, which it keeps as its ``origin``.
+
+    If the clock stops it before its first look, the monotone answer stands, with the status of the stop.
+    """
+    over = clock.over()
+    if over is not None:
+        return settled._replace(code=over)
+    task, assumptions = raised(settled.task, settled.assumptions, scheme)
+    sharp = settled._replace(task=task, assumptions=assumptions, origin=settled)
+    state, ended, residuals = iterate(sharp.running, settled.state.value, clock)
+    if int(state.step) < 0:
+        return settled._replace(code=ended)
+    return sharp._replace(state=state, code=ended, residuals=residuals)
+
+
+def better_of(settled: Settled, sharp: Settled, clock: Clock, *, sharpen: bool) -> Settled:
+    """The second-order answer, or, if the caller left the choice (``sharpen``), possibly the monotone one with a note.
+
+    The monotone answer stands if the second-order iteration did not converge, or if it moved V further than the error
+    of the grid explains.
+    """
+    if not sharpen:
+        return sharp
+    if sharp.code is not Status.CONVERGED:
+        # Ctrl-C leaves the solve unfinished; after a time limit the monotone answer is complete
+        code = sharp.code if sharp.code is Status.INTERRUPTED else settled.code
+        note = f"It is of first order: the second-order iteration ended {sharp.code.name}."
+        return settled._replace(code=code, note=note)
+    contradiction = _contradiction(settled, sharp, clock)
+    return sharp if contradiction is None else settled._replace(note=contradiction)
+
+
+def _contradiction(settled: Settled, sharp: Settled, clock: Clock) -> str | None:
+    """The note on a second-order answer that contradicts the certified monotone one; None if it does not.
+
+    The error of the monotone answer is its change from the next coarser grid over 2^q − 1, with the least order q = ½.
+    Nothing is computed where the second order changed little.
+    """
+    before, after = finite(settled.task, settled.state), finite(sharp.task, sharp.state)
+    moved = float(np.max(nested_grids.apart(before, after)))
+    if moved <= LITTLE * float(np.ptp(before)):
+        return None
+    found = coarser_answer(settled, clock)
+    if found.grid is None or found.value is None:
+        return None
+    coarse, value = found.grid, found.value
+    change = nested_grids.apart(nested_grids.restrict(before, settled.task.grid, coarse), value)
+    explained = float(np.max(change)) / (nested_grids.ratio_of(settled.task.grid, coarse) ** grid_error.LEAST - 1)
+    if moved <= explained + float(settled.task.tol):
+        return None
+    return (
+        f"It is of first order: the second-order answer differs from this certified one by up to {moved:.3g}, of which "
+        f"the grid explains {explained:.3g}."
+    )

@@ -1,0 +1,117 @@
+"""From a prepared task to the end of its iteration, with everything that has to happen in between."""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from hjbjax.iteration.certificates import Certificate
+from hjbjax.iteration.evaluation import Krylov
+from hjbjax.iteration.fixed_point import State, Task
+from hjbjax.iteration.methods import PolicyIteration
+from hjbjax.markov_chain import resting
+from hjbjax.problem.types import Mask, Nodes
+from hjbjax.solution.clock import Clock, Stopped
+from hjbjax.solution.status import Status
+from hjbjax.solvers.order import at_order
+from hjbjax.solvers.setup import Assumptions, forced_only, linear_solve
+from hjbjax.solvers.stationary_run import iterate
+from hjbjax.solvers.vanishing_discounts import FURTHER, follow, needs_a_way, warm
+
+FAILED = (Status.STALLED, Status.DIVERGED, Status.NONFINITE)
+
+
+class Settled(NamedTuple):
+    """The end of an iteration.
+
+    Attributes:
+      task: the task as it was solved in the end.
+      assumptions: what was assumed about it.
+      reached: the nodes that can be brought to the target, bool (*grid); None if nobody asked.
+      state: the last state.
+      code: its status.
+      residuals: the residuals of all steps.
+      origin: the end of the monotone iteration from which a second-order one started.
+      note: a further sentence of the solution's message.
+    """
+
+    task: Task
+    assumptions: Assumptions
+    reached: Mask | None
+    state: State
+    code: Status
+    residuals: np.ndarray
+    origin: "Settled | None" = None
+    note: str = ""
+
+    @property
+    def running(self) -> Task:
+        """The task as its program has it: for an answer of high order, the program may be that of its chain."""
+        if self.origin is None or self.origin.task.first_order is None:
+            return self.task
+        return at_order(self.origin.task, first=False)
+
+    def of_chain(self) -> "Settled":
+        """The end of a monotone iteration without traces of the scheme whose program it shared."""
+        return self if self.task.first_order is None else self._replace(task=self.task.of_chain)
+
+
+def may_go_on(task: Task, assumptions: Assumptions, state: State, code: Status) -> bool:
+    """True if a run that ended so may have to go on: it may pay to leave a rest node, or a game or a start failed."""
+    if code is Status.CONVERGED:
+        return assumptions.may_rest and float(np.min(np.asarray(state.value), initial=0)) < 0
+    return code in FAILED and (task.problem.is_game or needs_a_way(task))
+
+
+def settle(task: Task, assumptions: Assumptions, reached: Mask | None, guess: Nodes | None, clock: Clock) -> Settled:
+    """The end of the iteration of a task.
+
+    Rest nodes are fixed first, at the cost of resting, and released where it pays to leave them. Their fixed value is
+    an upper bound, from which the iteration only descends: a released node that was too low would stay too low, since
+    resting costs nothing. If a game does not converge, the nodes from which its target can be forced are found, and the
+    game is solved there. Sweeps that stall, as where the drift circulates under a small discount, are replaced by a
+    linear solve.
+    """
+    value = warm(task, guess, clock)
+    state, code, residuals = iterate(task, value, clock)
+    if needs_a_way(task):
+        for discounts in FURTHER:  # under a larger discount a policy stays where it is and pays if the way is too long
+            if code not in FAILED:
+                break
+            value = follow(task, value, discounts, clock)
+            state, code, residuals = iterate(task, value, clock)
+    evaluation = task.method.evaluation
+    # sweeps follow the drift from the target; on a circle no node is first, and with β Δt ≪ 1 they take 1/(β Δt) rounds
+    if code is Status.STALLED and evaluation is not None and evaluation.rough:
+        solver = linear_solve(task.grid) if task.on.mesh is None else Krylov()
+        task = dataclasses.replace(task, method=PolicyIteration(solver))
+        state, code, residuals = iterate(task, state.value, clock)
+    if code in FAILED:
+        try:
+            fewer, forced = forced_only(task, clock)
+        except Stopped as stop:
+            return Settled(task, assumptions, reached, state, stop.status, residuals)
+        # where the disturbance can keep the state from the target, V is infinite and the iteration climbs without end
+        if forced is not None and not forced.all():
+            task, reached = fewer, forced
+            # from the start, since the value so far is the result of that climb
+            state, code, residuals = iterate(task, warm(task, None, clock), clock)
+    while code is Status.CONVERGED and may_go_on(task, assumptions, state, code):
+        pays = _leaving_pays(task, state.value)
+        if not np.any(np.asarray(pays)):
+            break
+        # the bound by the least running cost needs it to be positive wherever V is not fixed; at rest it is zero
+        assumptions = dataclasses.replace(assumptions, certificate=Certificate.NONE)
+        task = dataclasses.replace(
+            task, obstacles=resting.release(task.obstacles, pays), certificate=Certificate.NONE, least_cost=None
+        )
+        state, code, more = iterate(task, state.value, clock)
+        residuals = np.concatenate([residuals, more])
+    return Settled(task, assumptions, reached, state, code, residuals)
+
+
+@jax.jit
+def _leaving_pays(task: Task, value: jax.Array) -> jax.Array:
+    """The fixed rest nodes that it pays to leave, bool (*grid)."""
+    return resting.leaving_pays(task.on.chain, task.obstacles, task.counted, value)

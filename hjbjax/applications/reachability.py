@@ -192,8 +192,8 @@ def from_hj_reachability(dynamics: Any, distance: Callable, *, tube: bool = True
         raise ValueError(f"{name}: got the modes {modes}, wanted 'min' or 'max'")
     controls = _admissible(dynamics.control_space, f"{name}: control_space")
     others = _admissible(dynamics.disturbance_space, f"{name}: disturbance_space")
-    m, resting = controls.dim, isinstance(others, Box) and bool(np.all(others.lo == others.hi))
-    helping = modes[0] == modes[1] and not resting
+    m, fixed = controls.dim, others.lo if isinstance(others, Box) and bool(np.all(others.lo == others.hi)) else None
+    helping = modes[0] == modes[1] and fixed is None
     if helping and not (isinstance(controls, Box) and isinstance(others, Box)):
         raise ValueError(
             f"{name}: control and disturbance both {modes[0]}imise, over sets that are not both boxes; reverse one "
@@ -201,13 +201,15 @@ def from_hj_reachability(dynamics: Any, distance: Callable, *, tube: bool = True
         )
 
     def drift(x: State, u: Control, d: Array | None = None) -> Array:
-        d = u[m:] if helping else jnp.asarray(others.lo) if d is None else d  # type: ignore[union-attr]
+        d = u[m:] if helping else jnp.asarray(fixed) if d is None else d
         return dynamics(x, u[:m], d, 0.0)
 
     if helping:
-        controls = Box(np.append(controls.lo, others.lo), np.append(controls.hi, others.hi))  # type: ignore[union-attr]
+        assert isinstance(controls, Box)
+        assert isinstance(others, Box)
+        controls = Box(np.append(controls.lo, others.lo), np.append(controls.hi, others.hi))
     pose = reach if modes[0] == "min" else avoid
-    return pose(drift, controls, distance, disturbances=None if resting or helping else others, tube=tube)
+    return pose(drift, controls, distance, disturbances=None if helping or fixed is not None else others, tube=tube)
 
 
 def _admissible(space: Any, name: str) -> Box | Ball:

@@ -49,7 +49,7 @@ def details(entry: Entry) -> Iterator[str]:
 
 def _facts(entry: Entry, problem: Problem, grid: Grid) -> Iterator[tuple[str, str]]:
     """The facts of a problem, as pairs of label and text."""
-    ends = zip(_with_units(grid.names, grid.units), grid.lo, grid.hi, grid.periodic or (), strict=True)
+    ends = zip(_with_units(grid.names, grid.units), grid.lo, grid.hi, grid.periodic, strict=True)
     states = (f"{name} from {lo:.4g} to {hi:.4g}{', periodic' * bool(round_)}" for name, lo, hi, round_ in ends)
     yield "states", "; ".join(states)
     yield "controls", _actions(problem.controls, problem.control_names, problem.control_units)

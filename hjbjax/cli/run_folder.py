@@ -298,7 +298,7 @@ def difference(exact: Exact, solution: Solution) -> float | None:
         lo, hi, nodes = grid.lo[axis], grid.hi[axis], np.asarray(grid.axis(axis))
         # the half around the centre; all of a periodic axis, which has no boundary
         inner = np.abs(nodes - (lo + hi) / 2) <= (hi - lo) / 4
-        index.append(np.arange(len(nodes)) if grid.periodic[axis] else np.flatnonzero(inner))  # type: ignore[index]
+        index.append(np.arange(len(nodes)) if grid.periodic[axis] else np.flatnonzero(inner))
     corner = np.ix_(*index)
     states = grid.nodes()[corner]  # (k₁, …, k_n, n)
     # in chunks, because evaluating the series or Newton steps at all nodes at once takes much memory

@@ -102,7 +102,7 @@ class Arcs:
 def widened(value: AtNodes, grid: Grid) -> jax.Array:
     """Node values, flat, the first of a periodic axis again behind its last ones: every cell has all its corners."""
     for axis in range(grid.ndim):
-        if grid.periodic[axis]:  # type: ignore[index]
+        if grid.periodic[axis]:
             first = jax.lax.slice_in_dim(value, 0, 1, axis=axis)
             value = jnp.concatenate([value, first], axis=axis)
     return value.reshape(-1)
@@ -231,7 +231,7 @@ def _moved(grid: Grid, x: Sequence[jax.Array], f: Sequence[jax.Array], time: jax
     for axis, (place, velocity) in enumerate(zip(x, f, strict=True)):
         lo, hi = jnp.asarray(grid.lo[axis], place.dtype), jnp.asarray(grid.hi[axis], place.dtype)
         place = place + time * velocity
-        if grid.periodic[axis]:  # type: ignore[index]
+        if grid.periodic[axis]:
             found.append(into_period(place, lo, hi))
         else:
             found.append(jnp.clip(place, lo, hi))
@@ -243,7 +243,7 @@ def speed(grid: Grid, x: Sequence[jax.Array], f: Sequence[jax.Array]) -> jax.Arr
     most = jnp.zeros((), f[0].dtype)
     for axis, (place, velocity) in enumerate(zip(x, f, strict=True)):
         width: Number | jax.Array = grid.spacing(axis)
-        if grid.stretch[axis] is not None:  # type: ignore[index]
+        if grid.stretch[axis] is not None:
             width = jnp.diff(jnp.asarray(grid.axis(axis), place.dtype))[grid._locate(axis, place)[0]]
         most = jnp.maximum(most, jnp.abs(velocity) / width)
     return most
@@ -264,5 +264,5 @@ def _fastest(on: Discretisation, plan: Plan) -> Scalar:
 
 def _strides(grid: Grid) -> list[int]:
     """The distance in the array of ``widened`` between two neighbours along every axis."""
-    counts = [count + bool(around) for count, around in zip(grid.shape, grid.periodic, strict=True)]  # type: ignore[arg-type]
+    counts = [count + bool(around) for count, around in zip(grid.shape, grid.periodic, strict=True)]
     return [int(np.prod(counts[axis + 1 :], dtype=np.int64)) for axis in range(grid.ndim)]

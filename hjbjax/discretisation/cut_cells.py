@@ -87,7 +87,7 @@ def kept(on: Discretisation) -> Discretisation:
 
 def _across_seam(coordinate: jax.Array, grid: Grid, axis: int) -> jax.Array:
     """A coordinate at most one spacing beyond the seam of a periodic axis, back in [lo, hi)."""
-    if not grid.periodic[axis]:  # type: ignore[index]
+    if not grid.periodic[axis]:
         return coordinate
     lo, hi = grid.lo[axis], grid.hi[axis]
     # by comparison and not by %, which would round every coordinate anew

@@ -24,7 +24,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, pytree_dataclass
 from hjbjax.tracing import components, dependence
 
-T = TypeVar("T")
+T = TypeVar("T", bound=Any)
 
 
 class Scheme(abc.ABC):
@@ -256,7 +256,7 @@ class Discretisation:
         pairs = list(itertools.product(sets.probes(self.problem.controls, self.dtype),
                                        sets.probes(self.problem.disturbances, self.dtype)))  # fmt: skip
         for axis, step in itertools.product(range(self.grid.ndim), (-1, 1)):
-            if self.grid.periodic[axis] or not stencil.has_wall(self.grid, axis, step):  # type: ignore[index]
+            if self.grid.periodic[axis] or not stencil.has_wall(self.grid, axis, step):
                 continue
             ends = [stencil.slices(c, self.grid, axis, step) if i == axis else c for i, c in enumerate(x)]
             noise = [self.diffusion(u, d, ends).get((axis, axis), jnp.zeros((), self.dtype)) for u, d in pairs]
@@ -278,7 +278,7 @@ def over_nodes(task: T, shape: tuple[int, ...]) -> T:
     def mark(leaf: Any) -> bool:
         return np.shape(leaf) == shape
 
-    on: Discretisation = task.on  # type: ignore[attr-defined]
+    on = task.on
     # without those of the problem and the grid, which may have the shape of the nodes by chance
     nothing, cut = jax.tree.map(lambda _: False, on), jax.tree.map(mark, on.cut)
     return altered(jax.tree.map(mark, altered(task, on=None)), on=altered(nothing, cut=cut))
@@ -286,8 +286,7 @@ def over_nodes(task: T, shape: tuple[int, ...]) -> T:
 
 def on_part(task: T, parts: Parts) -> T:
     """A task, or a march, as one of the devices sees it, inside ``shard_map``."""
-    on: Discretisation = task.on  # type: ignore[attr-defined]
-    return altered(task, on=altered(on, grid=on.grid.divided(parts)))
+    return altered(task, on=altered(task.on, grid=task.on.grid.divided(parts)))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -153,7 +153,7 @@ def check(scheme: Any, name: str, grid: Grid, *, stationary: bool = False, paths
             f"{name} is {arguments.shown(scheme)}, whose chain {arguments.shown(scheme.chain)} is not derived from "
             "hjbjax.discretisation.schemes.Chain; that module shows how to write one"
         )
-    if scheme.even and any(each is not None for each in grid.stretch or ()):
+    if scheme.even and any(each is not None for each in grid.stretch):
         caller = name.partition(":")[0]
         raise ValueError(
             f"{caller}: {scheme!r} wants equal spacings; leave out Grid.stretch, or use Upwind() or Limited()"
@@ -264,7 +264,7 @@ class Limited(Scheme):
 
 def _is_plain(grid: Grid, axis: int) -> bool:
     """True if an axis has equal spacings, three nodes, and all of them here."""
-    return grid.stretch[axis] is None and grid.shape[axis] > 2 and not grid.is_divided(axis)  # type: ignore[index]
+    return grid.stretch[axis] is None and grid.shape[axis] > 2 and not grid.is_divided(axis)
 
 
 def calm(on: Discretisation, x: list, links: Sequence[Links]) -> list:

@@ -34,17 +34,17 @@ def on_edge(grid: Grid, axis: int, step: int) -> Array:
     along = [-1 if i == axis else 1 for i in range(grid.ndim)]
     # which nodes are here, only the running program knows
     if grid.parts is not None and (grid.is_divided(axis) or not grid.parts.even(axis)):
-        ended = jnp.asarray(not grid.periodic[axis])  # type: ignore[index]
+        ended = jnp.asarray(not grid.periodic[axis])
         return (grid.parts.last(axis, step) & ended).reshape(along)
     # (1, …, N, …, 1) and on the host: as a constant of the size of the grid it would stand in every program
     mask = np.zeros(grid.shape[axis], dtype=bool)
-    mask[-1 if step > 0 else 0] = not grid.periodic[axis]  # type: ignore[index]
+    mask[-1 if step > 0 else 0] = not grid.periodic[axis]
     return mask.reshape(along)
 
 
 def has_walls(grid: Grid, axis: int) -> bool:
     """True if an end of an axis, or both, stops drift and noise."""
-    return not grid.periodic[axis] and any(has_wall(grid, axis, step) for step in (-1, 1))  # type: ignore[index]
+    return not grid.periodic[axis] and any(has_wall(grid, axis, step) for step in (-1, 1))
 
 
 def has_wall(grid: Grid, axis: int, step: int) -> bool:
@@ -90,7 +90,7 @@ def continuation(grid: Grid, axis: int, step: int) -> tuple[Number, ...]:
         return 2.0, -1.0
     if (end := sloped(grid, axis, step)) is not None:
         return step * 2 * _last_gap(grid, axis, step) * getattr(end, "rate", 0.0), 1.0
-    if grid.stretch[axis] is None:  # type: ignore[index]
+    if grid.stretch[axis] is None:
         return 3.0, -3.0, 1.0
     gaps = jnp.diff(jnp.asarray(grid.whole.axis(axis)))
     last, before = (gaps[-1], gaps[-2]) if step > 0 else (gaps[0], gaps[1])
@@ -101,7 +101,7 @@ def continuation(grid: Grid, axis: int, step: int) -> tuple[Number, ...]:
 
 def _last_gap(grid: Grid, axis: int, step: int) -> Number:
     """The distance between the end of an axis and the node next to it."""
-    if grid.stretch[axis] is None:  # type: ignore[index]
+    if grid.stretch[axis] is None:
         return grid.spacing(axis)
     gaps = jnp.diff(jnp.asarray(grid.whole.axis(axis)))
     return gaps[-1] if step > 0 else gaps[0]
@@ -123,9 +123,9 @@ def continued(
         return neighbour(values, grid, offset)
     for axis, step in enumerate(offset):  # beyond a corner: what one axis says through what the other says
         moved = neighbour(values, grid, unit(grid, axis, step))
-        if step and not grid.periodic[axis] and not has_wall(grid, axis, step):  # type: ignore[index]
+        if step and not grid.periodic[axis] and not has_wall(grid, axis, step):
             moved = jnp.where(on_edge(grid, axis, step), _ended(values, grid, axis, step, change=change), moved)
-        elif step and mirror and not grid.periodic[axis]:  # type: ignore[index]
+        elif step and mirror and not grid.periodic[axis]:
             moved = jnp.where(on_edge(grid, axis, step), slices(values, grid, axis, step, 1), moved)
         values = moved
     return values
@@ -183,7 +183,7 @@ def beyond(values: AtNodes, grid: Grid, axis: int, step: int, ended: jax.Array) 
 
     ``ended`` is what stands beyond an end of the box, and says how many slices there are to be.
     """
-    cyclic = bool(grid.periodic[axis])  # type: ignore[index]
+    cyclic = bool(grid.periodic[axis])
     if not (cyclic or grid.is_divided(axis)):
         return ended
     # what the other side has at the end that faces this one
@@ -255,7 +255,7 @@ class Links:
 
 def links(grid: Grid, axis: int) -> Links:
     """The links of the grid itself along one axis; on a stretched one an end repeats its only distance."""
-    if grid.stretch[axis] is None:  # type: ignore[index]
+    if grid.stretch[axis] is None:
         return Links(grid.spacing(axis), grid.spacing(axis))
     gaps = jnp.diff(jnp.asarray(grid.whole.axis(axis)))
     along = [-1 if i == axis else 1 for i in range(grid.ndim)]

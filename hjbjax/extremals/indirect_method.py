@@ -188,7 +188,7 @@ def _pose(
     return BoundaryValueProblem(
         problem=problem,
         # wrapping is traced into every evaluation, so leave the grid out if no axis is periodic
-        grid=grid if grid is not None and any(grid.periodic or ()) else None,
+        grid=grid if grid is not None and any(grid.periodic) else None,
         start=start,
         horizon=0.0 if given is None else arguments.fixed_horizon(given),
         final=final,

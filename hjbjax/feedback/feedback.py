@@ -356,7 +356,7 @@ def beyond_ends(look: Callable, points: jax.Array, grid: Grid, sides: Sequence[t
 def continuing_sides(grid: Grid) -> list[tuple[int, int]]:
     """The ends beyond which V continues: pairs of an axis and a step, −1 lower and 1 upper."""
     sides = itertools.product(range(grid.ndim), (-1, 1))
-    return [side for side in sides if not grid.periodic[side[0]] and not stencil.has_wall(grid, *side)]  # type: ignore[index]
+    return [side for side in sides if not grid.periodic[side[0]] and not stencil.has_wall(grid, *side)]
 
 
 def _middle(action: list[Array], dtype: DType, n: int) -> jax.Array:

@@ -180,7 +180,7 @@ def _jump(grid: Grid, value: np.ndarray) -> float:
     for axis in range(grid.ndim):
         following = np.roll(value, -1, axis=first + axis)
         crosses = (value < 0) != (following < 0)
-        if not grid.periodic[axis]:  # type: ignore[index]
+        if not grid.periodic[axis]:
             np.moveaxis(crosses, first + axis, 0)[-1] = False  # the last node's neighbour by `roll` is the first
         largest = max(largest, float(np.max(np.where(crosses, np.abs(following - value), 0))))
     return largest

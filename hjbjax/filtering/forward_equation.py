@@ -158,7 +158,7 @@ def _marginal(probability: Field, axis: int) -> jax.Array:
 def _mean_along(grid: Grid, axis: int, probability: jax.Array) -> jax.Array:
     dtype = probability.dtype
     x = jnp.asarray(grid.axis(axis, dtype), dtype)
-    if not grid.periodic[axis]:  # type: ignore[index]
+    if not grid.periodic[axis]:
         return probability @ x
     lo, hi = jnp.asarray(grid.lo[axis], dtype), jnp.asarray(grid.hi[axis], dtype)
     angle = 2 * np.pi * (x - lo) / (hi - lo)
@@ -170,7 +170,7 @@ def _mean_along(grid: Grid, axis: int, probability: jax.Array) -> jax.Array:
 def _difference(grid: Grid, axis: int, center: jax.Array, dtype: np.dtype) -> jax.Array:
     """x − mean along one axis, the short way round a periodic one; broadcasts over the nodes."""
     off = grid.components(dtype)[axis] - center
-    if not grid.periodic[axis]:  # type: ignore[index]
+    if not grid.periodic[axis]:
         return off
     length = jnp.asarray(grid.hi[axis], dtype) - jnp.asarray(grid.lo[axis], dtype)
     return jnp.mod(off + length / 2, length) - length / 2

@@ -231,7 +231,7 @@ def _neighbours(grid: Grid, best: Sequence[jax.Array], dtype: Any) -> list[tuple
     found = []
     for axis, count in enumerate(grid.shape):
         here, x = best[axis], jnp.asarray(grid.axis(axis), dtype)
-        if grid.periodic[axis]:  # type: ignore[index]
+        if grid.periodic[axis]:
             numbers = [(here + step) % count for step in (-1, 0, 1)]
             spacing = jnp.asarray(grid.spacing(axis), dtype)
             found.append((numbers, [spacing, spacing], jnp.ones((), bool)))

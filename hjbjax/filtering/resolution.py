@@ -111,7 +111,7 @@ def local_width(probability: np.ndarray, grid: Grid, axis: int) -> float:
     height = np.log(np.maximum(probability, np.finfo(np.float64).tiny))
     bend = 2 * height - np.roll(height, 1, axis) - np.roll(height, -1, axis)
     weights = probability.copy()
-    if not grid.periodic[axis]:  # type: ignore[index]
+    if not grid.periodic[axis]:
         np.moveaxis(weights, axis, 0)[[0, -1]] = 0
     if not np.sum(weights) > 0.5:  # most of the mass is at an end
         return np.inf

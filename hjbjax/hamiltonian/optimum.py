@@ -68,7 +68,7 @@ def missed(hamiltonian: DiscreteHamiltonian) -> tuple[Field, Field]:
     first, second = (control, disturbance) if upper else (disturbance, control)
     if not (first.enumerated and second.programmed):
         return none, none
-    points = jnp.zeros((1, 0)) if first.admissible is None else first.admissible.points  # type: ignore[union-attr]
+    points = first.admissible.points if isinstance(first.admissible, Finite) else jnp.zeros((1, 0))
 
     def against(point: jax.Array) -> Field:
         return exact.missed(hamiltonian, second, lambda mine: (list(point), mine) if upper else (mine, list(point)))

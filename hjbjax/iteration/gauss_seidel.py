@@ -100,7 +100,7 @@ class Layout:
 
     def closes(self, axis: int) -> bool:
         """True if an axis of the arrays is periodic, and all of it here."""
-        return bool(self.grid.periodic[self.axes[axis]]) and not self.is_divided(axis)  # type: ignore[index]
+        return bool(self.grid.periodic[self.axes[axis]]) and not self.is_divided(axis)
 
 
 def _layout(grid: Grid) -> Layout:
@@ -135,7 +135,7 @@ def _exchanged(carried: Carried, layout: Layout, flips: list[jax.Array]) -> Carr
             continue
         assert parts is not None
         along = layout.axes[axis]
-        count, cyclic = parts.count(along), bool(layout.grid.periodic[along])  # type: ignore[index]
+        count, cyclic = parts.count(along), bool(layout.grid.periodic[along])
         for step, first, layer in ((1, 1, count + 1), (-1, count, 0)):
             # what the part beside needs of this one is its node at that end; places count the layer
             given = planes.at[_within(_places(source.shape, axis, first, flips))].get(**KNOWN)

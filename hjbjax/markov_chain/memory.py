@@ -73,7 +73,7 @@ def of_march(on: Discretisation, kept: int, method: TimeMethod, *, policy: bool)
     if not method.limited:
         inner = PolicyIteration(method.evaluation or Krylov())
         return kept * one * grid.size + estimate(problem, grid, inner, on.dtype)
-    plain = scheme.even or (not any(grid.stretch or ()) and not (scheme.subcell and problem.target is not None))
+    plain = scheme.even or (not any(grid.stretch) and not (scheme.subcell and problem.target is not None))
     if scheme.monotone:
         slopes = float(n <= stencil.LONGER)
     elif plain:

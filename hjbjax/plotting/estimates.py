@@ -70,7 +70,7 @@ def estimates(
     artists: list[Artist] = []
     for k, i in enumerate(shown):
         colour, estimate = COLOURS[k % len(COLOURS)], guessed[:, i]
-        if grid is not None and grid.periodic[i]:  # type: ignore[index]
+        if grid is not None and grid.periodic[i]:
             # the states of a path are unwound, while the mean of a density on a grid is inside the box
             period = float(grid.hi[i] - grid.lo[i])
             estimate = estimate + period * np.round((states[:, i] - estimate) / period)
@@ -139,9 +139,9 @@ def density(
         [grid.lo[i] for i in kept],
         [grid.hi[i] for i in kept],
         tuple(grid.shape[i] for i in kept),
-        tuple(grid.periodic[i] for i in kept),  # type: ignore[index]
+        tuple(grid.periodic[i] for i in kept),
         tuple(grid.names[i] for i in kept),
-        stretch=tuple(grid.stretch[i] for i in kept),  # type: ignore[index]
+        stretch=tuple(grid.stretch[i] for i in kept),
         units=tuple(grid.units[i] for i in kept),
     )
     others = tuple(i for i in range(grid.ndim) if i not in kept)

@@ -261,7 +261,7 @@ def _cube(field: Field, fixed: Mapping[str, float]) -> tuple[list[int], np.ndarr
 def _surface(field: Field, fixed: Mapping[str, float], ax: Any, color: str, label: str | None) -> Picture:
     """Draw the surface V = 0 over the three free axes."""
     from matplotlib.ticker import MaxNLocator
-    from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-untyped]
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     grid = field.grid
     free, closed, lines = _cube(field, fixed)

@@ -50,7 +50,7 @@ def angle_text(value: float, _position: int | None = None) -> str:
 def is_angle(grid: Grid, axis: int) -> bool:
     """True for an axis in radians, by its unit, or if it has no unit and the period 2π."""
     unit = grid.units[axis]
-    if unit or not grid.periodic[axis]:  # type: ignore[index]
+    if unit or not grid.periodic[axis]:
         return unit in ANGLES
     # to 1e-6, because periods may come from float32
     return math.isclose(float(grid.hi[axis]) - float(grid.lo[axis]), 2 * math.pi, rel_tol=1e-6)

@@ -229,7 +229,7 @@ def cut_field(what: str, field: np.ndarray, grid: Grid, cuts: Mapping[int, float
 def closed_field(field: np.ndarray, grid: Grid, free: Sequence[int]) -> np.ndarray:
     """Repeat the first row of a field at the upper end of each periodic free axis, so that no gap remains."""
     for position, axis in enumerate(free):
-        if grid.periodic[axis]:  # type: ignore[index]
+        if grid.periodic[axis]:
             field = np.concatenate([field, np.take(field, [0], position)], position)
     return field
 
@@ -237,7 +237,7 @@ def closed_field(field: np.ndarray, grid: Grid, free: Sequence[int]) -> np.ndarr
 def _cut(what: str, field: np.ndarray, grid: Grid, axis: int, place: float, nearest: bool) -> np.ndarray:
     """Interpolate linearly along one axis; a neighbour with weight zero does not contribute, even if infinite."""
     lo, hi, last = float(grid.lo[axis]), float(grid.hi[axis]), grid.intervals(axis)
-    if grid.periodic[axis] and math.isfinite(place):  # type: ignore[index]
+    if grid.periodic[axis] and math.isfinite(place):
         place = lo + (place - lo) % (hi - lo)
     slack = ON_NODE * (hi - lo) / last
     if not lo - slack <= place <= hi + slack:  # in this form NaN is refused
@@ -256,7 +256,7 @@ def _cut(what: str, field: np.ndarray, grid: Grid, axis: int, place: float, near
 def closed_axis(grid: Grid, axis: int) -> np.ndarray:
     """The coordinates of an axis, including the upper end of a periodic axis."""
     nodes = np.asarray(grid.axis(axis))
-    return np.append(nodes, grid.hi[axis]) if grid.periodic[axis] else nodes  # type: ignore[index]
+    return np.append(nodes, grid.hi[axis]) if grid.periodic[axis] else nodes
 
 
 def zeros(x: np.ndarray, values: np.ma.MaskedArray) -> list[float]:
@@ -277,9 +277,10 @@ def zeros(x: np.ndarray, values: np.ma.MaskedArray) -> list[float]:
 def without_jumps(states: np.ndarray, grid: Grid | None) -> np.ndarray:
     """States (k, n) made continuous in time, without the jumps of periodic states at their seam."""
     states = np.array(states, dtype=float)
-    for axis in range(0 if grid is None else grid.ndim):
-        if grid.periodic[axis]:  # type: ignore[union-attr, index]
-            states[:, axis] = np.unwrap(states[:, axis], period=float(grid.hi[axis] - grid.lo[axis]))  # type: ignore[union-attr]
+    if grid is None:
+        return states
+    for axis in np.flatnonzero(grid.periodic):
+        states[:, axis] = np.unwrap(states[:, axis], period=float(grid.hi[axis] - grid.lo[axis]))
     return states
 
 
@@ -289,7 +290,7 @@ def line_in_box(states: np.ndarray, axes: tuple[int, int], grid: Grid | None) ->
     # the period of an axis that is not periodic is infinite, so both columns use the same code
     lo, period = np.zeros(2), np.full(2, np.inf)
     for column, axis in enumerate(axes):
-        if grid is not None and grid.periodic[axis]:  # type: ignore[index]
+        if grid is not None and grid.periodic[axis]:
             lo[column], period[column] = grid.lo[axis], grid.hi[axis] - grid.lo[axis]
 
     def turns(point: np.ndarray) -> np.ndarray:  # the number of periods between the point and the box, (2,)

@@ -18,7 +18,7 @@ from jax.sharding import Mesh
 from hjbjax.problem.ends import KINDS, PRESCRIBED
 from hjbjax.problem.parts import FEWEST
 from hjbjax.problem.pytree import is_traced, numbers
-from hjbjax.problem.stretching import Sinh
+from hjbjax.problem.stretching import Sinh, Stretching
 from hjbjax.problem.types import Array, DType, Key
 
 T = TypeVar("T")
@@ -137,8 +137,10 @@ def shown(value: object) -> str:
     return text if len(text) <= SHOWN else text[: SHOWN - 4] + " ..."
 
 
-def stretchings(stretch: Any) -> tuple:
-    """The stretching of every axis as a tuple; one alone, or a word, is refused with what to write."""
+def stretchings(stretch: Any, n: int) -> tuple[Stretching | None, ...]:
+    """The stretching of each of the n axes; None and () stand for no such axis."""
+    if stretch is None or (isinstance(stretch, tuple) and not stretch):
+        return (None,) * n
     if isinstance(stretch, str) or not isinstance(stretch, Iterable):
         raise TypeError(f"Grid.stretch: got {stretch!r}, wanted one an axis, as in (hjb.Sinh(3.0), None)")
     return tuple(stretch)
@@ -229,8 +231,8 @@ def counts(shape: object) -> tuple[int, ...]:
 
 
 def periodic_flags(periodic: object, n: int) -> tuple[bool, ...]:
-    """One flag for each of the n axes, True where it is periodic; None stands for no such axis."""
-    if periodic is None:
+    """One flag for each of the n axes, True where it is periodic; None and () stand for no such axis."""
+    if periodic is None or (isinstance(periodic, tuple) and not periodic):
         return (False,) * n
     wanted = f"wanted one bool an axis (not axis numbers), as in {(True,) + (False,) * (n - 1)}"
     if isinstance(periodic, (str, bool)) or not isinstance(periodic, (Sequence, np.ndarray)):

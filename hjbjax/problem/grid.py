@@ -35,9 +35,10 @@ class Grid:
       lo: lower corner, shape (n,), in the units of each state.
       hi: upper corner, shape (n,); on a periodic axis the point that is the same as ``lo``.
       shape: number of nodes an axis, n integers of at least 2.
-      periodic: one bool an axis; ``None`` means none.
+      periodic: one bool per axis; by default no axis is periodic.
       names: one name an axis, used by pictures and printed tables.
-      stretch: one ``Sinh(strength, center)`` or ``None`` an axis; ``None`` means uniform. Not on a periodic axis.
+      stretch: one ``Sinh(strength, center)`` or ``None`` per axis; by default all spacings are equal. Not on a
+        periodic axis.
       edges: what happens to drift that points out of the box: a name for every end, or one entry an axis, a name or
         a pair (lower end, upper end); ``None`` on a periodic axis, which has no ends.
         "projected": the component that leaves is cut off, while the control keeps what it costs and earns.
@@ -61,9 +62,9 @@ class Grid:
     lo: Any
     hi: Any
     shape: tuple[int, ...]
-    periodic: tuple[bool, ...] | None = None
+    periodic: tuple[bool, ...] = ()
     names: tuple[str, ...] = ()
-    stretch: tuple[Stretching | None, ...] | None = None
+    stretch: tuple[Stretching | None, ...] = ()
     edges: Any = "projected"
     units: tuple[str, ...] = ()
     coordinates: tuple[Any, ...] = dataclasses.field(init=False, repr=False)
@@ -76,7 +77,7 @@ class Grid:
         shape = arguments.counts(self.shape)
         periodic = arguments.periodic_flags(self.periodic, len(shape))
         names = tuple(str(name) for name in self.names) or tuple(f"x{axis + 1}" for axis in range(len(shape)))
-        stretch = (None,) * len(shape) if self.stretch is None else arguments.stretchings(self.stretch)
+        stretch = arguments.stretchings(self.stretch, len(shape))
         lengths = (len(lo), len(hi), len(shape), len(periodic), len(names), len(stretch))
         if len(set(lengths)) != 1:
             raise ValueError(
@@ -242,7 +243,7 @@ class Grid:
     def intervals(self, axis: int) -> int:
         """The number M of intervals between ``lo`` and ``hi``."""
         count = self.whole.shape[axis]
-        return count if self.periodic[axis] else count - 1  # type: ignore[index]
+        return count if self.periodic[axis] else count - 1
 
     def spacing(self, axis: int) -> Number:
         """The distance h between neighbours along ``axis``; their mean on a stretched one."""
@@ -266,7 +267,7 @@ class Grid:
         """The coordinates by the formula, in NumPy where the corners are known numbers."""
         index: Array = np.arange(self.shape[axis], dtype=np.float64)
         last = self.intervals(axis)
-        stretching = self.stretch[axis]  # type: ignore[index]
+        stretching = self.stretch[axis]
         if stretching is not None:
             index = last * stretching.place(index / last)
         return (known(self.lo)[axis] * (last - index) + known(self.hi)[axis] * index) / last
@@ -292,7 +293,7 @@ class Grid:
         """The nodes in the middle ``share`` of every axis that is not periodic, bool (*grid); host level."""
         inside = np.ones(self.shape, bool)
         for axis in range(self.ndim):
-            if not self.periodic[axis]:  # type: ignore[index]
+            if not self.periodic[axis]:
                 nodes, lo, hi = np.asarray(self.axis(axis)), float(self.lo[axis]), float(self.hi[axis])
                 # a node that lies on the rim belongs to the middle, whichever way its coordinate was rounded
                 near = np.abs(nodes - (lo + hi) / 2) <= share * (hi - lo) / 2 * (1 + 1e-9)
@@ -306,7 +307,7 @@ class Grid:
         """
         total = np.ones(())
         for axis, count in enumerate(self.shape):
-            gaps = np.diff(np.append(np.asarray(self.axis(axis)), self.hi[axis] if self.periodic[axis] else []))  # type: ignore[index]
+            gaps = np.diff(np.append(np.asarray(self.axis(axis)), self.hi[axis] if self.periodic[axis] else []))
             # Each gap gives half to the node before and half to the one behind it. On a periodic axis there are as many
             # gaps as nodes and the two slices are one, which is right as such an axis is uniform.
             share = np.zeros(count)
@@ -362,7 +363,7 @@ class Grid:
         """The node below ``x``, the fraction of the way to the next, and a flag: True if ``x`` lies in the box."""
         lo, hi, last = jnp.asarray(self.lo[axis], x.dtype), jnp.asarray(self.hi[axis], x.dtype), self.intervals(axis)
         place = (x - lo) / (hi - lo)
-        if self.stretch[axis] is not None:  # type: ignore[index]
+        if self.stretch[axis] is not None:
             return self._locate_stretched(axis, x, place)
         place = place * last
         # What rounding of coordinates of the size of the ends can do to a place, in cells, with room to spare.
@@ -380,7 +381,9 @@ class Grid:
         slack = 64 * jnp.finfo(x.dtype).eps  # of the whole axis, as ``place`` runs from 0 to 1
         inside = (place >= -slack) & (place <= 1 + slack)
         nodes, last = jnp.asarray(self.axis(axis), x.dtype), self.intervals(axis)
-        guess = last * self.stretch[axis].fraction(jnp.clip(jnp.nan_to_num(place), 0, 1))  # type: ignore[index, union-attr]
+        stretch = self.stretch[axis]
+        assert stretch is not None
+        guess = last * stretch.fraction(jnp.clip(jnp.nan_to_num(place), 0, 1))
         cell = jnp.clip(jnp.floor(jax.lax.stop_gradient(guess)).astype(int), 0, last - 1)
         # the inverse map is off by rounding, and its cell by one at most: the coordinates decide
         cell = jnp.clip(cell + (x >= nodes[cell + 1]) - (x < nodes[cell]), 0, last - 1)

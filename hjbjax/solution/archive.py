@@ -43,7 +43,7 @@ def contents(solution: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
             "edges": grid.edges,
             "names": grid.names,
             "units": grid.units,
-            "stretch": [s and [float(s.strength), float(s.center)] for s in grid.stretch or ()],
+            "stretch": [s and [float(s.strength), float(s.center)] for s in grid.stretch],
         },
         "labels": solution.labels,
         "marched": None if solution.times is None else int(np.shape(solution.times)[0]),

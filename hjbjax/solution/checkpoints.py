@@ -386,7 +386,7 @@ def describe_question(problems: Sequence[Problem], grid: Grid, **others: Any) ->
         grid.shape,
         grid.periodic,
         grid.edges,
-        [each and (each.strength, each.center) for each in grid.stretch or ()],
+        [each and (each.strength, each.center) for each in grid.stretch],
     )
     ends = np.concatenate([np.asarray(grid.lo, np.float64), np.asarray(grid.hi, np.float64)])
     digests = " ".join(closures.digest(problem, grid.ndim) for problem in problems)

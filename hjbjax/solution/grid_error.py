@@ -169,7 +169,7 @@ def _exponent(fine: np.ndarray, rough: np.ndarray, ratio: float) -> np.ndarray:
 def _padded(values: np.ndarray, grid: Grid, axis: int, beyond: float | None, reach: int = 1) -> np.ndarray:
     """The values with more at both ends of an axis: around a period, else a number or the end itself."""
     width = [(reach * (i == axis),) * 2 for i in range(grid.ndim)]
-    if grid.periodic[axis]:  # type: ignore[index]
+    if grid.periodic[axis]:
         return np.pad(values, width, mode="wrap")
     return np.pad(values, width, mode="edge") if beyond is None else np.pad(values, width, constant_values=beyond)
 

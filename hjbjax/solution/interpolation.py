@@ -198,7 +198,7 @@ def _slope_along(
     is not finite, that of the parabola through the next three, or what is left of it.
     """
     cell, fraction, _ = place
-    count, cyclic = grid.shape[axis], grid.periodic[axis]  # type: ignore[index]
+    count, cyclic = grid.shape[axis], grid.periodic[axis]
     row, at = [], []  # values and coordinates of two nodes before the edge, of its two ends, and of one behind it
     coordinates = jnp.asarray(grid.axis(axis), fraction.dtype)
     for shift in (-2, -1, 0, 1, 2):
@@ -242,7 +242,7 @@ def extended(grid: Grid, values: Array, enumerated: bool) -> Any:
     for axis in range(grid.ndim):
         lost = xp.any(xp.isnan(values), axis=-1, keepdims=True)
         lower, upper = (xp.roll(values, shift, axis=first + axis) for shift in (1, -1))
-        if not grid.periodic[axis]:  # type: ignore[index]
+        if not grid.periodic[axis]:
             place = xp.arange(grid.shape[axis]).reshape(-1, *(1,) * (grid.ndim - axis))
             # ``roll`` brings the nodes of the opposite end, which are neighbours on a periodic axis alone
             lower = xp.where(place == 0, xp.nan, lower)

@@ -45,7 +45,7 @@ def telling(grid: Grid, held: np.ndarray, *, nested: bool = False) -> Grid | Non
       held: the fixed nodes, bool (*grid).
       nested: all coarse nodes are to be nodes of ``grid``.
     """
-    many = [axis for axis, count in enumerate(grid.shape) if count > 2 or grid.periodic[axis]]  # type: ignore[index]
+    many = [axis for axis, count in enumerate(grid.shape) if count > 2 or grid.periodic[axis]]
     choices = {axis: _fewer(grid.intervals(axis), nested) for axis in many}
     if not choices or not all(choices.values()):
         return None
@@ -160,7 +160,7 @@ def restrict(values: np.ndarray, fine: Grid, coarse: Grid) -> np.ndarray:
             continue
         place = np.arange(count) * (many / few)
         first = np.floor(place).astype(int) - 1
-        if not fine.periodic[axis]:  # type: ignore[index]  # near an end the four nearest, off the middle
+        if not fine.periodic[axis]:  # near an end the four nearest, off the middle
             first = np.clip(first, 0, fine.shape[axis] - 4)
         total: Any = 0
         for k in range(4):

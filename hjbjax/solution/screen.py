@@ -62,7 +62,7 @@ class _Answer(Protocol):
 def show(solution: _Answer) -> str:
     """The screen of a solution: at most 15 lines; lines of which nothing is known are left out."""
     stats, grid = solution.stats, solution.grid
-    axes = " x ".join(name + " (periodic)" * flag for name, flag in zip(grid.labels, grid.periodic or (), strict=True))
+    axes = " x ".join(name + " (periodic)" * flag for name, flag in zip(grid.labels, grid.periodic, strict=True))
     last = "" if solution.residual is None else f", last residual {solution.residual:.3g}"
     reached = 1.0 if solution.reached is None else float(np.mean(np.asarray(solution.reached)))
     compiling = f", and {number(stats['compile_seconds'])} to check and compile" if "compile_seconds" in stats else ""

@@ -95,5 +95,5 @@ def _nearest(grid: Grid, x: list[AtNodes]) -> tuple[jax.Array, ...]:
     for axis, place in enumerate(x):
         lower, fraction, _ = grid._locate(axis, place)
         index = lower + (fraction > 0.5)
-        found.append(index % grid.shape[axis] if grid.periodic[axis] else index)  # type: ignore[index]
+        found.append(index % grid.shape[axis] if grid.periodic[axis] else index)
     return tuple(found)

@@ -22,7 +22,7 @@ from hjbjax.iteration import bellman, time_stepping
 from hjbjax.iteration.time_methods import TOL, TimeMethod
 from hjbjax.iteration.time_stepping import March
 from hjbjax.problem.pytree import altered, cast
-from hjbjax.problem.types import Nodes
+from hjbjax.problem.types import Nodes, Number
 from hjbjax.solution import grid_error, nested_grids
 from hjbjax.solution.clock import Clock
 from hjbjax.solution.grid_error import TwoGrids
@@ -226,13 +226,13 @@ def _steps(task: March, longer: float) -> jax.Array:
     return jnp.where(step < float(task.horizon) / time_probes.PARTS * (1 - 1e-6), step, longer * step)
 
 
-def _limit(task: March, on: Discretisation) -> jax.Array | None:
+def _limit(task: March, on: Discretisation) -> Number | None:
     """The longest stable step on a coarser grid; None where it is found before every step.
 
     Where all spacings grow by r, the rates Q fall by r at least, and no program needs to be compiled to know it.
     """
     if task.limit is None or not task.method.limited or not math.isfinite(float(task.limit)):
-        return task.limit  # type: ignore[return-value]
+        return task.limit
     tableau, beta = task.method.tableau, float(task.problem.discount)
     fine, coarse = task.grid, on.grid
     if task.problem.target is not None or any(a == b for a, b in zip(fine.shape, coarse.shape, strict=True)):

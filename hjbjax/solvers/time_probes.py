@@ -104,8 +104,8 @@ def _places(problem: Problem, grid: Grid, random: np.random.Generator, dtype: DT
         points = np.zeros((1, 0)) if admissible is None else np.asarray(sets.samples(admissible, PLACES))
         return np.take(points, random.integers(len(points), size=PLACES), axis=0)
 
-    players = (actions(each) for each in (problem.controls, problem.disturbances))
-    return tuple(jnp.asarray(each, dtype) for each in (states, *players))  # type: ignore[return-value]
+    x, u, d = (jnp.asarray(each, dtype) for each in (states, actions(problem.controls), actions(problem.disturbances)))
+    return x, u, d
 
 
 @jax.jit

@@ -76,7 +76,7 @@ def shapes(problem: Problem, grid: Grid, scheme: Any) -> None:
 
 def refuse_stretched(grid: Grid) -> None:
     """Refuse correlated noise, σ of shape (n, k), on a stretched grid: its diagonal jumps want equal spacings."""
-    if grid.ndim > 1 and any(each is not None for each in grid.stretch or ()):
+    if grid.ndim > 1 and any(each is not None for each in grid.stretch):
         raise ValueError(
             "noise: correlated noise, σ of shape (n, k), wants equal spacings: leave out Grid.stretch, or give noise "
             "by axis, (n,)"
@@ -133,7 +133,7 @@ def _middle(grid: Grid) -> str:
     """Advice on the shape that puts a node in the middle of the box: even on a periodic axis, odd on another."""
     shape = tuple(
         count - (count % 2 if cyclic else 1 - count % 2)
-        for count, cyclic in zip(grid.shape, grid.periodic or (), strict=True)
+        for count, cyclic in zip(grid.shape, grid.periodic, strict=True)
     )
     if shape == grid.shape or min(shape) < 2:  # one stands there already, or an axis of two points would lose one
         return ""

@@ -191,7 +191,7 @@ class Marked:
         """
         leaves, structure = jax.tree.flatten((options, arguments))
         kinds = tuple(map(_kind, leaves))
-        key = (structure, kinds, jax.config.jax_enable_x64)  # type: ignore[attr-defined]
+        key = (structure, kinds, jax.config.read("jax_enable_x64"))
         if key in self._jaxprs:
             return self._jaxprs[key]
 

@@ -1,11 +1,9 @@
-"""What ``docs/benchmarks.md`` and the README quote of the recorded rows: lines made from ``benchmarks/results``.
+"""The tables of measurements in ``docs/benchmarks.md`` and the README, made from the rows in ``benchmarks/results``.
 
-Nothing is measured. A test compares their tables with these lines, so that they say what was recorded and
-nothing better.
+Nothing is measured here. A test compares both tables with these lines.
 """
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,122 +13,135 @@ from benchmarks.harness.report import RESULTS
 
 SIZES = ([200, 201], [400, 401], [800, 801], [1600, 1601])
 OURS, NUMBA, THEIRS = "hjbjax", "numba", "hj_reachability"
+PLACES = tuple(" x ".join(map(str, shape)) for shape in SIZES)
 Row = dict[str, Any]
+Figures = dict[str, float]  # by case
 
 
 def rows_of(folder: Path, benchmark: str, **wanted: Any) -> list[Row]:
-    """The rows of a benchmark that say what is ``wanted``, in order."""
+    """The rows of a benchmark whose entries equal ``wanted``, in order."""
     rows = json.loads((folder / f"{benchmark}.json").read_text(encoding="utf-8"))
     return [row for row in rows if all(row.get(key) == value for key, value in wanted.items())]
 
 
 def one(folder: Path, benchmark: str, **wanted: Any) -> Row:
-    """The only row that says what is ``wanted``."""
+    """The only row of a benchmark whose entries equal ``wanted``."""
     (row,) = rows_of(folder, benchmark, **wanted)
     return row
 
 
-def numbers(values: Sequence[float]) -> str:
-    """Two significant digits of each: .98; 2.4; 23."""
-    return "; ".join(f"{value:.2g}".replace("e+02", "00").removeprefix("0") for value in values)
+def number(value: float) -> str:
+    """Two significant digits: 0.98, 2.4, 23, 120."""
+    return f"{value:.2g}".replace("e+02", "00")
 
 
-def of_peers(folder: Path) -> dict[str, Sequence[float]]:
-    """One certified solve, beside QuantEcon and the numba solver."""
+def of_peers(folder: Path) -> dict[str, Figures]:
+    """Figures of one certified solve, compared with QuantEcon and with the numba solver."""
     ours = [one(folder, "peers", code=OURS, shape=shape) for shape in SIZES]
     numba = [one(folder, "peers", code=NUMBA, shape=shape) for shape in SIZES]
     chain = [row for row in rows_of(folder, "peers", shape=SIZES[0]) if row.get("code", "").startswith("QuantEcon")]
     best = min(chain, key=lambda row: row["seconds"])
-    places = "200 x 201, 400 x 401, 800 x 801 and 1600 x 1601"
     return {
-        "pendulum on 200 x 201, 21 controls, certified to 1e-3: seconds of the faster of QuantEcon's two methods over "
-        "ours; over those of our first call, which compiles": [
-            best["ours_is_faster"],
-            best["seconds"] / ours[0]["first_seconds"],
-        ],
-        f"the same, seconds of the numba solver over ours on {places}: below 1 it is the faster": [
-            row["ours_is_faster"] for row in numba
-        ],
-        "the same on 200 x 201 with `method=hjb.Nested()`, since the numba solver starts on coarser grids, too": [
-            numba[0]["nested_is_faster"]
-        ],
-        "the same by seconds of the processor, all threads together": [row["by_cpu_seconds"] for row in numba],
-        "seconds of our first call at those sizes": [row["first_seconds"] for row in ours],
-        "seconds of the numba solver's, whose functions are of this one problem": [
-            row["first_seconds"] for row in numba
-        ],
+        "pendulum, 21 controls, certified to 1e-3: seconds of QuantEcon's faster method / ours": {
+            f"{PLACES[0]}, compiled": best["ours_is_faster"],
+            f"{PLACES[0]}, our first call, which compiles": best["seconds"] / ours[0]["first_seconds"],
+        },
+        "the same problem: seconds of the numba solver / ours (below 1 numba is faster)": {
+            **{place: row["ours_is_faster"] for place, row in zip(PLACES, numba, strict=True)},
+            f"{PLACES[0]}, `method=hjb.Nested()` (numba also starts on coarser grids)": numba[0]["nested_is_faster"],
+        },
+        "the same problem: CPU seconds of the numba solver / ours, all threads": {
+            place: row["by_cpu_seconds"] for place, row in zip(PLACES, numba, strict=True)
+        },
+        "the same problem: seconds of our first call": {
+            place: row["first_seconds"] for place, row in zip(PLACES, ours, strict=True)
+        },
+        "the same problem: seconds of the first call of the numba solver, written for this one problem": {
+            place: row["first_seconds"] for place, row in zip(PLACES, numba, strict=True)
+        },
     }
 
 
-def of_sweeps(folder: Path) -> dict[str, Sequence[float]]:
-    """One sweep, beside the numba loop."""
-    found = [
-        one(folder, "sweep", kernel=kernel, shape=[nodes, nodes], problem="pendulum")["against_numba"]
-        for kernel in ("sweep", "step")
-        for nodes in (1024, 2048)
-    ]
+def of_sweeps(folder: Path) -> dict[str, Figures]:
+    """Figures of one sweep, compared with the numba loop."""
+    kernels = {"one sweep": "sweep", "a whole step of `solve` with its certificate": "step"}
     return {
-        "one sweep of 1024² and 2048² nodes in float32, 21 controls: seconds of the numba loop over ours, both on two "
-        "threads; the same of a whole step of `solve`, with its certificate": found
+        "pendulum in float32, 21 controls, two threads: seconds of the numba loop / ours": {
+            f"{nodes} x {nodes}, {words}": one(
+                folder, "sweep", kernel=kernel, shape=[nodes, nodes], problem="pendulum"
+            )["against_numba"]
+            for words, kernel in kernels.items()
+            for nodes in (1024, 2048)
+        }
     }
 
 
-def of_growth(folder: Path) -> dict[str, Sequence[float]]:
-    """How seconds grow with the nodes."""
+def of_growth(folder: Path) -> dict[str, Figures]:
+    """Growth of the seconds with the number of nodes."""
     middle, large = (one(folder, "growth", problem="pendulum", shape=shape) for shape in (SIZES[1], SIZES[3]))
     numba = [one(folder, "peers", code=NUMBA, shape=shape)["seconds"] for shape in (SIZES[1], SIZES[3])]
     exponents = [rows_of(folder, "growth", problem=name)[-1]["exponent"] for name in ("dubins", "manipulator")]
     return {
-        "seconds on 1600 x 1601 over those on 400 x 401, sixteen times the nodes: ours; the numba solver's": [
-            large["seconds"] / middle["seconds"],
-            numba[1] / numba[0],
-        ],
-        "seconds grow like nodes to the power of, on a Dubins car to 101 x 101 x 100 and a two-link arm to "
-        "40 x 40 x 41 x 41": exponents,
+        f"pendulum: seconds on {PLACES[3]} / seconds on {PLACES[1]}, 16 times the nodes": {
+            "ours": large["seconds"] / middle["seconds"],
+            "the numba solver": numba[1] / numba[0],
+        },
+        "exponent p of seconds = C nodes^p": {
+            "Dubins car, up to 101 x 101 x 100": exponents[0],
+            "two-link arm, up to 40 x 40 x 41 x 41": exponents[1],
+        },
     }
 
 
-def of_marches(folder: Path) -> dict[str, Sequence[float]]:
-    """Marching, beside hj_reachability."""
-    found: dict[str, Sequence[float]] = {}
+def of_marches(folder: Path) -> dict[str, Figures]:
+    """Figures of marches, compared with hj_reachability."""
+    found: dict[str, Figures] = {}
     shares = []
     for problem in ("Air3D", "4-D car"):
         ours, theirs = (rows_of(folder, "march", problem=problem, who=who) for who in (OURS, THEIRS))
         size = " x ".join(map(str, ours[0]["shape"]))
-        found[
-            f"{problem} on {size} in float32, by `Upwind`, `Eno2` and `Weno5`: seconds a step of hj_reachability 0.7 "
-            "over ours, both on two threads"
-        ] = [row["times"] for row in ours]
+        found[f"{problem} on {size} in float32, two threads: seconds per step of hj_reachability 0.7 / ours"] = {
+            f"`{name}`": row["times"] for name, row in zip(("Upwind", "Eno2", "Weno5"), ours, strict=True)
+        }
         shares += [mine["bytes_per_node"] / other["bytes_per_node"] for mine, other in zip(ours, theirs, strict=True)]
-    found["our bytes a node over its own there, least and most"] = [min(shares), max(shares)]
+    found["the same marches: our bytes per node / those of hj_reachability"] = {
+        "smallest": min(shares),
+        "largest": max(shares),
+    }
     return found
 
 
-def of_the_rest(folder: Path) -> dict[str, Sequence[float]]:
-    """Batches and starts."""
+def of_the_rest(folder: Path) -> dict[str, Figures]:
+    """Figures of gradients, batches and starts."""
     starts = [
         one(folder, "startup", problem="double-integrator", start=start)["seconds"] for start in ("cold", "cached")
     ]
     batch = one(folder, "batch", code="solve_batch")
     gradients = [row["over_solve"] for row in rows_of(folder, "gradients") if "over_solve" in row]
     return {
-        "value and gradient of a solve over the value alone, compiled, of seven questions the least and the most": [
-            min(gradients),
-            max(gradients),
-        ],
-        "`solve_batch` of 64 pendulums on 100 x 101, against one solve after the other": [batch["throughput"]],
-        "seconds of `hjbjax solve double-integrator` from process start to pictures; with JAX's compile cache": starts,
+        "seconds of value and gradient / seconds of the value, compiled, seven problems": {
+            "smallest": min(gradients),
+            "largest": max(gradients),
+        },
+        "seconds of 64 solves one by one / seconds of `solve_batch`": {"pendulums on 100 x 101": batch["throughput"]},
+        "seconds of `hjbjax solve double-integrator`, from process start to pictures": {
+            "nothing cached": starts[0],
+            "with JAX's compile cache": starts[1],
+        },
     }
 
 
 def lines(folder: Path = RESULTS) -> list[str]:
     """The lines of the table; the README has some of them."""
     parts = (of_peers, of_sweeps, of_growth, of_marches, of_the_rest)
-    return [f"| {figure} | {numbers(found)} |" for part in parts for figure, found in part(folder).items()]
+    figures = {figure: cases for part in parts for figure, cases in part(folder).items()}
+    return [
+        f"| {figure} | {case} | {number(value)} |" for figure, cases in figures.items() for case, value in cases.items()
+    ]
 
 
 @click.command()
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Folder of the rows.")
 def command(out: Path) -> None:
-    """The table of what was seen, from the recorded rows."""
-    click.echo("\n".join(["| figure | seen |", "|---|---|", *lines(out)]))
+    """Print the table of measurements from the recorded rows."""
+    click.echo("\n".join(["| figure | case | measured |", "|---|---|---|", *lines(out)]))

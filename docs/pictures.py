@@ -104,8 +104,9 @@ def gallery_page(cards: list[gallery.Card]) -> str:
     lines = [
         "# Gallery",
         "",
-        "Every ready problem of `hjb.zoo`, solved on a small grid by `python -m docs pictures`. `hjbjax gallery --out FOLDER`",
-        "makes this page on your machine, and `hjbjax solve NAME` solves one problem on its full grid.",
+        "Every ready problem of `hjb.zoo`, solved on a small grid by `python -m docs pictures`.",
+        "`hjbjax gallery --out FOLDER` makes this page on your machine. `hjbjax solve NAME` solves one problem on its",
+        "full grid.",
         "",
     ]
     for card in cards:

@@ -13,8 +13,8 @@
 # %% [markdown]
 # # Controllability and observability
 #
-# Section 4 of the chapter. Where a system without drift, $\dot x = g_1(x)u_1 + g_2(x)u_2$, has fewer inputs than
-# states, it may still reach a full neighbourhood: by switching between its inputs it moves along the bracket
+# Section 4 of the chapter. A system without drift, $\dot x = g_1(x)u_1 + g_2(x)u_2$, may reach a full neighbourhood of
+# its state although it has fewer inputs than states. By switching between its inputs it moves along the bracket
 #
 # $$[g_1, g_2] = \frac{\partial g_2}{\partial x} g_1 - \frac{\partial g_1}{\partial x} g_2.$$
 
@@ -30,7 +30,7 @@ import numpy as np
 import hjbjax as hjb
 from hjbjax import plotting
 
-warnings.simplefilter("ignore", hjb.SolveWarning)  # that paths leave the box is no matter here
+warnings.simplefilter("ignore", hjb.SolveWarning)  # paths may leave the box here
 
 car = hjb.zoo.Unicycle()
 _, (forward, turn) = hjb.geometry.affine_fields(car.drift, inputs=2)
@@ -42,8 +42,8 @@ assert np.allclose(sideways(origin), [0, -1, 0], atol=1e-6)
 # %% [markdown]
 # ## Figure 6: how a car parks
 #
-# Forward, turn, back, turn back, each for a time $\tau$: the car ends beside its start, off by $\tau^2[g_1, g_2]$ up to
-# a rest of third order. (The chapter prints $\tfrac12\tau^2$, which the figures below exclude.)
+# The car drives forward, turns, drives back and turns back, each for a time $\tau$. It ends next to its start,
+# displaced by $\tau^2[g_1, g_2] + O(\tau^3)$. (The chapter prints $\tfrac12\tau^2$, which the numbers below exclude.)
 
 # %%
 plan = jnp.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
@@ -58,7 +58,7 @@ def switched(tau):
     """The path of the four pieces, each for a time tau."""
     states = [np.zeros((1, 3))]
     for u in plan:
-        constant = jax.tree_util.Partial(hold, u)  # u as a leaf: another one compiles nothing again
+        constant = jax.tree_util.Partial(hold, u)  # u is a leaf: another u compiles nothing again
         piece = hjb.simulate(problem, constant, states[-1][-1], tau, steps=20)
         states.append(np.asarray(piece.states)[1:])
     return np.concatenate(states)
@@ -83,9 +83,9 @@ assert abs(shares[-1] + 1) < 0.06
 # %% [markdown]
 # ## Ranks
 #
-# With that bracket the fields span all three directions: the car is controllable. In Example 4.1,
-# $\dot x_1 = u$, $\dot x_2 = x_1^2$, the brackets span the plane as well, but $x_2$ never falls: the system is
-# accessible and not controllable. Rank says the first and cannot say the second.
+# Together with this bracket the fields span all three directions, so the car is controllable. In Example 4.1,
+# $\dot x_1 = u$, $\dot x_2 = x_1^2$, the brackets span the plane as well, but $x_2$ never decreases: the system is
+# accessible and not controllable. The rank condition shows accessibility only.
 
 # %%
 for depth, rank in ((0, 2), (1, 3)):
@@ -101,26 +101,26 @@ reachable = hjb.march(
     hjb.reach(one_way.drift, hjb.Box([-1.0], [1.0]), lambda x: jnp.hypot(x[0], x[1]) - 0.1, forward=True),
     hjb.Grid([-1.5, -0.5], [1.5, 1.5], (121, 81)),
     1.2,
-    scheme=hjb.Weno5(),  # the set ends in two thin tips, which a scheme of first order cuts off
+    scheme=hjb.Weno5(),  # the set has two thin tips, which a first-order scheme cuts off
 )
 figure, ax = plt.subplots(figsize=(5.4, 3.6), layout="constrained")
 place = np.linspace(-1.2, 1.2, 101)
 ax.plot(place, np.abs(place) ** 3 / 3, "--", color="0.4", label="x₂ = |x₁|³/3")
 ax.add_patch(plt.Circle((0, 0), 0.1, fill=False, label="start"))
-# without the problem, whose disc would be called a target
+# without the problem, or the disc would be labelled as a target
 plotting.zero_level_set(dataclasses.replace(reachable, problem=None), ax=ax, label="reached by t = 1.2")
 ax.set_aspect("equal")
-ax.set_title("", loc="right")  # the set grows forward in time, and the legend says until when
+ax.set_title("", loc="right")  # no title: the legend gives the time of the set
 plt.show()
 assert reachable.value_at(0.0, [1.2, 1.2**3 / 3]) < 0  # straight on at full speed
-assert reachable.value_at(0.0, [-1.35, 0.8]) > 0  # farther than speed one gets
+assert reachable.value_at(0.0, [-1.35, 0.8]) > 0  # too far for speed one
 assert reachable.value_at(0.0, [0.0, -0.3]) > 0
 
 # %% [markdown]
 # ## Observability
 #
-# Seen through $(\cos x, \sin x)$, as in Example 4.2, a state on the line is told apart from its neighbours, so that the
-# rank is full, and not from those a whole turn away: observability is a local verdict.
+# The output $(\cos x, \sin x)$ of Example 4.2 distinguishes a state on the line from its neighbours, so the rank is
+# full. It does not distinguish states that are a full turn apart: the rank condition for observability is local.
 
 # %%
 angle = hjb.zoo.Angle()

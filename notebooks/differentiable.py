@@ -13,8 +13,8 @@
 # %% [markdown]
 # # A solver that can be differentiated
 #
-# Numbers in a problem are leaves of a pytree. So a value has a derivative with respect to them, and so has the feedback
-# at a state: design and imitation become descent.
+# Numbers in a problem are leaves of a pytree. A value and the feedback at a state can be differentiated with respect to
+# them, so you can optimise a design or imitate a controller by gradient methods.
 
 # %%
 import jax
@@ -39,7 +39,8 @@ def regulated(weight, strength=1.0):
 # %% [markdown]
 # ## The derivative of a value
 #
-# How much is a stronger motor worth? $V = \tfrac12 P x^2$ with $\tfrac32 P + s^2P^2/w = 1$ tells it in closed form.
+# How much is a stronger motor worth? The closed form for comparison is $V = \tfrac12 P x^2$ with
+# $\tfrac32 P + s^2P^2/w = 1$.
 
 
 # %%
@@ -59,8 +60,8 @@ assert abs(slope - wanted) < 0.03 * abs(wanted)
 # %% [markdown]
 # ## Imitation
 #
-# Somebody steers well, and we see their controls at a few states. Which weight on the control do they have in mind?
-# `control_at` is differentiable, so that Gauss and Newton find it.
+# We observe the controls of an expert at a few states. Which weight on the control does the expert use? `control_at` is
+# differentiable, so the Gauss–Newton method finds the weight.
 
 # %%
 places = np.array([[0.5], [1.0], [1.5]])

@@ -13,8 +13,8 @@
 # %% [markdown]
 # # Growth, a portfolio, and a put
 #
-# Three problems of economics, each with an answer to compare with: the equation of dynamic programming is the same,
-# only the signs are those of a cost.
+# Three problems of economics, each with a known answer. The equation of dynamic programming is the same as in control;
+# utility enters as a negative cost.
 
 # %%
 import warnings
@@ -32,8 +32,8 @@ warnings.simplefilter("ignore", hjb.SolveWarning)
 # %% [markdown]
 # ## How much of the capital to eat
 #
-# Capital grows by $k^{.36} - .05k$ and shrinks by what is consumed; utility is $c^{.64}/.64$, discounted at 4 %. With
-# these numbers the best consumption is exactly proportional to the capital.
+# Capital grows at the rate $k^{0.36} - 0.05k$ minus consumption $c$. Utility is $c^{0.64}/0.64$, discounted at 4 %. For
+# these numbers the optimal consumption is exactly proportional to the capital.
 
 # %%
 capital = hjb.Problem(
@@ -54,8 +54,8 @@ assert abs(growth.control_at([5.0])[0] - 5 * share) < 0.01
 # %% [markdown]
 # ## Merton's portfolio
 #
-# Wealth earns interest or, at risk, more; constant relative risk aversion makes the best share at risk the
-# same for rich and poor. The picture shows a constant, and is drawn as one.
+# Wealth earns interest, or a higher and risky return. With constant relative risk aversion the optimal risky share does
+# not depend on wealth, so the picture shows a constant.
 
 # %%
 problem, grid = hjb.zoo.merton()
@@ -71,15 +71,16 @@ assert abs(portfolio.control_at([0.0])[0] - best.share) < 0.01
 # %% [markdown]
 # ## An American put
 #
-# The right to sell at 1 may be used at any time: a problem of optimal stopping, $V \ge$ what it pays, over the
-# logarithm of the price. The European put, which waits for the end, has the formula of Black and Scholes.
+# The right to sell at 1 may be exercised at any time. This is a problem of optimal stopping in the logarithm of the
+# price, and the value of the put is at least the payoff. The European put, exercised at the end only, has the formula
+# of Black and Scholes.
 
 # %%
 rate, sigma, horizon = 0.06, 0.3, 1.0
 
 
 def shortfall(x):
-    return -jnp.maximum(1 - jnp.exp(x[0]), 0.0)  # a cost: what is paid, with a minus
+    return -jnp.maximum(1 - jnp.exp(x[0]), 0.0)  # a cost: minus the payoff
 
 
 def price(early):

@@ -13,11 +13,11 @@
 # %% [markdown]
 # # Feedback holds a pendulum up
 #
-# Section 2 of the chapter: a pendulum, its angle measured from upright, with a torque at its pivot,
+# Section 2 of the chapter: a pendulum with a torque at its pivot. The angle is measured from upright:
 #
 # $$m\ddot\theta - m g\sin\theta = \tau. \qquad (2.1)$$
 #
-# Figures 3 to 5 of the chapter show the pendulum, and what it does without and with feedback.
+# Figure 3 of the chapter shows the pendulum. Below it falls without a torque and is stabilised by feedback.
 
 # %%
 import jax.numpy as jnp
@@ -56,8 +56,9 @@ plt.show()
 # %% [markdown]
 # ## Figure 4: without a torque
 #
-# Upright is an equilibrium, and an unstable one: the linearisation has the eigenvalues $\pm\sqrt g$. A pendulum that is
-# let go swings through hanging and comes back; its energy $\tfrac12\dot\theta^2 + g\cos\theta$ does not change.
+# Upright is an unstable equilibrium: the linearisation has the eigenvalues $\pm\sqrt g$. A pendulum that is released
+# near upright swings through the hanging position and back. Its energy $\tfrac12\dot\theta^2 + g\cos\theta$ is
+# constant.
 
 # %%
 fall = hjb.simulate(problem, lambda x: jnp.zeros(1), start, duration, rtol=1e-8, atol=1e-8)
@@ -72,12 +73,12 @@ plt.show()
 # %% [markdown]
 # ## Figure 5: with feedback
 #
-# The torque of (2.7) cancels gravity and adds friction and a spring:
+# The torque of (2.8) cancels gravity and adds friction and a spring:
 #
 # $$\tau = -m g\sin\theta - k_1\dot\theta - k_2\theta.$$
 #
-# With $k_1 = 3m$ and $k_2 = 2m$ the angle obeys $\ddot\theta + 3\dot\theta + 2\theta = 0$, and from rest at $\theta_0$
-# it is $\theta_0(2e^{-t} - e^{-2t})$.
+# With $k_1 = 3m$ and $k_2 = 2m$ the angle obeys $\ddot\theta + 3\dot\theta + 2\theta = 0$. Starting at rest at
+# $\theta_0$, it is $\theta_0(2e^{-t} - e^{-2t})$.
 
 
 # %%
@@ -97,7 +98,7 @@ plt.show()
 # %% [markdown]
 # ## In the plane of angle and velocity
 #
-# The same two paths, over the arrows of the closed loop.
+# The same two paths, drawn over the vector field of the closed loop.
 
 # %%
 angles, rates = np.meshgrid(np.linspace(-np.pi, np.pi, 21), np.linspace(-6, 6, 21))

@@ -13,9 +13,9 @@
 # %% [markdown]
 # # Feedback linearisation
 #
-# Section 5 of the chapter: where an output $y$ has a relative degree $r$, its $r$-th derivative is
-# $L_f^r h + L_g L_f^{r-1} h\,u$, and the feedback $u = \alpha(x) + \beta(x)v$ makes it equal to $v$. What is left of
-# the system, if anything, is its zero dynamics.
+# Section 5 of the chapter: if an output $y$ has relative degree $r$, its $r$-th derivative is
+# $L_f^r h + L_g L_f^{r-1} h\,u$, and the feedback $u = \alpha(x) + \beta(x)v$ makes it equal to $v$. If $r$ is smaller
+# than the number of states, the rest of the system is its zero dynamics.
 
 # %%
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ from hjbjax import plotting
 # %% [markdown]
 # ## A flexible joint
 #
-# A link driven through a spring has four states; its angle has relative degree four, and nothing is left over.
+# A link driven through a spring has four states. Its angle has relative degree four, so there are no zero dynamics.
 
 # %%
 arm = hjb.zoo.FlexibleJoint()
@@ -38,7 +38,7 @@ print(degree.message)
 assert degree.degree == 4
 
 # %% [markdown]
-# The ball on a beam is another matter: its degree breaks down where the beam is level, and no change of
+# The ball on a beam is different: its relative degree is not defined where the beam is level, and no change of
 # coordinates makes it linear.
 
 # %%
@@ -51,10 +51,10 @@ assert not verdict.linearisable
 # %% [markdown]
 # ## Figure 7: a manipulator follows a path
 #
-# For a planar arm, $M(q)\ddot q + C(q, \dot q) + G(q) = \tau$, the torque computed as
+# For a planar arm, $M(q)\ddot q + C(q, \dot q) + G(q) = \tau$, the computed torque
 # $\tau = M(q)a + C(q, \dot q) + G(q)$ makes each joint a double integrator. With
 # $a = \ddot q^* - k_1(\dot q - \dot q^*) - k_2(q - q^*)$ the error decays as if there were neither inertia nor gravity.
-# Here two links draw circles with their joints, from a start that is half a radian off.
+# Here the joint angles of two links follow sine and cosine, from a start that is half a radian off.
 
 # %%
 links = hjb.zoo.Manipulator(links=2)

@@ -13,9 +13,9 @@
 # %% [markdown]
 # # The chain on the grid
 #
-# Section 13 of the chapter: the state is replaced by a particle that jumps between the nodes of a grid, to neighbours
-# with the probabilities (13.3), such that it moves on average as the system does. The value of the chain converges to
-# the value of the system, whatever kinks that has.
+# Section 13 of the chapter: a particle that jumps between the nodes of a grid replaces the state. It jumps to
+# neighbours with the probabilities (13.3), so that it moves on average as the system does. The value of the chain
+# converges to the value of the system, even if that has kinks.
 
 # %%
 import tempfile
@@ -32,8 +32,8 @@ from hjbjax import plotting
 # %% [markdown]
 # ## Figure 16: the particle
 #
-# A mass is brought to rest in the least time. The generator of the optimal chain is a matrix; its exponential clock and
-# its jumps are drawn here as a particle on the grid, from rest at one.
+# A mass is brought to rest in the least time. The generator of the optimal chain is a matrix. A particle starts at rest
+# at one; its exponential waiting times and its jumps are drawn at random.
 
 # %%
 count = 41
@@ -49,7 +49,7 @@ node, t = np.ravel_multi_index((3 * (count - 1) // 4, (count - 1) // 2), grid.sh
 visited, clock = [node], [t]
 states = grid.nodes().reshape(-1, 2)
 while np.linalg.norm(states[node]) > 0.2 and len(visited) < 400:
-    row = matrix[[node]]  # as a matrix of one row
+    row = matrix[[node]]  # a matrix with one row
     jumps = row.indices != node
     targets, rates = row.indices[jumps], row.data[jumps]
     t += random.exponential(1 / rates.sum())
@@ -59,7 +59,7 @@ while np.linalg.norm(states[node]) > 0.2 and len(visited) < 400:
 places = states[visited]
 print(f"{len(places) - 1} jumps in a time of {t:.2f}; the least time is about 2")
 assert np.linalg.norm(places[-1]) <= 0.2
-assert np.abs(np.diff(places, axis=0)).max() < 0.1 + 1e-9  # to neighbours alone
+assert np.abs(np.diff(places, axis=0)).max() < 0.1 + 1e-9  # only to neighbours
 
 figure, ax = plt.subplots(figsize=(5.4, 4.2), layout="constrained")
 plotting.value(solution, ax=ax)
@@ -69,7 +69,7 @@ ax.plot(*states.T, ".", color="white", markersize=0.8, alpha=0.5)
 plt.show()
 
 # %% [markdown]
-# The same, moving:
+# The same particle as an animation:
 
 
 # %%
@@ -88,8 +88,8 @@ Image(film, format="webp")
 # %% [markdown]
 # ## What finer grids cost
 #
-# With $n$ states and $N$ nodes an axis there are $N^n$ of them: halving the spacing makes twice, four times, eight
-# times as many. The error of the monotone chain falls like the spacing; that is the curse of dimension in one table.
+# With $n$ states and $N$ nodes per axis a grid has $N^n$ nodes. Halving the spacing multiplies the number of nodes by
+# $2^n$ and halves the error of the monotone chain. This is the curse of dimensionality:
 
 # %%
 errors = {}

@@ -13,17 +13,17 @@
 # %% [markdown]
 # # Minimum time
 #
-# A mass on a line is to be brought to rest at the origin as fast as possible by a force of at most one:
+# A force of at most one brings a mass on a line to rest at the origin as fast as possible:
 #
 # $$\dot x_1 = x_2, \qquad \dot x_2 = u, \qquad |u| \le 1.$$
 #
-# The least time $T(x)$ is known in closed form, and its level sets have a kink along the switching curve
+# The least time $T(x)$ is known in closed form, and has a kink along the switching curve
 # $x_1 = -\tfrac12 x_2|x_2|$. The chapter solves the discounted problem (8.14), whose value
 #
 # $$S(x) = 1 - e^{-T(x)}$$
 #
 # stays below one and satisfies $S = 1 + \min_u f(x,u)\cdot DS$ away from the origin. Figures 8 and 9 of the chapter
-# show $S$ and the feedback; here they stand beside the exact answer.
+# show $S$ and the feedback. This notebook compares both with the exact answer.
 
 # %%
 import warnings
@@ -35,13 +35,13 @@ import numpy as np
 import hjbjax as hjb
 from hjbjax import plotting
 
-warnings.simplefilter("ignore", hjb.SolveWarning)  # that the grid is coarse for this problem is looked at below
+warnings.simplefilter("ignore", hjb.SolveWarning)  # the coarse grid is studied below
 
-nodes = 201  # an axis; odd, so that the origin is a node
+nodes = 201  # per axis; odd, so that the origin is a node
 
 # %% [markdown]
-# The zoo has the problem with its exact answer. A single node resolves the target poorly, since $S$ is only Hölder
-# continuous there; so the exact value is held on a small disc around the origin.
+# The zoo contains the problem and its exact answer. $S$ is only Hölder continuous at the origin, so a target of one
+# node is inaccurate. The problem therefore prescribes the exact value on a small disc around the origin.
 
 # %%
 problem, grid = hjb.zoo.double_integrator(shape=(nodes, nodes))
@@ -66,9 +66,9 @@ axes[1].set_xlabel(grid.labels[0])
 plt.show()
 
 # %% [markdown]
-# The screen above shows two errors. What the iteration left is bounded; the distance to $S$ is another matter, and is
-# estimated from a coarser grid: the scheme rounds the kink off, and since optimal paths run along the kink, the error
-# converges slowly. Refining the grid shows it, on the inner half of the box, where the edge is not felt:
+# The printout above shows two errors. The error of the iteration has a bound. The distance to $S$ is estimated from a
+# coarser grid. The scheme rounds the kink off, and optimal paths run along the kink, so this error converges slowly.
+# The errors on finer grids, on the inner half of the box, which the boundary does not affect:
 
 # %%
 for count in (nodes // 4 + 1, nodes // 2 + 1, nodes):
@@ -83,7 +83,7 @@ print(f"S(1, 0): computed {solution.value_at([1.0, 0.0]):.3f}, exact {1 - np.exp
 # %% [markdown]
 # ## Figure 9: the feedback and its switching curve
 #
-# The computed curve lies on the early side of the exact one: with diffusion in the model it pays to brake early.
+# The computed feedback switches slightly too early: with the numerical diffusion of the chain it pays to brake early.
 
 # %%
 velocity = np.linspace(-2.0, 2.0, 201)
@@ -97,11 +97,11 @@ plt.show()
 # ## The closed loop
 #
 # From rest at one the least time is two: full force towards the origin for one unit of time, then full force back. The
-# run stops on the disc where the exact value is held.
+# path stops on the disc where the exact value is prescribed.
 #
-# Between the nodes the solution's control is a mean, and a mean of full forces is no full force. `greedy_feedback`
-# minimises the Hamiltonian at the state instead; a jumping control is sampled, here every hundredth of a unit. Its path
-# costs what the computed value says, with the early braking of Figure 9.
+# Between the nodes `control_at` is a mean, and the mean of two opposite full forces is not a full force.
+# `greedy_feedback` minimises the Hamiltonian at the state instead. The control jumps, so it is sampled every 0.01 time
+# units. The cost of the path equals the computed value, including the early braking of Figure 9.
 
 # %%
 feedback = hjb.greedy_feedback(problem, solution)

@@ -13,13 +13,13 @@
 # %% [markdown]
 # # Output feedback
 #
-# The state $x$ is not measured. What is seen is
+# The state $x$ is not measured. The measurement is
 #
 # $$dy = h(x)\,dt + r\,dv,$$
 #
-# and the control is a function of an *information state* that an observer makes of the record. Section 12 of the
-# chapter has three of them, in the loops of its figures 13 to 15: the estimate of an observer (12.3), the law of the
-# state given the record (12.6), and the robust information state (12.10).
+# and the control is a function of an *information state*, which an observer computes from the record. Section 12 of the
+# chapter has three information states, in the loops of its figures 13 to 15: the estimate of an observer (12.3), the
+# law of the state given the record (12.6), and the robust information state (12.10).
 
 # %%
 import warnings
@@ -32,14 +32,14 @@ import numpy as np
 import hjbjax as hjb
 from hjbjax import filtering, plotting
 
-warnings.simplefilter("ignore", hjb.SolveWarning)  # that the grids are coarse is no matter here
+warnings.simplefilter("ignore", hjb.SolveWarning)  # coarse grids are accurate enough here
 
 # %% [markdown]
 # ## Figure 13: an estimate in the loop
 #
-# A pendulum is seen by its angle alone. The torque is bounded by .7 of what gravity pulls with, so that the pendulum
-# has to be swung up, and its velocity is not measured. The value function is solved as if the state were known; an
-# extended Kalman filter says where it is. The loop: plant, sensor, observer, and the optimal feedback at the estimate.
+# Only the angle of a pendulum is measured. The torque is at most 0.7 times the largest torque of gravity, so the
+# pendulum has to be swung up. The value function is computed as if the state were known, and an extended Kalman filter
+# estimates the state. The loop consists of plant, sensor, observer, and the optimal feedback at the estimate.
 
 
 # %%
@@ -51,7 +51,7 @@ def effort(x, u):
     return 2 * (1 - jnp.cos(x[0])) + 0.5 * x[1] ** 2 + 0.1 * u[0] ** 2
 
 
-def angle(x):  # as an encoder sees it
+def angle(x):  # the measurement of an encoder
     return jnp.stack([jnp.sin(x[0]), jnp.cos(x[0])])
 
 
@@ -68,7 +68,7 @@ plotting.estimates(path, grid=grid, ax=ax)
 plt.show()
 
 # %% [markdown]
-# It ends upright, and the estimate of the angle stays within a few degrees.
+# The pendulum ends upright, and the error of the estimated angle stays within a few degrees.
 
 # %%
 assert np.all(np.cos(path.states[path.times > 17, 0]) > 0.95)
@@ -77,8 +77,8 @@ assert np.max(np.abs(np.sin(path.estimates[50:, 0] - path.states[50:, 0]))) < 0.
 # %% [markdown]
 # ## Figure 14: the law of the state
 #
-# Where the sensor sees $x^2$ alone, two states fit every record. A Kalman filter believes in one of them; the law on
-# a grid, by the Duncan–Mortensen–Zakai equation (12.6), has both, until drift tells them apart.
+# If the sensor measures $x^2$, two states fit every record. A Kalman filter follows one of them. The law on a grid,
+# from the Duncan–Mortensen–Zakai equation (12.6), contains both until the drift distinguishes them.
 
 # %%
 line = hjb.Grid([-3.0], [3.0], (241,))
@@ -102,15 +102,15 @@ assert np.max(np.abs(mass - 1)) < 1e-10
 assert law.density.min() >= 0
 
 # %% [markdown]
-# ## Figure 15: the robust information state, and what it buys
+# ## Figure 15: the robust information state and its gain
 #
-# On $\dot x = x + u + w$, $y = 2x + v$ with cost $\tfrac12\int x^2 + u^2$, Kalman's filter with the regulator's gain is
-# optimal for white noise. The minimum-stress controller takes the state where $p + V$ is largest for the true one, with
-# $p$ the robust information state for $\gamma = 2.5$ and $V$ the value of the game: it keeps
-# $\int |z|^2 \le \gamma^2 \int |w|^2 + |v|^2$ whatever the disturbances do. The third controller minimises the
-# Hamiltonian averaged over the law of the state.
+# For $\dot x = x + u + w$, $y = 2x + v$ with cost $\tfrac12\int x^2 + u^2$, the Kalman filter with the regulator's gain
+# is optimal for white noise. The minimum-stress controller acts as if the state were the maximiser of $p + V$, where
+# $p$ is the robust information state for $\gamma = 2.5$ and $V$ the value of the game. It guarantees
+# $\int |z|^2 \le \gamma^2 \int |w|^2 + |v|^2$ for all disturbances. The third controller minimises the Hamiltonian
+# averaged over the law of the state.
 #
-# The largest gain of each loop is the largest singular value of its response to unit disturbances in each interval.
+# The largest gain of a loop is the largest singular value of its response to unit disturbances in each interval.
 
 # %%
 gamma, noise, dt, steps = 2.5, 0.3, 0.1, 60
@@ -171,9 +171,8 @@ for name, (observer, control) in controllers.items():
     print(f"{name:22} mean cost {figures[name][0]:.3f} ± {figures[name][1]:.3f}, largest gain {gain:.2f}")
 
 # %% [markdown]
-# Each is best at what it is made for: the first two at the mean cost, the third at the gain, which alone it keeps
-# below 2.5.
-# One of its paths: the state, and the state that is the worst of those that fit the record.
+# Each controller is best at its own criterion: the first two have the lowest mean cost, and only the third keeps the
+# gain below 2.5. One path of the third: the state, and the worst state that fits the record.
 
 # %%
 figure, ax = plt.subplots(figsize=(8, 3), layout="constrained")
@@ -188,10 +187,10 @@ assert abs(cost["averaged Hamiltonian"] - cost["certainty equivalence"]) < 0.05 
 # %% [markdown]
 # ## Two hidden states: dual control
 #
-# A machine works or stands, and fails at the rate .3. Its sound tells which, through noise. A repair runs at the rate
-# $u$ and costs even where nothing is broken. The belief $\pi$ that the machine works is a diffusion whose value
-# function is that of a stationary problem of this library, with degenerate noise; a better sensor bends it down, and
-# the one who sees the state pays the chord below all of them.
+# A machine either works or is broken, and fails at the rate 0.3. Its sound is a noisy measurement of its state. A
+# repair runs at the rate $u$ and costs even if nothing is broken. The belief $\pi$ that the machine works is a
+# diffusion, and its control is a stationary problem with degenerate noise. A better sensor lowers the value. With
+# perfect measurement of the state the value is the straight line below all curves.
 
 
 # %%
@@ -199,7 +198,7 @@ def repaired(u):
     return jnp.stack([jnp.stack([-0.3, 0.3]), jnp.stack([u[0], -u[0]])])
 
 
-def price(u):  # per unit time, in the state that works and in the one that stands
+def price(u):  # per unit time, for the states 'works' and 'broken'
     return jnp.stack([2 * u[0], 2.0 + u[0]])
 
 

@@ -13,13 +13,13 @@
 # %% [markdown]
 # # Swinging up a pendulum
 #
-# A pendulum with a torque at its pivot, its angle measured from upright, as in (2.1) of the chapter at unit length:
+# A pendulum of unit length with a torque at its pivot, as in (2.1) of the chapter. The angle is measured from upright:
 #
 # $$m\ddot\theta - m g \sin\theta = \tau.$$
 #
-# It is to be swung up and held there at the cost $\int \tfrac12(\theta^2 + \dot\theta^2 + \tau^2)\,dt$, without
-# discount. The angle lives on a circle; upright at rest costs nothing, and that is what makes the value finite.
-# Figures 10 to 12 of the chapter, with the pendulum (9.4), show the value, the feedback and a stabilising trajectory.
+# Swing it up and hold it upright at the cost $\int \tfrac12(\theta^2 + \dot\theta^2 + \tau^2)\,dt$, without discount.
+# The angle is periodic. The value is finite because resting upright costs nothing. Figures 10 to 12 of the chapter,
+# with the pendulum (9.4), show the value, the feedback and a stabilising trajectory.
 
 # %%
 import matplotlib.pyplot as plt
@@ -55,8 +55,8 @@ plt.show()
 # %% [markdown]
 # ## An independent answer: near upright
 #
-# Close to the rest point $\sin\theta \approx \theta$, the torque is far from its bound, and the value is the quadratic
-# form of the Riccati equation, which SciPy solves. At rest, along the angle:
+# Near the rest point $\sin\theta \approx \theta$ and the torque is far from its bound. So the value is the quadratic
+# form of the Riccati equation, which SciPy solves. For velocity zero, as a function of the angle:
 
 # %%
 riccati = hjb.zoo.pendulum_near_upright()
@@ -72,9 +72,9 @@ ax.legend(loc="lower left", frameon=False)
 plt.show()
 
 # %% [markdown]
-# They part at a kink: from there on it is cheaper to let the pendulum fall through and to come up on the other side,
-# which no linearisation knows of. Inside, the difference is the sine against its tangent and the error of the grid,
-# whose estimate the screen above shows.
+# The two curves separate at a kink. Beyond it, it is cheaper to let the pendulum fall and come up on the other side,
+# which a linearisation cannot describe. Inside, the difference has two sources: the linearisation of the sine, and the
+# grid error, which is estimated in the printout above.
 
 # %%
 for angle in (0.2, 0.4):
@@ -83,7 +83,7 @@ for angle in (0.2, 0.4):
 # %% [markdown]
 # ## Figure 12: a stabilising trajectory
 #
-# From nearly hanging, far outside the linear region, at rest:
+# The start is nearly hanging, at rest, and far outside the linear region:
 
 # %%
 path = hjb.simulate(problem, solution, x0=[2.8, 0.0], duration=6.0)
@@ -94,13 +94,13 @@ plotting.closed_loop(solution, path)
 plt.show()
 
 # %% [markdown]
-# The cost that the simulated path really pays and the value computed on the grid are two roads to one number. The path
-# uses the feedback between the nodes; the value carries the error of the scheme.
+# The cost of the simulated path and the value on the grid are two approximations of the same number. The path uses the
+# feedback between the nodes, and the value has the error of the scheme.
 #
 # ## Pontryagin's costates
 #
-# A third road needs no grid: along an optimal path the costate $\lambda$ of Pontryagin's principle is the gradient of
-# the value. Its boundary-value problem is solved by collocation, from the Riccati feedback as the first guess.
+# A third approximation needs no grid: along an optimal path the costate $\lambda$ of Pontryagin's principle is the
+# gradient of the value. The boundary-value problem is solved by collocation, starting from the Riccati feedback.
 
 # %%
 start = [0.5, 0.0]
@@ -116,8 +116,8 @@ plt.show()
 # %% [markdown]
 # ## As printed
 #
-# The chapter prints (9.4) with the input gain $g/m$ in place of $1/m$. The figures there may have been made with it, so
-# the zoo keeps it, with a bound of 6 on the torque:
+# The chapter prints (9.4) with the input gain $g/m$ instead of $1/m$. Its figures may have been made with this gain, so
+# the zoo keeps it as an option, with a bound of 6 on the torque:
 
 # %%
 printed, _ = hjb.zoo.pendulum(as_printed=True, shape=(nodes - 1, nodes))

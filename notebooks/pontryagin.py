@@ -11,11 +11,11 @@
 # ---
 
 # %% [markdown]
-# # Pontryagin's principle beside dynamic programming
+# # Pontryagin's principle and dynamic programming
 #
-# Section 8 of the chapter has two roads to an optimal control. Dynamic programming solves a partial differential
-# equation for the value of every state. Pontryagin's principle, (8.4) to (8.7), solves a boundary-value problem along
-# one path; its costate $\lambda$ is the gradient of the value there.
+# Section 8 of the chapter has two methods for an optimal control. Dynamic programming solves a partial differential
+# equation for the value of every state. Pontryagin's principle, (8.4) to (8.7), is a boundary-value problem along one
+# path. Its costate $\lambda$ is the gradient of the value along the path.
 
 # %%
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ from hjbjax import plotting
 # %% [markdown]
 # ## A mass at a quadratic cost
 #
-# A force moves a mass to the origin at the cost $\tfrac12\int |x|^2 + u^2\,dt$: linear and quadratic, so that the
+# A force moves a mass to the origin at the cost $\tfrac12\int |x|^2 + u^2\,dt$. The problem is linear-quadratic, so the
 # value is $\tfrac12 x^\top P x$ with $P$ from the Riccati equation.
 
 
@@ -53,9 +53,9 @@ print(f"cost by dynamic programming {solution.value_at(0.0, start):.4f}, by Pont
 assert abs(solution.value_at(0.0, start) - extremal.cost) < 0.01
 
 # %% [markdown]
-# ## Two roads to one curve
+# ## Costates and gradients
 #
-# The costates, and broken beneath them the slopes of the value along the same path.
+# The costates (solid) and the gradient of the value along the same path (dashed):
 
 # %%
 figure, ax = plt.subplots(figsize=(6.4, 3.4), layout="constrained")
@@ -69,11 +69,11 @@ print(f"largest difference {difference:.3f} of costates up to {np.abs(extremal.c
 assert difference < 0.05
 
 # %% [markdown]
-# ## What each is good for
+# ## Strengths of the two methods
 #
-# The extremal is accurate to many digits and needs no grid, however many states there are; but it is one path from one
-# state, and its control is a function of the time. The value is a number for every state, and its feedback answers a
-# disturbance. Pushed off its path, the open loop does not come back.
+# The extremal is accurate to many digits and needs no grid, whatever the number of states. But it is one path from one
+# state, and its control is a function of time. The value function gives a feedback for every state, which reacts to
+# disturbances. After a disturbance the open loop does not return to the origin.
 
 # %%
 pushed = [1.0, 0.5]

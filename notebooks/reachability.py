@@ -13,8 +13,8 @@
 # %% [markdown]
 # # Reachability for robots
 #
-# Who can get where, and who cannot be kept away. Sets are given by signed distances, and tubes are zero level sets of a
-# value: `reach` for "can be brought there", `avoid` for "cannot be kept away".
+# Which states can be brought to a target, and from which states is an obstacle unavoidable? Sets are given by signed
+# distances, and the answers are zero level sets of a value: `reach` for the first question, `avoid` for the second.
 
 # %%
 import warnings
@@ -38,7 +38,8 @@ def disc(x):
 # %% [markdown]
 # ## A car that cannot turn on the spot
 #
-# Dubins' car drives at speed 1 and turns at a rate of at most 1. From where does it get to the disc within two seconds?
+# Dubins' car drives at speed 1 and turns at a rate of at most 1. From which states does it reach the disc within two
+# seconds?
 
 
 # %%
@@ -48,8 +49,8 @@ def car(x, u):
 
 grid = hjb.Grid([-4.0, -4.0, -jnp.pi], [4.0, 4.0, jnp.pi], (31, 31, 24), **box)
 tube = hjb.march(hjb.reach(car, hjb.Box([-1.0], [1.0]), disc), grid, 2.0, scheme=hjb.Limited(split=True))
-assert tube.value_at(0.0, [-2.5, 0.0, 0.0]) < 0  # heads for the disc from 1.5 away
-assert tube.value_at(0.0, [2.5, 0.0, 0.0]) > 0  # heads away from it
+assert tube.value_at(0.0, [-2.5, 0.0, 0.0]) < 0  # towards the disc, 1.5 away from it
+assert tube.value_at(0.0, [2.5, 0.0, 0.0]) > 0  # away from the disc
 
 figure = plt.figure(figsize=(10, 4.4), layout="constrained")
 plotting.zero_level_set(tube, ax=figure.add_subplot(1, 2, 1, projection="3d"))
@@ -59,8 +60,8 @@ plt.show()
 # %% [markdown]
 # ## Air3D: two aircraft
 #
-# The classical game: the evader, at the origin of a moving frame, turns to keep the pursuer five units away; both fly
-# at speed 5 and turn at 1. `avoid` gives the states in which the pursuer wins, and the picture shades them.
+# In this classical game the evader, at the origin of a moving frame, turns to keep the pursuer five units away. Both
+# fly at speed 5 and turn at a rate of at most 1. `avoid` gives the states in which the pursuer wins, which are shaded.
 
 
 # %%
@@ -83,8 +84,8 @@ plt.show()
 # %% [markdown]
 # ## A safety filter
 #
-# A mass heads for a wall under a pilot who pushes it forward all the time. The filter leaves the pilot alone as long as
-# the tube says that braking still helps, and takes over a cell before it would not.
+# A pilot constantly pushes a mass towards a wall. The filter passes the pilot's control through as long as braking
+# still prevents the crash, and takes over one cell before it would be too late.
 
 
 # %%

@@ -13,11 +13,11 @@
 # %% [markdown]
 # # Robust control
 #
-# Section 11 of the chapter: the disturbance is not a noise but an opponent. A feedback has gain at most $\gamma$ if
+# Section 11 of the chapter: the disturbance is an opponent instead of noise. A feedback has gain at most $\gamma$ if
 #
 # $$\int |z|^2\,dt \le \gamma^2 \int |d|^2\,dt + 2V(x_0)$$
 #
-# whatever $d$ does. The least such $V$ is the value of a game and solves Isaacs' equation, as in (11.7),
+# for all disturbances $d$. The smallest such $V$ is the value of a game and solves Isaacs' equation, as in (11.6),
 #
 # $$0 = \min_u\max_d\,[\,DV\cdot(f + d) + \tfrac12|z|^2 - \tfrac12\gamma^2|d|^2\,].$$
 
@@ -33,7 +33,7 @@ from hjbjax import plotting
 warnings.simplefilter("ignore", hjb.SolveWarning)
 
 plant = hjb.Problem(lambda x, u: u - x, lambda x, u: 0.5 * (x @ x + u @ u), hjb.Box([-4.0], [4.0]))
-grid = hjb.Grid([-1.5], [1.5], (61,))  # wider than what is shown: at its ends the drift is cut
+grid = hjb.Grid([-1.5], [1.5], (61,))  # wider than the picture, because the drift is cut off at the ends
 
 
 def game(gamma):
@@ -43,8 +43,8 @@ def game(gamma):
 # %% [markdown]
 # ## The price of a smaller gain
 #
-# For $\dot x = -x + u + d$ the value is $\tfrac12 P x^2$ with $P^2(1 - \gamma^{-2}) + 2P = 1$. Demanding a smaller gain
-# makes the value larger and the feedback stiffer, until at $\gamma = 1/\sqrt2$ no feedback keeps it.
+# For $\dot x = -x + u + d$ the value is $\tfrac12 P x^2$ with $P^2(1 - \gamma^{-2}) + 2P = 1$. A smaller gain requires
+# a larger value and a stiffer feedback. Below $\gamma = 1/\sqrt2$ no feedback achieves it.
 
 # %%
 shown = np.abs(grid.axis(0)) < 1 + 1e-9
@@ -66,7 +66,7 @@ plt.show()
 # %% [markdown]
 # ## The least gain
 #
-# Bisection finds it: below, $V$ runs away; above, it settles.
+# `hinf_level` finds it by bisection: $V$ settles above the least gain, and grows without bound below it.
 
 # %%
 level = hjb.hinf_level(game, hjb.Grid([-1.0], [1.0], (21,)), lo=0.6, hi=0.9)

@@ -14,8 +14,8 @@
 # # Stabilisation: Brockett's condition and Pomet's feedback
 #
 # Section 6 of the chapter. If a continuous feedback of the state makes the origin asymptotically stable, then the
-# velocities $f(x, u)$ near the origin cover a neighbourhood of zero. A car that cannot move sideways misses some, and
-# so does Pomet's system (6.6),
+# velocities $f(x, u)$ near the origin cover a neighbourhood of zero (Brockett's condition). A car that cannot move
+# sideways violates this condition, and so does Pomet's system (6.6),
 #
 # $$\dot x_1 = u_1, \qquad \dot x_2 = x_1 u_2, \qquad \dot x_3 = u_2.$$
 
@@ -38,9 +38,9 @@ assert verdict.message.startswith("violated")
 # %% [markdown]
 # ## A feedback of time and state
 #
-# Time makes the difference. Pomet's feedback (6.7) has the Lyapunov function (6.8),
-# $V = \tfrac12(x_1 + x_2\cos t)^2 + \tfrac12 x_2^2 + \tfrac12 x_3^2$, which never grows. A search over states and
-# times finds nothing against it.
+# A feedback that also depends on time can stabilise the system. Pomet's feedback (6.7) has the Lyapunov function (6.8),
+# $V = \tfrac12(x_1 + x_2\cos t)^2 + \tfrac12 x_2^2 + \tfrac12 x_3^2$, which never increases. A search over states and
+# times finds no counterexample.
 
 # %%
 report = hjb.lyapunov_check(
@@ -61,5 +61,5 @@ assert np.all(np.diff(energy) < 1e-6)
 assert energy[-1] < 0.1 * energy[0]
 
 # %% [markdown]
-# $V$ falls, but ever more slowly: like $1/t$, and the state like $t^{-1/2}$, since no feedback that is smooth in the
-# state can make it exponential.
+# $V$ falls like $1/t$, and the state like $t^{-1/2}$. No feedback that is smooth in the state can make the decay
+# exponential.

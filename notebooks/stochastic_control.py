@@ -14,7 +14,7 @@
 # # Stochastic control
 #
 # Section 10 of the chapter. With noise, $dx = f(x, u)\,dt + \varepsilon\,dw$, the equation of dynamic programming has
-# second derivatives, as in (10.6):
+# second derivatives, as in (10.4):
 #
 # $$\beta V = \tfrac{\varepsilon^2}{2}\Delta V + \min_u\,[\,f(x, u)\cdot DV + L(x, u)\,].$$
 
@@ -30,10 +30,10 @@ from hjbjax import plotting
 warnings.simplefilter("ignore", hjb.SolveWarning)
 
 # %% [markdown]
-# ## What noise costs
+# ## The cost of noise
 #
-# A point on a line is held near zero by a bounded speed. Noise makes the value higher, and the more so the
-# stronger it is, since the point cannot be kept where it costs nothing. All three have a closed form.
+# A bounded speed holds a point on a line near zero. Noise keeps the point away from zero, so the value increases with
+# the noise. All three values have a closed form.
 
 # %%
 figure, axes = plt.subplots(1, 2, figsize=(10, 3.4), layout="constrained")
@@ -54,9 +54,9 @@ print({noise: f"{error:.1e}" for noise, error in errors.items()})
 assert max(errors.values()) < 0.01
 
 # %% [markdown]
-# ## What a value promises
+# ## The value is a mean
 #
-# $V(x_0)$ is a mean. Over many paths the mean cost comes to it; one path may cost half or twice as much.
+# $V(x_0)$ is the mean cost over many paths. A single path may cost half or twice as much.
 
 # %%
 problem, grid = hjb.zoo.stochastic_lq()
@@ -66,10 +66,10 @@ print(f"V(1) = {solution.value_at([1.0]):.4f}, in closed form {reference:.4f}")
 assert abs(solution.value_at([1.0]) - reference) < 1e-3
 
 # %% [markdown]
-# ## How long it stays
+# ## Exit times
 #
-# The same generator tells how long a state stays in a region. From the centre of a disc of radius 1 a Brownian motion
-# takes $\tfrac{1}{2}$ in the mean.
+# The same generator gives the mean time that a state stays in a region. A Brownian motion that starts in the centre of
+# a disc of radius 1 stays for $\tfrac{1}{2}$ in the mean.
 
 # %%
 problem, grid = hjb.zoo.brownian_ball(shape=(41, 41))

@@ -1,1 +1,1 @@
-"""Measurements, beside the package and not part of it: ``python -m benchmarks NAME --help``."""
+"""Measurements of hjbjax, not part of the package: ``python -m benchmarks NAME --help``."""

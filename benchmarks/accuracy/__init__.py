@@ -1,4 +1,4 @@
 """Benchmarks of errors: against known answers, against seconds and against a dense solver.
 
-A file is named as its command.
+A file has the name of its command.
 """

@@ -1,6 +1,6 @@
-"""Errors, orders and seconds over the zoo's problems with known answers, with hj_reachability beside them.
+"""Errors, orders and seconds over the zoo's problems with known answers, for hjbjax and hj_reachability.
 
-Writes ``accuracy.json`` and ``accuracy.png``. Every number is from a second run; compiling stands apart.
+Writes ``accuracy.json`` and ``accuracy.png``. Every number is from a second run; compile time is separate.
 """
 
 import dataclasses
@@ -26,9 +26,9 @@ HORIZON, TIME_LIMIT = 40.0, 60.0  # of hj_reachability's march: units of the pro
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """A problem of the catalogue, the nodes an axis and the region in which errors count.
+    """A problem of the catalogue, the nodes per axis and the region in which errors count.
 
-    Where the box holds no exact value at its ends, optimal paths feel the edge, and errors count on the inner half.
+    If the ends of the box do not prescribe the exact value, they affect V, and errors count on the inner half.
     """
 
     entry: str
@@ -66,14 +66,14 @@ CASES = (
 
 
 def ours(case: Case, nodes: Sequence[int], scheme: Any, tol: float) -> list[dict[str, Any]]:
-    """One row a grid from ``convergence_study``."""
+    """One row per grid from ``convergence_study``."""
     problem, grids, exact = case.build(nodes)
     study = hjb.convergence_study(problem, grids, exact, scheme=scheme, tol=tol, region=case.region)
     return [{**row, "order": study.order, "mean_order": study.mean_order, "tol": tol} for row in study.rows]
 
 
 def marched(problem: Any, grids: Sequence[Any], exact: Any, *, tol: float, region: Any = None) -> list[dict[str, Any]]:
-    """One row a grid from hj_reachability, or one row with the reason why there is none."""
+    """One row per grid from hj_reachability, or one row with the reason that it cannot solve the problem."""
     if reason := stationary_march.obstacle(problem, grids[0]):
         return [{"status": "SKIPPED", "reason": reason}]
     rows = []
@@ -93,7 +93,7 @@ def marched(problem: Any, grids: Sequence[Any], exact: Any, *, tol: float, regio
 
 
 def measure(cases: Sequence[Case], *, quick: bool, tol: float) -> list[dict[str, Any]]:
-    """All rows, printed case by case."""
+    """Measure all cases and print the rows of each."""
     rows: list[dict[str, Any]] = []
     for case in cases:
         nodes = case.nodes[:2] if quick else case.nodes

@@ -1,6 +1,6 @@
-"""Random problems beside a dense solver in NumPy: whether what is certified holds, family by family.
+"""Random problems against a dense solver in NumPy: checks the certified bounds, family by family.
 
-The problems and the solver are those of ``tests/oracles``; the seeds are random, and one that fails is named.
+Problems and solver are in ``tests/oracles``. Seeds are random, and a failing seed is printed.
 """
 
 import collections
@@ -24,7 +24,9 @@ COLUMNS = ("problem", "count", "certified", "refused", "held", "unfinished", "ti
 
 
 @click.command()
-@click.option("--problems", default=2000, show_default=True, help="How many, spread evenly over the families.")
+@click.option(
+    "--problems", default=2000, show_default=True, help="Number of problems, spread evenly over the families."
+)
 @click.option("--family", "names", multiple=True, help="Only these families.")
 @click.option("--quick", is_flag=True, help="Two of each family.")
 @click.option("--out", type=Folder(), default=RESULTS, help="Folder of the files.")
@@ -47,7 +49,7 @@ def command(problems, names, quick, out):
 
 
 def _verdicts(family, count, failures):
-    """One verdict for each of ``count`` problems; what does not hold is added to ``failures``."""
+    """One verdict per problem; violated bounds are appended to ``failures``."""
     found = []
 
     @settings(max_examples=count, deadline=None, database=None, phases=[Phase.generate],
@@ -57,7 +59,7 @@ def _verdicts(family, count, failures):
         rng = np.random.default_rng(seed)
         try:
             verdict = agreement.compare(random_problems.draw(family, rng), rng)
-        except Exception as error:  # a crash is a failure of this problem, and the others go on
+        except Exception as error:  # a crash counts as a failure of this problem; the others continue
             verdict = agreement.Verdict("uncertified", (f"{type(error).__name__}: {error}",))
         found.append(verdict)
         failures.extend((family.name, seed, complaint) for complaint in verdict.complaints[:1])

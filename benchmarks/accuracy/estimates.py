@@ -1,9 +1,9 @@
-"""The estimated error beside the true one: default answers to problems with known values.
+"""The estimated error against the true one, for default answers to problems with known values.
 
-The zoo's problems on three grids each, and those of ``known_answers``. The estimate is the largest ``grid_error``, plus
-the largest ``box_error``, plus what the iteration left. A row counts where the true error is above a thousandth of the
-range of V and an estimate was made. Of the rows that count at most one in twenty may have an estimate below a third of
-the error, and none of these without a warning. Writes ``estimates.json``.
+The problems are the zoo's on three grids each, and ``known_answers``. The estimate is the largest ``grid_error`` plus
+the largest ``box_error`` plus the error of the iteration. A row counts if the true error is above a thousandth of the
+range of V and an estimate exists. At most one row in twenty may have an estimate below a third of the error, and each
+of them must have a warning. Writes ``estimates.json``.
 """
 
 import warnings
@@ -25,11 +25,11 @@ COLUMNS = ("kind", "problem", "shape", "error", "range", "estimate", "ratio", "w
 LEAST, MOST = 1 / 3, 5.0  # ratios outside are "too small" and "too large"
 SMALL = 1e-3  # of the range of V: smaller errors do not count
 TOL = 1e-6
-MISSING = "not estimated"  # so begins the reason that there is no estimate
+MISSING = "not estimated"  # beginning of the reason for a missing estimate
 
 
 def row_of(solution: hjb.Solution, exact: np.ndarray, mask: np.ndarray, warned: bool, walls: bool) -> dict[str, Any]:
-    """What the table says of one answer; ``exact`` and ``mask`` are (*grid)."""
+    """The entries of one answer in the table; ``exact`` and ``mask`` have the shape (*grid)."""
     value = np.asarray(solution.value) if solution.times is None else np.asarray(solution.value)[0]
     true, known = np.abs(value - exact)[mask], exact[mask]
     parts = [0.0 if solution.error is None else min(solution.error, TOL)]
@@ -89,7 +89,7 @@ def measured(quick: bool) -> Iterator[dict[str, Any]]:
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """One row per kind of problem: how many count, and how far the estimates are from the errors."""
+    """One row per kind of problem: the number of rows that count, and the ratios of estimate and error."""
     found = []
     for kind in dict.fromkeys(row["kind"] for row in rows):
         mine = [row for row in rows if row["kind"] == kind]
@@ -130,10 +130,10 @@ def verdict(rows: Sequence[dict[str, Any]]) -> str:
 @click.option("--quick", is_flag=True, help="A few problems, on one grid each.")
 @click.option("--out", type=Folder(), default=RESULTS, help="Folder of the files.")
 def command(quick: bool, out: Path) -> None:
-    """The estimated error beside the true one, over problems with known answers."""
+    """Compare estimated and true errors of problems with known answers."""
     rows = []
     for row in measured(quick):
-        jax.clear_caches()  # the programs of so many problems are more than a process may map
+        jax.clear_caches()  # a process cannot map the programs of all problems at once
         rows.append({"benchmark": "estimates", "dtype": "float64", "tol": TOL, **row})
         click.echo(table(rows[-1:], COLUMNS).splitlines()[-1])
     click.echo(table(rows, COLUMNS))

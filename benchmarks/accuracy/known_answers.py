@@ -1,6 +1,6 @@
-"""Problems with exact answers that are hard for an estimate of the error: jumps, corners, layers, ends, small targets.
+"""Problems with exact answers that are hard for error estimates: jumps, corners, layers, ends, small targets.
 
-Each is a problem on one grid with its exact value as a NumPy function of states, shape (k, n) -> (k,).
+Each is a problem on one grid. Its exact value is a NumPy function of states, shape (k, n) -> (k,).
 """
 
 import dataclasses
@@ -30,7 +30,7 @@ class Known:
       exact: the exact value, (k, n) -> (k,).
       region: True where errors count, (k, n) -> bool (k,); None is the whole box.
       walls: the ends are part of the problem, so ``box_error`` does not belong to the estimate.
-      horizon: of a march, whose V at the time zero counts; None for ``solve``.
+      horizon: of a march, of which V at time zero counts; None for ``solve``.
     """
 
     kind: str
@@ -43,7 +43,7 @@ class Known:
     horizon: float | None = None
 
     def solved(self, tol: float) -> hjb.Solution:
-        """The answer by the defaults."""
+        """The answer of the default solver."""
         if self.horizon is None:
             return hjb.solve(self.problem, self.grid, tol=tol, throw=False)
         return hjb.march(self.problem, self.grid, self.horizon, throw=False)
@@ -105,14 +105,14 @@ def _hit_box(x: np.ndarray, way: np.ndarray, centre: tuple[float, float], half: 
 
 
 def past(angle: float, level: Callable, hit: Callable, name: str, nodes: int, discount: float = 1.0) -> Known:
-    """A flow without control that pays 5 where it meets a target, and nothing where it passes it by."""
+    """A flow without control that pays 5 if it meets a target, and nothing if it passes the target."""
     way = np.array([np.cos(angle), np.sin(angle)])
     problem = hjb.Problem(lambda x, u: jnp.asarray(way) + 0 * x, None, discount=discount, target=level, exit_cost=5.0)
     return Known("jump", name, problem, plane(nodes), lambda x: 5 * np.exp(-discount * hit(x, way)))
 
 
 def circling(nodes: int, centre: float, radius: float, discount: float) -> Known:
-    """A rotation, of which some circles meet a disc and some do not."""
+    """A rotation; some of its circles meet a disc and some do not."""
     problem = hjb.Problem(
         lambda x, u: jnp.stack([-x[1], x[0]]), None, discount=discount, target=disc_at((centre, 0.0), radius),
         exit_cost=1.0,
@@ -163,7 +163,7 @@ def to(name: str, level: Callable, exact: Exact, grid: hjb.Grid, controls: Any =
 
 
 def corners() -> list[Known]:
-    """Distances to targets with corners, to small ones and to several."""
+    """Distances to targets with corners, to small targets and to several targets."""
     block, ell = ((0.3, -0.2), (0.33, 0.21)), (((-0.2, 0.1), (0.43, 0.17)), ((0.1, -0.2), (0.13, 0.47)))
     round_, other = ((0.37, -0.21), 0.26), ((-0.5, 0.45), 0.17)
     cube = ((0.1, 0.2, -0.1), (0.35, 0.25, 0.3))
@@ -171,7 +171,7 @@ def corners() -> list[Known]:
     to_disc = lambda x, disc: np.maximum(norm(x - np.array(disc[0])) - disc[1], 0)  # noqa: E731
     rim = np.stack([np.cos(np.linspace(0, 2 * np.pi, 2000)), np.sin(np.linspace(0, 2 * np.pi, 2000))], axis=1)
 
-    def squarely(x: np.ndarray) -> np.ndarray:  # the least largest coordinate to a point of the disc
+    def squarely(x: np.ndarray) -> np.ndarray:  # the smallest maximum-norm distance to the disc
         points = np.array(round_[0]) + round_[1] * rim
         found = np.min(np.max(np.abs(x[:, None] - points), axis=2), axis=1)
         return np.where(norm(x - np.array(round_[0])) <= round_[1], 0, found)
@@ -311,7 +311,7 @@ def default(nodes: int, logs: bool) -> Known:
 
 
 def put(nodes: int, logs: bool) -> Known:
-    """The perpetual American put, K = 1, r = .05, σ = .3."""
+    """The perpetual American put, K = 1, r = 0.05, σ = 0.3."""
     r, sigma = 0.05, 0.3
     power = 2 * r / sigma**2
     best = power / (1 + power)
@@ -347,7 +347,7 @@ def merton_levels(nodes: int, kind: str) -> Known:
 
 
 def ends() -> list[Known]:
-    """Reflecting walls and open ends, most of them where the noise is."""
+    """Reflecting walls and open ends, most of them with noise."""
     return [
         *(reflected(0.01, 0.01, 0.05, nodes) for nodes in (26, 51, 101)),
         reflected(0.05, 0.05, 0.1, 41),
@@ -376,7 +376,7 @@ def ends() -> list[Known]:
 def income(nodes: int, rate: float, square: bool, back: float = 1.0) -> Known:
     """A state that follows a two-state income chain z, dx = (z − x) dt, cost x² or −x.
 
-    V = a x² + b(z) x + c(z), whose numbers solve a small linear system.
+    V = a x² + b(z) x + c(z), where a, b and c solve a small linear system.
     """
     discount, z = 0.1, np.array([0.0, 1.0])
     up, down = rate, rate * back
@@ -422,7 +422,7 @@ def ornstein(power: int, nodes: int, noise: float = 0.5, **options: Any) -> Know
 
 
 def drifting(drift: float, nodes: int, radius: float = 0.2) -> Known:
-    """Minimum time on a line with a drift of its own."""
+    """Minimum time on a line with constant drift."""
     problem = hjb.Problem(
         lambda x, u: u + drift, lambda x, u: 1.0, hjb.Box([-1.0], [1.0]), target=lambda x: jnp.abs(x[0]) - radius
     )  # fmt: skip
@@ -495,12 +495,12 @@ def others() -> list[Known]:
 
 
 def marches() -> list[Known]:
-    """V at the time zero."""
+    """Marches, compared at time zero."""
     obstacle = lambda t, x: jnp.abs(x[0] + 3.0 - 2.0 * t) - 0.5  # noqa: E731
     evading = hjb.avoid(lambda t, x, u: u, hjb.Box([-1.0], [1.0]), obstacle, time_dependent=True)
     times = np.linspace(0, 2, 201)
 
-    def nearest_approach(x: np.ndarray) -> np.ndarray:  # the best is full speed to one side, from any time on
+    def nearest_approach(x: np.ndarray) -> np.ndarray:  # optimal is full speed to one side, starting at any time
         ways = [np.min(np.abs(x[:, :1] + side * times + 3 - 2 * times) - 0.5, axis=1) for side in (-1, 1)]
         return -np.maximum(*ways)
 
@@ -540,5 +540,5 @@ def marches() -> list[Known]:
 
 
 def problems() -> list[Known]:
-    """All of them."""
+    """The problems of all groups."""
     return [*jumps(), *corners(), *lost_targets(), *ends(), *two_nodes(), *others(), *marches()]

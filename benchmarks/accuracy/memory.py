@@ -1,6 +1,6 @@
-"""What was told of the memory beforehand, beside the peak of a process of its own: solves and marches on large grids.
+"""The memory estimate against the measured peak of a separate process, for solves and marches on large grids.
 
-A small grid is solved first, whose memory is that of JAX and of what it compiles; the peak counts from there.
+Each process first solves a small grid to load JAX and compile; the peak is measured relative to that.
 """
 
 import json
@@ -15,7 +15,7 @@ import click
 from benchmarks.harness.report import RESULTS, Folder, attempt, publish, table
 
 COLUMNS = ("question", "run", "shape", "told", "peak", "told_over_peak", "seconds", "steps", "status")
-# what is asked, how it is run, the nodes an axis, and the steps or the horizon; all in single precision
+# question, run, nodes per axis, and number of steps or horizon; all in single precision
 CASES: tuple[tuple[str, str, int, float], ...] = (
     ("quadrotor tube", "march, value alone", 21, 0.25),
     ("quadrotor tube", "march, Upwind", 17, 0.02),
@@ -26,15 +26,15 @@ CASES: tuple[tuple[str, str, int, float], ...] = (
     ("Dubins tube", "march, value alone", 361, 0.02),
     ("Dubins tube", "march, Limited", 201, 0.02),
 )
-QUICK = 12  # nodes an axis in six dimensions, and its cube root of as many in three
+QUICK = 12  # nodes per axis
 SMALL = 6
 
 
 @click.command()
-@click.option("--quick", is_flag=True, help="Small grids, of which compiling is most: no verdict.")
+@click.option("--quick", is_flag=True, help="Small grids, on which compiling dominates: no verdict.")
 @click.option("--out", type=Folder(), default=RESULTS, help="Folder of the files.")
 def command(quick: bool, out: Path) -> None:
-    """Run large grids each in a process of its own, and print what was told and what was taken."""
+    """Run each large grid in a separate process, and print estimated and measured memory."""
     rows = []
     for question, run, count, length in CASES[:2] if quick else CASES:
         about = {"benchmark": "memory", "question": question, "run": run, "dtype": "float32"}
@@ -45,7 +45,7 @@ def command(quick: bool, out: Path) -> None:
 
 
 def apart(question: str, run: str, count: int, length: float) -> dict[str, Any]:
-    """The row of one run, made by a process of its own."""
+    """The row of one run in a separate process."""
     command = [sys.executable, "-m", "benchmarks.accuracy.memory", question, run, str(count), str(length)]
     done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True, check=False)
     if done.returncode:
@@ -69,13 +69,13 @@ def here(question: str, run: str, count: int, length: float) -> dict[str, Any]:
 
 
 def status(name: str) -> int:
-    """Bytes that Linux says of this process."""
+    """Bytes of an entry in this process's Linux status file."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return int(next(line for line in lines if line.startswith(name)).split()[1]) * 1024
 
 
 def answer(question: str, run: str, count: int, length: float) -> Any:
-    """The solution of a question on so many nodes an axis; an angle has an even number."""
+    """The solution of a question with ``count`` nodes per axis; angles have an even number."""
     import warnings
 
     import jax.numpy as jnp

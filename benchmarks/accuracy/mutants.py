@@ -1,8 +1,8 @@
-"""Seeded bugs: one after the other in a copy of the checkout, to see whether the default suite finds each.
+"""Seeded bugs in a copy of the checkout, one after the other, to check that the default suite finds each of them.
 
-A mutant is one text in place of another. The test files that are most likely to find it run first, up to the first
-failure; where they pass the whole default suite follows. At the end the tests that found something run once more
-without any bug: one that fails there, too, has found nothing.
+A mutant replaces one text by another. The test files that are most likely to find it run first, up to the first
+failure. If they pass, the whole default suite runs. At the end the tests that found a bug run again without any bug; a
+test that fails there too does not count.
 """
 
 import dataclasses
@@ -22,18 +22,18 @@ from benchmarks.harness.report import RESULTS, Folder, publish, table
 ROOT = Path(__file__).parents[2]
 LEFT_OUT = (".git", ".venv", "__pycache__", "site", "build", "dist", "*.egg-info", ".*_cache", ".hypothesis")
 COLUMNS = ("mutant", "file", "caught_by", "seconds", "status")
-LONGEST = 1800.0  # seconds of one run of tests, the whole suite among them
+LONGEST = 1800.0  # seconds of one run of tests, including the whole suite
 
 
 @dataclasses.dataclass(frozen=True)
 class Mutant:
-    """A bug as one text in place of another, and the test files that are most likely to find it, in order.
+    """A bug as a replacement of one text, and the test files that are most likely to find it, in order.
 
     Attributes:
-      name: what is wrong, in words.
-      file: where, within the package.
-      old: the text that stands there exactly once.
-      new: the text in its place.
+      name: the bug, in words.
+      file: its file within the package.
+      old: a text that occurs exactly once in the file.
+      new: its replacement.
       likely: test files.
     """
 
@@ -47,12 +47,12 @@ class Mutant:
         """The text of the file with the bug in it.
 
         Raises:
-          ValueError: the old text is not there, or not once.
+          ValueError: the old text does not occur exactly once.
         """
         if (count := text.count(self.old)) != 1:
             raise ValueError(
                 f"mutants: {self.name}: hjbjax/{self.file} holds {self.old!r} {count} times, wanted once; "
-                "the code has moved on: write the mutant anew"
+                "the code has changed: write the mutant again"
             )
         return text.replace(self.old, self.new)
 
@@ -168,8 +168,8 @@ QUICK = ("ghost cell", "seam of an interpolation")
 
 
 @click.command()
-@click.option("--mutant", "names", multiple=True, help="Only those whose names hold this text.")
-@click.option("--quick", is_flag=True, help="Two of them, without the whole suite.")
+@click.option("--mutant", "names", multiple=True, help="Only mutants whose names contain this text.")
+@click.option("--quick", is_flag=True, help="Two mutants, without the whole suite.")
 @click.option("--out", type=Folder(), default=RESULTS, help="Folder of the rows.")
 def command(names: Sequence[str], quick: bool, out: Path) -> None:
     """Seed one bug after the other in a copy of the checkout, and print which test found it."""
@@ -178,7 +178,7 @@ def command(names: Sequence[str], quick: bool, out: Path) -> None:
         chosen = [each for each in chosen if each.name in QUICK]
     if not chosen:
         raise click.UsageError(f"--mutant: none of {', '.join(each.name for each in MUTANTS)} holds that text")
-    for each in chosen:  # a stale one is refused before the first test
+    for each in chosen:  # a stale mutant raises before the first test
         each.applied(source(ROOT, each).read_text(encoding="utf-8"))
     rows = []
     with tempfile.TemporaryDirectory() as folder:
@@ -203,7 +203,7 @@ def source(root: Path, mutant: Mutant) -> Path:
 
 
 def measured(mutant: Mutant, copy: Path, *, whole: bool) -> dict:
-    """The row of one mutant, whose bug stands in the copy as long as its tests run."""
+    """The row of one mutant; its bug is in the copy while its tests run."""
     path, began = source(copy, mutant), time.perf_counter()
     before = path.read_text(encoding="utf-8")
     path.write_text(mutant.applied(before), encoding="utf-8")
@@ -221,19 +221,19 @@ def measured(mutant: Mutant, copy: Path, *, whole: bool) -> dict:
 
 
 def failures(copy: Path, tests: Sequence[str], *options: str) -> list[str]:
-    """The tests that fail, by name, of some files or tests of a copy; of the default suite without any.
+    """The names of the failing tests of some files or tests of a copy, or of the default suite if none are named.
 
     Raises:
-      RuntimeError: the tests could not be run at all, so that nothing was found.
+      RuntimeError: the tests could not run.
     """
-    # no compiled files: Python would take those of a file that had another text within the same second
+    # no compiled files: Python would use stale ones if a file changes within the same second
     environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}
-    one = ("-n", "0") if tests else ()  # a few files are not worth two processes
+    one = ("-n", "0") if tests else ()  # two processes do not pay for a few files
     command = [sys.executable, "-m", "pytest", "-q", "--tb=no", "-rfE", "-p", "no:cacheprovider", *one, *options]
     done = subprocess.run(
         [*command, *tests], cwd=copy, env=environment, capture_output=True, text=True, timeout=LONGEST, check=False
     )
-    # 0: all passed, 1: some failed; all else is no verdict, and neither is a file that cannot be imported
+    # 0: all passed, 1: some failed; anything else, and a file that cannot be imported, is not a verdict
     if done.returncode not in (0, 1) or "\nERROR " in done.stdout:
         raise RuntimeError(f"mutants: pytest ended with {done.returncode}:\n{done.stdout[-2000:]}{done.stderr[-2000:]}")
     lines = done.stdout.splitlines()

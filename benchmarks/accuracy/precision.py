@@ -1,14 +1,14 @@
-"""Error against seconds: what schemes of high order are worth, on the pendulum, the double integrator, a smooth value.
+"""Error against seconds for schemes of high order, on the pendulum, the double integrator and a smooth value.
 
-The pendulum (gain 1/m) has no exact value; errors are relative ones at the states of ``STATES``, against Limited() on
-a grid twice as fine as the finest measured. What the plain chain would need for an error that it does not reach is
-read off its fitted order and off the fitted growth of its seconds. On the double integrator (minimum time in
-Kružkov's form on [−1, 1]², exact values on {T ≤ ½} and on the edge) hj_reachability's "very_high" marches beside us,
-and seconds are compared at equal mean error; so it does on the zoo's smooth problem, compared at equal largest error.
-SemiLagrangian() is held against the plain chain on the same nodes of the double integrator.
+The exact value of the pendulum (gain 1/m) is unknown. Its errors are relative, at ``STATES``, against Limited() on a
+grid twice as fine as the finest measured grid. If the first-order chain does not reach an error, its seconds are
+extrapolated from its fitted order and the fitted growth of its seconds. On the double integrator (minimum time in
+Kružkov's form on [−1, 1]², exact values on {T ≤ ½} and at the ends), seconds are compared with hj_reachability's
+"very_high" at equal mean error, and on the zoo's smooth problem at equal largest error. SemiLagrangian() is compared
+with the first-order chain on the same nodes of the double integrator.
 
-Writes ``precision.json`` and ``precision.png``. Our seconds are medians of whole solves that take turns,
-hj_reachability's those of a second march; compiling stands apart.
+Writes ``precision.json`` and ``precision.png``. Our seconds are medians of whole solves that take turns. The seconds of
+hj_reachability are from a second march. Compile time is separate.
 """
 
 import functools
@@ -30,17 +30,17 @@ COLUMNS = ("problem", "scheme", "shape", "error", "seconds", "compile_seconds", 
 PLAIN, LIMITED = hjb.Upwind(central=False), hjb.Limited()
 FIFTH = hjb.Weno5()
 PATHS = hjb.SemiLagrangian()
-HELD = hjb.Limited(subcell=False)  # where a level set of time, no distance, says which nodes are held
+HELD = hjb.Limited(subcell=False)  # the target is a level set of time and not a signed distance
 STATES = ((0.5, 0.0), (np.pi / 4, 0.0), (1.5, -1.0), (2.8, 1.5), (-2.0, -2.0))
 PENDULUM, DOUBLE_INTEGRATOR, SMOOTH = (50, 100, 200, 400), (21, 41, 81, 161, 321), (21, 41, 81, 161)
 LEVELS = 25  # errors at which seconds are compared
 REPEATS = 15
-SIDE_BY_SIDE, LEAST_ERROR, MOST_SECONDS = 161, 0.3, 3.0  # nodes an axis of the double integrator, and the thresholds
+SIDE_BY_SIDE, LEAST_ERROR, MOST_SECONDS = 161, 0.3, 3.0  # nodes per axis of the double integrator, and the thresholds
 TOL, SMALL = 1e-4, 1e-12
 
 
 def pendulum(nodes: Sequence[int]) -> list[dict[str, Any]]:
-    """One row a scheme and grid; the error is the mean relative one at ``STATES``."""
+    """One row per scheme and grid; the error is the mean relative error at ``STATES``."""
 
     def grid(count: int) -> Any:
         return hjb.zoo.pendulum(shape=(count, count + 1))[1]
@@ -61,7 +61,7 @@ def pendulum(nodes: Sequence[int]) -> list[dict[str, Any]]:
 
 
 def double_integrator(nodes: Sequence[int]) -> list[dict[str, Any]]:
-    """One row a code, scheme and grid; the error is the mean one over the box."""
+    """One row per code, scheme and grid; the error is the mean over the box."""
     exact = hjb.zoo.double_integrator_exact()
     problem, grids = cases.double_integrator(nodes[0])[0], [cases.double_integrator(n)[1] for n in nodes]
     rows, asked = [], []
@@ -77,7 +77,7 @@ def double_integrator(nodes: Sequence[int]) -> list[dict[str, Any]]:
 
 
 def smooth(nodes: Sequence[int]) -> list[dict[str, Any]]:
-    """One row a code, scheme and grid; the error is the largest one where the edge is not felt."""
+    """One row per code, scheme and grid; the error is the largest in the region that the ends do not affect."""
     problem, exact = hjb.zoo.smooth()[0], hjb.zoo.smooth_exact()
     grids, rows, asked = [hjb.zoo.smooth(shape=(n, n))[1] for n in nodes], [], []
     for scheme in (LIMITED, FIFTH):
@@ -86,7 +86,7 @@ def smooth(nodes: Sequence[int]) -> list[dict[str, Any]]:
         rows += [label | row for row in study.rows]
         asked += [(grid, scheme) for grid in grids]
     rows = with_seconds(rows, problem, asked, SMALL)
-    # settled to a hundredth of the error on the finest of its grids
+    # settled to a hundredth of the error on its finest grid
     rows += _theirs(accuracy.marched(problem, grids[:3], exact, tol=1e-9, region=cases.inner))
     return [row | {"problem": "smooth"} for row in rows]
 
@@ -98,9 +98,9 @@ def _theirs(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def with_seconds(
     rows: list[dict[str, Any]], problem: Any, asked: Sequence[tuple[Any, Any]], tol: float = TOL
 ) -> list[dict[str, Any]]:
-    """The rows with the wall time of a whole solve that compiles nothing any more, a grid and a scheme a row.
+    """The rows with the wall time of a whole warm solve, one grid and scheme per row.
 
-    It is the median of ``REPEATS``, in which all rows take turns.
+    The time is the median of ``REPEATS`` solves; the rows take turns.
     """
     calls = {
         number: functools.partial(hjb.solve, problem, grid, scheme=scheme, tol=tol)
@@ -115,7 +115,7 @@ def _name(scheme: Any) -> str:
 
 
 def would_need(rows: Sequence[dict[str, Any]], error: float) -> float:
-    """Seconds for an error that the rows do not reach, by their fitted order and growth of seconds."""
+    """Seconds for an error that the rows do not reach, extrapolated from their fitted order and growth of seconds."""
     h, errors, seconds = (np.log([row[key] for row in rows]) for key in ("h", "error", "seconds"))
     order, offset = np.polyfit(h, errors, 1)
     growth, start = np.polyfit(h, seconds, 1)
@@ -123,7 +123,7 @@ def would_need(rows: Sequence[dict[str, Any]], error: float) -> float:
 
 
 def advantage(rows: Sequence[dict[str, Any]], others: Sequence[dict[str, Any]]) -> tuple[float, float] | None:
-    """The smallest and largest ratio of the others' seconds to ours over the errors that both reach, log-linear."""
+    """Smallest and largest ratio of the others' seconds to ours over the errors that both reach, by log-linear fits."""
 
     def curve(points: Sequence[dict[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
         ordered = sorted((row["error"], row["seconds"]) for row in points)
@@ -139,7 +139,7 @@ def advantage(rows: Sequence[dict[str, Any]], others: Sequence[dict[str, Any]]) 
 
 
 def verdicts(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """What the rows say, one sentence a figure."""
+    """One sentence per figure."""
 
     def of(problem: str, scheme: str) -> list[dict[str, Any]]:
         return [
@@ -181,7 +181,7 @@ def verdicts(rows: Sequence[dict[str, Any]]) -> list[str]:
 @click.option("--quick", is_flag=True, help="Coarse grids only.")
 @click.option("--out", type=Folder(), default=RESULTS, help="Folder of the files.")
 def command(quick: bool, out: Path) -> None:
-    """Error against seconds, plain and second order, on the pendulum and the double integrator."""
+    """Measure error against seconds, at first and second order, on the pendulum and the double integrator."""
     about = {"benchmark": "precision", "dtype": "float64"}
     rows = attempt(lambda: pendulum(PENDULUM[:2] if quick else PENDULUM), about)
     rows += attempt(lambda: double_integrator(DOUBLE_INTEGRATOR[:2] if quick else DOUBLE_INTEGRATOR), about)

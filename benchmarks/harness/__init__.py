@@ -1,4 +1,4 @@
-"""What the benchmarks share: turns and seconds, bytes, tables and files, and what figures are held to.
+"""Code shared by the benchmarks: timing, memory, tables, files and thresholds.
 
 Nothing here imports a case or a benchmark.
 """

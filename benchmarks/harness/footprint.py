@@ -1,4 +1,4 @@
-"""What compiled programs need, by their own account: nothing is allocated, arrays are shapes."""
+"""Memory of compiled programs, as reported by XLA; nothing is allocated, because arrays are shapes."""
 
 from typing import Any
 
@@ -14,14 +14,14 @@ from hjbjax.solvers.setup import assumptions_of, choose, prepare
 
 
 def bytes_of(lowered: Any) -> int:
-    """Arguments, results and scratch of a lowered program together, once it is compiled."""
+    """Bytes of arguments, results and scratch of a lowered program after compiling."""
     found = lowered.compile().memory_analysis()
     total = found.argument_size_in_bytes + found.output_size_in_bytes + found.temp_size_in_bytes
     return int(total - found.alias_size_in_bytes)
 
 
 def of_solve(problem: Any, grid: Any, tol: float, *, method: Any = None, dtype: Any = np.float64) -> dict[str, Any]:
-    """Bytes a node of that loop at the finest level of a solve."""
+    """Bytes per node of the loop at the finest level of a solve."""
     method = choose(problem, grid, traced=False, method=method)
     inner = method.inner if isinstance(method, hjb.Nested) else method
     kind = np.dtype(dtype)

@@ -1,6 +1,6 @@
-"""Every recorded row, as Markdown tables: one section a benchmark, made from ``benchmarks/results``.
+"""Markdown tables of every recorded row, one section per benchmark, made from ``benchmarks/results``.
 
-Nothing is measured. ``quoted`` picks the figures that the text names; here stands all that they were picked from.
+Nothing is measured here. ``quoted`` selects the figures for the documentation from the same rows.
 """
 
 import json
@@ -12,14 +12,14 @@ import click
 
 from benchmarks.harness.report import RESULTS
 
-SHARED = ("benchmark", "versions", "date", "device", "cores", "load", "status")  # said once, above a table
-LONGEST = 60  # rows of a table; the file has the others
+SHARED = ("benchmark", "versions", "date", "device", "cores", "load", "status")  # written once, above the table
+LONGEST = 60  # rows of a table; the JSON file contains the others
 
 Row = dict[str, Any]
 
 
 def cell(value: Any) -> str:
-    """A figure as a table shows it: three digits, shapes with crosses, a dash where there is none."""
+    """A figure as a table shows it: three digits, shapes with crosses, a dash if missing."""
     if value is None:
         return "–"
     if isinstance(value, bool):
@@ -59,7 +59,7 @@ def section(name: str, rows: Sequence[Row]) -> list[str]:
 
 
 def markdown(folder: Path = RESULTS) -> str:
-    """The tables of all benchmarks whose rows are recorded, in the order of their names."""
+    """The tables of all recorded benchmarks, ordered by name."""
     lines: list[str] = []
     for path in sorted(folder.glob("*.json")):
         lines += section(path.stem, json.loads(path.read_text(encoding="utf-8")))
@@ -67,7 +67,7 @@ def markdown(folder: Path = RESULTS) -> str:
 
 
 def write(path: Path) -> None:
-    """The tables in a file, which stays as it is where they have not changed, so that a second build has less to do."""
+    """Write the tables to a file, which is not touched if they have not changed, so a second build has less to do."""
     text = markdown()
     if not path.exists() or path.read_text(encoding="utf-8") != text:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -77,5 +77,5 @@ def write(path: Path) -> None:
 @click.command()
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Folder of the rows.")
 def command(out: Path) -> None:
-    """Every recorded row as Markdown tables."""
+    """Print every recorded row as Markdown tables."""
     click.echo(markdown(out))

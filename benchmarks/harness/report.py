@@ -1,4 +1,4 @@
-"""What the benchmarks share: where a number was measured, tables, JSON files and one kind of picture.
+"""Reports of benchmarks: the environment of a measurement, tables, JSON files and one kind of picture.
 
 A measurement is a flat dictionary; ``stamped`` adds the machine, the versions and the date to each.
 """
@@ -24,12 +24,12 @@ PACKAGES = ("jax", "numpy", "scipy", "hj-reachability", "quantecon", "numba", "m
 
 
 def threads() -> int:
-    """The threads that XLA computes with on a processor: one for each core that this process may use."""
+    """The number of threads of XLA on a processor: one per core that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def environment() -> dict[str, Any]:
-    """The machine, the versions and the date, to stand in every row."""
+    """The machine, the versions and the date, for every row."""
     import jax
 
     import hjbjax
@@ -38,26 +38,26 @@ def environment() -> dict[str, Any]:
     for package in PACKAGES:
         try:
             versions[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:  # a peer that is not installed
+        except importlib.metadata.PackageNotFoundError:  # this package is not installed
             continue
     device = jax.devices()[0]
     return {
         "device": device.platform if device.platform == "cpu" else device.device_kind,
         "cores": os.cpu_count(),
-        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,  # processes that want a core, at the end
+        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,  # runnable processes at the end
         "versions": versions,
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
 
 
 def stamped(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The rows with the environment in each; what a row says itself has precedence."""
+    """The rows with the environment added to each; entries of a row take precedence."""
     common = environment()
     return [common | row for row in rows]
 
 
 def table(rows: Sequence[dict[str, Any]], columns: Sequence[str]) -> str:
-    """The columns of the rows as aligned text; numbers to the right, what is missing as a dash."""
+    """The columns of the rows as aligned text; numbers right-aligned, missing entries as a dash."""
     cells = [list(columns), *([_cell(row.get(column)) for column in columns] for row in rows)]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     right = [any(_is_number(row.get(column)) for row in rows) for column in columns]
@@ -72,7 +72,7 @@ def table(rows: Sequence[dict[str, Any]], columns: Sequence[str]) -> str:
 
 
 def write_json(path: Path, rows: Sequence[dict[str, Any]]) -> None:
-    """The rows as a JSON list, whole or not at all; numbers that are not finite become null, as JSON has none."""
+    """Write the rows as a JSON list, atomically; numbers that are not finite become null, because JSON lacks them."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
@@ -83,7 +83,7 @@ def write_json(path: Path, rows: Sequence[dict[str, Any]]) -> None:
 
 
 class Folder(click.Path):
-    """A folder that can be written, as is checked before anything is measured."""
+    """A folder; checked to be writable before anything is measured."""
 
     def __init__(self) -> None:
         super().__init__(path_type=Path, file_okay=False)
@@ -99,10 +99,10 @@ class Folder(click.Path):
 
 
 def put(out: Path, write: Callable[[Path], None]) -> None:
-    """Let ``write`` write its files into a folder, or into a new one if that folder no longer takes them.
+    """Call ``write`` with a folder, or with a new folder if the first one is no longer writable.
 
     Raises:
-      Failure: the folder no longer takes them; it says where they are.
+      Failure: the first folder is no longer writable; the message names the new one.
     """
     try:
         write(out)
@@ -111,7 +111,7 @@ def put(out: Path, write: Callable[[Path], None]) -> None:
 
 
 def publish(out: Path, name: str, rows: Sequence[dict[str, Any]], **drawing: Any) -> None:
-    """The rows, stamped, in ``name``.json; what ``drawing`` says of them (see ``picture``) in ``name``.png."""
+    """Write the stamped rows to ``name``.json, and their picture to ``name``.png; ``drawing`` as in ``picture``."""
     rows = stamped(rows)
 
     def write(folder: Path) -> None:
@@ -126,13 +126,13 @@ def publish(out: Path, name: str, rows: Sequence[dict[str, Any]], **drawing: Any
 def picture(
     path: Path, rows: Sequence[dict[str, Any]], *, panel: str, line: str, x: Sequence[str], y: str, across: int = 4
 ) -> None:
-    """Small panels, logarithmic: one block for every value of ``panel``, in it ``y`` over every ``x``.
+    """Draw logarithmic panels: one block per value of ``panel``, with ``y`` over every ``x``.
 
     Args:
       path: of the PNG.
-      rows: the measurements; those without finite positive numbers are left out.
-      panel: the column that says in which block a row is drawn.
-      line: the column that says on which line.
+      rows: the measurements; rows without finite positive numbers are left out.
+      panel: the column that selects the block of a row.
+      line: the column that selects its line.
       x: the columns of the horizontal axes, one panel each.
       y: the column of the vertical axis.
       across: blocks in a row.
@@ -159,7 +159,7 @@ def picture(
                 points = [[row[column] for row in mine] for column in (key, y)]
                 ax.plot(*points, marker="o", markersize=3, linewidth=1, color=colour, label=label)
             logarithmic(ax)
-            ax.tick_params(labelsize=6, labelleft=side == 0)  # the panels of a block show the same numbers
+            ax.tick_params(labelsize=6, labelleft=side == 0)  # the panels of a block share their vertical axis
             ax.set_xlabel(key, fontsize=7)
             if side == 0:
                 ax.set_title(name, fontsize=8, loc="left")
@@ -172,17 +172,17 @@ def picture(
 
 
 def without(module: str) -> str | None:
-    """Why a peer cannot be measured; ``None`` where it can."""
+    """The reason that a package cannot be measured, or ``None``."""
     if importlib.util.find_spec(module) is not None:
         return None
     return f"{module} is not installed (pip install '.[bench]')"
 
 
 def attempt(measure: Callable[[], list[dict[str, Any]]], about: dict[str, Any]) -> list[dict[str, Any]]:
-    """The rows of a measurement, or one row that says how it failed: a benchmark records failures too."""
+    """The rows of a measurement, or one row with the error: a benchmark records failures too."""
     try:
         return [about | row for row in measure()]
-    except Exception as error:  # whatever a peer or a solve raises is a result
+    except Exception as error:  # any error of a package or a solve is a result
         return [about | {"status": "FAILED", "reason": f"{type(error).__name__}: {' '.join(str(error).split())}"[:300]}]
 
 

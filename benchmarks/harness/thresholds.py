@@ -1,7 +1,6 @@
-"""What the measurements are held to: one line a figure, "figure: measured, threshold".
+"""Thresholds of all benchmarks, with one printed line per figure: "figure: measured, threshold".
 
-A benchmark looks its figures up here, so that all thresholds stand in one place; a figure that was not measured at the
-size it is meant for has no line.
+A figure that was not measured at its intended size has no line.
 """
 
 import dataclasses
@@ -13,7 +12,7 @@ import click
 
 @dataclasses.dataclass(frozen=True)
 class Threshold:
-    """A figure in words, its bound, the aim where there is one, and whether more is better."""
+    """A figure in words, its bound, an optional aim, and ``most``: True if the bound is an upper bound."""
 
     figure: str
     bound: float
@@ -22,11 +21,11 @@ class Threshold:
     most: bool = False
 
     def met(self, measured: float) -> bool:
-        """Whether the bound holds; NaN meets none."""
+        """True if the bound holds; False for NaN."""
         return measured <= self.bound if self.most else measured >= self.bound
 
     def line(self, measured: float) -> str:
-        """The figure, what was measured, and the threshold."""
+        """The figure, the measurement and the threshold."""
         sign = "≤" if self.most else "≥"
         aim = "" if self.aim is None else f", aim {self.aim:g}{self.unit}"
         return (
@@ -77,7 +76,7 @@ THRESHOLDS = {
 
 
 def announced(measured: Mapping[str, float], benchmark: str) -> list[dict[str, Any]]:
-    """Says one line for every figure measured; the same as rows of a JSON file."""
+    """Print one line per measured figure, and return the same as rows of a JSON file."""
     rows = []
     for name, value in measured.items():
         threshold = THRESHOLDS[name]

@@ -1,7 +1,7 @@
-"""Timing on a machine that others use too: candidates take turns, and ratios are taken round by round.
+"""Timing on a shared machine: candidates take turns, and ratios are taken per round.
 
-A first call stands apart, since it compiles. Load that comes and goes then meets all candidates alike; what one
-quotes is the ratio, and the median over the rounds.
+Changing load then affects all candidates equally. Quote the ratio, as the median over the rounds. First calls are
+separate, because they compile.
 """
 
 import dataclasses
@@ -13,12 +13,12 @@ from typing import Any, TypeVar
 import jax
 
 Name = TypeVar("Name", bound=Hashable)
-PAUSE = 0.02  # seconds between two candidates: the threads of some runtimes spin on for a few milliseconds
+PAUSE = 0.02  # seconds between two candidates: threads of some runtimes keep spinning for a few milliseconds
 
 
 @dataclasses.dataclass(frozen=True)
 class Timing:
-    """Seconds of the first call and of every later one, and the processor's seconds of those on all cores."""
+    """Seconds of the first call and of every later call, and CPU seconds of the later calls on all cores."""
 
     first: float
     rounds: tuple[float, ...]
@@ -31,16 +31,16 @@ class Timing:
 
     @property
     def compile_seconds(self) -> float:
-        """How much longer the first call took."""
+        """The additional seconds of the first call."""
         return max(0.0, self.first - self.seconds)
 
     def over(self, other: "Timing") -> float:
-        """How many times as long as ``other``: the median over the rounds of the ratio in each."""
+        """The ratio to ``other``: the median over the rounds."""
         return median(mine / theirs for mine, theirs in zip(self.rounds, other.rounds, strict=True))
 
     @property
     def row(self) -> dict[str, Any]:
-        """The numbers of a row."""
+        """The entries of a row."""
         return {
             "seconds": self.seconds,
             "fastest": min(self.rounds),
@@ -51,7 +51,7 @@ class Timing:
 
 
 def timed(call: Callable[[], Any]) -> tuple[Any, float]:
-    """What ``call`` returns, ready, and its wall time in seconds."""
+    """The result of ``call``, ready, and its wall time in seconds."""
     began = time.perf_counter()
     result = jax.block_until_ready(call())
     return result, time.perf_counter() - began
@@ -64,12 +64,12 @@ def _nothing() -> None:
 def interleaved(
     candidates: Mapping[Name, Callable[[], Any]], repeats: int, before: Mapping[Name, Callable[[], Any]] | None = None
 ) -> tuple[dict[Name, Any], dict[Name, Timing]]:
-    """Calls every candidate once, then ``repeats`` rounds of all of them in turn.
+    """Call every candidate once, and then all of them in turn for ``repeats`` rounds.
 
     Args:
-      candidates: by name, what to call.
+      candidates: functions to call, by name.
       repeats: rounds after the first.
-      before: by name, what to call before a candidate, outside of its seconds.
+      before: functions to call before a candidate, outside of its seconds, by name.
 
     Returns:
       The last result and the timing of every candidate.
@@ -79,7 +79,7 @@ def interleaved(
     busy: dict[Name, list[float]] = {name: [] for name in candidates}
     for _ in range(1 + repeats):
         for name, call in candidates.items():
-            results[name] = None  # before the next one is made: two of them may not fit
+            results[name] = None  # free the old result first: two results may not fit in memory
             (before or {}).get(name, _nothing)()
             began = time.process_time()
             results[name], took = timed(call)

@@ -1,1 +1,1 @@
-"""Other people's solvers, set to the problems that ours solves; what measures them is ``speed`` and ``accuracy``."""
+"""Other solvers, applied to the problems of hjbjax; ``speed`` and ``accuracy`` measure them."""

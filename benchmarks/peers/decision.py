@@ -1,11 +1,12 @@
-"""Other people's solvers of Markov decision problems, on the chain that hjbjax exports.
+"""Solvers of Markov decision problems, on the chain that hjbjax exports.
 
-QuantEcon's ``DiscreteDP`` takes the pairs of state and action as they are; mdpsolver takes lists. Both maximise.
-QuantEcon's modified policy iteration stops at half of ``epsilon``, so that twice the tolerance certifies it; its policy
-iteration knows no tolerance and solves to rounding, ours stops at the one that is asked for. The chain moves by very
-short steps, with a factor near one: it is uniform in time, as such solvers want it, and hard on value iteration and on
-plain sweeps of theirs, while ours take each node's own step. mdpsolver's value iteration takes minutes where its
-Gauss–Seidel modified policy iteration takes seconds.
+QuantEcon's ``DiscreteDP`` takes pairs of state and action, and mdpsolver takes lists. Both maximise. QuantEcon's
+modified policy iteration stops at half of ``epsilon``, so it gets twice the tolerance. Its policy iteration has no
+tolerance and solves to rounding.
+
+The exported chain is uniform in time, as these solvers require. So its steps are very short and its factor is near one,
+which makes their value iteration and sweeps slow. hjbjax uses the time step of each node instead. mdpsolver's value
+iteration takes minutes, and its Gauss–Seidel modified policy iteration takes seconds.
 """
 
 from collections.abc import Callable
@@ -17,7 +18,7 @@ Chain = tuple[np.ndarray, Any, np.ndarray, np.ndarray, float]
 
 
 def quantecon(pairs: Chain, tol: float) -> dict[str, Callable[[], np.ndarray]]:
-    """Its two methods that can do it, each a function that returns the value, shape (nodes,)."""
+    """The two suitable methods of QuantEcon, as functions that return the value, shape (nodes,)."""
     from quantecon.markov import DiscreteDP
 
     costs, probabilities, states, actions, factor = pairs
@@ -31,7 +32,7 @@ def quantecon(pairs: Chain, tol: float) -> dict[str, Callable[[], np.ndarray]]:
 
 
 def mdpsolver(pairs: Chain, tol: float) -> tuple[Callable[[], None], Callable[[], np.ndarray]]:
-    """Modified policy iteration with Gauss–Seidel: what to call before, so that it starts afresh, and the solve."""
+    """Modified policy iteration with Gauss–Seidel: a function that resets the solver, and the solve."""
     import mdpsolver
 
     costs, probabilities, states, _, factor = pairs

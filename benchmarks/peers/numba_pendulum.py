@@ -1,4 +1,4 @@
-"""The hand-written competitor: what an expert would write in numba for one problem.
+"""A hand-written competitor: an expert's numba solver for one problem.
 
 Pendulum θ̈ = g sin θ + u on [−π, π) × [−8, 8] (angle periodic), cost (θ² + ω² + u²)/2, discount beta, K equally
 spaced controls in [−30, 30], first-order Kushner–Dupuis upwinding, projection at |ω| = 8.

@@ -1,8 +1,8 @@
-"""hj_reachability on stationary problems: its WENO scheme marches V_t + H = 0 backwards until V stays.
+"""hj_reachability on stationary problems: its WENO scheme marches V_t + H = 0 backwards until V is stationary.
 
-The Hamiltonian is that of the problem, H = min_u [L + f·DV] − βV, with the exact value held in the target after
-every step, so that both codes solve the same equation on the same nodes. That covers problems of one player without
-noise, a drift affine in u, and a cost affine or convex quadratic in each u_i alone: all of the zoo that come here.
+The Hamiltonian is H = min_u [L + f·DV] − βV. After every step V is set to its exact value in the target, so both codes
+solve the same equation on the same nodes. The adapter covers problems of one player without noise, with drift affine in
+u and cost affine or convex quadratic in each u_i separately.
 """
 
 import time
@@ -14,11 +14,11 @@ import numpy as np
 
 from hjbjax.problem.sets import Ball, Box
 
-PERIOD = 1.0  # the value is looked at once in so much of the problem's time
+PERIOD = 1.0  # time units of the problem between two checks of V
 
 
 def obstacle(problem: Any, grid: Any) -> str | None:
-    """Why hj_reachability cannot solve this one here; ``None`` where it can."""
+    """The reason that this adapter cannot solve a problem, or ``None``."""
     try:
         import hj_reachability  # noqa: F401
     except ImportError:
@@ -57,25 +57,25 @@ def rate(problem: Any, x: Any, value: Any, p: Any) -> Any:
 def march(
     problem: Any, grid: Any, exact: Any, *, accuracy: str = "very_high", tol: float, horizon: float, time_limit: float
 ) -> dict[str, Any]:
-    """Marches twice; the second time is the one that counts.
+    """March twice; the second run is measured.
 
     Returns:
       value: node values, shape (*grid).
-      seconds: of the second march; compile_seconds: by how much the first took longer.
-      status: SETTLED once V moves by at most ``tol`` over a unit of time; else HORIZON or TIME_LIMIT.
-      moved: by how much V moved over the last unit of time; WENO slopes need not come to rest.
+      seconds: of the second march; compile_seconds: the additional seconds of the first.
+      status: SETTLED if V changes by at most ``tol`` over a unit of time; otherwise HORIZON or TIME_LIMIT.
+      moved: the change of V over the last unit of time; WENO slopes need not become stationary.
     """
     with jax.enable_x64(True):
         settings, dynamics, lattice, start = _prepared(problem, grid, exact, accuracy)
         first = _run(settings, dynamics, lattice, start, tol, horizon, time_limit)
-        if first["status"] == "TIME_LIMIT":  # once is long enough; its seconds include compiling
+        if first["status"] == "TIME_LIMIT":  # one march is enough; its seconds include compiling
             return first | {"compile_seconds": None}
         second = _run(settings, dynamics, lattice, start, tol, horizon, time_limit)
     return second | {"compile_seconds": max(0.0, first["seconds"] - second["seconds"])}
 
 
 def _cost(problem: Any, x: Any, u: Any) -> Any:
-    return jnp.asarray(problem.cost(x, u), x.dtype) + 0.0 * jnp.sum(u)  # a constant cost has derivatives, too
+    return jnp.asarray(problem.cost(x, u), x.dtype) + 0.0 * jnp.sum(u)  # so that a constant cost has derivatives
 
 
 def _run(settings, dynamics, lattice, value, tol, horizon, time_limit) -> dict[str, Any]:
@@ -85,7 +85,7 @@ def _run(settings, dynamics, lattice, value, tol, horizon, time_limit) -> dict[s
     while now < horizon:
         later = hj.step(settings, dynamics, lattice, -now, value, -(now + PERIOD), progress_bar=False)
         moved, value, now = float(jnp.max(jnp.abs(later - value))), later, now + PERIOD
-        if not moved > tol:  # NaN stops here too
+        if not moved > tol:  # also stops at NaN
             status = "SETTLED" if moved <= tol else "NONFINITE"
             break
         if time.perf_counter() - begin > time_limit:

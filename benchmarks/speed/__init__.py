@@ -1,4 +1,4 @@
-"""Benchmarks of seconds and bytes, alone and beside other people's codes.
+"""Benchmarks of seconds and bytes of hjbjax and other packages.
 
-A file is named as its command.
+A file has the name of its command.
 """

@@ -1,7 +1,7 @@
 """Many problems at once: ``solve_batch`` of pendulums of different mass, against one ``solve`` after the other.
 
-Both compile once, since masses are leaves; both run the same method by the default scheme, and the values are the same.
-On a CPU lanes run side by side, one a core; on a GPU they fill the machine.
+Both compile once, because masses are leaves. Both use the same method and the default scheme, and the values agree.
+On a CPU each core solves one lane at a time; on a GPU all lanes run together.
 """
 
 from pathlib import Path
@@ -57,7 +57,7 @@ def measure(nodes: int, lanes: int, repeats: int) -> list[dict[str, Any]]:
 @click.option("--repeats", type=click.IntRange(1), default=None, help="Rounds; 3 if not given, quick 1.")
 @click.option("--out", type=Folder(), default=RESULTS, help="Folder of the files.")
 def command(quick: bool, lanes: int | None, nodes: int | None, repeats: int | None, out: Path) -> None:
-    """solve_batch of pendulums of different mass, against one solve after the other."""
+    """Measure solve_batch of pendulums of different mass against one solve after the other."""
     lanes, nodes, again = lanes or (4 if quick else 64), nodes or (16 if quick else 100), repeats or (1 if quick else 3)
     about = {"benchmark": "batch", "problem": "pendulum", "dtype": "float64"}
     rows = attempt(lambda: measure(nodes, lanes, again), about)

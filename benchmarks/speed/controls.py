@@ -1,13 +1,13 @@
 """Seconds against the number K of controls, and against the error: the picture of Chow and Tsitsiklis.
 
-They showed that value functions of n states and m inputs take of the order of 1/ε^{2n+m} operations to know to ε
-when nothing but continuity is given: 1/ε^n states, from each of which 1/ε^m controls may lead to any of 1/ε^n states.
-A Markov chain on neighbours drops one of the n: nodes times controls, 1/ε^{n+m} with K and N in proportion to 1/ε.
-Minimising over the continuum exactly, where the drift is affine in u and the cost quadratic, drops m as well: 1/ε^n.
+They showed that a value function of n states and m inputs takes of the order of 1/ε^{2n+m} operations for an error of
+ε if only continuity is known: from each of 1/ε^n states, 1/ε^m controls may lead to any of 1/ε^n states. A Markov chain
+jumps to neighbours only, which takes nodes times controls, 1/ε^{n+m} with K and N proportional to 1/ε. An exact minimum
+over the continuum (drift affine in u, cost quadratic) removes m as well: 1/ε^n.
 
-``number``: one grid, more and more controls; what they still miss is the difference from the continuum. ``error``:
-the smooth problem of the zoo on finer and finer grids, whose value is known, K = N (``sampled``) against the
-continuum (``exact``). Source: C.-S. Chow, J. N. Tsitsiklis, The complexity of dynamic programming (1989).
+``number``: one grid with more and more controls; the error is the difference from the continuum. ``error``: the smooth
+problem of the zoo, whose value is known, on finer and finer grids, with K = N (``sampled``) and with the continuum
+(``exact``). Source: C.-S. Chow, J. N. Tsitsiklis, The complexity of dynamic programming (1989).
 """
 
 import dataclasses
@@ -43,7 +43,7 @@ def solved(problems: dict[str, tuple[Any, Any]], repeats: int) -> dict[str, tupl
 
 
 def by_number(nodes: int, counts: tuple[int, ...], repeats: int) -> list[dict[str, Any]]:
-    """More and more torques on one grid of the pendulum, and all of them at once."""
+    """More and more torques on one grid of the pendulum, and the continuum."""
     asked = {str(count): cases.pendulum(nodes, count) for count in counts}
     found = solved(asked | {"exact": cases.pendulum(nodes, None)}, repeats)
     limit = found["exact"][0].value
@@ -57,7 +57,7 @@ def by_number(nodes: int, counts: tuple[int, ...], repeats: int) -> list[dict[st
 
 
 def by_error(sizes: tuple[int, ...], repeats: int) -> list[dict[str, Any]]:
-    """Finer and finer grids of the smooth problem: as many controls as nodes an axis, against the continuum."""
+    """Finer and finer grids of the smooth problem: N controls on N nodes per axis, against the continuum."""
     entry = hjb.zoo.catalogue["smooth"]
     rows: list[dict[str, Any]] = []
     for nodes in sizes:
@@ -80,7 +80,7 @@ def _row(part: str, minimum: str, solution: hjb.Solution, timing: dict[str, Any]
 
 
 def _with_exponent(rows: list[dict[str, Any]], key: str, bound: float) -> list[dict[str, Any]]:
-    """The rows with the fitted exponent of seconds in ``key``, and the one that theory puts above it in size."""
+    """The rows with the fitted exponent of seconds in ``key``, and its theoretical bound."""
     done = [row for row in rows if row["status"] == "CONVERGED" and row[key]]
     exponent = fitted_order([row[key] for row in done], [row["seconds"] for row in done])
     return [row | {"exponent": exponent, "bound": bound} for row in rows]
@@ -92,7 +92,7 @@ def _with_exponent(rows: list[dict[str, Any]], key: str, bound: float) -> list[d
 @click.option("--nodes", type=click.IntRange(8), default=None, help="N of N x (N + 1), for the part by number.")
 @click.option("--out", type=Folder(), default=RESULTS, help="Folder of the files.")
 def command(quick: bool, repeats: int | None, nodes: int | None, out: Path) -> None:
-    """Seconds against the number of controls, and against the error."""
+    """Measure seconds against the number of controls and against the error."""
     again = repeats or (1 if quick else 3)
     about = {"benchmark": "controls", "dtype": "float64"}
     counts, sizes = ((5, 9), (11, 21)) if quick else ((11, 21, 41, 81, 161, 321), (21, 41, 81, 161))

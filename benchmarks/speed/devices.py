@@ -1,12 +1,12 @@
-"""One problem over many devices: two devices on the cores of one processor beside one, and outer steps on eight.
+"""One problem on many devices: two devices on one processor against one device, and outer steps on eight devices.
 
-The devices of a processor are made when JAX starts, so that every mesh is timed in a process of its own:
-``python -m benchmarks.speed.devices NODES MESH`` solves once a line that it reads, and prints a row for each. The
-processes take turns, and ratios are taken round by round. On eight devices, which two cores are not, steps are counted
-and not seconds.
+JAX creates the devices of a processor when it starts, so each mesh is timed in a separate process.
+``python -m benchmarks.speed.devices NODES MESH`` solves once per line of its input and prints a row for each. The
+processes take turns, and ratios are taken per round. On eight devices only steps are counted, because the machine has
+fewer cores.
 
-``python -m benchmarks.speed.devices NODES 2x2x2 planes`` solves three double integrators side by side, in six
-dimensions, beside one in the plane.
+``python -m benchmarks.speed.devices NODES 2x2x2 planes`` solves three independent double integrators in six dimensions,
+and compares V with the sum of the values in the plane.
 """
 
 import json
@@ -33,11 +33,11 @@ COLUMNS = (
     "steps_over_one", "difference", "status",
 )  # fmt: skip
 SIZES, EIGHT, TOL, ACTIONS = (800, 1600), 800, 1e-3, 21
-SAMPLE = 40  # nodes an axis that are compared
+SAMPLE = 40  # compared nodes per axis
 
 
 class Worker:
-    """A process with as many devices as a mesh has, which solves when it is told to."""
+    """A process with the devices of a mesh, which solves on request."""
 
     def __init__(self, nodes: int, mesh: Sequence[int]):
         command, environment = _of_process(nodes, mesh)
@@ -55,19 +55,19 @@ class Worker:
         return json.loads(answer)
 
     def end(self) -> None:
-        """Let the process end, and close both pipes."""
+        """End the process, and close both pipes."""
         self.process.communicate()
 
 
 def _of_process(nodes: int, mesh: Sequence[int]) -> tuple[list[str], dict[str, str]]:
-    """The command and the environment of a process of this file with as many devices as a mesh has."""
+    """The command and the environment of a process of this file with the devices of a mesh."""
     devices = str(np.prod(mesh, dtype=int))
     command = [sys.executable, "-m", "benchmarks.speed.devices", str(nodes), "x".join(map(str, mesh))]
     return command, os.environ | {"JAX_NUM_CPU_DEVICES": devices, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
 
 
 def work(nodes: int, mesh: Sequence[int]) -> None:
-    """Solve the pendulum on a mesh once a line of the standard input; a row each on the standard output."""
+    """Solve the pendulum on a mesh once per line of standard input; print a row for each to standard output."""
     import jax
 
     problem, grid = cases.pendulum(nodes, ACTIONS)
@@ -83,7 +83,7 @@ def work(nodes: int, mesh: Sequence[int]) -> None:
 
 
 def planes(nodes: int, mesh: Sequence[int]) -> dict[str, Any]:
-    """The row of three double integrators on a mesh, by V alone, beside the sum of the values of one in the plane."""
+    """The row of three double integrators on a mesh, compared with the sum of their values in the plane."""
     import jax
 
     axes = jax.make_mesh(tuple(mesh), ("a", "b", "c")[: len(mesh)])
@@ -95,12 +95,12 @@ def planes(nodes: int, mesh: Sequence[int]) -> dict[str, Any]:
     off = float(np.max(np.abs(found.value - truth)))
     row = {"problem": "three double integrators", "shape": list(grid.shape), "nodes": grid.size, "mesh": list(mesh)}
     row |= {"tol": TOL, "error": float(found.error), "difference": off, "steps": found.steps, "seconds": seconds}
-    # both values are those of one chain, up to what they are certified to
+    # both values belong to one chain, up to their certified errors
     return row | {"status": "DISAGREES" if off > TOL * 1.03 else found.status.name}
 
 
 def apart(nodes: int, mesh: Sequence[int]) -> list[dict[str, Any]]:
-    """The row of ``planes``, found by a process with as many devices."""
+    """The row of ``planes``, from a process with the devices of the mesh."""
     command, environment = _of_process(nodes, mesh)
     done = subprocess.run([*command, "planes"], env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
@@ -109,7 +109,7 @@ def apart(nodes: int, mesh: Sequence[int]) -> list[dict[str, Any]]:
 
 
 def measure(nodes: int, meshes: Sequence[Sequence[int]], repeats: int, *, timed: bool) -> list[dict[str, Any]]:
-    """A row a mesh, the first of which is one device; with ``repeats`` rounds after the first solves."""
+    """One row per mesh, starting with one device; ``repeats`` rounds after the first solves."""
     workers = [Worker(nodes, mesh) for mesh in meshes]
     try:
         rounds = [[worker.solve() for worker in workers] for _ in range(1 + repeats)]
@@ -136,12 +136,12 @@ def measure(nodes: int, meshes: Sequence[Sequence[int]], repeats: int, *, timed:
 
 
 @click.command()
-@click.option("--quick", is_flag=True, help="A small grid, one round, two devices alone.")
+@click.option("--quick", is_flag=True, help="A small grid, one round, two devices only.")
 @click.option("--nodes", type=click.IntRange(16), multiple=True, help="N of N x (N + 1); 800 and 1600 if not given.")
 @click.option("--repeats", type=click.IntRange(1), default=None, help="Rounds; 7 if not given, quick 1.")
 @click.option("--out", type=Folder(), default=RESULTS, help="Folder of the files.")
 def command(quick: bool, nodes: Sequence[int], repeats: int | None, out: Path) -> None:
-    """The pendulum to 1e-3 on two devices of one processor beside one, and its outer steps on eight."""
+    """Solve the pendulum to 1e-3 on one, two and eight devices of one processor."""
     sizes, again = nodes or ((48,) if quick else SIZES), repeats or (1 if quick else 7)
     about = {"benchmark": "devices", "problem": "pendulum", "dtype": "float64"}
     rows, figures = [], {}

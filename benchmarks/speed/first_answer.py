@@ -1,9 +1,8 @@
-"""The first answer of a process: from ``hjb.solve`` to the value, with all that is compiled for it.
+"""The first answer of a process: the time from calling ``hjb.solve`` to the value, including compiling.
 
-``python -m benchmarks.speed.first_answer PROBLEM NODES WAY`` solves one problem in a process that has solved none and
-prints its row as JSON; ``startup`` starts such processes. The seconds count from the call to the value, those of the
-programs are JAX's own events. "one loop" is the longest compilation of a loop of steps: the least that a first answer
-on such a grid can take, since every solve has one.
+``python -m benchmarks.speed.first_answer PROBLEM NODES WAY`` solves one problem in a new process and prints its row as
+JSON; ``startup`` starts these processes. Seconds of programs come from JAX's own events. "one loop" is the longest
+compilation of a loop of steps. It is a lower bound for a first answer on the grid, because every solve has such a loop.
 """
 
 import json
@@ -26,7 +25,7 @@ from benchmarks import cases
 ROOT = Path(__file__).parents[2]
 COMPILED = "/jax/core/compile/backend_compile_duration"
 LOOP = "jit(run)"
-LIMIT = 60.0  # seconds of a solve: sweeps without coarser grids need more of them the finer the grid
+LIMIT = 60.0  # seconds of a solve: sweeps without coarser grids need more steps on finer grids
 
 Case = Callable[[int], tuple[hjb.Problem, hjb.Grid]]
 ZOO: dict[str, Case] = {
@@ -53,7 +52,7 @@ WAYS: dict[str, dict[str, Any]] = {
 
 
 def solve(problem: str, nodes: int, way: str) -> dict[str, Any]:
-    """The row of a solve in this process, of which it has to be the first; then of the same once more."""
+    """The row of the first solve in this process, and of the same solve again."""
     programs: list[tuple[str, float]] = []
 
     def note(event, seconds, fun_name="", **_):
@@ -61,7 +60,7 @@ def solve(problem: str, nodes: int, way: str) -> dict[str, Any]:
             programs.append((fun_name, seconds))
 
     question, grid = (ZOO | SAMPLED)[problem](nodes)
-    jax.block_until_ready(jax.device_put(0.0))  # the device is found before the clock starts
+    jax.block_until_ready(jax.device_put(0.0))  # initialise the device before the clock starts
     jax.monitoring.register_event_duration_secs_listener(note)
     seconds, busy = [], []
     for _ in range(2):
@@ -89,7 +88,7 @@ def solve(problem: str, nodes: int, way: str) -> dict[str, Any]:
 
 
 def apart(problem: str, nodes: int, way: str, **environment: str) -> dict[str, Any]:
-    """The row of a solve in a process of its own."""
+    """The row of a solve in a separate process."""
     command = [sys.executable, "-m", __spec__.name, problem, str(nodes), way]
     surroundings = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false", "PYTHONPATH": str(ROOT)} | environment
     done = subprocess.run(command, env=surroundings, cwd=ROOT, check=True, capture_output=True, text=True)
@@ -97,7 +96,7 @@ def apart(problem: str, nodes: int, way: str, **environment: str) -> dict[str, A
 
 
 def middle(problem: str, nodes: int, ways: tuple[str, ...], repeats: int) -> list[dict[str, Any]]:
-    """One row a way, that of the median first answer; the ways take turns."""
+    """One row per way of solving, from the median first answer; the ways take turns."""
     found: dict[str, list[dict[str, Any]]] = {way: [] for way in ways}
     for _ in range(repeats):
         for way in ways:
@@ -113,7 +112,7 @@ def middle(problem: str, nodes: int, ways: tuple[str, ...], repeats: int) -> lis
 
 
 def sizes(problem: str, nodes: int, way: str) -> list[int]:
-    """How many operations each loop has before XLA looks at it; in a process that writes its programs down."""
+    """The number of operations of each loop before XLA optimises it, from a process that dumps its programs."""
     with tempfile.TemporaryDirectory() as folder:
         flags = f"--xla_dump_to={folder} --xla_dump_hlo_as_text --xla_dump_hlo_module_re=jit_run"
         apart(problem, nodes, way, XLA_FLAGS=f"{os.environ.get('XLA_FLAGS', '')} {flags}")

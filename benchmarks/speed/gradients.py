@@ -1,8 +1,8 @@
-"""What a derivative costs: value and gradient of a solve beside the value alone, both compiled, and how right it is.
+"""The cost and the accuracy of derivatives: value and gradient of a solve against the value only, both compiled.
 
-The gradient is with respect to every number named, in reverse mode; central differences of fourth order stand beside
-it. An iteration is differentiated at its fixed point, so that nothing of it is kept: the bytes of the compiled gradient
-are those of its arrays, for ten steps and for ten thousand.
+The gradient is in reverse mode, with respect to all named numbers, and is compared with central differences of fourth
+order. An iteration is differentiated at its fixed point, so no steps are stored, and memory does not depend on their
+number.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ COLUMNS = (
 )  # fmt: skip
 TOL, RELATIVE = 1e-10, 1e-6
 MORE_STEPS = 10_000
-STEP = 1e-5  # relative: so small that the branches of a limited slope, and of a minimum, stay what they are
+STEP = 1e-5  # relative: so small that the branches of limited slopes and minima do not change
 
 Question = tuple[hjb.Problem, hjb.Grid]
 
@@ -107,7 +107,7 @@ def differences(function: Callable[[np.ndarray], Any], at: np.ndarray) -> np.nda
 
 
 def memory(case: Case, at: np.ndarray, nodes: int, steps: int) -> int:
-    """Bytes that the compiled gradient takes beside its arguments and its results."""
+    """Bytes of the compiled gradient in addition to its arguments and results."""
     gradient = jax.jit(jax.grad(partial(case, nodes=nodes, max_steps=steps)))
     return int(gradient.lower(at).compile().memory_analysis().temp_size_in_bytes)
 
@@ -150,7 +150,7 @@ def measure(name: str, nodes: int | None, repeats: int) -> dict[str, Any]:
 @click.option("--only", type=click.Choice(list(CASES)), multiple=True, help="These cases alone.")
 @click.option("--out", type=Folder(), default=RESULTS, help="Folder of the file.")
 def command(quick: bool, nodes: int | None, repeats: int | None, only: tuple[str, ...], out: Path) -> None:
-    """Value and gradient of a solve beside the value alone."""
+    """Measure value and gradient of a solve against the value only."""
     nodes, repeats = nodes or (16 if quick else None), repeats or (1 if quick else 5)
     rows: list[dict[str, Any]] = []
     for name in only or CASES:
@@ -158,6 +158,6 @@ def command(quick: bool, nodes: int | None, repeats: int | None, only: tuple[str
         rows += attempt(lambda name=name: [measure(name, nodes, repeats)], about)
         click.echo(table(rows[-1:], COLUMNS))
     costs = [row["over_solve"] for row in rows if row["status"] == "OK"]
-    if costs and not quick and not only:  # small grids take the time of a call, not of a solve
+    if costs and not quick and not only:  # on small grids the time is dominated by the call
         rows += announced({"gradient": max(costs)}, "gradients")
     publish(out, "gradients", rows)

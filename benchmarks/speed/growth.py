@@ -1,11 +1,10 @@
 """Seconds against nodes at a fixed tolerance: a certified solve on finer and finer grids.
 
-A method whose steps do not grow with the grid takes seconds in proportion to the nodes, an exponent of one; value
-iteration on one grid takes N times as many steps on N times as fine a one. Seconds are those of a whole ``solve`` once
-it is compiled, checks and coarser grids included; the sizes of a problem take turns, and what one takes over another
-is the median over the rounds. Bytes a node are the peak of the program that ``solve`` runs on the finest grid, by that
-program's own account. Exponents are fitted over the grids with at least ``FITTED`` nodes: below that a solve is made
-of what it does once.
+If the number of steps does not depend on the grid, seconds are proportional to the nodes, with exponent one. Value
+iteration on one grid takes N times as many steps if the grid is N times finer. Seconds are of a whole warm ``solve``,
+including checks and coarser grids. The sizes of a problem take turns, and ratios are medians over the rounds. Bytes per
+node are the peak of the program on the finest grid, as reported by XLA. Exponents are fitted over grids with at least
+``FITTED`` nodes, because fixed costs dominate on smaller grids.
 """
 
 import dataclasses
@@ -35,9 +34,9 @@ FITTED = 10_000
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """A family of cases by one number, the sizes at which it is asked, quick ones apart, and the tolerance.
+    """A family of cases by one number, its sizes, its quick sizes, and the tolerance.
 
-    ``repeats`` is how often each is solved once it is compiled.
+    ``repeats`` is the number of warm solves of each size.
     """
 
     name: str
@@ -57,7 +56,7 @@ CASES = (
 
 
 def first(case: Case, size: int, time_limit: float | None) -> dict[str, Any]:
-    """One row: what a solve that compiles finds, how long it takes, and how much memory."""
+    """One row: the answer of a solve that compiles, its seconds and its memory."""
     problem, grid = case.build(size)
     solution, seconds = timed(lambda: solve(case, size, time_limit))
     row = {"size": size, "shape": list(grid.shape), "nodes": grid.size, "tol": case.tol, "first_seconds": seconds}
@@ -71,12 +70,12 @@ def solve(case: Case, size: int, time_limit: float | None) -> hjb.Solution:
     """The answer, whatever its status."""
     problem, grid = case.build(size)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", hjb.SolveWarning)  # of nodes that cannot reach the target; see reached
+        warnings.simplefilter("ignore", hjb.SolveWarning)  # nodes that cannot reach the target
         return hjb.solve(problem, grid, tol=case.tol, time_limit=time_limit, throw=False, scheme=hjb.Upwind())
 
 
 def in_turns(case: Case, rows: list[dict[str, Any]], repeats: int, time_limit: float | None) -> list[dict[str, Any]]:
-    """The rows with the seconds of ``repeats`` solves that compile nothing, the sizes taking turns."""
+    """The rows with the seconds of ``repeats`` warm solves; the sizes take turns."""
     calls = {row["size"]: functools.partial(solve, case, row["size"], time_limit) for row in rows}
     _, timings = interleaved(calls, repeats)
     measured = []
@@ -88,7 +87,7 @@ def in_turns(case: Case, rows: list[dict[str, Any]], repeats: int, time_limit: f
 
 
 def fit(rows: list[dict[str, Any]]) -> None:
-    """Writes the exponent of seconds in nodes into the rows of one problem."""
+    """Add the exponent of seconds in nodes to the rows of one problem."""
     counted = [row for row in rows if row["status"] == "CONVERGED" and row["nodes"] >= FITTED]
     exponent = fitted_order([row["nodes"] for row in counted], [row["seconds"] for row in counted])
     for row in rows:
@@ -96,7 +95,7 @@ def fit(rows: list[dict[str, Any]]) -> None:
 
 
 def judged(rows: list[dict[str, Any]]) -> dict[str, float]:
-    """The figures of the thresholds that these rows hold."""
+    """The figures with a threshold that these rows contain."""
     found = {(row["problem"], row["shape"][0]): row for row in rows if row["status"] == "CONVERGED"}
     figures = {}
     if {("pendulum", 400), ("pendulum", 1600)} <= set(found):
@@ -112,7 +111,7 @@ def judged(rows: list[dict[str, Any]]) -> dict[str, float]:
 @click.command()
 @click.option("--quick", is_flag=True, help="Small grids, one round.")
 @click.option("--problem", "names", multiple=True, type=click.Choice([case.name for case in CASES]))
-@click.option("--repeats", type=click.IntRange(1), default=None, help="Warm solves; if not given the case says.")
+@click.option("--repeats", type=click.IntRange(1), default=None, help="Warm solves; the default depends on the case.")
 @click.option("--largest", type=click.IntRange(1), default=None, help="Leave out grids with more nodes.")
 @click.option(
     "--time-limit", type=click.FloatRange(0, min_open=True), default=600, show_default=True, help="Of a solve."
@@ -126,7 +125,7 @@ def command(
     time_limit: float | None,
     out: Path,
 ) -> None:
-    """Seconds, steps and bytes a node of certified solves on finer and finer grids."""
+    """Measure seconds, steps and bytes per node of certified solves on finer and finer grids."""
     rows: list[dict[str, Any]] = []
     for case in CASES:
         if names and case.name not in names:

@@ -1,15 +1,15 @@
-"""What it takes to keep and to use an information state, against state feedback: section 13.2 of the chapter.
+"""The cost of feedback from an information state, against state feedback: section 13.2 of the chapter.
 
-A feedback of n measured states is a table of O(1/h^n) numbers on a grid of spacing h. Without measuring them the
-controller feeds back a function on that grid, p or a density; with each of its 1/h^n values kept to h as well, its own
-table has O((1/h)^(1/h^n)) entries. ``formula`` rows are these two counts and nothing that was measured.
+A feedback of n measured states is a table of O(1/h^n) numbers on a grid of spacing h. If the states are not measured,
+the controller feeds back a function on that grid (p or a density). With each of its 1/h^n values resolved to h, the
+table of the controller has O((1/h)^(1/h^n)) entries. ``formula`` rows contain these two counts and no measurement.
 
-``measured`` rows solve the control problem of a belief: S hidden states, the 1/h^n cells of the formula, and N nodes an
-axis, its 1/h, so that a table has N^(S−1) entries: one fewer in the exponent, since beliefs sum to one. Beside it stand
-the S entries of the table of a controller that sees the state. Seconds are those of a whole ``solve`` once it is
-compiled, bytes those of the table of value and action, and a node's the peak of the program; ``error`` is the largest
-difference from the finest grid with as many hidden states, which has none, at beliefs of at least .05 in every state.
-More than two states lie on a grid in the logarithms of π, where a belief takes far more nodes for an error than two do.
+``measured`` rows solve the control problem of a belief with S hidden states (the 1/h^n cells of the formula) on N nodes
+per axis (its 1/h). The table has N^(S−1) entries, with S − 1 because beliefs sum to one; the table of a controller that
+measures the state has S entries. Seconds are of a whole warm ``solve``. Bytes are the table of value and action; bytes
+per node are the peak of the program. ``error`` is the largest difference from the finest grid with the same number of
+hidden states, at beliefs of at least 0.05 in every state. With more than two hidden states the grid is in the
+logarithms of π and needs far more nodes for the same error.
 """
 
 import dataclasses
@@ -37,29 +37,29 @@ COLUMNS = (
 SIZES = {2: (11, 21, 41, 81, 161, 321), 3: (11, 21, 41, 81, 161), 4: (9, 13, 19, 27)}
 QUICK = {2: (11, 21), 3: (7, 9)}
 TOL = 1e-6  # well below the errors of the grids
-LEAST = 0.05  # belief in every state, where errors are looked at: away from the faces, which the grid cuts off
+LEAST = 0.05  # belief in every state where errors count; the grid cuts off the faces
 WORD = 8  # bytes of a float64
 
 
 @dataclasses.dataclass(frozen=True)
 class Machine:
-    """A machine that wears from state to state and is made new by a repair; what it makes is seen with noise."""
+    """A machine that wears from state to state and is renewed by a repair; its output is measured with noise."""
 
     hidden: int
 
     def generator(self, u: Any) -> jax.Array:
-        """Wear at the rate .4, repair at the rate u."""
+        """Wear at the rate 0.4, repair at the rate u."""
         wear = 0.4 * (np.eye(self.hidden, k=1) - np.diag([1.0] * (self.hidden - 1) + [0.0]))
         renewed = np.zeros((self.hidden, self.hidden))
         renewed[:, 0] = 1
         return jnp.asarray(wear) + u[0] * jnp.asarray(renewed - np.eye(self.hidden))
 
     def cost(self, u: Any) -> jax.Array:
-        """What is not made, from 0 when new to 1 when worn, and the repair."""
+        """The lost output, from 0 when new to 1 when worn, and the cost of the repair."""
         return jnp.linspace(0.0, 1.0, self.hidden) + 0.3 * u[0]
 
     def posed(self, nodes: int) -> BeliefProblem:
-        """The problem of its belief."""
+        """The control problem of its belief."""
         return belief_problem(
             self.generator, np.linspace(1.0, 0.0, self.hidden), self.cost,
             controls=hjb.Finite([[0.0], [2.0]]), discount=0.5, measurement_noise=0.5, nodes=nodes,
@@ -81,7 +81,7 @@ def formula() -> list[dict[str, Any]]:
 
 
 def measured(hidden: int, sizes: tuple[int, ...], repeats: int) -> list[dict[str, Any]]:
-    """Finer and finer grids for as many hidden states."""
+    """Finer and finer grids for one number of hidden states."""
     questions = {nodes: Machine(hidden).posed(nodes) for nodes in sizes}
     solutions: dict[int, hjb.Solution] = {}
 
@@ -115,7 +115,7 @@ def _values(question: BeliefProblem, solution: hjb.Solution, beliefs: np.ndarray
 
 def _with_exponents(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """The rows with the fitted exponent of the nodes in the error, by grids of at most half the finest's intervals."""
-    # of a finer one the difference from the finest is much less than its error
+    # on finer grids the difference from the finest grid is much smaller than the error
     finest = rows[-1]["inverse_h"] - 1
     known = [row for row in rows if row["status"] == "CONVERGED" and 2 * (row["inverse_h"] - 1) <= finest]
     exponent = fitted_order([row["error"] for row in known], [row["nodes"] for row in known])
@@ -127,7 +127,7 @@ def _with_exponents(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 @click.option("--repeats", type=click.IntRange(1), default=None, help="Rounds; 3 if not given, quick 1.")
 @click.option("--out", type=Folder(), default=RESULTS, help="Folder of the files.")
 def command(quick: bool, repeats: int | None, out: Path) -> None:
-    """Nodes, bytes, seconds and errors of beliefs on grids, beside the counts of section 13.2."""
+    """Measure nodes, bytes, seconds and errors of beliefs on grids; print the counts of section 13.2."""
     again = repeats or (1 if quick else 3)
     about = {"benchmark": "information", "dtype": "float64"}
     rows = attempt(formula, about | {"problem": "formula"})

@@ -1,11 +1,12 @@
-"""Marching beside hj_reachability at equal scheme: seconds a step, memory, and whether the zero levels agree.
+"""Marches against hj_reachability with equal schemes: seconds per step, memory, and agreement of the zero levels.
 
-Both go backward over the same short horizon on the same grid in the same precision, with equal order in space and time,
-on the same threads, all that XLA takes. Each takes steps of its own length at one fraction of its own limit, and its
-seconds are divided by its own count of them: theirs bounds the rates by axis, half a per cent more in Air3D, and ends
-with a step that is short and costs as much as any. Medians over several runs in turn, compiling apart; the ratio is the
-median of that in each.
-Memory is what XLA says that the compiled step needs. Writes ``march.json``.
+Both codes march backward over the same short horizon, on the same grid, in the same precision, with equal order in
+space and time and with all threads of XLA. Each code uses the same fraction of its own stability limit, and its seconds
+are divided by its own number of steps. hj_reachability bounds the rates per axis, which gives 0.5 % more steps in
+Air3D, and its last step is shorter but costs the same.
+
+Seconds and ratios are medians over several runs that take turns, without compile time. Memory is reported by XLA for
+the compiled step. Writes ``march.json``.
 """
 
 import itertools
@@ -49,7 +50,7 @@ def collision(x: Any, u: Any, d: Any) -> Any:
 
 
 def car(x: Any, u: Any) -> Any:
-    """Position, speed and heading; steers and accelerates."""
+    """A car with position, speed and heading, which steers and accelerates."""
     return jnp.stack([x[2] * jnp.cos(x[3]), x[2] * jnp.sin(x[3]), u[0], u[1]])
 
 
@@ -73,7 +74,7 @@ def cases(scale: float) -> dict[str, tuple[Any, Any]]:
 
 
 def ours(problem: Any, grid: Any, scheme: Any, steps: int) -> tuple[Any, float, float, float]:
-    """A function that marches so many steps, how far that goes, bytes a node and seconds to compile."""
+    """A function that marches ``steps`` steps, its horizon, bytes per node and seconds to compile."""
     began = time.perf_counter()
     dtype = np.dtype(np.float32)
     on = Discretisation(problem, grid, scheme, dtype)
@@ -86,7 +87,7 @@ def ours(problem: Any, grid: Any, scheme: Any, steps: int) -> tuple[Any, float, 
 
 
 def theirs(problem: Any, grid: Any, accuracy: str, duration: float) -> tuple[Any, float, float, int]:
-    """The same of hj_reachability, for the same time, and how many steps it makes of it."""
+    """The same for hj_reachability over the same horizon, and its number of steps."""
     import hj_reachability as hj
 
     began = time.perf_counter()
@@ -136,7 +137,7 @@ def theirs(problem: Any, grid: Any, accuracy: str, duration: float) -> tuple[Any
 
 
 def _count(settings: Any, dynamics: Any, lattice: Any, values: Any, until: float) -> int:
-    """The steps that hj_reachability's own integrator makes from 0 to a time, as its ``step`` makes them."""
+    """The number of steps of hj_reachability's integrator from 0 to a time."""
 
     def more(state):
         return jnp.abs(until - state[0]) > 0
@@ -149,20 +150,20 @@ def _count(settings: Any, dynamics: Any, lattice: Any, values: Any, until: float
 
 
 def _bytes(compiled: Any, grid: Any) -> float:
-    """Scratch, arguments and result of a compiled function, a node."""
+    """Bytes per node of scratch, arguments and result of a compiled function."""
     memory = compiled.memory_analysis()
     total = memory.temp_size_in_bytes + memory.argument_size_in_bytes + memory.output_size_in_bytes
     return total / grid.size
 
 
 def measure(problem: Any, grid: Any, accuracy: str, steps: int, runs: int) -> list[dict[str, Any]]:
-    """One row for each of the two; without the peer ours alone."""
+    """One row per code; only ours if hj_reachability is not installed."""
     scheme = SCHEMES[accuracy]
     mine, dt, my_bytes, my_compile = ours(problem, grid, scheme, steps)
     marches, counts = [mine], [steps]
     reason = without("hj_reachability")
     if reason is None:
-        # a little less than so many steps: where both limits agree, rounding must not add one that is almost empty
+        # slightly shorter: with equal limits, rounding must not add an almost empty step
         other, their_bytes, their_compile, their_steps = theirs(problem, grid, accuracy, steps * dt * (1 - 1e-4))
         marches, counts = [mine, other], [steps, their_steps]
     seconds, values = np.zeros((runs, len(marches))), [np.zeros(0)] * len(marches)

@@ -1,15 +1,15 @@
-"""A certified solve beside other people's solvers, on one chain: the pendulum, K torques, discount .1.
+"""A certified solve against other solvers on one chain: the pendulum, K torques, discount 0.1.
 
-The hand-written numba solver (``peers.numba_pendulum``) knows this one problem; QuantEcon and mdpsolver
-(``peers.decision``) get the exported chain, which is built beforehand and whose making is not in their seconds. All
-three run on one thread and ours on all that XLA takes, so that each row has its threads, the processor's seconds, and
-the ratio by those. mdpsolver gets the chain of half as many nodes an axis, and one round, since it takes minutes on the
-whole one. All stop at the same tolerance, so that two values differ by at most twice that, which is checked before
-anything is called faster. The first call, which compiles, stands beside the later ones for everybody: ours is measured
-in this process before any other, and twice more after clearing JAX's caches; numba's is its compiling and one solve.
-The numba solver starts on coarser grids at every size, ours by itself only where that pays for another program: at the
-smallest size it stands with nested grids, too. hj_reachability would march such a problem for thousands of steps;
-``python -m benchmarks accuracy`` has it where it does better.
+The hand-written numba solver (``peers.numba_pendulum``) solves only this problem. QuantEcon and mdpsolver
+(``peers.decision``) get the exported chain; building it does not count. These three run on one thread, and hjbjax on
+all threads of XLA, so each row also has the number of threads, the CPU seconds and their ratio. mdpsolver gets half the
+nodes per axis and one round, because it takes minutes on the whole chain. All stop at the same tolerance. The benchmark
+checks that two values differ by at most twice the tolerance.
+
+First calls, which compile, are reported for every solver. Ours is the first call of this process, and two more after
+clearing JAX's caches; numba's is compiling and one solve. The numba solver uses coarser grids at every size, and hjbjax
+only if that pays for another program; at the smallest size it also runs with nested grids. hj_reachability would march
+this problem for thousands of steps, so it is in ``python -m benchmarks accuracy`` instead.
 """
 
 import functools
@@ -29,7 +29,7 @@ from benchmarks.harness.report import RESULTS, Folder, attempt, publish, table, 
 from benchmarks.harness.timing import interleaved, timed
 from benchmarks.peers import decision
 
-PAIRS = 2_000_000  # of state and action in a chain: beyond that it takes gigabytes
+PAIRS = 2_000_000  # of state and action; a larger chain takes gigabytes
 OURS, NESTED, NUMBA, MDP = "hjbjax", "hjbjax, nested grids", "numba", "mdpsolver"
 COLUMNS = (
     "code", "threads", "shape", "controls", "seconds", "cpu_seconds", "fastest", "compile_seconds", "first_seconds",
@@ -40,7 +40,7 @@ ABOUT = {"benchmark": "peers", "problem": "pendulum", "dtype": "float64"}
 
 
 def our_first(solve: Any, times: int) -> dict[str, float]:
-    """First calls of ``solve``, compiling each time: the median of their seconds, and of the processor's."""
+    """Median seconds and CPU seconds of first calls of ``solve``, which compile each time."""
     seconds, busy = [], []
     for _ in range(times):
         jax.clear_caches()
@@ -52,17 +52,17 @@ def our_first(solve: Any, times: int) -> dict[str, float]:
 
 @functools.cache
 def handwritten() -> tuple[Any, float]:
-    """The numba solver, compiled, and the seconds that took."""
+    """The compiled numba solver, and the seconds for compiling."""
     from benchmarks.peers import numba_pendulum
 
     return numba_pendulum.solve, timed(lambda: numba_pendulum.solve(8, 3, 0.1, 1e-3)[0])[1]
 
 
 def measure(nodes: int, actions: int, tol: float, repeats: int, *, chain: bool, first: int) -> list[dict[str, Any]]:
-    """Our solver and the numba one at one size; QuantEcon where ``chain`` says so."""
+    """Rows of hjbjax and the numba solver at one size, and of QuantEcon if ``chain``."""
     problem, grid = cases.pendulum(nodes, actions)
     ours = {OURS: functools.partial(hjb.solve, problem, grid, tol=tol, scheme=hjb.Upwind())}
-    if chain:  # the smallest size, at which coarser grids are left to the user
+    if chain:  # the smallest size, at which coarser grids are not the default
         ours[NESTED] = functools.partial(ours[OURS], method=hjb.Nested())
     cold = {name: our_first(solve, first) for name, solve in ours.items()}
     solutions: dict[str, hjb.Solution] = {}
@@ -97,7 +97,7 @@ def measure(nodes: int, actions: int, tol: float, repeats: int, *, chain: bool, 
 
 
 def beside_mdpsolver(nodes: int, actions: int, tol: float) -> list[dict[str, Any]]:
-    """mdpsolver, one round of it: minutes at a size that the others do in seconds."""
+    """One round of mdpsolver, which takes minutes at sizes that take the others seconds."""
     problem, grid = cases.pendulum(nodes, actions)
     if reason := without("mdpsolver"):
         return [_about(grid, actions, tol) | {"code": MDP, "status": "SKIPPED", "reason": reason}]
@@ -128,7 +128,7 @@ def _rows(calls: Any, measured: Any, build: dict[str, float]) -> list[dict[str, 
 
 
 def checked(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The rows, those whose value is off by more than both tolerances marked as such."""
+    """The rows; a value that is off by more than both tolerances is marked DISAGREES."""
     for row in rows:
         if not row.get("difference", 0.0) <= 2 * row.get("tol", 0.0):
             row["status"] = "DISAGREES"
@@ -136,7 +136,7 @@ def checked(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def judged(rows: list[dict[str, Any]]) -> dict[str, float]:
-    """The figures of the thresholds that these rows hold."""
+    """The figures with a threshold that these rows contain."""
     figures = {}
     done = [row for row in rows if row["status"] == "DONE" and row["controls"] == 21 and row["tol"] == 1e-3]
     chain = [row for row in done if row["code"].startswith("QuantEcon") and row["shape"] == [200, 201]]
@@ -161,7 +161,7 @@ def judged(rows: list[dict[str, Any]]) -> dict[str, float]:
 @click.option("--tol", type=click.FloatRange(0, min_open=True), default=1e-3, show_default=True)
 @click.option("--out", type=Folder(), default=RESULTS, help="Folder of the files.")
 def command(quick: bool, nodes: tuple[int, ...], repeats: int | None, controls: int, tol: float, out: Path) -> None:
-    """A certified solve beside QuantEcon, mdpsolver and a hand-written numba solver, on one chain."""
+    """Measure a certified solve against QuantEcon, mdpsolver and a hand-written numba solver on one chain."""
     sizes = nodes or ((26, 52) if quick else (200, 400, 800, 1600))
     rows: list[dict[str, Any]] = []
     for place, count in enumerate(sizes):

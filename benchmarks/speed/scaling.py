@@ -1,9 +1,8 @@
-"""The N^n law: nodes, steps, seconds and bytes a node of a certified solve in one to six dimensions.
+"""The N^n law: nodes, steps, seconds and bytes per node of a certified solve in one to six dimensions.
 
-A grid of N nodes an axis has N^n of them, and no method on it does better than a constant amount of work and memory
-a node. What a method can do is keep that constant, and the steps, from growing with N: an exponent of seconds in
-nodes of one. The states of the problem do not touch each other, so that its value, also that of the chain, is the
-sum of n values of one state; every row is checked against it. Exponents are fitted as in ``growth``.
+A grid with N nodes per axis has N^n nodes. A good method needs constant work and memory per node, so seconds grow like
+the number of nodes, with exponent one. The states of the problem are independent, so V and the value of the chain are
+sums of n values of one state; every row is checked against this sum. Exponents are fitted as in ``growth``.
 """
 
 from pathlib import Path
@@ -32,7 +31,7 @@ TOL = 1e-3
 
 
 def measure(dimension: int, nodes: int, repeats: int) -> list[dict[str, Any]]:
-    """One row: a solve that compiles, ``repeats`` that do not, and the check of their value."""
+    """One row: a solve that compiles, ``repeats`` warm solves, and the check of their value."""
     problem, grid = cases.apart(dimension, nodes)
     line = hjb.solve(*cases.apart(1, nodes), tol=TOL / dimension, scheme=hjb.Upwind()).value
     solutions: list[hjb.Solution] = []
@@ -53,10 +52,10 @@ def measure(dimension: int, nodes: int, repeats: int) -> list[dict[str, Any]]:
 @click.option("--quick", is_flag=True, help="Small grids in up to three dimensions, one round.")
 @click.option("--dimension", "dimensions", multiple=True, type=click.IntRange(1, 6), help="Only this one; repeatable.")
 @click.option("--repeats", type=click.IntRange(1), default=None, help="Warm solves; 3 if not given, quick 1.")
-@click.option("--times", type=click.IntRange(1), default=1, help="So many times the nodes in all, for a GPU.")
+@click.option("--times", type=click.IntRange(1), default=1, help="Factor for the number of nodes, for a GPU.")
 @click.option("--out", type=Folder(), default=RESULTS, help="Folder of the files.")
 def command(quick: bool, dimensions: tuple[int, ...], repeats: int | None, times: int, out: Path) -> None:
-    """The N^n law: seconds, steps and bytes a node in one to six dimensions."""
+    """Measure seconds, steps and bytes per node in one to six dimensions."""
     rows: list[dict[str, Any]] = []
     for dimension, sizes in (QUICK if quick else SIZES).items():
         if dimensions and dimension not in dimensions:

@@ -1,12 +1,11 @@
-"""How long one waits for the first answer, everything in processes of its own that take turns.
+"""Waiting time for the first answer, measured in separate processes that take turns.
 
-* import: importing hjbjax up to its first name, which imports the rest, next to importing jax.
-* pictures: ``hjbjax solve`` from the start of the process to its pictures. ``cold`` compiles everything, by
-  ``--no-cache``; ``cached`` finds what an earlier process left in the user's folder for caches, here one of the
-  benchmark's own.
-* pendulum: its default answer and the monotone one alone, by the programs that they compile.
-* chain: the monotone answer, compiling counted, against QuantEcon's warm solve of the exported chain.
-* zoo: twelve problems by default and by policy iteration on the one grid.
+* import: importing hjbjax and using its first name, which imports the rest, compared with importing jax.
+* pictures: ``hjbjax solve`` from the start of the process to its pictures. ``cold`` compiles all (``--no-cache``);
+  ``cached`` uses the compiled programs of an earlier process, in a cache folder of the benchmark.
+* pendulum: the default answer and the monotone answer, with the programs that they compile.
+* chain: the monotone answer including compiling, against QuantEcon's warm solve of the exported chain.
+* zoo: twelve problems by default, and by policy iteration on one grid.
 """
 
 import os
@@ -42,11 +41,11 @@ COLUMNS = {
     ),
 }  # fmt: skip
 USED = {"jax": "jit", "hjbjax": "solve"}  # a name of each package
-HOMES = ("XDG_CACHE_HOME", "HOME", "LOCALAPPDATA")  # where a user's caches are, on one platform or another
+HOMES = ("XDG_CACHE_HOME", "HOME", "LOCALAPPDATA")  # variables that locate the cache folder on different platforms
 
 
 def process(command: list[str], environment: dict[str, str]) -> tuple[float, float]:
-    """Seconds of a process, and the processor's seconds on all cores."""
+    """Seconds and CPU seconds of a process."""
     began, before = time.perf_counter(), os.times()
     subprocess.run(command, env=environment, check=True, capture_output=True)
     seconds, after = time.perf_counter() - began, os.times()
@@ -54,7 +53,7 @@ def process(command: list[str], environment: dict[str, str]) -> tuple[float, flo
 
 
 def one(problem: str, shape: str | None, cache: str | None) -> tuple[float, float, int]:
-    """Seconds of the process, the processor's seconds on all cores, and the pictures it left."""
+    """Seconds and CPU seconds of the process, and the pictures that it wrote."""
     kept = {key: value for key, value in os.environ.items() if "COMPILATION_CACHE" not in key}
     environment = kept | {"MPLBACKEND": "Agg", "PYTHONPATH": str(ROOT)}
     if cache is not None:
@@ -68,7 +67,7 @@ def one(problem: str, shape: str | None, cache: str | None) -> tuple[float, floa
 
 
 def measure(problem: str, shape: str | None, repeats: int) -> list[dict[str, Any]]:
-    """Two rows; cold and cached processes take turns, after one that fills the cache."""
+    """Two rows; cold and cached processes take turns after one that fills the cache."""
     with tempfile.TemporaryDirectory() as cache:
         filling, *_ = one(problem, shape, cache)
         found: dict[str, list[tuple[float, float, int]]] = {"cold": [], "cached": []}
@@ -86,12 +85,12 @@ def measure(problem: str, shape: str | None, repeats: int) -> list[dict[str, Any
 
 
 def importing(repeats: int) -> list[dict[str, Any]]:
-    """Two rows; bytecode is written by a round that does not count, as an installation does."""
+    """Two rows; an uncounted round writes the bytecode, as an installation does."""
     kept = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
     runs: dict[str, list[tuple[float, float]]] = {"jax": [], "hjbjax": []}
     for _ in range(repeats + 1):
         for name, found in runs.items():
-            code = f"import {name}; {name}.{USED[name]}"  # hjbjax imports what it needs with its first name
+            code = f"import {name}; {name}.{USED[name]}"  # hjbjax imports its modules with the first name
             found.append(process([sys.executable, "-c", code], kept | {"PYTHONPATH": str(ROOT)}))
     rows = []
     for name, (_, *found) in runs.items():
@@ -103,7 +102,7 @@ def importing(repeats: int) -> list[dict[str, Any]]:
 
 
 def pendulum(nodes: int, repeats: int) -> list[dict[str, Any]]:
-    """The default answer and the monotone one; the operations of each loop are those of one more process."""
+    """The default and the monotone answer; one more process counts the operations of each loop."""
     rows = first_answer.middle("pendulum", nodes, ("monotone", "default"), repeats)
     for row in rows:
         row["operations"] = first_answer.sizes("pendulum", nodes, row["way"])
@@ -111,7 +110,7 @@ def pendulum(nodes: int, repeats: int) -> list[dict[str, Any]]:
 
 
 def chain(nodes: int, actions: int, repeats: int) -> list[dict[str, Any]]:
-    """Our first answer beside the faster of QuantEcon's methods, whose own compiling is not counted."""
+    """Our first answer against the faster method of QuantEcon, whose compiling does not count."""
     if reason := without("quantecon"):
         return [{"status": "SKIPPED", "reason": reason}]
     name, tol = f"pendulum, {actions} torques", 1e-3
@@ -136,7 +135,7 @@ def chain(nodes: int, actions: int, repeats: int) -> list[dict[str, Any]]:
 @click.option("--repeats", type=click.IntRange(1), default=None, help="Rounds; 3 if not given, quick 1.")
 @click.option("--out", type=Folder(), default=RESULTS, help="Folder of the files.")
 def command(quick: bool, part: tuple[str, ...], repeats: int | None, out: Path) -> None:
-    """The first answer: importing, compiling, and from process start to pictures."""
+    """Measure the first answer: importing, compiling, and from process start to pictures."""
     rounds, shape = repeats or (1 if quick else 3), "15x15" if quick else None
     sizes, chains = ((21,), ((27, 21),)) if quick else ((101, 201, 401, 801), ((161, 31), (201, 21)))
     problems = list(first_answer.ZOO)[:1] if quick else list(first_answer.ZOO)
@@ -160,7 +159,7 @@ def command(quick: bool, part: tuple[str, ...], repeats: int | None, out: Path) 
 
 
 def judged(rows: list[dict[str, Any]]) -> dict[str, float]:
-    """The figures of the thresholds that these rows hold."""
+    """The figures with a threshold that these rows contain."""
     figures: dict[str, float] = {}
     for row in rows:
         if row["part"] == "import" and row.get("start") == "import hjbjax":

@@ -1,13 +1,13 @@
 """One Bellman sweep: node-controls per second, against a hand-written numba loop and against copying the value.
 
-    V ← V + (min_u H − β V)/(max_u Q + β)        what a step of value iteration does, once over all nodes
+    V ← V + (min_u H − β V)/(max_u Q + β)        a step of value iteration, once over all nodes
 
-Kernels: ``sweep`` is that line in a compiled call of its own; ``loop`` is several of them in one compiled loop;
-``improve`` also writes down the greedy controls, as policy iteration needs them; ``step`` is a whole step of
-``solve`` with ``ValueIteration``, certificate included; ``numba`` is the peer's ``jacobi_sweep``; ``copy`` reads a
-value and writes a multiple of it, which is what memory allows. The pace max_u Q + β stays the same from sweep to
-sweep: both codes are given it as an array, and both use all cores. The fraction of the copy bandwidth is the seconds
-of ``copy`` over those of the kernel. Before anything is timed, both sweeps are compared number by number.
+Kernels: ``sweep`` is this line in a separate compiled call, and ``loop`` several of them in one compiled loop.
+``improve`` also stores the greedy controls, as policy iteration requires. ``step`` is a whole step of ``solve`` with
+``ValueIteration``, including the certificate. ``numba`` is the ``jacobi_sweep`` of the numba solver. ``copy`` reads a
+value and writes a multiple of it, the limit set by the memory. The pace max_u Q + β does not change between sweeps, so
+both codes get it as an array. Both use all cores. The fraction of the copy bandwidth is the seconds of ``copy`` over
+the seconds of the kernel. Both sweeps are compared number by number before anything is timed.
 """
 
 import functools
@@ -42,8 +42,8 @@ COLUMNS = (
 SCHEME = hjb.Upwind()
 KIND = np.dtype(np.float32)
 AGREE = 1e-5  # of the largest |V|: float32, and two orders of summation
-LARGE = ((8192, 8192), (512,) * 3, (104,) * 4, (22,) * 6)  # what fills a GPU
-LIMIT_ON_CPU = 1 << 24  # nodes: beyond that a sweep on two cores tells nothing new
+LARGE = ((8192, 8192), (512,) * 3, (104,) * 4, (22,) * 6)  # sizes that fill a GPU
+LIMIT_ON_CPU = 1 << 24  # nodes; larger sweeps on two cores show nothing new
 SIX = (20,) * 6
 
 
@@ -53,31 +53,31 @@ def greedy(problem: Any, grid: Any, value: jax.Array) -> Any:
 
 
 def sweep(problem: Any, grid: Any, value: jax.Array, outflow: jax.Array) -> jax.Array:
-    """V + r/(max Q + β) with r = min H − β V, as value iteration makes it: no action is kept."""
+    """V + r/(max Q + β) with r = min H − β V, as in value iteration; no action is stored."""
     return value + bellman.relaxation(Discretisation(problem, grid, SCHEME, value.dtype), value, outflow)[0] / outflow
 
 
 @functools.partial(jax.jit, donate_argnums=0, keep_unused=True)
 def one(old: jax.Array, problem: Any, grid: Any, value: jax.Array, outflow: jax.Array) -> jax.Array:
-    """A sweep that writes over ``old``, as the peer's does."""
+    """A sweep that overwrites ``old``, as the numba sweep does."""
     return sweep(problem, grid, value, outflow)
 
 
 @functools.partial(jax.jit, donate_argnums=0, static_argnums=4)
 def several(value: jax.Array, problem: Any, grid: Any, outflow: jax.Array, count: int) -> jax.Array:
-    """Sweeps in one compiled loop."""
+    """Several sweeps in one compiled loop."""
     return jax.lax.fori_loop(0, count, lambda _, value: sweep(problem, grid, value, outflow), value)
 
 
 @jax.jit
 def improve(problem: Any, grid: Any, value: jax.Array) -> Any:
-    """The greedy controls and the rate they leave."""
+    """The greedy controls and their residual."""
     return greedy(problem, grid, value)
 
 
 @functools.partial(jax.jit, donate_argnums=0, keep_unused=True)
 def copy(old: jax.Array, value: jax.Array) -> jax.Array:
-    """Reads one array, writes another."""
+    """Read one array and write another."""
     return value * jnp.asarray(0.999, value.dtype)
 
 
@@ -88,12 +88,12 @@ def paces(problem: Any, grid: Any) -> jax.Array:
 
 
 def started(grid: hjb.Grid) -> jax.Array:
-    """A smooth value to begin with."""
+    """A smooth initial value."""
     return jnp.asarray(sum(np.cos(each) for each in jax.device_get(grid.components(KIND))), KIND)
 
 
 def turning(function: Any, *arrays: jax.Array, count: int) -> Any:
-    """Calls ``function(old, new)`` ``count`` times, each result being the next ``new``; keeps both arrays between."""
+    """Call ``function(old, new)`` ``count`` times; each result is the next ``new``, and both arrays are reused."""
     pair = list(arrays)
 
     def call():
@@ -105,7 +105,7 @@ def turning(function: Any, *arrays: jax.Array, count: int) -> Any:
 
 
 def theirs(problem: Any, grid: hjb.Grid, points: np.ndarray, count: int) -> Any:
-    """The peer's sweeps, in the same manner."""
+    """The sweeps of the numba solver, called in the same way."""
     from benchmarks.peers.numba_pendulum import jacobi_sweep
 
     pair = [np.empty(grid.shape, KIND), np.array(started(grid))]
@@ -137,7 +137,7 @@ def largest_difference(problem: Any, grid: hjb.Grid, points: np.ndarray) -> floa
 
 
 def candidates(problem: Any, grid: hjb.Grid, count: int) -> dict[str, Any]:
-    """What is timed at one size, ``count`` sweeps a call."""
+    """The timed functions at one size, ``count`` sweeps per call."""
     case = cast((problem, grid), KIND)
     outflow, value = paces(*case), started(grid)
     again, looping = jnp.copy, [started(grid)]
@@ -160,7 +160,7 @@ def candidates(problem: Any, grid: hjb.Grid, count: int) -> dict[str, Any]:
 
 
 def whole_steps(problem: Any, grid: hjb.Grid, count: int) -> Any:
-    """Steps of ``solve`` with value iteration, as its host loop runs them."""
+    """Steps of ``solve`` with value iteration, run as its host loop does."""
     method = hjb.ValueIteration()
     task, _, _ = prepare_on_host(Discretisation(problem, grid, SCHEME, KIND), method=method, tol=1e-30)
     states = [stationary_run.run(task, fixed_point.begin(task, started(grid)), 0)]
@@ -173,7 +173,7 @@ def whole_steps(problem: Any, grid: hjb.Grid, count: int) -> Any:
 
 
 def sweeps_per_call(grid: hjb.Grid) -> int:
-    """So many that a call outlasts what starting it costs."""
+    """The number of sweeps for which a call takes much longer than starting it."""
     return min(32, max(1, (1 << 23) // grid.size))
 
 
@@ -200,7 +200,7 @@ def against_numba(nodes: int, actions: int, repeats: int) -> list[dict[str, Any]
 
 
 def by_dimension(shape: tuple[int, ...], actions: int, repeats: int) -> list[dict[str, Any]]:
-    """The kernels in any dimension, on the chain of integrators, with what they take in memory."""
+    """The kernels in any dimension, on the chain of integrators, with their memory."""
     problem, grid = cases.integrators(shape, actions)
     count = sweeps_per_call(grid)
     calls = candidates(problem, grid, count)
@@ -224,7 +224,7 @@ def _row(kernel: str, grid: hjb.Grid, actions: int, count: int, timings: dict[st
 
 
 def footprint(kernel: str, problem: Any, grid: hjb.Grid, dtype: Any = KIND) -> dict[str, Any]:
-    """Bytes a node by the compiled program's own account: in all, and beyond the two values of a sweep.
+    """Bytes per node as reported by XLA: in total, and in addition to the two values of a sweep.
 
     Nothing is allocated: the arrays are shapes.
     """
@@ -241,7 +241,7 @@ def footprint(kernel: str, problem: Any, grid: hjb.Grid, dtype: Any = KIND) -> d
 
 
 def in_six_dimensions() -> list[dict[str, Any]]:
-    """What a sweep on 20^6 needs beside the value before and after, in both precisions."""
+    """Memory of a sweep on 20^6 nodes in addition to the old and the new value, in both precisions."""
     rows = []
     for dtype in (np.float32, np.float64):
         with jax.enable_x64(dtype is np.float64):
@@ -252,9 +252,9 @@ def in_six_dimensions() -> list[dict[str, Any]]:
 
 
 def fitted(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """The shape, or the largest like it that this machine takes."""
+    """The shape, or the largest similar shape that fits this machine."""
     free = memory.available()
-    most = math.inf if free is None else free / (8 * KIND.itemsize)  # values, pace, controls, and as much again
+    most = math.inf if free is None else free / (8 * KIND.itemsize)  # values, pace and controls, doubled
     if jax.devices()[0].platform == "cpu":
         most = min(most, LIMIT_ON_CPU)
     scale = min(1.0, most / math.prod(shape)) ** (1 / len(shape))
@@ -262,7 +262,7 @@ def fitted(shape: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def judged(rows: list[dict[str, Any]]) -> dict[str, float]:
-    """The figures of the thresholds that these rows hold."""
+    """The figures with a threshold that these rows contain."""
     figures = {}
     for row in rows:
         if row.get("kernel") == "sweep" and row.get("controls") == 21 and "against_numba" in row:
@@ -279,7 +279,7 @@ def judged(rows: list[dict[str, Any]]) -> dict[str, float]:
 @click.option("--few", type=click.IntRange(2), default=3, show_default=True, help="Controls in the other dimensions.")
 @click.option("--out", type=Folder(), default=RESULTS, help="Folder of the files.")
 def command(quick: bool, repeats: int | None, controls: int, few: int, out: Path) -> None:
-    """Node-controls per second of one sweep, against numba and against the copy bandwidth."""
+    """Measure node-controls per second of one sweep, against numba and against the copy bandwidth."""
     repeats = repeats or (2 if quick else 9)
     plane = (64, 96) if quick else (1024, 2048)
     shapes = ((96, 96), (16,) * 3, (9,) * 4, (5,) * 6) if quick else tuple(map(fitted, LARGE))

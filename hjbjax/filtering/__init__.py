@@ -1,12 +1,14 @@
-"""State estimates and control from them: output feedback.
+"""State estimation and output feedback: observers and controllers that act on measurements.
 
     dx = f(x, u) dt + σ dw,    dy = h(x) dt + r dv,    u = control(information state)
 
-Read ``observers`` first: the extended Kalman filter, the Luenberger observer, and how to write one; then
-``information_state``, the law of the state on a grid; ``robust_filter`` for the worst case, with its equation in
-``max_plus``; ``beliefs`` with ``hidden_chain`` for hidden chains of a few states; and ``controllers`` for controls from
-the states of all these. The loop through plant, sensor, observer and control stands with the other closed loops, in
-``hjbjax.feedback.output_feedback``.
+- ``observers``: the extended Kalman filter and the Luenberger observer. Read it first, also to write your own observer.
+- ``information_state``: the law of the state on a grid.
+- ``robust_filter``: the worst-case filter; its equation is in ``max_plus``.
+- ``beliefs`` and ``hidden_chain``: hidden Markov chains with a few states.
+- ``controllers``: controllers that act on the information state of these filters.
+
+The closed loop of plant, sensor, observer and controller is in ``hjbjax.feedback.output_feedback``.
 """
 
 from hjbjax.feedback.output_feedback import simulate_output

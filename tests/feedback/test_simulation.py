@@ -447,7 +447,7 @@ BOX2 = Grid([-1.0, -1.0], [1.0, 1.0], (3, 3))
         (GAME, toward_zero, [1.0], {"disturbance": lambda x: x[0]}, r"disturbance returned shape \(\)"),
         (PLAIN, lambda x: x[0], [1.0], {}, r"feedback returned shape \(\), expected \(1,\)"),
         (PLAIN, lambda x: -x if x[0] > 0 else x, [1.0], {}, "jnp.where"),
-        (PLAIN, lambda x: np.sign(np.asarray(x)), [1.0], {}, "use jnp in place of np"),
+        (PLAIN, lambda x: np.sign(np.asarray(x)), [1.0], {}, "use jnp instead of np"),
         (LQ, Answer(BOX2, np.zeros((4, 3, 3, 1)), times=np.arange(4.0)), [0.5, 0.5], {}, "marched"),
     ],
 )

@@ -7,9 +7,7 @@ The running cost is one more state of the integrator, so it has the accuracy of 
 
 Without noise: Tsit5 with adaptive steps, at most one output interval long. A feedback that jumps (bang-bang) makes any
 adaptive stepper crawl along its switching curve, so no step is shorter than 2·duration/max_steps. The path then
-chatters within f·(that step) of the curve, like a fast sampler. For these feedbacks a zero-order hold is faster, and it
-is also what hardware does.
-
+chatters within f·(that step) of the curve, like a fast sampler. A zero-order hold, as in hardware, is faster there.
 With noise: fixed steps in the Itô sense on a virtual Brownian tree. Noise that is a number or a matrix uses SRA1
 (strong order 1.5 in a smooth closed loop); noise that is a function uses Euler–Maruyama (strong order ½, weak order 1).
 Rejecting steps would bias the law of the path, so ``rtol`` and ``atol`` are ignored.
@@ -48,7 +46,7 @@ Beginning: TypeAlias = tuple[Control, Number, State]  # of an interval: the held
 # For each interval: time and state at its end, both actions at its start, and True if the path runs through it.
 Rows: TypeAlias = tuple[jax.Array, jax.Array, jax.Array, jax.Array | None, jax.Array]
 
-LOOKS = 16  # evaluations of a tube's functions per output interval; the error of an extreme falls as 1/16²
+LOOKS = 16  # evaluations of a tube's functions per output interval; an extreme is off by 1/16² of its change
 LEAST_STEPS = 10  # per output interval with noise, where no error estimate shortens a step
 TREE = 64  # the shortest step over the tolerance of the Brownian tree, below which w is interpolated
 DEEPEST = 2**30  # the largest duration over that tolerance: each halving adds a level of the tree to every step

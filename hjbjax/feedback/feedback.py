@@ -54,7 +54,7 @@ class GridFeedback(Protocol):
 
     @property
     def disturbance(self) -> Array | None:
-        """Not None exactly if the worst case is known."""
+        """Not None if and only if the worst case is known."""
 
     @property
     def control_at(self) -> Callable[..., Array]:

@@ -339,7 +339,7 @@ def bridging(kind: type) -> type:
     """A diffrax solver that writes the flag of each step into the last entry of the state at its end."""
 
     class Bridging(kind):
-        flag: Any = None  # fields after those of the base class need a default
+        flag: Any = None  # a field after the base class's fields needs a default
 
         def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
             y1, error, dense, state, result = super().step(terms, t0, t1, y0, args, solver_state, made_jump)

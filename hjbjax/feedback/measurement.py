@@ -62,7 +62,7 @@ def measurement(h: Callable, n: int, noise: Numbers | Sequence, name: str, *, pe
       TypeError: an h that cannot be called, noise that is not a number.
     """
     if not callable(h):
-        raise TypeError(f"{name}: h is {h!r}, wanted the measured function of one state, (x) -> (p,)")
+        raise TypeError(f"{name}: h is {h!r}, wanted a function of one state, (x) -> (p,)")
     # handled like a problem's function: changed numbers in its closure are noticed, and traced ones become leaves
     function = closures.settled(Problem(_rest, target=h), n).target
     try:
@@ -229,7 +229,7 @@ def controls_of(given: Any, name: str, problem: Problem, steps: tuple[int, ...])
     m = 0 if problem.controls is None else problem.controls.dim
     wanted = (*steps, m)
     if given is None and m > 0:
-        raise ValueError(f"{name} is None, but the problem has {m}; pass the applied controls, shape {wanted}")
+        raise ValueError(f"{name} is None, but the problem has {m} inputs; pass the applied controls, shape {wanted}")
     acts = np.zeros(wanted) if given is None else numbers(given, name)
     if np.shape(acts) == wanted[1:] and len(wanted) == 3:
         acts = jnp.broadcast_to(acts, wanted) if is_traced(acts) else np.broadcast_to(acts, wanted)

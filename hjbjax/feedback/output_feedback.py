@@ -288,7 +288,6 @@ def _report(path: OutputPath) -> None:
 
 
 ADVICE = {
-    PathStatus.NONFINITE: "stopped before a step to a state or estimate that is not finite; try a shorter dt or more "
-    "substeps",
+    PathStatus.NONFINITE: "stopped before a state or estimate that is not finite; try a shorter dt or more substeps",
     PathStatus.UNDEFINED: "stopped where the control is not finite",
 }

@@ -73,7 +73,7 @@ def simulate(
       steps: number of output intervals; ``None`` is 200, or the sampling intervals under ``hold``.
       disturbance: a function that returns the opponent's d, shape (l,). Default: the worst case of the Solution.
       time_varying: True if feedback and disturbance take ``(t, x)`` although the problem does not depend on time.
-      key: a JAX random key or an integer; required exactly if the problem has noise.
+      key: a JAX random key or an integer; required if and only if the problem has noise.
       hold: the sampling interval of a zero-order hold of the control, in units of time; ``False`` for none.
       grid: the box of a feedback that is a function; a Solution has its own grid.
       clamp: outside the box, ``False`` ends the path at the boundary; ``True`` continues with the feedback at the
@@ -218,7 +218,7 @@ def rollout(
 
     Keyword Args:
       disturbance: as in ``simulate``, like ``time_varying``.
-      key: a JAX random key; required exactly if the problem has noise.
+      key: a JAX random key; required if and only if the problem has noise.
       hold: True if the control is held from one output time to the next.
       grid: as in ``simulate``, like ``clamp``, ``rtol``, ``atol``, ``max_step`` and ``max_steps``.
       due: the payment after the last time: "terminal cost", "V at the horizon" of a march, or "nothing". Default: the

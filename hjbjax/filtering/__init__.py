@@ -2,13 +2,10 @@
 
     dx = f(x, u) dt + σ dw,    dy = h(x) dt + r dv,    u = control(information state)
 
-- ``observers``: the extended Kalman filter and the Luenberger observer. Read it first, also to write your own observer.
-- ``information_state``: the law of the state on a grid.
-- ``robust_filter``: the worst-case filter; its equation is in ``max_plus``.
-- ``beliefs`` and ``hidden_chain``: hidden Markov chains with a few states.
-- ``controllers``: controllers that act on the information state of these filters.
-
-The closed loop of plant, sensor, observer and controller is in ``hjbjax.feedback.output_feedback``.
+Read ``observers`` first: the extended Kalman filter, the Luenberger observer, and how to write an observer. Then read
+``information_state`` for the law of the state on a grid, ``robust_filter`` for the worst-case filter (its equation is
+in ``max_plus``), ``beliefs`` and ``hidden_chain`` for hidden Markov chains, and ``controllers`` for controllers that
+act on these information states. The closed loop is in ``hjbjax.feedback.output_feedback``.
 """
 
 from hjbjax.feedback.output_feedback import simulate_output

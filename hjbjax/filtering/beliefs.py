@@ -19,8 +19,8 @@ basis B of the vectors with sum zero that makes B H Hᵀ Bᵀ = diag(a₁, …) 
 
 The second term of μ is the Itô correction. The noise acts along the axes, so the chain is monotone for any spacings.
 The faces of the simplex lie at infinity; the box ends where the smallest π is ``floor`` times the largest. This
-changes the value by about as much as a belief of size ``floor`` does. The drift there is about a rate divided by
-``floor``. The default scheme may stall on so fast a drift and then reports it: use ``scheme=hjb.Upwind()``.
+changes the value by about as much as a belief of size ``floor`` does. The drift near the end is fast, about a rate
+divided by ``floor``. If the default scheme stalls there and reports it, use ``scheme=hjb.Upwind()``.
 """
 
 import dataclasses

@@ -141,8 +141,7 @@ class MinimumStress:
             warn(
                 f"minimum_stress: the worst case is at an end of the box on {np.sum(ends)} of {len(ends)} paths, the "
                 f"first at {np.array2string(states[np.argmax(ends)], separator=', ')}: p + V has no maximum inside.\n"
-                "Either γ is too small for filter and feedback together, or V belongs to another γ, or the box is too "
-                "small.",
+                "γ is too small for filter and feedback together, V belongs to another γ, or the box is too small.",
                 UserWarning,
             )
 

@@ -8,7 +8,8 @@ The factors are exact for a state that does not move. The middle step conserves 
 record, see ``forward_equation``. The splitting has order 2 in dt along a smooth record. The likelihood of a noisy
 record has order 1, because an increment does not show when within its interval the noise arrived. In space the order
 is 2 where the law is smooth, by central differences or a limited flux, see ``transport``. The factors are multiplied as
-logarithms after subtracting the largest, so nothing overflows or vanishes; the logarithm of the mass keeps it.
+logarithms after subtracting the largest product, so nothing overflows or vanishes. The subtracted logarithms add up to
+the log-likelihood.
 """
 
 from collections.abc import Callable, Sequence

@@ -68,9 +68,8 @@ def zakai(
 
     Computes in float64. Under a tracer it computes in the type of the record and has forward derivatives (``jacfwd``),
     and outside ``jit`` and ``vmap`` also reverse derivatives (``grad``).
-
     Along a periodic axis the mean is circular, the angle of the mean of e^{iθ} wrapped into the box. The covariance
-    uses the differences from it, taken the short way round.
+    uses differences from this mean, taken the short way round.
 
     Args:
       problem: the plant; only its drift, controls and noise are used.

@@ -55,9 +55,7 @@ def initial_values(initial: Any, grid: Grid) -> Any:
     else:
         values = numbers(initial, "robust_filter: initial")
     if np.shape(values) != grid.shape:
-        raise ValueError(
-            f"robust_filter: initial has shape {np.shape(values)}, wanted {grid.shape}: one number per node"
-        )
+        raise ValueError(f"robust_filter: initial has shape {np.shape(values)}, wanted {grid.shape}: one per node")
     if not is_traced(values) and not np.all(np.isfinite(values)):
         bad = np.asarray(values)[~np.isfinite(values)][0]
         raise ValueError(

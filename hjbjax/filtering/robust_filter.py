@@ -245,7 +245,7 @@ def robust_filter(
 
     Keyword Args:
       gamma: γ > 0; a smaller γ makes disturbances cheaper.
-      controls: the controls that were applied, shape (k, m); required exactly if the problem has controls.
+      controls: the controls that were applied, shape (k, m); required if and only if the problem has controls.
       sigma: the gain of w, as in ``RobustGridFilter``. Default: the noise of the problem, or the identity.
       measurement_noise: r: a number, one per measurement (p,), or a matrix (p, p), in the units of h.
       scheme: the scheme for the slopes.
@@ -274,7 +274,7 @@ def robust_filter(
     """
     options: Any = {"sigma": sigma, "measurement_noise": measurement_noise, "scheme": scheme}
     robust_arguments.check_question(problem, grid, scheme)
-    # copy the numbers that the functions close over as they are in this call, as for h
+    # look for changes in the problem's functions at every call, as for h
     asked = settled(Problem(problem.drift, problem.cost, problem.controls, noise=problem.noise), grid.ndim)
     observer = RobustGridFilter(asked, h, grid, initial, gamma, **options)
     if not is_traced(dt):

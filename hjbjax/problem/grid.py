@@ -44,8 +44,7 @@ class Grid:
         "constrained": actions whose drift leaves the box are not admissible: the state-constrained problem.
         "open": paths may leave; beyond the end V is extended by the parabola through its last three nodes.
         "linear": paths may leave; beyond the end V is extended by the straight line through its last two nodes.
-        Noise reflects at a projected and at a constrained end, on the node itself, and uses the extension of V at the
-        other two.
+        Noise reflects at a projected or constrained end, on the node itself, and uses the extension of V at the others.
         A prescribed end: see ``Dirichlet(value)``, ``Neumann(slope)`` and ``Robin(rate)``.
       units: one unit per axis, as in ("rad", "rad/s"), for plots and printed tables; empty without a unit.
 

@@ -26,7 +26,7 @@ class Problem:
     """An optimal control problem or a two-player zero-sum differential game.
 
     Functions act on one state. ``drift``, ``cost`` and a callable ``noise`` take ``(x, u)``; they take
-    ``(x, u, d)`` exactly if ``disturbances`` is given. ``target``, ``exit_cost``, ``terminal_cost``,
+    ``(x, u, d)`` if ``disturbances`` is given. ``target``, ``exit_cost``, ``terminal_cost``,
     ``stopping_cost`` and ``running_max`` take ``(x)``. With ``time_dependent=True`` the time comes first in all.
 
     Args:

@@ -248,7 +248,7 @@ def test_the_terminal_cost_is_paid_at_the_end_alone():
 
 def test_a_loop_that_fails_says_so():
     problem = Problem(lambda x, u: x**3)
-    with pytest.warns(UserWarning, match="the path stopped before a step to a state or estimate that is not finite"):
+    with pytest.warns(UserWarning, match="the path stopped before a state or estimate that is not finite"):
         path = simulate_output(problem, Memory0(), None, **options(x0=[4.0], h=lambda x: x))
     assert path.status is PathStatus.NONFINITE
     assert np.all(np.isfinite(path.states))
